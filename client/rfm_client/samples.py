@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: MIT
+"""Samples and results: what a reward model is asked, and what it answers.
+
+Shapes: T frames, H x W pixels, D width of a frame embedding, Dt width of a text embedding, K progress bins.
+Arrays are checked once, here; everything behind trusts them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.errors import InvalidSampleError
+
+Float32Array: TypeAlias = npt.NDArray[np.float32]
+UInt8Array: TypeAlias = npt.NDArray[np.uint8]
+
+MIN_FRAME_STEPS = 2  # a prefix of the trajectory sampled to one frame would not be a trajectory
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Trajectory:
+    """The frames, or precomputed frame embeddings, of one episode, and its task.
+
+    frames: uint8 [T, H, W, 3], RGB
+    video_embeddings: float32 [T, D]
+    text_embedding: float32 [Dt], embedding of the task; goes with video_embeddings
+    task: the task as a sentence; goes with frames
+
+    Exactly one of ``frames`` and ``video_embeddings`` is given. Raises InvalidSampleError.
+    """
+
+    frames: UInt8Array | None = None
+    video_embeddings: Float32Array | None = None
+    text_embedding: Float32Array | None = None
+    task: str = ""
+
+    def __post_init__(self) -> None:
+        if (self.frames is None) == (self.video_embeddings is None):
+            got = "neither" if self.frames is None else "both"
+            raise InvalidSampleError.at("trajectory", "either frames or video_embeddings", got)
+        if not isinstance(self.task, str):
+            raise InvalidSampleError.at("task", "str", type(self.task).__name__)
+        if any(0xD800 <= ord(character) <= 0xDFFF for character in self.task):
+            raise InvalidSampleError.at("task", "text that UTF-8 can encode", "a lone surrogate")
+        if self.frames is not None:
+            object.__setattr__(self, "frames", _checked_frames(self.frames))
+        if self.video_embeddings is not None:
+            embeddings = _checked_floats("video_embeddings", self.video_embeddings, ("T", "D"))
+            object.__setattr__(self, "video_embeddings", embeddings)
+        if self.text_embedding is not None:
+            text = _checked_floats("text_embedding", self.text_embedding, ("Dt",))
+            object.__setattr__(self, "text_embedding", text)
+
+    @property
+    def positions(self) -> npt.NDArray[Any]:
+        """The array whose first axis is time: ``frames`` or ``video_embeddings``."""
+        array = self.video_embeddings if self.frames is None else self.frames
+        assert array is not None  # __post_init__ has seen to it
+        return array
+
+    @property
+    def num_frames(self) -> int:
+        """T."""
+        return int(self.positions.shape[0])
+
+
+@dataclass(frozen=True, eq=False)
+class ProgressSample:
+    """How far has ``trajectory`` come, and has it succeeded, at each of its frames?
+
+    frame_steps: 0 scores the trajectory as a whole. K >= 2 is dense mode: frame t is scored on the
+    prefix 0..t alone, sampled to K frames, as an RL loop would have seen it at that step.
+    """
+
+    trajectory: Trajectory
+    frame_steps: int = 0
+
+    def __post_init__(self) -> None:
+        _check_text(self.trajectory, "trajectory")
+        if self.frame_steps != 0 and self.frame_steps < MIN_FRAME_STEPS:
+            raise InvalidSampleError.at("frame_steps", f"0 or at least {MIN_FRAME_STEPS}", str(self.frame_steps))
+
+    @property
+    def trajectories(self) -> tuple[Trajectory, ...]:
+        """The trajectories in the order in which they lie on the time axis."""
+        return (self.trajectory,)
+
+
+@dataclass(frozen=True, eq=False)
+class PreferenceSample:
+    """Which trajectory does the task of ``first`` better?"""
+
+    first: Trajectory
+    second: Trajectory
+
+    def __post_init__(self) -> None:
+        _check_text(self.first, "first")
+        _check_pair(self.first, self.second, "second")
+
+    @property
+    def trajectories(self) -> tuple[Trajectory, ...]:
+        """The trajectories in the order in which they lie on the time axis."""
+        return (self.first, self.second)
+
+
+@dataclass(frozen=True, eq=False)
+class SimilaritySample:
+    """How similar is ``other`` to ``reference``, as ways of doing the task of ``reference``?"""
+
+    reference: Trajectory
+    other: Trajectory
+
+    def __post_init__(self) -> None:
+        _check_text(self.reference, "reference")
+        _check_pair(self.reference, self.other, "other")
+
+    @property
+    def trajectories(self) -> tuple[Trajectory, ...]:
+        """The trajectories in the order in which they lie on the time axis."""
+        return (self.reference, self.other)
+
+
+Sample: TypeAlias = ProgressSample | PreferenceSample | SimilaritySample
+
+
+@dataclass(frozen=True)
+class BatchTiming:
+    """Milliseconds that the server spent on the batch in which a sample was scored."""
+
+    collate_ms: float
+    forward_ms: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameScores:
+    """Scores of each frame of one trajectory.
+
+    progress: float32 [T], share of the task done, 0..1
+    success: float32 [T], probability that the task is done
+    progress_logits: float32 [T, K], raw scores of the progress bins; only of discrete checkpoints, on request
+    """
+
+    progress: Float32Array
+    success: Float32Array
+    progress_logits: Float32Array | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ProgressResult(FrameScores):
+    """Answer to a ProgressSample: the scores of its trajectory's frames."""
+
+    timing: BatchTiming | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PreferenceResult:
+    """Answer to a PreferenceSample: the probability that ``first`` is preferred, and each frame's scores."""
+
+    preference: float
+    first: FrameScores
+    second: FrameScores
+    timing: BatchTiming | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SimilarityResult:
+    """Answer to a SimilaritySample: the model's raw similarity score (unbounded), and each frame's scores."""
+
+    similarity: float
+    reference: FrameScores
+    other: FrameScores
+    timing: BatchTiming | None = None
+
+
+Result: TypeAlias = ProgressResult | PreferenceResult | SimilarityResult
+
+
+def float_frames_to_uint8(frames: npt.ArrayLike) -> UInt8Array:
+    """uint8 frames from float frames in 0..255, as the original evaluation server made them: clip, then truncate.
+
+    Raises InvalidSampleError for frames in 0..1, which truncation would turn black, and for NaN.
+    """
+    array = np.asarray(frames)
+    if array.size == 0 or not np.isfinite(array).all():
+        raise InvalidSampleError.at("frames", "finite values in 0..255", "NaN, Inf or nothing")
+    largest = float(array.max())
+    if 0.0 < largest <= 1.0:
+        raise InvalidSampleError.at("frames", "values in 0..255", f"values up to {largest:g}: multiply by 255 first")
+    return np.clip(array, 0, 255).astype(np.uint8)
+
+
+def _checked_frames(frames: Any) -> UInt8Array:
+    array = np.asarray(frames)
+    got = f"{array.dtype} {list(array.shape)}"
+    if array.dtype != np.uint8:
+        raise InvalidSampleError.at("frames", "uint8 [T, H, W, 3] (see float_frames_to_uint8)", got)
+    if array.ndim != 4 or array.shape[3] != 3:
+        raise InvalidSampleError.at("frames", "uint8 [T, H, W, 3]", got)
+    if 0 in array.shape:
+        raise InvalidSampleError.at("frames", "at least one frame of at least one pixel", got)
+    return array
+
+
+def _checked_floats(where: str, values: Any, axes: tuple[str, ...]) -> Float32Array:
+    expected = f"float32 [{', '.join(axes)}]"
+    try:
+        array = np.asarray(values)
+    except ValueError:  # lists of unequal length
+        raise InvalidSampleError.at(where, expected, "rows of unequal length") from None
+    got = f"{array.dtype} {list(array.shape)}"
+    if array.dtype.kind not in "fiu" or array.ndim != len(axes):
+        raise InvalidSampleError.at(where, expected, got)
+    if 0 in array.shape:
+        raise InvalidSampleError.at(where, f"{expected} without an empty axis", got)
+    with np.errstate(over="ignore"):  # what does not fit becomes Inf and is refused below
+        array = array.astype(np.float32, copy=False)
+    finite = np.isfinite(array)
+    if not finite.all():
+        position = np.argwhere(~finite)[0].tolist()
+        raise InvalidSampleError.at(where, "finite values", f"{array[tuple(position)]} at {position}")
+    return array
+
+
+def _check_text(trajectory: Trajectory, where: str) -> None:
+    """The first trajectory's text is the one that the model reads."""
+    if trajectory.frames is None and trajectory.text_embedding is None:
+        raise InvalidSampleError.at(f"{where}.text_embedding", "float32 [Dt] with video_embeddings", "None")
+    if trajectory.frames is not None and not trajectory.task.strip():
+        raise InvalidSampleError.at(f"{where}.task", "a task sentence with frames", repr(trajectory.task))
+
+
+def _check_pair(first: Trajectory, second: Trajectory, where: str) -> None:
+    """Both trajectories of a sample lie in one array."""
+    if (first.frames is None) != (second.frames is None):
+        expected, got = ("video_embeddings", "frames") if first.frames is None else ("frames", "video_embeddings")
+        raise InvalidSampleError.at(where, f"{expected}, as the first trajectory", got)
+    if first.positions.shape[1:] != second.positions.shape[1:]:
+        name = "video_embeddings" if first.frames is None else "frames"
+        expected, got = str(list(first.positions.shape[1:])), str(list(second.positions.shape[1:]))
+        raise InvalidSampleError.at(f"{where}.{name}", f"{expected} per frame, as the first trajectory", got)

@@ -1,0 +1,304 @@
+# SPDX-License-Identifier: MIT
+"""The wire contract: samples and results as named tensors. The only place where tensor names stand.
+
+Letters: B samples of one request (the batch axis), P frame positions: the first trajectory's frames, then
+the second's, then zero padding; D, Dt, K, H, W as in ``rfm_client.samples``.
+
+Every input is always present, and whatever changes the answer is an input: that is what lets Triton put
+requests of different callers, lengths and sample types into one batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.errors import InferenceFailedError, InvalidSampleError
+from rfm_client.samples import (
+    BatchTiming,
+    Float32Array,
+    FrameScores,
+    PreferenceResult,
+    PreferenceSample,
+    ProgressResult,
+    ProgressSample,
+    Result,
+    Sample,
+    SimilarityResult,
+    SimilaritySample,
+    Trajectory,
+)
+
+Tensors: TypeAlias = dict[str, npt.NDArray[Any]]
+
+SAMPLE_TYPE = "sample_type"
+NUM_FRAMES = "num_frames"
+FRAME_STEPS = "frame_steps"
+VIDEO_EMBEDDINGS = "video_embeddings"
+TEXT_EMBEDDING = "text_embedding"
+FRAMES = "frames"
+TASK = "task"
+
+PROGRESS = "progress"
+SUCCESS = "success"
+PREFERENCE = "preference"
+SIMILARITY = "similarity"
+PROGRESS_LOGITS = "progress_logits"
+TIMING_MS = "timing_ms"
+
+VARIABLE = -1  # a dimension that differs from request to request
+
+
+class SampleType(IntEnum):
+    """Values of the ``sample_type`` input."""
+
+    PROGRESS = 0
+    PREFERENCE = 1
+    SIMILARITY = 2
+
+
+_SAMPLE_TYPES = {
+    ProgressSample: SampleType.PROGRESS,
+    PreferenceSample: SampleType.PREFERENCE,
+    SimilaritySample: SampleType.SIMILARITY,
+}
+
+
+@dataclass(frozen=True)
+class TensorSpec:
+    """Name, element type and dimensions (without the batch axis) of one input or output.
+
+    ragged: requests in which the variable dimensions differ may still share a batch.
+    """
+
+    name: str
+    datatype: Literal["UINT8", "INT32", "FP32", "BYTES"]
+    dims: tuple[int, ...]
+    ragged: bool = False
+
+
+_NUM_FRAMES_SPEC = TensorSpec(NUM_FRAMES, "INT32", (2,))
+_QUESTION_SPECS = (TensorSpec(SAMPLE_TYPE, "UINT8", (1,)), _NUM_FRAMES_SPEC, TensorSpec(FRAME_STEPS, "INT32", (1,)))
+_FRAMES_SPECS = (
+    TensorSpec(FRAMES, "UINT8", (VARIABLE, VARIABLE, VARIABLE, 3), ragged=True),
+    TensorSpec(TASK, "BYTES", (1,)),
+)
+
+
+def embedding_inputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
+    """Inputs of a model that scores embeddings of widths D = video_dim and Dt = text_dim."""
+    video = TensorSpec(VIDEO_EMBEDDINGS, "FP32", (VARIABLE, video_dim), ragged=True)
+    return (*_QUESTION_SPECS, video, TensorSpec(TEXT_EMBEDDING, "FP32", (text_dim,)))
+
+
+def frame_inputs() -> tuple[TensorSpec, ...]:
+    """Inputs of a model that scores raw frames."""
+    return (*_QUESTION_SPECS, *_FRAMES_SPECS)
+
+
+def encoder_inputs() -> tuple[TensorSpec, ...]:
+    """Inputs of the encoder; num_frames keeps it from encoding padding."""
+    return (_NUM_FRAMES_SPEC, *_FRAMES_SPECS)
+
+
+def encoder_outputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
+    """Outputs of the encoder: what ``embedding_inputs`` takes in place of frames and task."""
+    return tuple(
+        TensorSpec(spec.name, spec.datatype, spec.dims)
+        for spec in embedding_inputs(video_dim, text_dim)
+        if spec.name in (VIDEO_EMBEDDINGS, TEXT_EMBEDDING)
+    )
+
+
+def score_outputs(progress_bins: int | None) -> tuple[TensorSpec, ...]:
+    """Outputs of every reward model; progress_bins is K of a discrete checkpoint, None of a continuous one."""
+    scores = (
+        TensorSpec(PROGRESS, "FP32", (VARIABLE,)),
+        TensorSpec(SUCCESS, "FP32", (VARIABLE,)),
+        TensorSpec(PREFERENCE, "FP32", (1,)),
+        TensorSpec(SIMILARITY, "FP32", (1,)),
+        TensorSpec(TIMING_MS, "FP32", (2,)),
+    )
+    if progress_bins is None:
+        return scores
+    return (*scores, TensorSpec(PROGRESS_LOGITS, "FP32", (VARIABLE, progress_bins)))
+
+
+def encode_samples(samples: Sequence[Sample]) -> Tensors:
+    """One request for samples whose frame positions have the same shape beyond the time axis."""
+    positions = [np.concatenate([t.positions for t in sample.trajectories]) for sample in samples]
+    tensors: Tensors = {
+        SAMPLE_TYPE: np.array([[_SAMPLE_TYPES[type(sample)]] for sample in samples], np.uint8),
+        NUM_FRAMES: np.array([_num_frames(sample) for sample in samples], np.int32),
+        FRAME_STEPS: np.array([[getattr(sample, "frame_steps", 0)] for sample in samples], np.int32),
+    }
+    texts = [sample.trajectories[0] for sample in samples]
+    if texts[0].frames is not None:
+        tensors[FRAMES] = pad_stack(positions)
+        tensors[TASK] = np.array([[text.task.encode()] for text in texts], np.object_)
+    else:
+        tensors[VIDEO_EMBEDDINGS] = pad_stack(positions)
+        tensors[TEXT_EMBEDDING] = np.stack([text.text_embedding for text in texts if text.text_embedding is not None])
+    return tensors
+
+
+def decode_samples(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Sample]:
+    """The samples of one request. Raises InvalidSampleError that names the sample and the field."""
+    return [_located(_decode_sample, tensors, row) for row in range(len(tensors[SAMPLE_TYPE]))]
+
+
+def decode_trajectories(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Trajectory]:
+    """What the encoder is to encode: per sample its frames without padding, and its task."""
+
+    def decode(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> Trajectory:
+        lengths = tensors[NUM_FRAMES][row].tolist()
+        if lengths[0] < 1 or lengths[1] < 0:
+            raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, at least 0]", str(lengths))
+        return Trajectory(frames=_unpadded(tensors, FRAMES, row, sum(lengths)), task=_task(tensors, row))
+
+    return [_located(decode, tensors, row) for row in range(len(tensors[NUM_FRAMES]))]
+
+
+def encode_results(results: Sequence[Result], num_positions: int, outputs: Collection[str]) -> Tensors:
+    """The requested outputs of one request of ``num_positions`` = P; what a result lacks is NaN, never 0."""
+    columns: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in outputs}
+    for result in results:
+        scores = _frame_scores(result)
+        row: dict[str, npt.NDArray[Any] | list[float]] = {
+            PROGRESS: np.concatenate([s.progress for s in scores]),
+            SUCCESS: np.concatenate([s.success for s in scores]),
+            PREFERENCE: [result.preference if isinstance(result, PreferenceResult) else np.nan],
+            SIMILARITY: [result.similarity if isinstance(result, SimilarityResult) else np.nan],
+        }
+        if TIMING_MS in columns and result.timing is not None:
+            row[TIMING_MS] = [result.timing.collate_ms, result.timing.forward_ms]
+        if PROGRESS_LOGITS in columns:
+            row[PROGRESS_LOGITS] = np.concatenate([s.progress_logits for s in scores if s.progress_logits is not None])
+        for name, column in columns.items():
+            column.append(np.asarray(row[name], np.float32))
+    by_frame = (PROGRESS, SUCCESS, PROGRESS_LOGITS)
+    return {
+        name: pad_stack(column, num_positions, fill=np.nan) if name in by_frame else np.stack(column)
+        for name, column in columns.items()
+    }
+
+
+def decode_results(tensors: Mapping[str, npt.NDArray[Any]], samples: Sequence[Sample]) -> list[Result]:
+    """The results of the samples that a request asked about.
+
+    Raises InferenceFailedError for an answer that lacks a score: a missing reward is no reward of 0 or NaN.
+    """
+    return [_decode_result(tensors, row, sample) for row, sample in enumerate(samples)]
+
+
+def pad_stack(
+    arrays: Sequence[npt.NDArray[Any]], length: int | None = None, *, fill: float = 0
+) -> npt.NDArray[Any]:
+    """[B, length, ...] from B arrays [P_b, ...] of one dtype; length is the longest unless given."""
+    if length is None:
+        length = max(len(array) for array in arrays)
+    if len(arrays) == 1 and len(arrays[0]) == length:
+        return arrays[0][np.newaxis]  # no copy for the common single sample
+    padded = np.full((len(arrays), length, *arrays[0].shape[1:]), fill, arrays[0].dtype)
+    for row, array in zip(padded, arrays, strict=True):
+        row[: len(array)] = array
+    return padded
+
+
+def _num_frames(sample: Sample) -> tuple[int, int]:
+    lengths = [trajectory.num_frames for trajectory in sample.trajectories]
+    return lengths[0], lengths[1] if len(lengths) > 1 else 0
+
+
+def _located(decode: Any, tensors: Mapping[str, npt.NDArray[Any]], row: int) -> Any:
+    try:
+        return decode(tensors, row)
+    except InvalidSampleError as error:
+        raise error.inside(f"samples[{row}]") from None
+
+
+def _decode_sample(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> Sample:
+    sample_type = int(tensors[SAMPLE_TYPE][row, 0])
+    lengths = tensors[NUM_FRAMES][row].tolist()
+    frame_steps = int(tensors[FRAME_STEPS][row, 0])
+    if sample_type not in tuple(SampleType):
+        known = ", ".join(f"{t.value} ({t.name.lower()})" for t in SampleType)
+        raise InvalidSampleError.at(SAMPLE_TYPE, f"one of {known}", str(sample_type))
+    if sample_type == SampleType.PROGRESS:
+        if lengths[0] < 1 or lengths[1] != 0:
+            raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, 0] for progress", str(lengths))
+        return ProgressSample(_trajectory(tensors, row, 0, lengths[0], sum(lengths)), frame_steps=frame_steps)
+    if min(lengths) < 1:
+        raise InvalidSampleError.at(NUM_FRAMES, "at least one frame of each of the two trajectories", str(lengths))
+    if frame_steps != 0:
+        raise InvalidSampleError.at(FRAME_STEPS, "0 unless the sample is of type progress", str(frame_steps))
+    first = _trajectory(tensors, row, 0, lengths[0], sum(lengths))
+    second = _trajectory(tensors, row, lengths[0], sum(lengths), sum(lengths))
+    return (PreferenceSample if sample_type == SampleType.PREFERENCE else SimilaritySample)(first, second)
+
+
+def _trajectory(tensors: Mapping[str, npt.NDArray[Any]], row: int, start: int, stop: int, total: int) -> Trajectory:
+    if FRAMES in tensors:
+        return Trajectory(frames=_unpadded(tensors, FRAMES, row, total)[start:stop], task=_task(tensors, row))
+    embeddings = _unpadded(tensors, VIDEO_EMBEDDINGS, row, total)[start:stop]
+    return Trajectory(video_embeddings=embeddings, text_embedding=tensors[TEXT_EMBEDDING][row])
+
+
+def _unpadded(tensors: Mapping[str, npt.NDArray[Any]], name: str, row: int, total: int) -> npt.NDArray[Any]:
+    """Positions up to ``total``; what lies behind must be padding, or num_frames is wrong."""
+    positions = tensors[name][row]
+    if total > len(positions):
+        raise InvalidSampleError.at(NUM_FRAMES, f"at most the {len(positions)} frames in {name}", str(total))
+    if positions[total:].any():
+        raise InvalidSampleError.at(name, f"zeros behind the {total} frames that num_frames tells", "other values")
+    return positions[:total]
+
+
+def _task(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> str:
+    raw = tensors[TASK][row, 0]
+    try:
+        return raw.decode() if isinstance(raw, bytes) else str(raw)
+    except UnicodeDecodeError:
+        raise InvalidSampleError.at(TASK, "UTF-8 text", "other bytes") from None
+
+
+def _frame_scores(result: Result) -> tuple[FrameScores, ...]:
+    if isinstance(result, ProgressResult):
+        return (result,)
+    if isinstance(result, PreferenceResult):
+        return (result.first, result.second)
+    return (result.reference, result.other)
+
+
+def _decode_result(tensors: Mapping[str, npt.NDArray[Any]], row: int, sample: Sample) -> Result:
+    bounds = np.cumsum([0, *_num_frames(sample)])
+    first, second = (_scores_between(tensors, row, bounds[i], bounds[i + 1]) for i in range(2))
+    timing = BatchTiming(*tensors[TIMING_MS][row].tolist()) if TIMING_MS in tensors else None
+    if isinstance(sample, PreferenceSample):
+        preference = float(_present(PREFERENCE, tensors[PREFERENCE][row], 1)[0])
+        return PreferenceResult(preference=preference, first=first, second=second, timing=timing)
+    if isinstance(sample, SimilaritySample):
+        similarity = float(_present(SIMILARITY, tensors[SIMILARITY][row], 1)[0])
+        return SimilarityResult(similarity=similarity, reference=first, other=second, timing=timing)
+    return ProgressResult(
+        progress=first.progress, success=first.success, progress_logits=first.progress_logits, timing=timing
+    )
+
+
+def _scores_between(tensors: Mapping[str, npt.NDArray[Any]], row: int, start: int, stop: int) -> FrameScores:
+    def part(name: str) -> Float32Array:
+        return _present(name, tensors[name][row, start:stop], stop - start)
+
+    logits = part(PROGRESS_LOGITS) if PROGRESS_LOGITS in tensors else None
+    return FrameScores(progress=part(PROGRESS), success=part(SUCCESS), progress_logits=logits)
+
+
+def _present(name: str, scores: Float32Array, count: int) -> Float32Array:
+    if len(scores) != count or not np.isfinite(scores).all():
+        raise InferenceFailedError(f"{name}: expected {count} finite scores, got {scores.tolist()}")
+    return scores
