@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Rewards for robot trajectories from a served reward model.
 
-    from rfm_client import RewardClient, Trajectory
+from rfm_client import RewardClient, Trajectory
 
-    with RewardClient("grpc://localhost:8001") as client:
-        result = client.progress(Trajectory(frames=frames, task="put the red block in the bowl"))
-        result.progress, result.success  # float32 [T] each
+with RewardClient("grpc://localhost:8001") as client:
+    result = client.progress(Trajectory(frames=frames, task="put the red block in the bowl"))
+    result.progress, result.success  # float32 [T] each
 """
 
 from rfm_client.client import RewardClient

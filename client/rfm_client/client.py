@@ -66,7 +66,9 @@ class RewardClient:
     def evaluate(self, samples: Sequence[Sample], *, logits: bool = False, timing: bool = False) -> list[Result]:
         """The results of any mix of samples, in order. Raises the RewardError of the first that has one."""
         outcomes = self.evaluate_each(samples, logits=logits, timing=timing)
-        for outcome in outcomes:
+        for index, outcome in enumerate(outcomes):
+            if isinstance(outcome, InvalidSampleError) and len(samples) > 1:
+                raise outcome.inside(f"samples[{index}]") from outcome
             if isinstance(outcome, RewardError):
                 raise outcome
         return cast("list[Result]", outcomes)

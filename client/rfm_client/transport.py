@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
@@ -24,6 +25,8 @@ _STATUS_ERRORS: dict[str, type[errors.RewardError]] = {
     "StatusCode.DEADLINE_EXCEEDED": errors.DeadlineExceededError,
     "504": errors.DeadlineExceededError,
 }
+
+_IN_ENSEMBLE = re.compile(r"^in ensemble '[^']*', ")  # what Triton puts before a message; the caller knows the model
 
 
 class Transport(Protocol):
@@ -139,7 +142,8 @@ def _mapped_errors(bad_request: type[errors.RewardError] = errors.InvalidSampleE
         yield
     except InferenceServerException as error:
         kind = _STATUS_ERRORS.get(str(error.status()), errors.InferenceFailedError)
-        raise (bad_request if kind is errors.InvalidSampleError else kind)(error.message()) from error
+        kind = bad_request if kind is errors.InvalidSampleError else kind
+        raise kind(_IN_ENSEMBLE.sub("", error.message() or "no reason given")) from error
     except TimeoutError as error:
         raise errors.DeadlineExceededError(f"no answer in time: {error}") from error
     except (OSError, EOFError) as error:

@@ -164,6 +164,21 @@ def decode_trajectories(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Traject
     return [_located(decode, tensors, row) for row in range(len(tensors[NUM_FRAMES]))]
 
 
+def encode_trajectories(trajectories: Sequence[Trajectory], num_positions: int, outputs: Collection[str]) -> Tensors:
+    """The requested outputs of the encoder for one request of ``num_positions`` = P, padded with zeros."""
+    texts = [t.text_embedding for t in trajectories if t.text_embedding is not None]
+    embeddings = {
+        VIDEO_EMBEDDINGS: pad_stack([trajectory.positions for trajectory in trajectories], num_positions),
+        TEXT_EMBEDDING: np.stack(texts),
+    }
+    return {name: embeddings[name] for name in outputs}
+
+
+def num_positions(inputs: Mapping[str, npt.NDArray[Any]]) -> int:
+    """P of one request."""
+    return int(inputs[FRAMES if FRAMES in inputs else VIDEO_EMBEDDINGS].shape[1])
+
+
 def encode_results(results: Sequence[Result], num_positions: int, outputs: Collection[str]) -> Tensors:
     """The requested outputs of one request of ``num_positions`` = P; what a result lacks is NaN, never 0."""
     columns: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in outputs}
@@ -196,9 +211,7 @@ def decode_results(tensors: Mapping[str, npt.NDArray[Any]], samples: Sequence[Sa
     return [_decode_result(tensors, row, sample) for row, sample in enumerate(samples)]
 
 
-def pad_stack(
-    arrays: Sequence[npt.NDArray[Any]], length: int | None = None, *, fill: float = 0
-) -> npt.NDArray[Any]:
+def pad_stack(arrays: Sequence[npt.NDArray[Any]], length: int | None = None, *, fill: float = 0) -> npt.NDArray[Any]:
     """[B, length, ...] from B arrays [P_b, ...] of one dtype; length is the longest unless given."""
     if length is None:
         length = max(len(array) for array in arrays)
@@ -219,6 +232,8 @@ def _located(decode: Any, tensors: Mapping[str, npt.NDArray[Any]], row: int) -> 
     try:
         return decode(tensors, row)
     except InvalidSampleError as error:
+        if len(tensors[NUM_FRAMES]) == 1:
+            raise
         raise error.inside(f"samples[{row}]") from None
 
 

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: MIT
+"""The models that serve a ReWiND checkpoint, and every generated file of them.
+
+``<name>`` scores embeddings. With encoders there are also ``<name>_encoder`` and ``<name>_frames``, the ensemble
+of the two that scores raw frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from importlib import resources
+
+import numpy as np
+from tritonclient.grpc import model_config_pb2 as pb
+
+from rfm.config import ServeConfig
+from rfm.models.rewind import RewindConfig
+from rfm_client import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory, wire
+from rfm_export.pbtxt import Interface, Warmup, ensemble_config, python_config, render
+
+CONFIG_FILE = "config.pbtxt"
+MODEL_FILE = "model.py"
+WARMUP_FOLDER = "warmup"
+KEEP_FILE = ".keep"  # Triton wants an ensemble's version folder, and git forgets empty ones
+
+WARMUP_FRAMES = 2
+WARMUP_SIZE_PX = 64
+
+
+@dataclass(frozen=True)
+class GeneratedModel:
+    """A model's configuration and files, but for its weights.
+
+    model_file: content of its model.py; None for an ensemble
+    warmup_files: contents by name
+    """
+
+    config: pb.ModelConfig
+    version: int
+    model_file: bytes | None = None
+    warmup_files: dict[str, bytes] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Its name in the repository."""
+        return str(self.config.name)
+
+    @property
+    def is_ensemble(self) -> bool:
+        """Whether it is made of other models."""
+        return self.model_file is None
+
+    def files(self) -> dict[str, bytes]:
+        """Contents by path in the repository."""
+        in_version = (KEEP_FILE, b"") if self.model_file is None else (MODEL_FILE, self.model_file)
+        contents = {CONFIG_FILE: render(self.config).encode(), f"{self.version}/{in_version[0]}": in_version[1]}
+        contents |= {f"{WARMUP_FOLDER}/{name}": content for name, content in self.warmup_files.items()}
+        return {f"{self.name}/{path}": content for path, content in contents.items()}
+
+
+def encoder_name(name: str) -> str:
+    """Name of the encoder that goes with the model ``name``."""
+    return f"{name}_encoder"
+
+
+def frames_name(name: str) -> str:
+    """Name of the ensemble that scores raw frames."""
+    return f"{name}_frames"
+
+
+def rewind_models(
+    config: RewindConfig, serve: ServeConfig, *, num_gpus: int, version: int, with_encoders: bool
+) -> list[GeneratedModel]:
+    """The models of a checkpoint; an ensemble stands behind what it is made of."""
+    dims = config.video_feature_dim, config.text_feature_dim
+    outputs = wire.score_outputs(config.progress_bins if config.progress_bins > 1 else None)
+    scorer = Interface(serve.name, wire.embedding_inputs(*dims), outputs)
+    models = [_python_model(scorer, "rfm", serve, num_gpus, version, _scorer_warmups(config))]
+    if with_encoders:
+        encoder = Interface(encoder_name(serve.name), wire.encoder_inputs(), wire.encoder_outputs(*dims))
+        frames = Interface(frames_name(serve.name), wire.frame_inputs(), outputs)
+        models.append(_python_model(encoder, "rfm_encoder", serve, num_gpus, version, [_encoder_warmup()]))
+        models.append(GeneratedModel(ensemble_config(frames, serve, version, encoder, scorer), version))
+    return models
+
+
+def _python_model(
+    interface: Interface, template: str, serve: ServeConfig, num_gpus: int, version: int, warmups: list[Warmup]
+) -> GeneratedModel:
+    model_file = resources.files("rfm_export") / "templates" / template / MODEL_FILE
+    files = {name: content for warmup in warmups for name, content in warmup.files().items()}
+    config = python_config(interface, serve, num_gpus, version, warmups)
+    return GeneratedModel(config, version, model_file.read_bytes(), files)
+
+
+def _scorer_warmups(config: RewindConfig) -> list[Warmup]:
+    """One sample of each type that the checkpoint can score."""
+    trajectory = Trajectory(
+        video_embeddings=np.zeros((WARMUP_FRAMES, config.video_feature_dim), np.float32),
+        text_embedding=np.zeros(config.text_feature_dim, np.float32),
+    )
+    samples: dict[str, Sample] = {
+        "progress": ProgressSample(trajectory),
+        "preference": PreferenceSample(trajectory, trajectory),
+    }
+    if config.has_similarity:
+        samples["similarity"] = SimilaritySample(trajectory, trajectory)
+    return [Warmup(name, wire.encode_samples([sample])) for name, sample in samples.items()]
+
+
+def _encoder_warmup() -> Warmup:
+    frames = np.zeros((WARMUP_FRAMES, WARMUP_SIZE_PX, WARMUP_SIZE_PX, 3), np.uint8)
+    tensors = wire.encode_samples([ProgressSample(Trajectory(frames=frames, task="warm up"))])
+    return Warmup("frames", {spec.name: tensors[spec.name] for spec in wire.encoder_inputs()})

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: MIT
+"""Does an exported model give the numbers of the checkpoint that it was made from?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rfm.engine import Engine, Outcome
+from rfm.models.rewind import RewindConfig
+from rfm_client import (
+    FrameScores,
+    PreferenceResult,
+    PreferenceSample,
+    ProgressResult,
+    ProgressSample,
+    RewardError,
+    Sample,
+    SimilaritySample,
+    Trajectory,
+)
+from rfm_export.errors import ExportDiffersError
+
+TOLERANCE = 1e-6  # same weights, same machine, same code: the numbers are the same but for rounding
+PROBE_FRAMES = (1, 3, 8)
+PROBE_SIZE_PX = (48, 80)
+PROBE_SEED = 0
+
+
+def probes(config: RewindConfig, *, with_frames: bool) -> list[Sample]:
+    """Random samples of each type that the checkpoint can score, of several lengths."""
+    random = np.random.default_rng(PROBE_SEED)
+
+    def embedded(num_frames: int) -> Trajectory:
+        return Trajectory(
+            video_embeddings=random.standard_normal((num_frames, config.video_feature_dim), np.float32),
+            text_embedding=random.standard_normal(config.text_feature_dim, np.float32),
+        )
+
+    def filmed(num_frames: int) -> Trajectory:
+        frames = random.integers(0, 256, (num_frames, *PROBE_SIZE_PX, 3), np.uint8)
+        return Trajectory(frames=frames, task=f"pick up {num_frames} red cups")
+
+    samples: list[Sample] = []
+    for make in (embedded, filmed) if with_frames else (embedded,):
+        for num_frames in PROBE_FRAMES:
+            length = min(num_frames, config.max_frames or num_frames)
+            samples.append(ProgressSample(make(length)))
+            samples.append(PreferenceSample(make(length), make(1)))
+            if config.has_similarity:
+                samples.append(SimilaritySample(make(1), make(length)))
+    return samples
+
+
+def verify(original: Engine, exported: Engine, samples: Sequence[Sample]) -> None:
+    """Raises ExportDiffersError unless both engines give the same numbers for every sample."""
+    for index, (before, after) in enumerate(zip(original.evaluate(samples), exported.evaluate(samples), strict=True)):
+        expected, got = _numbers(before), _numbers(after)
+        if not np.allclose(got, expected, rtol=0, atol=TOLERANCE):
+            largest = np.abs(got - expected).max()
+            raise ExportDiffersError(
+                f"probe {index}: expected the checkpoint's scores, got some that differ by {largest:g}"
+            )
+
+
+def _numbers(outcome: Outcome) -> np.ndarray:
+    if isinstance(outcome, RewardError):
+        raise ExportDiffersError(f"expected scores, got: {outcome}") from outcome
+    if isinstance(outcome, ProgressResult):
+        return _frame_numbers(outcome)
+    if isinstance(outcome, PreferenceResult):
+        return np.concatenate([[outcome.preference], _frame_numbers(outcome.first), _frame_numbers(outcome.second)])
+    return np.concatenate([[outcome.similarity], _frame_numbers(outcome.reference), _frame_numbers(outcome.other)])
+
+
+def _frame_numbers(scores: FrameScores) -> np.ndarray:
+    return np.concatenate([scores.progress, scores.success])

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Reward models for robot learning, served by Triton: checkpoints, models, collation, engine."""

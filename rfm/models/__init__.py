@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""The networks: one file per model family."""

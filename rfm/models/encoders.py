@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: MIT
+"""Raw frames and task -> the embeddings that a ReWiND transformer reads.
+
+A DINOv2-type image encoder (its pooled output) and a BERT-type sentence encoder (the mean of its last
+hidden state over the text's tokens, not normalised), both carried by ``transformers``.
+N images, C = 3 channels, H x W pixels, T frames, L tokens, Dv and Dt widths of the embeddings.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from rfm_client import InferenceFailedError, InvalidSampleError, RewardError, Trajectory
+from rfm_client.samples import Float32Array, UInt8Array
+
+IMAGES_PER_FORWARD = 64
+PREPROCESSOR_CONFIG = "preprocessor_config.json"
+PIL_BICUBIC = 3  # the value of `resample` in preprocessor_config.json
+MAX_UINT8 = 255
+
+
+@dataclass(frozen=True)
+class ImagePreprocessor:
+    """uint8 images -> normalised crops, bit for bit as the "fast" (torchvision) Bit image processor makes them.
+
+    Shortest edge to ``resize_px`` (bicubic, antialiased, on uint8), centre crop to ``crop_px`` = (height, width),
+    then per channel (value - 255 mean) / (255 std).
+    """
+
+    resize_px: int
+    crop_px: tuple[int, int]
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any], where: str) -> ImagePreprocessor:
+        """From the fields of preprocessor_config.json. Raises ValueError for steps other than the above."""
+        crop = config.get("crop_size", {})
+        required = {
+            "do_resize": True,
+            "do_center_crop": True,
+            "do_rescale": True,
+            "do_normalize": True,
+            "resample": PIL_BICUBIC,
+        }
+        for name, value in required.items():
+            if config.get(name) != value:
+                raise ValueError(f"{where}: {name}: expected {value}, got {config.get(name)}")
+        if abs(config.get("rescale_factor", 0.0) - 1 / MAX_UINT8) > 1e-9:
+            raise ValueError(f"{where}: rescale_factor: expected 1/255, got {config.get('rescale_factor')}")
+        if set(config.get("size", {})) != {"shortest_edge"} or set(crop) != {"height", "width"}:
+            expected = "size {shortest_edge} and crop_size {height, width}"
+            raise ValueError(f"{where}: expected {expected}, got {config.get('size')} and {crop}")
+        return cls(
+            resize_px=config["size"]["shortest_edge"],
+            crop_px=(crop["height"], crop["width"]),
+            mean=tuple(config["image_mean"]),
+            std=tuple(config["image_std"]),
+        )
+
+    def __call__(self, images: Tensor) -> Tensor:
+        """uint8 [N, H, W, C] -> float32 [N, C, *crop_px], on the device of ``images``."""
+        crops = self._crop(self._resize(images.permute(0, 3, 1, 2))).float()
+        mean, std = (torch.tensor(v, device=crops.device).view(-1, 1, 1) * MAX_UINT8 for v in (self.mean, self.std))
+        return (crops - mean) / std
+
+    def _resize(self, images: Tensor) -> Tensor:
+        height, width = images.shape[-2:]
+        short, long = min(height, width), max(height, width)
+        resized = (self.resize_px, int(self.resize_px * long / short))
+        size = resized if height <= width else resized[::-1]
+        if size == (height, width):
+            return images
+        return F.interpolate(images, size, mode="bicubic", antialias=True)
+
+    def _crop(self, images: Tensor) -> Tensor:
+        height, width = images.shape[-2:]
+        crop_height, crop_width = self.crop_px
+        pad_height, pad_width = max(crop_height - height, 0), max(crop_width - width, 0)
+        if pad_height or pad_width:
+            sides = (pad_width // 2, (pad_width + 1) // 2, pad_height // 2, (pad_height + 1) // 2)
+            images = F.pad(images, sides)
+            height, width = images.shape[-2:]
+        top, left = round((height - crop_height) / 2), round((width - crop_width) / 2)
+        return images[..., top : top + crop_height, left : left + crop_width]
+
+
+class Encoders:
+    """An image and a text encoder with what goes before them. Built by ``from_pretrained``."""
+
+    def __init__(self, image_model: Any, preprocessor: ImagePreprocessor, text_model: Any, tokenizer: Any) -> None:
+        self.image_model = image_model.eval()
+        self.preprocessor = preprocessor
+        self.text_model = text_model.eval()
+        self.tokenizer = tokenizer
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        image_source: str | Path,
+        text_source: str | Path,
+        *,
+        image_weights: Mapping[str, Tensor] | None = None,
+        text_weights: Mapping[str, Tensor] | None = None,
+    ) -> Encoders:
+        """From local folders or Hugging Face ids; given weights (a checkpoint's own) win over the source's.
+
+        Raises ImportError without transformers, OSError for a source that cannot be had, ValueError for one
+        that does not fit.
+        """
+        try:
+            from transformers import AutoTokenizer
+            from transformers.utils import cached_file
+        except ImportError as error:
+            raise ImportError('raw frames need transformers: pip install "rfm-triton[encoders]"') from error
+        preprocessor_file = cached_file(str(image_source), PREPROCESSOR_CONFIG)
+        preprocessor_config = json.loads(Path(preprocessor_file).read_text())
+        return cls(
+            _load_model(image_source, image_weights),
+            ImagePreprocessor.from_config(preprocessor_config, f"{image_source}/{PREPROCESSOR_CONFIG}"),
+            _load_model(text_source, text_weights),
+            AutoTokenizer.from_pretrained(str(text_source), use_fast=True),
+        )
+
+    def save_pretrained(self, image_folder: Path, text_folder: Path) -> None:
+        """Writes both so that ``from_pretrained`` needs no network."""
+        self.image_model.save_pretrained(image_folder)
+        preprocessor = {
+            "do_resize": True,
+            "size": {"shortest_edge": self.preprocessor.resize_px},
+            "resample": PIL_BICUBIC,
+            "do_center_crop": True,
+            "crop_size": dict(zip(("height", "width"), self.preprocessor.crop_px, strict=True)),
+            "do_rescale": True,
+            "rescale_factor": 1 / MAX_UINT8,
+            "do_normalize": True,
+            "image_mean": self.preprocessor.mean,
+            "image_std": self.preprocessor.std,
+            "image_processor_type": "BitImageProcessor",
+        }
+        (image_folder / PREPROCESSOR_CONFIG).write_text(json.dumps(preprocessor, indent=2) + "\n")
+        self.text_model.save_pretrained(text_folder)
+        self.tokenizer.save_pretrained(text_folder)
+
+    def to(self, device: torch.device) -> Encoders:
+        """Moves both encoders to ``device``."""
+        self.image_model.to(device)
+        self.text_model.to(device)
+        return self
+
+    @property
+    def video_feature_dim(self) -> int:
+        """Dv."""
+        return int(self.image_model.config.hidden_size)
+
+    @property
+    def text_feature_dim(self) -> int:
+        """Dt."""
+        return int(self.text_model.config.hidden_size)
+
+    def encode(self, films: Sequence[Trajectory]) -> list[Trajectory | RewardError]:
+        """Trajectories of embeddings for trajectories of frames and task, or the error of one that has none."""
+        outcomes: dict[int, Trajectory | RewardError] = {}
+        for index, film in enumerate(films):
+            try:
+                self.check_task(film.task)
+            except InvalidSampleError as error:
+                outcomes[index] = error
+        good = [index for index in range(len(films)) if index not in outcomes]
+        if good:
+            videos = self.encode_frames([film.frames for i in good if (film := films[i]).frames is not None])
+            texts = self.encode_tasks([films[index].task for index in good])
+            for index, video, text in zip(good, videos, texts, strict=True):
+                outcomes[index] = _embedded(video, text)
+        return [outcomes[index] for index in range(len(films))]
+
+    @torch.inference_mode()
+    def encode_frames(self, videos: Sequence[UInt8Array]) -> list[Float32Array]:
+        """uint8 [T, H, W, 3] of any T, H, W each -> float32 [T, Dv] each."""
+        batches = self._crop_batches(videos)
+        embeddings = torch.cat([self.image_model(pixel_values=batch).pooler_output for batch in batches])
+        lengths = [len(video) for video in videos]
+        return [part.float().cpu().numpy() for part in embeddings.split(lengths)]
+
+    @torch.inference_mode()
+    def encode_tasks(self, tasks: Sequence[str]) -> Float32Array:
+        """float32 [B, Dt] of B tasks that ``check_task`` accepts."""
+        tokens = self._tokenize(list(tasks), padding=True, return_tensors="pt").to(self.text_model.device)
+        hidden = self.text_model(**tokens).last_hidden_state
+        mask = tokens["attention_mask"].unsqueeze(-1).to(hidden.dtype)
+        return ((hidden * mask).sum(dim=1) / mask.sum(dim=1)).float().cpu().numpy()
+
+    def _crop_batches(self, videos: Sequence[UInt8Array]) -> Iterator[Tensor]:
+        """The crops of all videos' frames, in order, at most IMAGES_PER_FORWARD of them in memory."""
+        waiting: list[Tensor] = []
+        for video in videos:
+            for start in range(0, len(video), IMAGES_PER_FORWARD):
+                images = torch.from_numpy(video[start : start + IMAGES_PER_FORWARD]).to(self.image_model.device)
+                if sum(map(len, waiting)) + len(images) > IMAGES_PER_FORWARD:
+                    yield torch.cat(waiting)
+                    waiting = []
+                waiting.append(self.preprocessor(images))
+        yield torch.cat(waiting)
+
+    def check_task(self, task: str) -> None:
+        """Raises InvalidSampleError for a task longer than the text encoder reads; it is never cut silently."""
+        if not task.strip():
+            raise InvalidSampleError.at("task", "a task sentence", repr(task))
+        limit = min(self.tokenizer.model_max_length, self.text_model.config.max_position_embeddings)
+        count = len(self._tokenize(task)["input_ids"])
+        if count > limit:
+            raise InvalidSampleError.at("task", f"at most {limit} tokens (limit of the text encoder)", str(count))
+
+    def _tokenize(self, text: str | list[str], **options: Any) -> Any:
+        # A task is data: "[SEP]" in it is five characters, not a separator.
+        return self.tokenizer(text, split_special_tokens=True, verbose=False, **options)
+
+
+def _embedded(video: Float32Array, text: Float32Array) -> Trajectory | RewardError:
+    if not (np.isfinite(video).all() and np.isfinite(text).all()):
+        return InferenceFailedError("an encoder gave an embedding that is not finite")
+    return Trajectory(video_embeddings=video, text_embedding=text)
+
+
+def _load_model(source: str | Path, weights: Mapping[str, Tensor] | None) -> Any:
+    from transformers import AutoConfig, AutoModel
+
+    if weights is None:
+        return AutoModel.from_pretrained(str(source), use_safetensors=True, dtype=torch.float32)
+    model = AutoModel.from_config(AutoConfig.from_pretrained(str(source)))
+    try:
+        model.load_state_dict(dict(weights), strict=True)
+    except RuntimeError as error:
+        raise ValueError(f"{source}: the checkpoint's encoder weights do not fit: {error}") from error
+    return model

@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: MIT
+"""The ReWiND transformer: frame and text embeddings in; progress, success, preference, similarity out.
+
+B rows, T frames of a trajectory, L tokens, D width, K progress bins (1: continuous progress).
+
+A row is the token sequence ``[text] [first trajectory] ([second trajectory] [query])``. The order of frames
+is known through the causal mask, the embedding added to each trajectory's first frame and, where the
+checkpoint has them, a progress token behind each frame; there is no other positional encoding.
+Architecture: ReWiND (https://arxiv.org/abs/2505.10911) as in the public implementation ``reward_fm``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from rfm.models.heads import PredictionHead
+
+FEED_FORWARD_RATIO = 4
+
+
+@dataclass(frozen=True)
+class RewindConfig:
+    """What a checkpoint's network looks like; field names as in upstream's config.json where it has them."""
+
+    video_feature_dim: int
+    text_feature_dim: int
+    hidden_dim: int
+    num_layers: int
+    num_attention_heads: int
+    max_len: int
+    causal_mask: bool
+    use_per_frame_progress_token: bool
+    progress_bins: int
+    has_similarity: bool
+
+    @property
+    def max_frames(self) -> int | None:
+        """The longest trajectory the network can take; None: any length."""
+        return self.max_len if self.use_per_frame_progress_token else None
+
+    @property
+    def tokens_per_frame(self) -> int:
+        """Tokens that one frame adds to a row."""
+        return 2 if self.use_per_frame_progress_token else 1
+
+    def num_tokens(self, num_first: int, num_second: int) -> int:
+        """L of a row of two trajectories of so many frames; num_second = 0: of one trajectory."""
+        query = 1 if num_second else 0
+        return 1 + self.tokens_per_frame * (num_first + num_second) + query
+
+
+@dataclass(frozen=True)
+class RewindBatch:
+    """Rows of one kind, padded to their longest.
+
+    text: float32 [B, Dt]
+    first, second: float32 [B, T, Dv]; second is None in rows of one trajectory
+    token_mask: bool [B, L], false at padding; None when there is none
+    is_similarity: bool [B], asks for similarity rather than preference; None in rows of one trajectory
+    """
+
+    text: Tensor
+    first: Tensor
+    second: Tensor | None = None
+    token_mask: Tensor | None = None
+    is_similarity: Tensor | None = None
+
+    def to(self, device: torch.device) -> RewindBatch:
+        """The batch on ``device``."""
+        tensors = (getattr(self, field.name) for field in fields(self))
+        return RewindBatch(*(None if t is None else t.to(device, non_blocking=True) for t in tensors))
+
+
+@dataclass(frozen=True)
+class RewindOutput:
+    """Raw scores of a RewindBatch: progress logits [B, T, K], success logits [B, T], query logits [B]."""
+
+    first_progress: Tensor
+    first_success: Tensor
+    second_progress: Tensor | None = None
+    second_success: Tensor | None = None
+    query: Tensor | None = None
+
+
+class SelfAttention(nn.Module):
+    """Multi-head self-attention, [B, L, D] -> [B, L, D]; parameters named as nn.MultiheadAttention's."""
+
+    def __init__(self, hidden_dim: int, num_heads: int) -> None:
+        super().__init__()
+        self.num_heads = num_heads
+        self.in_proj_weight = nn.Parameter(torch.empty(3 * hidden_dim, hidden_dim))
+        self.in_proj_bias = nn.Parameter(torch.zeros(3 * hidden_dim))
+        self.out_proj = nn.Linear(hidden_dim, hidden_dim)
+        nn.init.xavier_uniform_(self.in_proj_weight)
+
+    def forward(self, x: Tensor, mask: Tensor | None) -> Tensor:
+        queries, keys, values = (
+            part.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
+            for part in F.linear(x, self.in_proj_weight, self.in_proj_bias).chunk(3, dim=-1)
+        )
+        attended = F.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
+        return self.out_proj(attended.transpose(1, 2).flatten(2))
+
+
+class EncoderLayer(nn.Module):
+    """Post-norm transformer layer with a ReLU feed-forward; parameters named as nn.TransformerEncoderLayer's."""
+
+    def __init__(self, hidden_dim: int, num_heads: int) -> None:
+        super().__init__()
+        self.self_attn = SelfAttention(hidden_dim, num_heads)
+        self.norm1 = nn.LayerNorm(hidden_dim)
+        self.linear1 = nn.Linear(hidden_dim, FEED_FORWARD_RATIO * hidden_dim)
+        self.linear2 = nn.Linear(FEED_FORWARD_RATIO * hidden_dim, hidden_dim)
+        self.norm2 = nn.LayerNorm(hidden_dim)
+
+    def forward(self, x: Tensor, mask: Tensor | None) -> Tensor:
+        x = self.norm1(x + self.self_attn(x, mask))
+        return self.norm2(x + self.linear2(F.relu(self.linear1(x))))
+
+
+class Encoder(nn.Module):
+    """A stack of EncoderLayer."""
+
+    def __init__(self, config: RewindConfig) -> None:
+        super().__init__()
+        layer = (config.hidden_dim, config.num_attention_heads)
+        self.layers = nn.ModuleList(EncoderLayer(*layer) for _ in range(config.num_layers))
+
+    def forward(self, x: Tensor, mask: Tensor | None) -> Tensor:
+        for layer in self.layers:
+            x = layer(x, mask)
+        return x
+
+
+class RewindTransformer(nn.Module):
+    """The network; its state dict has upstream's names."""
+
+    def __init__(self, config: RewindConfig) -> None:
+        super().__init__()
+        self.config = config
+        width = config.hidden_dim
+        self.video_proj = nn.Linear(config.video_feature_dim, width)
+        self.text_proj = nn.Linear(config.text_feature_dim, width)
+        self.first_embedding_A = nn.Parameter(torch.randn(1, 1, width))
+        self.first_embedding_B = nn.Parameter(torch.randn(1, 1, width))
+        if config.use_per_frame_progress_token:
+            self.text_position_embedding = nn.Parameter(torch.randn(1, 1, width))
+            self.prog_token_A = nn.Parameter(torch.randn(1, config.max_len, width))
+            self.prog_token_B = nn.Parameter(torch.randn(1, config.max_len, width))
+        self.transformer = Encoder(config)
+        self.progress_head = PredictionHead(width, config.progress_bins)
+        self.success_head = PredictionHead(width, 1)
+        self.preference_token = nn.Parameter(torch.randn(1, 1, width))
+        self.preference_head = PredictionHead(width, 1)
+        if config.has_similarity:
+            self.similarity_token = nn.Parameter(torch.randn(1, 1, width))
+            self.similarity_head = PredictionHead(width, 1)
+
+    def forward(self, batch: RewindBatch) -> RewindOutput:
+        """Raw scores; those at padding positions mean nothing."""
+        text = self.text_proj(batch.text).unsqueeze(1)
+        if self.config.use_per_frame_progress_token:
+            text = text + self.text_position_embedding
+        tokens = [text, self._trajectory_tokens(batch.first, second=False)]
+        if batch.second is not None:
+            tokens += [self._trajectory_tokens(batch.second, second=True), self._query_tokens(batch)]
+        x = torch.cat(tokens, dim=1)
+        hidden = self.transformer(x, self._attention_mask(batch, x.shape[1]))
+
+        parts = hidden.split([part.shape[1] for part in tokens], dim=1)
+        first_progress, first_success = self._frame_scores(parts[1])
+        if batch.second is None:
+            return RewindOutput(first_progress, first_success)
+        second_progress, second_success = self._frame_scores(parts[2])
+        query = self._query_scores(parts[3].squeeze(1), batch)
+        return RewindOutput(first_progress, first_success, second_progress, second_success, query)
+
+    def _trajectory_tokens(self, video: Tensor, *, second: bool) -> Tensor:
+        """[B, T, Dv] -> [B, T, D], or [B, 2T, D] with a progress token behind each frame."""
+        frames = self.video_proj(video)
+        frames[:, :1] += self.first_embedding_B if second else self.first_embedding_A
+        if not self.config.use_per_frame_progress_token:
+            return frames
+        progress_tokens = self.prog_token_B if second else self.prog_token_A
+        interleaved = torch.stack([frames, progress_tokens[:, : video.shape[1]].expand_as(frames)], dim=2)
+        return interleaved.flatten(1, 2)
+
+    def _query_tokens(self, batch: RewindBatch) -> Tensor:
+        """[B, 1, D]: the token whose output answers the row's question."""
+        if not self.config.has_similarity:
+            return self.preference_token.expand(len(batch.text), -1, -1)
+        assert batch.is_similarity is not None
+        return torch.where(batch.is_similarity[:, None, None], self.similarity_token, self.preference_token)
+
+    def _query_scores(self, hidden: Tensor, batch: RewindBatch) -> Tensor:
+        """[B] logits of the query tokens' [B, D]."""
+        preference = self.preference_head(hidden).squeeze(-1)
+        if not self.config.has_similarity:
+            return preference
+        assert batch.is_similarity is not None
+        return torch.where(batch.is_similarity, self.similarity_head(hidden).squeeze(-1), preference)
+
+    def _frame_scores(self, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        """Progress [B, T, K] and success [B, T] logits from one trajectory's tokens."""
+        read = hidden[:, 1::2] if self.config.use_per_frame_progress_token else hidden
+        return self.progress_head(read), self.success_head(read).squeeze(-1)
+
+    def _attention_mask(self, batch: RewindBatch, length: int) -> Tensor | None:
+        """bool, broadcastable to [B, heads, L, L], true where a token may look; None: everywhere.
+
+        Padding is never looked at, so a row's scores are those it has alone.
+        """
+        keys = None if batch.token_mask is None else batch.token_mask[:, None, None, :]
+        if not self.config.causal_mask:
+            return keys
+        causal = torch.ones(length, length, dtype=torch.bool, device=batch.text.device).tril()
+        return causal if keys is None else causal & keys

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: MIT
+"""Where tritonserver is and what it needs to run: an explicit path, PATH, or the nvidia-pytriton wheel.
+
+The wheel is used as a distribution of the binary. It lacks what an installed Triton has around it: a backend
+directory with the stub of the running Python, and the search path of its libraries and of libpython.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import shutil
+import sys
+import sysconfig
+from dataclasses import dataclass, field
+from pathlib import Path
+
+EXECUTABLE = "tritonserver"
+WHEEL = "nvidia-pytriton"
+_BACKEND_FILES = ("libtriton_python.so", "triton_python_backend_utils.py")
+_STUB = "triton_python_backend_stub"
+
+
+class ServerStartError(Exception):
+    """tritonserver cannot be started: the reason in one line."""
+
+
+@dataclass(frozen=True)
+class Installation:
+    """A tritonserver that can be run.
+
+    wheel: the wheel's ``tritonserver`` folder; None for a Triton that knows its own surroundings
+    """
+
+    executable: Path
+    environment: dict[str, str] = field(default_factory=dict)
+    wheel: Path | None = None
+
+    def lay_out_backends(self, folder: Path) -> list[str]:
+        """Fills the empty ``folder`` if need be, and gives the arguments that point at it."""
+        if self.wheel is None:
+            return []
+        backend = folder / "python"
+        backend.mkdir(parents=True)
+        for name in _BACKEND_FILES:
+            (backend / name).symlink_to(self.wheel / "backends" / "python" / name)
+        (backend / _STUB).symlink_to(_stub(self.wheel))
+        return [f"--backend-directory={folder}"]
+
+
+def find_installation(executable: Path | None = None) -> Installation:
+    """The explicit ``executable``, else the one in PATH, else the wheel's. Raises ServerStartError."""
+    if executable is not None:
+        if not (executable.is_file() and os.access(executable, os.X_OK)):
+            raise ServerStartError(f"tritonserver: expected a program at {executable}, got none")
+        return Installation(executable)
+    in_path = shutil.which(EXECUTABLE)
+    return Installation(Path(in_path)) if in_path else _wheel_installation()
+
+
+def _wheel_installation() -> Installation:
+    package = importlib.util.find_spec("pytriton")
+    if package is None or not package.submodule_search_locations:
+        where = f'an explicit path, {EXECUTABLE} in PATH or the wheel (pip install "rfm-triton[triton]")'
+        raise ServerStartError(f"tritonserver: expected {where}, got none of them")
+    wheel = Path(package.submodule_search_locations[0]) / EXECUTABLE
+    numpy_version = importlib.metadata.version("numpy")
+    if int(numpy_version.partition(".")[0]) >= 2:
+        # With numpy 2 the stub of this release answers with empty outputs and no error.
+        raise ServerStartError(f"numpy: expected < 2 with the Triton of {WHEEL}, got {numpy_version}")
+    _stub(wheel)
+    library_folders = (wheel.parent.parent / "nvidia_pytriton.libs", _libpython().parent)
+    # The stub takes its Python environment from the first python3 in PATH.
+    environment = {
+        "LD_LIBRARY_PATH": _prepended("LD_LIBRARY_PATH", *library_folders),
+        "PATH": _prepended("PATH", Path(sys.executable).parent),
+    }
+    return Installation(wheel / "bin" / EXECUTABLE, environment, wheel)
+
+
+def _stub(wheel: Path) -> Path:
+    version = f"{sys.version_info.major}.{sys.version_info.minor}"
+    stub = wheel / "python_backend_stubs" / version / _STUB
+    if not stub.is_file():
+        there = ", ".join(sorted(path.name for path in stub.parent.parent.glob("*")))
+        raise ServerStartError(f"Python: expected one of {there} for the Triton of {WHEEL}, got {version}")
+    return stub
+
+
+def _libpython() -> Path:
+    """The shared library that the stub is linked against."""
+    name = f"libpython{sys.version_info.major}.{sys.version_info.minor}.so.1.0"
+    folders = [sysconfig.get_config_var("LIBDIR"), str(Path(sys.base_prefix, "lib"))]
+    for folder in folders:
+        if folder and (Path(folder) / name).is_file():
+            return Path(folder) / name
+    package = name.partition(".so")[0]
+    hint = f"apt-get install {package}, or a Python built with --enable-shared"
+    raise ServerStartError(f"{name}: expected in {folders[0]}, got nothing there ({hint})")
+
+
+def _prepended(variable: str, *folders: Path) -> str:
+    return os.pathsep.join([*map(str, folders), *filter(None, [os.environ.get(variable)])])

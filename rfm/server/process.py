@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: MIT
+"""One tritonserver process: started, ready, stopped, and nothing of it left behind."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+import signal
+import socket
+import subprocess
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import IO
+
+import tritonclient.http
+from tritonclient.utils import InferenceServerException
+
+from rfm.config import DEFAULT_HOST, ServeConfig
+from rfm.server.installation import Installation, ServerStartError
+
+POLL_S = 0.1
+EXIT_TIMEOUT_S = 10  # Triton waits this long for requests in flight, and for a stub that is dead
+KILL_AFTER_S = 2 * EXIT_TIMEOUT_S
+SHARED_MEMORY = Path("/dev/shm")
+
+
+@dataclass(frozen=True)
+class Endpoints:
+    """Addresses of one server."""
+
+    host: str = DEFAULT_HOST
+    http_port: int = 8000
+    grpc_port: int = 8001
+    metrics_port: int = 8002
+
+    @classmethod
+    def of(cls, config: ServeConfig) -> Endpoints:
+        """The endpoints that a configuration names."""
+        return cls(config.host, config.server_port, config.grpc_port, config.metrics_port)
+
+    @classmethod
+    def free(cls) -> Endpoints:
+        """Loopback endpoints on ports that are free now."""
+        sockets = [socket.create_server((DEFAULT_HOST, 0)) for _ in range(3)]
+        ports = [bound.getsockname()[1] for bound in sockets]
+        for bound in sockets:
+            bound.close()
+        return cls(DEFAULT_HOST, *ports)
+
+    @property
+    def http_url(self) -> str:
+        """For RewardClient, over HTTP."""
+        return f"http://{self.host}:{self.http_port}"
+
+    @property
+    def grpc_url(self) -> str:
+        """For RewardClient, over gRPC."""
+        return f"grpc://{self.host}:{self.grpc_port}"
+
+    @property
+    def metrics_url(self) -> str:
+        """What Prometheus scrapes."""
+        return f"http://{self.host}:{self.metrics_port}/metrics"
+
+    def check_free(self) -> None:
+        """Raises ServerStartError for a port that is taken or an address that is not this machine's."""
+        for name, port in (("HTTP", self.http_port), ("gRPC", self.grpc_port), ("metrics", self.metrics_port)):
+            try:
+                socket.create_server((self.host, port)).close()
+            except OSError as error:
+                expected = f"a free port of this machine at {self.host}:{port}"
+                reason = os.strerror(error.errno) if error.errno else str(error)
+                raise ServerStartError(f"{name}: expected {expected}, got: {reason}") from error
+
+
+class TritonServer:
+    """A tritonserver on ``repository`` with every model of it loaded. A context manager that stops it.
+
+    http_threads: threads that read HTTP requests; None: Triton's choice
+    log: where Triton's log goes; None: this process's standard error
+    """
+
+    def __init__(
+        self,
+        repository: Path,
+        endpoints: Endpoints,
+        installation: Installation,
+        *,
+        http_threads: int | None = None,
+        log: IO[bytes] | None = None,
+    ) -> None:
+        if not repository.is_dir() or not any(repository.glob("*/config.pbtxt")):
+            raise ServerStartError(f"repository: expected a folder of models, got {repository}")
+        endpoints.check_free()
+        self.endpoints = endpoints
+        self._region_prefix = f"rfm_{os.getpid()}_{secrets.token_hex(4)}_"
+        self._backends = Path(tempfile.mkdtemp(prefix="rfm-backends-"))
+        arguments = [
+            f"--model-repository={repository}",
+            "--model-control-mode=explicit",
+            "--load-model=*",
+            "--disable-auto-complete-config",
+            "--strict-readiness=true",
+            "--exit-on-error=false",  # so that the reason of each model that fails can be asked for
+            f"--exit-timeout-secs={EXIT_TIMEOUT_S}",
+            f"--http-address={endpoints.host}",
+            f"--http-port={endpoints.http_port}",
+            f"--grpc-address={endpoints.host}",
+            f"--grpc-port={endpoints.grpc_port}",
+            f"--metrics-address={endpoints.host}",
+            f"--metrics-port={endpoints.metrics_port}",
+            f"--backend-config=python,shm-region-prefix-name={self._region_prefix}",
+            *([f"--http-thread-count={http_threads}"] if http_threads else []),
+            *installation.lay_out_backends(self._backends),
+        ]
+        self.process = subprocess.Popen(
+            [installation.executable, *arguments],
+            env={**os.environ, **installation.environment},
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,  # a Ctrl-C in the terminal reaches it once, through us
+        )
+
+    def wait_ready(self) -> None:
+        """Returns when every model is ready. Raises ServerStartError with the reason of one that is not."""
+        client = tritonclient.http.InferenceServerClient(f"{self.endpoints.host}:{self.endpoints.http_port}")
+        try:
+            while self.process.poll() is None:
+                try:
+                    index = client.get_model_repository_index()
+                except (OSError, EOFError, InferenceServerException):
+                    time.sleep(POLL_S)  # Triton answers nothing while it loads
+                    continue
+                failed = [model for model in index if model.get("state") != "READY"]
+                if not failed:
+                    return
+                reasons = "; ".join(f"{m['name']}: {_one_line(m.get('reason', 'not loaded'))}" for m in failed)
+                raise ServerStartError(f"models: expected all to be ready, got {reasons}")
+            raise ServerStartError(f"tritonserver: expected to run, got exit status {self.process.returncode}")
+        finally:
+            client.close()
+
+    def stop(self) -> int:
+        """Ends the server gracefully, by force after KILL_AFTER_S, and gives its exit status."""
+        if self.process.poll() is None:
+            self.process.terminate()
+        try:
+            self.process.wait(KILL_AFTER_S)
+        except subprocess.TimeoutExpired:
+            os.killpg(self.process.pid, signal.SIGKILL)
+        return self.wait()
+
+    def wait(self) -> int:
+        """Waits for the server to end and clears away what it leaves; gives its exit status."""
+        status = self.process.wait()
+        shutil.rmtree(self._backends, ignore_errors=True)
+        for region in SHARED_MEMORY.glob(f"{self._region_prefix}*"):
+            region.unlink(missing_ok=True)
+        return status
+
+    def run(self) -> int:
+        """Serves until the server ends or this process is told to (SIGINT, SIGTERM); gives Triton's exit status."""
+
+        told_to_stop = False
+
+        def forward(number: int, _frame: FrameType | None) -> None:
+            nonlocal told_to_stop
+            told_to_stop = True
+            self.process.send_signal(number)
+
+        previous = {number: signal.signal(number, forward) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            self.wait_ready()
+            return self.wait()
+        except ServerStartError:
+            status = self.stop()
+            if told_to_stop:  # while it was still loading
+                return status
+            raise
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+
+    def __enter__(self) -> TritonServer:
+        try:
+            self.wait_ready()
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.stop()
+
+
+def _one_line(reason: str) -> str:
+    """The part of a Triton reason that says what happened: the last line of a Python traceback."""
+    lines = [line.strip() for line in reason.strip().splitlines() if line.strip() and not line.startswith("At:")]
+    return lines[0] if lines else "unknown"
