@@ -245,7 +245,8 @@ def _stated(folder: Path) -> dict[str, Any]:
                 raise CheckpointError(f"{folder}: {name} in {source}: expected {kind.__name__}, got {value!r}")
         if len(set(values.values())) > 1:
             raise CheckpointError(f"{folder}: {name}: expected {' and '.join(values)} to agree, got {values}")
-        stated.update({name: value for value in values.values()})
+        if values:
+            stated[name] = next(iter(values.values()))
     return stated
 
 

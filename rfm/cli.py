@@ -42,9 +42,7 @@ def export(
     config: Config = None,
     image_encoder: Annotated[str | None, typer.Option(help="Folder or id of the image encoder.")] = None,
     text_encoder: Annotated[str | None, typer.Option(help="Folder or id of the text encoder.")] = None,
-    check: Annotated[
-        bool, typer.Option("--check", help="Write nothing; compare with what would be generated.")
-    ] = False,
+    check: Annotated[bool, typer.Option("--check", help="Write nothing; compare with what would be written.")] = False,
 ) -> None:
     """Write a checkpoint into a model repository as the next version of its models."""
     import rfm_export
@@ -60,9 +58,7 @@ def export(
             typer.echo(f"{repository}: as generated")
             return
         if serve.model_path is None:
-            raise typer.BadParameter(
-                "expected a checkpoint, here or as model_path in --config", param_hint="--checkpoint"
-            )
+            _fail("--checkpoint: expected a checkpoint, here or as model_path in --config, got none")
         version = rfm_export.export(serve.model_path, repository, serve)
     except (CheckpointError, rfm_export.ExportError) as error:
         _fail(str(error))
@@ -114,7 +110,7 @@ def demo(
     from rfm.demo.checkpoint import write_random_checkpoint
 
     if (video is None) != (task is None):
-        raise typer.BadParameter("expected both or neither", param_hint="--video, --task")
+        _fail("--video and --task: expected both or neither, got one")
     console = Console()
     output.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix="rfm-demo-") as folder:

@@ -116,13 +116,16 @@ class Engine:
     def _embedded(self, samples: Sequence[Sample]) -> list[Sample | RewardError]:
         """The samples with embeddings in place of raw frames."""
         embedded: list[Sample | RewardError] = list(samples)
-        films = {i: film for i, sample in enumerate(samples) if (film := _film(sample)) is not None}
+        films = {i: _film(sample) for i, sample in enumerate(samples) if sample.trajectories[0].frames is not None}
         if films and self.encoders is None:
             missing = InvalidSampleError.at("frames", "video_embeddings (no encoders are loaded)", "frames")
             return [missing if index in films else sample for index, sample in enumerate(samples)]
         if films and self.encoders is not None:
-            for index, film in zip(films, self.encoders.encode(list(films.values())), strict=True):
-                embedded[index] = film if isinstance(film, RewardError) else _with_embeddings(samples[index], film)
+            for index, encoded in zip(films, self.encoders.encode(list(films.values())), strict=True):
+                if isinstance(encoded, Trajectory):
+                    embedded[index] = _with_embeddings(samples[index], encoded)
+                else:
+                    embedded[index] = encoded
         return embedded
 
     def _rows(self, sample: Sample | RewardError) -> list[Row]:
@@ -184,12 +187,10 @@ def _frame_scores(progress_logits: Tensor, success_logits: Tensor, lengths: Sequ
     ]
 
 
-def _film(sample: Sample) -> Trajectory | None:
-    """All frames of a sample and its task, as one trajectory; None for a sample of embeddings."""
-    frames = [trajectory.frames for trajectory in sample.trajectories if trajectory.frames is not None]
-    if not frames:
-        return None
-    return Trajectory(frames=np.concatenate(frames), task=sample.trajectories[0].task)
+def _film(sample: Sample) -> Trajectory:
+    """All frames of a sample and its task, as one trajectory."""
+    frames = np.concatenate([trajectory.positions for trajectory in sample.trajectories])
+    return Trajectory(frames=frames, task=sample.trajectories[0].task)
 
 
 def _with_embeddings(sample: Sample, film: Trajectory) -> Sample:

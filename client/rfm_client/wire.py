@@ -266,7 +266,7 @@ def _trajectory(tensors: Mapping[str, npt.NDArray[Any]], row: int, start: int, s
 
 def _unpadded(tensors: Mapping[str, npt.NDArray[Any]], name: str, row: int, total: int) -> npt.NDArray[Any]:
     """Positions up to ``total``; what lies behind must be padding, or num_frames is wrong."""
-    positions = tensors[name][row]
+    positions: npt.NDArray[Any] = tensors[name][row]
     if total > len(positions):
         raise InvalidSampleError.at(NUM_FRAMES, f"at most the {len(positions)} frames in {name}", str(total))
     if positions[total:].any():

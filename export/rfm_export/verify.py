@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from rfm.engine import Engine, Outcome
 from rfm.models.rewind import RewindConfig
@@ -60,11 +61,11 @@ def verify(original: Engine, exported: Engine, samples: Sequence[Sample]) -> Non
         if not np.allclose(got, expected, rtol=0, atol=TOLERANCE):
             largest = np.abs(got - expected).max()
             raise ExportDiffersError(
-                f"probe {index}: expected the checkpoint's scores, got some that differ by {largest:g}"
+                f"probe {index}: expected the checkpoint's scores, got a difference of {largest:g}"
             )
 
 
-def _numbers(outcome: Outcome) -> np.ndarray:
+def _numbers(outcome: Outcome) -> npt.NDArray[np.float64]:
     if isinstance(outcome, RewardError):
         raise ExportDiffersError(f"expected scores, got: {outcome}") from outcome
     if isinstance(outcome, ProgressResult):
@@ -74,5 +75,5 @@ def _numbers(outcome: Outcome) -> np.ndarray:
     return np.concatenate([[outcome.similarity], _frame_numbers(outcome.reference), _frame_numbers(outcome.other)])
 
 
-def _frame_numbers(scores: FrameScores) -> np.ndarray:
-    return np.concatenate([scores.progress, scores.success])
+def _frame_numbers(scores: FrameScores) -> npt.NDArray[np.float64]:
+    return np.concatenate([scores.progress, scores.success]).astype(np.float64)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from rfm_client import PreferenceResult, ProgressResult, Result, SimilarityResult
+from rfm_client import FrameScores, PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.samples import UInt8Array
 
 STRIP_FRAMES = 8
@@ -35,6 +35,7 @@ def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> Table:
     table = Table(title=title, title_justify="left")
     for column in ("sample", "answer", "progress at the end", "success at the end"):
         table.add_column(column)
+    frames: FrameScores
     for name, result in rows:
         if isinstance(result, ProgressResult):
             answer, frames = f"{len(result.progress)} frames", result

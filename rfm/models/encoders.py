@@ -119,11 +119,11 @@ class Encoders:
         """
         try:
             from transformers import AutoTokenizer
-            from transformers.utils import cached_file
+            from transformers.utils.hub import cached_file
         except ImportError as error:
             raise ImportError('raw frames need transformers: pip install "rfm-triton[encoders]"') from error
         preprocessor_file = cached_file(str(image_source), PREPROCESSOR_CONFIG)
-        preprocessor_config = json.loads(Path(preprocessor_file).read_text())
+        preprocessor_config = json.loads(Path(str(preprocessor_file)).read_text())
         return cls(
             _load_model(image_source, image_weights),
             ImagePreprocessor.from_config(preprocessor_config, f"{image_source}/{PREPROCESSOR_CONFIG}"),

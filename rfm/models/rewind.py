@@ -12,6 +12,7 @@ Architecture: ReWiND (https://arxiv.org/abs/2505.10911) as in the public impleme
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -71,8 +72,9 @@ class RewindBatch:
 
     def to(self, device: torch.device) -> RewindBatch:
         """The batch on ``device``."""
-        tensors = (getattr(self, field.name) for field in fields(self))
-        return RewindBatch(*(None if t is None else t.to(device, non_blocking=True) for t in tensors))
+        tensors: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
+        moved: dict[str, Any] = {name: None if t is None else t.to(device) for name, t in tensors.items()}
+        return RewindBatch(**moved)
 
 
 @dataclass(frozen=True)

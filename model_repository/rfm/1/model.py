@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: MIT
+"""Triton <-> Engine: samples of the wire contract in, their rewards out."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+
+import torch
+
+from rfm.engine import Engine, Outcome
+from rfm.server.batch_model import BUDGET_PARAMETER, BatchModel
+from rfm_client import Result, Sample, wire
+
+
+class TritonPythonModel(BatchModel[Sample, Result]):
+    """One instance: one engine on one device."""
+
+    def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
+        token_budget = int(settings[BUDGET_PARAMETER])
+        self.engine = Engine.from_checkpoint(version / "checkpoint", device=device, token_budget=token_budget)
+
+    def decode(self, tensors: wire.Tensors) -> list[Sample]:
+        return wire.decode_samples(tensors)
+
+    def answer(self, questions: Sequence[Sample]) -> list[Outcome]:
+        return self.engine.evaluate(questions)
+
+    def encode(self, answers: Sequence[Result], tensors: wire.Tensors, outputs: Collection[str]) -> wire.Tensors:
+        return wire.encode_results(answers, wire.num_positions(tensors), outputs)

@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: MIT
+"""Triton <-> Encoders: frames and task in, the embeddings that the reward model reads out."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+
+import torch
+
+from rfm.models.encoders import Encoders
+from rfm.server.batch_model import BatchModel
+from rfm_client import RewardError, Trajectory, wire
+
+
+class TritonPythonModel(BatchModel[Trajectory, Trajectory]):
+    """One instance: one pair of encoders on one device."""
+
+    def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
+        encoders = Encoders.from_pretrained(version / "image_encoder", version / "text_encoder")
+        self.encoders = encoders.to(device)
+
+    def decode(self, tensors: wire.Tensors) -> list[Trajectory]:
+        return wire.decode_trajectories(tensors)
+
+    def answer(self, questions: Sequence[Trajectory]) -> list[Trajectory | RewardError]:
+        return self.encoders.encode(questions)
+
+    def encode(self, answers: Sequence[Trajectory], tensors: wire.Tensors, outputs: Collection[str]) -> wire.Tensors:
+        return wire.encode_trajectories(answers, wire.num_positions(tensors), outputs)
