@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: MIT
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import goldens
+import numpy as np
+import pytest
+import torch
+
+import rfm_export
+from rfm import checkpoint as checkpoints
+from rfm.config import ServeConfig
+from rfm.engine import Engine
+from rfm.server.installation import find_installation
+from rfm.server.process import Endpoints, TritonServer
+from rfm_client import RewardClient, Trajectory
+from rfm_export.export import load_encoders
+
+torch.set_num_threads(1)
+
+
+def serve_config(config: goldens.Config, name: str = "rfm") -> ServeConfig:
+    """How the tests export a reference checkpoint."""
+    return ServeConfig(
+        name=name,
+        num_gpus=0,
+        torch_threads=1,
+        image_encoder=str(config.image_encoder) if config.image_encoder else None,
+        text_encoder=str(config.text_encoder) if config.text_encoder else None,
+    )
+
+
+@functools.cache
+def load_engine(name: str) -> Engine:
+    """The engine of a reference checkpoint, with its encoders if it has some."""
+    config = goldens.config(name)
+    checkpoint = checkpoints.load(config.checkpoint)
+    return Engine(checkpoint.build(), encoders=load_encoders(checkpoint, serve_config(config)))
+
+
+@pytest.fixture
+def engine() -> Callable[[str], Engine]:
+    return load_engine
+
+
+@dataclass(frozen=True)
+class Served:
+    """A running server with every reference checkpoint under its own name."""
+
+    repository: Path
+    endpoints: Endpoints
+
+    def url(self, protocol: str) -> str:
+        return self.endpoints.grpc_url if protocol == "grpc" else self.endpoints.http_url
+
+    def client(self, protocol: str, model: str = "c1_t1_disc10") -> RewardClient:
+        return RewardClient(self.url(protocol), model=model)
+
+
+@pytest.fixture(scope="session")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("served")
+    repository = folder / "model_repository"
+    for config in (*goldens.REWIND, *goldens.WITH_ENCODERS):
+        rfm_export.export(config.checkpoint, repository, serve_config(config, config.name))
+    with (
+        (folder / "tritonserver.log").open("wb") as log,
+        TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+    ):
+        yield Served(repository, server.endpoints)
+
+
+@pytest.fixture(params=["grpc", "http"])
+def protocol(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def random_trajectory(seed: int, num_frames: int, video_dim: int = 768, text_dim: int = 384) -> Trajectory:
+    """Embeddings in the widths of the upstream checkpoints."""
+    random = np.random.default_rng(seed)
+    return Trajectory(
+        video_embeddings=random.standard_normal((num_frames, video_dim), np.float32),
+        text_embedding=random.standard_normal(text_dim, np.float32),
+    )

@@ -1,0 +1,326 @@
+# SPDX-License-Identifier: MIT
+"""The real thing: tritonserver, gRPC and HTTP, every reference checkpoint."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import goldens
+import numpy as np
+import pytest
+import tritonclient.grpc
+from conftest import Served, load_engine, random_trajectory
+
+from rfm_client import (
+    InvalidSampleError,
+    ModelNotFoundError,
+    PreferenceSample,
+    ProgressSample,
+    RewardClient,
+    RewardError,
+    Sample,
+    ServerUnavailableError,
+    SimilaritySample,
+    Trajectory,
+    wire,
+)
+from rfm_client.transport import connect
+
+MODEL = "c1_t1_disc10"  # tokens, so T <= 16; discrete; all heads
+FRAMES_MODEL = "enc_c1_t1_disc10"
+TOLERANCE = 1e-5
+NO_SUCH_MODEL = "not_served"
+
+
+def mixed_samples(count: int, longest: int = 16) -> list[Sample]:
+    """All types, all lengths from 1 to ``longest``, in turn."""
+    samples: list[Sample] = []
+    for index in range(count):
+        first = random_trajectory(2 * index, 1 + index % longest)
+        second = random_trajectory(2 * index + 1, 1 + (7 * index) % longest)
+        kinds: tuple[Callable[[], Sample], ...] = (
+            lambda first=first: ProgressSample(first),
+            lambda first=first, second=second: PreferenceSample(first, second),
+            lambda first=first, second=second: SimilaritySample(first, second),
+        )
+        samples.append(kinds[index % 3]())
+    return samples
+
+
+@pytest.mark.parametrize("case", goldens.ANSWERED, ids=str)
+def test_every_reference_answer_comes_back_over_the_wire(served: Served, protocol: str, case: goldens.Case) -> None:
+    config = load_engine(case.config.name).network.config
+    with served.client(protocol, case.config.name) as client:
+        results = client.evaluate(case.samples(), logits=config.progress_bins > 1)
+    for result, expected in zip(results, case.expected(), strict=True):
+        goldens.check(result, expected)
+    case.check_response(results)
+
+
+@pytest.mark.parametrize("case", goldens.REFUSED, ids=str)
+def test_too_long_a_trajectory_is_refused_with_the_limit(served: Served, protocol: str, case: goldens.Case) -> None:
+    limit = load_engine(case.config.name).network.config.max_len
+    with served.client(protocol, case.config.name) as client, pytest.raises(InvalidSampleError, match=f"at most {limit} "):
+        client.evaluate(case.samples())
+
+
+def test_any_mixture_equals_its_samples_alone(served: Served, protocol: str) -> None:
+    samples = mixed_samples(100)
+    with served.client(protocol) as client:
+        together = client.evaluate(samples)
+        alone = [client.evaluate([sample])[0] for sample in samples]
+    for left, right in zip(together, alone, strict=True):
+        assert_same(left, right)
+
+
+def test_concurrent_callers_of_mixed_lengths_and_types_share_batches(served: Served) -> None:
+    samples = mixed_samples(200)
+    alone = [load_engine(MODEL).evaluate([sample])[0] for sample in samples]
+    plug = [ProgressSample(random_trajectory(0, 256), frame_steps=16) for _ in range(32)]  # keeps the model busy
+    start = threading.Barrier(len(samples))
+    with served.client("grpc") as client, ThreadPoolExecutor(len(samples) + 1) as pool:
+        before = counts(served, MODEL)
+
+        def ask(sample: Sample) -> object:
+            start.wait()
+            return client.evaluate([sample])[0]
+
+        plugged = pool.submit(client.evaluate, plug)
+        answers = list(pool.map(ask, samples))
+        plugged.result()
+        requests, executions = (after - b for after, b in zip(counts(served, MODEL), before, strict=True))
+    for answer, expected in zip(answers, alone, strict=True):
+        assert_same(answer, expected)
+    assert requests == len(samples) + 1
+    assert executions <= requests // 4
+
+
+def test_dense_mode_scores_each_frame_on_its_prefix(served: Served, protocol: str) -> None:
+    trajectory = random_trajectory(5, 9)
+    assert trajectory.video_embeddings is not None
+    with served.client(protocol) as client:
+        dense = client.progress(trajectory, frame_steps=4)
+        for t in range(9):
+            picked = trajectory.video_embeddings[np.linspace(0, t, 4).astype(int)]
+            prefix = Trajectory(video_embeddings=picked, text_embedding=trajectory.text_embedding)
+            assert abs(client.progress(prefix).progress[-1] - dense.progress[t]) <= TOLERANCE
+
+
+def test_dense_mode_takes_trajectories_longer_than_max_len(served: Served, protocol: str) -> None:
+    with served.client(protocol) as client:
+        assert len(client.progress(random_trajectory(6, 40), frame_steps=4).progress) == 40
+
+
+def test_a_bad_sample_fails_alone(served: Served, protocol: str) -> None:
+    samples = mixed_samples(9)
+    samples[4] = ProgressSample(random_trajectory(0, 17))
+    with served.client(protocol) as client:
+        outcomes = client.evaluate_each(samples)
+    assert isinstance(outcomes[4], InvalidSampleError)
+    assert str(outcomes[4]).startswith("num_frames: expected at most 16")
+    for index, outcome in enumerate(outcomes):
+        if index != 4:
+            assert_same(outcome, load_engine(MODEL).evaluate([samples[index]])[0])
+    with served.client(protocol) as client, pytest.raises(InvalidSampleError, match=r"^samples\[4\]\.num_frames: "):
+        client.evaluate(samples)
+
+
+def test_a_bad_request_in_a_batch_of_callers_fails_alone(served: Served, protocol: str) -> None:
+    """Other callers' requests that share its batch are served."""
+    samples = mixed_samples(24)
+    samples[11] = ProgressSample(random_trajectory(0, 17))
+    start = threading.Barrier(len(samples))
+
+    def ask(sample: Sample) -> object:
+        with served.client(protocol) as client:
+            start.wait()
+            return client.evaluate_each([sample])[0]
+
+    with ThreadPoolExecutor(len(samples)) as pool:
+        outcomes = list(pool.map(ask, samples))
+    assert isinstance(outcomes.pop(11), InvalidSampleError)
+    assert not [outcome for outcome in outcomes if isinstance(outcome, RewardError)]
+
+
+def good_tensors() -> wire.Tensors:
+    pair = PreferenceSample(random_trajectory(1, 3), random_trajectory(2, 2))
+    return {name: array.copy() for name, array in wire.encode_samples([pair]).items()}
+
+
+def bad(**changes: object) -> wire.Tensors:
+    return good_tensors() | changes  # type: ignore[return-value]
+
+
+def with_value(value: float) -> np.ndarray:
+    embeddings = good_tensors()[wire.VIDEO_EMBEDDINGS]
+    embeddings[0, 1, 7] = value
+    return embeddings
+
+
+int32 = np.int32
+BAD_TENSORS = {
+    "unknown sample type": (
+        bad(sample_type=np.array([[3]], np.uint8)),
+        r"^sample_type: expected one of 0 \(progress\), 1 \(preference\), 2 \(similarity\), got 3$",
+    ),
+    "NaN": (
+        bad(video_embeddings=with_value(np.nan)),
+        r"^video_embeddings: expected finite values, got nan at \[1, 7\]$",
+    ),
+    "Inf": (
+        bad(video_embeddings=with_value(np.inf)),
+        r"^video_embeddings: expected finite values, got inf at \[1, 7\]$",
+    ),
+    "wrong D": (bad(video_embeddings=np.ones((1, 5, 7), np.float32)), r"video_embeddings.*[Ee]xpected.*768.*got.*7"),
+    "wrong Dt": (bad(text_embedding=np.ones((1, 7), np.float32)), r"text_embedding.*[Ee]xpected.*384.*got.*7"),
+    "more frames told than sent": (
+        bad(num_frames=np.array([[3, 3]], int32)),
+        r"^num_frames: expected at most the 5 frames in video_embeddings, got 6$",
+    ),
+    "fewer frames told than sent": (
+        bad(num_frames=np.array([[3, 1]], int32)),
+        r"^video_embeddings: expected zeros behind the 4 frames that num_frames tells, got other values$",
+    ),
+    "empty second trajectory": (
+        bad(num_frames=np.array([[5, 0]], int32)),
+        r"^num_frames: expected at least one frame of each of the two trajectories, got \[5, 0\]$",
+    ),
+    "negative length": (
+        bad(num_frames=np.array([[-1, 6]], int32)),
+        r"^num_frames: expected at least one frame of each of the two trajectories, got \[-1, 6\]$",
+    ),
+    "second trajectory in a progress sample": (
+        bad(sample_type=np.array([[0]], np.uint8)),
+        r"^num_frames: expected \[at least 1, 0\] for progress, got \[3, 2\]$",
+    ),
+    "empty trajectory": (
+        bad(sample_type=np.array([[0]], np.uint8), num_frames=np.array([[0, 0]], int32)),
+        r"^num_frames: expected \[at least 1, 0\] for progress, got \[0, 0\]$",
+    ),
+    "dense mode of one frame": (
+        bad(sample_type=np.array([[0]], np.uint8), num_frames=np.array([[5, 0]], int32), frame_steps=np.array([[1]], int32)),
+        r"^frame_steps: expected 0 or at least 2, got 1$",
+    ),
+    "dense mode of a pair": (
+        bad(frame_steps=np.array([[4]], int32)),
+        r"^frame_steps: expected 0 unless the sample is of type progress, got 4$",
+    ),
+    "dense mode beyond max_len": (
+        bad(sample_type=np.array([[0]], np.uint8), num_frames=np.array([[5, 0]], int32), frame_steps=np.array([[17]], int32)),
+        r"^frame_steps: expected at most 16 \(max_len of this checkpoint.*\), got 17$",
+    ),
+}
+
+
+@pytest.mark.parametrize(("tensors", "message"), BAD_TENSORS.values(), ids=BAD_TENSORS)
+def test_bad_tensors_are_refused_with_what_was_expected(
+    served: Served, protocol: str, tensors: wire.Tensors, message: str
+) -> None:
+    transport = connect(served.url(protocol), timeout_s=30)
+    with pytest.raises(InvalidSampleError, match=message):
+        transport.infer(MODEL, tensors, [wire.PROGRESS])
+    assert transport.infer(MODEL, good_tensors(), [wire.PROGRESS])[wire.PROGRESS].shape == (1, 5)
+    transport.close()
+
+
+def test_no_frames_at_all_are_refused(served: Served, protocol: str) -> None:
+    transport = connect(served.url(protocol), timeout_s=30)
+    empty = bad(video_embeddings=np.ones((1, 0, 768), np.float32), num_frames=np.array([[0, 0]], int32))
+    with pytest.raises(RewardError):
+        transport.infer(MODEL, empty, [wire.PROGRESS])
+    transport.close()
+
+
+def test_a_checkpoint_without_similarity_says_so(served: Served, protocol: str) -> None:
+    pair = random_trajectory(1, 2), random_trajectory(2, 2)
+    message = "sample_type: expected progress or preference .*no similarity head.*, got similarity"
+    with served.client(protocol, "robometer_c1_t1_disc10") as client, pytest.raises(InvalidSampleError, match=message):
+        client.similarity(*pair)
+
+
+def test_what_was_not_asked_is_nan_on_the_wire(served: Served, protocol: str) -> None:
+    samples = [ProgressSample(random_trajectory(1, 2)), PreferenceSample(random_trajectory(2, 1), random_trajectory(3, 3))]
+    transport = connect(served.url(protocol), timeout_s=30)
+    outputs = [wire.PROGRESS, wire.SUCCESS, wire.PREFERENCE, wire.SIMILARITY, wire.PROGRESS_LOGITS, wire.TIMING_MS]
+    tensors = transport.infer(MODEL, wire.encode_samples(samples), outputs)
+    transport.close()
+    assert np.isnan(tensors[wire.PROGRESS]).tolist() == [[False, False, True, True], [False] * 4]
+    assert np.isnan(tensors[wire.SUCCESS]).tolist() == [[False, False, True, True], [False] * 4]
+    assert np.isnan(tensors[wire.PROGRESS_LOGITS][0]).all(axis=-1).tolist() == [False, False, True, True]
+    assert np.isnan(tensors[wire.PREFERENCE]).tolist() == [[True], [False]]
+    assert np.isnan(tensors[wire.SIMILARITY]).all()
+    assert (tensors[wire.TIMING_MS] > 0).all()
+    assert {array.dtype for array in tensors.values()} == {np.dtype(np.float32)}
+
+
+def test_frames_of_many_sizes_and_lengths_go_in_one_call(served: Served, protocol: str) -> None:
+    random = np.random.default_rng(3)
+    samples: list[Sample] = [
+        ProgressSample(Trajectory(frames=random.integers(0, 256, (t, h, w, 3), np.uint8), task=f"task {t}"))
+        for t, h, w in ((1, 64, 64), (3, 48, 100), (5, 64, 64), (2, 90, 60))
+    ]
+    with served.client(protocol, FRAMES_MODEL) as client:
+        results = client.evaluate(samples)
+    for result, expected in zip(results, load_engine(FRAMES_MODEL).evaluate(samples), strict=True):
+        assert_same(result, expected)
+
+
+def test_special_tokens_in_a_task_are_text(served: Served, protocol: str) -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), np.uint8)
+    with served.client(protocol, FRAMES_MODEL) as client:
+        plain, special = (
+            client.progress(Trajectory(frames=frames, task=task)).progress for task in ("lift [ SEP ] it", "lift [SEP] it")
+        )
+    np.testing.assert_allclose(plain, special, rtol=0, atol=TOLERANCE)
+
+
+def test_too_long_a_task_is_refused(served: Served, protocol: str) -> None:
+    film = Trajectory(frames=np.zeros((1, 64, 64, 3), np.uint8), task="lift " * 50)
+    with (
+        served.client(protocol, FRAMES_MODEL) as client,
+        pytest.raises(InvalidSampleError, match="^task: expected at most 32 tokens .*, got"),
+    ):
+        client.progress(film)
+
+
+def test_a_model_that_is_not_served_is_named(served: Served, protocol: str) -> None:
+    with served.client(protocol, NO_SUCH_MODEL) as client:
+        assert not client.is_ready()
+        with pytest.raises(ModelNotFoundError, match=NO_SUCH_MODEL):
+            client.progress(random_trajectory(0, 2))
+
+
+def test_one_model_missing_does_not_cost_the_others(served: Served, protocol: str) -> None:
+    film = ProgressSample(Trajectory(frames=np.zeros((1, 8, 8, 3), np.uint8), task="lift"))
+    with served.client(protocol) as client:  # embeddings only
+        outcomes = client.evaluate_each([film, ProgressSample(random_trajectory(0, 2)), film])
+    assert [type(outcome).__name__ for outcome in outcomes] == ["ModelNotFoundError", "ProgressResult", "ModelNotFoundError"]
+
+
+def test_a_server_that_is_not_there_is_unavailable(protocol: str) -> None:
+    with RewardClient(f"{protocol}://127.0.0.1:9") as client:
+        assert not client.is_ready()
+        with pytest.raises(ServerUnavailableError):
+            client.progress(random_trajectory(0, 2))
+
+
+
+def counts(served: Served, model: str) -> tuple[int, int]:
+    """Requests and executions so far."""
+    with tritonclient.grpc.InferenceServerClient(served.url("grpc").removeprefix("grpc://")) as client:
+        stats = client.get_inference_statistics(model).model_stats[0]
+    return stats.inference_stats.success.count, stats.execution_count
+
+
+def assert_same(left: object, right: object) -> None:
+    assert not isinstance(left, RewardError), left
+    assert not isinstance(right, RewardError), right
+    for a, b in zip(goldens.frame_scores(left), goldens.frame_scores(right), strict=True):  # type: ignore[arg-type]
+        np.testing.assert_allclose(a.progress, b.progress, rtol=0, atol=TOLERANCE)
+        np.testing.assert_allclose(a.success, b.success, rtol=0, atol=TOLERANCE)
+    for name in ("preference", "similarity"):
+        if hasattr(left, name):
+            assert abs(getattr(left, name) - getattr(right, name)) <= TOLERANCE
