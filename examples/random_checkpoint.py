@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Writes the small random checkpoint that ``model_repository/`` serves until there is a trained one.
 
-    python examples/random_checkpoint.py FOLDER
+python examples/random_checkpoint.py FOLDER
 """
 
 from __future__ import annotations

@@ -94,7 +94,7 @@ def save(checkpoint: RewindCheckpoint, folder: Path) -> None:
 def find(source: str | Path) -> Path:
     """The local folder of a checkpoint, fetched from the Hub if need be. An existing path wins over an id."""
     path = Path(source).expanduser()
-    if path.is_dir():
+    if str(source) and path.is_dir():
         return path
     repo_id, _, tag = str(source).partition("@")
     if not re.fullmatch(r"[\w.-]+/[\w.-]+", repo_id):
@@ -233,7 +233,11 @@ def _stated(folder: Path) -> dict[str, Any]:
         sources[NETWORK_CONFIG] = _read_json(folder / NETWORK_CONFIG)
     run_config = next((f for f in (folder / RUN_CONFIG, folder.resolve().parent / RUN_CONFIG) if f.is_file()), None)
     if run_config is not None:
-        sources[RUN_CONFIG] = (read_run_config(run_config).get("model") or {}).get("rewind") or {}
+        model = read_run_config(run_config).get("model") or {}
+        network = model.get("rewind") or {} if isinstance(model, dict) else model
+        if not isinstance(network, dict):
+            raise CheckpointError(f"{run_config}: model.rewind: expected a mapping, got {network!r}")
+        sources[RUN_CONFIG] = network
     model_type = sources.get(NETWORK_CONFIG, {}).get("model_type", MODEL_TYPE)
     if model_type != MODEL_TYPE:
         raise CheckpointError(f"{folder / NETWORK_CONFIG}: model_type: expected {MODEL_TYPE}, got {model_type}")

@@ -107,7 +107,9 @@ class Case:
         arrays = dict(np.load(self.file.with_suffix("").with_suffix(".expected.npz")))
         if self.content["kind"] in ("ragg", "ragp", "ragged"):  # evaluated one by one, each with arrays of its own
             return [
-                _expected(sample, {k.partition(".")[2]: v for k, v in arrays.items() if k.startswith(f"sample_{i}.")}, 0)
+                _expected(
+                    sample, {k.partition(".")[2]: v for k, v in arrays.items() if k.startswith(f"sample_{i}.")}, 0
+                )
                 for i, sample in enumerate(self.samples())
             ]
         rows = {"progress": 0, "preference": 0, "similarity": 0}
@@ -230,4 +232,3 @@ def _expected(sample: Sample, arrays: dict[str, Array], row: int) -> Expected:
     query = {"preference": "pref_logits", "similarity": "sim_logits"}.get(kind)
     answer = float(arrays[f"{kind}.{query}"][row, 0]) if query else None
     return Expected(progress, logits or None, success, answer)
-

@@ -6,7 +6,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import goldens
 import numpy as np
@@ -63,7 +62,10 @@ def test_every_reference_answer_comes_back_over_the_wire(served: Served, protoco
 @pytest.mark.parametrize("case", goldens.REFUSED, ids=str)
 def test_too_long_a_trajectory_is_refused_with_the_limit(served: Served, protocol: str, case: goldens.Case) -> None:
     limit = load_engine(case.config.name).network.config.max_len
-    with served.client(protocol, case.config.name) as client, pytest.raises(InvalidSampleError, match=f"at most {limit} "):
+    with (
+        served.client(protocol, case.config.name) as client,
+        pytest.raises(InvalidSampleError, match=f"at most {limit} "),
+    ):
         client.evaluate(case.samples())
 
 
@@ -201,7 +203,11 @@ BAD_TENSORS = {
         r"^num_frames: expected \[at least 1, 0\] for progress, got \[0, 0\]$",
     ),
     "dense mode of one frame": (
-        bad(sample_type=np.array([[0]], np.uint8), num_frames=np.array([[5, 0]], int32), frame_steps=np.array([[1]], int32)),
+        bad(
+            sample_type=np.array([[0]], np.uint8),
+            num_frames=np.array([[5, 0]], int32),
+            frame_steps=np.array([[1]], int32),
+        ),
         r"^frame_steps: expected 0 or at least 2, got 1$",
     ),
     "dense mode of a pair": (
@@ -209,7 +215,11 @@ BAD_TENSORS = {
         r"^frame_steps: expected 0 unless the sample is of type progress, got 4$",
     ),
     "dense mode beyond max_len": (
-        bad(sample_type=np.array([[0]], np.uint8), num_frames=np.array([[5, 0]], int32), frame_steps=np.array([[17]], int32)),
+        bad(
+            sample_type=np.array([[0]], np.uint8),
+            num_frames=np.array([[5, 0]], int32),
+            frame_steps=np.array([[17]], int32),
+        ),
         r"^frame_steps: expected at most 16 \(max_len of this checkpoint.*\), got 17$",
     ),
 }
@@ -242,7 +252,10 @@ def test_a_checkpoint_without_similarity_says_so(served: Served, protocol: str) 
 
 
 def test_what_was_not_asked_is_nan_on_the_wire(served: Served, protocol: str) -> None:
-    samples = [ProgressSample(random_trajectory(1, 2)), PreferenceSample(random_trajectory(2, 1), random_trajectory(3, 3))]
+    samples = [
+        ProgressSample(random_trajectory(1, 2)),
+        PreferenceSample(random_trajectory(2, 1), random_trajectory(3, 3)),
+    ]
     transport = connect(served.url(protocol), timeout_s=30)
     outputs = [wire.PROGRESS, wire.SUCCESS, wire.PREFERENCE, wire.SIMILARITY, wire.PROGRESS_LOGITS, wire.TIMING_MS]
     tensors = transport.infer(MODEL, wire.encode_samples(samples), outputs)
@@ -272,7 +285,8 @@ def test_special_tokens_in_a_task_are_text(served: Served, protocol: str) -> Non
     frames = np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), np.uint8)
     with served.client(protocol, FRAMES_MODEL) as client:
         plain, special = (
-            client.progress(Trajectory(frames=frames, task=task)).progress for task in ("lift [ SEP ] it", "lift [SEP] it")
+            client.progress(Trajectory(frames=frames, task=task)).progress
+            for task in ("lift [ SEP ] it", "lift [SEP] it")
         )
     np.testing.assert_allclose(plain, special, rtol=0, atol=TOLERANCE)
 
@@ -281,7 +295,7 @@ def test_too_long_a_task_is_refused(served: Served, protocol: str) -> None:
     film = Trajectory(frames=np.zeros((1, 64, 64, 3), np.uint8), task="lift " * 50)
     with (
         served.client(protocol, FRAMES_MODEL) as client,
-        pytest.raises(InvalidSampleError, match="^task: expected at most 32 tokens .*, got"),
+        pytest.raises(InvalidSampleError, match=r"^task: expected at most 32 tokens .*, got"),
     ):
         client.progress(film)
 
@@ -297,7 +311,11 @@ def test_one_model_missing_does_not_cost_the_others(served: Served, protocol: st
     film = ProgressSample(Trajectory(frames=np.zeros((1, 8, 8, 3), np.uint8), task="lift"))
     with served.client(protocol) as client:  # embeddings only
         outcomes = client.evaluate_each([film, ProgressSample(random_trajectory(0, 2)), film])
-    assert [type(outcome).__name__ for outcome in outcomes] == ["ModelNotFoundError", "ProgressResult", "ModelNotFoundError"]
+    assert [type(outcome).__name__ for outcome in outcomes] == [
+        "ModelNotFoundError",
+        "ProgressResult",
+        "ModelNotFoundError",
+    ]
 
 
 def test_a_server_that_is_not_there_is_unavailable(protocol: str) -> None:
@@ -305,7 +323,6 @@ def test_a_server_that_is_not_there_is_unavailable(protocol: str) -> None:
         assert not client.is_ready()
         with pytest.raises(ServerUnavailableError):
             client.progress(random_trajectory(0, 2))
-
 
 
 def counts(served: Served, model: str) -> tuple[int, int]:

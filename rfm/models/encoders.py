@@ -237,8 +237,15 @@ def _load_model(source: str | Path, weights: Mapping[str, Tensor] | None) -> Any
     if weights is None:
         return AutoModel.from_pretrained(str(source), use_safetensors=True, dtype=torch.float32)
     model = AutoModel.from_config(AutoConfig.from_pretrained(str(source)))
-    try:
-        model.load_state_dict(dict(weights), strict=True)
-    except RuntimeError as error:
-        raise ValueError(f"{source}: the checkpoint's encoder weights do not fit: {error}") from error
+    expected, got = ({name: tuple(w.shape) for name, w in state.items()} for state in (model.state_dict(), weights))
+    if expected != got:
+        differing = {name for name in expected.keys() & got.keys() if expected[name] != got[name]}
+        keys = {
+            "missing": expected.keys() - got.keys(),
+            "unexpected": got.keys() - expected.keys(),
+            "shapes": differing,
+        }
+        found = "; ".join(f"{kind}: {sorted(names) or 'none'}" for kind, names in keys.items())
+        raise ValueError(f"{source}: the checkpoint's encoder weights do not fit: {found}")
+    model.load_state_dict(dict(weights), strict=True)
     return model

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: MIT
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import goldens
+import numpy as np
+import pytest
+import torch
+from conftest import load_engine
+
+from rfm.models.encoders import PREPROCESSOR_CONFIG, Encoders, ImagePreprocessor
+from rfm_client import InvalidSampleError, RewardError, Trajectory
+
+NAME = "enc_c1_t1_disc10"
+# The original's embeddings, of images and of texts.
+EMBEDDING_TOLERANCE = 2e-5
+
+
+@pytest.fixture
+def encoders() -> Encoders:
+    encoders = load_engine(NAME).encoders
+    assert encoders is not None
+    return encoders
+
+
+CASES = [case for config in goldens.WITH_ENCODERS for case in config.cases()]
+WITH_PIXELS = [case for case in CASES if any("pixel_values" in key for key in case.content["expected_arrays"])]
+
+
+def cases_arrays(case: goldens.Case) -> dict[str, np.ndarray]:
+    return dict(np.load(case.file.with_suffix("").with_suffix(".expected.npz")))
+
+
+@pytest.mark.parametrize("case", WITH_PIXELS, ids=str)
+def test_pixels_are_those_of_the_original(case: goldens.Case, encoders: Encoders) -> None:
+    expected = next(array for key, array in cases_arrays(case).items() if "pixel_values" in key)
+    frames = [trajectory.frames for sample in case.samples() for trajectory in sample.trajectories]
+    pixels = torch.cat([encoders.preprocessor(torch.from_numpy(video)) for video in frames if video is not None])
+    np.testing.assert_allclose(pixels.numpy(), expected.reshape(pixels.shape), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if "steps" not in case.content["kind"]], ids=str)
+def test_embeddings_are_those_of_the_original(case: goldens.Case) -> None:
+    encoders = load_engine(case.config.name).encoders
+    assert encoders is not None
+    arrays = cases_arrays(case)
+    samples = case.samples()
+    films = [
+        Trajectory(frames=np.concatenate([t.positions for t in sample.trajectories]), task=sample.trajectories[0].task)
+        for sample in samples
+    ]
+    kind = goldens.sample_type(samples[0])
+    for row, encoded in enumerate(encoders.encode(films)):
+        assert isinstance(encoded, Trajectory)
+        expected_video, expected_text = (arrays[f"{kind}.encoder.{name}_embeddings"][row] for name in ("video", "text"))
+        np.testing.assert_allclose(encoded.positions, expected_video, rtol=0, atol=EMBEDDING_TOLERANCE)
+        np.testing.assert_allclose(encoded.text_embedding, expected_text, rtol=0, atol=EMBEDDING_TOLERANCE)
+
+
+def test_a_trajectory_is_encoded_as_alone(encoders: Encoders) -> None:
+    random = np.random.default_rng(0)
+    shapes = ((1, 64, 64), (70, 48, 100), (3, 1, 1), (130, 20, 31))
+    films = [
+        Trajectory(frames=random.integers(0, 256, (*shape, 3), np.uint8), task=f"lift {'the cup ' * index}")
+        for index, shape in enumerate(shapes)
+    ]
+    for film, together in zip(films, encoders.encode(films), strict=True):
+        (alone,) = encoders.encode([film])
+        assert isinstance(together, Trajectory)
+        assert isinstance(alone, Trajectory)
+        np.testing.assert_allclose(together.positions, alone.positions, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(together.text_embedding, alone.text_embedding, rtol=0, atol=1e-5)
+
+
+def test_a_task_that_is_too_long_fails_alone(encoders: Encoders) -> None:
+    frames = np.zeros((2, 30, 30, 3), np.uint8)
+    films = [Trajectory(frames=frames, task=task) for task in ("lift", "lift " * 100, "drop")]
+    first, failed, last = encoders.encode(films)
+    assert isinstance(failed, InvalidSampleError)
+    assert str(failed).startswith("task: expected at most 32 tokens (limit of the text encoder), got ")
+    assert not isinstance(first, RewardError)
+    assert not isinstance(last, RewardError)
+
+
+def test_special_tokens_in_a_task_are_text(encoders: Encoders) -> None:
+    plain, special = encoders.encode_tasks(["a [ SEP ] b [ PAD ]", "a [SEP] b [PAD]"])
+    np.testing.assert_allclose(plain, special, rtol=0, atol=1e-6)
+
+
+def test_saving_and_loading_changes_nothing(encoders: Encoders, tmp_path: Path) -> None:
+    encoders.save_pretrained(tmp_path / "image", tmp_path / "text")
+    copy = Encoders.from_pretrained(tmp_path / "image", tmp_path / "text")
+    frames = [np.random.default_rng(0).integers(0, 256, (2, 50, 70, 3), np.uint8)]
+    np.testing.assert_array_equal(copy.encode_frames(frames)[0], encoders.encode_frames(frames)[0])
+    np.testing.assert_array_equal(copy.encode_tasks(["lift the cup"]), encoders.encode_tasks(["lift the cup"]))
+
+
+def test_a_checkpoints_own_encoder_weights_win(encoders: Encoders) -> None:
+    config = goldens.config(NAME)
+    assert config.image_encoder is not None
+    assert config.text_encoder is not None
+    base = Encoders.from_pretrained(config.image_encoder, config.text_encoder)
+    weights = {name: tensor + 0.1 for name, tensor in base.image_model.state_dict().items()}
+    changed = Encoders.from_pretrained(config.image_encoder, config.text_encoder, image_weights=weights)
+    frames = [np.full((1, 64, 64, 3), 99, np.uint8)]
+    assert np.abs(changed.encode_frames(frames)[0] - base.encode_frames(frames)[0]).max() > 1e-3
+    np.testing.assert_array_equal(changed.encode_tasks(["lift"]), base.encode_tasks(["lift"]))
+
+
+def test_encoder_weights_that_do_not_fit_are_named() -> None:
+    config = goldens.config(NAME)
+    assert config.image_encoder is not None
+    assert config.text_encoder is not None
+    weights = {"embeddings.cls_token": torch.zeros(1, 1, 48)}
+    with pytest.raises(
+        ValueError, match=r"encoder weights do not fit: missing: .*'layernorm.weight'.*; unexpected: none; shapes: none"
+    ):
+        Encoders.from_pretrained(config.image_encoder, config.text_encoder, image_weights=weights)
+
+
+UNSUPPORTED = {
+    "no resize": ({"do_resize": False}, "do_resize: expected True, got False"),
+    "bilinear": ({"resample": 2}, "resample: expected 3, got 2"),
+    "another scale": ({"rescale_factor": 1.0}, "rescale_factor: expected 1/255, got 1.0"),
+    "fixed size": ({"size": {"height": 3, "width": 3}}, "expected size {shortest_edge}"),
+}
+
+
+@pytest.mark.parametrize(("change", "message"), UNSUPPORTED.values(), ids=UNSUPPORTED)
+def test_a_preprocessor_that_works_otherwise_is_refused(
+    tmp_path: Path, change: dict[str, object], message: str
+) -> None:
+    config = goldens.config(NAME)
+    assert config.image_encoder is not None
+    assert config.text_encoder is not None
+    shutil.copytree(config.image_encoder, tmp_path / "image")
+    file = tmp_path / "image" / PREPROCESSOR_CONFIG
+    content = json.loads(file.read_text()) | change
+    file.chmod(0o644)
+    file.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=message):
+        Encoders.from_pretrained(tmp_path / "image", config.text_encoder)
+
+
+def test_images_smaller_than_the_crop_are_padded_evenly() -> None:
+    preprocessor = ImagePreprocessor(resize_px=4, crop_px=(7, 6), mean=(0.0,) * 3, std=(1.0,) * 3)
+    white = preprocessor(torch.full((1, 4, 4, 3), 255, dtype=torch.uint8))[0, 0]
+    assert white.shape == (7, 6)
+    assert white.sum() == 16
+    assert white[1:5, 1:5].sum() == 16

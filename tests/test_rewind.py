@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: MIT
+"""The network against torch's own transformer, in every variant; the collator; the engine's batches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import product
+
+import goldens
+import numpy as np
+import pytest
+import torch
+from conftest import random_trajectory
+from torch import Tensor, nn
+
+from rfm.collate import RewindCollator, prefix_indices
+from rfm.engine import Engine, Outcome
+from rfm.models.heads import PredictionHead, progress_from_logits
+from rfm.models.rewind import RewindConfig, RewindTransformer
+from rfm_client import (
+    InferenceFailedError,
+    InvalidSampleError,
+    PreferenceSample,
+    ProgressResult,
+    ProgressSample,
+    RewardError,
+    Sample,
+    SimilaritySample,
+    Trajectory,
+)
+
+TOLERANCE = 1e-5
+BASE = RewindConfig(
+    video_feature_dim=12,
+    text_feature_dim=6,
+    hidden_dim=24,
+    num_layers=2,
+    num_attention_heads=3,
+    max_len=8,
+    causal_mask=True,
+    use_per_frame_progress_token=True,
+    progress_bins=5,
+    has_similarity=True,
+)
+VARIANTS = {
+    f"causal={causal} tokens={tokens} bins={bins}": replace(
+        BASE, causal_mask=causal, use_per_frame_progress_token=tokens, progress_bins=bins
+    )
+    for causal, tokens, bins in product((True, False), (True, False), (1, 5))
+} | {
+    "one wide layer": replace(BASE, num_layers=1, hidden_dim=64, num_attention_heads=8),
+    "many narrow layers": replace(BASE, num_layers=5, hidden_dim=4, num_attention_heads=1),
+    "no similarity": replace(BASE, has_similarity=False),
+}
+
+
+def build(config: RewindConfig, seed: int = 0) -> RewindTransformer:
+    torch.manual_seed(seed)
+    network = RewindTransformer(config).eval()
+    for parameter in network.parameters():  # no layer is left at zeros or ones
+        nn.init.normal_(parameter, std=0.3)
+    return network.requires_grad_(False)
+
+
+def trajectory(seed: int, num_frames: int) -> Trajectory:
+    return random_trajectory(seed, num_frames, BASE.video_feature_dim, BASE.text_feature_dim)
+
+
+def sequence_of(network: RewindTransformer, sample: Sample) -> tuple[Tensor, list[list[int]]]:
+    """Written from the format's description, one token at a time: the row's tokens, and where scores are read."""
+    weights, config = network.state_dict(), network.config
+    text = torch.as_tensor(sample.trajectories[0].text_embedding)
+    token = weights["text_proj.weight"] @ text + weights["text_proj.bias"]
+    if config.use_per_frame_progress_token:
+        token = token + weights["text_position_embedding"][0, 0]
+    tokens, read = [token], []
+    for side, part in zip("AB", sample.trajectories, strict=False):
+        positions = []
+        for index, frame in enumerate(torch.as_tensor(part.video_embeddings)):
+            token = weights["video_proj.weight"] @ frame + weights["video_proj.bias"]
+            tokens.append(token + weights[f"first_embedding_{side}"][0, 0] if index == 0 else token)
+            if config.use_per_frame_progress_token:
+                tokens.append(weights[f"prog_token_{side}"][0, index])
+            positions.append(len(tokens) - 1)
+        read.append(positions)
+    if len(sample.trajectories) == 2:
+        name = "similarity_token" if isinstance(sample, SimilaritySample) else "preference_token"
+        tokens.append(weights[name][0, 0])
+    return torch.stack(tokens), read
+
+
+def reference_scores(network: RewindTransformer, sample: Sample) -> list[Tensor]:
+    """The sample's scores by torch's own transformer: per trajectory progress and success, then the query."""
+    config = network.config
+    layer = nn.TransformerEncoderLayer(
+        config.hidden_dim, config.num_attention_heads, 4 * config.hidden_dim, batch_first=True, dropout=0.0
+    )
+    transformer = nn.TransformerEncoder(layer, config.num_layers, enable_nested_tensor=False)
+    transformer.load_state_dict(network.transformer.state_dict())
+    tokens, read = sequence_of(network, sample)
+    length = len(tokens)
+    mask = torch.ones(length, length, dtype=torch.bool).triu(1) if config.causal_mask else None
+    hidden = transformer(tokens[None], mask=mask)[0]  # in training mode, without dropout: the plain path
+    scores = []
+    for positions in read:
+        logits = network.progress_head(hidden[positions])
+        if config.progress_bins == 1:
+            scores.append(logits.squeeze(-1).sigmoid())
+        else:
+            scores.append(logits.softmax(-1) @ torch.linspace(0, 1, config.progress_bins))
+        scores.append(network.success_head(hidden[positions]).squeeze(-1).sigmoid())
+    if isinstance(sample, PreferenceSample):
+        scores.append(network.preference_head(hidden[-1]).sigmoid())
+    elif isinstance(sample, SimilaritySample):
+        scores.append(network.similarity_head(hidden[-1]))
+    return scores
+
+
+def numbers(outcome: Outcome) -> np.ndarray:
+    assert not isinstance(outcome, RewardError), outcome
+    parts = [part for scores in goldens.frame_scores(outcome) for part in (scores.progress, scores.success)]
+    query = [[getattr(outcome, name)] for name in ("preference", "similarity") if hasattr(outcome, name)]
+    return np.concatenate([*parts, *query])
+
+
+def samples_for(config: RewindConfig) -> list[Sample]:
+    samples: list[Sample] = [ProgressSample(trajectory(t, t)) for t in (1, 2, 5, 8)]
+    samples += [PreferenceSample(trajectory(a, a), trajectory(b + 50, b)) for a, b in ((1, 1), (3, 6), (8, 2))]
+    if config.has_similarity:
+        samples += [SimilaritySample(trajectory(a, a), trajectory(b + 70, b)) for a, b in ((1, 4), (6, 6))]
+    return samples
+
+
+@pytest.mark.parametrize("config", VARIANTS.values(), ids=VARIANTS)
+def test_every_variant_scores_as_torchs_own_transformer(config: RewindConfig) -> None:
+    network = build(config)
+    samples = samples_for(config)
+    for sample, outcome in zip(samples, Engine(network).evaluate(samples), strict=True):
+        expected = torch.cat([score.detach().flatten() for score in reference_scores(network, sample)])
+        np.testing.assert_allclose(numbers(outcome), expected.numpy(), rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("config", VARIANTS.values(), ids=VARIANTS)
+@pytest.mark.parametrize("token_budget", [64, 16_384])
+def test_a_result_does_not_depend_on_its_neighbours(config: RewindConfig, token_budget: int) -> None:
+    samples = samples_for(config) * 3
+    order = np.random.default_rng(0).permutation(len(samples))
+    network = build(config)
+    alone = [numbers(Engine(network).evaluate([sample])[0]) for sample in samples]
+    together = Engine(network, token_budget=token_budget).evaluate([samples[index] for index in order])
+    for index, outcome in zip(order, together, strict=True):
+        np.testing.assert_allclose(numbers(outcome), alone[index], rtol=0, atol=TOLERANCE)
+
+
+def test_frames_beyond_max_len_are_taken_without_progress_tokens() -> None:
+    config = replace(BASE, use_per_frame_progress_token=False)
+    (outcome,) = Engine(build(config)).evaluate([ProgressSample(trajectory(0, 3 * config.max_len))])
+    assert isinstance(outcome, ProgressResult)
+    assert len(outcome.progress) == 3 * config.max_len
+
+
+def test_the_token_budget_bounds_every_forward() -> None:
+    network = build(BASE)
+    sizes: list[int] = []
+    network.transformer.register_forward_hook(lambda _m, inputs, _o: sizes.append(inputs[0].shape[:2].numel()))
+    Engine(network, token_budget=100).evaluate(samples_for(BASE) * 5)
+    assert max(sizes) <= 100
+    assert len(sizes) < 30
+
+
+def test_dense_mode_takes_as_few_forwards_as_the_budget_allows() -> None:
+    network = build(BASE)
+    calls: list[int] = []
+    network.transformer.register_forward_hook(lambda *_: calls.append(1))
+    samples = [ProgressSample(trajectory(t, t), frame_steps=4) for t in (3, 9, 20)]
+    Engine(network).evaluate(samples)
+    assert len(calls) == 1
+
+
+def test_a_row_over_the_token_budget_is_refused() -> None:
+    (outcome,) = Engine(build(BASE), token_budget=10).evaluate([ProgressSample(trajectory(0, 8))])
+    assert str(outcome) == "num_frames: expected at most 10 tokens (token_budget of this server), got 17 tokens"
+
+
+BAD_FOR_CHECKPOINT: dict[str, tuple[Sample, str]] = {
+    "T over max_len": (
+        ProgressSample(trajectory(0, 9)),
+        "num_frames: expected at most 8 (max_len of this checkpoint, which has per-frame progress tokens), got 9",
+    ),
+    "second T over max_len": (
+        PreferenceSample(trajectory(0, 1), trajectory(0, 9)),
+        "num_frames: expected at most 8 (max_len of this checkpoint, which has per-frame progress tokens), got 9",
+    ),
+    "wrong D": (
+        ProgressSample(random_trajectory(0, 2, 13, 6)),
+        "video_embeddings: expected float32 [T, 12], got [2, 13]",
+    ),
+    "wrong Dt": (ProgressSample(random_trajectory(0, 2, 12, 7)), "text_embedding: expected float32 [6], got [7]"),
+    "frames without encoders": (
+        ProgressSample(Trajectory(frames=np.zeros((1, 4, 4, 3), np.uint8), task="lift")),
+        "frames: expected video_embeddings (no encoders are loaded), got frames",
+    ),
+}
+
+
+@pytest.mark.parametrize(("sample", "message"), BAD_FOR_CHECKPOINT.values(), ids=BAD_FOR_CHECKPOINT)
+def test_what_the_checkpoint_cannot_take_fails_alone(sample: Sample, message: str) -> None:
+    good = ProgressSample(trajectory(1, 3))
+    engine = Engine(build(BASE))
+    first, failed, last = engine.evaluate([good, sample, good])
+    assert isinstance(failed, InvalidSampleError)
+    assert str(failed) == message
+    np.testing.assert_allclose(numbers(first), numbers(engine.evaluate([good])[0]), atol=TOLERANCE)
+    np.testing.assert_allclose(numbers(first), numbers(last), atol=TOLERANCE)
+
+
+def test_a_score_that_is_no_number_is_an_error() -> None:
+    huge = Trajectory(video_embeddings=np.full((2, 12), 3e38, np.float32), text_embedding=np.ones(6, np.float32))
+    failed, good = Engine(build(BASE)).evaluate([ProgressSample(huge), ProgressSample(trajectory(0, 2))])
+    assert isinstance(failed, InferenceFailedError)
+    assert isinstance(good, ProgressResult)
+
+
+def test_no_samples_no_results() -> None:
+    assert Engine(build(BASE)).evaluate([]) == []
+
+
+def test_prefixes_are_sampled_as_the_original_samples_them() -> None:
+    assert prefix_indices(1, 4).tolist() == [[0, 0, 0, 0]]
+    assert prefix_indices(6, 4).tolist() == [
+        [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 2], [0, 1, 2, 3], [0, 1, 2, 4], [0, 1, 3, 5]
+    ]  # fmt: skip
+
+
+def test_a_batch_is_padded_and_masked() -> None:
+    collator = RewindCollator(replace(BASE, use_per_frame_progress_token=False))
+    samples: Sequence[Sample] = [
+        PreferenceSample(trajectory(0, 1), trajectory(1, 3)),
+        SimilaritySample(trajectory(2, 2), trajectory(3, 1)),
+    ]
+    batch = collator.collate([row for sample in samples for row in collator.rows(sample)])
+    assert batch.first.shape == (2, 2, 12)
+    assert batch.second is not None
+    assert batch.second.shape == (2, 3, 12)
+    assert batch.token_mask is not None
+    # [text] [A A] [B B B] [query]
+    assert batch.token_mask.int().tolist() == [[1, 1, 0, 1, 1, 1, 1], [1, 1, 1, 1, 0, 0, 1]]
+    assert batch.is_similarity is not None
+    assert batch.is_similarity.tolist() == [False, True]
+
+
+def test_a_batch_of_equal_lengths_has_no_mask() -> None:
+    collator = RewindCollator(BASE)
+    rows = [row for seed in range(3) for row in collator.rows(ProgressSample(trajectory(seed, 4)))]
+    assert collator.collate(rows).token_mask is None
+
+
+def test_discrete_progress_is_read_in_float32() -> None:
+    logits = torch.randn(3, 4, 10, generator=torch.manual_seed(0)).bfloat16()
+    expected = logits.double().softmax(-1) @ torch.linspace(0, 1, 10, dtype=torch.float64)
+    torch.testing.assert_close(progress_from_logits(logits).double(), expected, rtol=0, atol=1e-6)
+
+
+def test_head_parameters_have_the_names_of_checkpoints() -> None:
+    assert set(PredictionHead(8, 3).state_dict()) == {f"{i}.{kind}" for i in (0, 1, 4) for kind in ("weight", "bias")}
+
+
+@pytest.mark.parametrize("case", goldens.CASES, ids=str)
+def test_the_engine_gives_every_reference_answer(case: goldens.Case, engine: Callable[[str], Engine]) -> None:
+    outcomes = engine(case.config.name).evaluate(case.samples())
+    if case.is_refused:
+        assert all(isinstance(outcome, InvalidSampleError) and "max_len" in str(outcome) for outcome in outcomes)
+        return
+    results = [outcome for outcome in outcomes if not isinstance(outcome, RewardError)]
+    for result, expected in zip(results, case.expected(), strict=True):
+        goldens.check(result, expected)
+    case.check_response(results)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("config", VARIANTS.values(), ids=VARIANTS)
+def test_the_gpu_gives_the_numbers_of_the_cpu(config: RewindConfig) -> None:
+    samples = samples_for(config)
+    on_cpu, on_gpu = (Engine(build(config), device=device).evaluate(samples) for device in ("cpu", "cuda"))
+    for left, right in zip(on_cpu, on_gpu, strict=True):
+        np.testing.assert_allclose(numbers(left), numbers(right), rtol=0, atol=1e-4)

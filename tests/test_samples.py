@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: MIT
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rfm_client import (
+    InferenceFailedError,
+    InvalidSampleError,
+    PreferenceResult,
+    PreferenceSample,
+    ProgressSample,
+    RewardClient,
+    RewardError,
+    Sample,
+    SimilarityResult,
+    SimilaritySample,
+    Trajectory,
+    float_frames_to_uint8,
+    wire,
+)
+
+FRAMES = np.zeros((3, 8, 6, 3), np.uint8)
+VIDEO = np.ones((3, 5), np.float32)
+TEXT = np.ones(4, np.float32)
+
+
+def embedded(num_frames: int = 3, width: int = 5) -> Trajectory:
+    return Trajectory(video_embeddings=np.ones((num_frames, width), np.float32), text_embedding=TEXT)
+
+
+def filmed(num_frames: int = 3, height: int = 8) -> Trajectory:
+    return Trajectory(frames=np.zeros((num_frames, height, 6, 3), np.uint8), task="lift the cup")
+
+
+with_nan = VIDEO.copy()
+with_nan[2, 1] = np.nan
+
+BAD: dict[str, tuple[Callable[[], Any], str]] = {
+    "nothing": (lambda: Trajectory(), "trajectory: expected either frames or video_embeddings, got neither"),
+    "both": (
+        lambda: Trajectory(frames=FRAMES, video_embeddings=VIDEO),
+        "trajectory: expected either frames or video_embeddings, got both",
+    ),
+    "float frames": (
+        lambda: Trajectory(frames=FRAMES.astype(np.float32)),  # type: ignore[arg-type]
+        "frames: expected uint8 [T, H, W, 3] (see float_frames_to_uint8), got float32 [3, 8, 6, 3]",
+    ),
+    "one image": (lambda: Trajectory(frames=FRAMES[0]), "frames: expected uint8 [T, H, W, 3], got uint8 [8, 6, 3]"),
+    "channels first": (
+        lambda: Trajectory(frames=FRAMES.transpose(0, 3, 1, 2)),
+        "frames: expected uint8 [T, H, W, 3], got uint8 [3, 3, 8, 6]",
+    ),
+    "no frames": (
+        lambda: Trajectory(frames=FRAMES[:0]),
+        "frames: expected at least one frame of at least one pixel, got uint8 [0, 8, 6, 3]",
+    ),
+    "paths as frames": (
+        lambda: Trajectory(frames=["/etc/passwd"]),  # type: ignore[arg-type]
+        "frames: expected uint8 [T, H, W, 3] (see float_frames_to_uint8), got <U11 [1]",
+    ),
+    "one embedding": (
+        lambda: Trajectory(video_embeddings=VIDEO[0]),
+        "video_embeddings: expected float32 [T, D], got float32 [5]",
+    ),
+    "no embeddings": (
+        lambda: Trajectory(video_embeddings=VIDEO[:0]),
+        "video_embeddings: expected float32 [T, D] without an empty axis, got float32 [0, 5]",
+    ),
+    "rows of unequal length": (
+        lambda: Trajectory(video_embeddings=[[1.0], [1.0, 2.0]]),  # type: ignore[arg-type]
+        "video_embeddings: expected float32 [T, D], got rows of unequal length",
+    ),
+    "text as embeddings": (
+        lambda: Trajectory(video_embeddings=[["a"]]),  # type: ignore[arg-type]
+        "video_embeddings: expected float32 [T, D], got <U1 [1, 1]",
+    ),
+    "NaN": (
+        lambda: Trajectory(video_embeddings=with_nan),
+        "video_embeddings: expected finite values, got nan at [2, 1]",
+    ),
+    "too large for float32": (
+        lambda: Trajectory(video_embeddings=VIDEO.astype(np.float64) * 1e300),
+        "video_embeddings: expected finite values, got inf at [0, 0]",
+    ),
+    "text embedding of rank 2": (
+        lambda: Trajectory(video_embeddings=VIDEO, text_embedding=TEXT[None]),
+        "text_embedding: expected float32 [Dt], got float32 [1, 4]",
+    ),
+    "task that is no text": (
+        lambda: Trajectory(frames=FRAMES, task=3),  # type: ignore[arg-type]
+        "task: expected str, got int",
+    ),
+    "task that UTF-8 cannot encode": (
+        lambda: Trajectory(frames=FRAMES, task="\ud800"),
+        "task: expected text that UTF-8 can encode, got a lone surrogate",
+    ),
+    "embeddings without text": (
+        lambda: ProgressSample(Trajectory(video_embeddings=VIDEO)),
+        "trajectory.text_embedding: expected float32 [Dt] with video_embeddings, got None",
+    ),
+    "frames without task": (
+        lambda: ProgressSample(Trajectory(frames=FRAMES, task=" ")),
+        "trajectory.task: expected a task sentence with frames, got ' '",
+    ),
+    "one frame step": (
+        lambda: ProgressSample(embedded(), frame_steps=1),
+        "frame_steps: expected 0 or at least 2, got 1",
+    ),
+    "frames against embeddings": (
+        lambda: PreferenceSample(embedded(), filmed()),
+        "second: expected video_embeddings, as the first trajectory, got frames",
+    ),
+    "unequal image sizes": (
+        lambda: SimilaritySample(filmed(), filmed(height=9)),
+        "other.frames: expected [8, 6, 3] per frame, as the first trajectory, got [9, 6, 3]",
+    ),
+    "unequal widths": (
+        lambda: PreferenceSample(embedded(), embedded(width=6)),
+        "second.video_embeddings: expected [5] per frame, as the first trajectory, got [6]",
+    ),
+}
+
+
+@pytest.mark.parametrize(("make", "message"), BAD.values(), ids=BAD)
+def test_what_cannot_be_scored_cannot_be_made(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises(InvalidSampleError) as caught:
+        make()
+    assert str(caught.value) == message
+
+
+def test_embeddings_become_float32() -> None:
+    trajectory = Trajectory(video_embeddings=[[1, 2]], text_embedding=np.ones(3, np.float64))  # type: ignore[arg-type]
+    assert trajectory.positions.dtype == np.float32
+    assert trajectory.text_embedding is not None
+    assert trajectory.text_embedding.dtype == np.float32
+
+
+def test_float_frames_are_clipped_and_truncated() -> None:
+    frames = np.array([-3.0, 0.9, 1.0, 254.99, 300.0])
+    assert float_frames_to_uint8(frames).tolist() == [0, 0, 1, 254, 255]
+
+
+@pytest.mark.parametrize("frames", [np.full((2, 2), 0.7), np.array([np.nan, 3.0])], ids=["0..1", "NaN"])
+def test_float_frames_that_would_turn_black_are_refused(frames: np.ndarray) -> None:
+    with pytest.raises(InvalidSampleError, match=r"^frames: expected"):
+        float_frames_to_uint8(frames)
+
+
+SAMPLES: dict[str, list[Sample]] = {
+    "one of embeddings": [ProgressSample(embedded(), frame_steps=4)],
+    "all types, all lengths": [
+        ProgressSample(embedded(1)),
+        PreferenceSample(embedded(2), embedded(5)),
+        SimilaritySample(embedded(3), embedded(1)),
+    ],
+    "frames": [ProgressSample(filmed(2), frame_steps=2), PreferenceSample(filmed(1), filmed(3))],
+}
+
+
+@pytest.mark.parametrize("samples", SAMPLES.values(), ids=SAMPLES)
+def test_samples_survive_the_wire(samples: list[Sample]) -> None:
+    decoded = wire.decode_samples(wire.encode_samples(samples))
+    for sample, copy in zip(samples, decoded, strict=True):
+        assert type(copy) is type(sample)
+        assert getattr(copy, "frame_steps", 0) == getattr(sample, "frame_steps", 0)
+        assert copy.trajectories[0].task == sample.trajectories[0].task
+        for trajectory, its_copy in zip(sample.trajectories, copy.trajectories, strict=True):
+            np.testing.assert_array_equal(its_copy.positions, trajectory.positions)
+
+
+def test_a_sample_of_a_larger_request_is_named_in_its_error() -> None:
+    tensors = wire.encode_samples(SAMPLES["all types, all lengths"])
+    tensors[wire.SAMPLE_TYPE][1] = 9
+    with pytest.raises(InvalidSampleError, match=r"^samples\[1\]\.sample_type: expected"):
+        wire.decode_samples(tensors)
+
+
+def answer(sample: Sample, **changes: Any) -> wire.Tensors:
+    count = sum(trajectory.num_frames for trajectory in sample.trajectories)
+    scores = np.linspace(0, 1, count, dtype=np.float32)[None]
+    query = np.array([[0.5]], np.float32)
+    tensors = {wire.PROGRESS: scores, wire.SUCCESS: scores, wire.PREFERENCE: query, wire.SIMILARITY: query}
+    return {**tensors, **changes}
+
+
+def test_an_answer_is_cut_at_the_trajectories() -> None:
+    preference = PreferenceSample(embedded(2), embedded(3))
+    (result,) = wire.decode_results(answer(preference), [preference])
+    assert isinstance(result, PreferenceResult)
+    assert result.first.progress.tolist() == [0, 0.25]
+    assert result.second.success.tolist() == [0.5, 0.75, 1]
+    similarity = SimilaritySample(embedded(1), embedded(1))
+    (result,) = wire.decode_results(answer(similarity), [similarity])
+    assert isinstance(result, SimilarityResult)
+    assert result.similarity == 0.5
+
+
+NO_ANSWER = {
+    "NaN for a frame": ({wire.PROGRESS: np.array([[0, np.nan, 0]], np.float32)}, "progress: expected 2 finite scores"),
+    "too few frames": ({wire.SUCCESS: np.zeros((1, 2), np.float32)}, "success: expected 2 finite scores"),
+    "NaN for the question": (
+        {wire.PREFERENCE: np.array([[np.nan]], np.float32)},
+        "preference: expected 1 finite scores",
+    ),
+}
+
+
+@pytest.mark.parametrize(("changes", "message"), NO_ANSWER.values(), ids=NO_ANSWER)
+def test_a_missing_reward_is_an_error_and_no_number(changes: wire.Tensors, message: str) -> None:
+    sample = PreferenceSample(embedded(1), embedded(2))
+    with pytest.raises(InferenceFailedError, match=message):
+        wire.decode_results(answer(sample, **changes), [sample])
+
+
+@pytest.mark.parametrize("url", ["localhost:8001", "ftp://host:1", "grpc://", ""])
+def test_a_url_that_names_no_protocol_is_refused(url: str) -> None:
+    with pytest.raises(ValueError, match="expected grpc://host:port or http://host:port"):
+        RewardClient(url)
+
+
+def test_every_error_is_a_reward_error() -> None:
+    import rfm_client
+
+    errors = [getattr(rfm_client, name) for name in rfm_client.__all__ if name.endswith("Error")]
+    assert len(errors) == 7
+    assert all(issubclass(error, RewardError) for error in errors)
+
+
+def test_the_client_needs_neither_torch_nor_yaml() -> None:
+    check = "import sys, rfm_client, rfm_client.client; print(sorted({'torch', 'yaml', 'transformers', 'rfm'} & set(sys.modules)))"
+    output = subprocess.run([sys.executable, "-c", check], check=True, capture_output=True, text=True).stdout
+    assert output.strip() == "[]"

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: MIT
+"""``rfm serve``: the process, its signals, and what it leaves behind."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import sysconfig
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rfm.demo import clip
+from rfm.server import installation
+from rfm.server.installation import ServerStartError, find_installation
+from rfm.server.process import SHARED_MEMORY, Endpoints, TritonServer
+from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
+
+REPOSITORY = Path(__file__).parents[1] / "model_repository"
+RFM = Path(sys.executable).parent / "rfm"
+EXIT_S = 60
+
+
+def command(repository: Path, endpoints: Endpoints) -> list[str]:
+    ports = {
+        "--http-port": endpoints.http_port,
+        "--grpc-port": endpoints.grpc_port,
+        "--metrics-port": endpoints.metrics_port,
+    }
+    return [str(RFM), "serve", "--repository", str(repository), *(str(word) for pair in ports.items() for word in pair)]
+
+
+def regions() -> set[str]:
+    return {path.name for path in SHARED_MEMORY.iterdir()}
+
+
+def tritons() -> set[int]:
+    """Process ids of every tritonserver on this machine."""
+    found = set()
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            if "tritonserver" in (folder / "cmdline").read_text().split("\0")[0]:
+                found.add(int(folder.name))
+        except (FileNotFoundError, ProcessLookupError):  # it ended meanwhile
+            continue
+    return found
+
+
+@contextmanager
+def nothing_left_behind() -> Iterator[None]:
+    regions_before, tritons_before = regions(), tritons()
+    yield
+    assert regions() <= regions_before
+    assert tritons() <= tritons_before
+
+
+def wait_for_http(process: subprocess.Popen[str], endpoints: Endpoints) -> None:
+    with RewardClient(endpoints.http_url) as client:
+        while not client.is_ready():
+            assert process.poll() is None, process.communicate()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
+def test_the_committed_repository_is_served_until_a_signal(number: signal.Signals) -> None:
+    endpoints = Endpoints.free()
+    with nothing_left_behind():
+        process = subprocess.Popen(command(REPOSITORY, endpoints), stderr=subprocess.PIPE, text=True)
+        try:
+            wait_for_http(process, endpoints)
+            film = Trajectory(frames=clip.render()[::4], task=clip.TASK)
+            with RewardClient(endpoints.grpc_url) as client:
+                first, second = client.evaluate([ProgressSample(film), PreferenceSample(film, film)])
+            assert np.isfinite(first.progress).all()  # type: ignore[union-attr]
+            assert 0 < second.preference < 1  # type: ignore[union-attr]
+        finally:
+            process.send_signal(number)
+            _, log = process.communicate(timeout=EXIT_S)
+        assert process.returncode == 0
+        assert "successfully unloaded" in log  # Triton's log is forwarded
+
+
+def test_a_signal_while_it_still_loads_ends_it() -> None:
+    with nothing_left_behind():
+        process = subprocess.Popen(command(REPOSITORY, Endpoints.free()), stderr=subprocess.PIPE, text=True)
+        assert process.stderr is not None
+        next(line for line in process.stderr if "server.cc" in line or "model_lifecycle" in line)
+        process.terminate()
+        _, rest = process.communicate(timeout=EXIT_S)
+        assert "rfm: " not in rest
+
+
+def test_a_model_that_cannot_be_loaded_is_named(tmp_path: Path) -> None:
+    repository = tmp_path / "model_repository"
+    shutil.copytree(REPOSITORY, repository)
+    (repository / "rfm" / "1" / "checkpoint" / "config.json").write_text("{")
+    with nothing_left_behind():
+        result = subprocess.run(
+            command(repository, Endpoints.free()), capture_output=True, text=True, timeout=EXIT_S, check=False
+        )
+    assert result.returncode == 1
+    (line,) = (line for line in result.stderr.splitlines() if line.startswith("rfm: "))
+    assert line.startswith("rfm: models: expected all to be ready, got rfm: ")
+    assert "config.json: expected JSON" in line
+
+
+def test_a_port_that_is_taken_is_named() -> None:
+    endpoints = Endpoints.free()
+    with nothing_left_behind(), socket.create_server((endpoints.host, endpoints.grpc_port)):
+        result = subprocess.run(
+            command(REPOSITORY, endpoints), capture_output=True, text=True, timeout=EXIT_S, check=False
+        )
+    assert result.returncode == 1
+    where = f"gRPC: expected a free port of this machine at 127.0.0.1:{endpoints.grpc_port}"
+    assert result.stderr == f"rfm: {where}, got: Address already in use\n"
+
+
+def test_a_folder_without_models_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ServerStartError, match="repository: expected a folder of models, got"):
+        TritonServer(tmp_path, Endpoints.free(), find_installation())
+
+
+def test_a_server_that_ends_at_once_is_told(tmp_path: Path) -> None:
+    program = tmp_path / "tritonserver"
+    program.write_text("#!/bin/sh\nexit 3\n")
+    program.chmod(0o755)
+    with (
+        pytest.raises(ServerStartError, match="tritonserver: expected to run, got exit status 3"),
+        TritonServer(REPOSITORY, Endpoints.free(), find_installation(program)),
+    ):
+        pass
+
+
+def test_an_explicit_program_wins_over_path_and_path_over_the_wheel(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert find_installation().wheel is not None
+    for folder in ("in_path", "explicit"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "tritonserver").touch(mode=0o755)
+    monkeypatch.setenv("PATH", str(tmp_path / "in_path"), prepend=os.pathsep)
+    assert find_installation().executable == tmp_path / "in_path" / "tritonserver"
+    explicit = tmp_path / "explicit" / "tritonserver"
+    assert find_installation(explicit).executable == explicit
+
+
+def test_a_program_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ServerStartError, match=r"tritonserver: expected a program at .*/nothing, got none"):
+        find_installation(tmp_path / "nothing")
+
+
+def test_no_triton_at_all_is_told_with_the_command_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
+    with pytest.raises(ServerStartError, match=r'pip install "rfm-triton\[triton\]"'):
+        find_installation()
+
+
+def test_numpy_2_is_refused_with_the_wheel(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.metadata, "version", lambda _name: "2.1.0")
+    with pytest.raises(ServerStartError, match=r"numpy: expected < 2 with the Triton of nvidia-pytriton, got 2\.1\.0"):
+        find_installation()
+
+
+def test_a_missing_libpython_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(sysconfig, "get_config_var", lambda _name: str(tmp_path))
+    monkeypatch.setattr(installation.sys, "base_prefix", str(tmp_path))
+    with pytest.raises(ServerStartError, match=r"libpython3\.\d+\.so\.1\.0: expected in .*apt-get install libpython3"):
+        find_installation()
