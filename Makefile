@@ -26,7 +26,7 @@ format: $(INSTALLED)
 # Exports the demo's checkpoint anew, as version 1.
 model_repository: $(INSTALLED)
 	rm -rf build/demo_checkpoint model_repository/rfm model_repository/rfm_encoder model_repository/rfm_frames
-	$(BIN)/python examples/random_checkpoint.py build/demo_checkpoint
+	$(BIN)/python -m rfm.demo.checkpoint build/demo_checkpoint
 	$(BIN)/rfm export --repository model_repository --config model_repository/serve.yaml \
 	  --checkpoint build/demo_checkpoint/checkpoint \
 	  --image-encoder build/demo_checkpoint/image_encoder --text-encoder build/demo_checkpoint/text_encoder

@@ -137,14 +137,14 @@ _PlainLoader.add_multi_constructor("tag:yaml.org,2002:python/", _plain)
 
 def _fetch(repo_id: str, tag: str | None) -> Path:
     from huggingface_hub import HfApi, snapshot_download
-    from huggingface_hub.errors import HfHubHTTPError
+    from huggingface_hub.errors import HfHubHTTPError, HFValidationError
 
     patterns = ["*.safetensors", "*.json", "*.yaml", "*.txt"]
     try:
         if tag is None:
             tag = best_tag(ref.name for ref in HfApi().list_repo_refs(repo_id).tags)
         return Path(snapshot_download(repo_id, revision=tag, allow_patterns=patterns))
-    except (HfHubHTTPError, OSError) as error:
+    except (HfHubHTTPError, HFValidationError, OSError) as error:
         raise CheckpointError(f"{repo_id}@{tag or 'latest'}: cannot be fetched: {error}") from error
 
 
@@ -220,7 +220,7 @@ def _rewind_config(folder: Path, weights: Mapping[str, Tensor]) -> RewindConfig:
         )
     except KeyError as error:
         raise CheckpointError(f"{folder}: expected a ReWiND checkpoint, which has {error}") from error
-    if config.hidden_dim % config.num_attention_heads:
+    if config.num_attention_heads < 1 or config.hidden_dim % config.num_attention_heads:
         heads = f"a divisor of the hidden width {config.hidden_dim}"
         raise CheckpointError(f"{folder}: num_attention_heads: expected {heads}, got {config.num_attention_heads}")
     return config
@@ -247,7 +247,7 @@ def _stated(folder: Path) -> dict[str, Any]:
         for source, value in values.items():
             if type(value) is not kind:
                 raise CheckpointError(f"{folder}: {name} in {source}: expected {kind.__name__}, got {value!r}")
-        if len(set(values.values())) > 1:
+        if name != "max_len" and len(set(values.values())) > 1:  # weights tell max_len where it matters
             raise CheckpointError(f"{folder}: {name}: expected {' and '.join(values)} to agree, got {values}")
         if values:
             stated[name] = next(iter(values.values()))

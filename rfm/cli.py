@@ -18,6 +18,7 @@ from rfm.server.process import Endpoints, TritonServer
 from rfm_client import RewardError
 
 EXIT_FAILED = 1
+WHEEL_WARNING = "the wheel's Triton 2.51 has known remote vulnerabilities and open admin APIs: use NVIDIA's container"
 
 app = typer.Typer(
     name="rfm",
@@ -60,7 +61,7 @@ def export(
         if serve.model_path is None:
             _fail("--checkpoint: expected a checkpoint, here or as model_path in --config, got none")
         version = rfm_export.export(serve.model_path, repository, serve)
-    except (CheckpointError, rfm_export.ExportError) as error:
+    except (CheckpointError, rfm_export.ExportError, OSError) as error:
         _fail(str(error))
     typer.echo(f"{repository}: {serve.name} version {version}, scores equal to the checkpoint's")
 
@@ -80,12 +81,10 @@ def serve(
         config, server_url=host, server_port=http_port, grpc_port=grpc_port, metrics_port=metrics_port
     )
     try:
-        server = TritonServer(
-            repository,
-            Endpoints.of(settings),
-            find_installation(tritonserver),
-            http_threads=settings.max_workers,
-        )
+        installation = find_installation(tritonserver)
+        if installation.wheel is not None and not settings.is_loopback:
+            typer.echo(f"rfm: warning: {settings.host} is no loopback address, and {WHEEL_WARNING}", err=True)
+        server = TritonServer(repository, Endpoints.of(settings), installation, http_threads=settings.max_workers)
         status = server.run()
     except ServerStartError as error:
         _fail(str(error))
@@ -106,35 +105,36 @@ def demo(
     """Export a checkpoint, serve it, score samples and a video, plot, and stop everything."""
     import rfm_export
     from rfm import checkpoint as checkpoints
-    from rfm.demo import clip, run
-    from rfm.demo.checkpoint import write_random_checkpoint
 
+    try:
+        from rfm.demo import clip, run
+        from rfm.demo.checkpoint import write_random_checkpoint
+    except ImportError as error:
+        _fail(f'the demo needs {error.name}: pip install "rfm-triton[demo,encoders,triton]"')
     if (video is None) != (task is None):
         _fail("--video and --task: expected both or neither, got one")
     console = Console()
     output.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix="rfm-demo-") as folder:
+    with run.stopped_by_signals(), TemporaryDirectory(prefix="rfm-demo-") as folder:
         if checkpoint is None:
             console.print("The checkpoint has random weights: its scores show that all is connected, and mean nothing.")
-            written = write_random_checkpoint(Path(folder) / "random")
-            checkpoint, image_encoder, text_encoder = map(
-                str, (written.checkpoint, written.image_encoder, written.text_encoder)
-            )
+            checkpoint, image_encoder, text_encoder = map(str, write_random_checkpoint(Path(folder) / "random"))
         settings = _serve_config(None, image_encoder=image_encoder, text_encoder=text_encoder)
         repository = Path(folder) / "model_repository"
         if video is None or task is None:
             video, task = Path(folder) / "clip.mp4", clip.TASK
             clip.write(video)
         try:
-            rfm_export.export(checkpoint, repository, settings)
             config = checkpoints.load(checkpoint).config
+            frames = run.video_frames(video, fps, config, console)
+            rfm_export.export(checkpoint, repository, settings)
             with (
                 (output / "tritonserver.log").open("wb") as log,
                 TritonServer(repository, Endpoints.free(), find_installation(tritonserver), log=log) as server,
             ):
                 run.score_embeddings(server.endpoints, config, console)
                 if (repository / f"{settings.name}_frames").exists():
-                    run.score_video(server.endpoints, video, task, fps, output / "rewards.png", console)
+                    run.score_frames(server.endpoints, frames, task, output / "rewards.png", console)
                 else:
                     console.print("no video: the checkpoint has no encoders (--image-encoder, --text-encoder)")
                 run.show_metrics(server.endpoints, console)

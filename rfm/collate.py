@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,12 +23,26 @@ from rfm_client.wire import pad_stack
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One token sequence: text [Dt], first [T, Dv], and in a question about two trajectories second [T, Dv]."""
+    """One token sequence: text [Dt], first [T, Dv], and in a question about two trajectories second [T, Dv].
+
+    picked: in dense mode int64 [K], the frames of ``first`` that the row is about; None: all
+    """
 
     text: Float32Array
     first: Float32Array
     second: Float32Array | None = None
     is_similarity: bool = False
+    picked: npt.NDArray[np.int64] | None = None
+
+    @property
+    def num_first(self) -> int:
+        """Frames of the first trajectory in the row."""
+        return len(self.first if self.picked is None else self.picked)
+
+    @property
+    def num_second(self) -> int:
+        """Frames of the second trajectory in the row, 0 without one."""
+        return 0 if self.second is None else len(self.second)
 
 
 def prefix_indices(num_frames: int, frame_steps: int) -> npt.NDArray[np.int64]:
@@ -36,6 +51,11 @@ def prefix_indices(num_frames: int, frame_steps: int) -> npt.NDArray[np.int64]:
     K positions evenly from 0 to t, truncated to whole frames, as the original server samples them.
     """
     return np.stack([np.linspace(0, t, frame_steps).astype(np.int64) for t in range(num_frames)])
+
+
+def as_tensor(array: npt.NDArray[Any]) -> Tensor:
+    """The array as a tensor; a copy only where torch cannot share its memory (read-only, reversed)."""
+    return torch.from_numpy(np.require(array, requirements=("C", "W")))
 
 
 @dataclass(frozen=True)
@@ -53,23 +73,23 @@ class RewindCollator:
         text = self._text(sample.trajectories[0])
         videos = [self._video(trajectory, frame_steps) for trajectory in sample.trajectories]
         if frame_steps:
-            return [Row(text, videos[0][indices]) for indices in prefix_indices(len(videos[0]), frame_steps)]
+            return [Row(text, videos[0], picked=picked) for picked in prefix_indices(len(videos[0]), frame_steps)]
         if len(videos) == 1:
             return [Row(text, videos[0])]
         return [Row(text, videos[0], videos[1], isinstance(sample, SimilaritySample))]
 
     def num_tokens(self, row: Row) -> int:
         """L of the row alone."""
-        return self.config.num_tokens(len(row.first), 0 if row.second is None else len(row.second))
+        return self.config.num_tokens(row.num_first, row.num_second)
 
     def collate(self, rows: Sequence[Row]) -> RewindBatch:
         """A batch of rows that all have, or all lack, a second trajectory."""
-        firsts = [row.first for row in rows]
+        firsts = [row.first if row.picked is None else row.first[row.picked] for row in rows]
         seconds = [row.second for row in rows if row.second is not None]
         return RewindBatch(
-            text=torch.from_numpy(np.stack([row.text for row in rows])),
-            first=torch.from_numpy(pad_stack(firsts)),
-            second=torch.from_numpy(pad_stack(seconds)) if seconds else None,
+            text=as_tensor(np.stack([row.text for row in rows])),
+            first=as_tensor(pad_stack(firsts)),
+            second=as_tensor(pad_stack(seconds)) if seconds else None,
             token_mask=self._token_mask(firsts, seconds),
             is_similarity=torch.tensor([row.is_similarity for row in rows]) if seconds else None,
         )

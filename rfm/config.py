@@ -13,6 +13,7 @@ import yaml
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_TOKEN_BUDGET = 16_384
+MAX_PORT = 65_535
 
 
 class ConfigError(Exception):
@@ -58,6 +59,11 @@ class ServeConfig:
     def __post_init__(self) -> None:
         _at_least(1, self, "batch_size", "max_workers", "token_budget", "server_port", "grpc_port", "metrics_port")
         _at_least(0, self, "num_gpus", "torch_threads")
+        ports = {name: getattr(self, name) for name in ("server_port", "grpc_port", "metrics_port")}
+        if max(ports.values()) > MAX_PORT or len(set(ports.values())) < len(ports):
+            raise ConfigError(f"ports: expected three different ones up to {MAX_PORT}, got {ports}")
+        if ":" in self.host:
+            raise ConfigError(f"server_url: expected an address without port (server_port), got {self.server_url!r}")
         if not self.name.replace("_", "").replace("-", "").isalnum():
             raise ConfigError(f"name: expected letters, digits, _ and -, got {self.name!r}")
 
@@ -89,6 +95,11 @@ class ServeConfig:
         host = self.server_url.partition("://")[2] or self.server_url
         host = host.rstrip("/")
         return DEFAULT_HOST if host == "localhost" else host
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only this machine can reach it."""
+        return self.host.startswith("127.")
 
 
 def _at_least(least: int, config: ServeConfig, *keys: str) -> None:

@@ -116,12 +116,12 @@ class Engine:
     def _embedded(self, samples: Sequence[Sample]) -> list[Sample | RewardError]:
         """The samples with embeddings in place of raw frames."""
         embedded: list[Sample | RewardError] = list(samples)
-        films = {i: _film(sample) for i, sample in enumerate(samples) if sample.trajectories[0].frames is not None}
-        if films and self.encoders is None:
+        raw = {i: _joined(sample) for i, sample in enumerate(samples) if sample.trajectories[0].frames is not None}
+        if raw and self.encoders is None:
             missing = InvalidSampleError.at("frames", "video_embeddings (no encoders are loaded)", "frames")
-            return [missing if index in films else sample for index, sample in enumerate(samples)]
-        if films and self.encoders is not None:
-            for index, encoded in zip(films, self.encoders.encode(list(films.values())), strict=True):
+            return [missing if index in raw else sample for index, sample in enumerate(samples)]
+        if raw and self.encoders is not None:
+            for index, encoded in zip(raw, self.encoders.encode(list(raw.values())), strict=True):
                 if isinstance(encoded, Trajectory):
                     embedded[index] = _with_embeddings(samples[index], encoded)
                 else:
@@ -142,8 +142,7 @@ class Engine:
         """Indices of the rows of each forward: one kind, similar lengths, within the token budget."""
 
         def lengths(index: int) -> tuple[bool, int, int]:
-            second = rows[index].second
-            return second is not None, len(rows[index].first), 0 if second is None else len(second)
+            return rows[index].second is not None, rows[index].num_first, rows[index].num_second
 
         for _, kind in groupby(sorted(range(len(rows)), key=lengths), key=lambda index: lengths(index)[0]):
             part: list[int] = []
@@ -161,11 +160,10 @@ class Engine:
     @torch.inference_mode()
     def _score(self, rows: Sequence[Row], batch: RewindBatch) -> list[_RowScores]:
         output = self.network(batch.to(self.device))
-        firsts = _frame_scores(output.first_progress, output.first_success, [len(row.first) for row in rows])
+        firsts = _frame_scores(output.first_progress, output.first_success, [row.num_first for row in rows])
         if output.query is None:
             return [_RowScores([first]) for first in firsts]
-        lengths = [len(row.second) for row in rows if row.second is not None]
-        seconds = _frame_scores(output.second_progress, output.second_success, lengths)
+        seconds = _frame_scores(output.second_progress, output.second_success, [row.num_second for row in rows])
         logits, probabilities = output.query.float().tolist(), output.query.sigmoid().float().tolist()
         queries = [logits[i] if row.is_similarity else probabilities[i] for i, row in enumerate(rows)]
         return [_RowScores([*pair], query) for *pair, query in zip(firsts, seconds, queries, strict=True)]
@@ -187,16 +185,16 @@ def _frame_scores(progress_logits: Tensor, success_logits: Tensor, lengths: Sequ
     ]
 
 
-def _film(sample: Sample) -> Trajectory:
+def _joined(sample: Sample) -> Trajectory:
     """All frames of a sample and its task, as one trajectory."""
     frames = np.concatenate([trajectory.positions for trajectory in sample.trajectories])
     return Trajectory(frames=frames, task=sample.trajectories[0].task)
 
 
-def _with_embeddings(sample: Sample, film: Trajectory) -> Sample:
+def _with_embeddings(sample: Sample, joined: Trajectory) -> Sample:
     bounds = np.cumsum([trajectory.num_frames for trajectory in sample.trajectories])[:-1]
-    videos = np.split(film.positions, bounds)
-    parts = [Trajectory(video_embeddings=video, text_embedding=film.text_embedding) for video in videos]
+    videos = np.split(joined.positions, bounds)
+    parts = [Trajectory(video_embeddings=video, text_embedding=joined.text_embedding) for video in videos]
     if isinstance(sample, ProgressSample):
         return replace(sample, trajectory=parts[0])
     return type(sample)(parts[0], parts[1])

@@ -51,6 +51,22 @@ def test_the_clip_survives_its_video_file(video: Path) -> None:
     assert np.abs(frames.astype(int) - clip.render()).mean() < 8  # lossy, but the same picture
 
 
+@pytest.mark.parametrize(
+    ("name", "fps", "count"),
+    [
+        ("soar_put_green_stick_in_brown_bowl", 3, 10),
+        ("berkeley_rpt_stack_cup", 3, 10),
+        ("jaco_play_pick_up_green_cup", 2, 13),
+    ],
+)
+@pytest.mark.skipif(not VIDEOS.is_dir(), reason="robot videos are not at hand")
+def test_robot_videos_are_read_frame_for_frame(name: str, fps: float, count: int) -> None:
+    frames = read_video(VIDEOS / f"{name}.mp4", fps)
+    assert frames.shape[0] == count
+    assert frames.shape[3] == 3
+    assert frames.std() > 10
+
+
 FRAMES = {
     "3 of 10 fps": ((32, 10.0, 3.0), 10),
     "2 of 10 fps": ((64, 10.0, 2.0), 13),

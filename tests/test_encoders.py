@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import load_engine
+from safetensors.torch import load_file, save_file
 
 from rfm.models.encoders import PREPROCESSOR_CONFIG, Encoders, ImagePreprocessor
 from rfm_client import InvalidSampleError, RewardError, Trajectory
@@ -119,6 +120,30 @@ def test_encoder_weights_that_do_not_fit_are_named() -> None:
         ValueError, match=r"encoder weights do not fit: missing: .*'layernorm.weight'.*; unexpected: none; shapes: none"
     ):
         Encoders.from_pretrained(config.image_encoder, config.text_encoder, image_weights=weights)
+
+
+def test_a_base_encoder_with_missing_weights_is_refused(tmp_path: Path) -> None:
+    config = goldens.config(NAME)
+    assert config.image_encoder is not None
+    assert config.text_encoder is not None
+    shutil.copytree(config.image_encoder, tmp_path / "image")
+    weights = load_file(tmp_path / "image" / "model.safetensors")
+    del weights["layernorm.weight"]
+    (tmp_path / "image" / "model.safetensors").unlink()
+    save_file(weights, tmp_path / "image" / "model.safetensors", metadata={"format": "pt"})
+    with pytest.raises(ValueError, match=r"the encoder's weights are not complete: missing: \['layernorm.weight'\]"):
+        Encoders.from_pretrained(tmp_path / "image", config.text_encoder)
+
+
+@pytest.mark.gpu
+def test_the_gpu_gives_the_embeddings_of_the_cpu(encoders: Encoders) -> None:
+    frames = [np.random.default_rng(0).integers(0, 256, (5, 50, 70, 3), np.uint8)]
+    on_cpu = encoders.encode_frames(frames)[0]
+    try:
+        on_gpu = encoders.to(torch.device("cuda")).encode_frames(frames)[0]
+    finally:
+        encoders.to(torch.device("cpu"))
+    np.testing.assert_allclose(on_gpu, on_cpu, rtol=0, atol=1e-4)
 
 
 UNSUPPORTED = {

@@ -110,7 +110,31 @@ BAD: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "one frame step": (
         lambda: ProgressSample(embedded(), frame_steps=1),
-        "frame_steps: expected 0 or at least 2, got 1",
+        "frame_steps: expected 0 or a whole number from 2 to 4096, got 1",
+    ),
+    "frame steps that are no whole number": (
+        lambda: ProgressSample(embedded(), frame_steps=4.7),  # type: ignore[arg-type]
+        "frame_steps: expected 0 or a whole number from 2 to 4096, got 4.7",
+    ),
+    "frame steps beyond the wire's type": (
+        lambda: ProgressSample(embedded(), frame_steps=2**40),
+        f"frame_steps: expected 0 or a whole number from 2 to 4096, got {2**40}",
+    ),
+    "no trajectory": (
+        lambda: ProgressSample(VIDEO),  # type: ignore[arg-type]
+        "trajectory: expected Trajectory, got ndarray",
+    ),
+    "no second trajectory": (
+        lambda: PreferenceSample(embedded(), None),  # type: ignore[arg-type]
+        "second: expected Trajectory, got NoneType",
+    ),
+    "frames with a text embedding": (
+        lambda: Trajectory(frames=FRAMES, text_embedding=TEXT),
+        "text_embedding: expected None with frames, which go with task, got an embedding",
+    ),
+    "frames of unequal size": (
+        lambda: Trajectory(frames=[FRAMES[0], FRAMES[0, :2]]),  # type: ignore[arg-type]
+        "frames: expected uint8 [T, H, W, 3], got frames of unequal size",
     ),
     "frames against embeddings": (
         lambda: PreferenceSample(embedded(), filmed()),
@@ -204,6 +228,7 @@ def test_an_answer_is_cut_at_the_trajectories() -> None:
 NO_ANSWER = {
     "NaN for a frame": ({wire.PROGRESS: np.array([[0, np.nan, 0]], np.float32)}, "progress: expected 2 finite scores"),
     "too few frames": ({wire.SUCCESS: np.zeros((1, 2), np.float32)}, "success: expected 2 finite scores"),
+    "no samples": ({wire.PROGRESS: np.zeros((0, 3), np.float32)}, "progress: expected scores of sample 0"),
     "NaN for the question": (
         {wire.PREFERENCE: np.array([[np.nan]], np.float32)},
         "preference: expected 1 finite scores",

@@ -12,9 +12,11 @@ import socket
 import subprocess
 import sys
 import sysconfig
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -63,7 +65,7 @@ def nothing_left_behind() -> Iterator[None]:
     assert tritons() <= tritons_before
 
 
-def wait_for_http(process: subprocess.Popen[str], endpoints: Endpoints) -> None:
+def wait_for_http(process: subprocess.Popen[Any], endpoints: Endpoints) -> None:
     with RewardClient(endpoints.http_url) as client:
         while not client.is_ready():
             assert process.poll() is None, process.communicate()
@@ -86,6 +88,26 @@ def test_the_committed_repository_is_served_until_a_signal(number: signal.Signal
             _, log = process.communicate(timeout=EXIT_S)
         assert process.returncode == 0
         assert "successfully unloaded" in log  # Triton's log is forwarded
+
+
+@pytest.mark.parametrize(
+    "arguments", [["serve", "--repository", str(REPOSITORY)], ["demo"]], ids=lambda words: words[0]
+)
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
+def test_a_signal_leaves_nothing_running(tmp_path: Path, arguments: list[str], number: signal.Signals) -> None:
+    program = tmp_path / "tritonserver"  # a stand-in that never gets ready, so that the moment of the signal is known
+    program.write_text(f"#!/bin/sh\ntouch {tmp_path}/started\nexec sleep 600\n")
+    program.chmod(0o755)
+    rfm = [str(RFM), *arguments, "--tritonserver", str(program)]
+    backends = set(Path(tempfile.gettempdir()).glob("rfm-*"))
+    process = subprocess.Popen(rfm, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not (tmp_path / "started").exists():
+        assert process.poll() is None
+    process.send_signal(number)
+    process.wait(EXIT_S)
+    children = subprocess.run(["pgrep", "-f", str(program)], capture_output=True, text=True, check=False).stdout
+    assert children == ""
+    assert set(Path(tempfile.gettempdir()).glob("rfm-*")) <= backends
 
 
 def test_a_signal_while_it_still_loads_ends_it() -> None:
@@ -125,7 +147,51 @@ def test_a_port_that_is_taken_is_named() -> None:
 
 def test_a_folder_without_models_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ServerStartError, match="repository: expected a folder of models, got"):
-        TritonServer(tmp_path, Endpoints.free(), find_installation())
+        TritonServer(tmp_path, Endpoints.free(), find_installation()).start()
+
+
+def test_a_program_that_cannot_run_is_named(tmp_path: Path) -> None:
+    program = tmp_path / "tritonserver"
+    program.write_bytes(b"\x7fELF no program")
+    program.chmod(0o755)
+    server = TritonServer(REPOSITORY, Endpoints.free(), find_installation(program))
+    with pytest.raises(ServerStartError, match=r"tritonserver: expected a program at .*tritonserver, got: Exec format"):
+        server.start()
+
+
+def test_the_wheel_on_an_open_address_is_warned_of() -> None:
+    result = subprocess.run(
+        [str(RFM), "serve", "--repository", "/nowhere", "--host", "0.0.0.0"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.stderr.startswith("rfm: warning: 0.0.0.0 is no loopback address, and the wheel's Triton")
+
+
+def test_a_plain_tritonserver_serves_the_repository_too(tmp_path: Path) -> None:
+    """Without ``rfm serve``: no explicit model control, configurations completed automatically."""
+    triton, endpoints = find_installation(), Endpoints.free()
+    arguments = [f"--model-repository={REPOSITORY}", *triton.lay_out_backends(tmp_path / "backends")]
+    for protocol, port in {
+        "http": endpoints.http_port,
+        "grpc": endpoints.grpc_port,
+        "metrics": endpoints.metrics_port,
+    }.items():
+        arguments += [f"--{protocol}-address={endpoints.host}", f"--{protocol}-port={port}"]
+    arguments.append(f"--backend-config=python,shm-region-prefix-name=plain_{os.getpid()}_")
+    with (tmp_path / "log").open("wb") as log, nothing_left_behind():
+        process = subprocess.Popen(
+            [triton.executable, *arguments], env={**os.environ, **triton.environment}, stdout=log, stderr=log
+        )
+        try:
+            wait_for_http(process, endpoints)
+            with RewardClient(endpoints.http_url) as client:
+                result = client.progress(Trajectory(frames=clip.render()[::8], task=clip.TASK))
+            assert np.isfinite(result.progress).all()
+        finally:
+            process.terminate()
+            process.wait(EXIT_S)
 
 
 def test_a_server_that_ends_at_once_is_told(tmp_path: Path) -> None:

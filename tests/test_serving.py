@@ -78,19 +78,18 @@ def test_any_mixture_equals_its_samples_alone(served: Served, protocol: str) -> 
         assert_same(left, right)
 
 
-def test_concurrent_callers_of_mixed_lengths_and_types_share_batches(served: Served) -> None:
+def test_concurrent_callers_of_mixed_lengths_and_types_share_batches(served: Served, protocol: str) -> None:
     samples = mixed_samples(200)
     alone = [load_engine(MODEL).evaluate([sample])[0] for sample in samples]
-    plug = [ProgressSample(random_trajectory(0, 256), frame_steps=16) for _ in range(32)]  # keeps the model busy
     start = threading.Barrier(len(samples))
-    with served.client("grpc") as client, ThreadPoolExecutor(len(samples) + 1) as pool:
+    with served.client(protocol) as client, ThreadPoolExecutor(len(samples) + 1) as pool:
         before = counts(served, MODEL)
 
         def ask(sample: Sample) -> object:
             start.wait()
             return client.evaluate([sample])[0]
 
-        plugged = pool.submit(client.evaluate, plug)
+        plugged = pool.submit(client.evaluate, plug())
         answers = list(pool.map(ask, samples))
         plugged.result()
         requests, executions = (after - b for after, b in zip(counts(served, MODEL), before, strict=True))
@@ -98,6 +97,11 @@ def test_concurrent_callers_of_mixed_lengths_and_types_share_batches(served: Ser
         assert_same(answer, expected)
     assert requests == len(samples) + 1
     assert executions <= requests // 4
+
+
+def plug() -> list[Sample]:
+    """Keeps the model busy while other requests queue up."""
+    return [ProgressSample(random_trajectory(0, 256), frame_steps=16) for _ in range(32)]
 
 
 def test_dense_mode_scores_each_frame_on_its_prefix(served: Served, protocol: str) -> None:
@@ -134,17 +138,24 @@ def test_a_bad_request_in_a_batch_of_callers_fails_alone(served: Served, protoco
     """Other callers' requests that share its batch are served."""
     samples = mixed_samples(24)
     samples[11] = ProgressSample(random_trajectory(0, 17))
+    expected = load_engine(MODEL).evaluate(samples)
     start = threading.Barrier(len(samples))
+    with served.client(protocol) as client, ThreadPoolExecutor(len(samples) + 1) as pool:
+        before = counts(served, MODEL)
 
-    def ask(sample: Sample) -> object:
-        with served.client(protocol) as client:
+        def ask(sample: Sample) -> object:
             start.wait()
             return client.evaluate_each([sample])[0]
 
-    with ThreadPoolExecutor(len(samples)) as pool:
+        plugged = pool.submit(client.evaluate, plug())
         outcomes = list(pool.map(ask, samples))
-    assert isinstance(outcomes.pop(11), InvalidSampleError)
-    assert not [outcome for outcome in outcomes if isinstance(outcome, RewardError)]
+        plugged.result()
+        _, executions = (after - b for after, b in zip(counts(served, MODEL), before, strict=True))
+    assert executions < len(samples) // 2
+    assert isinstance(outcomes[11], InvalidSampleError)
+    for index, outcome in enumerate(outcomes):
+        if index != 11:
+            assert_same(outcome, expected[index])
 
 
 def good_tensors() -> wire.Tensors:
@@ -208,7 +219,7 @@ BAD_TENSORS = {
             num_frames=np.array([[5, 0]], int32),
             frame_steps=np.array([[1]], int32),
         ),
-        r"^frame_steps: expected 0 or at least 2, got 1$",
+        r"^frame_steps: expected 0 or a whole number from 2 to 4096, got 1$",
     ),
     "dense mode of a pair": (
         bad(frame_steps=np.array([[4]], int32)),
@@ -239,9 +250,74 @@ def test_bad_tensors_are_refused_with_what_was_expected(
 def test_no_frames_at_all_are_refused(served: Served, protocol: str) -> None:
     transport = connect(served.url(protocol), timeout_s=30)
     empty = bad(video_embeddings=np.ones((1, 0, 768), np.float32), num_frames=np.array([[0, 0]], int32))
-    with pytest.raises(RewardError):
+    with pytest.raises(InvalidSampleError, match=r"^num_frames: expected at least one frame of each .*, got \[0, 0\]$"):
         transport.infer(MODEL, empty, [wire.PROGRESS])
     transport.close()
+
+
+FRAMES = np.ones((1, 5, 8, 6, 3), np.uint8)
+QUESTION: wire.Tensors = {
+    wire.SAMPLE_TYPE: np.array([[1]], np.uint8),
+    wire.NUM_FRAMES: np.array([[3, 2]], int32),
+    wire.FRAME_STEPS: np.array([[0]], int32),
+    wire.FRAMES: FRAMES,
+    wire.TASK: np.array([[b"lift"]], np.object_),
+}
+BAD_FRAMES: dict[str, tuple[wire.Tensors, str]] = {
+    "bytes that are no text": ({wire.TASK: np.array([[b"\xff\xfe"]], np.object_)}, "^task: expected UTF-8 text, got"),
+    "no task": ({wire.TASK: np.array([[b" "]], np.object_)}, "task: expected a task sentence.*, got ' '$"),
+    "more frames told than sent": ({wire.NUM_FRAMES: np.array([[3, 3]], int32)}, "^num_frames: expected at most the 5"),
+    "fewer frames told than sent": (
+        {wire.NUM_FRAMES: np.array([[2, 2]], int32)},
+        "^frames: expected zeros behind the 4",
+    ),
+    "a negative length": ({wire.NUM_FRAMES: np.array([[-1, 6]], int32)}, "^num_frames: expected .*at least 1"),
+    "unknown sample type": ({wire.SAMPLE_TYPE: np.array([[9]], np.uint8)}, "^sample_type: expected one of"),
+    "no pixels": ({wire.FRAMES: FRAMES[:, :, :0]}, "^frames: expected at least one frame of at least one pixel"),
+    "four channels": ({wire.FRAMES: np.ones((1, 5, 8, 6, 4), np.uint8)}, "[Ee]xpected.*3.*got.*4"),
+    "a sliver": (
+        {wire.FRAMES: np.ones((1, 5, 2, 200, 3), np.uint8)},
+        "^frames: expected frames at most 50 times as long",
+    ),
+    "too many frames": (
+        {wire.FRAMES: np.ones((1, 19, 8, 6, 3), np.uint8), wire.NUM_FRAMES: np.array([[2, 17]], int32)},
+        "^num_frames: expected at most 16 .*, got 17$",
+    ),
+}
+
+
+@pytest.mark.parametrize(("changes", "message"), BAD_FRAMES.values(), ids=BAD_FRAMES)
+def test_bad_frames_are_refused_with_what_was_expected(
+    served: Served, protocol: str, changes: wire.Tensors, message: str
+) -> None:
+    transport = connect(served.url(protocol), timeout_s=30)
+    with pytest.raises(InvalidSampleError, match=message):
+        transport.infer(f"{FRAMES_MODEL}_frames", QUESTION | changes, [wire.PROGRESS])
+    assert transport.infer(f"{FRAMES_MODEL}_frames", QUESTION, [wire.PROGRESS])[wire.PROGRESS].shape == (1, 5)
+    transport.close()
+
+
+def test_samples_of_another_width_do_not_cost_the_others(served: Served, protocol: str) -> None:
+    good = ProgressSample(random_trajectory(1, 3))
+    samples = [
+        good,
+        ProgressSample(random_trajectory(1, 3, 768, 7)),
+        ProgressSample(random_trajectory(1, 3, 5, 384)),
+        good,
+    ]
+    with served.client(protocol) as client:
+        outcomes = client.evaluate_each(samples)
+    assert_same(outcomes[0], outcomes[3])
+    assert [type(outcome) for outcome in outcomes[1:3]] == [InvalidSampleError] * 2
+
+
+def test_a_rewound_trajectory_is_scored(served: Served, protocol: str) -> None:
+    forwards = random_trajectory(1, 6)
+    backwards = Trajectory(video_embeddings=forwards.positions[::-1], text_embedding=forwards.text_embedding)
+    copied = Trajectory(video_embeddings=forwards.positions[::-1].copy(), text_embedding=forwards.text_embedding)
+    with served.client(protocol) as client:
+        assert_same(client.progress(backwards), client.progress(copied))
+    assert_same(*load_engine(MODEL).evaluate([ProgressSample(backwards), ProgressSample(copied)]))
 
 
 def test_a_checkpoint_without_similarity_says_so(served: Served, protocol: str) -> None:

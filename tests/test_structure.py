@@ -20,7 +20,7 @@ MAY_IMPORT = {
     "rfm": {"rfm_client"},
     "export/rfm_export": {"rfm", "rfm_client"},
     "model_repository": {"rfm", "rfm_client"},
-    "examples": {"rfm", "rfm_client", "rfm_export"},
+    "examples": {"rfm_client"},
     "benchmarks": {"rfm_client"},
 }
 EXCEPTIONS = {"rfm/cli.py": {"rfm_export"}}  # the command, where all packages meet
@@ -100,7 +100,7 @@ def test_every_key_of_the_configuration_is_documented() -> None:
 
 
 def test_files_say_their_licence() -> None:
-    files = [file for part in ("client", "rfm", "export", "tests", "examples") for file in (ROOT / part).rglob("*.py")]
+    files = [file for part in ("client", "rfm", "export", "tests") for file in (ROOT / part).rglob("*.py")]
     assert files
     for file in files:
         assert re.match(r"# SPDX-License-Identifier: MIT\n", file.read_text()), file

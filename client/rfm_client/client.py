@@ -115,15 +115,16 @@ class RewardClient:
         return self.evaluate([sample])[0]
 
     def _groups(self, samples: Sequence[Sample]) -> Iterator[tuple[str, list[int]]]:
-        """Model and indices of the samples that fit one array: the same frame shape. Short ones first."""
+        """Model and indices of the samples that fit the same arrays. Short ones first."""
 
-        def key(index: int) -> tuple[str, tuple[int, ...]]:
+        def key(index: int) -> tuple[str, tuple[int, ...], tuple[int, ...]]:
             first = samples[index].trajectories[0]
             model = self._model if first.frames is None else f"{self._model}_frames"
-            return model, first.positions.shape[1:]
+            text = first.text_embedding
+            return model, first.positions.shape[1:], () if text is None else text.shape
 
         by_length = sorted(range(len(samples)), key=lambda index: (key(index), _num_positions(samples[index])))
-        for (model, _), group in groupby(by_length, key=key):
+        for (model, *_), group in groupby(by_length, key=key):
             yield model, list(group)
 
     def _parts(self, model: str, samples: Sequence[Sample], group: Sequence[int]) -> Iterator[list[int]]:

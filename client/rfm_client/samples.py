@@ -19,6 +19,7 @@ Float32Array: TypeAlias = npt.NDArray[np.float32]
 UInt8Array: TypeAlias = npt.NDArray[np.uint8]
 
 MIN_FRAME_STEPS = 2  # a prefix of the trajectory sampled to one frame would not be a trajectory
+MAX_FRAME_STEPS = 4096  # more samples of a prefix than any checkpoint takes
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -46,6 +47,8 @@ class Trajectory:
             raise InvalidSampleError.at("task", "str", type(self.task).__name__)
         if any(0xD800 <= ord(character) <= 0xDFFF for character in self.task):
             raise InvalidSampleError.at("task", "text that UTF-8 can encode", "a lone surrogate")
+        if self.frames is not None and self.text_embedding is not None:
+            raise InvalidSampleError.at("text_embedding", "None with frames, which go with task", "an embedding")
         if self.frames is not None:
             object.__setattr__(self, "frames", _checked_frames(self.frames))
         if self.video_embeddings is not None:
@@ -81,8 +84,11 @@ class ProgressSample:
 
     def __post_init__(self) -> None:
         _check_text(self.trajectory, "trajectory")
-        if self.frame_steps != 0 and self.frame_steps < MIN_FRAME_STEPS:
-            raise InvalidSampleError.at("frame_steps", f"0 or at least {MIN_FRAME_STEPS}", str(self.frame_steps))
+        steps = self.frame_steps
+        is_whole = isinstance(steps, (int, np.integer)) and not isinstance(steps, bool)
+        if not is_whole or not (steps == 0 or MIN_FRAME_STEPS <= steps <= MAX_FRAME_STEPS):
+            expected = f"0 or a whole number from {MIN_FRAME_STEPS} to {MAX_FRAME_STEPS}"
+            raise InvalidSampleError.at("frame_steps", expected, repr(steps))
 
     @property
     def trajectories(self) -> tuple[Trajectory, ...]:
@@ -194,7 +200,10 @@ def float_frames_to_uint8(frames: npt.ArrayLike) -> UInt8Array:
 
 
 def _checked_frames(frames: Any) -> UInt8Array:
-    array = np.asarray(frames)
+    try:
+        array = np.asarray(frames)
+    except ValueError:  # lists of unequal length
+        raise InvalidSampleError.at("frames", "uint8 [T, H, W, 3]", "frames of unequal size") from None
     got = f"{array.dtype} {list(array.shape)}"
     if array.dtype != np.uint8:
         raise InvalidSampleError.at("frames", "uint8 [T, H, W, 3] (see float_frames_to_uint8)", got)
@@ -227,6 +236,8 @@ def _checked_floats(where: str, values: Any, axes: tuple[str, ...]) -> Float32Ar
 
 def _check_text(trajectory: Trajectory, where: str) -> None:
     """The first trajectory's text is the one that the model reads."""
+    if not isinstance(trajectory, Trajectory):
+        raise InvalidSampleError.at(where, "Trajectory", type(trajectory).__name__)
     if trajectory.frames is None and trajectory.text_embedding is None:
         raise InvalidSampleError.at(f"{where}.text_embedding", "float32 [Dt] with video_embeddings", "None")
     if trajectory.frames is not None and not trajectory.task.strip():
@@ -235,6 +246,8 @@ def _check_text(trajectory: Trajectory, where: str) -> None:
 
 def _check_pair(first: Trajectory, second: Trajectory, where: str) -> None:
     """Both trajectories of a sample lie in one array."""
+    if not isinstance(second, Trajectory):
+        raise InvalidSampleError.at(where, "Trajectory", type(second).__name__)
     if (first.frames is None) != (second.frames is None):
         expected, got = ("video_embeddings", "frames") if first.frames is None else ("frames", "video_embeddings")
         raise InvalidSampleError.at(where, f"{expected}, as the first trajectory", got)

@@ -7,6 +7,7 @@ import re
 import threading
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from http.client import HTTPException
 from typing import Any, Protocol
 
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
@@ -64,10 +65,10 @@ class GrpcTransport:
         self._client = triton.InferenceServerClient(address)
 
     def infer(self, model: str, inputs: Tensors, outputs: Collection[str]) -> Tensors:
+        tensors, requested = _request(self._triton, inputs, outputs)
         with _mapped_errors():
-            tensors, requested = _request(self._triton, inputs, outputs)
             answer = self._client.infer(model, tensors, outputs=requested, client_timeout=self._timeout_s)
-            return {name: answer.as_numpy(name) for name in outputs}
+            return _outputs(answer, outputs)
 
     def max_batch_size(self, model: str) -> int:
         with _mapped_errors(errors.ModelNotFoundError):
@@ -75,7 +76,7 @@ class GrpcTransport:
             return int(answer.config.max_batch_size)
 
     def is_ready(self, model: str) -> bool:
-        return _is_ready(self._client, model)
+        return _is_ready(self._client, model, client_timeout=self._timeout_s)
 
     def close(self) -> None:
         self._client.close()
@@ -101,10 +102,10 @@ class HttpTransport:
         return self._of_thread.client
 
     def infer(self, model: str, inputs: Tensors, outputs: Collection[str]) -> Tensors:
+        tensors, requested = _request(self._triton, inputs, outputs)
         with _mapped_errors():
-            tensors, requested = _request(self._triton, inputs, outputs)
             answer = self._client.infer(model, tensors, outputs=requested)
-            return {name: answer.as_numpy(name) for name in outputs}
+            return _outputs(answer, outputs)
 
     def max_batch_size(self, model: str) -> int:
         with _mapped_errors(errors.ModelNotFoundError):
@@ -115,7 +116,9 @@ class HttpTransport:
 
     def close(self) -> None:
         """Closes this thread's connection; another thread's is closed when that thread ends."""
-        self._client.close()
+        if hasattr(self._of_thread, "client"):
+            self._of_thread.client.close()
+            del self._of_thread.client
 
 
 def _request(triton: Any, inputs: Tensors, outputs: Collection[str]) -> tuple[list[Any], list[Any]]:
@@ -127,10 +130,18 @@ def _request(triton: Any, inputs: Tensors, outputs: Collection[str]) -> tuple[li
     return tensors, [triton.InferRequestedOutput(name) for name in outputs]
 
 
-def _is_ready(client: Any, model: str) -> bool:
+def _outputs(answer: Any, names: Collection[str]) -> Tensors:
+    arrays = {name: answer.as_numpy(name) for name in names}
+    absent = [name for name, array in arrays.items() if array is None]
+    if absent:
+        raise errors.InferenceFailedError(f"outputs: expected {', '.join(names)}, got no {', '.join(absent)}")
+    return arrays
+
+
+def _is_ready(client: Any, model: str, **options: Any) -> bool:
     try:
         with _mapped_errors():
-            return bool(client.is_server_ready() and client.is_model_ready(model))
+            return bool(client.is_server_ready(**options) and client.is_model_ready(model, **options))
     except errors.ServerError:
         return False
 
@@ -146,5 +157,7 @@ def _mapped_errors(bad_request: type[errors.RewardError] = errors.InvalidSampleE
         raise kind(_IN_ENSEMBLE.sub("", error.message() or "no reason given")) from error
     except TimeoutError as error:
         raise errors.DeadlineExceededError(f"no answer in time: {error}") from error
-    except (OSError, EOFError) as error:
-        raise errors.ServerUnavailableError(f"connection lost: {error}") from error
+    except (OSError, EOFError, HTTPException) as error:
+        raise errors.ServerUnavailableError(f"connection lost: {error!r}") from error
+    except (ValueError, LookupError, TypeError) as error:  # while reading what is no answer of a KServe server
+        raise errors.InferenceFailedError(f"the answer cannot be read: {error!r}") from error

@@ -295,10 +295,10 @@ def _decode_result(tensors: Mapping[str, npt.NDArray[Any]], row: int, sample: Sa
     first, second = (_scores_between(tensors, row, bounds[i], bounds[i + 1]) for i in range(2))
     timing = BatchTiming(*tensors[TIMING_MS][row].tolist()) if TIMING_MS in tensors else None
     if isinstance(sample, PreferenceSample):
-        preference = float(_present(PREFERENCE, tensors[PREFERENCE][row], 1)[0])
+        preference = float(_present(tensors, PREFERENCE, row, slice(0, 1))[0])
         return PreferenceResult(preference=preference, first=first, second=second, timing=timing)
     if isinstance(sample, SimilaritySample):
-        similarity = float(_present(SIMILARITY, tensors[SIMILARITY][row], 1)[0])
+        similarity = float(_present(tensors, SIMILARITY, row, slice(0, 1))[0])
         return SimilarityResult(similarity=similarity, reference=first, other=second, timing=timing)
     return ProgressResult(
         progress=first.progress, success=first.success, progress_logits=first.progress_logits, timing=timing
@@ -307,13 +307,18 @@ def _decode_result(tensors: Mapping[str, npt.NDArray[Any]], row: int, sample: Sa
 
 def _scores_between(tensors: Mapping[str, npt.NDArray[Any]], row: int, start: int, stop: int) -> FrameScores:
     def part(name: str) -> Float32Array:
-        return _present(name, tensors[name][row, start:stop], stop - start)
+        return _present(tensors, name, row, slice(start, stop))
 
     logits = part(PROGRESS_LOGITS) if PROGRESS_LOGITS in tensors else None
     return FrameScores(progress=part(PROGRESS), success=part(SUCCESS), progress_logits=logits)
 
 
-def _present(name: str, scores: Float32Array, count: int) -> Float32Array:
-    if len(scores) != count or not np.isfinite(scores).all():
-        raise InferenceFailedError(f"{name}: expected {count} finite scores, got {scores.tolist()}")
-    return scores
+def _present(tensors: Mapping[str, npt.NDArray[Any]], name: str, row: int, positions: slice) -> Float32Array:
+    """One row's scores at some positions, which must be there and be numbers."""
+    scores, count = tensors[name], positions.stop - positions.start
+    if scores.ndim < 2 or row >= len(scores):
+        raise InferenceFailedError(f"{name}: expected scores of sample {row}, got an array {list(scores.shape)}")
+    part: Float32Array = scores[row, positions]
+    if len(part) != count or not np.isfinite(part).all():
+        raise InferenceFailedError(f"{name}: expected {count} finite scores, got {part.tolist()}")
+    return part

@@ -62,7 +62,10 @@ def export(source: str | Path, repository: Path, serve: ServeConfig) -> int:
 
 def check(repository: Path, serve: ServeConfig) -> list[str]:
     """How the repository's generated files differ from what an export would write now; empty if they do not."""
-    version = max(_read_config(repository, serve.name).version_policy.specific.versions)
+    versions = _read_config(repository, serve.name).version_policy.specific.versions
+    if not versions:
+        raise ExportError(f"{repository / serve.name}: expected a configuration that names its versions, got none")
+    version = max(versions)
     checkpoint = checkpoints.load(repository / serve.name / str(version) / CHECKPOINT_FOLDER)
     models = rewind_models(
         checkpoint.config,

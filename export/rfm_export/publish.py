@@ -21,9 +21,12 @@ from rfm_export.pbtxt import parse, render, serving_versions
 
 @contextmanager
 def staging(repository: Path) -> Iterator[Path]:
-    """A folder beside the repository (on its file system), gone afterwards."""
+    """A folder on the repository's file system, gone afterwards: beside it, or in it where it is a mount point."""
     repository.mkdir(parents=True, exist_ok=True)
-    folder = Path(tempfile.mkdtemp(prefix=f".{repository.name}.export-", dir=repository.resolve().parent))
+    repository = repository.resolve()
+    beside = repository.parent.stat().st_dev == repository.stat().st_dev
+    parent = repository.parent if beside else repository
+    folder = Path(tempfile.mkdtemp(prefix=f".{repository.name}.export-", dir=parent))
     try:
         yield folder
     finally:

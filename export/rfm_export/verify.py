@@ -26,6 +26,7 @@ from rfm_export.errors import ExportDiffersError
 TOLERANCE = 1e-6  # same weights, same machine, same code: the numbers are the same but for rounding
 PROBE_FRAMES = (1, 3, 8)
 PROBE_SIZE_PX = (48, 80)
+PROBE_FRAME_STEPS = 2
 PROBE_SEED = 0
 
 
@@ -48,6 +49,7 @@ def probes(config: RewindConfig, *, with_frames: bool) -> list[Sample]:
         for num_frames in PROBE_FRAMES:
             length = min(num_frames, config.max_frames or num_frames)
             samples.append(ProgressSample(make(length)))
+            samples.append(ProgressSample(make(length), frame_steps=PROBE_FRAME_STEPS))
             samples.append(PreferenceSample(make(length), make(1)))
             if config.has_similarity:
                 samples.append(SimilaritySample(make(1), make(length)))
@@ -76,4 +78,6 @@ def _numbers(outcome: Outcome) -> npt.NDArray[np.float64]:
 
 
 def _frame_numbers(scores: FrameScores) -> npt.NDArray[np.float64]:
-    return np.concatenate([scores.progress, scores.success]).astype(np.float64)
+    logits = [] if scores.progress_logits is None else [scores.progress_logits.ravel()]
+    numbers: npt.NDArray[np.float64] = np.concatenate([scores.progress, scores.success, *logits]).astype(np.float64)
+    return numbers

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
 """A small ReWiND checkpoint with encoders, in upstream's layout, with seeded random weights.
 
-It shows that everything is connected; its scores mean nothing.
+It shows that everything is connected; its scores mean nothing. ``python -m rfm.demo.checkpoint FOLDER`` writes it.
 """
 
 from __future__ import annotations
 
 import string
-from dataclasses import dataclass
+import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from safetensors.torch import load_file, save_file
@@ -41,8 +41,7 @@ CONFIG = RewindConfig(
 )
 
 
-@dataclass(frozen=True)
-class DemoCheckpoint:
+class DemoCheckpoint(NamedTuple):
     """Where it lies: the checkpoint folder, and the folders that stand for its encoders' base models."""
 
     checkpoint: Path
@@ -113,3 +112,7 @@ def _tokenizer() -> Any:
     tokenizer.post_processor = processors.TemplateProcessing(single="[CLS] $A [SEP]", special_tokens=ends)
     names = dict(zip(("pad_token", "unk_token", "cls_token", "sep_token", "mask_token"), special, strict=True))
     return PreTrainedTokenizerFast(tokenizer_object=tokenizer, model_max_length=MAX_TASK_TOKENS, **names)
+
+
+if __name__ == "__main__":
+    write_random_checkpoint(Path(sys.argv[1]))

@@ -78,7 +78,7 @@ def metrics_table(url: str) -> Table:
     """What Triton's metrics endpoint says of each model, and of the machine."""
     samples = _read_metrics(url)
     sampled_by_s = time.monotonic() + METRICS_TIMEOUT_S
-    while not _machine(samples)["nv_cpu_memory_used_bytes"] and time.monotonic() < sampled_by_s:
+    while not _machine(samples).get("nv_cpu_memory_used_bytes") and time.monotonic() < sampled_by_s:
         time.sleep(METRICS_POLL_S)  # Triton looks at the machine every two seconds
         samples = _read_metrics(url)
     by_model: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))

@@ -19,6 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from rfm.collate import as_tensor
 from rfm_client import InferenceFailedError, InvalidSampleError, RewardError, Trajectory
 from rfm_client.samples import Float32Array, UInt8Array
 
@@ -26,6 +27,7 @@ IMAGES_PER_FORWARD = 64
 PREPROCESSOR_CONFIG = "preprocessor_config.json"
 PIL_BICUBIC = 3  # the value of `resample` in preprocessor_config.json
 MAX_UINT8 = 255
+MAX_ASPECT_RATIO = 50
 
 
 @dataclass(frozen=True)
@@ -68,9 +70,9 @@ class ImagePreprocessor:
         )
 
     def __call__(self, images: Tensor) -> Tensor:
-        """uint8 [N, H, W, C] -> float32 [N, C, *crop_px], on the device of ``images``."""
+        """uint8 [N, H, W, C] -> float32 [N, C, *crop_px], on the CPU."""
         crops = self._crop(self._resize(images.permute(0, 3, 1, 2))).float()
-        mean, std = (torch.tensor(v, device=crops.device).view(-1, 1, 1) * MAX_UINT8 for v in (self.mean, self.std))
+        mean, std = (torch.tensor(values).view(-1, 1, 1) * MAX_UINT8 for values in (self.mean, self.std))
         return (crops - mean) / std
 
     def _resize(self, images: Tensor) -> Tensor:
@@ -167,21 +169,22 @@ class Encoders:
         """Dt."""
         return int(self.text_model.config.hidden_size)
 
-    def encode(self, films: Sequence[Trajectory]) -> list[Trajectory | RewardError]:
+    def encode(self, trajectories: Sequence[Trajectory]) -> list[Trajectory | RewardError]:
         """Trajectories of embeddings for trajectories of frames and task, or the error of one that has none."""
         outcomes: dict[int, Trajectory | RewardError] = {}
-        for index, film in enumerate(films):
+        for index, trajectory in enumerate(trajectories):
             try:
-                self.check_task(film.task)
+                self._check_task(trajectory.task)
+                _check_shape(trajectory)
             except InvalidSampleError as error:
                 outcomes[index] = error
-        good = [index for index in range(len(films)) if index not in outcomes]
+        good = [index for index in range(len(trajectories)) if index not in outcomes]
         if good:
-            videos = self.encode_frames([film.frames for i in good if (film := films[i]).frames is not None])
-            texts = self.encode_tasks([films[index].task for index in good])
+            videos = self.encode_frames([trajectories[index].positions for index in good])
+            texts = self.encode_tasks([trajectories[index].task for index in good])
             for index, video, text in zip(good, videos, texts, strict=True):
                 outcomes[index] = _embedded(video, text)
-        return [outcomes[index] for index in range(len(films))]
+        return [outcomes[index] for index in range(len(trajectories))]
 
     @torch.inference_mode()
     def encode_frames(self, videos: Sequence[UInt8Array]) -> list[Float32Array]:
@@ -193,7 +196,7 @@ class Encoders:
 
     @torch.inference_mode()
     def encode_tasks(self, tasks: Sequence[str]) -> Float32Array:
-        """float32 [B, Dt] of B tasks that ``check_task`` accepts."""
+        """float32 [B, Dt] of B tasks."""
         tokens = self._tokenize(list(tasks), padding=True, return_tensors="pt").to(self.text_model.device)
         hidden = self.text_model(**tokens).last_hidden_state
         mask = tokens["attention_mask"].unsqueeze(-1).to(hidden.dtype)
@@ -204,14 +207,14 @@ class Encoders:
         waiting: list[Tensor] = []
         for video in videos:
             for start in range(0, len(video), IMAGES_PER_FORWARD):
-                images = torch.from_numpy(video[start : start + IMAGES_PER_FORWARD]).to(self.image_model.device)
+                images = as_tensor(video[start : start + IMAGES_PER_FORWARD])
                 if sum(map(len, waiting)) + len(images) > IMAGES_PER_FORWARD:
-                    yield torch.cat(waiting)
+                    yield torch.cat(waiting).to(self.image_model.device)
                     waiting = []
-                waiting.append(self.preprocessor(images))
-        yield torch.cat(waiting)
+                waiting.append(self.preprocessor(images))  # on the CPU: nowhere else is uint8 resized antialiased
+        yield torch.cat(waiting).to(self.image_model.device)
 
-    def check_task(self, task: str) -> None:
+    def _check_task(self, task: str) -> None:
         """Raises InvalidSampleError for a task longer than the text encoder reads; it is never cut silently."""
         if not task.strip():
             raise InvalidSampleError.at("task", "a task sentence", repr(task))
@@ -231,11 +234,25 @@ def _embedded(video: Float32Array, text: Float32Array) -> Trajectory | RewardErr
     return Trajectory(video_embeddings=video, text_embedding=text)
 
 
+def _check_shape(trajectory: Trajectory) -> None:
+    """The shorter side is brought to size; a sliver of an image would become a huge one."""
+    height, width = trajectory.positions.shape[1:3]
+    if max(height, width) > MAX_ASPECT_RATIO * min(height, width):
+        expected = f"frames at most {MAX_ASPECT_RATIO} times as long as wide"
+        raise InvalidSampleError.at("frames", expected, f"{height} x {width}")
+
+
 def _load_model(source: str | Path, weights: Mapping[str, Tensor] | None) -> Any:
     from transformers import AutoConfig, AutoModel
 
     if weights is None:
-        return AutoModel.from_pretrained(str(source), use_safetensors=True, dtype=torch.float32)
+        model, loaded = AutoModel.from_pretrained(
+            str(source), use_safetensors=True, dtype=torch.float32, output_loading_info=True
+        )
+        if loaded["missing_keys"] or loaded["mismatched_keys"]:  # transformers would leave these random
+            found = f"missing: {sorted(loaded['missing_keys'])}; shapes: {sorted(loaded['mismatched_keys'])}"
+            raise ValueError(f"{source}: the encoder's weights are not complete: {found}")
+        return model
     model = AutoModel.from_config(AutoConfig.from_pretrained(str(source)))
     expected, got = ({name: tuple(w.shape) for name, w in state.items()} for state in (model.state_dict(), weights))
     if expected != got:

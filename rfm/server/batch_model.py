@@ -60,10 +60,10 @@ class BatchModel(Generic[Question, Answer]):
         """Called by Triton with the requests of one batch; gives one response each."""
         import triton_python_backend_utils as pb_utils
 
-        inputs = [self._inputs(request) for request in requests]
-        asked = [self._decoded(tensors) for tensors in inputs]
-        questions = [question for part in asked if isinstance(part, list) for question in part]
         try:
+            inputs = [self._inputs(request) for request in requests]
+            asked = [self._decoded(tensors) for tensors in inputs]
+            questions = [question for part in asked if isinstance(part, list) for question in part]
             answers = iter(self.answer(questions))
             answered = [part if isinstance(part, RewardError) else [next(answers) for _ in part] for part in asked]
             return [self._response(*parts) for parts in zip(requests, inputs, answered, strict=True)]

@@ -11,7 +11,9 @@ import socket
 import subprocess
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
+from http.client import HTTPException
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import IO
@@ -26,6 +28,7 @@ POLL_S = 0.1
 EXIT_TIMEOUT_S = 10  # Triton waits this long for requests in flight, and for a stub that is dead
 KILL_AFTER_S = 2 * EXIT_TIMEOUT_S
 SHARED_MEMORY = Path("/dev/shm")
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True)
@@ -71,9 +74,10 @@ class Endpoints:
         for name, port in (("HTTP", self.http_port), ("gRPC", self.grpc_port), ("metrics", self.metrics_port)):
             try:
                 socket.create_server((self.host, port)).close()
-            except OSError as error:
+            except (OSError, OverflowError) as error:
                 expected = f"a free port of this machine at {self.host}:{port}"
-                reason = os.strerror(error.errno) if error.errno else str(error)
+                number = getattr(error, "errno", None)
+                reason = os.strerror(number) if number and number > 0 else str(error)
                 raise ServerStartError(f"{name}: expected {expected}, got: {reason}") from error
 
 
@@ -81,7 +85,7 @@ class TritonServer:
     """A tritonserver on ``repository`` with every model of it loaded. A context manager that stops it.
 
     http_threads: threads that read HTTP requests; None: Triton's choice
-    log: where Triton's log goes; None: this process's standard error
+    log: where Triton's log goes; None: this process's standard output and error
     """
 
     def __init__(
@@ -93,90 +97,32 @@ class TritonServer:
         http_threads: int | None = None,
         log: IO[bytes] | None = None,
     ) -> None:
-        if not repository.is_dir() or not any(repository.glob("*/config.pbtxt")):
-            raise ServerStartError(f"repository: expected a folder of models, got {repository}")
-        endpoints.check_free()
         self.endpoints = endpoints
+        self._repository = repository
+        self._installation = installation
+        self._http_threads = http_threads
+        self._log = log
         self._region_prefix = f"rfm_{os.getpid()}_{secrets.token_hex(4)}_"
-        self._backends = Path(tempfile.mkdtemp(prefix="rfm-backends-"))
-        arguments = [
-            f"--model-repository={repository}",
-            "--model-control-mode=explicit",
-            "--load-model=*",
-            "--disable-auto-complete-config",
-            "--strict-readiness=true",
-            "--exit-on-error=false",  # so that the reason of each model that fails can be asked for
-            f"--exit-timeout-secs={EXIT_TIMEOUT_S}",
-            f"--http-address={endpoints.host}",
-            f"--http-port={endpoints.http_port}",
-            f"--grpc-address={endpoints.host}",
-            f"--grpc-port={endpoints.grpc_port}",
-            f"--metrics-address={endpoints.host}",
-            f"--metrics-port={endpoints.metrics_port}",
-            f"--backend-config=python,shm-region-prefix-name={self._region_prefix}",
-            *([f"--http-thread-count={http_threads}"] if http_threads else []),
-            *installation.lay_out_backends(self._backends),
-        ]
-        self.process = subprocess.Popen(
-            [installation.executable, *arguments],
-            env={**os.environ, **installation.environment},
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,  # a Ctrl-C in the terminal reaches it once, through us
-        )
-
-    def wait_ready(self) -> None:
-        """Returns when every model is ready. Raises ServerStartError with the reason of one that is not."""
-        client = tritonclient.http.InferenceServerClient(f"{self.endpoints.host}:{self.endpoints.http_port}")
-        try:
-            while self.process.poll() is None:
-                try:
-                    index = client.get_model_repository_index()
-                except (OSError, EOFError, InferenceServerException):
-                    time.sleep(POLL_S)  # Triton answers nothing while it loads
-                    continue
-                failed = [model for model in index if model.get("state") != "READY"]
-                if not failed:
-                    return
-                reasons = "; ".join(f"{m['name']}: {_one_line(m.get('reason', 'not loaded'))}" for m in failed)
-                raise ServerStartError(f"models: expected all to be ready, got {reasons}")
-            raise ServerStartError(f"tritonserver: expected to run, got exit status {self.process.returncode}")
-        finally:
-            client.close()
-
-    def stop(self) -> int:
-        """Ends the server gracefully, by force after KILL_AFTER_S, and gives its exit status."""
-        if self.process.poll() is None:
-            self.process.terminate()
-        try:
-            self.process.wait(KILL_AFTER_S)
-        except subprocess.TimeoutExpired:
-            os.killpg(self.process.pid, signal.SIGKILL)
-        return self.wait()
-
-    def wait(self) -> int:
-        """Waits for the server to end and clears away what it leaves; gives its exit status."""
-        status = self.process.wait()
-        shutil.rmtree(self._backends, ignore_errors=True)
-        for region in SHARED_MEMORY.glob(f"{self._region_prefix}*"):
-            region.unlink(missing_ok=True)
-        return status
+        self._backends: Path | None = None
+        self._process: subprocess.Popen[bytes] | None = None
 
     def run(self) -> int:
-        """Serves until the server ends or this process is told to (SIGINT, SIGTERM); gives Triton's exit status."""
-
+        """Serves until the server ends or this process is told to (STOP_SIGNALS); gives Triton's exit status."""
         told_to_stop = False
 
-        def forward(number: int, _frame: FrameType | None) -> None:
+        def stop(number: int, _frame: FrameType | None) -> None:
             nonlocal told_to_stop
             told_to_stop = True
-            self.process.send_signal(number)
+            if self._process is not None:
+                self._process.send_signal(signal.SIGTERM if number == signal.SIGHUP else number)
 
-        previous = {number: signal.signal(number, forward) for number in (signal.SIGINT, signal.SIGTERM)}
+        previous = {number: signal.signal(number, stop) for number in STOP_SIGNALS}
         try:
+            self.start()
+            if told_to_stop:  # before there was a process to pass it to
+                return self.stop()
             self.wait_ready()
-            return self.wait()
+            return self._wait()
         except ServerStartError:
             status = self.stop()
             if told_to_stop:  # while it was still loading
@@ -186,8 +132,63 @@ class TritonServer:
             for number, handler in previous.items():
                 signal.signal(number, handler)
 
+    def start(self) -> None:
+        """Starts the process. Raises ServerStartError for what can be seen to be wrong before."""
+        models = sorted(file.parent.name for file in self._repository.glob("*/config.pbtxt"))
+        if not models:
+            raise ServerStartError(f"repository: expected a folder of models, got {self._repository}")
+        self.endpoints.check_free()
+        self._backends = Path(tempfile.mkdtemp(prefix="rfm-backends-"))
+        arguments = [*self._arguments(models), *self._installation.lay_out_backends(self._backends)]
+        try:
+            self._process = subprocess.Popen(
+                [self._installation.executable, *arguments],
+                env={**os.environ, **self._installation.environment},
+                stdin=subprocess.DEVNULL,
+                stdout=self._log,
+                stderr=self._log,
+                start_new_session=True,  # a Ctrl-C in the terminal reaches it once, through us
+            )
+        except OSError as error:
+            self._clear()
+            program = self._installation.executable
+            raise ServerStartError(f"tritonserver: expected a program at {program}, got: {error.strerror}") from error
+
+    def wait_ready(self) -> None:
+        """Returns when every model is ready. Raises ServerStartError with the reason of one that is not."""
+        assert self._process is not None  # started
+        client = tritonclient.http.InferenceServerClient(f"{self.endpoints.host}:{self.endpoints.http_port}")
+        try:
+            while self._process.poll() is None:
+                try:
+                    index = client.get_model_repository_index()
+                except (OSError, EOFError, HTTPException, InferenceServerException):
+                    time.sleep(POLL_S)  # Triton answers nothing while it loads
+                    continue
+                failed = [model for model in index if model.get("state") != "READY"]
+                if not failed:
+                    return
+                reasons = "; ".join(f"{m['name']}: {_one_line(m.get('reason', 'not loaded'))}" for m in failed)
+                raise ServerStartError(f"models: expected all to be ready, got {reasons}")
+            raise ServerStartError(f"tritonserver: expected to run, got exit status {self._process.returncode}")
+        finally:
+            client.close()
+
+    def stop(self) -> int:
+        """Ends the server gracefully, by force after KILL_AFTER_S, and gives its exit status (0 if it never ran)."""
+        if self._process is None:
+            return 0
+        if self._process.poll() is None:
+            self._process.terminate()
+        try:
+            self._process.wait(KILL_AFTER_S)
+        except subprocess.TimeoutExpired:
+            os.killpg(self._process.pid, signal.SIGKILL)
+        return self._wait()
+
     def __enter__(self) -> TritonServer:
         try:
+            self.start()
             self.wait_ready()
         except BaseException:
             self.stop()
@@ -199,8 +200,41 @@ class TritonServer:
     ) -> None:
         self.stop()
 
+    def _arguments(self, models: Sequence[str]) -> list[str]:
+        endpoints = self.endpoints
+        return [
+            f"--model-repository={self._repository}",
+            "--model-control-mode=explicit",
+            *(f"--load-model={model}" for model in models),
+            "--disable-auto-complete-config",
+            "--strict-readiness=true",
+            "--exit-on-error=false",  # so that the reason of each model that fails can be asked for
+            f"--exit-timeout-secs={EXIT_TIMEOUT_S}",
+            f"--http-address={endpoints.host}",
+            f"--http-port={endpoints.http_port}",
+            f"--grpc-address={endpoints.host}",
+            f"--grpc-port={endpoints.grpc_port}",
+            f"--metrics-address={endpoints.host}",
+            f"--metrics-port={endpoints.metrics_port}",
+            f"--backend-config=python,shm-region-prefix-name={self._region_prefix}",
+            *([f"--http-thread-count={self._http_threads}"] if self._http_threads else []),
+        ]
+
+    def _wait(self) -> int:
+        """Waits for the server to end and clears away what it leaves; gives its exit status."""
+        assert self._process is not None  # started
+        status = self._process.wait()
+        self._clear()
+        return status
+
+    def _clear(self) -> None:
+        if self._backends is not None:
+            shutil.rmtree(self._backends, ignore_errors=True)
+        for region in SHARED_MEMORY.glob(f"{self._region_prefix}*"):
+            region.unlink(missing_ok=True)
+
 
 def _one_line(reason: str) -> str:
-    """The part of a Triton reason that says what happened: the last line of a Python traceback."""
-    lines = [line.strip() for line in reason.strip().splitlines() if line.strip() and not line.startswith("At:")]
-    return lines[0] if lines else "unknown"
+    """What happened; the lines behind it are where."""
+    lines = reason.strip().splitlines()
+    return lines[0].strip() if lines else "unknown"
