@@ -29,6 +29,9 @@ app = typer.Typer(
 )
 
 Config = Annotated[Path | None, typer.Option(help="YAML file of a ServeConfig; options given here win over it.")]
+BaseModel = Annotated[
+    str | None, typer.Option(help="Folder or id of a vision-language checkpoint's base model; else as it says itself.")
+]
 Repository = Annotated[Path, typer.Option(help="Triton model repository.")]
 TritonPath = Annotated[
     Path | None, typer.Option("--tritonserver", help="tritonserver program; else PATH, else the nvidia-pytriton wheel.")
@@ -41,15 +44,21 @@ def export(
     checkpoint: Annotated[str | None, typer.Option(help="Folder, or Hugging Face id org/name[@tag].")] = None,
     name: Annotated[str | None, typer.Option(help="Model name in the repository (rfm).")] = None,
     config: Config = None,
-    image_encoder: Annotated[str | None, typer.Option(help="Folder or id of the image encoder.")] = None,
-    text_encoder: Annotated[str | None, typer.Option(help="Folder or id of the text encoder.")] = None,
+    image_encoder: Annotated[str | None, typer.Option(help="Folder or id of ReWiND's image encoder.")] = None,
+    text_encoder: Annotated[str | None, typer.Option(help="Folder or id of ReWiND's text encoder.")] = None,
+    base_model: BaseModel = None,
     check: Annotated[bool, typer.Option("--check", help="Write nothing; compare with what would be written.")] = False,
 ) -> None:
     """Write a checkpoint into a model repository as the next version of its models."""
     import rfm_export
 
     serve = _serve_config(
-        config, model_path=checkpoint, name=name, image_encoder=image_encoder, text_encoder=text_encoder
+        config,
+        model_path=checkpoint,
+        name=name,
+        image_encoder=image_encoder,
+        text_encoder=text_encoder,
+        base_model=base_model,
     )
     try:
         if check:
@@ -99,12 +108,14 @@ def demo(
     checkpoint: Annotated[str | None, typer.Option(help="Checkpoint to serve; else one with random weights.")] = None,
     image_encoder: Annotated[str | None, typer.Option(help="Folder or id of its image encoder.")] = None,
     text_encoder: Annotated[str | None, typer.Option(help="Folder or id of its text encoder.")] = None,
+    base_model: BaseModel = None,
     output: Annotated[Path, typer.Option(help="Folder for the plot and Triton's log.")] = Path("demo_output"),
     tritonserver: TritonPath = None,
 ) -> None:
     """Export a checkpoint, serve it, score samples and a video, plot, and stop everything."""
     import rfm_export
     from rfm import checkpoint as checkpoints
+    from rfm.models.rewind import RewindConfig
 
     try:
         from rfm.demo import clip, run
@@ -119,20 +130,22 @@ def demo(
         if checkpoint is None:
             console.print("The checkpoint has random weights: its scores show that all is connected, and mean nothing.")
             checkpoint, image_encoder, text_encoder = map(str, write_random_checkpoint(Path(folder) / "random"))
-        settings = _serve_config(None, image_encoder=image_encoder, text_encoder=text_encoder)
+        settings = _serve_config(None, image_encoder=image_encoder, text_encoder=text_encoder, base_model=base_model)
         repository = Path(folder) / "model_repository"
         if video is None or task is None:
             video, task = Path(folder) / "clip.mp4", clip.TASK
             clip.write(video)
         try:
-            config = checkpoints.load(checkpoint).config
-            frames = run.video_frames(video, fps, config, console)
+            config = checkpoints.load(checkpoint, base_model=base_model).config
+            rewind = config if isinstance(config, RewindConfig) else None
+            frames = run.video_frames(video, fps, rewind.max_frames if rewind else None, console)
             rfm_export.export(checkpoint, repository, settings)
             with (
                 (output / "tritonserver.log").open("wb") as log,
                 TritonServer(repository, Endpoints.free(), find_installation(tritonserver), log=log) as server,
             ):
-                run.score_embeddings(server.endpoints, config, console)
+                if rewind is not None:
+                    run.score_embeddings(server.endpoints, rewind, console)
                 if (repository / f"{settings.name}_frames").exists():
                     run.score_frames(server.endpoints, frames, task, output / "rewards.png", console)
                 else:

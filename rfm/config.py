@@ -7,13 +7,17 @@ import types
 import typing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
+
+if TYPE_CHECKING:
+    import torch
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_TOKEN_BUDGET = 16_384
 MAX_PORT = 65_535
+_DTYPES = ("float32", "bfloat16", "float16")
 
 
 class ConfigError(Exception):
@@ -37,6 +41,8 @@ class ServeConfig:
 
     name: of the model in the repository; raw frames are scored by ``<name>_frames``
     image_encoder, text_encoder: folders or Hugging Face ids of a ReWiND checkpoint's encoders
+    base_model: folder or id of a vision-language checkpoint's base model; else the one that the checkpoint names
+    dtype: of a vision-language network, float32 or bfloat16; null: the checkpoint's on a GPU, float32 on the CPU
     token_budget: the most tokens, padding included, of one forward pass
     torch_threads: CPU threads of each model instance; 0: torch's choice
     grpc_port, metrics_port: Triton's other two ports
@@ -51,6 +57,8 @@ class ServeConfig:
     name: str = "rfm"
     image_encoder: str | None = None
     text_encoder: str | None = None
+    base_model: str | None = None
+    dtype: str | None = None
     token_budget: int = DEFAULT_TOKEN_BUDGET
     torch_threads: int = 0
     grpc_port: int = 8001
@@ -59,6 +67,8 @@ class ServeConfig:
     def __post_init__(self) -> None:
         _at_least(1, self, "batch_size", "max_workers", "token_budget", "server_port", "grpc_port", "metrics_port")
         _at_least(0, self, "num_gpus", "torch_threads")
+        if self.dtype not in (None, *_DTYPES):
+            raise ConfigError(f"dtype: expected one of {', '.join(_DTYPES)} or null, got {self.dtype!r}")
         ports = {name: getattr(self, name) for name in ("server_port", "grpc_port", "metrics_port")}
         if max(ports.values()) > MAX_PORT or len(set(ports.values())) < len(ports):
             raise ConfigError(f"ports: expected three different ones up to {MAX_PORT}, got {ports}")
@@ -95,6 +105,13 @@ class ServeConfig:
         host = self.server_url.partition("://")[2] or self.server_url
         host = host.rstrip("/")
         return DEFAULT_HOST if host == "localhost" else host
+
+    @property
+    def torch_dtype(self) -> torch.dtype | None:
+        """``dtype`` as torch has it."""
+        import torch  # here, since only few of those who read a configuration need it
+
+        return getattr(torch, self.dtype) if self.dtype else None
 
     @property
     def is_loopback(self) -> bool:

@@ -3,23 +3,23 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from rfm import checkpoint as checkpoints
-from rfm.collate import RewindCollator, Row
 from rfm.config import DEFAULT_TOKEN_BUDGET
+from rfm.families.rewind import RewindFamily
+from rfm.families.vlm import VlmFamily
+from rfm.family import Family, RowScores
 from rfm.models.encoders import Encoders
-from rfm.models.heads import progress_from_logits
-from rfm.models.rewind import RewindBatch, RewindTransformer
 from rfm_client import (
     BatchTiming,
     FrameScores,
@@ -33,189 +33,175 @@ from rfm_client import (
     RewardError,
     Sample,
     SimilarityResult,
-    Trajectory,
 )
 
 Outcome: TypeAlias = Result | RewardError
 
+PROCESSOR_FOLDER = "processor"  # in an exported vision-language checkpoint: its tokenizer and image preprocessing
 
-@dataclass(frozen=True, eq=False)
-class _RowScores:
-    """Scores of one row: of the frames of its trajectories, and of its question about two of them."""
-
-    frames: list[FrameScores]
-    query: float | None = None
-
-    def is_finite(self) -> bool:
-        arrays = [array for scores in self.frames for array in (scores.progress, scores.success)]
-        return all(np.isfinite(array).all() for array in arrays) and (self.query is None or np.isfinite(self.query))
+_log = logging.getLogger(__name__)
 
 
 class Engine:
     """Scores samples with one network on one device.
 
-    network: the ReWiND transformer
-    encoders: needed only for samples of raw frames
+    family: the network and how samples become its batches
     token_budget: the most tokens, padding included, of one forward pass
     """
 
-    def __init__(
-        self,
-        network: RewindTransformer,
-        *,
-        encoders: Encoders | None = None,
-        device: str | torch.device = "cpu",
-        token_budget: int = DEFAULT_TOKEN_BUDGET,
-    ) -> None:
-        self.device = torch.device(device)
-        self.network = network.to(self.device).eval()
-        self.encoders = encoders.to(self.device) if encoders is not None else None
+    def __init__(self, family: Family[Any, Any], *, token_budget: int = DEFAULT_TOKEN_BUDGET) -> None:
+        self.family = family
         self.token_budget = token_budget
-        self.collator = RewindCollator(network.config)
+        self.out_of_memory_count = 0
 
     @classmethod
     def from_checkpoint(
-        cls, source: str | Path, *, device: str | torch.device = "cpu", token_budget: int = DEFAULT_TOKEN_BUDGET
+        cls,
+        source: str | Path,
+        *,
+        encoders: Encoders | None = None,
+        base_model: str | None = None,
+        device: str | torch.device = "cpu",
+        dtype: torch.dtype | None = None,
+        token_budget: int = DEFAULT_TOKEN_BUDGET,
     ) -> Engine:
-        """The engine of a checkpoint folder or Hugging Face id, for embeddings. Raises CheckpointError."""
-        return cls(checkpoints.load(source).build(), device=device, token_budget=token_budget)
+        """The engine of a checkpoint folder or Hugging Face id. Raises CheckpointError.
+
+        encoders: of a ReWiND checkpoint, for samples of raw frames
+        base_model: of a vision-language checkpoint, as in ``rfm.checkpoint.load``
+        dtype: of a vision-language network; None: the checkpoint's on a GPU, float32 on the CPU
+        """
+        folder = checkpoints.find(source)
+        own = folder / PROCESSOR_FOLDER
+        return cls.of(
+            checkpoints.load(folder, base_model=base_model),
+            encoders=encoders,
+            processor=base_model or (own if own.is_dir() else None),
+            device=device,
+            dtype=dtype,
+            token_budget=token_budget,
+        )
+
+    @classmethod
+    def of(
+        cls,
+        checkpoint: checkpoints.Checkpoint,
+        *,
+        encoders: Encoders | None = None,
+        processor: str | Path | None = None,
+        device: str | torch.device = "cpu",
+        dtype: torch.dtype | None = None,
+        token_budget: int = DEFAULT_TOKEN_BUDGET,
+    ) -> Engine:
+        """The engine of a checkpoint in memory.
+
+        processor: folder or id of a vision-language checkpoint's tokenizer and image preprocessing; None: of the
+        base model that it names
+        """
+        on = torch.device(device)
+        if isinstance(checkpoint, checkpoints.RewindCheckpoint):
+            return cls(RewindFamily(checkpoint.build(), encoders=encoders, device=on), token_budget=token_budget)
+        if dtype is None and on.type == "cpu":
+            dtype = torch.float32
+        processor = processor or checkpoint.config.base_model_id
+        return cls(VlmFamily.of(checkpoint, processor, on, dtype), token_budget=token_budget)
 
     def evaluate(self, samples: Sequence[Sample]) -> list[Outcome]:
         """The result of each sample, or the error of one that has none; neighbours make no difference.
 
         InvalidSampleError: this checkpoint cannot score the sample.
-        InferenceFailedError: the network gave something that is no number.
+        InferenceFailedError: the network gave something that is no number, or the sample does not fit in memory.
         """
         started_s = time.perf_counter()
         outcomes: dict[int, Outcome] = {}
-        rows: list[Row] = []
+        rows: list[Any] = []
         rows_of: dict[int, slice] = {}
-        for index, sample in enumerate(self._embedded(samples)):
-            try:
-                sample_rows = self._rows(sample)
-            except RewardError as error:
-                outcomes[index] = error
+        for index, sample_rows in enumerate(self.family.rows(samples)):
+            error = sample_rows if isinstance(sample_rows, RewardError) else self._over_budget(sample_rows)
+            if isinstance(sample_rows, RewardError) or error is not None:
+                outcomes[index] = error  # type: ignore[assignment]
                 continue
             rows_of[index] = slice(len(rows), len(rows) + len(sample_rows))
             rows += sample_rows
-
-        forward_s = 0.0
-        scores: dict[int, _RowScores] = {}
-        for part in self._micro_batches(rows):
-            batch = self.collator.collate([rows[index] for index in part])
-            forward_started_s = time.perf_counter()
-            scores.update(zip(part, self._score([rows[index] for index in part], batch), strict=True))
-            forward_s += time.perf_counter() - forward_started_s
-
-        in_order = [scores[index] for index in range(len(rows))]
+        scores, forward_s = self._scores(rows)
         timing = BatchTiming((time.perf_counter() - started_s - forward_s) * 1e3, forward_s * 1e3)
-        for index, part_of_rows in rows_of.items():
-            outcomes[index] = _outcome(samples[index], in_order[part_of_rows], timing)
+        for index, of_sample in rows_of.items():
+            outcomes[index] = _outcome(samples[index], scores[of_sample], timing)
         return [outcomes[index] for index in range(len(samples))]
 
-    def _embedded(self, samples: Sequence[Sample]) -> list[Sample | RewardError]:
-        """The samples with embeddings in place of raw frames."""
-        embedded: list[Sample | RewardError] = list(samples)
-        raw = {i: _joined(sample) for i, sample in enumerate(samples) if sample.trajectories[0].frames is not None}
-        if raw and self.encoders is None:
-            missing = InvalidSampleError.at("frames", "video_embeddings (no encoders are loaded)", "frames")
-            return [missing if index in raw else sample for index, sample in enumerate(samples)]
-        if raw and self.encoders is not None:
-            for index, encoded in zip(raw, self.encoders.encode(list(raw.values())), strict=True):
-                if isinstance(encoded, Trajectory):
-                    embedded[index] = _with_embeddings(samples[index], encoded)
-                else:
-                    embedded[index] = encoded
-        return embedded
+    def _over_budget(self, rows: Sequence[Any]) -> InvalidSampleError | None:
+        longest = max(self.family.num_tokens(self.family.lengths(row)) for row in rows)
+        if longest <= self.token_budget:
+            return None
+        expected = f"at most {self.token_budget} tokens (token_budget of this server)"
+        return InvalidSampleError.at("num_frames", expected, f"{longest} tokens")
 
-    def _rows(self, sample: Sample | RewardError) -> list[Row]:
-        if isinstance(sample, RewardError):
-            raise sample
-        rows = self.collator.rows(sample)
-        longest = max(map(self.collator.num_tokens, rows))
-        if longest > self.token_budget:
-            expected = f"at most {self.token_budget} tokens (token_budget of this server)"
-            raise InvalidSampleError.at("num_frames", expected, f"{longest} tokens")
-        return rows
+    def _scores(self, rows: Sequence[Any]) -> tuple[list[RowScores | RewardError], float]:
+        """Each row's scores, and the seconds spent in forward passes. The next batch is collated meanwhile."""
+        scores: dict[int, RowScores | RewardError] = {}
+        forward_s = 0.0
+        parts = list(self._micro_batches(rows))
+        with ThreadPoolExecutor(1) as collating:
+            batches = [collating.submit(self.family.collate, [rows[i] for i in part]) for part in parts[:1]]
+            for number, part in enumerate(parts):
+                batch = batches.pop().result()
+                for following in parts[number + 1 : number + 2]:
+                    batches.append(collating.submit(self.family.collate, [rows[i] for i in following]))
+                started_s = time.perf_counter()
+                scores.update(zip(part, self._score([rows[i] for i in part], batch), strict=True))
+                forward_s += time.perf_counter() - started_s
+        return [scores[index] for index in range(len(rows))], forward_s
 
-    def _micro_batches(self, rows: Sequence[Row]) -> Iterator[list[int]]:
+    def _score(self, rows: Sequence[Any], batch: Any) -> Sequence[RowScores | RewardError]:
+        """One forward; out of memory, its halves; a row that does not fit alone is an error of its own."""
+        try:
+            return self.family.score(rows, batch)
+        except torch.OutOfMemoryError:
+            self.out_of_memory_count += 1
+            _log.warning("out of memory with %d rows (%d times so far)", len(rows), self.out_of_memory_count)
+        if torch.cuda.is_available():
+            torch.cuda.empty_cache()
+        if len(rows) == 1:
+            return [InferenceFailedError("the sample does not fit in the device's memory")]
+        half = len(rows) // 2
+        return [s for part in (rows[:half], rows[half:]) for s in self._score(part, self.family.collate(part))]
+
+    def _micro_batches(self, rows: Sequence[Any]) -> Iterator[list[int]]:
         """Indices of the rows of each forward: one kind, similar lengths, within the token budget."""
-
-        def lengths(index: int) -> tuple[bool, int, int]:
-            return rows[index].second is not None, rows[index].num_first, rows[index].num_second
-
-        for _, kind in groupby(sorted(range(len(rows)), key=lengths), key=lambda index: lengths(index)[0]):
+        lengths = [self.family.lengths(row) for row in rows]
+        in_order = sorted(range(len(rows)), key=lambda index: (len(lengths[index]), lengths[index]))
+        for _, kind in groupby(in_order, key=lambda index: len(lengths[index])):
             part: list[int] = []
-            padded = (0, 0)
+            padded: tuple[int, ...] = ()
             for index in kind:
-                _, *own = lengths(index)
-                grown = (max(padded[0], own[0]), max(padded[1], own[1]))
-                if part and (len(part) + 1) * self.network.config.num_tokens(*grown) > self.token_budget:
+                grown = tuple(map(max, padded, lengths[index])) if part else lengths[index]
+                if part and (len(part) + 1) * self.family.num_tokens(grown) > self.token_budget:
                     yield part
-                    part, grown = [], (own[0], own[1])
+                    part, grown = [], lengths[index]
                 part.append(index)
                 padded = grown
             yield part
 
-    @torch.inference_mode()
-    def _score(self, rows: Sequence[Row], batch: RewindBatch) -> list[_RowScores]:
-        output = self.network(batch.to(self.device))
-        firsts = _frame_scores(output.first_progress, output.first_success, [row.num_first for row in rows])
-        if output.query is None:
-            return [_RowScores([first]) for first in firsts]
-        seconds = _frame_scores(output.second_progress, output.second_success, [row.num_second for row in rows])
-        logits, probabilities = output.query.float().tolist(), output.query.sigmoid().float().tolist()
-        queries = [logits[i] if row.is_similarity else probabilities[i] for i, row in enumerate(rows)]
-        return [_RowScores([*pair], query) for *pair, query in zip(firsts, seconds, queries, strict=True)]
 
-
-def _frame_scores(progress_logits: Tensor, success_logits: Tensor, lengths: Sequence[int]) -> list[FrameScores]:
-    """Per row its frames' scores without padding, on the CPU; logits [B, T, K] and [B, T]."""
-    progress = progress_from_logits(progress_logits).cpu().numpy()
-    success = success_logits.sigmoid().float().cpu().numpy()
-    discrete = progress_logits.shape[-1] > 1
-    logits = progress_logits.float().cpu().numpy() if discrete else None
-    return [
-        FrameScores(
-            progress=progress[row, :length],
-            success=success[row, :length],
-            progress_logits=None if logits is None else logits[row, :length],
-        )
-        for row, length in enumerate(lengths)
-    ]
-
-
-def _joined(sample: Sample) -> Trajectory:
-    """All frames of a sample and its task, as one trajectory."""
-    frames = np.concatenate([trajectory.positions for trajectory in sample.trajectories])
-    return Trajectory(frames=frames, task=sample.trajectories[0].task)
-
-
-def _with_embeddings(sample: Sample, joined: Trajectory) -> Sample:
-    bounds = np.cumsum([trajectory.num_frames for trajectory in sample.trajectories])[:-1]
-    videos = np.split(joined.positions, bounds)
-    parts = [Trajectory(video_embeddings=video, text_embedding=joined.text_embedding) for video in videos]
-    if isinstance(sample, ProgressSample):
-        return replace(sample, trajectory=parts[0])
-    return type(sample)(parts[0], parts[1])
-
-
-def _outcome(sample: Sample, scores: Sequence[_RowScores], timing: BatchTiming) -> Outcome:
-    if not all(row.is_finite() for row in scores):
+def _outcome(sample: Sample, scores: Sequence[RowScores | RewardError], timing: BatchTiming) -> Outcome:
+    rows = [row for row in scores if isinstance(row, RowScores)]
+    if len(rows) < len(scores):
+        return next(row for row in scores if isinstance(row, RewardError))
+    if not all(row.is_finite() for row in rows):
         return InferenceFailedError("the network gave a score that is not finite")
     if isinstance(sample, ProgressSample):
-        frames = _last_of_each(scores) if sample.frame_steps else scores[0].frames[0]
+        frames = _last_of_each(rows) if sample.frame_steps else rows[0].frames[0]
         logits = frames.progress_logits
         return ProgressResult(progress=frames.progress, success=frames.success, progress_logits=logits, timing=timing)
-    first, second = scores[0].frames
-    query = scores[0].query
+    first, second = rows[0].frames
+    query = rows[0].query
     assert query is not None  # every row of two trajectories carries a question
     if isinstance(sample, PreferenceSample):
         return PreferenceResult(preference=query, first=first, second=second, timing=timing)
     return SimilarityResult(similarity=query, reference=first, other=second, timing=timing)
 
 
-def _last_of_each(rows: Sequence[_RowScores]) -> FrameScores:
+def _last_of_each(rows: Sequence[RowScores]) -> FrameScores:
     """Dense mode: frame t's score is the last one of the row of its prefix."""
     frames = [row.frames[0] for row in rows]
     logits = [scores.progress_logits[-1] for scores in frames if scores.progress_logits is not None]

@@ -15,6 +15,7 @@ import rfm_export
 from rfm import checkpoint as checkpoints
 from rfm.config import ServeConfig
 from rfm.engine import Engine
+from rfm.families.rewind import RewindFamily
 from rfm.server.installation import find_installation
 from rfm.server.process import Endpoints, TritonServer
 from rfm_client import RewardClient, Trajectory
@@ -31,6 +32,7 @@ def serve_config(config: goldens.Config, name: str = "rfm") -> ServeConfig:
         torch_threads=1,
         image_encoder=str(config.image_encoder) if config.image_encoder else None,
         text_encoder=str(config.text_encoder) if config.text_encoder else None,
+        base_model=str(config.base_model) if config.base_model else None,
     )
 
 
@@ -38,8 +40,18 @@ def serve_config(config: goldens.Config, name: str = "rfm") -> ServeConfig:
 def load_engine(name: str) -> Engine:
     """The engine of a reference checkpoint, with its encoders if it has some."""
     config = goldens.config(name)
+    if config.is_vlm:
+        return Engine.from_checkpoint(config.checkpoint, base_model=str(config.base_model))
     checkpoint = checkpoints.load(config.checkpoint)
-    return Engine(checkpoint.build(), encoders=load_encoders(checkpoint, serve_config(config)))
+    assert isinstance(checkpoint, checkpoints.RewindCheckpoint)
+    return Engine.of(checkpoint, encoders=load_encoders(checkpoint, serve_config(config)))
+
+
+def rewind_of(name: str) -> RewindFamily:
+    """What of a reference checkpoint's engine is ReWiND's own."""
+    family = load_engine(name).family
+    assert isinstance(family, RewindFamily)
+    return family
 
 
 @pytest.fixture
@@ -65,7 +77,7 @@ class Served:
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("served")
     repository = folder / "model_repository"
-    for config in (*goldens.REWIND, *goldens.WITH_ENCODERS):
+    for config in (*goldens.REWIND, *goldens.WITH_ENCODERS, *goldens.VLM):
         rfm_export.export(config.checkpoint, repository, serve_config(config, config.name))
     with (
         (folder / "tritonserver.log").open("wb") as log,

@@ -9,7 +9,7 @@ import goldens
 import numpy as np
 import pytest
 import torch
-from conftest import load_engine
+from conftest import rewind_of
 from safetensors.torch import load_file, save_file
 
 from rfm.models.encoders import PREPROCESSOR_CONFIG, Encoders, ImagePreprocessor
@@ -22,7 +22,7 @@ EMBEDDING_TOLERANCE = 2e-5
 
 @pytest.fixture
 def encoders() -> Encoders:
-    encoders = load_engine(NAME).encoders
+    encoders = rewind_of(NAME).encoders
     assert encoders is not None
     return encoders
 
@@ -45,7 +45,7 @@ def test_pixels_are_those_of_the_original(case: goldens.Case, encoders: Encoders
 
 @pytest.mark.parametrize("case", [case for case in CASES if "steps" not in case.content["kind"]], ids=str)
 def test_embeddings_are_those_of_the_original(case: goldens.Case) -> None:
-    encoders = load_engine(case.config.name).encoders
+    encoders = rewind_of(case.config.name).encoders
     assert encoders is not None
     arrays = cases_arrays(case)
     samples = case.samples()

@@ -211,7 +211,7 @@ def test_a_model_keeps_its_inputs_and_outputs(tmp_path: Path) -> None:
 
 def test_an_ensemble_does_not_lose_its_encoder(tmp_path: Path) -> None:
     export(FRAMES, tmp_path)
-    with pytest.raises(ExportError, match="scores raw frames, which this checkpoint cannot"):
+    with pytest.raises(ExportError, match="expected a checkpoint that this model can serve too"):
         export(EMBEDDINGS, tmp_path)
 
 

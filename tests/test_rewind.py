@@ -14,8 +14,10 @@ import torch
 from conftest import random_trajectory
 from torch import Tensor, nn
 
-from rfm.collate import RewindCollator, prefix_indices
+from rfm.collate.rewind import RewindCollator, prefix_indices
+from rfm.config import DEFAULT_TOKEN_BUDGET
 from rfm.engine import Engine, Outcome
+from rfm.families.rewind import RewindFamily
 from rfm.models.heads import PredictionHead, progress_from_logits
 from rfm.models.rewind import RewindConfig, RewindTransformer
 from rfm_client import (
@@ -61,6 +63,10 @@ def build(config: RewindConfig, seed: int = 0) -> RewindTransformer:
     for parameter in network.parameters():  # no layer is left at zeros or ones
         nn.init.normal_(parameter, std=0.3)
     return network.requires_grad_(False)
+
+
+def engine_of(network: RewindTransformer, *, device: str = "cpu", token_budget: int = DEFAULT_TOKEN_BUDGET) -> Engine:
+    return Engine(RewindFamily(network, encoders=None, device=torch.device(device)), token_budget=token_budget)
 
 
 def trajectory(seed: int, num_frames: int) -> Trajectory:
@@ -136,7 +142,7 @@ def samples_for(config: RewindConfig) -> list[Sample]:
 def test_every_variant_scores_as_torchs_own_transformer(config: RewindConfig) -> None:
     network = build(config)
     samples = samples_for(config)
-    for sample, outcome in zip(samples, Engine(network).evaluate(samples), strict=True):
+    for sample, outcome in zip(samples, engine_of(network).evaluate(samples), strict=True):
         expected = torch.cat([score.detach().flatten() for score in reference_scores(network, sample)])
         np.testing.assert_allclose(numbers(outcome), expected.numpy(), rtol=0, atol=TOLERANCE)
 
@@ -147,15 +153,15 @@ def test_a_result_does_not_depend_on_its_neighbours(config: RewindConfig, token_
     samples = samples_for(config) * 3
     order = np.random.default_rng(0).permutation(len(samples))
     network = build(config)
-    alone = [numbers(Engine(network).evaluate([sample])[0]) for sample in samples]
-    together = Engine(network, token_budget=token_budget).evaluate([samples[index] for index in order])
+    alone = [numbers(engine_of(network).evaluate([sample])[0]) for sample in samples]
+    together = engine_of(network, token_budget=token_budget).evaluate([samples[index] for index in order])
     for index, outcome in zip(order, together, strict=True):
         np.testing.assert_allclose(numbers(outcome), alone[index], rtol=0, atol=TOLERANCE)
 
 
 def test_frames_beyond_max_len_are_taken_without_progress_tokens() -> None:
     config = replace(BASE, use_per_frame_progress_token=False)
-    (outcome,) = Engine(build(config)).evaluate([ProgressSample(trajectory(0, 3 * config.max_len))])
+    (outcome,) = engine_of(build(config)).evaluate([ProgressSample(trajectory(0, 3 * config.max_len))])
     assert isinstance(outcome, ProgressResult)
     assert len(outcome.progress) == 3 * config.max_len
 
@@ -164,7 +170,7 @@ def test_the_token_budget_bounds_every_forward() -> None:
     network = build(BASE)
     sizes: list[int] = []
     network.transformer.register_forward_hook(lambda _m, inputs, _o: sizes.append(inputs[0].shape[:2].numel()))
-    Engine(network, token_budget=100).evaluate(samples_for(BASE) * 5)
+    engine_of(network, token_budget=100).evaluate(samples_for(BASE) * 5)
     assert max(sizes) <= 100
     assert len(sizes) < 30
 
@@ -174,12 +180,12 @@ def test_dense_mode_takes_as_few_forwards_as_the_budget_allows() -> None:
     calls: list[int] = []
     network.transformer.register_forward_hook(lambda *_: calls.append(1))
     samples = [ProgressSample(trajectory(t, t), frame_steps=4) for t in (3, 9, 20)]
-    Engine(network).evaluate(samples)
+    engine_of(network).evaluate(samples)
     assert len(calls) == 1
 
 
 def test_a_row_over_the_token_budget_is_refused() -> None:
-    (outcome,) = Engine(build(BASE), token_budget=10).evaluate([ProgressSample(trajectory(0, 8))])
+    (outcome,) = engine_of(build(BASE), token_budget=10).evaluate([ProgressSample(trajectory(0, 8))])
     assert str(outcome) == "num_frames: expected at most 10 tokens (token_budget of this server), got 17 tokens"
 
 
@@ -207,7 +213,7 @@ BAD_FOR_CHECKPOINT: dict[str, tuple[Sample, str]] = {
 @pytest.mark.parametrize(("sample", "message"), BAD_FOR_CHECKPOINT.values(), ids=BAD_FOR_CHECKPOINT)
 def test_what_the_checkpoint_cannot_take_fails_alone(sample: Sample, message: str) -> None:
     good = ProgressSample(trajectory(1, 3))
-    engine = Engine(build(BASE))
+    engine = engine_of(build(BASE))
     first, failed, last = engine.evaluate([good, sample, good])
     assert isinstance(failed, InvalidSampleError)
     assert str(failed) == message
@@ -217,13 +223,13 @@ def test_what_the_checkpoint_cannot_take_fails_alone(sample: Sample, message: st
 
 def test_a_score_that_is_no_number_is_an_error() -> None:
     huge = Trajectory(video_embeddings=np.full((2, 12), 3e38, np.float32), text_embedding=np.ones(6, np.float32))
-    failed, good = Engine(build(BASE)).evaluate([ProgressSample(huge), ProgressSample(trajectory(0, 2))])
+    failed, good = engine_of(build(BASE)).evaluate([ProgressSample(huge), ProgressSample(trajectory(0, 2))])
     assert isinstance(failed, InferenceFailedError)
     assert isinstance(good, ProgressResult)
 
 
 def test_no_samples_no_results() -> None:
-    assert Engine(build(BASE)).evaluate([]) == []
+    assert engine_of(build(BASE)).evaluate([]) == []
 
 
 def test_prefixes_are_sampled_as_the_original_samples_them() -> None:
@@ -274,7 +280,7 @@ def test_the_engine_gives_every_reference_answer(case: goldens.Case, engine: Cal
         return
     results = [outcome for outcome in outcomes if not isinstance(outcome, RewardError)]
     for result, expected in zip(results, case.expected(), strict=True):
-        goldens.check(result, expected)
+        goldens.check(result, expected, case.tolerances())
     case.check_response(results)
 
 
@@ -282,6 +288,6 @@ def test_the_engine_gives_every_reference_answer(case: goldens.Case, engine: Cal
 @pytest.mark.parametrize("config", VARIANTS.values(), ids=VARIANTS)
 def test_the_gpu_gives_the_numbers_of_the_cpu(config: RewindConfig) -> None:
     samples = samples_for(config)
-    on_cpu, on_gpu = (Engine(build(config), device=device).evaluate(samples) for device in ("cpu", "cuda"))
+    on_cpu, on_gpu = (engine_of(build(config), device=device).evaluate(samples) for device in ("cpu", "cuda"))
     for left, right in zip(on_cpu, on_gpu, strict=True):
         np.testing.assert_allclose(numbers(left), numbers(right), rtol=0, atol=1e-4)

@@ -11,7 +11,7 @@ import goldens
 import numpy as np
 import pytest
 import tritonclient.grpc
-from conftest import Served, load_engine, random_trajectory
+from conftest import Served, load_engine, random_trajectory, rewind_of
 
 from rfm_client import (
     InvalidSampleError,
@@ -51,17 +51,16 @@ def mixed_samples(count: int, longest: int = 16) -> list[Sample]:
 
 @pytest.mark.parametrize("case", goldens.ANSWERED, ids=str)
 def test_every_reference_answer_comes_back_over_the_wire(served: Served, protocol: str, case: goldens.Case) -> None:
-    config = load_engine(case.config.name).network.config
     with served.client(protocol, case.config.name) as client:
-        results = client.evaluate(case.samples(), logits=config.progress_bins > 1)
+        results = client.evaluate(case.samples(), logits=case.config.is_discrete)
     for result, expected in zip(results, case.expected(), strict=True):
-        goldens.check(result, expected)
+        goldens.check(result, expected, case.tolerances())
     case.check_response(results)
 
 
 @pytest.mark.parametrize("case", goldens.REFUSED, ids=str)
 def test_too_long_a_trajectory_is_refused_with_the_limit(served: Served, protocol: str, case: goldens.Case) -> None:
-    limit = load_engine(case.config.name).network.config.max_len
+    limit = rewind_of(case.config.name).network.config.max_len
     with (
         served.client(protocol, case.config.name) as client,
         pytest.raises(InvalidSampleError, match=f"at most {limit} "),

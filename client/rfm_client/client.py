@@ -96,8 +96,8 @@ class RewardClient:
         return [outcomes[index] for index in range(len(samples))]
 
     def is_ready(self) -> bool:
-        """Whether the server answers and the model is ready."""
-        return self._transport.is_ready(self._model)
+        """Whether the server answers and the model is ready, for embeddings or for raw frames."""
+        return any(self._transport.is_ready(model) for model in (self._model, f"{self._model}_frames"))
 
     def close(self) -> None:
         """Closes the connection."""

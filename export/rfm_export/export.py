@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,13 @@ import torch
 from google.protobuf.text_format import ParseError
 
 from rfm import checkpoint as checkpoints
-from rfm.checkpoint import RewindCheckpoint
+from rfm.checkpoint import Checkpoint, RewindCheckpoint, VlmCheckpoint
 from rfm.config import ServeConfig
-from rfm.engine import Engine
+from rfm.engine import PROCESSOR_FOLDER, Engine
+from rfm.families.vlm import load_collator, save_processor
 from rfm.models.encoders import Encoders
 from rfm_export.errors import ExportError
-from rfm_export.layout import GeneratedModel, encoder_name, frames_name, rewind_models
+from rfm_export.layout import GeneratedModel, encoder_name, frames_name, rewind_models, vlm_models
 from rfm_export.publish import next_version, publish, read_config, staging
 from rfm_export.verify import probes, verify
 
@@ -29,53 +31,57 @@ DEFAULT_IMAGE_ENCODER = "facebook/dinov2-base"
 DEFAULT_TEXT_ENCODER = "sentence-transformers/all-MiniLM-L12-v2"
 
 
+@dataclass(frozen=True)
+class _Plan:
+    """How one checkpoint is exported.
+
+    write: puts weights and what goes with them into a staged repository
+    original, exported: engines of the checkpoint, and of what was staged; made when needed, since both may be large
+    """
+
+    models: list[GeneratedModel]
+    write: Callable[[Path], None]
+    original: Callable[[], Engine]
+    exported: Callable[[Path], Engine]
+    embeddings: bool
+    frames: bool
+
+
 def export(source: str | Path, repository: Path, serve: ServeConfig) -> int:
     """Writes the checkpoint at ``source`` into ``repository`` and gives its version number.
 
     The staged files are loaded and compared with the original before anything in the repository changes.
     Raises CheckpointError, ExportError.
     """
-    checkpoint = checkpoints.load(source)
-    encoders = load_encoders(checkpoint, serve)
+    checkpoint = checkpoints.load(source, base_model=serve.base_model)
     version = next_version(repository, [serve.name, encoder_name(serve.name), frames_name(serve.name)])
-    models = rewind_models(
-        checkpoint.config, serve, num_gpus=_num_gpus(serve), version=version, with_encoders=encoders is not None
-    )
-    _check_replaceable(repository, models, serve)
+    if isinstance(checkpoint, RewindCheckpoint):
+        plan = _rewind_plan(checkpoint, serve, version)
+    else:
+        plan = _vlm_plan(checkpoint, serve, version, checkpoints.find(source))
+    _check_replaceable(repository, plan.models, serve)
     with staging(repository) as folder:
-        for path, content in (item for model in models for item in model.files().items()):
+        for path, content in (item for model in plan.models for item in model.files().items()):
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
             (folder / path).write_bytes(content)
-        scorer = folder / serve.name / str(version)
-        checkpoints.save(checkpoint, scorer / CHECKPOINT_FOLDER)
-        exported_encoders = None
-        if encoders is not None:
-            parts = folder / encoder_name(serve.name) / str(version)
-            encoders.save_pretrained(parts / IMAGE_ENCODER_FOLDER, parts / TEXT_ENCODER_FOLDER)
-            exported_encoders = Encoders.from_pretrained(parts / IMAGE_ENCODER_FOLDER, parts / TEXT_ENCODER_FOLDER)
-        original = Engine(checkpoint.build(), encoders=encoders)
-        exported = Engine(checkpoints.load(scorer / CHECKPOINT_FOLDER).build(), encoders=exported_encoders)
-        verify(original, exported, probes(checkpoint.config, with_frames=encoders is not None))
-        publish(repository, folder, models)
+        plan.write(folder)
+        samples = probes(checkpoint.config, with_embeddings=plan.embeddings, with_frames=plan.frames)
+        verify(plan.original, lambda: plan.exported(folder), samples)
+        publish(repository, folder, plan.models)
     return version
 
 
 def check(repository: Path, serve: ServeConfig) -> list[str]:
     """How the repository's generated files differ from what an export would write now; empty if they do not."""
-    versions = _read_config(repository, serve.name).version_policy.specific.versions
+    scorer = serve.name if (repository / serve.name).exists() else frames_name(serve.name)
+    versions = _read_config(repository, scorer).version_policy.specific.versions
     if not versions:
-        raise ExportError(f"{repository / serve.name}: expected a configuration that names its versions, got none")
+        raise ExportError(f"{repository / scorer}: expected a configuration that names its versions, got none")
     version = max(versions)
-    checkpoint = checkpoints.load(repository / serve.name / str(version) / CHECKPOINT_FOLDER)
-    models = rewind_models(
-        checkpoint.config,
-        serve,
-        num_gpus=_num_gpus(serve),
-        version=version,
-        with_encoders=(repository / encoder_name(serve.name)).exists(),
-    )
+    checkpoint = checkpoints.load(repository / scorer / str(version) / CHECKPOINT_FOLDER)
+    with_encoders = (repository / encoder_name(serve.name)).exists()
     differences = []
-    for path, content in (item for model in models for item in model.files().items()):
+    for path, content in (i for m in _models(checkpoint, serve, version, with_encoders) for i in m.files().items()):
         if not (repository / path).is_file():
             differences.append(f"{repository / path}: is missing")
         elif (repository / path).read_bytes() != content:
@@ -109,8 +115,64 @@ def load_encoders(checkpoint: RewindCheckpoint, serve: ServeConfig) -> Encoders 
     return encoders
 
 
-def _num_gpus(serve: ServeConfig) -> int:
-    return torch.cuda.device_count() if serve.num_gpus is None else serve.num_gpus
+def _models(checkpoint: Checkpoint, serve: ServeConfig, version: int, with_encoders: bool) -> list[GeneratedModel]:
+    num_gpus = torch.cuda.device_count() if serve.num_gpus is None else serve.num_gpus
+    if isinstance(checkpoint, VlmCheckpoint):
+        return vlm_models(checkpoint.config, serve, num_gpus=num_gpus, version=version)
+    return rewind_models(checkpoint.config, serve, num_gpus=num_gpus, version=version, with_encoders=with_encoders)
+
+
+def _rewind_plan(checkpoint: RewindCheckpoint, serve: ServeConfig, version: int) -> _Plan:
+    encoders = load_encoders(checkpoint, serve)
+
+    def of_scorer(folder: Path) -> Path:
+        return folder / serve.name / str(version) / CHECKPOINT_FOLDER
+
+    def of_encoders(folder: Path) -> tuple[Path, Path]:
+        parts = folder / encoder_name(serve.name) / str(version)
+        return parts / IMAGE_ENCODER_FOLDER, parts / TEXT_ENCODER_FOLDER
+
+    def write(folder: Path) -> None:
+        checkpoints.save(checkpoint, of_scorer(folder))
+        if encoders is not None:
+            encoders.save_pretrained(*of_encoders(folder))
+
+    def exported(folder: Path) -> Engine:
+        saved = Encoders.from_pretrained(*of_encoders(folder)) if encoders is not None else None
+        return Engine.from_checkpoint(of_scorer(folder), encoders=saved)
+
+    return _Plan(
+        models=_models(checkpoint, serve, version, encoders is not None),
+        write=write,
+        original=lambda: Engine.of(checkpoint, encoders=encoders),
+        exported=exported,
+        embeddings=True,
+        frames=encoders is not None,
+    )
+
+
+def _vlm_plan(checkpoint: VlmCheckpoint, serve: ServeConfig, version: int, source: Path) -> _Plan:
+    processor: str | Path = serve.base_model or checkpoint.config.base_model_id
+    if serve.base_model is None and (source / PROCESSOR_FOLDER).is_dir():
+        processor = source / PROCESSOR_FOLDER
+    collator = load_collator(checkpoint, processor)
+
+    def of_scorer(folder: Path) -> Path:
+        return folder / frames_name(serve.name) / str(version) / CHECKPOINT_FOLDER
+
+    def write(folder: Path) -> None:
+        checkpoints.save(checkpoint, of_scorer(folder))
+        save_processor(collator, of_scorer(folder) / PROCESSOR_FOLDER)
+
+    device = "cuda" if torch.cuda.is_available() and serve.num_gpus != 0 else "cpu"
+    return _Plan(
+        models=_models(checkpoint, serve, version, with_encoders=False),
+        write=write,
+        original=lambda: Engine.of(checkpoint, processor=processor, device=device, dtype=serve.torch_dtype),
+        exported=lambda folder: Engine.from_checkpoint(of_scorer(folder), device=device, dtype=serve.torch_dtype),
+        embeddings=False,
+        frames=True,
+    )
 
 
 def _read_config(repository: Path, name: str) -> Any:
@@ -123,11 +185,12 @@ def _read_config(repository: Path, name: str) -> Any:
 def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], serve: ServeConfig) -> None:
     """A model keeps its inputs and outputs from version to version; its clients rely on them."""
     names = {model.name for model in models}
-    if frames_name(serve.name) not in names and (repository / frames_name(serve.name)).exists():
-        raise ExportError(
-            f"{repository / frames_name(serve.name)} scores raw frames, which this checkpoint cannot without "
-            "--image-encoder and --text-encoder; give them, or another --name"
-        )
+    for name in (serve.name, encoder_name(serve.name), frames_name(serve.name)):
+        if name not in names and (repository / name).exists():
+            raise ExportError(
+                f"{repository / name}: expected a checkpoint that this model can serve too, got one that it cannot; "
+                "name its encoders (--image-encoder, --text-encoder) or choose another --name"
+            )
     for model in models:
         if not (repository / model.name).exists():
             continue

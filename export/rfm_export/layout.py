@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The models that serve a ReWiND checkpoint, and every generated file of them.
+"""The models that serve a checkpoint, and every generated file of them.
 
-``<name>`` scores embeddings. With encoders there are also ``<name>_encoder`` and ``<name>_frames``, the ensemble
-of the two that scores raw frames.
+ReWiND: ``<name>`` scores embeddings. With encoders there are also ``<name>_encoder`` and ``<name>_frames``, the
+ensemble of the two that scores raw frames. Vision-language: ``<name>_frames`` alone.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.config import ServeConfig
 from rfm.models.rewind import RewindConfig
+from rfm.models.vlm import VlmConfig
 from rfm_client import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory, wire
 from rfm_export.pbtxt import Interface, Warmup, ensemble_config, python_config, render
 
@@ -75,13 +76,25 @@ def rewind_models(
     dims = config.video_feature_dim, config.text_feature_dim
     outputs = wire.score_outputs(config.progress_bins if config.progress_bins > 1 else None)
     scorer = Interface(serve.name, wire.embedding_inputs(*dims), outputs)
-    models = [_python_model(scorer, "rfm", serve, num_gpus, version, _scorer_warmups(config))]
+    models = [
+        _python_model(
+            scorer, "rfm", serve, num_gpus, version, _warmups(_warmup_embeddings(config), config.has_similarity)
+        )
+    ]
     if with_encoders:
         encoder = Interface(encoder_name(serve.name), wire.encoder_inputs(), wire.encoder_outputs(*dims))
         frames = Interface(frames_name(serve.name), wire.frame_inputs(), outputs)
         models.append(_python_model(encoder, "rfm_encoder", serve, num_gpus, version, [_encoder_warmup()]))
         models.append(GeneratedModel(ensemble_config(frames, serve, version, encoder, scorer), version))
     return models
+
+
+def vlm_models(config: VlmConfig, serve: ServeConfig, *, num_gpus: int, version: int) -> list[GeneratedModel]:
+    """The one model of a vision-language checkpoint."""
+    outputs = wire.score_outputs(config.progress_bins if config.progress_bins > 1 else None)
+    frames = Interface(frames_name(serve.name), wire.frame_inputs(), outputs)
+    warmups = _warmups(_warmup_frames(), config.has_similarity)
+    return [_python_model(frames, "rfm", serve, num_gpus, version, warmups)]
 
 
 def _python_model(
@@ -93,22 +106,28 @@ def _python_model(
     return GeneratedModel(config, version, model_file.read_bytes(), files)
 
 
-def _scorer_warmups(config: RewindConfig) -> list[Warmup]:
+def _warmups(trajectory: Trajectory, has_similarity: bool) -> list[Warmup]:
     """One sample of each type that the checkpoint can score."""
-    trajectory = Trajectory(
-        video_embeddings=np.zeros((WARMUP_FRAMES, config.video_feature_dim), np.float32),
-        text_embedding=np.zeros(config.text_feature_dim, np.float32),
-    )
     samples: dict[str, Sample] = {
         "progress": ProgressSample(trajectory),
         "preference": PreferenceSample(trajectory, trajectory),
     }
-    if config.has_similarity:
+    if has_similarity:
         samples["similarity"] = SimilaritySample(trajectory, trajectory)
     return [Warmup(name, wire.encode_samples([sample])) for name, sample in samples.items()]
 
 
+def _warmup_embeddings(config: RewindConfig) -> Trajectory:
+    return Trajectory(
+        video_embeddings=np.zeros((WARMUP_FRAMES, config.video_feature_dim), np.float32),
+        text_embedding=np.zeros(config.text_feature_dim, np.float32),
+    )
+
+
+def _warmup_frames() -> Trajectory:
+    return Trajectory(frames=np.zeros((WARMUP_FRAMES, WARMUP_SIZE_PX, WARMUP_SIZE_PX, 3), np.uint8), task="warm up")
+
+
 def _encoder_warmup() -> Warmup:
-    frames = np.zeros((WARMUP_FRAMES, WARMUP_SIZE_PX, WARMUP_SIZE_PX, 3), np.uint8)
-    tensors = wire.encode_samples([ProgressSample(Trajectory(frames=frames, task="warm up"))])
+    tensors = wire.encode_samples([ProgressSample(_warmup_frames())])
     return Warmup("frames", {spec.name: tensors[spec.name] for spec in wire.encoder_inputs()})

@@ -13,7 +13,7 @@ from google.protobuf import text_format
 from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.config import ServeConfig
-from rfm.server.batch_model import BUDGET_PARAMETER, THREADS_PARAMETER
+from rfm.server.batch_model import BUDGET_PARAMETER, DTYPE_PARAMETER, THREADS_PARAMETER
 from rfm_client import wire
 from rfm_client.wire import TensorSpec
 
@@ -56,6 +56,7 @@ def python_config(
         group.gpus.extend(range(num_gpus))
     config.parameters[BUDGET_PARAMETER].string_value = str(serve.token_budget)
     config.parameters[THREADS_PARAMETER].string_value = str(serve.torch_threads)
+    config.parameters[DTYPE_PARAMETER].string_value = serve.dtype or ""
     for warmup in warmups:
         sample = config.model_warmup.add(name=warmup.name, batch_size=1)
         for spec in interface.inputs:

@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from rfm.engine import Engine, Outcome
 from rfm.models.rewind import RewindConfig
+from rfm.models.vlm import VlmConfig
 from rfm_client import (
     FrameScores,
     PreferenceResult,
@@ -30,11 +31,12 @@ PROBE_FRAME_STEPS = 2
 PROBE_SEED = 0
 
 
-def probes(config: RewindConfig, *, with_frames: bool) -> list[Sample]:
+def probes(config: RewindConfig | VlmConfig, *, with_embeddings: bool, with_frames: bool) -> list[Sample]:
     """Random samples of each type that the checkpoint can score, of several lengths."""
     random = np.random.default_rng(PROBE_SEED)
 
     def embedded(num_frames: int) -> Trajectory:
+        assert isinstance(config, RewindConfig)  # no other takes embeddings
         return Trajectory(
             video_embeddings=random.standard_normal((num_frames, config.video_feature_dim), np.float32),
             text_embedding=random.standard_normal(config.text_feature_dim, np.float32),
@@ -45,9 +47,10 @@ def probes(config: RewindConfig, *, with_frames: bool) -> list[Sample]:
         return Trajectory(frames=frames, task=f"pick up {num_frames} red cups")
 
     samples: list[Sample] = []
-    for make in (embedded, filmed) if with_frames else (embedded,):
+    limit = config.max_frames if isinstance(config, RewindConfig) else None
+    for make in ([embedded] if with_embeddings else []) + ([filmed] if with_frames else []):
         for num_frames in PROBE_FRAMES:
-            length = min(num_frames, config.max_frames or num_frames)
+            length = min(num_frames, limit or num_frames)
             samples.append(ProgressSample(make(length)))
             samples.append(ProgressSample(make(length), frame_steps=PROBE_FRAME_STEPS))
             samples.append(PreferenceSample(make(length), make(1)))
@@ -56,9 +59,10 @@ def probes(config: RewindConfig, *, with_frames: bool) -> list[Sample]:
     return samples
 
 
-def verify(original: Engine, exported: Engine, samples: Sequence[Sample]) -> None:
-    """Raises ExportDiffersError unless both engines give the same numbers for every sample."""
-    for index, (before, after) in enumerate(zip(original.evaluate(samples), exported.evaluate(samples), strict=True)):
+def verify(original: Callable[[], Engine], exported: Callable[[], Engine], samples: Sequence[Sample]) -> None:
+    """Raises ExportDiffersError unless both engines give the same numbers for every sample; one is made at a time."""
+    scores = [make().evaluate(samples) for make in (original, exported)]
+    for index, (before, after) in enumerate(zip(*scores, strict=True)):
         expected, got = _numbers(before), _numbers(after)
         if not np.allclose(got, expected, rtol=0, atol=TOLERANCE):
             largest = np.abs(got - expected).max()

@@ -14,7 +14,9 @@ from typing import Any, NamedTuple
 import torch
 from safetensors.torch import load_file, save_file
 
-from rfm.checkpoint import IMAGE_ENCODER_PREFIX, TEXT_ENCODER_PREFIX, WEIGHTS, RewindCheckpoint, save
+from rfm.checkpoint import RewindCheckpoint, save
+from rfm.checkpoint.files import WEIGHTS
+from rfm.checkpoint.rewind import IMAGE_ENCODER_PREFIX, TEXT_ENCODER_PREFIX
 from rfm.models.encoders import Encoders, ImagePreprocessor
 from rfm.models.rewind import RewindConfig, RewindTransformer
 

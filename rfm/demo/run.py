@@ -64,10 +64,10 @@ def score_embeddings(endpoints: Endpoints, config: RewindConfig, console: Consol
         console.print(scores_table(f"random embeddings over {url}", list(zip(samples, results, strict=True))))
 
 
-def video_frames(video: Path, fps: float, config: RewindConfig, console: Console) -> UInt8Array:
+def video_frames(video: Path, fps: float, max_frames: int | None, console: Console) -> UInt8Array:
     """uint8 [T, H, W, 3], the video's frames at ``fps``, or as many of them, evenly, as the checkpoint takes."""
     frames = read_video(video, fps)
-    limit = min(MAX_FRAMES, config.max_frames or MAX_FRAMES)
+    limit = min(MAX_FRAMES, max_frames or MAX_FRAMES)
     if len(frames) <= limit:
         return frames
     console.print(f"{video.name}: {len(frames)} frames at {fps:g} fps; {limit} of them, evenly, are scored")

@@ -19,6 +19,7 @@ Answer = TypeVar("Answer")
 
 THREADS_PARAMETER = "torch_threads"  # parameters of config.pbtxt; rfm_export writes them
 BUDGET_PARAMETER = "token_budget"
+DTYPE_PARAMETER = "dtype"  # empty: as the checkpoint and the device decide
 
 
 class BatchModel(Generic[Question, Answer]):

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from rfm.engine import Engine, Outcome
-from rfm.server.batch_model import BUDGET_PARAMETER, BatchModel
+from rfm.server.batch_model import BUDGET_PARAMETER, DTYPE_PARAMETER, BatchModel
 from rfm_client import Result, Sample, wire
 
 
@@ -17,8 +17,12 @@ class TritonPythonModel(BatchModel[Sample, Result]):
     """One instance: one engine on one device."""
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
-        token_budget = int(settings[BUDGET_PARAMETER])
-        self.engine = Engine.from_checkpoint(version / "checkpoint", device=device, token_budget=token_budget)
+        self.engine = Engine.from_checkpoint(
+            version / "checkpoint",
+            device=device,
+            dtype=getattr(torch, settings[DTYPE_PARAMETER]) if settings[DTYPE_PARAMETER] else None,
+            token_budget=int(settings[BUDGET_PARAMETER]),
+        )
 
     def decode(self, tensors: wire.Tensors) -> list[Sample]:
         return wire.decode_samples(tensors)

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from rfm.collate import as_tensor
 from rfm.models.rewind import RewindBatch, RewindConfig
 from rfm_client import InvalidSampleError, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.samples import Float32Array
@@ -53,11 +53,6 @@ def prefix_indices(num_frames: int, frame_steps: int) -> npt.NDArray[np.int64]:
     return np.stack([np.linspace(0, t, frame_steps).astype(np.int64) for t in range(num_frames)])
 
 
-def as_tensor(array: npt.NDArray[Any]) -> Tensor:
-    """The array as a tensor; a copy only where torch cannot share its memory (read-only, reversed)."""
-    return torch.from_numpy(np.require(array, requirements=("C", "W")))
-
-
 @dataclass(frozen=True)
 class RewindCollator:
     """What a checkpoint can take of a sample, and how a batch of it looks."""
@@ -77,10 +72,6 @@ class RewindCollator:
         if len(videos) == 1:
             return [Row(text, videos[0])]
         return [Row(text, videos[0], videos[1], isinstance(sample, SimilaritySample))]
-
-    def num_tokens(self, row: Row) -> int:
-        """L of the row alone."""
-        return self.config.num_tokens(row.num_first, row.num_second)
 
     def collate(self, rows: Sequence[Row]) -> RewindBatch:
         """A batch of rows that all have, or all lack, a second trajectory."""

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: MIT
+"""Upstream's checkpoint layouts -> configuration and weights.
+
+A checkpoint is a local folder or a Hugging Face id ``org/name[@tag]``. In it: ``model.safetensors`` (or shards
+with an index, or an adapter), ``config.json`` (the network) and, in the folder or its parent, ``config.yaml``
+(the training run). Nothing in a checkpoint is executed: safetensors only, and YAML tags construct nothing.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TypeAlias
+
+from rfm.checkpoint.files import NETWORK_CONFIG, CheckpointError, best_tag, find, read_json, read_run_config
+from rfm.checkpoint.rewind import RewindCheckpoint, load_rewind, save_rewind
+from rfm.checkpoint.vlm import ADAPTER_CONFIG, VlmCheckpoint, load_vlm, save_vlm
+from rfm.models.vlm import BACKBONES
+
+Checkpoint: TypeAlias = RewindCheckpoint | VlmCheckpoint
+
+__all__ = [
+    "Checkpoint",
+    "CheckpointError",
+    "RewindCheckpoint",
+    "VlmCheckpoint",
+    "best_tag",
+    "find",
+    "load",
+    "read_run_config",
+    "save",
+]
+
+
+def load(source: str | Path, *, base_model: str | None = None) -> Checkpoint:
+    """The checkpoint at a local folder or Hugging Face id. Raises CheckpointError.
+
+    base_model: folder or id of a vision-language checkpoint's backbone; else the one that the checkpoint names
+    """
+    folder = find(source)
+    if (folder / ADAPTER_CONFIG).is_file() or _model_type(folder) in BACKBONES:
+        return load_vlm(folder, base_model)
+    return load_rewind(folder)
+
+
+def save(checkpoint: Checkpoint, folder: Path) -> None:
+    """Writes network and configuration in a layout that ``load`` reads; no encoders."""
+    if isinstance(checkpoint, RewindCheckpoint):
+        save_rewind(checkpoint, folder)
+    else:
+        save_vlm(checkpoint, folder)
+
+
+def _model_type(folder: Path) -> str | None:
+    config = folder / NETWORK_CONFIG
+    return read_json(config).get("model_type") if config.is_file() else None

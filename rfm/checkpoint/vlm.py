@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: MIT
+"""Vision-language checkpoints: full weights, or LoRA weights that are merged into their base here.
+
+Names of weights become those of VlmRewardModel, by one rename table per form. LoRA: W + alpha / r * B A
+(https://arxiv.org/abs/2106.09685).
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from rfm.checkpoint.files import (
+    NETWORK_CONFIG,
+    RUN_CONFIG,
+    WEIGHTS,
+    CheckpointError,
+    check_shapes,
+    find_run_config,
+    read_json,
+    read_run_config,
+    read_tensors,
+    read_weights,
+)
+from rfm.models.vlm import BACKBONES, SMOL, VlmConfig, VlmRewardModel, build_backbone
+
+ADAPTER_CONFIG = "adapter_config.json"
+ADAPTER_WEIGHTS = "adapter_model.safetensors"
+CUSTOM_HEADS = "custom_heads.safetensors"
+SETTINGS = "rfm"  # key of our own fields in an exported config.json
+EMBEDDING = "model.language_model.embed_tokens.weight"
+
+# Renames of one form, tried in order on each name; the first that matches is applied.
+_Renames = Sequence[tuple[str, str]]
+_FULL: _Renames = ()
+_SMOL: _Renames = ((r"^model\.model\.", "model."),)
+_LORA_INSIDE: _Renames = ((r"^(model\.\w+)\.base_model\.model\.", r"\1."),)
+_ADAPTER: _Renames = ((r"^base_model\.model\.", "model."),)
+_UNUSED = ("lm_head.weight", "model.lm_head.weight")  # makes text, which no reward head reads
+
+_LORA_NAME = re.compile(r"(?P<module>.+)\.lora_(?P<side>[AB])(\.default)?\.weight")
+_BASE_LAYER = ".base_layer."
+# Fields of adapter_config.json that would make the merged weight another one.
+_UNSUPPORTED_LORA = ("use_dora", "use_rslora", "lora_bias", "alpha_pattern", "rank_pattern", "fan_in_fan_out")
+
+
+@dataclass(frozen=True)
+class VlmCheckpoint:
+    """A vision-language checkpoint in memory: weights of VlmRewardModel."""
+
+    config: VlmConfig
+    weights: dict[str, Tensor]
+
+    def build(self, dtype: torch.dtype | None = None, attention: str | None = None) -> VlmRewardModel:
+        """The network with these weights, on the CPU, ready to score, in ``dtype`` (None: its own)."""
+        wanted = dtype or self.config.torch_dtype
+        network = VlmRewardModel(self.config, build_backbone(self.config, wanted, attention))
+        check_shapes(network.state_dict(), self.weights)
+        # Parameters only: rotary frequencies stay float32, as in the original.
+        network.load_state_dict({k: v.to(wanted) for k, v in self.weights.items()}, strict=True, assign=True)
+        return network.eval().requires_grad_(False)
+
+
+def load_vlm(folder: Path, base_model: str | None = None) -> VlmCheckpoint:
+    """The checkpoint in a local folder; ``base_model`` as in ``rfm.checkpoint.load``. Raises CheckpointError."""
+    run = _run_config(folder)
+    if (folder / ADAPTER_CONFIG).is_file():
+        backbone, weights = _adapted(folder, base_model or _base_model_id(folder, run))
+    else:
+        backbone, weights = read_json(folder / NETWORK_CONFIG), read_weights(folder)
+        if any(_LORA_NAME.fullmatch(name) for name in weights):
+            peft = run.get("peft") or {}
+            weights = _merged(_renamed(weights, _LORA_INSIDE), _scaling(folder / RUN_CONFIG, peft))
+        weights = _renamed(weights, _SMOL if backbone["model_type"] == SMOL else _FULL)
+    weights = {name: tensor for name, tensor in weights.items() if name not in _UNUSED}
+    return VlmCheckpoint(_vlm_config(folder, backbone, run, weights), weights)
+
+
+def save_vlm(checkpoint: VlmCheckpoint, folder: Path) -> None:
+    """Writes merged weights and one config.json that says all."""
+    folder.mkdir(parents=True)
+    settings = {name: value for name, value in asdict(checkpoint.config).items() if name != "backbone"}
+    config = {**checkpoint.config.backbone, SETTINGS: settings}
+    (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
+    tensors = {name: tensor.contiguous() for name, tensor in checkpoint.weights.items()}
+    save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
+
+
+def _run_config(folder: Path) -> dict[str, Any]:
+    file = find_run_config(folder)
+    return {} if file is None else read_run_config(file)
+
+
+def _base_model_id(folder: Path, run: Mapping[str, Any]) -> str:
+    base = (run.get("model") or {}).get("base_model_id")
+    if not base:
+        raise CheckpointError(f"{folder}: expected model.base_model_id in {RUN_CONFIG} (or --base-model), got none")
+    return str(base)
+
+
+def _vlm_config(
+    folder: Path, backbone: dict[str, Any], run: Mapping[str, Any], weights: Mapping[str, Tensor]
+) -> VlmConfig:
+    if SETTINGS in backbone:  # written by save_vlm
+        settings = {**backbone[SETTINGS]}
+        size = settings.pop("size_px")
+        rest = {name: value for name, value in backbone.items() if name != SETTINGS}
+        return VlmConfig(backbone=rest, size_px=tuple(size) if size else None, **settings)
+    model, data, training = (run.get(section) or {} for section in ("model", "data", "training"))
+    family = backbone.get("model_type")
+    if family not in BACKBONES:
+        raise CheckpointError(f"{folder}: model_type: expected one of {', '.join(BACKBONES)}, got {family}")
+    if model.get("model_type", "default") != "default":
+        raise CheckpointError(f"{folder}: model.model_type: expected default, got {model['model_type']}")
+    for name in ("progress_head.4.weight", "frame_pool_attn.weight"):
+        if name not in weights:
+            raise CheckpointError(f"{folder}: expected reward heads, got no {name}")
+    height, width = data.get("resized_height"), data.get("resized_width")
+    config = VlmConfig(
+        backbone=backbone,
+        dtype=str(model.get("torch_dtype", "bfloat16")).removeprefix("torch."),  # type: ignore[arg-type]
+        multi_image=bool(model.get("use_multi_image", False)),
+        per_frame_progress_token=bool(model.get("use_per_frame_progress_token", False)),
+        frame_pooling=model.get("frame_pooling", "mean"),
+        pooling_temperature=float(model.get("frame_pooling_attn_temperature", 1.0)),
+        average_temporal_patches=bool(model.get("average_temporal_patches", False)),
+        progress_bins=weights["progress_head.4.weight"].shape[0],
+        has_similarity="similarity_head.0.weight" in weights,
+        progress_in_preference=bool(training.get("predict_pref_progress", False)),
+        size_px=(int(height), int(width)) if height and width else None,
+        base_model_id=str(model.get("base_model_id", "")),
+    )
+    _check_supported(folder, config)
+    return config
+
+
+def _check_supported(folder: Path, config: VlmConfig) -> None:
+    expectations: dict[str, tuple[object, tuple[object, ...]]] = {
+        "model.torch_dtype": (config.dtype, ("float32", "bfloat16", "float16")),
+        "model.frame_pooling": (config.frame_pooling, ("mean", "boundary", "attention")),
+    }
+    if config.family == SMOL or config.per_frame_progress_token:
+        why = "SmolVLM" if config.family == SMOL else "per-frame progress tokens"
+        expectations[f"model.use_multi_image with {why}"] = (config.multi_image, (True,))
+    for where, (got, expected) in expectations.items():
+        if got not in expected:
+            raise CheckpointError(f"{folder}: {where}: expected one of {expected}, got {got!r}")
+
+
+def _renamed(weights: Mapping[str, Tensor], renames: _Renames) -> dict[str, Tensor]:
+    def rename(name: str) -> str:
+        for pattern, replacement in renames:
+            changed, count = re.subn(pattern, replacement, name)
+            if count:
+                return changed
+        return name
+
+    return {rename(name): tensor for name, tensor in weights.items()}
+
+
+def _adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Configuration of the base model's backbone, and its weights with the adapter merged into them."""
+    adapter_config = read_json(folder / ADAPTER_CONFIG)
+    adapter = _renamed(read_tensors(folder / ADAPTER_WEIGHTS), _ADAPTER)
+    config, base = _read_base(base_model)
+    if EMBEDDING not in adapter:
+        raise CheckpointError(f"{folder / ADAPTER_WEIGHTS}: expected the embedding of the special tokens, got none")
+    factors = {name: tensor for name, tensor in adapter.items() if _LORA_NAME.fullmatch(name)}
+    replaced = {name: tensor for name, tensor in adapter.items() if name not in factors}
+    unknown = sorted(replaced.keys() - base.keys())
+    if unknown:
+        raise CheckpointError(f"{folder / ADAPTER_WEIGHTS}: expected weights of {base_model}, got also {unknown}")
+    config["text_config"]["vocab_size"] = len(replaced[EMBEDDING])
+    merged = _merged(base | replaced | factors, _scaling(folder / ADAPTER_CONFIG, adapter_config))
+    return config, merged | read_tensors(folder / CUSTOM_HEADS)
+
+
+def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The backbone of a base model: its configuration and its weights, named as in VlmRewardModel."""
+    import transformers
+
+    try:
+        config = transformers.AutoConfig.from_pretrained(base_model)
+        if config.model_type not in BACKBONES:
+            known = ", ".join(BACKBONES)
+            raise CheckpointError(f"base model {base_model}: expected one of {known}, got {config.model_type}")
+        network, loaded = getattr(transformers, BACKBONES[config.model_type]).from_pretrained(
+            base_model, use_safetensors=True, dtype="auto", output_loading_info=True
+        )
+    except (OSError, ValueError) as error:
+        hint = "name its folder with --base-model"
+        raise CheckpointError(f"base model {base_model}: cannot be had: {error} ({hint})") from error
+    if loaded["missing_keys"]:
+        raise CheckpointError(f"base model {base_model}: missing keys: {sorted(loaded['missing_keys'])}")
+    return config.to_dict(), {f"model.{name}": tensor for name, tensor in network.state_dict().items()}
+
+
+def _scaling(file: Path, config: Mapping[str, Any]) -> float:
+    """alpha / r of a LoRA configuration."""
+    unsupported = [name for name in _UNSUPPORTED_LORA if config.get(name)]
+    if unsupported:
+        raise CheckpointError(f"{file}: expected plain LoRA, got {', '.join(unsupported)}")
+    try:
+        return float(config["lora_alpha"]) / float(config["r"])
+    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+        raise CheckpointError(f"{file}: expected lora_alpha and r of the LoRA weights, got {error!r}") from error
+
+
+def _merged(weights: Mapping[str, Tensor], scaling: float) -> dict[str, Tensor]:
+    """The weights with each pair of LoRA factors added to the weight that it belongs to."""
+    factors: dict[str, dict[str, Tensor]] = {}
+    merged: dict[str, Tensor] = {}
+    for name, tensor in weights.items():
+        match = _LORA_NAME.fullmatch(name)
+        if match:
+            factors.setdefault(match["module"], {})[match["side"]] = tensor
+        else:
+            merged[name.replace(_BASE_LAYER, ".")] = tensor
+    for module, pair in factors.items():
+        base = merged.get(f"{module}.weight")
+        if base is None or pair.keys() != {"A", "B"}:
+            raise CheckpointError(f"{module}: expected a weight and LoRA factors A and B, got {sorted(pair)}")
+        update = scaling * (pair["B"].float() @ pair["A"].float())
+        merged[f"{module}.weight"] = (base.float() + update).to(base.dtype)
+    return merged

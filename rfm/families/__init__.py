@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""The kinds of checkpoint that can be scored, one module each."""

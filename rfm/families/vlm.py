@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: MIT
+"""RFM and Robometer: raw frames and a task as a conversation, into a vision-language backbone with reward heads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from rfm.checkpoint import CheckpointError, VlmCheckpoint
+from rfm.checkpoint.files import read_json
+from rfm.collate.images import FRAMES_PER_GROUP, Normalisation, QwenImages, SmolImages
+from rfm.collate.prompts import SPECIAL_TOKENS
+from rfm.collate.vlm import QwenCollator, SmolCollator, VlmCollator, VlmRow
+from rfm.family import RowScores, frame_scores, part_of
+from rfm.models.vlm import SMOL, VlmBatch, VlmConfig, VlmRewardModel
+from rfm_client import FrameScores, InvalidSampleError, RewardError, Sample
+
+PREPROCESSOR_CONFIG = "preprocessor_config.json"
+CHAT_TEMPLATE = "chat_template.json"
+
+
+class VlmFamily:
+    """A vision-language reward model on a device."""
+
+    def __init__(self, network: VlmRewardModel, collator: VlmCollator, device: torch.device) -> None:
+        self.network = network.to(device).eval()
+        self.collator = collator
+        self.device = device
+        self._dtype = next(network.parameters()).dtype
+
+    @classmethod
+    def of(
+        cls, checkpoint: VlmCheckpoint, processor: str | Path, device: torch.device, dtype: torch.dtype | None = None
+    ) -> VlmFamily:
+        """With tokenizer and image preprocessing from ``processor``, the base model's folder or id."""
+        collator = load_collator(checkpoint, processor)
+        return cls(checkpoint.build(dtype), collator, device)
+
+    def rows(self, samples: Sequence[Sample]) -> list[list[VlmRow] | RewardError]:
+        """Each sample's conversations, or its error."""
+        outcomes: list[list[VlmRow] | RewardError] = []
+        for sample in samples:
+            try:
+                outcomes.append(self.collator.rows(sample))
+            except InvalidSampleError as error:
+                outcomes.append(error)
+        return outcomes
+
+    def lengths(self, row: VlmRow) -> tuple[int, ...]:
+        """Tokens of the conversation."""
+        return (row.num_tokens,)
+
+    def num_tokens(self, lengths: Sequence[int]) -> int:
+        """Tokens of the conversation."""
+        return lengths[0]
+
+    def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
+        """Conversations of any kind; here their pixels are made."""
+        return self.collator.collate(rows)
+
+    @torch.inference_mode()
+    def score(self, rows: Sequence[VlmRow], batch: VlmBatch) -> list[RowScores]:
+        """One forward pass."""
+        output = self.network(batch.to(self.device, self._dtype))
+        scores = frame_scores(output.progress, output.success)
+        preference = output.preference.sigmoid().float().tolist()
+        similarity = [] if output.similarity is None else output.similarity.float().tolist()
+        of_rows, read, asked = [], 0, 0
+        for row in rows:
+            frames = []
+            for spans, video in zip(row.spans, row.frames, strict=True):
+                frames.append(self._per_frame(part_of(scores, slice(read, read + len(spans))), len(video)))
+                read += len(spans)
+            query = None
+            if row.query is not None:
+                query = (similarity if row.is_similarity else preference)[asked]
+                asked += 1
+            of_rows.append(RowScores(frames, query))
+        return of_rows
+
+    def _per_frame(self, scores: FrameScores, num_frames: int) -> FrameScores:
+        """In video mode both frames of a temporal group carry its value."""
+        if self.network.config.multi_image:
+            return scores
+        return part_of(scores, np.arange(num_frames) // FRAMES_PER_GROUP)
+
+
+def load_collator(checkpoint: VlmCheckpoint, processor: str | Path) -> VlmCollator:
+    """The collator of a checkpoint. Raises CheckpointError for a processor that cannot be had or does not fit."""
+    from transformers import AutoTokenizer
+    from transformers.utils.hub import cached_file
+
+    try:
+        tokenizer = AutoTokenizer.from_pretrained(str(processor), use_fast=True)
+        preprocessor = read_json(Path(str(cached_file(str(processor), PREPROCESSOR_CONFIG))))
+        if tokenizer.chat_template is None:
+            tokenizer.chat_template = read_json(Path(str(cached_file(str(processor), CHAT_TEMPLATE))))["chat_template"]
+    except (OSError, ValueError) as error:
+        hint = "name its folder with --base-model"
+        raise CheckpointError(f"base model {processor}: tokenizer and processor: {error} ({hint})") from error
+    tokenizer.add_tokens(list(SPECIAL_TOKENS), special_tokens=True)
+    rows = next(t for name, t in checkpoint.weights.items() if name.endswith("embed_tokens.weight")).shape[0]
+    if len(tokenizer) != rows:
+        expected = f"a tokenizer of {rows} tokens with the special ones, as the checkpoint's embedding"
+        raise CheckpointError(f"base model {processor}: expected {expected}, got {len(tokenizer)}")
+    return _collator(checkpoint.config, tokenizer, preprocessor, processor)
+
+
+def save_processor(collator: VlmCollator, folder: Path) -> None:
+    """Writes what ``load_collator`` reads, so that serving needs no network."""
+    import json
+
+    collator.tokenizer.save_pretrained(folder)
+    (folder / PREPROCESSOR_CONFIG).write_text(json.dumps(collator.images.to_config(), indent=2) + "\n")
+
+
+def _collator(config: VlmConfig, tokenizer: Any, preprocessor: dict[str, Any], where: str | Path) -> VlmCollator:
+    if abs(preprocessor.get("rescale_factor", 0.0) - 1 / 255) > 1e-9:
+        raise CheckpointError(f"{where}: rescale_factor: expected 1/255, got {preprocessor.get('rescale_factor')}")
+    normalisation = Normalisation(tuple(preprocessor["image_mean"]), tuple(preprocessor["image_std"]))
+    if config.family != SMOL:
+        images = QwenImages(preprocessor["patch_size"], normalisation, config.size_px)
+        return QwenCollator(config, tokenizer, images)
+    longest, size = preprocessor["size"]["longest_edge"], preprocessor["max_image_size"]["longest_edge"]
+    if longest > size:
+        raise CheckpointError(f"{where}: expected images that are not split (size <= max_image_size), got {longest}")
+    vision = config.backbone["vision_config"]
+    tokens = (vision["image_size"] // vision["patch_size"] // config.backbone["scale_factor"]) ** 2
+    return SmolCollator(config, tokenizer, SmolImages(longest, size, preprocessor["resample"], tokens, normalisation))

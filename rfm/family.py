@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: MIT
+"""What the engine needs of a kind of checkpoint. One module in ``rfm.families`` for each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import numpy as np
+from torch import Tensor
+
+from rfm.models.heads import progress_from_logits
+from rfm_client import FrameScores, RewardError, Sample
+
+Row = TypeVar("Row")
+Batch = TypeVar("Batch")
+
+
+@dataclass(frozen=True, eq=False)
+class RowScores:
+    """Scores of one row: of the frames of its trajectories, and of its question about two of them."""
+
+    frames: list[FrameScores]
+    query: float | None = None
+
+    def is_finite(self) -> bool:
+        """Whether every score is a number."""
+        arrays = [array for scores in self.frames for array in (scores.progress, scores.success)]
+        return all(np.isfinite(array).all() for array in arrays) and (self.query is None or np.isfinite(self.query))
+
+
+class Family(Protocol[Row, Batch]):
+    """A network on a device, and how samples become its batches. A row is one token sequence of a forward."""
+
+    def rows(self, samples: Sequence[Sample]) -> list[list[Row] | RewardError]:
+        """Each sample's rows (in dense mode one a frame), or why this checkpoint cannot score it."""
+
+    def lengths(self, row: Row) -> tuple[int, ...]:
+        """What of a row is padded, each to the longest of its batch. Rows of unlike counts share no batch."""
+
+    def num_tokens(self, lengths: Sequence[int]) -> int:
+        """Tokens of a row of these lengths."""
+
+    def collate(self, rows: Sequence[Row]) -> Batch:
+        """One batch, on the CPU; may run while the device computes."""
+
+    def score(self, rows: Sequence[Row], batch: Batch) -> list[RowScores]:
+        """One forward pass, read back to the CPU."""
+
+
+def frame_scores(progress_logits: Tensor, success_logits: Tensor) -> FrameScores:
+    """On the CPU, from logits [..., K] and [...]: progress and success, and of discrete progress its logits."""
+    discrete = progress_logits.shape[-1] > 1
+    return FrameScores(
+        progress=progress_from_logits(progress_logits).cpu().numpy(),
+        success=success_logits.sigmoid().float().cpu().numpy(),
+        progress_logits=progress_logits.float().cpu().numpy() if discrete else None,
+    )
+
+
+def part_of(scores: FrameScores, index: object) -> FrameScores:
+    """The scores at ``index`` of each array."""
+    logits = scores.progress_logits
+    return FrameScores(
+        progress=scores.progress[index],  # type: ignore[call-overload]
+        success=scores.success[index],  # type: ignore[call-overload]
+        progress_logits=None if logits is None else logits[index],  # type: ignore[call-overload]
+    )
