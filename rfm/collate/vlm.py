@@ -76,8 +76,8 @@ class VlmCollator:
         if isinstance(sample, SimilaritySample) and not self.config.has_similarity:
             supported = "progress or preference (this checkpoint has no similarity head)"
             raise InvalidSampleError.at("sample_type", supported, "similarity")
-        self._check_task(sample.trajectories[0].task)
         frames = tuple(_frames(trajectory) for trajectory in sample.trajectories)
+        self._check_task(sample.trajectories[0].task)
         frame_steps = sample.frame_steps if isinstance(sample, ProgressSample) else 0
         if frame_steps:
             prefixes = prefix_indices(len(frames[0]), frame_steps)
