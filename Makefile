@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed
 
-.PHONY: demo test check format model_repository clean
+.PHONY: demo test check parity format model_repository clean
 
 demo: $(INSTALLED)
 	$(BIN)/rfm demo
@@ -18,6 +18,10 @@ check: $(INSTALLED)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/rfm export --check --repository model_repository --config model_repository/serve.yaml
+
+# Every reference case through Triton: how far are the scores from the original's?
+parity: $(INSTALLED)
+	$(BIN)/python tests/parity.py
 
 format: $(INSTALLED)
 	$(BIN)/ruff check --fix .

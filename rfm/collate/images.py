@@ -185,14 +185,12 @@ class QwenImages:
 
 @dataclass(frozen=True)
 class SmolImages:
-    """Preprocessing for SmolVLM: every image becomes one square of ``size_px``.
+    """Preprocessing for SmolVLM: the longer side to ``size_px``, then a square of it.
 
-    longest_px: to which the longer side is brought first
     resample: Pillow's number of the filter
     tokens: image tokens that stand for one
     """
 
-    longest_px: int
     size_px: int
     resample: int
     tokens: int
@@ -200,15 +198,14 @@ class SmolImages:
 
     def to_config(self) -> dict[str, Any]:
         """The fields of preprocessor_config.json that tell this."""
-        sizes = {"size": {"longest_edge": self.longest_px}, "max_image_size": {"longest_edge": self.size_px}}
-        return {**sizes, "resample": self.resample, **self.normalisation.to_config()}
+        return {"resample": self.resample, **self.normalisation.to_config()}
 
     def images(self, frames: UInt8Array) -> Tensor:
         """float32 [T, C, size_px, size_px] of frames [T, H, W, 3]."""
         resample = Image.Resampling(self.resample)
         squares = []
         for frame in frames:
-            size = _scaled_to_longest(frame.shape[0], frame.shape[1], self.longest_px)
+            size = _scaled_to_longest(frame.shape[0], frame.shape[1], self.size_px)
             square = resized(resized(frame, *size, resample), self.size_px, self.size_px, resample)
             squares.append(_channels_first(square))
         return self.normalisation(torch.cat(squares))

@@ -21,6 +21,7 @@ from rfm_client import FrameScores, InvalidSampleError, RewardError, Sample
 
 PREPROCESSOR_CONFIG = "preprocessor_config.json"
 CHAT_TEMPLATE = "chat_template.json"
+SMOL_SIZE_PX = 512  # what upstream sets, whatever the base model says; so no image is split
 
 
 class VlmFamily:
@@ -125,9 +126,6 @@ def _collator(config: VlmConfig, tokenizer: Any, preprocessor: dict[str, Any], w
     if config.family != SMOL:
         images = QwenImages(preprocessor["patch_size"], normalisation, config.size_px)
         return QwenCollator(config, tokenizer, images)
-    longest, size = preprocessor["size"]["longest_edge"], preprocessor["max_image_size"]["longest_edge"]
-    if longest > size:
-        raise CheckpointError(f"{where}: expected images that are not split (size <= max_image_size), got {longest}")
     vision = config.backbone["vision_config"]
     tokens = (vision["image_size"] // vision["patch_size"] // config.backbone["scale_factor"]) ** 2
-    return SmolCollator(config, tokenizer, SmolImages(longest, size, preprocessor["resample"], tokens, normalisation))
+    return SmolCollator(config, tokenizer, SmolImages(SMOL_SIZE_PX, preprocessor["resample"], tokens, normalisation))
