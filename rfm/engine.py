@@ -18,6 +18,7 @@ from rfm import checkpoint as checkpoints
 from rfm.config import DEFAULT_TOKEN_BUDGET
 from rfm.families.rewind import RewindFamily
 from rfm.families.vlm import VlmFamily
+from rfm.families.vqa import VqaFamily
 from rfm.family import Family, RowScores
 from rfm.models.encoders import Encoders
 from rfm_client import (
@@ -103,8 +104,9 @@ class Engine:
             return cls(RewindFamily(checkpoint.build(), encoders=encoders, device=on), token_budget=token_budget)
         if dtype is None and on.type == "cpu":
             dtype = torch.float32
+        family = VqaFamily if checkpoint.config.generates_text else VlmFamily
         processor = processor or checkpoint.config.base_model_id
-        return cls(VlmFamily.of(checkpoint, processor, on, dtype), token_budget=token_budget)
+        return cls(family.of(checkpoint, processor, on, dtype), token_budget=token_budget)
 
     def evaluate(self, samples: Sequence[Sample]) -> list[Outcome]:
         """The result of each sample, or the error of one that has none; neighbours make no difference.
@@ -187,8 +189,6 @@ def _outcome(sample: Sample, scores: Sequence[RowScores | RewardError], timing: 
     rows = [row for row in scores if isinstance(row, RowScores)]
     if len(rows) < len(scores):
         return next(row for row in scores if isinstance(row, RewardError))
-    if not all(row.is_finite() for row in rows):
-        return InferenceFailedError("the network gave a score that is not finite")
     if isinstance(sample, ProgressSample):
         frames = _last_of_each(rows) if sample.frame_steps else rows[0].frames[0]
         logits = frames.progress_logits

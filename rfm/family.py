@@ -11,7 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from rfm.models.heads import progress_from_logits
-from rfm_client import FrameScores, RewardError, Sample
+from rfm_client import FrameScores, InferenceFailedError, RewardError, Sample
 
 Row = TypeVar("Row")
 Batch = TypeVar("Batch")
@@ -19,15 +19,25 @@ Batch = TypeVar("Batch")
 
 @dataclass(frozen=True, eq=False)
 class RowScores:
-    """Scores of one row: of the frames of its trajectories, and of its question about two of them."""
+    """Scores of one row: of the frames of its trajectories, and of its question about two of them.
+
+    Families that do not tell a score, whatever the sample, give NaN for it and have checked the others.
+    """
 
     frames: list[FrameScores]
     query: float | None = None
 
-    def is_finite(self) -> bool:
-        """Whether every score is a number."""
-        arrays = [array for scores in self.frames for array in (scores.progress, scores.success)]
-        return all(np.isfinite(array).all() for array in arrays) and (self.query is None or np.isfinite(self.query))
+
+def has_numbers(row: RowScores) -> bool:
+    """Whether a network that tells every score gave a number for each."""
+    arrays = [array for scores in row.frames for array in (scores.progress, scores.success)]
+    return all(np.isfinite(array).all() for array in arrays) and (row.query is None or bool(np.isfinite(row.query)))
+
+
+def checked(rows: Sequence[RowScores]) -> list[RowScores | RewardError]:
+    """The rows, with an error in place of one that has a score that is no number."""
+    failed = InferenceFailedError("the network gave a score that is not finite")
+    return [row if has_numbers(row) else failed for row in rows]
 
 
 class Family(Protocol[Row, Batch]):
@@ -45,8 +55,8 @@ class Family(Protocol[Row, Batch]):
     def collate(self, rows: Sequence[Row]) -> Batch:
         """One batch, on the CPU; may run while the device computes."""
 
-    def score(self, rows: Sequence[Row], batch: Batch) -> list[RowScores]:
-        """One forward pass, read back to the CPU."""
+    def score(self, rows: Sequence[Row], batch: Batch) -> list[RowScores | RewardError]:
+        """One forward pass, read back to the CPU; an error for a row that has no scores."""
 
 
 def frame_scores(progress_logits: Tensor, success_logits: Tensor) -> FrameScores:

@@ -148,6 +148,8 @@ class FrameScores:
     progress: float32 [T], share of the task done, 0..1
     success: float32 [T], probability that the task is done
     progress_logits: float32 [T, K], raw scores of the progress bins; only of discrete checkpoints, on request
+
+    A checkpoint that answers in generated text tells neither success nor the progress of a pair: all NaN.
     """
 
     progress: Float32Array

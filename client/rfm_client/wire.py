@@ -292,7 +292,8 @@ def _frame_scores(result: Result) -> tuple[FrameScores, ...]:
 
 def _decode_result(tensors: Mapping[str, npt.NDArray[Any]], row: int, sample: Sample) -> Result:
     bounds = np.cumsum([0, *_num_frames(sample)])
-    first, second = (_scores_between(tensors, row, bounds[i], bounds[i + 1]) for i in range(2))
+    asked = isinstance(sample, ProgressSample)
+    first, second = (_scores_between(tensors, row, slice(*bounds[i : i + 2]), asked) for i in range(2))
     timing = BatchTiming(*tensors[TIMING_MS][row].tolist()) if TIMING_MS in tensors else None
     if isinstance(sample, PreferenceSample):
         preference = float(_present(tensors, PREFERENCE, row, slice(0, 1))[0])
@@ -305,20 +306,26 @@ def _decode_result(tensors: Mapping[str, npt.NDArray[Any]], row: int, sample: Sa
     )
 
 
-def _scores_between(tensors: Mapping[str, npt.NDArray[Any]], row: int, start: int, stop: int) -> FrameScores:
-    def part(name: str) -> Float32Array:
-        return _present(tensors, name, row, slice(start, stop))
+def _scores_between(
+    tensors: Mapping[str, npt.NDArray[Any]], row: int, positions: slice, progress_asked: bool
+) -> FrameScores:
+    logits = _present(tensors, PROGRESS_LOGITS, row, positions) if PROGRESS_LOGITS in tensors else None
+    return FrameScores(
+        progress=_present(tensors, PROGRESS, row, positions, may_lack=not progress_asked),
+        success=_present(tensors, SUCCESS, row, positions, may_lack=True),
+        progress_logits=logits,
+    )
 
-    logits = part(PROGRESS_LOGITS) if PROGRESS_LOGITS in tensors else None
-    return FrameScores(progress=part(PROGRESS), success=part(SUCCESS), progress_logits=logits)
 
-
-def _present(tensors: Mapping[str, npt.NDArray[Any]], name: str, row: int, positions: slice) -> Float32Array:
-    """One row's scores at some positions, which must be there and be numbers."""
+def _present(
+    tensors: Mapping[str, npt.NDArray[Any]], name: str, row: int, positions: slice, *, may_lack: bool = False
+) -> Float32Array:
+    """One row's scores at some positions, which must be there and be numbers; ``may_lack``: or all be NaN."""
     scores, count = tensors[name], positions.stop - positions.start
     if scores.ndim < 2 or row >= len(scores):
         raise InferenceFailedError(f"{name}: expected scores of sample {row}, got an array {list(scores.shape)}")
     part: Float32Array = scores[row, positions]
-    if len(part) != count or not np.isfinite(part).all():
+    not_told = may_lack and count > 0 and np.isnan(part).all()
+    if len(part) != count or not (np.isfinite(part).all() or not_told):
         raise InferenceFailedError(f"{name}: expected {count} finite scores, got {part.tolist()}")
     return part

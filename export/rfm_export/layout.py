@@ -93,7 +93,8 @@ def vlm_models(config: VlmConfig, serve: ServeConfig, *, num_gpus: int, version:
     """The one model of a vision-language checkpoint."""
     outputs = wire.score_outputs(config.progress_bins if config.progress_bins > 1 else None)
     frames = Interface(frames_name(serve.name), wire.frame_inputs(), outputs)
-    warmups = _warmups(_warmup_frames(), config.has_similarity)
+    # What a model that generates text says to blank frames need not be an answer, and a failed warm-up fails the load.
+    warmups = [] if config.generates_text else _warmups(_warmup_frames(), config.has_similarity)
     return [_python_model(frames, "rfm", serve, num_gpus, version, warmups)]
 
 

@@ -13,6 +13,7 @@ from rfm.models.rewind import RewindConfig
 from rfm.models.vlm import VlmConfig
 from rfm_client import (
     FrameScores,
+    InferenceFailedError,
     PreferenceResult,
     PreferenceSample,
     ProgressResult,
@@ -63,8 +64,10 @@ def verify(original: Callable[[], Engine], exported: Callable[[], Engine], sampl
     """Raises ExportDiffersError unless both engines give the same numbers for every sample; one is made at a time."""
     scores = [make().evaluate(samples) for make in (original, exported)]
     for index, (before, after) in enumerate(zip(*scores, strict=True)):
+        if isinstance(before, InferenceFailedError) and repr(before) == repr(after):
+            continue  # a model that generates text said the same of random frames, and it was no answer
         expected, got = _numbers(before), _numbers(after)
-        if not np.allclose(got, expected, rtol=0, atol=TOLERANCE):
+        if not np.allclose(got, expected, rtol=0, atol=TOLERANCE, equal_nan=True):
             largest = np.abs(got - expected).max()
             raise ExportDiffersError(
                 f"probe {index}: expected the checkpoint's scores, got a difference of {largest:g}"

@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 from safetensors.torch import save_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from rfm.checkpoint.files import (
     NETWORK_CONFIG,
@@ -32,10 +32,12 @@ from rfm.checkpoint.files import (
 )
 from rfm.models.vlm import BACKBONES, SMOL, VlmConfig, VlmRewardModel, build_backbone
 
+VQA = "vqa"  # value of model.model_type of checkpoints that generate text
 ADAPTER_CONFIG = "adapter_config.json"
 ADAPTER_WEIGHTS = "adapter_model.safetensors"
 CUSTOM_HEADS = "custom_heads.safetensors"
 SETTINGS = "rfm"  # key of our own fields in an exported config.json
+LANGUAGE_HEAD = "lm_head.weight"
 EMBEDDING = "model.language_model.embed_tokens.weight"
 
 # Renames of one form, tried in order on each name; the first that matches is applied.
@@ -44,6 +46,10 @@ _FULL: _Renames = ()
 _SMOL: _Renames = ((r"^model\.model\.", "model."),)
 _LORA_INSIDE: _Renames = ((r"^(model\.\w+)\.base_model\.model\.", r"\1."),)
 _ADAPTER: _Renames = ((r"^base_model\.model\.", "model."),)
+_GENERATOR: _Renames = (  # as transformers saves the whole model of Qwen2.5-VL
+    (r"^visual\.", "model.visual."),
+    (r"^model\.(?=embed_tokens|layers|norm)", "model.language_model."),
+)
 _UNUSED = ("lm_head.weight", "model.lm_head.weight")  # makes text, which no reward head reads
 
 _LORA_NAME = re.compile(r"(?P<module>.+)\.lora_(?P<side>[AB])(\.default)?\.weight")
@@ -59,10 +65,14 @@ class VlmCheckpoint:
     config: VlmConfig
     weights: dict[str, Tensor]
 
-    def build(self, dtype: torch.dtype | None = None, attention: str | None = None) -> VlmRewardModel:
-        """The network with these weights, on the CPU, ready to score, in ``dtype`` (None: its own)."""
+    def build(self, dtype: torch.dtype | None = None, attention: str | None = None) -> nn.Module:
+        """The network with these weights, on the CPU, ready to score, in ``dtype`` (None: its own).
+
+        VlmRewardModel, or of a checkpoint that generates text transformers' own network.
+        """
         wanted = dtype or self.config.torch_dtype
-        network = VlmRewardModel(self.config, build_backbone(self.config, wanted, attention))
+        backbone = build_backbone(self.config, wanted, attention)
+        network = backbone if self.config.generates_text else VlmRewardModel(self.config, backbone)
         check_shapes(network.state_dict(), self.weights)
         # Parameters only: rotary frequencies stay float32, as in the original.
         network.load_state_dict({k: v.to(wanted) for k, v in self.weights.items()}, strict=True, assign=True)
@@ -80,8 +90,14 @@ def load_vlm(folder: Path, base_model: str | None = None) -> VlmCheckpoint:
             peft = run.get("peft") or {}
             weights = _merged(_renamed(weights, _LORA_INSIDE), _scaling(folder / RUN_CONFIG, peft))
         weights = _renamed(weights, _SMOL if backbone["model_type"] == SMOL else _FULL)
-    weights = {name: tensor for name, tensor in weights.items() if name not in _UNUSED}
-    return VlmCheckpoint(_vlm_config(folder, backbone, run, weights), weights)
+    config = _vlm_config(folder, backbone, run, weights)
+    if config.generates_text:
+        weights = _renamed(weights, _GENERATOR)
+        if LANGUAGE_HEAD not in weights and backbone.get("tie_word_embeddings", True):
+            weights[LANGUAGE_HEAD] = weights[EMBEDDING]
+    else:
+        weights = {name: tensor for name, tensor in weights.items() if name not in _UNUSED}
+    return VlmCheckpoint(config, weights)
 
 
 def save_vlm(checkpoint: VlmCheckpoint, folder: Path) -> None:
@@ -91,6 +107,8 @@ def save_vlm(checkpoint: VlmCheckpoint, folder: Path) -> None:
     config = {**checkpoint.config.backbone, SETTINGS: settings}
     (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
     tensors = {name: tensor.contiguous() for name, tensor in checkpoint.weights.items()}
+    if LANGUAGE_HEAD in tensors and tensors[LANGUAGE_HEAD] is tensors.get(EMBEDDING):
+        del tensors[LANGUAGE_HEAD]  # tied: the file holds it once
     save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
 
 
@@ -118,25 +136,28 @@ def _vlm_config(
     family = backbone.get("model_type")
     if family not in BACKBONES:
         raise CheckpointError(f"{folder}: model_type: expected one of {', '.join(BACKBONES)}, got {family}")
-    if model.get("model_type", "default") != "default":
-        raise CheckpointError(f"{folder}: model.model_type: expected default, got {model['model_type']}")
+    generates_text = model.get("model_type", "default") == VQA
+    if model.get("model_type", "default") not in ("default", VQA) or (generates_text and family == SMOL):
+        expected = "default (or vqa of a Qwen backbone)"
+        raise CheckpointError(f"{folder}: model.model_type: expected {expected}, got {model['model_type']}")
     for name in ("progress_head.4.weight", "frame_pool_attn.weight"):
-        if name not in weights:
+        if name not in weights and not generates_text:
             raise CheckpointError(f"{folder}: expected reward heads, got no {name}")
     height, width = data.get("resized_height"), data.get("resized_width")
     config = VlmConfig(
         backbone=backbone,
         dtype=str(model.get("torch_dtype", "bfloat16")).removeprefix("torch."),  # type: ignore[arg-type]
         multi_image=bool(model.get("use_multi_image", False)),
-        per_frame_progress_token=bool(model.get("use_per_frame_progress_token", False)),
+        per_frame_progress_token=bool(model.get("use_per_frame_progress_token", False)) and not generates_text,
         frame_pooling=model.get("frame_pooling", "mean"),
         pooling_temperature=float(model.get("frame_pooling_attn_temperature", 1.0)),
         average_temporal_patches=bool(model.get("average_temporal_patches", False)),
-        progress_bins=weights["progress_head.4.weight"].shape[0],
+        progress_bins=1 if generates_text else weights["progress_head.4.weight"].shape[0],
         has_similarity="similarity_head.0.weight" in weights,
         progress_in_preference=bool(training.get("predict_pref_progress", False)),
         size_px=(int(height), int(width)) if height and width else None,
         base_model_id=str(model.get("base_model_id", "")),
+        generates_text=generates_text,
     )
     _check_supported(folder, config)
     return config

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from rfm.collate.rewind import RewindCollator, Row
-from rfm.family import RowScores, frame_scores, part_of
+from rfm.family import RowScores, checked, frame_scores, part_of
 from rfm.models.encoders import Encoders
 from rfm.models.rewind import RewindBatch, RewindTransformer
 from rfm_client import InvalidSampleError, ProgressSample, RewardError, Sample, Trajectory
@@ -48,18 +48,18 @@ class RewindFamily:
         return self.collator.collate(rows)
 
     @torch.inference_mode()
-    def score(self, rows: Sequence[Row], batch: RewindBatch) -> list[RowScores]:
+    def score(self, rows: Sequence[Row], batch: RewindBatch) -> list[RowScores | RewardError]:
         """One forward pass."""
         output = self.network(batch.to(self.device))
         first = frame_scores(output.first_progress, output.first_success)
         firsts = [part_of(first, (index, slice(row.num_first))) for index, row in enumerate(rows)]
         if output.query is None:
-            return [RowScores([scores]) for scores in firsts]
+            return checked([RowScores([scores]) for scores in firsts])
         second = frame_scores(output.second_progress, output.second_success)
         seconds = [part_of(second, (index, slice(row.num_second))) for index, row in enumerate(rows)]
         logits, probabilities = output.query.float().tolist(), output.query.sigmoid().float().tolist()
         queries = [logits[i] if row.is_similarity else probabilities[i] for i, row in enumerate(rows)]
-        return [RowScores([*pair], query) for *pair, query in zip(firsts, seconds, queries, strict=True)]
+        return checked([RowScores([*pair], query) for *pair, query in zip(firsts, seconds, queries, strict=True)])
 
     def _embedded(self, samples: Sequence[Sample]) -> list[Sample | RewardError]:
         """The samples with embeddings in place of raw frames."""

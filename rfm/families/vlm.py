@@ -15,8 +15,8 @@ from rfm.checkpoint.files import read_json
 from rfm.collate.images import FRAMES_PER_GROUP, Normalisation, QwenImages, SmolImages
 from rfm.collate.prompts import SPECIAL_TOKENS
 from rfm.collate.vlm import QwenCollator, SmolCollator, VlmCollator, VlmRow
-from rfm.family import RowScores, frame_scores, part_of
-from rfm.models.vlm import SMOL, VlmBatch, VlmConfig, VlmRewardModel
+from rfm.family import RowScores, checked, frame_scores, part_of
+from rfm.models.vlm import SMOL, VlmBatch, VlmConfig
 from rfm_client import FrameScores, InvalidSampleError, RewardError, Sample
 
 PREPROCESSOR_CONFIG = "preprocessor_config.json"
@@ -27,7 +27,7 @@ SMOL_SIZE_PX = 512  # what upstream sets, whatever the base model says; so no im
 class VlmFamily:
     """A vision-language reward model on a device."""
 
-    def __init__(self, network: VlmRewardModel, collator: VlmCollator, device: torch.device) -> None:
+    def __init__(self, network: Any, collator: VlmCollator, device: torch.device) -> None:
         self.network = network.to(device).eval()
         self.collator = collator
         self.device = device
@@ -64,7 +64,7 @@ class VlmFamily:
         return self.collator.collate(rows)
 
     @torch.inference_mode()
-    def score(self, rows: Sequence[VlmRow], batch: VlmBatch) -> list[RowScores]:
+    def score(self, rows: Sequence[VlmRow], batch: VlmBatch) -> list[RowScores | RewardError]:
         """One forward pass."""
         output = self.network(batch.to(self.device, self._dtype))
         scores = frame_scores(output.progress, output.success)
@@ -81,7 +81,7 @@ class VlmFamily:
                 query = (similarity if row.is_similarity else preference)[asked]
                 asked += 1
             of_rows.append(RowScores(frames, query))
-        return of_rows
+        return checked(of_rows)
 
     def _per_frame(self, scores: FrameScores, num_frames: int) -> FrameScores:
         """In video mode both frames of a temporal group carry its value."""
@@ -103,9 +103,11 @@ def load_collator(checkpoint: VlmCheckpoint, processor: str | Path) -> VlmCollat
     except (OSError, ValueError) as error:
         hint = "name its folder with --base-model"
         raise CheckpointError(f"base model {processor}: tokenizer and processor: {error} ({hint})") from error
-    tokenizer.add_tokens(list(SPECIAL_TOKENS), special_tokens=True)
+    if not checkpoint.config.generates_text:
+        tokenizer.add_tokens(list(SPECIAL_TOKENS), special_tokens=True)
     rows = next(t for name, t in checkpoint.weights.items() if name.endswith("embed_tokens.weight")).shape[0]
-    if len(tokenizer) != rows:
+    exact = not checkpoint.config.generates_text  # upstream resizes the embedding where it appends tokens
+    if len(tokenizer) != rows if exact else len(tokenizer) > rows:
         expected = f"a tokenizer of {rows} tokens with the special ones, as the checkpoint's embedding"
         raise CheckpointError(f"base model {processor}: expected {expected}, got {len(tokenizer)}")
     return _collator(checkpoint.config, tokenizer, preprocessor, processor)

@@ -21,6 +21,11 @@ from rfm.models.heads import PredictionHead
 Pooling: TypeAlias = Literal["mean", "boundary", "attention"]
 
 BACKBONES = {"qwen2_5_vl": "Qwen2_5_VLModel", "qwen3_vl": "Qwen3VLModel", "smolvlm": "SmolVLMModel"}
+GENERATORS = {
+    "qwen2_5_vl": "Qwen2_5_VLForConditionalGeneration",
+    "qwen3_vl": "Qwen3VLForConditionalGeneration",
+    "smolvlm": "SmolVLMForConditionalGeneration",
+}
 SMOL = "smolvlm"
 
 
@@ -37,6 +42,7 @@ class VlmConfig:
     average_temporal_patches: in video mode, a group's tokens are averaged; else the token behind them is read
     progress_in_preference: questions of preference ask for progress too
     size_px: height and width that every frame is brought to; None: each its own
+    generates_text: no heads; the backbone with its language head writes the answer
     """
 
     backbone: dict[str, Any] = field(hash=False)
@@ -51,6 +57,7 @@ class VlmConfig:
     progress_in_preference: bool
     size_px: tuple[int, int] | None
     base_model_id: str
+    generates_text: bool = False
 
     @property
     def family(self) -> str:
@@ -59,8 +66,8 @@ class VlmConfig:
 
     @property
     def pads_left(self) -> bool:
-        """On which side the checkpoint was trained to be padded."""
-        return self.family == SMOL
+        """On which side the checkpoint was trained to be padded; to be continued, text must end at the end."""
+        return self.family == SMOL or self.generates_text
 
     @property
     def hidden_dim(self) -> int:
@@ -161,7 +168,8 @@ def build_backbone(config: VlmConfig, dtype: torch.dtype, attention: str | None 
         from transformers.utils.import_utils import is_flash_attn_2_available
     except ImportError as error:
         raise ImportError('vision-language checkpoints need transformers: pip install "rfm-triton[vlm]"') from error
-    network = getattr(transformers, BACKBONES[config.family])
+    names = GENERATORS if config.generates_text else BACKBONES
+    network = getattr(transformers, names[config.family])
     settings = network.config_class.from_dict(config.backbone)
     if attention is None:
         usable = is_flash_attn_2_available() and dtype != torch.float32
