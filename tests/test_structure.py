@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -56,11 +58,15 @@ def test_the_client_s_layers_point_left() -> None:
 
 
 def test_the_client_needs_only_light_packages() -> None:
-    import sys
-
     for file in (ROOT / "client" / "rfm_client").rglob("*.py"):
         tops = {name.partition(".")[0] for name in imports(file)}
         assert tops - sys.stdlib_module_names <= LIGHT | {"rfm_client"}, file
+
+
+def test_scoring_embeddings_needs_no_extra() -> None:
+    check = "import sys, rfm.engine; print(sorted({'transformers', 'PIL', 'av', 'matplotlib'} & set(sys.modules)))"
+    output = subprocess.run([sys.executable, "-c", check], check=True, capture_output=True, text=True).stdout
+    assert output.strip() == "[]"
 
 
 def test_the_domain_knows_nothing_of_triton() -> None:

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from PIL import Image
 from torch import Tensor
 
 from rfm_client.samples import UInt8Array
 
 MAX_UINT8 = 255
+PIL_BICUBIC = 3
 MERGE = 2
 FRAMES_PER_GROUP = 2  # frames that share the patches of one temporal group
 IMAGE_TOKENS = (4, 16_384)  # merged tokens of one image: at least, at most
@@ -90,11 +90,13 @@ def fitted_size(height: int, width: int, factor: int, tokens: tuple[float, float
     return fitted[0], fitted[1]
 
 
-def resized(
-    frame: UInt8Array, height: int, width: int, resample: Image.Resampling = Image.Resampling.BICUBIC
-) -> UInt8Array:
-    """uint8 [H, W, 3] -> [height, width, 3], as Pillow resizes."""
-    return np.asarray(Image.fromarray(frame).resize((width, height), resample))
+def resized(frame: UInt8Array, height: int, width: int, resample: int = PIL_BICUBIC) -> UInt8Array:
+    """uint8 [H, W, 3] -> [height, width, 3], as Pillow resizes; ``resample``: its number of the filter."""
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise ImportError('vision-language checkpoints need Pillow: pip install "rfm-triton[vlm]"') from error
+    return np.asarray(Image.fromarray(frame).resize((width, height), Image.Resampling(resample)))
 
 
 @dataclass(frozen=True)
@@ -202,11 +204,10 @@ class SmolImages:
 
     def images(self, frames: UInt8Array) -> Tensor:
         """float32 [T, C, size_px, size_px] of frames [T, H, W, 3]."""
-        resample = Image.Resampling(self.resample)
         squares = []
         for frame in frames:
             size = _scaled_to_longest(frame.shape[0], frame.shape[1], self.size_px)
-            square = resized(resized(frame, *size, resample), self.size_px, self.size_px, resample)
+            square = resized(resized(frame, *size, self.resample), self.size_px, self.size_px, self.resample)
             squares.append(_channels_first(square))
         return self.normalisation(torch.cat(squares))
 
