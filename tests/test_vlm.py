@@ -13,6 +13,7 @@ import goldens
 import numpy as np
 import pytest
 import torch
+import transformers
 from conftest import Served, load_engine
 from safetensors.torch import load_file, save_file
 
@@ -329,7 +330,6 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
     ),
     "a pooling that is none": (PLAIN, change_yaml("frame_pooling: mean", "frame_pooling: max"), r"frame_pooling: expected"),
     "a type that is none": (PLAIN, change_yaml("torch_dtype: float32", "torch_dtype: int8"), r"torch_dtype: expected"),
-    "answers as generated text": (PLAIN, change_yaml("model_type: default", "model_type: vqa"), r"model_type: expected default, got vqa"),
     "tokens without images": (PLAIN, change_yaml("use_multi_image: true", "use_multi_image: false"), r"per-frame progress tokens: expected"),
     "LoRA without alpha": (LORA_INSIDE, change_yaml("lora_alpha: 8", "lora_beta: 8"), r"expected lora_alpha and r of the LoRA weights"),
     "half a LoRA pair": (LORA_INSIDE, change_tensors("model.safetensors", drop_first("lora_B")), r"expected a weight and LoRA factors A and B, got \['A'\]"),
@@ -360,6 +360,13 @@ def test_a_spoiled_checkpoint_is_refused(
 def test_an_adapter_whose_base_model_is_missing_is_refused(copied: Callable[[str], Path]) -> None:
     with pytest.raises(CheckpointError, match=r"base model /no/such/base: cannot be had: .*--base-model"):
         load(ADAPTER, copied(ADAPTER), base="/no/such/base")
+
+
+def test_smolvlm_is_refused_where_its_scores_would_differ(monkeypatch: pytest.MonkeyPatch) -> None:
+    checkpoint = load("smol_mean_disc10")
+    monkeypatch.setattr(transformers, "__version__", "5.0.0")
+    with pytest.raises(CheckpointError, match=r"transformers: expected transformers < 5 for a SmolVLM checkpoint"):
+        checkpoint.build()
 
 
 def test_a_processor_of_another_model_is_refused() -> None:

@@ -71,6 +71,7 @@ class VlmCheckpoint:
         VlmRewardModel, or of a checkpoint that generates text transformers' own network.
         """
         wanted = dtype or self.config.torch_dtype
+        _check_transformers(self.config)
         backbone = build_backbone(self.config, wanted, attention)
         network = backbone if self.config.generates_text else VlmRewardModel(self.config, backbone)
         check_shapes(network.state_dict(), self.weights)
@@ -161,6 +162,15 @@ def _vlm_config(
     )
     _check_supported(folder, config)
     return config
+
+
+def _check_transformers(config: VlmConfig) -> None:
+    """transformers 5 computes other image features for SmolVLM than those that checkpoints were trained on."""
+    import transformers
+
+    if config.family == SMOL and int(transformers.__version__.partition(".")[0]) >= 5:
+        expected = "transformers < 5 for a SmolVLM checkpoint, whose scores would differ"
+        raise CheckpointError(f"transformers: expected {expected}, got {transformers.__version__}")
 
 
 def _check_supported(folder: Path, config: VlmConfig) -> None:

@@ -12,11 +12,13 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from safetensors.torch import save_file
 from torch import Tensor
 
 from rfm.collate import as_tensor
@@ -28,6 +30,7 @@ PREPROCESSOR_CONFIG = "preprocessor_config.json"
 PIL_BICUBIC = 3  # the value of `resample` in preprocessor_config.json
 MAX_UINT8 = 255
 MAX_ASPECT_RATIO = 50
+_LOADING_PROBLEMS = ("missing_keys", "unexpected_keys", "mismatched_keys")  # as transformers tells of a load
 
 
 @dataclass(frozen=True)
@@ -243,26 +246,28 @@ def _check_shape(trajectory: Trajectory) -> None:
 
 
 def _load_model(source: str | Path, weights: Mapping[str, Tensor] | None) -> Any:
+    """The model of ``source``, with ``weights`` in place of its own. Raises ValueError unless they fit to the letter.
+
+    transformers does the loading, since it knows how names of weights changed from release to release.
+    """
     from transformers import AutoConfig, AutoModel
 
-    if weights is None:
-        model, loaded = AutoModel.from_pretrained(
-            str(source), use_safetensors=True, dtype=torch.float32, output_loading_info=True
-        )
-        if loaded["missing_keys"] or loaded["mismatched_keys"]:  # transformers would leave these random
-            found = f"missing: {sorted(loaded['missing_keys'])}; shapes: {sorted(loaded['mismatched_keys'])}"
-            raise ValueError(f"{source}: the encoder's weights are not complete: {found}")
-        return model
-    model = AutoModel.from_config(AutoConfig.from_pretrained(str(source)))
-    expected, got = ({name: tuple(w.shape) for name, w in state.items()} for state in (model.state_dict(), weights))
-    if expected != got:
-        differing = {name for name in expected.keys() & got.keys() if expected[name] != got[name]}
-        keys = {
-            "missing": expected.keys() - got.keys(),
-            "unexpected": got.keys() - expected.keys(),
-            "shapes": differing,
-        }
-        found = "; ".join(f"{kind}: {sorted(names) or 'none'}" for kind, names in keys.items())
-        raise ValueError(f"{source}: the checkpoint's encoder weights do not fit: {found}")
-    model.load_state_dict(dict(weights), strict=True)
+    with TemporaryDirectory() as folder:
+        if weights is not None:
+            AutoConfig.from_pretrained(str(source)).save_pretrained(folder)
+            tensors = {name: tensor.contiguous() for name, tensor in weights.items()}
+            save_file(tensors, Path(folder) / "model.safetensors", metadata={"format": "pt"})
+        try:
+            model, loaded = AutoModel.from_pretrained(
+                str(source) if weights is None else folder,
+                use_safetensors=True,
+                dtype=torch.float32,
+                output_loading_info=True,
+            )
+        except RuntimeError as error:  # shapes
+            raise ValueError(f"{source}: the encoder's weights do not fit: {error}") from error
+    problems = ("missing_keys", "mismatched_keys") if weights is None else _LOADING_PROBLEMS
+    found = {name: sorted(map(str, loaded[name])) for name in problems if loaded[name]}
+    if found:  # transformers would leave missing ones random, and others out
+        raise ValueError(f"{source}: the encoder's weights do not fit: {found}")
     return model
