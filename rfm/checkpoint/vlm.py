@@ -7,6 +7,7 @@ Names of weights become those of VlmRewardModel, by one rename table per form. L
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -166,11 +167,12 @@ def _vlm_config(
 
 def _check_transformers(config: VlmConfig) -> None:
     """transformers 5 computes other image features for SmolVLM than those that checkpoints were trained on."""
-    import transformers
-
-    if config.family == SMOL and int(transformers.__version__.partition(".")[0]) >= 5:
+    if config.family != SMOL:
+        return
+    version = importlib.metadata.version("transformers")
+    if int(version.partition(".")[0]) >= 5:
         expected = "transformers < 5 for a SmolVLM checkpoint, whose scores would differ"
-        raise CheckpointError(f"transformers: expected {expected}, got {transformers.__version__}")
+        raise CheckpointError(f"transformers: expected {expected}, got {version}")
 
 
 def _check_supported(folder: Path, config: VlmConfig) -> None:
