@@ -158,7 +158,9 @@ def test_preference_is_one_of_two_letters() -> None:
             parse_preference(text)
 
 
-def test_it_is_exported_and_served(checkpoint: Path, tmp_path: Path) -> None:
+def test_it_is_exported_and_served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vqa, "MAX_NEW_TOKENS", 8)  # while it is verified; the server generates in full
+    checkpoint = write_checkpoint(tmp_path / "checkpoint", "q3")
     serve = ServeConfig(num_gpus=0, torch_threads=1)
     repository = tmp_path / "model_repository"
     rfm_export.export(checkpoint, repository, serve)
