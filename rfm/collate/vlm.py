@@ -9,7 +9,7 @@ Reading a row is cheap; its pixels are made when its batch is collated.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from itertools import pairwise
 from typing import Any, TypeAlias
 
@@ -50,6 +50,7 @@ class VlmRow:
 
     input_ids: int64 [L]
     frames: uint8 [T, H, W, 3] of each trajectory
+    picked: in dense mode int64 [K], the frames that the conversation shows; None: all
     spans: for each trajectory, the tokens (first, behind the last) over which each frame's state is read
     query: token whose state answers the question about two trajectories
     """
@@ -59,6 +60,16 @@ class VlmRow:
     spans: tuple[Spans, ...]
     query: int | None
     is_similarity: bool
+    picked: npt.NDArray[np.int64] | None = None
+
+    @property
+    def num_frames(self) -> list[int]:
+        """Frames of each trajectory that the conversation shows."""
+        return [len(video) for video in self.frames] if self.picked is None else [len(self.picked)]
+
+    def videos(self) -> tuple[UInt8Array, ...]:
+        """The frames that the conversation shows, of each trajectory; copied in dense mode, hence late."""
+        return self.frames if self.picked is None else (self.frames[0][self.picked],)
 
     @property
     def num_tokens(self) -> int:
@@ -89,8 +100,10 @@ class VlmCollator:
         self._check_task(sample.trajectories[0].task)
         frame_steps = sample.frame_steps if isinstance(sample, ProgressSample) else 0
         if frame_steps:
-            prefixes = prefix_indices(len(frames[0]), frame_steps)
-            return [self._row(sample, (frames[0][indices],)) for indices in prefixes]
+            # Every prefix is as long and its frames are as large, so all conversations have the same tokens.
+            shown = np.broadcast_to(frames[0][:1], (frame_steps, *frames[0].shape[1:]))
+            row = self._row(sample, (shown,))
+            return [replace(row, frames=frames, picked=p) for p in prefix_indices(len(frames[0]), frame_steps)]
         return [self._row(sample, frames)]
 
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
@@ -222,7 +235,7 @@ class QwenCollator(VlmCollator):
     def _pixel_inputs(self, rows: Sequence[VlmRow], ids: Tensor) -> dict[str, Tensor]:
         image_pad, video_pad = (self.tokenizer.convert_tokens_to_ids(pad) for pad in (IMAGE_PAD, VIDEO_PAD))
         types = torch.where(ids == image_pad, IMAGE, torch.where(ids == video_pad, VIDEO, TEXT))
-        videos = [video for row in rows for video in row.frames]
+        videos = [video for row in rows for video in row.videos()]
         if self.config.multi_image:
             pixels = [image for video in videos for image in self.images.images(video)]
         else:
@@ -250,7 +263,7 @@ class SmolCollator(VlmCollator):
         return self._image_spans(ids, frames, list(zip(around[::2], around[1::2], strict=True)))
 
     def _pixel_inputs(self, rows: Sequence[VlmRow], ids: Tensor) -> dict[str, Tensor]:
-        images = [torch.cat([self.images.images(video) for video in row.frames]) for row in rows]
+        images = [torch.cat([self.images.images(video) for video in row.videos()]) for row in rows]
         most = max(len(each) for each in images)
         pixels = torch.zeros(len(rows), most, *images[0].shape[1:])  # the backbone leaves out images of zeros
         mask = torch.zeros(len(rows), most, *images[0].shape[2:], dtype=torch.bool)

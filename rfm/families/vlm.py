@@ -73,8 +73,8 @@ class VlmFamily:
         of_rows, read, asked = [], 0, 0
         for row in rows:
             frames = []
-            for spans, video in zip(row.spans, row.frames, strict=True):
-                frames.append(self._per_frame(part_of(scores, slice(read, read + len(spans))), len(video)))
+            for spans, num_frames in zip(row.spans, row.num_frames, strict=True):
+                frames.append(self._per_frame(part_of(scores, slice(read, read + len(spans))), num_frames))
                 read += len(spans)
             query = None
             if row.query is not None:

@@ -82,7 +82,7 @@ def _answer(text: str) -> str:
 
 
 def _read(text: str, row: VlmRow) -> RowScores | RewardError:
-    lengths = [len(video) for video in row.frames]
+    lengths = row.num_frames
     try:
         if len(lengths) == 1:
             return RowScores([FrameScores(progress=parse_progress(text, lengths[0]), success=_not_told(lengths[0]))])
