@@ -382,6 +382,25 @@ def test_a_processor_of_another_model_is_refused() -> None:
         Engine.from_checkpoint(goldens.config(PLAIN).checkpoint, base_model=other)
 
 
+def test_a_preprocessor_file_as_qwen_publishes_it_is_read(tmp_path: Path) -> None:
+    """With few fields, where the references have all that transformers writes."""
+    base = tmp_path / "base"
+    shutil.copytree(str(goldens.config(PLAIN).base_model), base)
+    file = base / "preprocessor_config.json"
+    few = ("size", "patch_size", "temporal_patch_size", "merge_size", "image_mean", "image_std")
+    fields = {name: value for name, value in json.loads(file.read_text()).items() if name in few}
+    file.chmod(0o644)
+    file.write_text(json.dumps(fields))
+    Engine.from_checkpoint(goldens.config(PLAIN).checkpoint, base_model=str(base))
+
+
+def test_a_thin_video_is_refused() -> None:
+    sample = ProgressSample(film(0, 2, 1, 500))
+    (outcome,) = load_engine("q25_video_last_l2").evaluate([sample])
+    assert isinstance(outcome, InvalidSampleError)
+    assert str(outcome) == "frames: expected an image at most 200 times as long as wide, got 1 x 500"
+
+
 def test_fields_that_a_config_lacks_have_defaults(copied: Callable[[str], Path]) -> None:
     folder = copied("q25_video_last_l2")
     (folder / "config.yaml").write_text("model:\n  base_model_id: some/base\n")

@@ -154,9 +154,10 @@ class QwenImages:
         factor = self.patch_px * MERGE
         sizes = []
         height, width = frames.shape[1:3]
+        fitted_size(height, width, factor)  # refuses slivers, which scaling down would leave without pixels
         if max(height, width) > MAX_VIDEO_SIDE_PX:
             scale = MAX_VIDEO_SIDE_PX / max(height, width)
-            height, width = int(height * scale), int(width * scale)
+            height, width = max(int(height * scale), 1), max(int(width * scale), 1)
             sizes.append((height, width))
         sizes.append(fitted_size(*(self.size_px or (height, width)), MERGE * factor))
         if self.size_px:

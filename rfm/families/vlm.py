@@ -122,7 +122,7 @@ def save_processor(collator: VlmCollator, folder: Path) -> None:
 
 
 def _collator(config: VlmConfig, tokenizer: Any, preprocessor: dict[str, Any], where: str | Path) -> VlmCollator:
-    if abs(preprocessor.get("rescale_factor", 0.0) - 1 / 255) > 1e-9:
+    if abs(preprocessor.get("rescale_factor", 1 / 255) - 1 / 255) > 1e-9:  # Qwen's own files leave the default out
         raise CheckpointError(f"{where}: rescale_factor: expected 1/255, got {preprocessor.get('rescale_factor')}")
     normalisation = Normalisation(tuple(preprocessor["image_mean"]), tuple(preprocessor["image_std"]))
     if config.family != SMOL:

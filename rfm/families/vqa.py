@@ -58,7 +58,10 @@ class VqaFamily(VlmFamily):
 
 def parse_progress(text: str, num_frames: int) -> Float32Array:
     """float32 [T] from ``<ans>[0.1, 0.4, ...]</ans>``. Raises ValueError for anything else."""
-    values = ast.literal_eval(_answer(text))
+    try:
+        values = ast.literal_eval(_answer(text))
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError) as error:
+        raise ValueError(f"expected a list of numbers ({error})") from error
     if not isinstance(values, list) or not all(type(value) in (int, float) for value in values):
         raise ValueError("expected a list of numbers")
     if len(values) != num_frames or not all(0 <= value <= 1 for value in values):
@@ -88,7 +91,7 @@ def _read(text: str, row: VlmRow) -> RowScores | RewardError:
             return RowScores([FrameScores(progress=parse_progress(text, lengths[0]), success=_not_told(lengths[0]))])
         frames = [FrameScores(progress=_not_told(length), success=_not_told(length)) for length in lengths]
         return RowScores(frames, parse_preference(text))
-    except (ValueError, SyntaxError, MemoryError, RecursionError) as error:  # literal_eval raises all of these
+    except ValueError as error:
         return InferenceFailedError(f"the model's answer cannot be read: {error}, got {text[:SHOWN_CHARACTERS]!r}")
 
 
