@@ -58,8 +58,9 @@ class VqaFamily(VlmFamily):
 
 def parse_progress(text: str, num_frames: int) -> Float32Array:
     """float32 [T] from ``<ans>[0.1, 0.4, ...]</ans>``. Raises ValueError for anything else."""
+    answer = _answer(text)
     try:
-        values = ast.literal_eval(_answer(text))
+        values = ast.literal_eval(answer)
     except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError) as error:
         raise ValueError(f"expected a list of numbers ({error})") from error
     if not isinstance(values, list) or not all(type(value) in (int, float) for value in values):
