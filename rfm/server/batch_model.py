@@ -39,6 +39,8 @@ class BatchModel(Generic[Question, Answer]):
             torch.set_num_threads(threads)
         on_gpu = args["model_instance_kind"] == "GPU"
         device = torch.device("cuda", int(args["model_instance_device_id"])) if on_gpu else torch.device("cpu")
+        if on_gpu:
+            torch.cuda.set_device(device)  # some kernels launch on the current device, whatever their tensors'
         self.load(Path(args["model_repository"], args["model_version"]), device, settings)
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
