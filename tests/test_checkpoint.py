@@ -183,6 +183,14 @@ SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
         lambda folder: (folder / "config.yaml").write_text("- 1") and None,
         r"config.yaml: expected a mapping, got list",
     ),
+    "data that is no mapping": (
+        lambda folder: (folder / "config.yaml").write_text("data: [1]") and None,
+        r"config.yaml: data: expected a mapping, got \[1\]",
+    ),
+    "a half frame": (
+        change_json("config.json", lambda c: c.update(trained_frames=7.5)),
+        r"config.json: trained_frames: expected a whole number of at least 1, got 7.5",
+    ),
 }
 
 

@@ -29,6 +29,7 @@ EXCEPTIONS = {
     "rfm/cli.py": {"rfm_export"},  # the command, where all packages meet
     "examples/demo_training/losses.py": {"rfm"},  # what is trained is the network that is served
     "examples/demo_training/networks.py": {"rfm"},
+    "examples/train_demo_checkpoint.py": {"rfm"},
     "examples/evaluate_demo_checkpoint.py": {"rfm"},  # starts the server
 }
 CLIENT_LAYERS = (  # imports point left

@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from http.client import HTTPException
 from typing import Any
-from urllib.parse import urlsplit
 
 from tritonclient.utils import InferenceServerException
 
 from rfm_client.errors import DeadlineExceededError, InferenceFailedError, ServerUnavailableError
+from rfm_client.transport import split_url
 
 METRICS_PORT = 8002
 DEVICE_METRICS = "nv_cpu_utilization, nv_gpu_utilization, nv_*_memory_*_bytes"
@@ -104,12 +104,10 @@ def read_status(url: str, *, metrics_url: str | None = None, timeout_s: float = 
 
     Raises ServerUnavailableError, DeadlineExceededError, and InferenceFailedError for what is no Triton server.
     """
-    scheme, _, address = url.rstrip("/").partition("://")
-    if scheme not in ("grpc", "http") or not address or not _has_port(url):
-        raise ValueError(f"url: expected grpc://host:port or http://host:port, got {url!r}")
+    scheme, address = split_url(url)
     try:
         server = (_ask_grpc if scheme == "grpc" else _ask_http)(address, timeout_s)
-        metrics_url = metrics_url or f"http://{_host(url)}:{METRICS_PORT}/metrics"
+        metrics_url = metrics_url or f"http://{address.rpartition(':')[0]}:{METRICS_PORT}/metrics"
         metrics = _read_metrics(metrics_url, timeout_s)
         models = tuple(_models(server, metrics))
     except InferenceServerException as error:
@@ -229,15 +227,3 @@ def _scrape(url: str, timeout_s: float) -> list[Any]:
 
 def _is_unsampled(samples: list[Any]) -> bool:
     return any(sample.name == _SAMPLED_METRIC and not sample.value for sample in samples)
-
-
-def _has_port(url: str) -> bool:
-    try:
-        return urlsplit(url).port is not None
-    except ValueError:  # beyond 65535
-        return False
-
-
-def _host(url: str) -> str:
-    host = urlsplit(url).hostname or "localhost"
-    return f"[{host}]" if ":" in host else host

@@ -40,7 +40,8 @@ _STATUS_ERRORS: dict[str, type[errors.RewardError]] = {
 _LOST_REGION = "Unable to find shared memory region"
 # Triton answers these with other statuses, but the sample is not at fault and another try may succeed.
 _UNAVAILABLE = re.compile(f"{_LOST_REGION}|has no available versions|Stub process .* is not healthy")
-_URL = re.compile(r"(?P<scheme>grpc|http)://(?P<address>[^/]+:[0-9]{1,5})/?")
+_URL = re.compile(r"(?P<scheme>grpc|http)://(?P<address>[^/]+:(?P<port>[0-9]{1,5}))/?")
+MAX_PORT = 65535
 _REQUEST_ID = re.compile(r"^\[request id: [^\]]*\] ")
 _WRONG_SHAPE = re.compile(  # behind the batch axis, which the caller did not make
     r"unexpected shape for input '(?P<name>\w+)'.*?Expected \[-1,(?P<expected>[^\]]*)\], got \[\d+,(?P<got>[^\]]*)\]"
@@ -87,11 +88,16 @@ def connect(url: str, *, shared_memory: bool = False) -> Transport:
 
     shared_memory: large inputs go through memory that the server, on the same host, maps too
     """
+    scheme, address = split_url(url)
+    return (GrpcTransport if scheme == "grpc" else HttpTransport)(url, address, shared_memory=shared_memory)
+
+
+def split_url(url: str) -> tuple[str, str]:
+    """``grpc`` or ``http``, and ``host:port``. Raises ValueError."""
     match = _URL.fullmatch(url)
-    if match is None:
+    if match is None or int(match["port"]) > MAX_PORT:
         raise ValueError(f"url: expected grpc://host:port or http://host:port, got {url!r}")
-    transport = GrpcTransport if match["scheme"] == "grpc" else HttpTransport
-    return transport(url, match["address"], shared_memory=shared_memory)
+    return match["scheme"], match["address"]
 
 
 class _TritonTransport:

@@ -32,7 +32,7 @@ def frame_indices(total: int, native_fps: float, fps: float) -> npt.NDArray[np.i
     all, evenly from the first to the last, truncated to whole frames.
     """
     count = min(max(round(total * fps / native_fps), 1), total)
-    return np.linspace(0, total - 1, count).astype(np.int64)
+    return _spread(total, count)
 
 
 def is_url(source: str | Path) -> bool:
@@ -76,7 +76,12 @@ def frame_times_s(file: str | Path, num_frames: int) -> npt.NDArray[np.float64] 
         times = sorted(float(packet.pts * packet.time_base) for packet in packets if packet.pts is not None)
     if len(times) < num_frames:
         return None
-    return np.array(times)[np.linspace(0, len(times) - 1, num_frames).astype(np.int64)] - times[0]
+    return np.array(times)[_spread(len(times), num_frames)] - times[0]
+
+
+def _spread(total: int, count: int) -> npt.NDArray[np.int64]:
+    """int64 [count], evenly from the first to the last of ``total``, truncated."""
+    return np.linspace(0, total - 1, count).astype(np.int64)
 
 
 @contextmanager

@@ -11,7 +11,7 @@ requests of different callers, lengths and sample types into one batch.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Literal, TypeAlias
 
@@ -212,9 +212,7 @@ def decode_results(
 
     Raises InferenceFailedError for an answer that lacks a score: a missing reward is no reward of 0 or NaN.
     """
-    return [
-        replace(_decode_result(tensors, row, sample), model_version=model_version) for row, sample in enumerate(samples)
-    ]
+    return [_decode_result(tensors, row, sample, model_version) for row, sample in enumerate(samples)]
 
 
 def pad_stack(arrays: Sequence[npt.NDArray[Any]], length: int | None = None, *, fill: float = 0) -> npt.NDArray[Any]:
@@ -302,19 +300,22 @@ def _frame_scores(result: Result) -> tuple[FrameScores, ...]:
     return (result.reference, result.other)
 
 
-def _decode_result(tensors: Mapping[str, npt.NDArray[Any]], row: int, sample: Sample) -> Result:
+def _decode_result(
+    tensors: Mapping[str, npt.NDArray[Any]], row: int, sample: Sample, model_version: str | None
+) -> Result:
     bounds = np.cumsum([0, *_num_frames(sample)])
     asked = isinstance(sample, ProgressSample)
     first, second = (_scores_between(tensors, row, slice(*bounds[i : i + 2]), asked) for i in range(2))
     timing = BatchTiming(*tensors[TIMING_MS][row].tolist()) if TIMING_MS in tensors else None
+    of_request: dict[str, Any] = {"timing": timing, "model_version": model_version}
     if isinstance(sample, PreferenceSample):
         preference = float(_present(tensors, PREFERENCE, row, slice(0, 1))[0])
-        return PreferenceResult(preference=preference, first=first, second=second, timing=timing)
+        return PreferenceResult(preference=preference, first=first, second=second, **of_request)
     if isinstance(sample, SimilaritySample):
         similarity = float(_present(tensors, SIMILARITY, row, slice(0, 1))[0])
-        return SimilarityResult(similarity=similarity, reference=first, other=second, timing=timing)
+        return SimilarityResult(similarity=similarity, reference=first, other=second, **of_request)
     return ProgressResult(
-        progress=first.progress, success=first.success, progress_logits=first.progress_logits, timing=timing
+        progress=first.progress, success=first.success, progress_logits=first.progress_logits, **of_request
     )
 
 

@@ -76,9 +76,16 @@ def read_run_config(file: Path) -> dict[str, Any]:
 
 def trained_frames(run: Mapping[str, Any], file: Path) -> int | None:
     """The most frames of a trajectory in training, as config.yaml tells it; None if it does not."""
-    frames = (run.get("data") or {}).get("max_frames")
+    data = run.get("data") or {}
+    if not isinstance(data, dict):
+        raise CheckpointError(f"{file}: data: expected a mapping, got {data!r}")
+    return frame_count(data.get("max_frames"), f"{file}: data.max_frames")
+
+
+def frame_count(frames: Any, where: str) -> int | None:
+    """The value if it is a count of frames, or None. Raises CheckpointError."""
     if frames is not None and (type(frames) is not int or frames < 1):
-        raise CheckpointError(f"{file}: data.max_frames: expected a whole number of at least 1, got {frames!r}")
+        raise CheckpointError(f"{where}: expected a whole number of at least 1, got {frames!r}")
     return frames
 
 

@@ -22,6 +22,7 @@ from rfm.checkpoint.files import (
     CheckpointError,
     check_shapes,
     find_run_config,
+    frame_count,
     read_json,
     read_run_config,
     read_weights,
@@ -109,7 +110,7 @@ def _trained_frames(folder: Path) -> int | None:
     if (folder / NETWORK_CONFIG).is_file():
         saved = read_json(folder / NETWORK_CONFIG).get("trained_frames")
         if saved is not None:
-            return int(saved)
+            return frame_count(saved, f"{folder / NETWORK_CONFIG}: trained_frames")
     run_config = find_run_config(folder)
     return None if run_config is None else trained_frames(read_run_config(run_config), run_config)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import string
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,9 +58,14 @@ def write_random_checkpoint(folder: Path) -> DemoCheckpoint:
         torch.manual_seed(SEED)
         network = RewindTransformer(CONFIG)
         encoders = _encoders()
+    return write_checkpoint(folder, network, encoders)
+
+
+def write_checkpoint(folder: Path, network: RewindTransformer, encoders: Encoders) -> DemoCheckpoint:
+    """Writes network and encoders into ``folder`` as upstream's training leaves them."""
     written = DemoCheckpoint(folder / "checkpoint", folder / "image_encoder", folder / "text_encoder")
     encoders.save_pretrained(written.image_encoder, written.text_encoder)
-    save(RewindCheckpoint(CONFIG, network.state_dict()), written.checkpoint)
+    save(RewindCheckpoint(network.config, network.state_dict()), written.checkpoint)
     weights = load_file(written.checkpoint / WEIGHTS)
     parts = ((IMAGE_ENCODER_PREFIX, encoders.image_model), (TEXT_ENCODER_PREFIX, encoders.text_model))
     for prefix, model in parts:
@@ -84,7 +90,7 @@ def _encoders() -> Encoders:
     preprocessor = ImagePreprocessor(
         resize_px=IMAGE_SIZE_PX, crop_px=(IMAGE_SIZE_PX, IMAGE_SIZE_PX), mean=IMAGENET_MEAN, std=IMAGENET_STD
     )
-    tokenizer = _tokenizer()
+    tokenizer = word_tokenizer(MAX_TASK_TOKENS)
     text_model = BertModel(
         BertConfig(
             vocab_size=len(tokenizer),
@@ -98,22 +104,23 @@ def _encoders() -> Encoders:
     return Encoders(image_model, preprocessor, text_model, tokenizer)
 
 
-def _tokenizer() -> Any:
-    """Reads a task letter by letter, in the way of a BERT tokenizer."""
+def word_tokenizer(max_tokens: int, words: Sequence[str] = ()) -> Any:
+    """Reads ``words`` whole and all else letter by letter, in the way of a BERT tokenizer."""
     from tokenizers import Tokenizer, normalizers, pre_tokenizers, processors
     from tokenizers.models import WordPiece
     from transformers import PreTrainedTokenizerFast
 
     special = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "[MASK]"]
     letters = [*string.ascii_lowercase, *string.digits, *string.punctuation]
-    vocabulary = {token: i for i, token in enumerate([*special, *letters, *(f"##{letter}" for letter in letters)])}
+    tokens = [*special, *letters, *(f"##{letter}" for letter in letters), *words]
+    vocabulary = {token: i for i, token in enumerate(tokens)}
     tokenizer = Tokenizer(WordPiece(vocabulary, unk_token="[UNK]"))
     tokenizer.normalizer = normalizers.BertNormalizer(lowercase=True)
     tokenizer.pre_tokenizer = pre_tokenizers.BertPreTokenizer()
     ends = [(token, vocabulary[token]) for token in ("[CLS]", "[SEP]")]
     tokenizer.post_processor = processors.TemplateProcessing(single="[CLS] $A [SEP]", special_tokens=ends)
     names = dict(zip(("pad_token", "unk_token", "cls_token", "sep_token", "mask_token"), special, strict=True))
-    return PreTrainedTokenizerFast(tokenizer_object=tokenizer, model_max_length=MAX_TASK_TOKENS, **names)
+    return PreTrainedTokenizerFast(tokenizer_object=tokenizer, model_max_length=max_tokens, **names)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from rich.console import Console
 from rfm.models.rewind import RewindConfig
 from rfm.server.process import STOP_SIGNALS, Endpoints
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Sample, SimilaritySample, Trajectory
+from rfm_client.fit import evenly_spaced
 from rfm_client.samples import UInt8Array
 from rfm_client.show import Panel, plot, scores_table, status_tables
 from rfm_client.status import read_status
@@ -68,11 +69,11 @@ def score_embeddings(endpoints: Endpoints, config: RewindConfig, console: Consol
 def video_frames(video: Path, fps: float, max_frames: int | None, console: Console) -> UInt8Array:
     """uint8 [T, H, W, 3], the video's frames at ``fps``, or as many of them, evenly, as the checkpoint takes."""
     frames = read_video(video, fps)
-    limit = min(MAX_FRAMES, max_frames or MAX_FRAMES)
-    if len(frames) <= limit:
+    kept = evenly_spaced(len(frames), min(MAX_FRAMES, max_frames or MAX_FRAMES))
+    if kept is None:
         return frames
-    console.print(f"{video.name}: {len(frames)} frames at {fps:g} fps; {limit} of them, evenly, are scored")
-    return frames[np.linspace(0, len(frames) - 1, limit).astype(np.int64)]
+    console.print(f"{video.name}: {len(frames)} frames at {fps:g} fps; {len(kept)} of them, evenly, are scored")
+    return frames[kept]
 
 
 def score_frames(endpoints: Endpoints, frames: UInt8Array, task: str, picture: Path, console: Console) -> None:

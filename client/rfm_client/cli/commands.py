@@ -17,6 +17,7 @@ from rfm_client.cli.options import EXIT_CODES, STANDARD_OUTPUT, OneLineCommand, 
 from rfm_client.cli.scoring import Failed, Question, Scored
 from rfm_client.errors import RewardError
 from rfm_client.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS
+from rfm_client.transport import split_url
 
 FILE_WIDTH = 200
 
@@ -237,7 +238,7 @@ def bench_input(
     made_up = _toy(kind, num_samples, num_frames, use_frames, seed)
     with Server(urls, model, timeout).connected() as client:
         write_perf_analyzer_input(output, made_up.samples(client))
-    protocol, _, address = urls[0].rstrip("/").partition("://")
+    protocol, address = split_url(urls[0])
     name = f"{model}_frames" if use_frames else model
     arguments = ["perf_analyzer", "-m", name, "-i", protocol, "-u", address, "--input-data", str(output)]
     typer.echo(shlex.join([*arguments, "--async", "--concurrency-range", "1:16:5"]))
