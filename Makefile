@@ -1,4 +1,4 @@
-# make demo    a first look: exports a small checkpoint, serves it, scores samples and a video
+# make demo    a first look: serves a small trained checkpoint, scores clips, draws their curves
 # make test    everything that CI runs: lint, types, generated files, tests
 PYTHON ?= python3
 VENV := .venv
@@ -8,7 +8,7 @@ INSTALLED := $(VENV)/installed
 .PHONY: demo test check parity format model_repository clean
 
 demo: $(INSTALLED)
-	$(BIN)/rfm demo
+	$(BIN)/python examples/demo.py
 
 test: check
 	$(BIN)/pytest
@@ -27,10 +27,11 @@ format: $(INSTALLED)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Exports the demo's checkpoint anew, as version 1.
+# Trains the demo's checkpoint anew and exports it as version 1. Takes half an hour.
 model_repository: $(INSTALLED)
-	rm -rf build/demo_checkpoint model_repository/rfm model_repository/rfm_encoder model_repository/rfm_frames
-	$(BIN)/python -m rfm.demo.checkpoint build/demo_checkpoint
+	rm -rf build/demo_checkpoint
+	$(BIN)/python examples/train_demo_checkpoint.py build/demo_checkpoint
+	rm -rf model_repository/rfm model_repository/rfm_encoder model_repository/rfm_frames
 	$(BIN)/rfm export --repository model_repository --config model_repository/serve.yaml \
 	  --checkpoint build/demo_checkpoint/checkpoint \
 	  --image-encoder build/demo_checkpoint/image_encoder --text-encoder build/demo_checkpoint/text_encoder

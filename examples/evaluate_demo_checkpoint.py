@@ -74,14 +74,12 @@ def _evaluator(
         with RewardClient(url) as client:
             yield client.evaluate
     else:
-        from rfm.server.installation import find_installation
-        from rfm.server.process import Endpoints, TritonServer
+        from rfm.demo import served
 
         assert repository is not None  # one of the three is given
         with (
-            (log_folder / "tritonserver.log").open("wb") as log,
-            TritonServer(repository, Endpoints.free(), find_installation(None), log=log) as server,
-            RewardClient(server.endpoints.grpc_url) as client,
+            served(repository, log_folder / "tritonserver.log") as endpoints,
+            RewardClient(endpoints.grpc_url) as client,
         ):
             yield client.evaluate
 

@@ -26,12 +26,11 @@ from torch.utils.data import DataLoader
 
 from demo_training.groups import Groups, GroupsDataset
 from demo_training.losses import Questions, drawn_verb, hint_loss
-from demo_training.networks import Learner, num_parameters, seeded_learner
-from rfm.demo.checkpoint import write_checkpoint
+from demo_training.networks import Learner, num_parameters, seeded_learner, write_checkpoint
 
-ENCODER_STEPS = 800
-FROZEN_STEPS = 700
-JOINT_STEPS = 200
+ENCODER_STEPS = 1400
+FROZEN_STEPS = 900
+JOINT_STEPS = 500
 GROUPS_PER_STEP = 8
 PEAK_LEARNING_RATE = 1.5e-3
 WARMUP_STEPS = 100
@@ -85,7 +84,7 @@ def train(
     dataset = GroupsDataset(seed, plan.total, groups, encoder_steps)
     loader = DataLoader(dataset, batch_size=None, num_workers=1, prefetch_factor=8)
     log = _run(learner, loader, plan, folder)
-    write_checkpoint(folder, learner.network, learner.encoders)
+    write_checkpoint(learner, folder)
     parts = ("image_model", "text_model", "network")
     record = {
         "seed": seed,
@@ -125,7 +124,7 @@ def _run(learner: Learner, loader: DataLoader[Groups], plan: Plan, folder: Path)
                 bar.update(shown, description=text)
                 bar.console.print(text, highlight=False, soft_wrap=True)
             if step % SAVE_EVERY == 0 and plan.encoder < step < plan.total:  # what a run that is cut short leaves
-                write_checkpoint(folder / f"step_{step}", learner.network, learner.encoders)
+                write_checkpoint(learner, folder / f"step_{step}")
     return log
 
 

@@ -102,55 +102,34 @@ def serve(
 
 @app.command()
 def demo(
-    video: Annotated[Path | None, typer.Option(help="Video file to score; else a clip that is rendered here.")] = None,
-    task: Annotated[str | None, typer.Option(help="What is to be done in the video, as a sentence.")] = None,
+    video: Annotated[Path, typer.Option(help="Video file to score.")],
+    task: Annotated[str, typer.Option(help="What is to be done in the video, as a sentence.")],
     fps: Annotated[float, typer.Option(help="Frames a second that are scored.")] = 3.0,
-    checkpoint: Annotated[str | None, typer.Option(help="Checkpoint to serve; else one with random weights.")] = None,
+    repository: Annotated[Path, typer.Option(help="Triton model repository.")] = Path("model_repository"),
+    checkpoint: Annotated[str | None, typer.Option(help="Folder or id to export and serve, instead.")] = None,
     image_encoder: Annotated[str | None, typer.Option(help="Folder or id of its image encoder.")] = None,
     text_encoder: Annotated[str | None, typer.Option(help="Folder or id of its text encoder.")] = None,
     base_model: BaseModel = None,
     output: Annotated[Path, typer.Option(help="Folder for the plot and Triton's log.")] = Path("demo_output"),
     tritonserver: TritonPath = None,
 ) -> None:
-    """Export a checkpoint, serve it, score samples and a video, plot, and stop everything."""
+    """Serve a checkpoint, score one video, plot, and stop everything."""
     import rfm_export
-    from rfm import checkpoint as checkpoints
-    from rfm.models.rewind import RewindConfig
 
     try:
-        from rfm.demo import clip, run
-        from rfm.demo.checkpoint import write_random_checkpoint
+        from rfm.demo import score_video, served, show_metrics, stopped_by_signals
     except ImportError as error:
         _fail(f'the demo needs {error.name}: pip install "rfm-triton[demo,encoders,triton]"')
-    if (video is None) != (task is None):
-        _fail("--video and --task: expected both or neither, got one")
     console = Console()
-    output.mkdir(parents=True, exist_ok=True)
-    with run.stopped_by_signals(), TemporaryDirectory(prefix="rfm-demo-") as folder:
-        if checkpoint is None:
-            console.print("The checkpoint has random weights: its scores show that all is connected, and mean nothing.")
-            checkpoint, image_encoder, text_encoder = map(str, write_random_checkpoint(Path(folder) / "random"))
-        settings = _serve_config(None, image_encoder=image_encoder, text_encoder=text_encoder, base_model=base_model)
-        repository = Path(folder) / "model_repository"
-        if video is None or task is None:
-            video, task = Path(folder) / "clip.mp4", clip.TASK
-            clip.write(video)
+    with stopped_by_signals(), TemporaryDirectory(prefix="rfm-demo-") as folder:
         try:
-            config = checkpoints.load(checkpoint, base_model=base_model).config
-            rewind = config if isinstance(config, RewindConfig) else None
-            frames = run.video_frames(video, fps, rewind.max_frames if rewind else None, console)
-            rfm_export.export(checkpoint, repository, settings)
-            with (
-                (output / "tritonserver.log").open("wb") as log,
-                TritonServer(repository, Endpoints.free(), find_installation(tritonserver), log=log) as server,
-            ):
-                if rewind is not None:
-                    run.score_embeddings(server.endpoints, rewind, console)
-                if (repository / f"{settings.name}_frames").exists():
-                    run.score_frames(server.endpoints, frames, task, output / "rewards.png", console)
-                else:
-                    console.print("no video: the checkpoint has no encoders (--image-encoder, --text-encoder)")
-                run.show_metrics(server.endpoints, console)
+            if checkpoint is not None:
+                repository = Path(folder) / "model_repository"
+                encoders = {"image_encoder": image_encoder, "text_encoder": text_encoder}
+                rfm_export.export(checkpoint, repository, _serve_config(None, **encoders, base_model=base_model))
+            with served(repository, output / "tritonserver.log", tritonserver) as endpoints:
+                score_video(endpoints, video, task, fps, output / "rewards.png", console)
+                show_metrics(endpoints, console)
         except (CheckpointError, rfm_export.ExportError, ServerStartError, RewardError) as error:
             _fail(str(error))
 

@@ -19,6 +19,7 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import clip
 import numpy as np
 import pytest
 import tritonclient.http
@@ -26,7 +27,6 @@ from conftest import Served, random_trajectory
 from typer.main import get_command
 from typer.testing import CliRunner, Result
 
-from rfm.demo import clip
 from rfm_client import (
     FrameScores,
     PreferenceSample,

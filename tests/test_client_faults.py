@@ -90,7 +90,7 @@ def trajectory(seed: int, num_frames: int = 8) -> Trajectory:
     random = np.random.default_rng(seed)
     return Trajectory(
         video_embeddings=random.standard_normal((num_frames, 64), np.float32),
-        text_embedding=random.standard_normal(48, np.float32),
+        text_embedding=random.standard_normal(32, np.float32),
     )
 
 
@@ -346,7 +346,7 @@ import os, signal, sys
 import numpy as np
 from rfm_client import RewardClient, Trajectory
 client = RewardClient(sys.argv[1], shared_memory=True)
-client.progress(Trajectory(video_embeddings=np.ones((2000, 64)), text_embedding=np.ones(48)), frame_steps=2)
+client.progress(Trajectory(video_embeddings=np.ones((2000, 64)), text_embedding=np.ones(32)), frame_steps=2)
 os.kill(os.getpid(), signal.SIGKILL)
 """
 
@@ -394,7 +394,7 @@ from rfm_client import RewardClient, Trajectory
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16))  # as a full /dev/shm, for this process alone
 with RewardClient(sys.argv[1], shared_memory=True) as client:
-    trajectory = Trajectory(video_embeddings=np.ones((2000, 64)), text_embedding=np.ones(48))
+    trajectory = Trajectory(video_embeddings=np.ones((2000, 64)), text_embedding=np.ones(32))
     print(client.progress(trajectory, frame_steps=2).last_progress)
 """
 

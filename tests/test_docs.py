@@ -12,11 +12,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import clip
 import numpy as np
 import pytest
 from typer.main import get_command
 
-from rfm.demo import clip
 from rfm.server.installation import find_installation
 from rfm.server.process import Endpoints, TritonServer
 from rfm_client import PreferenceSample, ProgressSample, Trajectory
@@ -66,9 +66,9 @@ def pictures(seed: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
 
 
 def names() -> dict[str, Any]:
-    """What the examples take as given: the demo checkpoint reads embeddings of 64 and 48."""
+    """What the examples take as given: the demo checkpoint reads embeddings of 64 and 32."""
     random = np.random.default_rng(0)
-    embeddings, text = random.standard_normal((8, 64), np.float32), random.standard_normal(48, np.float32)
+    embeddings, text = random.standard_normal((8, 64), np.float32), random.standard_normal(32, np.float32)
     filmed = Trajectory(frames=pictures(1), task="stack the cups")
     rewound = Trajectory(video_embeddings=embeddings[::-1], text_embedding=text)
     steps = [{"observation.images.top": image, "task": "stack the cups"} for image in pictures(2)]

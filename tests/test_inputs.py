@@ -19,13 +19,13 @@ from threading import Thread
 from typing import Any
 
 import av
+import clip
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 from rfm.collate.images import Normalisation, QwenImages, SmolImages, _scaled_to_longest, fitted_size
-from rfm.demo import clip
 from rfm.engine import Engine
 from rfm.models.encoders import ImagePreprocessor
 from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, Trajectory

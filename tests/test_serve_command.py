@@ -18,10 +18,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import clip
 import numpy as np
 import pytest
 
-from rfm.demo import clip
 from rfm.server import installation
 from rfm.server.installation import ServerStartError, find_installation
 from rfm.server.process import SHARED_MEMORY, Endpoints, TritonServer
@@ -91,7 +91,12 @@ def test_the_committed_repository_is_served_until_a_signal(number: signal.Signal
 
 
 @pytest.mark.parametrize(
-    "arguments", [["serve", "--repository", str(REPOSITORY)], ["demo"]], ids=lambda words: words[0]
+    "arguments",
+    [
+        ["serve", "--repository", str(REPOSITORY)],
+        ["demo", "--repository", str(REPOSITORY), "--video", "clip.mp4", "--task", clip.TASK],
+    ],
+    ids=lambda words: words[0],
 )
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
 def test_a_signal_leaves_nothing_running(tmp_path: Path, arguments: list[str], number: signal.Signals) -> None:

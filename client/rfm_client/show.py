@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 STRIP_FRAMES = 8
 WIDTH_IN = 10.0
+COLUMN_WIDTH_IN = 7.0  # where panels stand side by side
 PANEL_HEIGHT_IN = 4.0
 DOTS_PER_IN = 200
 MAX_PANELS = 50  # one picture of more could not be looked at, nor drawn much further
@@ -128,21 +129,27 @@ class Panel:
         return cls(title, scores, positions, "frame" if times_s is None else "s", strip, positions[shown])
 
 
-def plot(file: Path, panels: Sequence[Panel], title: str | None = None) -> None:
-    """Writes a picture, in the format that the file's name ends in: per panel a film strip, and below it the scores."""
+def plot(file: Path, panels: Sequence[Panel], title: str | None = None, *, columns: int = 1) -> None:
+    """Writes a picture, in the format that the file's name ends in: per panel a film strip, and below it the scores.
+
+    columns: panels that stand side by side
+    """
     try:
         import matplotlib
         from matplotlib.figure import Figure
     except ImportError as error:
         raise ImportError('plots need matplotlib: pip install "rfm-client[cli]"') from error
 
-    heights_in = [PANEL_HEIGHT_IN * (1 if panel.strip is not None else 0.7) for panel in panels]
+    rows = [panels[start : start + columns] for start in range(0, len(panels), columns)]
+    heights_in = [PANEL_HEIGHT_IN * (1 if any(panel.strip is not None for panel in row) else 0.7) for row in rows]
     with matplotlib.rc_context({"pdf.fonttype": 42, "text.parse_math": False}):  # fonts that journals take
-        figure = Figure(figsize=(WIDTH_IN, sum(heights_in)), layout="constrained")
+        figure = Figure(
+            figsize=(WIDTH_IN if columns == 1 else COLUMN_WIDTH_IN * columns, sum(heights_in)), layout="constrained"
+        )
         if title is not None:
             figure.suptitle(title)
-        parts = figure.subfigures(len(panels), 1, squeeze=False, height_ratios=heights_in)
-        for part, panel in zip(parts[:, 0], panels, strict=True):
+        parts = figure.subfigures(len(rows), columns, squeeze=False, height_ratios=heights_in)
+        for part, panel in zip(parts.flat, panels):  # noqa: B905 - the last row may have room left
             _draw(part, panel)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Glyph")  # letters that the font lacks are drawn as boxes

@@ -3,11 +3,18 @@
 
 from __future__ import annotations
 
+import string
+from pathlib import Path
+from typing import Any
+
 import torch
+from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from demo_training.groups import HINT_DIM
-from rfm.demo.checkpoint import IMAGENET_MEAN, IMAGENET_STD, MAX_TASK_TOKENS, word_tokenizer
+from rfm.checkpoint import RewindCheckpoint, save
+from rfm.checkpoint.files import WEIGHTS
+from rfm.checkpoint.rewind import IMAGE_ENCODER_PREFIX, TEXT_ENCODER_PREFIX
 from rfm.models.encoders import Encoders, ImagePreprocessor
 from rfm.models.rewind import RewindConfig, RewindTransformer
 from toy_world.tasks import COLOURS, TARGETS, TASKS, VERBS
@@ -16,6 +23,9 @@ IMAGE_SIZE_PX = 48
 PATCH_SIZE_PX = 8
 VIDEO_DIM = 64
 TEXT_DIM = 32
+MAX_TASK_TOKENS = 128
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
 _INIT_STD = 0.1  # about 1 / sqrt(width); the 0.02 of large models starts such narrow ones too slowly
 _TEXT_GAIN = 6.0
 
@@ -76,6 +86,18 @@ def _waves(length: int, width: int) -> Tensor:
     return torch.cat([torch.sin(position * rates), torch.cos(position * rates)], dim=1)
 
 
+def write_checkpoint(learner: Learner, folder: Path) -> None:
+    """Writes ``checkpoint`` in upstream's layout, and ``image_encoder`` and ``text_encoder``, its base models."""
+    encoders = learner.encoders
+    encoders.save_pretrained(folder / "image_encoder", folder / "text_encoder")
+    save(RewindCheckpoint(CONFIG, learner.network.state_dict()), folder / "checkpoint")
+    weights = load_file(folder / "checkpoint" / WEIGHTS)
+    parts = ((IMAGE_ENCODER_PREFIX, encoders.image_model), (TEXT_ENCODER_PREFIX, encoders.text_model))
+    for prefix, model in parts:
+        weights |= {prefix + name: tensor.contiguous() for name, tensor in model.state_dict().items()}
+    save_file(weights, folder / "checkpoint" / WEIGHTS, metadata={"format": "pt"})
+
+
 def num_parameters(module: nn.Module) -> int:
     """How many numbers it has."""
     return sum(parameter.numel() for parameter in module.parameters())
@@ -98,7 +120,7 @@ def _encoders() -> Encoders:
     preprocessor = ImagePreprocessor(
         resize_px=IMAGE_SIZE_PX, crop_px=(IMAGE_SIZE_PX, IMAGE_SIZE_PX), mean=IMAGENET_MEAN, std=IMAGENET_STD
     )
-    tokenizer = word_tokenizer(MAX_TASK_TOKENS, [*COLOURS, *TARGETS, *VERBS, "the", "block", "in", "on"])
+    tokenizer = _tokenizer()
     text_model = BertModel(
         BertConfig(
             vocab_size=len(tokenizer),
@@ -111,6 +133,26 @@ def _encoders() -> Encoders:
         )
     )
     return Encoders(image_model, preprocessor, text_model, tokenizer)
+
+
+def _tokenizer() -> Any:
+    """Reads the tasks' words whole and any other letter by letter, in the way of a BERT tokenizer."""
+    from tokenizers import Tokenizer, normalizers, pre_tokenizers, processors
+    from tokenizers.models import WordPiece
+    from transformers import PreTrainedTokenizerFast
+
+    special = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "[MASK]"]
+    letters = [*string.ascii_lowercase, *string.digits, *string.punctuation]
+    words = [*COLOURS, *TARGETS, *VERBS, "the", "block", "in", "on"]
+    tokens = [*special, *letters, *(f"##{letter}" for letter in letters), *words]
+    vocabulary = {token: i for i, token in enumerate(tokens)}
+    tokenizer = Tokenizer(WordPiece(vocabulary, unk_token="[UNK]"))
+    tokenizer.normalizer = normalizers.BertNormalizer(lowercase=True)
+    tokenizer.pre_tokenizer = pre_tokenizers.BertPreTokenizer()
+    ends = [(token, vocabulary[token]) for token in ("[CLS]", "[SEP]")]
+    tokenizer.post_processor = processors.TemplateProcessing(single="[CLS] $A [SEP]", special_tokens=ends)
+    names = dict(zip(("pad_token", "unk_token", "cls_token", "sep_token", "mask_token"), special, strict=True))
+    return PreTrainedTokenizerFast(tokenizer_object=tokenizer, model_max_length=MAX_TASK_TOKENS, **names)
 
 
 def seeded_learner(seed: int) -> Learner:
