@@ -40,7 +40,7 @@ $(INSTALLED): pyproject.toml client/pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-	  --editable "client[cli,gym]" --editable ".[encoders,vlm,triton,demo,dev]"
+	  --editable "client[cli,gateway,gym]" --editable ".[encoders,vlm,triton,demo,dev]"
 	touch $@
 
 clean:

@@ -16,6 +16,7 @@ from rfm.config import ConfigError, ServeConfig
 from rfm.server.installation import ServerStartError, find_installation
 from rfm.server.process import Endpoints, TritonServer
 from rfm_client import RewardError
+from rfm_client.gateway.command import gateway, gateway_command
 
 EXIT_FAILED = 1
 WHEEL_WARNING = "the wheel's Triton 2.51 has known remote vulnerabilities and open admin APIs: use NVIDIA's container"
@@ -83,21 +84,38 @@ def serve(
     http_port: Annotated[int | None, typer.Option(help="HTTP port (8000).")] = None,
     grpc_port: Annotated[int | None, typer.Option(help="gRPC port (8001).")] = None,
     metrics_port: Annotated[int | None, typer.Option(help="Port of the Prometheus metrics (8002).")] = None,
+    gateway_port: Annotated[
+        int | None, typer.Option(help="Port of the FastAPI evaluation server's endpoints, too (see rfm gateway).")
+    ] = None,
     tritonserver: TritonPath = None,
 ) -> None:
     """Run tritonserver on a model repository until it is told to stop."""
     settings = _serve_config(
-        config, server_url=host, server_port=http_port, grpc_port=grpc_port, metrics_port=metrics_port
+        config,
+        server_url=host,
+        server_port=http_port,
+        grpc_port=grpc_port,
+        metrics_port=metrics_port,
+        gateway_port=gateway_port,
     )
     try:
         installation = find_installation(tritonserver)
         if installation.wheel is not None and not settings.is_loopback:
             typer.echo(f"rfm: warning: {settings.host} is no loopback address, and {WHEEL_WARNING}", err=True)
-        server = TritonServer(repository, Endpoints.of(settings), installation, http_threads=settings.max_workers)
-        status = server.run()
+        endpoints = Endpoints.of(settings)
+        companion = None
+        if settings.gateway_port is not None:
+            companion = gateway_command(
+                endpoints.grpc_url, endpoints.metrics_url, settings.name, settings.host, settings.gateway_port
+            )
+        server = TritonServer(repository, endpoints, installation, http_threads=settings.max_workers)
+        status = server.run(companion)
     except ServerStartError as error:
         _fail(str(error))
     raise typer.Exit(status)
+
+
+app.command()(gateway)
 
 
 @app.command()

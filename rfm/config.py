@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_TOKEN_BUDGET = 16_384
 MAX_PORT = 65_535
+_PORTS = ("server_port", "grpc_port", "metrics_port", "gateway_port")
 _DTYPES = ("float32", "bfloat16", "float16")
 
 
@@ -46,6 +47,7 @@ class ServeConfig:
     token_budget: the most tokens, padding included, of one forward pass
     torch_threads: CPU threads of each model instance; 0: torch's choice
     grpc_port, metrics_port: Triton's other two ports
+    gateway_port: of the FastAPI evaluation server's endpoints before it; null: there are none
     """
 
     model_path: str | None = None
@@ -63,15 +65,16 @@ class ServeConfig:
     torch_threads: int = 0
     grpc_port: int = 8001
     metrics_port: int = 8002
+    gateway_port: int | None = None
 
     def __post_init__(self) -> None:
-        _at_least(1, self, "batch_size", "max_workers", "token_budget", "server_port", "grpc_port", "metrics_port")
+        _at_least(1, self, "batch_size", "max_workers", "token_budget", *_PORTS)
         _at_least(0, self, "num_gpus", "torch_threads")
         if self.dtype not in (None, *_DTYPES):
             raise ConfigError(f"dtype: expected one of {', '.join(_DTYPES)} or null, got {self.dtype!r}")
-        ports = {name: getattr(self, name) for name in ("server_port", "grpc_port", "metrics_port")}
+        ports = {name: getattr(self, name) for name in _PORTS if getattr(self, name) is not None}
         if max(ports.values()) > MAX_PORT or len(set(ports.values())) < len(ports):
-            raise ConfigError(f"ports: expected three different ones up to {MAX_PORT}, got {ports}")
+            raise ConfigError(f"ports: expected different ones up to {MAX_PORT}, got {ports}")
         if ":" in self.host:
             raise ConfigError(f"server_url: expected an address without port (server_port), got {self.server_url!r}")
         if not self.name.replace("_", "").replace("-", "").isalnum():

@@ -5,14 +5,17 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import clip
+import httpx
 import numpy as np
 import pytest
 from typer.main import get_command
@@ -99,6 +102,9 @@ def test_every_example_runs(demo_server: Endpoints, folder: Path, code: str) -> 
 
 @pytest.mark.parametrize("command", found(COMMAND))
 def test_every_command_line_runs(demo_server: Endpoints, folder: Path, command: str) -> None:
+    if command.startswith("rfm-client gateway"):
+        check_gateway(demo_server, command)
+        return
     environment = {
         **os.environ,
         "RFM_URL": demo_server.grpc_url,
@@ -106,6 +112,25 @@ def test_every_command_line_runs(demo_server: Endpoints, folder: Path, command: 
     }
     done = subprocess.run(command, shell=True, env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
+
+
+def check_gateway(endpoints: Endpoints, command: str) -> None:
+    """It runs until it is told to stop."""
+    port = Endpoints.free().http_port
+    words = [*shlex.split(command), "--triton", endpoints.grpc_url, "--metrics-url", endpoints.metrics_url]
+    program = Path(sys.executable).parent / words[0]
+    gateway = subprocess.Popen([program, *words[1:], "--port", str(port)], stderr=subprocess.PIPE)
+    try:
+        while True:
+            assert gateway.poll() is None, gateway.communicate()
+            try:
+                assert httpx.get(f"http://127.0.0.1:{port}/health").json()["status"] == "healthy"
+                break
+            except httpx.TransportError:  # it does not listen yet
+                time.sleep(0.1)
+    finally:
+        gateway.terminate()
+        gateway.communicate(timeout=60)
 
 
 def test_every_command_of_the_client_is_shown() -> None:

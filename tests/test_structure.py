@@ -40,12 +40,18 @@ LIGHT = {"numpy", "tritonclient", "aiohttp", "typing_extensions"}  # the last fo
 # What only an extra brings, and which files need it.
 EXTRAS = {
     "av": {"video.py"},
-    "PIL": {"resize.py"},
+    "PIL": {"resize.py", "gateway"},
     "gymnasium": {"gym.py"},
-    "typer": {"cli"},
+    "typer": {"cli", "gateway"},
+    "fastapi": {"gateway"},
+    "starlette": {"gateway"},
+    "pydantic": {"gateway"},
+    "pydantic_core": {"gateway"},
+    "uvicorn": {"gateway"},
+    "anyio": {"gateway"},
     "rich": {"cli", "show.py"},
     "matplotlib": {"show.py"},
-    "prometheus_client": {"status.py"},
+    "prometheus_client": {"status.py", "gateway"},
 }
 
 

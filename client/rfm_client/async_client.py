@@ -145,6 +145,19 @@ class AsyncRewardClient:
                 raise outcome
         return cast("list[Result]", outcomes)
 
+    async def encode(self, trajectory: Trajectory, *, timeout_s: float | None = None) -> Trajectory:
+        """The trajectory with embeddings of its frames and its task in place of the frames, for a checkpoint that is
+        served with encoders. What is asked often is then encoded once. Raises RewardError.
+        """
+        if trajectory.frames is None:
+            raise InvalidSampleError.at("trajectory", "frames", "video_embeddings")
+        tensors = await off_loop(trajectory.frames.nbytes, wire.encode_frames, trajectory)
+        outputs = (wire.VIDEO_EMBEDDINGS, wire.TEXT_EMBEDDING)
+        deadline = self._deadline(timeout_s)
+        async with self._in_flight.room(trajectory.frames.nbytes, deadline):
+            answer = await self._servers.infer(f"{self._model}_encoder", tensors, outputs, deadline)
+        return wire.decode_embeddings(answer.tensors, trajectory)
+
     async def is_ready(self, *, timeout_s: float | None = None) -> bool:
         """Whether a server answers and has the model ready, for embeddings or for raw frames."""
         left_s = self._deadline(timeout_s).remaining_s()

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from rfm_client import wire
@@ -12,6 +13,9 @@ from rfm_client.resize import FrameSize
 
 MAX_FRAMES_PARAMETER = "max_frames"  # parameters of config.pbtxt; empty: no limit
 FRAME_SIZE_PARAMETER = "frame_size"
+FRAMES_PER_VALUE_PARAMETER = "frames_per_value"
+SOURCE_PARAMETER = "source"
+NETWORK_PARAMETER = "network"
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,9 @@ class ModelInfo:
     frame_size: to what the checkpoint brings each frame; None: that depends on the frame
     video_dim, text_dim: widths D and Dt of the embeddings; None: it reads raw frames
     progress_bins: K of a discrete checkpoint; None: continuous
+    frames_per_value: frames that share their scores; 2 where a vision-language model sees a trajectory as a video
+    source: which checkpoint was exported: its Hub id, or the end of its path; None: it does not say
+    network: its class, its configuration (config), and how many numbers each part of it has (parameters)
     """
 
     name: str
@@ -34,6 +41,9 @@ class ModelInfo:
     video_dim: int | None
     text_dim: int | None
     progress_bins: int | None
+    frames_per_value: int = 1
+    source: str | None = None
+    network: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> ModelInfo:
@@ -55,4 +65,7 @@ class ModelInfo:
             video_dim=last_dims.get(wire.VIDEO_EMBEDDINGS),
             text_dim=last_dims.get(wire.TEXT_EMBEDDING),
             progress_bins=last_dims.get(wire.PROGRESS_LOGITS),
+            frames_per_value=int(parameters.get(FRAMES_PER_VALUE_PARAMETER) or 1),
+            source=parameters.get(SOURCE_PARAMETER) or None,
+            network=json.loads(parameters.get(NETWORK_PARAMETER) or "{}"),
         )

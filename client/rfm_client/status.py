@@ -19,14 +19,19 @@ from rfm_client.transport import split_url
 
 METRICS_PORT = 8002
 DEVICE_METRICS = "nv_cpu_utilization, nv_gpu_utilization, nv_*_memory_*_bytes"
+_PROCESSOR = "CPU"
 PENDING_METRIC = "nv_inference_pending_request_count"
 
 _DEVICE_METRIC = re.compile("nv_(cpu|gpu)_(utilization|memory_used_bytes|memory_total_bytes)")
+_REQUESTS_METRIC = "nv_inference_request_success_total"
+_COMPUTE_METRIC = "nv_inference_compute_infer_duration_us_total"
 _SAMPLED_METRIC = "nv_cpu_memory_used_bytes"
 _SAMPLING_S = 2.5  # Triton looks at the machine every two seconds; until the first time it tells zeros
 _POLL_S = 0.2
 _REASON_CHARACTERS = 120
 _NS_PER_MS = 1e6
+_MS_PER_S = 1e3
+_US_PER_S = 1e6
 
 
 @dataclass(frozen=True)
@@ -36,6 +41,7 @@ class ModelStatus:
     requests_pending: requests that wait for their turn now; None: the metrics do not tell
     samples, executions: of all requests together; a batch is executed once
     queue_ms, compute_ms: of all requests in the queue, of all executions in the model
+    last_used_s: Unix time of the last request; None: there was none
     """
 
     name: str
@@ -49,6 +55,7 @@ class ModelStatus:
     executions: int
     queue_ms: float
     compute_ms: float
+    last_used_s: float | None = None
 
     @property
     def samples_per_execution(self) -> float | None:
@@ -68,12 +75,24 @@ class ModelStatus:
 
 @dataclass(frozen=True)
 class Device:
-    """The processor (``CPU``), or a GPU by its UUID. utilization: 0..1. What Triton does not report is None."""
+    """The processor (``CPU``), or a GPU by its UUID. utilization: 0..1. What Triton does not report is None.
+
+    work: what each model has done there, by its name
+    """
 
     name: str
     utilization: float | None
     memory_used_bytes: float | None
     memory_total_bytes: float | None
+    work: Mapping[str, DeviceWork] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class DeviceWork:
+    """Of one model on one device, all its versions together. requests: answered; compute_s: seconds of its batches"""
+
+    requests: int
+    compute_s: float
 
 
 @dataclass(frozen=True)
@@ -180,6 +199,7 @@ def _models(server: _Server, metrics: _Metrics) -> list[ModelStatus]:
                 queue_ms=_whole(times, "queue", "ns") / _NS_PER_MS,
                 compute_ms=sum(_whole(batch, "compute_infer", "ns") for batch in done.get("batch_stats", []))
                 / _NS_PER_MS,
+                last_used_s=int(done.get("last_inference", 0)) / _MS_PER_S or None,
             )
         )
     return models
@@ -206,7 +226,13 @@ def _read_metrics(url: str, timeout_s: float) -> _Metrics:
             devices.setdefault(sample.labels.get("gpu_uuid", match[1].upper()), {})[match[2]] = sample.value
     return _Metrics(
         devices=tuple(
-            Device(name, told.get("utilization"), told.get("memory_used_bytes"), told.get("memory_total_bytes"))
+            Device(
+                name,
+                told.get("utilization"),
+                told.get("memory_used_bytes"),
+                told.get("memory_total_bytes"),
+                _work(samples, name),
+            )
             for name, told in devices.items()
         ),
         pending={
@@ -215,6 +241,19 @@ def _read_metrics(url: str, timeout_s: float) -> _Metrics:
             if sample.name == PENDING_METRIC
         },
     )
+
+
+def _work(samples: list[Any], device: str) -> dict[str, DeviceWork]:
+    """By model. Triton names the GPU of a count; what it names none for is the processor's."""
+    counts: dict[str, dict[str, float]] = {}
+    for sample in samples:
+        if sample.name in (_REQUESTS_METRIC, _COMPUTE_METRIC) and sample.labels.get("gpu_uuid", _PROCESSOR) == device:
+            of_model = counts.setdefault(sample.labels["model"], {_REQUESTS_METRIC: 0, _COMPUTE_METRIC: 0})
+            of_model[sample.name] += sample.value
+    return {
+        model: DeviceWork(int(count[_REQUESTS_METRIC]), count[_COMPUTE_METRIC] / _US_PER_S)
+        for model, count in counts.items()
+    }
 
 
 def _scrape(url: str, timeout_s: float) -> list[Any]:

@@ -154,6 +154,23 @@ def decode_samples(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Sample]:
     return [_located(_decode_sample, tensors, row) for row in range(len(tensors[SAMPLE_TYPE]))]
 
 
+def encode_frames(trajectory: Trajectory) -> Tensors:
+    """One request to the encoder, for one trajectory of raw frames."""
+    tensors = encode_samples([ProgressSample(trajectory)])
+    return {spec.name: tensors[spec.name] for spec in encoder_inputs()}
+
+
+def decode_embeddings(tensors: Mapping[str, npt.NDArray[Any]], trajectory: Trajectory) -> Trajectory:
+    """The encoder's answer for one trajectory. Raises InferenceFailedError if it lacks an embedding."""
+    count, video, text = trajectory.num_frames, tensors[VIDEO_EMBEDDINGS], tensors[TEXT_EMBEDDING]
+    if video.ndim != 3 or text.ndim != 2 or video.shape[:2] != (1, count) or len(text) != 1:
+        raise InferenceFailedError(f"embeddings: expected [1, {count}, D] and [1, Dt], got {video.shape}, {text.shape}")
+    try:
+        return Trajectory(video_embeddings=video[0], text_embedding=text[0], task=trajectory.task)
+    except InvalidSampleError as error:
+        raise InferenceFailedError(f"embeddings: {error}") from error
+
+
 def decode_trajectories(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Trajectory]:
     """What the encoder is to encode: per sample its frames without padding, and its task."""
 

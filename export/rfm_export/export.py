@@ -19,6 +19,7 @@ from rfm.engine import PROCESSOR_FOLDER, Engine
 from rfm.families.vlm import load_collator, save_processor
 from rfm.models.encoders import PREPROCESSOR_CONFIG, Encoders, ImagePreprocessor
 from rfm_client.resize import FrameSize
+from rfm_export.about import about, told_source
 from rfm_export.errors import ExportError
 from rfm_export.layout import GeneratedModel, encoder_name, frames_name, rewind_models, vlm_models
 from rfm_export.publish import next_version, publish, read_config, staging
@@ -58,9 +59,9 @@ def export(source: str | Path, repository: Path, serve: ServeConfig) -> int:
     checkpoint = checkpoints.load(source, base_model=serve.base_model)
     version = next_version(repository, [serve.name, encoder_name(serve.name), frames_name(serve.name)])
     if isinstance(checkpoint, RewindCheckpoint):
-        plan = _rewind_plan(checkpoint, serve, version)
+        plan = _rewind_plan(checkpoint, serve, version, source)
     else:
-        plan = _vlm_plan(checkpoint, serve, version, checkpoints.find(source))
+        plan = _vlm_plan(checkpoint, serve, version, source)
     _check_replaceable(repository, plan.models, serve)
     with staging(repository) as folder:
         for path, content in (item for model in plan.models for item in model.files().items()):
@@ -76,14 +77,16 @@ def export(source: str | Path, repository: Path, serve: ServeConfig) -> int:
 def check(repository: Path, serve: ServeConfig) -> list[str]:
     """How the repository's generated files differ from what an export would write now; empty if they do not."""
     scorer = serve.name if (repository / serve.name).exists() else frames_name(serve.name)
-    versions = _read_config(repository, scorer).version_policy.specific.versions
+    config = _read_config(repository, scorer)
+    versions = config.version_policy.specific.versions
     if not versions:
         raise ExportError(f"{repository / scorer}: expected a configuration that names its versions, got none")
     version = max(versions)
     checkpoint = checkpoints.load(repository / scorer / str(version) / CHECKPOINT_FOLDER)
     frame_size = _exported_frame_size(repository / encoder_name(serve.name) / str(version))
+    models = _models(checkpoint, serve, version, frame_size, told_source(config))
     differences = []
-    for path, content in (i for m in _models(checkpoint, serve, version, frame_size) for i in m.files().items()):
+    for path, content in (i for model in models for i in model.files().items()):
         if not (repository / path).is_file():
             differences.append(f"{repository / path}: is missing")
         elif (repository / path).read_bytes() != content:
@@ -124,15 +127,16 @@ def _exported_frame_size(encoder: Path) -> FrameSize | None:
 
 
 def _models(
-    checkpoint: Checkpoint, serve: ServeConfig, version: int, frame_size: FrameSize | None
+    checkpoint: Checkpoint, serve: ServeConfig, version: int, frame_size: FrameSize | None, source: str | Path
 ) -> list[GeneratedModel]:
+    told = about(checkpoint, source)
     num_gpus = torch.cuda.device_count() if serve.num_gpus is None else serve.num_gpus
     if isinstance(checkpoint, VlmCheckpoint):
-        return vlm_models(checkpoint.config, serve, num_gpus=num_gpus, version=version)
-    return rewind_models(checkpoint.config, serve, num_gpus=num_gpus, version=version, frame_size=frame_size)
+        return vlm_models(checkpoint.config, serve, told, num_gpus=num_gpus, version=version)
+    return rewind_models(checkpoint.config, serve, told, num_gpus=num_gpus, version=version, frame_size=frame_size)
 
 
-def _rewind_plan(checkpoint: RewindCheckpoint, serve: ServeConfig, version: int) -> _Plan:
+def _rewind_plan(checkpoint: RewindCheckpoint, serve: ServeConfig, version: int, source: str | Path) -> _Plan:
     encoders = load_encoders(checkpoint, serve)
 
     def of_scorer(folder: Path) -> Path:
@@ -152,7 +156,7 @@ def _rewind_plan(checkpoint: RewindCheckpoint, serve: ServeConfig, version: int)
         return Engine.from_checkpoint(of_scorer(folder), encoders=saved)
 
     return _Plan(
-        models=_models(checkpoint, serve, version, encoders.preprocessor.frame_size if encoders is not None else None),
+        models=_models(checkpoint, serve, version, encoders.preprocessor.frame_size if encoders else None, source),
         write=write,
         original=lambda: Engine.of(checkpoint, encoders=encoders),
         exported=exported,
@@ -161,10 +165,11 @@ def _rewind_plan(checkpoint: RewindCheckpoint, serve: ServeConfig, version: int)
     )
 
 
-def _vlm_plan(checkpoint: VlmCheckpoint, serve: ServeConfig, version: int, source: Path) -> _Plan:
+def _vlm_plan(checkpoint: VlmCheckpoint, serve: ServeConfig, version: int, source: str | Path) -> _Plan:
+    folder = checkpoints.find(source)
     processor: str | Path = serve.base_model or checkpoint.config.base_model_id
-    if serve.base_model is None and (source / PROCESSOR_FOLDER).is_dir():
-        processor = source / PROCESSOR_FOLDER
+    if serve.base_model is None and (folder / PROCESSOR_FOLDER).is_dir():
+        processor = folder / PROCESSOR_FOLDER
     collator = load_collator(checkpoint, processor)
 
     def of_scorer(folder: Path) -> Path:
@@ -176,7 +181,7 @@ def _vlm_plan(checkpoint: VlmCheckpoint, serve: ServeConfig, version: int, sourc
 
     device = "cuda" if torch.cuda.is_available() and serve.num_gpus != 0 else "cpu"
     return _Plan(
-        models=_models(checkpoint, serve, version, frame_size=None),
+        models=_models(checkpoint, serve, version, None, source),
         write=write,
         original=lambda: Engine.of(checkpoint, processor=processor, device=device, dtype=serve.torch_dtype),
         exported=lambda folder: Engine.from_checkpoint(of_scorer(folder), device=device, dtype=serve.torch_dtype),

@@ -7,6 +7,7 @@ ensemble of the two that scores raw frames. Vision-language: ``<name>_frames`` a
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 
@@ -19,7 +20,11 @@ from rfm.families.vlm import SMOL_SIZE_PX
 from rfm.models.rewind import RewindConfig
 from rfm.models.vlm import SMOL, VlmConfig
 from rfm_client import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory, wire
-from rfm_client.model_info import FRAME_SIZE_PARAMETER, MAX_FRAMES_PARAMETER
+from rfm_client.model_info import (
+    FRAME_SIZE_PARAMETER,
+    FRAMES_PER_VALUE_PARAMETER,
+    MAX_FRAMES_PARAMETER,
+)
 from rfm_client.resize import FrameSize
 from rfm_export.pbtxt import Interface, Warmup, ensemble_config, python_config, render
 
@@ -74,16 +79,23 @@ def frames_name(name: str) -> str:
 
 
 def rewind_models(
-    config: RewindConfig, serve: ServeConfig, *, num_gpus: int, version: int, frame_size: FrameSize | None
+    config: RewindConfig,
+    serve: ServeConfig,
+    about: Mapping[str, str],
+    *,
+    num_gpus: int,
+    version: int,
+    frame_size: FrameSize | None,
 ) -> list[GeneratedModel]:
     """The models of a checkpoint; an ensemble stands behind what it is made of.
 
+    about: parameters that tell which checkpoint it is
     frame_size: to what its encoders bring each frame; None: it has no encoders
     """
     dims = config.video_feature_dim, config.text_feature_dim
     outputs = wire.score_outputs(config.progress_bins if config.progress_bins > 1 else None)
     limit = min((n for n in (config.trained_frames, config.max_frames) if n is not None), default=None)
-    scorer = Interface(serve.name, wire.embedding_inputs(*dims), outputs, _limits(limit))
+    scorer = Interface(serve.name, wire.embedding_inputs(*dims), outputs, {**_limits(limit), **about})
     models = [
         _python_model(
             scorer, "rfm", serve, num_gpus, version, _warmups(_warmup_embeddings(config), config.has_similarity)
@@ -91,27 +103,33 @@ def rewind_models(
     ]
     if frame_size is not None:
         encoder = Interface(encoder_name(serve.name), wire.encoder_inputs(), wire.encoder_outputs(*dims))
-        frames = Interface(frames_name(serve.name), wire.frame_inputs(), outputs, _limits(limit, frame_size))
+        frames = Interface(
+            frames_name(serve.name), wire.frame_inputs(), outputs, {**_limits(limit, frame_size), **about}
+        )
         models.append(_python_model(encoder, "rfm_encoder", serve, num_gpus, version, [_encoder_warmup()]))
         models.append(GeneratedModel(ensemble_config(frames, serve, version, encoder, scorer), version))
     return models
 
 
-def vlm_models(config: VlmConfig, serve: ServeConfig, *, num_gpus: int, version: int) -> list[GeneratedModel]:
+def vlm_models(
+    config: VlmConfig, serve: ServeConfig, about: Mapping[str, str], *, num_gpus: int, version: int
+) -> list[GeneratedModel]:
     """The one model of a vision-language checkpoint."""
     outputs = wire.score_outputs(config.progress_bins if config.progress_bins > 1 else None)
-    limits = _limits(config.trained_frames, _frame_size(config))
-    frames = Interface(frames_name(serve.name), wire.frame_inputs(), outputs, limits)
+    shares_values = not (config.multi_image or config.generates_text)
+    limits = _limits(config.trained_frames, _frame_size(config), FRAMES_PER_GROUP if shares_values else 1)
+    frames = Interface(frames_name(serve.name), wire.frame_inputs(), outputs, {**limits, **about})
     # What a model that generates text says to blank frames need not be an answer, and a failed warm-up fails the load.
     warmups = [] if config.generates_text else _warmups(_warmup_frames(), config.has_similarity)
     return [_python_model(frames, "rfm", serve, num_gpus, version, warmups)]
 
 
-def _limits(max_frames: int | None, frame_size: FrameSize | None = None) -> dict[str, str]:
+def _limits(max_frames: int | None, frame_size: FrameSize | None = None, frames_per_value: int = 1) -> dict[str, str]:
     """What a client may want to know before it sends a trajectory; empty: no limit."""
     return {
         MAX_FRAMES_PARAMETER: "" if max_frames is None else str(max_frames),
         FRAME_SIZE_PARAMETER: "" if frame_size is None else str(frame_size),
+        FRAMES_PER_VALUE_PARAMETER: str(frames_per_value),
     }
 
 

@@ -11,7 +11,7 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from http.client import HTTPException
@@ -106,15 +106,21 @@ class TritonServer:
         self._region_prefix = f"rfm_{os.getpid()}_{secrets.token_hex(4)}_"
         self._backends: Path | None = None
         self._process: subprocess.Popen[bytes] | None = None
+        self._companion: subprocess.Popen[bytes] | None = None
 
-    def run(self) -> int:
-        """Serves until the server ends or this process is told to (STOP_SIGNALS); gives Triton's exit status."""
+    def run(self, companion: Sequence[str] | None = None) -> int:
+        """Serves until the server ends or this process is told to (STOP_SIGNALS); gives Triton's exit status.
+
+        companion: command line of a program that runs as long as the server is ready; if it ends, so does the server
+        """
         told_to_stop = False
 
         def stop(number: int, _frame: FrameType | None) -> None:
             nonlocal told_to_stop
             told_to_stop = True
-            if self._process is not None:
+            if self._companion is not None:  # it answers what it has begun, and then the server is stopped
+                self._companion.terminate()
+            elif self._process is not None:
                 self._process.send_signal(signal.SIGTERM if number == signal.SIGHUP else number)
 
         previous = {number: signal.signal(number, stop) for number in STOP_SIGNALS}
@@ -123,7 +129,10 @@ class TritonServer:
             if told_to_stop:  # before there was a process to pass it to
                 return self.stop()
             self.wait_ready()
-            return self._wait()
+            if companion is None or told_to_stop:
+                return self._wait()
+            self._companion = subprocess.Popen(companion, stdin=subprocess.DEVNULL, start_new_session=True)
+            return self._wait_with(self._companion, lambda: told_to_stop)
         except ServerStartError:
             status = self.stop()
             if told_to_stop:  # while it was still loading
@@ -221,6 +230,19 @@ class TritonServer:
             *([f"--http-thread-count={self._http_threads}"] if self._http_threads else []),
         ]
 
+    def _wait_with(self, companion: subprocess.Popen[bytes], is_told_to_stop: Callable[[], bool]) -> int:
+        """Waits for the server and its companion, and ends the one when the other has ended."""
+        assert self._process is not None  # started
+        try:
+            while self._process.poll() is None and companion.poll() is None:
+                time.sleep(POLL_S)
+        finally:
+            _end(companion)
+        status = self.stop()
+        if not is_told_to_stop() and companion.returncode not in (0, -signal.SIGTERM):
+            raise ServerStartError(f"gateway: expected to run, got exit status {companion.returncode}")
+        return status
+
     def _wait(self) -> int:
         """Waits for the server to end and clears away what it leaves; gives its exit status."""
         assert self._process is not None  # started
@@ -235,6 +257,17 @@ class TritonServer:
             shutil.rmtree(self._backends, ignore_errors=True)
         for region in SHARED_MEMORY.glob(f"{self._region_prefix}*"):
             region.unlink(missing_ok=True)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Gracefully, by force after KILL_AFTER_S."""
+    if process.poll() is None:
+        process.terminate()
+    try:
+        process.wait(KILL_AFTER_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 def _one_line(reason: str) -> str:

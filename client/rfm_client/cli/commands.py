@@ -16,6 +16,7 @@ from rfm_client.cli import options, outputs, scoring, toy
 from rfm_client.cli.options import EXIT_CODES, STANDARD_OUTPUT, OneLineCommand, Server
 from rfm_client.cli.scoring import Failed, Question, Scored
 from rfm_client.errors import RewardError
+from rfm_client.gateway.command import gateway
 from rfm_client.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS
 from rfm_client.transport import split_url
 
@@ -270,3 +271,6 @@ def _print(*tables: object) -> None:
     console = Console()
     console = console if console.is_terminal else Console(width=FILE_WIDTH)
     console.print(*tables, sep="\n")
+
+
+app.command(cls=OneLineCommand)(gateway)

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: MIT
+"""``rfm-client gateway`` and ``rfm gateway``."""
+
+from __future__ import annotations
+
+import ipaddress
+import logging
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+API_KEY_VARIABLE = "RFM_GATEWAY_API_KEY"
+KEEP_ALIVE_S = 30
+STOP_WITHIN_S = 30
+
+logger = logging.getLogger("rfm_client.gateway")
+
+
+def gateway(
+    triton: Annotated[str, typer.Option(help="grpc://host:port or http://host:port of Triton.")],
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port to listen on.")] = 8000,
+    metrics_url: Annotated[
+        str | None, typer.Option(help="Triton's metrics; else port 8002 of the same host.", show_default=False)
+    ] = None,
+    model: Annotated[str, typer.Option(help="Name under which the checkpoint was exported.")] = "rfm",
+    timeout: Annotated[
+        float, typer.Option(min=0.001, help="Seconds that a request may take to arrive, and then to be scored.")
+    ] = 60.0,
+    max_body_mib: Annotated[int, typer.Option(min=1, help="Largest request.")] = 256,
+    max_in_flight: Annotated[int, typer.Option(min=1, help="Evaluations at a time; more are refused with 503.")] = 256,
+    api_key_file: Annotated[
+        Path | None,
+        typer.Option(help=f"File with the key that requests must show; else {API_KEY_VARIABLE}.", show_default=False),
+    ] = None,
+    cors_origin: Annotated[
+        list[str] | None, typer.Option(help="Origin from which browsers may ask. Again for more.", show_default=False)
+    ] = None,
+    allow_folder: Annotated[
+        Path | None, typer.Option(help="Folder whose files requests may name.", show_default=False)
+    ] = None,
+) -> None:
+    """Serve the FastAPI evaluation server's endpoints before a Triton server."""
+    try:
+        import uvicorn
+
+        from rfm_client.gateway.app import MIB, GatewaySettings, create_app
+    except ModuleNotFoundError as error:
+        raise typer.BadParameter(f'the gateway needs {error.name}: pip install "rfm-client[gateway]"') from None
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    key = _key(api_key_file)
+    try:
+        settings = GatewaySettings(
+            triton_url=triton,
+            metrics_url=metrics_url,
+            model=model,
+            timeout_s=timeout,
+            max_body_bytes=max_body_mib * MIB,
+            max_in_flight=max_in_flight,
+            api_key=key,
+            cors_origins=tuple(cors_origin or ()),
+            folder=allow_folder,
+        )
+        app = create_app(settings)
+    except (ValueError, OSError) as error:
+        raise typer.BadParameter(str(error)) from None
+    if key is None and not _is_loopback(host):
+        logger.warning("%s is no loopback address, and no key is asked for: whoever reaches it may use it", host)
+    uvicorn.run(
+        app,
+        host=host,
+        port=port,
+        access_log=False,
+        log_config=None,
+        timeout_keep_alive=KEEP_ALIVE_S,
+        timeout_graceful_shutdown=STOP_WITHIN_S,
+    )
+
+
+def gateway_command(triton: str, metrics_url: str, model: str, host: str, port: int) -> list[str]:
+    """A command line that serves a gateway as ``gateway`` does, in a process of its own."""
+    options = {"triton": triton, "metrics-url": metrics_url, "model": model, "host": host, "port": port}
+    words = (word for name, value in options.items() for word in (f"--{name}", str(value)))
+    return [sys.executable, "-m", "rfm_client.gateway", *words]
+
+
+def _key(file: Path | None) -> str | None:
+    try:
+        key = os.environ.get(API_KEY_VARIABLE) if file is None else file.read_text().strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise typer.BadParameter(f"--api-key-file: expected a text file, got {error}") from None
+    if key is not None and not key:
+        raise typer.BadParameter("key: expected at least one character, got none")
+    return key
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: MIT
+"""Files that requests name: none, unless the operator allows a folder; then those in it alone, and no pickle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rfm_client.errors import InvalidSampleError
+from rfm_client.inputs import ARRAY_SUFFIXES, load_trajectory
+from rfm_client.samples import Trajectory, UInt8Array
+
+
+class AllowedFolder:
+    """The folder that requests may name files of. None: they may name none."""
+
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = None if folder is None else folder.resolve(strict=True)
+
+    def frames(self, names: Sequence[str]) -> UInt8Array:
+        """uint8 [T, H, W, 3], the images of these names. Raises InvalidSampleError."""
+        from PIL import Image
+
+        images = []
+        for index, name in enumerate(names):
+            where = f"frames.{index}"
+            try:
+                with Image.open(self._file(name, where)) as image:
+                    images.append(np.asarray(image.convert("RGB")))
+            except (OSError, Image.DecompressionBombError):
+                raise InvalidSampleError.at(where, "an image file", name) from None
+        if len({image.shape for image in images}) > 1:
+            raise InvalidSampleError.at("frames", "images of one size", "different ones")
+        return np.stack(images)
+
+    def embeddings(self, name: str) -> Trajectory:
+        """The embeddings in a .npy or .npz file. Raises InvalidSampleError."""
+        file = self._file(name, "embeddings_path")
+        if file.suffix.lower() not in ARRAY_SUFFIXES:
+            raise InvalidSampleError.at("embeddings_path", " or ".join(ARRAY_SUFFIXES), name)
+        trajectory = load_trajectory(file)
+        if trajectory.video_embeddings is None:
+            raise InvalidSampleError.at("embeddings_path", "a file of embeddings", "frames")
+        return trajectory
+
+    def _file(self, name: str, where: str) -> Path:
+        if self._folder is None:
+            raise InvalidSampleError.at(where, "an array (this gateway reads no files)", "the name of a file")
+        file = (self._folder / name).resolve()
+        if not file.is_relative_to(self._folder) or not file.is_file():  # links are followed before
+            raise InvalidSampleError.at(where, "a file in the allowed folder", name)
+        return file

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: MIT
+"""What the gateway counts, in Prometheus' terms, and how many requests it lets in at a time."""
+
+from __future__ import annotations
+
+import time
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+from starlette.responses import JSONResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+RETRY_AFTER_S = "1"
+EVALUATIONS = ("/evaluate_batch", "/evaluate_batch_npy")
+ENDPOINTS = (*EVALUATIONS, "/gpu_status", "/health", "/model_info", "/metrics")
+REJECTIONS = {401: "key", 408: "slow", 413: "size", 415: "format", 422: "invalid", 503: "unavailable", 504: "deadline"}
+
+_BUCKETS_S = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0)
+
+
+class Metrics:
+    """One gateway's."""
+
+    def __init__(self) -> None:
+        self._registry = CollectorRegistry()
+        labels = ("endpoint", "code")
+        self.requests = Counter("rfm_gateway_requests", "Requests answered.", labels, registry=self._registry)
+        self.durations = Histogram(
+            "rfm_gateway_request_duration_seconds",
+            "From a request's first byte to its answer's last.",
+            ("endpoint",),
+            buckets=_BUCKETS_S,
+            registry=self._registry,
+        )
+        self.rejections = Counter(
+            "rfm_gateway_rejections",
+            "Evaluations that were not scored, by reason.",
+            ("reason",),
+            registry=self._registry,
+        )
+        self.samples = Counter("rfm_gateway_samples", "Samples scored.", ("sample_type",), registry=self._registry)
+        self.in_flight = Gauge("rfm_gateway_requests_in_flight", "Evaluations under way.", registry=self._registry)
+
+    def text(self) -> bytes:
+        """As Prometheus scrapes it."""
+        return generate_latest(self._registry)
+
+
+class Observed:
+    """ASGI middleware: times and counts every request, and refuses evaluations beyond ``max_in_flight``."""
+
+    def __init__(self, app: ASGIApp, metrics: Metrics, max_in_flight: int) -> None:
+        self._app = app
+        self._metrics = metrics
+        self._max_in_flight = max_in_flight
+        self._in_flight = 0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """The request, and its answer."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        started_s = time.perf_counter()
+        code = 500  # if nothing is answered
+
+        async def send_counted(message: Message) -> None:
+            nonlocal code
+            if message["type"] == "http.response.start":
+                code = message["status"]
+            await send(message)
+
+        is_evaluation = scope["path"] in EVALUATIONS
+        try:
+            if is_evaluation and self._in_flight >= self._max_in_flight:
+                refused = {"detail": f"expected at most {self._max_in_flight} evaluations at a time, got more"}
+                await JSONResponse(refused, 503, {"Retry-After": RETRY_AFTER_S})(scope, receive, send_counted)
+                return
+            self._count(is_evaluation, 1)
+            try:
+                await self._app(scope, receive, send_counted)
+            finally:
+                self._count(is_evaluation, -1)
+        finally:
+            endpoint = scope["path"] if scope["path"] in ENDPOINTS else "other"  # not whatever somebody asks for
+            self._metrics.requests.labels(endpoint, str(code)).inc()
+            self._metrics.durations.labels(endpoint).observe(time.perf_counter() - started_s)
+            if is_evaluation and code >= 400:
+                self._metrics.rejections.labels(REJECTIONS.get(code, "other")).inc()
+
+    def _count(self, is_evaluation: bool, change: int) -> None:
+        if is_evaluation:
+            self._in_flight += change
+            self._metrics.in_flight.set(self._in_flight)

@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: MIT
+"""Requests and answers of the evaluation server, as its clients write and read them.
+
+Field names are those of ``dataset_types.py`` of reward_fm and robometer; what is not named here is ignored, as there.
+T frames, H x W pixels, D width of a frame embedding, Dt width of a text embedding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, TypeAlias
+
+import numpy as np
+from pydantic import (
+    AliasChoices,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    TypeAdapter,
+    ValidationInfo,
+    WithJsonSchema,
+)
+
+from rfm_client.gateway.npy import Upload, read_npy
+
+UPLOAD_KEY = "__numpy_file__"
+
+_UPLOADED = {
+    "type": "object",
+    "description": "Multipart requests only: the name of the part that is this array as a .npy file.",
+    "properties": {UPLOAD_KEY: {"type": "string"}},
+    "required": [UPLOAD_KEY],
+}
+_NUMBERS = {"type": "array", "items": {"type": "number"}, "minItems": 1}
+
+
+def _nested(depth: int) -> dict[str, Any]:
+    return _NUMBERS if depth == 1 else {"type": "array", "items": _nested(depth - 1), "minItems": 1}
+
+
+def _array_schema(description: str, depth: int, *others: dict[str, Any]) -> WithJsonSchema:
+    return WithJsonSchema({"description": description, "anyOf": [_nested(depth), _UPLOADED, *others, {"type": "null"}]})
+
+
+def _array(value: Any, info: ValidationInfo) -> Any:
+    """An array from nested lists, or from the upload that it names."""
+    if value is None or isinstance(value, np.ndarray):
+        return value
+    if isinstance(value, Mapping):
+        return _uploaded(value, info.context or {})
+    if not isinstance(value, list):
+        raise ValueError(f"expected an array, got {type(value).__name__}")
+    try:
+        array = np.asarray(value)
+    except (ValueError, OverflowError):
+        raise ValueError("expected rows of equal length, got unequal ones") from None
+    if array.dtype.kind not in "biuf":
+        raise ValueError("expected numbers, got something else")
+    return array
+
+
+def _frames(value: Any, info: ValidationInfo) -> Any:
+    """As ``_array``; or a list of names of image files."""
+    if isinstance(value, list) and value and all(isinstance(name, str) for name in value):
+        return value
+    return _array(value, info)
+
+
+def _uploaded(value: Mapping[str, Any], uploads: Mapping[str, Upload]) -> np.ndarray[Any, Any]:
+    name = value.get(UPLOAD_KEY)
+    if not isinstance(name, str):
+        raise ValueError(f'expected an array or {{"{UPLOAD_KEY}": name}}, got an object without it')
+    if name not in uploads:
+        raise ValueError(f"expected a .npy part named {name!r}, got none")
+    return read_npy(uploads[name])
+
+
+class Trajectory(BaseModel):
+    """Frames, or their embeddings, of one episode, and its task."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    task: str | None = Field(None, description="The task as a sentence.")
+    frames: Annotated[
+        Any,
+        BeforeValidator(_frames),
+        _array_schema(
+            "[T, H, W, 3], RGB, 0..255; or names of image files in the folder that the gateway may read, if it has one",
+            4,
+            {"type": "array", "items": {"type": "string"}},
+        ),
+    ] = None
+    video_embeddings: Annotated[Any, BeforeValidator(_array), _array_schema("[T, D]", 2)] = None
+    text_embedding: Annotated[
+        Any,
+        BeforeValidator(_array),
+        _array_schema("[Dt], of the task; where it is missing the task is encoded, if an encoder is served", 1),
+    ] = None
+    embeddings_path: str | None = Field(
+        None, description="Name of a .npy or .npz file of embeddings in the folder that the gateway may read."
+    )
+    data_source: str | None = None
+    data_gen_strategy: str | None = None
+    metadata: dict[str, Any] | None = None
+
+
+class ProgressSample(BaseModel):
+    """How far has the trajectory come at each frame?"""
+
+    model_config = ConfigDict(extra="ignore")
+
+    sample_type: Literal["progress"]
+    trajectory: Trajectory
+
+    @property
+    def named_trajectories(self) -> dict[str, Trajectory]:
+        """By field name, in the order in which they are asked about."""
+        return {"trajectory": self.trajectory}
+
+
+class PreferenceSample(BaseModel):
+    """Which trajectory does the chosen one's task better?"""
+
+    model_config = ConfigDict(extra="ignore")
+
+    sample_type: Literal["preference"]
+    chosen_trajectory: Trajectory
+    rejected_trajectory: Trajectory
+
+    @property
+    def named_trajectories(self) -> dict[str, Trajectory]:
+        """By field name, in the order in which they are asked about."""
+        return {"chosen_trajectory": self.chosen_trajectory, "rejected_trajectory": self.rejected_trajectory}
+
+
+class SimilaritySample(BaseModel):
+    """How similar is ``sim_trajectory`` to ``ref_trajectory``? ``diff_trajectory`` is ignored, as it was."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    sample_type: Literal["similarity"]
+    ref_trajectory: Trajectory = Field(validation_alias=AliasChoices("ref_trajectory", "reference_trajectory"))
+    sim_trajectory: Trajectory = Field(validation_alias=AliasChoices("sim_trajectory", "traj_sim_trajectory"))
+    data_gen_strategy: str | None = None
+
+    @property
+    def named_trajectories(self) -> dict[str, Trajectory]:
+        """By field name, in the order in which they are asked about."""
+        return {"ref_trajectory": self.ref_trajectory, "sim_trajectory": self.sim_trajectory}
+
+
+Sample: TypeAlias = ProgressSample | PreferenceSample | SimilaritySample
+_ByType: TypeAlias = Annotated[
+    Sample,
+    Discriminator(
+        "sample_type",
+        custom_error_type="sample_type",
+        custom_error_message="sample_type: expected progress, preference or similarity, got another or none",
+    ),
+]
+SAMPLES: TypeAdapter[list[Sample]] = TypeAdapter(list[_ByType])
+
+
+class EvaluateBatchRequest(BaseModel):
+    """A bare list of samples, a single sample, and an object whose one value is the list, are read too."""
+
+    samples: list[_ByType] = Field(min_length=1)
+    use_frame_steps: bool = Field(
+        False, description="Score each frame of progress samples on its prefix alone, sampled to 4 frames."
+    )
+
+
+class PreferenceOutputs(BaseModel):
+    """One entry a preference sample, in order."""
+
+    predictions: list[int] = Field(description="1: the chosen trajectory is preferred, 0: the rejected one.")
+    prediction_probs: list[float] | None = Field(description="Probability that the chosen trajectory is preferred.")
+    preference_labels: list[float] = Field(description="What is true: 1, the chosen one.")
+
+
+class ProgressOutputs(BaseModel):
+    """One entry a progress sample, in order."""
+
+    progress_pred: list[list[float]] = Field(description="0..1, for each frame.")
+
+
+class SuccessOutputs(BaseModel):
+    """One entry a progress sample, in order."""
+
+    success_probs: list[list[float]] = Field(description="0..1, for each frame.")
+
+
+class SimilarityOutputs(BaseModel):
+    """One entry a similarity sample, in order."""
+
+    sim_score_ref_sim: list[float] = Field(description="Raw score of sim_trajectory against ref_trajectory.")
+    task: list[str | None]
+    data_source: list[str | None]
+    data_gen_strategy: list[str | None]
+    metadata: list[dict[str, Any] | None]
+
+
+class EvaluateBatchAnswer(BaseModel):
+    """Null where no sample of that type was sent, and where the checkpoint does not tell success."""
+
+    outputs_preference: PreferenceOutputs | None = None
+    outputs_progress: ProgressOutputs | None = None
+    outputs_success: SuccessOutputs | None = None
+    outputs_similarity: SimilarityOutputs | None = None
+
+
+class FieldError(BaseModel):
+    """What is wrong with a field of a request."""
+
+    type: str
+    loc: list[str | int] = Field(description="Path of the field.")
+    msg: str = Field(description="expected X, got Y")
+
+
+class InvalidRequest(BaseModel):
+    """Answer 422."""
+
+    detail: list[FieldError]
+
+
+class Failure(BaseModel):
+    """Every other answer that is no success."""
+
+    detail: str
+
+
+class GpuStats(BaseModel):
+    """One device that models run on; a server without GPUs has one, its CPU."""
+
+    device: str = Field(description="UUID of the GPU, or CPU.")
+    status: Literal["ready", "processing"] = Field(description="processing: requests wait for their turn.")
+    total_requests: int = Field(description="Requests that Triton has answered there, each counted once.")
+    total_processing_time: float = Field(description="Seconds that models computed there.")
+    last_used: float | None = Field(description="Unix time of the last request to any device; null: none yet.")
+    utilization: float | None = Field(description="0..1, now; null where Triton does not tell.")
+    memory_used_bytes: float | None
+    memory_total_bytes: float | None
+
+
+class GpuStatus(BaseModel):
+    """Fields of the evaluation server, from Triton's metrics and statistics."""
+
+    total_gpus: int = Field(description="Devices that models run on.")
+    available_gpus: int = Field(description="Those at which no request waits.")
+    max_workers: int = Field(description="Batches that are computed at a time: model instances.")
+    pool_size: int = Field(description="As total_gpus.")
+    gpu_stats: dict[str, GpuStats] = Field(description='By number, from "0".')
+
+
+class Health(BaseModel):
+    """A server whose every model has answered a request just now."""
+
+    status: Literal["healthy"]
+    available_gpus: int
+    total_gpus: int
+
+
+class ModelInformation(BaseModel):
+    """The served checkpoint."""
+
+    model_path: str | None = Field(description="Hub id, or name of the folder, that was exported.")
+    model_version: str | None = Field(description="Version in the model repository.")
+    num_gpus: int
+    experiment_config: dict[str, Any] = Field(description="The network's configuration.")
+    model_architecture: dict[str, Any] = Field(description="Class and numbers of parameters.")

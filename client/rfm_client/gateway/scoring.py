@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: MIT
+"""Samples of a request -> the client's samples -> results -> the evaluation server's answer."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rfm_client.async_client import AsyncRewardClient
+from rfm_client.errors import InvalidSampleError, ModelNotFoundError, RewardError
+from rfm_client.gateway import schema
+from rfm_client.gateway.body import Batch, invalid
+from rfm_client.gateway.folder import AllowedFolder
+from rfm_client.model_info import ModelInfo
+from rfm_client.off_loop import off_loop
+from rfm_client.results import PreferenceResult, ProgressResult, Result, SimilarityResult
+from rfm_client.samples import (
+    Float32Array,
+    PreferenceSample,
+    ProgressSample,
+    Sample,
+    SimilaritySample,
+    Trajectory,
+    UInt8Array,
+    as_array,
+    float_frames_to_uint8,
+)
+
+FRAME_STEPS = 4  # frames to which the evaluation server samples each prefix
+PREFERRED = 0.5
+CHOSEN_IS_FIRST = 1.0  # the evaluation server's label: the first trajectory, which is the chosen one, is better
+
+_SIDES = {  # what the client calls them
+    "first": "chosen_trajectory",
+    "second": "rejected_trajectory",
+    "reference": "ref_trajectory",
+    "other": "sim_trajectory",
+}
+_TEXT_FRAME_PX = 32  # of the blank frame that goes with a task, where only the task's embedding is wanted
+
+
+@dataclass(frozen=True)
+class Served:
+    """What is served of the checkpoint: for embeddings, and for raw frames; None: it is not."""
+
+    embeddings: ModelInfo | None
+    frames: ModelInfo | None
+
+
+class Scorer:
+    """Asks the server behind ``client``."""
+
+    def __init__(self, client: AsyncRewardClient, folder: AllowedFolder) -> None:
+        self._client = client
+        self._folder = folder
+
+    async def evaluate(self, batch: Batch) -> schema.EvaluateBatchAnswer:
+        """The answer to a batch, whole: one that lacked a sample would shift the others', or be read as a reward of 0.
+
+        Raises RequestValidationError for samples that cannot be scored, all of them told, and ServerError.
+        """
+        served = await self._served(batch.samples)
+        num_bytes = sum(_num_bytes(sample) for sample in batch.samples)
+        texts = await self._texts(batch.samples, served)
+        steps = FRAME_STEPS if batch.use_frame_steps else 0
+        samples = await off_loop(num_bytes, self._samples, batch.samples, served, texts, steps)
+        results = await self._client.evaluate(samples, return_errors=True)
+        failed = {index: result for index, result in enumerate(results) if isinstance(result, RewardError)}
+        refused = {i: error for i, error in failed.items() if isinstance(error, InvalidSampleError)}
+        if refused:
+            raise _refused(refused)
+        for error in failed.values():
+            raise error
+        group = served.frames.frames_per_value if served.frames is not None and not steps else 1
+        return _answer(batch.samples, results, group)  # type: ignore[arg-type]  # no errors among them
+
+    async def _served(self, samples: Sequence[schema.Sample]) -> Served:
+        """Asks about the model for frames only if a sample may need it: what is not served is asked for every time."""
+        trajectories = [t for sample in samples for t in sample.named_trajectories.values()]
+        has_embeddings = any(_has_embeddings(trajectory) for trajectory in trajectories)
+        embeddings = await self._model_info(frames=False) if has_embeddings else None
+        has_frames = any(trajectory.frames is not None for trajectory in trajectories)
+        needs_frames = has_frames and not (embeddings is not None and all(map(_has_embeddings, trajectories)))
+        frames = await self._model_info(frames=True) if needs_frames else None
+        if embeddings is None and frames is None:  # is the other one served, or none at all?
+            await self._client.model_info(frames=not needs_frames)
+        return Served(embeddings, frames)
+
+    async def _model_info(self, *, frames: bool) -> ModelInfo | None:
+        try:
+            return await self._client.model_info(frames=frames)
+        except ModelNotFoundError:
+            return None
+
+    async def _texts(self, samples: Sequence[schema.Sample], served: Served) -> Mapping[str, Float32Array]:
+        """Embeddings of the tasks that come without one, by task; empty if there is no encoder."""
+        tasks = {
+            first.task
+            for first, *_ in (tuple(sample.named_trajectories.values()) for sample in samples)
+            if _has_embeddings(first) and first.text_embedding is None and first.task
+        }
+        if not tasks or served.embeddings is None:
+            return {}
+        blank = np.zeros((1, _TEXT_FRAME_PX, _TEXT_FRAME_PX, 3), np.uint8)
+        try:
+            encoded = await asyncio.gather(
+                *(self._client.encode(Trajectory(frames=blank, task=task)) for task in sorted(tasks))
+            )
+        except ModelNotFoundError:
+            return {}
+        return {t.task: t.text_embedding for t in encoded if t.text_embedding is not None}
+
+    def _samples(
+        self, samples: Sequence[schema.Sample], served: Served, texts: Mapping[str, Float32Array], frame_steps: int
+    ) -> list[Sample]:
+        converted: list[Sample] = []
+        errors: dict[int, InvalidSampleError] = {}
+        for index, sample in enumerate(samples):
+            try:
+                converted.append(self._sample(sample, served, texts, frame_steps))
+            except InvalidSampleError as error:
+                errors[index] = error
+        if errors:
+            raise _refused(errors)
+        return converted
+
+    def _sample(
+        self, sample: schema.Sample, served: Served, texts: Mapping[str, Float32Array], frame_steps: int
+    ) -> Sample:
+        given = sample.named_trajectories
+        by_embeddings = served.embeddings is not None and all(map(_has_embeddings, given.values()))
+        trajectories: list[Trajectory] = []
+        for name, trajectory in given.items():
+            try:
+                if by_embeddings:
+                    needs_text = not trajectories
+                    trajectories.append(self._of_embeddings(trajectory, served.embeddings, texts, needs_text))
+                else:
+                    trajectories.append(self._of_frames(trajectory, served))
+            except InvalidSampleError as error:
+                raise error.inside(name) from None
+        if isinstance(sample, schema.ProgressSample):
+            return ProgressSample(trajectories[0], frame_steps=frame_steps)
+        if isinstance(sample, schema.PreferenceSample):
+            return PreferenceSample(*trajectories)
+        return SimilaritySample(*trajectories)
+
+    def _of_embeddings(
+        self,
+        given: schema.Trajectory,
+        info: ModelInfo | None,
+        texts: Mapping[str, Float32Array],
+        needs_text: bool,
+    ) -> Trajectory:
+        video, text = given.video_embeddings, given.text_embedding
+        if video is None:
+            in_file = self._folder.embeddings(given.embeddings_path or "")
+            video, text = in_file.video_embeddings, in_file.text_embedding if text is None else text
+        if text is None and given.task is not None:
+            text = texts.get(given.task)
+        trajectory = Trajectory(video_embeddings=video, text_embedding=text, task=given.task or "")
+        assert info is not None and trajectory.video_embeddings is not None
+        _check_width("video_embeddings", trajectory.video_embeddings, info.video_dim)
+        if trajectory.text_embedding is not None:
+            _check_width("text_embedding", trajectory.text_embedding, info.text_dim)
+        elif needs_text:
+            got = "neither" if not given.task else "a task, and no encoder is served"
+            raise InvalidSampleError.at("text_embedding", "an embedding, or a task to encode", got)
+        return trajectory
+
+    def _of_frames(self, given: schema.Trajectory, served: Served) -> Trajectory:
+        if given.frames is None:
+            what = "video_embeddings" if _has_embeddings(given) else "neither frames nor video_embeddings"
+            if _has_embeddings(given) and served.embeddings is not None:
+                raise InvalidSampleError.at("video_embeddings", "them in both trajectories or neither", "one of two")
+            raise InvalidSampleError.at("frames", "frames", what)
+        if served.frames is None:
+            raise InvalidSampleError.at(
+                "video_embeddings", "embeddings, since no model for raw frames is served", "frames"
+            )
+        if isinstance(given.frames, list):
+            return Trajectory(frames=self._folder.frames(given.frames), task=given.task or "")
+        return Trajectory(frames=_uint8(given.frames), task=given.task or "")
+
+
+def _has_embeddings(trajectory: schema.Trajectory) -> bool:
+    return trajectory.video_embeddings is not None or trajectory.embeddings_path is not None
+
+
+def _num_bytes(sample: schema.Sample) -> int:
+    arrays = (a for t in sample.named_trajectories.values() for a in (t.frames, t.video_embeddings))
+    return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
+
+
+def _uint8(frames: Any) -> UInt8Array:
+    """As the evaluation server made images: whole numbers as they are, floats clipped and truncated."""
+    array = as_array(frames)
+    if array.dtype.kind == "f":
+        return float_frames_to_uint8(array)
+    if array.dtype != np.uint8 and array.dtype.kind in "iu" and array.size:
+        if array.min() < 0 or array.max() > 255:
+            raise InvalidSampleError.at("frames", "values in 0..255", f"{array.min()}..{array.max()}")
+        return array.astype(np.uint8)
+    return array  # Trajectory checks the rest
+
+
+def _check_width(where: str, array: Float32Array, width: int | None) -> None:
+    if width is not None and array.shape[-1] != width:
+        axes = "[T, " if array.ndim > 1 else "["
+        raise InvalidSampleError.at(where, f"{axes}{width}]", str(list(array.shape)))
+
+
+def _refused(errors: Mapping[int, InvalidSampleError]) -> Exception:
+    """One error that tells of all samples that cannot be scored, each at its field as the caller named it."""
+    told: list[Any] = []
+    for index, error in errors.items():
+        where, _, message = str(error).partition(": ")
+        path: list[str | int] = [int(word) if word.isdecimal() else _SIDES.get(word, word) for word in where.split(".")]
+        told += invalid(("samples", index, *path), message).errors()
+    return type(invalid((), ""))(told)
+
+
+def _answer(samples: Sequence[schema.Sample], results: Sequence[Result], group: int) -> schema.EvaluateBatchAnswer:
+    """group: frames that share a value; the evaluation server gave one value a group."""
+    progress = [result for result in results if isinstance(result, ProgressResult)]
+    preferences = [result.preference for result in results if isinstance(result, PreferenceResult)]
+    similar = [(s, r) for s, r in zip(samples, results, strict=True) if isinstance(r, SimilarityResult)]
+    success = [result.success[::group] for result in progress]
+    answer = schema.EvaluateBatchAnswer()
+    if progress:
+        answer.outputs_progress = schema.ProgressOutputs.model_construct(
+            progress_pred=[result.progress[::group].tolist() for result in progress]
+        )
+    if progress and all(np.isfinite(values).all() for values in success):
+        answer.outputs_success = schema.SuccessOutputs.model_construct(
+            success_probs=[values.tolist() for values in success]
+        )
+    if preferences:
+        answer.outputs_preference = schema.PreferenceOutputs.model_construct(
+            predictions=[int(preference > PREFERRED) for preference in preferences],
+            prediction_probs=preferences,
+            preference_labels=[CHOSEN_IS_FIRST] * len(preferences),
+        )
+    if similar:
+        references = [sample.ref_trajectory for sample, _ in similar if isinstance(sample, schema.SimilaritySample)]
+        answer.outputs_similarity = schema.SimilarityOutputs.model_construct(
+            sim_score_ref_sim=[result.similarity for _, result in similar],
+            task=[reference.task for reference in references],
+            data_source=[reference.data_source for reference in references],
+            data_gen_strategy=[getattr(sample, "data_gen_strategy", None) for sample, _ in similar],
+            metadata=[reference.metadata for reference in references],
+        )
+    return answer
