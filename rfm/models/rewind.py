@@ -93,7 +93,10 @@ class RewindOutput:
 
 
 class SelfAttention(nn.Module):
-    """Multi-head self-attention, [B, L, D] -> [B, L, D]; parameters named as nn.MultiheadAttention's."""
+    """Multi-head attention of some tokens [B, Q, D] to all of their row [B, L, D] -> [B, Q, D].
+
+    Parameters are named as nn.MultiheadAttention's.
+    """
 
     def __init__(self, hidden_dim: int, num_heads: int) -> None:
         super().__init__()
@@ -103,13 +106,19 @@ class SelfAttention(nn.Module):
         self.out_proj = nn.Linear(hidden_dim, hidden_dim)
         nn.init.xavier_uniform_(self.in_proj_weight)
 
-    def forward(self, x: Tensor, mask: Tensor | None) -> Tensor:
+    def forward(self, asking: Tensor, x: Tensor, mask: Tensor | None) -> Tensor:
         queries, keys, values = (
-            part.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
-            for part in F.linear(x, self.in_proj_weight, self.in_proj_bias).chunk(3, dim=-1)
+            part.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for part in self._projected(asking, x)
         )
         attended = F.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
         return self.out_proj(attended.transpose(1, 2).flatten(2))
+
+    def _projected(self, asking: Tensor, x: Tensor) -> tuple[Tensor, ...]:
+        weight, bias, width = self.in_proj_weight, self.in_proj_bias, x.shape[-1]
+        if asking is x:
+            return F.linear(x, weight, bias).chunk(3, dim=-1)
+        queries = F.linear(asking, weight[:width], bias[:width])
+        return (queries, *F.linear(x, weight[width:], bias[width:]).chunk(2, dim=-1))
 
 
 class EncoderLayer(nn.Module):
@@ -123,23 +132,25 @@ class EncoderLayer(nn.Module):
         self.linear2 = nn.Linear(FEED_FORWARD_RATIO * hidden_dim, hidden_dim)
         self.norm2 = nn.LayerNorm(hidden_dim)
 
-    def forward(self, x: Tensor, mask: Tensor | None) -> Tensor:
-        x = self.norm1(x + self.self_attn(x, mask))
-        return self.norm2(x + self.linear2(F.relu(self.linear1(x))))
+    def forward(self, asking: Tensor, x: Tensor, mask: Tensor | None) -> Tensor:
+        asking = self.norm1(asking + self.self_attn(asking, x, mask))
+        return self.norm2(asking + self.linear2(F.relu(self.linear1(asking))))
 
 
 class Encoder(nn.Module):
-    """A stack of EncoderLayer."""
+    """A stack of EncoderLayer, the last of which is computed for those tokens alone that are read."""
 
     def __init__(self, config: RewindConfig) -> None:
         super().__init__()
         layer = (config.hidden_dim, config.num_attention_heads)
         self.layers = nn.ModuleList(EncoderLayer(*layer) for _ in range(config.num_layers))
 
-    def forward(self, x: Tensor, mask: Tensor | None) -> Tensor:
-        for layer in self.layers:
-            x = layer(x, mask)
-        return x
+    def forward(self, x: Tensor, mask: Tensor | None, read: Tensor) -> Tensor:
+        """[B, L, D] -> [B, R, D], the tokens at the positions ``read``, int64 [R]."""
+        for layer in self.layers[:-1]:
+            x = layer(x, x, mask)
+        mask_of_read = mask if mask is None or mask.shape[-2] == 1 else mask[..., read, :]
+        return self.layers[-1](x[:, read], x, mask_of_read)
 
 
 class RewindTransformer(nn.Module):
@@ -175,14 +186,16 @@ class RewindTransformer(nn.Module):
         if batch.second is not None:
             tokens += [self._trajectory_tokens(batch.second, second=True), self._query_tokens(batch)]
         x = torch.cat(tokens, dim=1)
-        hidden = self.transformer(x, self._attention_mask(batch, x.shape[1]))
+        num_frames = [video.shape[1] for video in (batch.first, batch.second) if video is not None]
+        read = self._read_positions(sum(num_frames), x)
+        hidden = self.transformer(x, self._attention_mask(batch, x.shape[1]), read)
 
-        parts = hidden.split([part.shape[1] for part in tokens], dim=1)
-        first_progress, first_success = self._frame_scores(parts[1])
+        parts = hidden.split([*num_frames, len(read) - sum(num_frames)], dim=1)
+        first_progress, first_success = self._frame_scores(parts[0])
         if batch.second is None:
             return RewindOutput(first_progress, first_success)
-        second_progress, second_success = self._frame_scores(parts[2])
-        query = self._query_scores(parts[3].squeeze(1), batch)
+        second_progress, second_success = self._frame_scores(parts[1])
+        query = self._query_scores(parts[2].squeeze(1), batch)
         return RewindOutput(first_progress, first_success, second_progress, second_success, query)
 
     def _trajectory_tokens(self, video: Tensor, *, second: bool) -> Tensor:
@@ -211,9 +224,15 @@ class RewindTransformer(nn.Module):
         return torch.where(batch.is_similarity, self.similarity_head(hidden).squeeze(-1), preference)
 
     def _frame_scores(self, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Progress [B, T, K] and success [B, T] logits from one trajectory's tokens."""
-        read = hidden[:, 1::2] if self.config.use_per_frame_progress_token else hidden
-        return self.progress_head(read), self.success_head(read).squeeze(-1)
+        """Progress [B, T, K] and success [B, T] logits from the tokens that carry the frames' states, [B, T, D]."""
+        return self.progress_head(hidden), self.success_head(hidden).squeeze(-1)
+
+    def _read_positions(self, num_frames: int, x: Tensor) -> Tensor:
+        """int64, the tokens of [B, L, D] whose outputs are read: the last of each frame's, and the query."""
+        step = self.config.tokens_per_frame
+        positions = torch.arange(num_frames, device=x.device) * step + step
+        has_query = x.shape[1] > 1 + num_frames * step
+        return F.pad(positions, (0, 1), value=x.shape[1] - 1) if has_query else positions
 
     def _attention_mask(self, batch: RewindBatch, length: int) -> Tensor | None:
         """bool, broadcastable to [B, heads, L, L], true where a token may look; None: everywhere.
