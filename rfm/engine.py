@@ -142,17 +142,23 @@ class Engine:
         """Each row's scores, and the seconds spent in forward passes. The next batch is collated meanwhile."""
         scores: dict[int, RowScores | RewardError] = {}
         forward_s = 0.0
-        parts = list(self._micro_batches(rows))
-        with ThreadPoolExecutor(1) as collating:
-            batches = [collating.submit(self.family.collate, [rows[i] for i in part]) for part in parts[:1]]
-            for number, part in enumerate(parts):
-                batch = batches.pop().result()
-                for following in parts[number + 1 : number + 2]:
-                    batches.append(collating.submit(self.family.collate, [rows[i] for i in following]))
-                started_s = time.perf_counter()
-                scores.update(zip(part, self._score([rows[i] for i in part], batch), strict=True))
-                forward_s += time.perf_counter() - started_s
+        for part, batch in self._collated(rows, list(self._micro_batches(rows))):
+            started_s = time.perf_counter()
+            scores.update(zip(part, self._score([rows[i] for i in part], batch), strict=True))
+            forward_s += time.perf_counter() - started_s
         return [scores[index] for index in range(len(rows))], forward_s
+
+    def _collated(self, rows: Sequence[Any], parts: Sequence[list[int]]) -> Iterator[tuple[list[int], Any]]:
+        """Each part with its batch. While one is scored the next is collated, in a thread; the first needs none."""
+        batch = self.family.collate([rows[i] for i in parts[0]]) if parts else None
+        if len(parts) < 2:
+            yield from ((part, batch) for part in parts)
+            return
+        with ThreadPoolExecutor(1) as collating:
+            for part, following in zip(parts, [*parts[1:], None], strict=True):
+                coming = collating.submit(self.family.collate, [rows[i] for i in following]) if following else None
+                yield part, batch
+                batch = coming.result() if coming is not None else None
 
     def _score(self, rows: Sequence[Any], batch: Any) -> Sequence[RowScores | RewardError]:
         """One forward; out of memory, its halves; a row that does not fit alone is an error of its own."""
