@@ -344,10 +344,16 @@ def broken_npz(file: Path) -> None:
     file.write_bytes(content)
 
 
+def broken_header(file: Path) -> None:
+    header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3\n"  # a bracket is missing
+    file.write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(24))
+
+
 BAD_FILES: dict[str, tuple[str, Callable[[Path], Any], str]] = {
     "a text": ("text.npy", text_file, r"^file: expected arrays .*, got .*pickled.* \(.*text\.npy\)$"),
     "an empty file": ("empty.npy", Path.touch, r"^file: expected arrays .*, got No data left in file \(.*\)$"),
     "a broken archive": ("film.npz", broken_npz, r"^file: expected arrays .*, got Bad CRC-32 .*film\.npz\)$"),
+    "a broken header": ("film.npy", broken_header, r"^file: expected arrays .*, got .*film\.npy\)$"),
     "no file": ("nothing.npy", lambda file: None, r"^file: expected arrays .*, got .*No such file.*nothing\.npy\)$"),
     "one text embedding": (
         "text.npy",

@@ -6,6 +6,7 @@ T steps, H x W pixels. Any array may be a torch tensor, on a GPU or with a gradi
 
 from __future__ import annotations
 
+import tokenize
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -20,6 +21,10 @@ from rfm_client.samples import Trajectory, UInt8Array, as_array
 from rfm_client.video import is_url, read_video
 
 MAX_UINT8 = 255
+BROKEN_NPY = (  # what numpy raises of a .npy header that is none
+    *(ValueError, TypeError, LookupError, SyntaxError),
+    *(tokenize.TokenError, MemoryError, RecursionError),
+)
 ARRAY_SUFFIXES = (".npy", ".npz")
 
 _CAMERA_PREFIX = "observation.images."  # LeRobot's keys, followed by the camera's name
@@ -93,7 +98,7 @@ def _arrays(file: Path) -> Mapping[str, npt.NDArray[Any]]:
             if isinstance(loaded, np.ndarray):
                 return {"video_embeddings" if loaded.ndim == 2 else "frames": loaded}
             return {key: loaded[key] for key in loaded.files}
-    except (OSError, ValueError, EOFError, BadZipFile, zlib.error) as error:
+    except (OSError, EOFError, BadZipFile, zlib.error, *BROKEN_NPY) as error:
         raise InvalidSampleError.at("file", "arrays of numbers and text, none pickled", f"{error} ({file})") from error
 
 

@@ -20,6 +20,7 @@ from fastapi.responses import JSONResponse
 from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
 from pydantic.json_schema import models_json_schema
 from starlette.exceptions import HTTPException as StarletteHTTPException
+from starlette.requests import ClientDisconnect
 
 from rfm_client import errors
 from rfm_client.async_client import DEFAULT_MODEL, DEFAULT_TIMEOUT_S, AsyncRewardClient
@@ -33,6 +34,9 @@ from rfm_client.gateway.state import State
 MIB = 2**20
 DEFAULT_MAX_BODY_BYTES = 256 * MIB
 DEFAULT_MAX_IN_FLIGHT = 256
+
+_KEY_HEADER = APIKeyHeader(name="X-API-Key", auto_error=False)  # FastAPI looks annotations up in the module
+_KEY_BEARER = HTTPBearer(auto_error=False)
 
 _REFERENCE = "#/components/schemas/{model}"
 _MODELS = (schema.EvaluateBatchRequest, schema.InvalidRequest, schema.Failure)
@@ -196,11 +200,10 @@ def _in_time(timeout_s: float) -> Any:
 def _key_check(key: str) -> Callable[..., None]:
     """A dependency that refuses requests without the key."""
     expected = key.encode()
-    header, bearer = APIKeyHeader(name="X-API-Key", auto_error=False), HTTPBearer(auto_error=False)
 
     def check(
-        in_header: Annotated[str | None, Depends(header)],
-        in_bearer: Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)],
+        in_header: Annotated[str | None, Depends(_KEY_HEADER)],
+        in_bearer: Annotated[HTTPAuthorizationCredentials | None, Depends(_KEY_BEARER)],
     ) -> None:
         given = in_header or (in_bearer.credentials if in_bearer is not None else "")
         if not secrets.compare_digest(given.encode(), expected):
@@ -219,6 +222,10 @@ def _answer_errors(app: FastAPI) -> None:
     @app.exception_handler(TimeoutError)
     async def slow(_request: Request, _error: TimeoutError) -> JSONResponse:
         return JSONResponse({"detail": "body: expected all of it in time, got a part"}, 408, {"Connection": "close"})
+
+    @app.exception_handler(ClientDisconnect)
+    async def gone(_request: Request, _error: ClientDisconnect) -> JSONResponse:
+        return JSONResponse({"detail": "body: expected all of it, got a part"}, 400)  # which nobody reads
 
     @app.exception_handler(errors.RewardError)
     async def failed(_request: Request, error: errors.RewardError) -> JSONResponse:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+import reprlib
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 from fastapi import HTTPException, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
-from pydantic_core import from_json
+from pydantic_core import ErrorDetails, from_json
 from starlette.datastructures import UploadFile
 from starlette.types import Message
 
@@ -23,8 +24,18 @@ MAX_PARTS = 10_000  # files, and fields, of one multipart request
 TOO_LARGE = 413
 UNREADABLE = 400
 
+_LAST_BOUNDARY = b"--"  # of multipart, behind its name
+_TAIL_BYTES = 16
+
 _SAMPLE_FIELD = re.compile(r"sample_(0|[1-9][0-9]{0,5})")
 _STEPS_FIELD = "use_frame_steps"
+_TAG_ERRORS = ("union_tag_invalid", "union_tag_not_found")
+_EXPECTED = {  # pydantic's kind of error, and what a field of it is
+    "string_type": "text",
+    "dict_type": "an object",
+    "model_type": "an object",
+    "model_attributes_type": "an object",
+}
 
 
 class Batch:
@@ -57,7 +68,7 @@ async def read_multipart(request: Request, max_bytes: int) -> AsyncIterator[Batc
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind != "multipart/form-data":
         raise HTTPException(415, f"content-type: expected multipart/form-data, got {kind or 'none'}")
-    limited = _limited(request, max_bytes)
+    limited = _limited(request, max_bytes, ending=_LAST_BOUNDARY)
     async with limited.form(max_files=MAX_PARTS, max_fields=MAX_PARTS, max_part_size=max_bytes) as form:
         uploads: dict[str, Upload] = {}
         fields: dict[str, str] = {}
@@ -72,20 +83,27 @@ async def read_multipart(request: Request, max_bytes: int) -> AsyncIterator[Batc
         yield Batch(checked, use_frame_steps=fields.get(_STEPS_FIELD, "").strip().lower() == "true")
 
 
-def _limited(request: Request, max_bytes: int) -> Request:
-    """The request, which raises 413 as soon as more than ``max_bytes`` are announced or have come."""
+def _limited(request: Request, max_bytes: int, *, ending: bytes = b"") -> Request:
+    """The request, which raises 413 as soon as more than ``max_bytes`` are announced or have come, and 400 if it does
+    not end as it must: what is left out of it may be a sample.
+    """
     announced = request.headers.get("content-length", "")
     too_large = HTTPException(TOO_LARGE, f"body: expected at most {max_bytes} bytes, got more")
     if announced.isdecimal() and int(announced) > max_bytes:
         raise too_large
-    come = 0
+    come, tail = 0, b""
 
     async def receive() -> Message:
-        nonlocal come
+        nonlocal come, tail
         message = await request.receive()
-        come += len(message.get("body", b""))
+        part = message.get("body", b"")
+        come += len(part)
         if come > max_bytes:
             raise too_large
+        tail = (tail + part[-_TAIL_BYTES:])[-_TAIL_BYTES:]
+        is_last = message["type"] == "http.request" and not message.get("more_body", False)
+        if is_last and not tail.rstrip(b"\r\n").endswith(ending):
+            raise HTTPException(UNREADABLE, "body: expected its last boundary at its end, got none")
         return message
 
     return Request(request.scope, receive)
@@ -141,17 +159,21 @@ def _checked(samples: list[Any], uploads: Mapping[str, Upload]) -> list[schema.S
         return schema.SAMPLES.validate_python(samples, context=uploads)
     except ValidationError as error:
         raise RequestValidationError(
-            [
-                {"type": each["type"], "loc": ["body", "samples", *_path(each["loc"])], "msg": _message(each["msg"])}
-                for each in error.errors(include_url=False, include_context=False, include_input=False)
-            ]
+            [_field_error(each) for each in error.errors(include_url=False, include_context=False)]
         ) from None
 
 
-def _path(loc: tuple[str | int, ...]) -> list[str | int]:
-    """Without the sample's type, which pydantic puts behind its index."""
-    return [*loc[:1], *loc[2:]]
-
-
-def _message(message: str) -> str:
-    return message.removeprefix("Value error, ")
+def _field_error(error: ErrorDetails) -> dict[str, Any]:
+    """As this gateway tells its own: ``expected X, got Y`` at a path without the sample's type, which pydantic puts
+    behind its index.
+    """
+    kind, given, loc = error["type"], error["input"], [*error["loc"][:1], *error["loc"][2:]]
+    message = error["msg"].removeprefix("Value error, ")
+    if kind in _TAG_ERRORS:
+        loc.append("sample_type")
+        message = f"expected progress, preference or similarity, got {reprlib.repr(given.get('sample_type'))}"
+    elif kind == "missing":
+        message = "expected a value, got none"
+    elif kind in _EXPECTED:
+        message = f"expected {_EXPECTED[kind]}, got {type(given).__name__}"
+    return {"type": kind, "loc": ["body", "samples", *loc], "msg": message}

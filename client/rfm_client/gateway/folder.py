@@ -26,10 +26,11 @@ class AllowedFolder:
         images = []
         for index, name in enumerate(names):
             where = f"frames.{index}"
+            file = self._file(name, where)
             try:
-                with Image.open(self._file(name, where)) as image:
+                with Image.open(file) as image:
                     images.append(np.asarray(image.convert("RGB")))
-            except (OSError, Image.DecompressionBombError):
+            except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
                 raise InvalidSampleError.at(where, "an image file", name) from None
         if len({image.shape for image in images}) > 1:
             raise InvalidSampleError.at("frames", "images of one size", "different ones")
@@ -40,7 +41,10 @@ class AllowedFolder:
         file = self._file(name, "embeddings_path")
         if file.suffix.lower() not in ARRAY_SUFFIXES:
             raise InvalidSampleError.at("embeddings_path", " or ".join(ARRAY_SUFFIXES), name)
-        trajectory = load_trajectory(file)
+        try:
+            trajectory = load_trajectory(file)
+        except InvalidSampleError:  # which tells the whole path
+            raise InvalidSampleError.at("embeddings_path", "a file of embeddings [T, D]", name) from None
         if trajectory.video_embeddings is None:
             raise InvalidSampleError.at("embeddings_path", "a file of embeddings", "frames")
         return trajectory
@@ -48,7 +52,11 @@ class AllowedFolder:
     def _file(self, name: str, where: str) -> Path:
         if self._folder is None:
             raise InvalidSampleError.at(where, "an array (this gateway reads no files)", "the name of a file")
-        file = (self._folder / name).resolve()
-        if not file.is_relative_to(self._folder) or not file.is_file():  # links are followed before
+        try:
+            file = (self._folder / name).resolve()
+            is_in_folder = file.is_relative_to(self._folder) and file.is_file()  # links are followed before
+        except (OSError, ValueError, RuntimeError):  # no name of a file, or links in a circle
+            is_in_folder = False
+        if not is_in_folder:
             raise InvalidSampleError.at(where, "a file in the allowed folder", name)
         return file

@@ -9,6 +9,8 @@ from typing import Any, BinaryIO, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from rfm_client.inputs import BROKEN_NPY
+
 _format: Any = np.lib.format  # numpy does not tell its types
 _HEADERS = {(1, 0): _format.read_array_header_1_0, (2, 0): _format.read_array_header_2_0}
 
@@ -25,11 +27,15 @@ def read_npy(upload: Upload) -> npt.NDArray[Any]:
     file = upload.file
     file.seek(0)
     try:
-        shape, is_fortran, dtype = _HEADERS[_format.read_magic(file)](file)
-    except KeyError as error:
-        raise ValueError(f"expected a .npy file of version 1.0 or 2.0, got {error}") from None
+        version = _format.read_magic(file)
     except ValueError as error:
         raise ValueError(f"expected a .npy file, got {error}") from None
+    if version not in _HEADERS:
+        raise ValueError(f"expected a .npy file of version 1.0 or 2.0, got {version}")
+    try:
+        shape, is_fortran, dtype = _HEADERS[version](file)
+    except BROKEN_NPY as error:
+        raise ValueError(f"expected a .npy file, got a broken header: {error}") from None
     if dtype.kind not in "biuf":
         raise ValueError(f"expected a .npy file of numbers, got {dtype}")
     num_bytes = math.prod(shape) * dtype.itemsize

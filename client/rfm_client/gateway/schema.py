@@ -152,14 +152,7 @@ class SimilaritySample(BaseModel):
 
 
 Sample: TypeAlias = ProgressSample | PreferenceSample | SimilaritySample
-_ByType: TypeAlias = Annotated[
-    Sample,
-    Discriminator(
-        "sample_type",
-        custom_error_type="sample_type",
-        custom_error_message="sample_type: expected progress, preference or similarity, got another or none",
-    ),
-]
+_ByType: TypeAlias = Annotated[Sample, Discriminator("sample_type")]
 SAMPLES: TypeAdapter[list[Sample]] = TypeAdapter(list[_ByType])
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -40,6 +40,8 @@ _SIDES = {  # what the client calls them
     "reference": "ref_trajectory",
     "other": "sim_trajectory",
 }
+Texts: TypeAlias = Mapping[str, Float32Array | InvalidSampleError]  # by task; why one cannot be encoded
+
 _TEXT_FRAME_PX = 32  # of the blank frame that goes with a task, where only the task's embedding is wanted
 
 
@@ -96,26 +98,31 @@ class Scorer:
         except ModelNotFoundError:
             return None
 
-    async def _texts(self, samples: Sequence[schema.Sample], served: Served) -> Mapping[str, Float32Array]:
+    async def _texts(self, samples: Sequence[schema.Sample], served: Served) -> Texts:
         """Embeddings of the tasks that come without one, by task; empty if there is no encoder."""
         tasks = {
             first.task
             for first, *_ in (tuple(sample.named_trajectories.values()) for sample in samples)
-            if _has_embeddings(first) and first.text_embedding is None and first.task
+            if _has_embeddings(first) and first.text_embedding is None and first.task and first.task.strip()
         }
         if not tasks or served.embeddings is None:
             return {}
-        blank = np.zeros((1, _TEXT_FRAME_PX, _TEXT_FRAME_PX, 3), np.uint8)
         try:
-            encoded = await asyncio.gather(
-                *(self._client.encode(Trajectory(frames=blank, task=task)) for task in sorted(tasks))
-            )
+            return dict(zip(tasks, await asyncio.gather(*map(self._text, tasks)), strict=True))
         except ModelNotFoundError:
             return {}
-        return {t.task: t.text_embedding for t in encoded if t.text_embedding is not None}
+
+    async def _text(self, task: str) -> Float32Array | InvalidSampleError:
+        blank = np.zeros((1, _TEXT_FRAME_PX, _TEXT_FRAME_PX, 3), np.uint8)
+        try:
+            encoded = await self._client.encode(Trajectory(frames=blank, task=task))
+        except InvalidSampleError as error:  # of one task; the others' samples are told of theirs
+            return error
+        assert encoded.text_embedding is not None
+        return encoded.text_embedding
 
     def _samples(
-        self, samples: Sequence[schema.Sample], served: Served, texts: Mapping[str, Float32Array], frame_steps: int
+        self, samples: Sequence[schema.Sample], served: Served, texts: Texts, frame_steps: int
     ) -> list[Sample]:
         converted: list[Sample] = []
         errors: dict[int, InvalidSampleError] = {}
@@ -128,9 +135,7 @@ class Scorer:
             raise _refused(errors)
         return converted
 
-    def _sample(
-        self, sample: schema.Sample, served: Served, texts: Mapping[str, Float32Array], frame_steps: int
-    ) -> Sample:
+    def _sample(self, sample: schema.Sample, served: Served, texts: Texts, frame_steps: int) -> Sample:
         given = sample.named_trajectories
         by_embeddings = served.embeddings is not None and all(map(_has_embeddings, given.values()))
         trajectories: list[Trajectory] = []
@@ -153,7 +158,7 @@ class Scorer:
         self,
         given: schema.Trajectory,
         info: ModelInfo | None,
-        texts: Mapping[str, Float32Array],
+        texts: Texts,
         needs_text: bool,
     ) -> Trajectory:
         video, text = given.video_embeddings, given.text_embedding
@@ -162,13 +167,15 @@ class Scorer:
             video, text = in_file.video_embeddings, in_file.text_embedding if text is None else text
         if text is None and given.task is not None:
             text = texts.get(given.task)
+            if isinstance(text, InvalidSampleError):
+                raise text
         trajectory = Trajectory(video_embeddings=video, text_embedding=text, task=given.task or "")
         assert info is not None and trajectory.video_embeddings is not None
         _check_width("video_embeddings", trajectory.video_embeddings, info.video_dim)
         if trajectory.text_embedding is not None:
             _check_width("text_embedding", trajectory.text_embedding, info.text_dim)
         elif needs_text:
-            got = "neither" if not given.task else "a task, and no encoder is served"
+            got = "neither" if not (given.task and given.task.strip()) else "a task, and no encoder is served"
             raise InvalidSampleError.at("text_embedding", "an embedding, or a task to encode", got)
         return trajectory
 
@@ -188,7 +195,8 @@ class Scorer:
 
 
 def _has_embeddings(trajectory: schema.Trajectory) -> bool:
-    return trajectory.video_embeddings is not None or trajectory.embeddings_path is not None
+    in_file = trajectory.embeddings_path is not None and trajectory.frames is None
+    return trajectory.video_embeddings is not None or in_file
 
 
 def _num_bytes(sample: schema.Sample) -> int:

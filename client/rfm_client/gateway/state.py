@@ -148,4 +148,4 @@ def _requests(device: Device, model: str) -> int:
 
 
 def _models_alone(device: Device, model: str) -> list[Any]:
-    return [work for name, work in device.work.items() if name.startswith(model)]
+    return [work for name, work in device.work.items() if name in (model, f"{model}_encoder", f"{model}_frames")]

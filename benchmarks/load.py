@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: MIT
+"""Callers of one server, in a process of their own: reads a Load a line from standard input, answers a line of JSON.
+
+Closed loop: each caller asks about one sample at a time and waits for the answer. Open loop: samples are asked about at
+random moments (Poisson), however long the answers take, so that a slow answer does not hide those that wait behind it;
+a latency counts from the moment that a sample should have been sent.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+import time
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import asdict, dataclass
+
+import aiohttp
+import numpy as np
+from peers import clients
+from peers.clients import Ask
+
+from rfm_client import (
+    AsyncRewardClient,
+    PreferenceSample,
+    ProgressResult,
+    ProgressSample,
+    Sample,
+    SimilaritySample,
+    Trajectory,
+)
+
+NUM_SAMPLES = 256
+IN_FLIGHT = 4096  # more than any load has under way, so that no client holds samples back
+MS_PER_S = 1e3
+PEERS = {
+    "FastAPI, JSON": clients.fastapi_json,
+    "FastAPI, npy": clients.fastapi_npy,
+    "gateway": clients.gateway_npy,
+    "LitServe": clients.litserve,
+    "mosec": clients.mosec,
+}
+SHARED_MEMORY = "shared memory"
+
+
+@dataclass(frozen=True)
+class Load:
+    """What is asked, and how.
+
+    callers: at a time, in the closed loop; rate_per_s: samples a second of the open loop; one of them is 0
+    frames: fewest and most of a trajectory; mixed: all three sample types in turn, else progress alone
+    """
+
+    callers: int
+    seconds: float
+    frames: tuple[int, int]
+    mixed: bool = False
+    rate_per_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Measured:
+    """samples_per_s: answered; failed: samples that were not; latencies in milliseconds"""
+
+    samples_per_s: float
+    failed: int
+    p50_ms: float
+    p99_ms: float
+
+
+def samples(load: Load, video_dim: int, text_dim: int) -> list[Sample]:
+    """The same for every server. Pairs are as long together as single trajectories."""
+    random = np.random.default_rng(0)
+
+    def trajectory(num_frames: int) -> Trajectory:
+        return Trajectory(
+            video_embeddings=random.standard_normal((num_frames, video_dim), np.float32),
+            text_embedding=random.standard_normal(text_dim, np.float32),
+        )
+
+    made: list[Sample] = []
+    for index in range(NUM_SAMPLES):
+        num_frames = int(random.integers(load.frames[0], load.frames[1] + 1))
+        kind = index % 3 if load.mixed and num_frames > 1 else 0
+        if kind == 0:
+            made.append(ProgressSample(trajectory(num_frames)))
+        else:
+            pair = trajectory(num_frames // 2), trajectory(num_frames - num_frames // 2)
+            made.append(PreferenceSample(*pair) if kind == 1 else SimilaritySample(*pair))
+    return made
+
+
+@asynccontextmanager
+async def connected(way: str, url: str) -> AsyncIterator[Ask]:
+    """A function that asks about one sample."""
+    if way in PEERS:
+        async with aiohttp.ClientSession(connector=aiohttp.TCPConnector(limit=0)) as session:
+            yield PEERS[way](session, url)
+        return
+    async with AsyncRewardClient(
+        url, shared_memory=way == SHARED_MEMORY, max_in_flight=IN_FLIGHT, retry=False
+    ) as client:
+
+        async def ask(sample: Sample) -> float:
+            result = await client.score(sample)
+            if isinstance(result, ProgressResult):
+                return result.last_progress
+            return result.preference if isinstance(sample, PreferenceSample) else result.similarity  # type: ignore[union-attr]
+
+        yield ask
+
+
+async def measure(ask: Ask, load: Load, asked: Sequence[Sample]) -> Measured:
+    """Asks for ``load.seconds``."""
+    latencies_s: list[float] = []
+    failed = 0
+    started_s = time.perf_counter()
+    end_s = started_s + load.seconds
+
+    async def answered(sample: Sample, due_s: float) -> None:
+        nonlocal failed
+        try:
+            await ask(sample)
+            latencies_s.append(time.perf_counter() - due_s)
+        except Exception:  # noqa: BLE001  whatever it was, the sample has no score, and is counted
+            failed += 1
+
+    async def call(first: int) -> None:
+        index = first
+        while time.perf_counter() < end_s:
+            await answered(asked[index % len(asked)], time.perf_counter())
+            index += load.callers
+
+    if load.rate_per_s:
+        random = np.random.default_rng(1)
+        due_s = started_s + np.cumsum(random.exponential(1 / load.rate_per_s, int(load.rate_per_s * load.seconds)))
+        calls = []
+        for index, moment_s in enumerate(due_s.tolist()):
+            await asyncio.sleep(max(moment_s - time.perf_counter(), 0))
+            calls.append(asyncio.create_task(answered(asked[index % len(asked)], moment_s)))
+        await asyncio.gather(*calls)
+    else:
+        await asyncio.gather(*map(call, range(load.callers)))
+    took_s = time.perf_counter() - started_s
+    p50, p99 = np.percentile(latencies_s, [50, 99]) * MS_PER_S if latencies_s else (float("nan"),) * 2
+    return Measured(len(latencies_s) / took_s, failed, float(p50), float(p99))
+
+
+async def main(way: str, url: str, video_dim: int, text_dim: int) -> None:
+    """Answers loads until standard input ends."""
+    async with connected(way, url) as ask:
+        while line := await asyncio.to_thread(sys.stdin.readline):
+            load = Load(**json.loads(line))
+            asked = samples(load, video_dim, text_dim)
+            for sample in asked[:3]:  # connections are made, and each type has been answered once
+                await ask(sample)
+            print(json.dumps(asdict(await measure(ask, load, asked))), flush=True)
+
+
+if __name__ == "__main__":
+    asyncio.run(main(sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])))

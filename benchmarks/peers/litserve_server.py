@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: MIT
+"""Our engine behind LitServe, with its dynamic batching: an HTTP process and an inference process.
+
+Requests and answers are raw bytes (``message``), so that neither JSON nor a form is parsed. One that the engine cannot
+score is answered with 400; one that cannot be read fails its batch, as LitServe has it.
+"""
+
+# No "from __future__ import annotations": LitServe gives FastAPI the annotations as they are.
+import argparse
+import multiprocessing
+import signal
+from typing import Annotated, Any
+
+import litserve
+import msgpack
+import torch
+from fastapi import Body, Response
+from message import answer_of, sample_of
+
+from rfm.engine import Engine, Outcome
+from rfm_client import Sample
+
+MAX_BATCH_SIZE = 64
+BATCH_TIMEOUT_S = 0.002  # 0 would spin on the queue, which another process holds
+REQUEST_TIMEOUT_S = 60
+MIME_TYPE = "application/msgpack"
+
+
+class RewardAPI(litserve.LitAPI):
+    """Samples in, scores out."""
+
+    def __init__(self, checkpoint: str, threads: int, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.checkpoint = checkpoint
+        self.threads = threads
+
+    def setup(self, device: str) -> None:
+        """Loads the engine, in the inference process."""
+        torch.set_num_threads(self.threads)
+        torch.set_num_interop_threads(1)
+        self.engine = Engine.from_checkpoint(self.checkpoint, device=device)
+
+    def decode_request(self, request: Annotated[bytes, Body(media_type=MIME_TYPE)]) -> Sample:
+        """The sample in the body of a request."""
+        return sample_of(msgpack.unpackb(request))
+
+    def batch(self, inputs: list[Sample]) -> list[Sample]:
+        """The samples as they are: the engine takes any mix."""
+        return inputs
+
+    def predict(self, x: list[Sample]) -> list[Outcome]:
+        """The outcome of each sample."""
+        return self.engine.evaluate(x)
+
+    def unbatch(self, output: list[Outcome]) -> list[Outcome]:
+        """The outcomes as they are."""
+        return output
+
+    def encode_response(self, output: Outcome) -> Response:
+        """The answer to a request."""
+        answer = answer_of(output)
+        return Response(msgpack.packb(answer), 400 if "error" in answer else 200, media_type=MIME_TYPE)
+
+
+def main() -> None:
+    """Serves until SIGTERM."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--checkpoint", required=True, help="checkpoint folder")
+    parser.add_argument("--port", type=int, default=8201)
+    parser.add_argument("--threads", type=int, default=1, help="of torch")
+    arguments = parser.parse_args()
+    batching = {"max_batch_size": MAX_BATCH_SIZE, "batch_timeout": BATCH_TIMEOUT_S}
+    api = RewardAPI(arguments.checkpoint, arguments.threads, **batching)
+    server = litserve.LitServer(api, accelerator="cpu", timeout=REQUEST_TIMEOUT_S, fast_queue=True)
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        server.run(
+            host="127.0.0.1",
+            port=arguments.port,
+            log_level="warning",
+            access_log=False,
+            generate_client_file=False,
+        )
+    finally:
+        for process in multiprocessing.active_children():  # of a start that was broken off
+            process.terminate()
+
+
+def _interrupt(*_: object) -> None:
+    """Ends the server as SIGINT does, on which alone LitServe ends its processes; those inherit this."""
+    if multiprocessing.parent_process() is None:
+        raise KeyboardInterrupt
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: MIT
+"""Our engine behind mosec, with its dynamic batching: a Rust HTTP process and an inference process.
+
+Requests and answers are msgpack (``message``). A sample that the engine cannot score is answered with ``error``; a
+request that cannot be read fails its batch, as mosec has it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import mosec
+import torch
+from message import answer_of, sample_of
+from mosec.mixin import MsgpackMixin
+
+from rfm.engine import Engine
+
+MAX_BATCH_SIZE = 64
+MAX_WAIT_MS = 2
+REQUEST_TIMEOUT_MS = 60_000
+
+
+class RewardWorker(MsgpackMixin, mosec.Worker):
+    """Samples in, scores out; runs in the inference process, which is told of the checkpoint by its environment."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        warnings.filterwarnings("ignore", "IPC data", RuntimeWarning)  # told of every large batch
+        torch.set_num_threads(int(os.environ["PEER_THREADS"]))
+        torch.set_num_interop_threads(1)
+        self.engine = Engine.from_checkpoint(os.environ["PEER_CHECKPOINT"])
+
+    def forward(self, data: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """The answer to each request of a batch."""
+        return [answer_of(outcome) for outcome in self.engine.evaluate([sample_of(message) for message in data])]
+
+
+def main() -> None:
+    """Serves until SIGTERM."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--checkpoint", required=True, help="checkpoint folder")
+    parser.add_argument("--port", type=int, default=8202)
+    parser.add_argument("--threads", type=int, default=1, help="of torch")
+    arguments = parser.parse_args()
+    os.environ |= {  # mosec reads its own settings from here
+        "MOSEC_ADDRESS": "127.0.0.1",
+        "MOSEC_PORT": str(arguments.port),
+        "MOSEC_LOG_LEVEL": "error",
+        "MOSEC_TIMEOUT": str(REQUEST_TIMEOUT_MS),
+    }
+    server = mosec.Server()
+    settings = {"PEER_CHECKPOINT": arguments.checkpoint, "PEER_THREADS": str(arguments.threads)}
+    server.append_worker(RewardWorker, max_batch_size=MAX_BATCH_SIZE, max_wait_time=MAX_WAIT_MS, env=[settings])
+    server.run()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: MIT
+"""The original ReWiND forward in stock torch modules: what the FastAPI evaluation server runs for each request.
+
+It is written as the original is: ``nn.TransformerEncoder``, a causal mask built on every call, progress tokens
+interleaved by stacking, and rows of one length. Its state dict has the names of the checkpoint.
+B rows, T frames of a trajectory, L tokens, D width, K progress bins.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from rfm.checkpoint import load as load_checkpoint
+from rfm.checkpoint.rewind import RewindCheckpoint
+from rfm.models.rewind import RewindConfig
+
+SampleType = Literal["progress", "preference", "similarity"]
+
+
+class Scores(NamedTuple):
+    """Raw scores: progress logits [B, T, K], success logits [B, T]; of pairs the second's too, and query [B]."""
+
+    progress: Tensor
+    success: Tensor
+    second_progress: Tensor | None = None
+    second_success: Tensor | None = None
+    query: Tensor | None = None
+
+
+def _head(width: int, num_outputs: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Linear(width, width // 2),
+        nn.LayerNorm(width // 2),
+        nn.GELU(),
+        nn.Dropout(),
+        nn.Linear(width // 2, num_outputs),
+    )
+
+
+class UpstreamRewind(nn.Module):
+    """The network of a ReWiND checkpoint."""
+
+    def __init__(self, config: RewindConfig) -> None:
+        super().__init__()
+        self.config = config
+        width = config.hidden_dim
+        self.video_proj = nn.Linear(config.video_feature_dim, width)
+        self.text_proj = nn.Linear(config.text_feature_dim, width)
+        self.first_embedding_A = nn.Parameter(torch.randn(1, 1, width))
+        self.first_embedding_B = nn.Parameter(torch.randn(1, 1, width))
+        if config.use_per_frame_progress_token:
+            self.text_position_embedding = nn.Parameter(torch.randn(1, 1, width))
+            self.prog_token_A = nn.Parameter(torch.randn(1, config.max_len, width))
+            self.prog_token_B = nn.Parameter(torch.randn(1, config.max_len, width))
+        layer = nn.TransformerEncoderLayer(
+            d_model=width, nhead=config.num_attention_heads, dim_feedforward=4 * width, batch_first=True
+        )
+        self.transformer = nn.TransformerEncoder(layer, num_layers=config.num_layers)
+        self.progress_head = _head(width, config.progress_bins)
+        self.success_head = _head(width, 1)
+        self.preference_token = nn.Parameter(torch.randn(1, 1, width))
+        self.preference_head = _head(width, 1)
+        if config.has_similarity:
+            self.similarity_token = nn.Parameter(torch.randn(1, 1, width))
+            self.similarity_head = _head(width, 1)
+
+    def forward(
+        self, text: Tensor, first: Tensor, second: Tensor | None = None, sample_type: SampleType = "progress"
+    ) -> Scores:
+        """Scores of text [B, Dt], first [B, T, Dv] and, unless progress is asked, second [B, T, Dv]."""
+        text_token = self.text_proj(text).unsqueeze(1)
+        if self.config.use_per_frame_progress_token:
+            text_token = text_token + self.text_position_embedding
+        first_tokens = self._trajectory_tokens(first, "A")
+        if sample_type == "progress":
+            hidden = self._encode(torch.cat([text_token, first_tokens], dim=1))
+            return Scores(*self._frame_scores(hidden[:, 1:]))
+        assert second is not None
+        if first.shape != second.shape:
+            raise ValueError(f"second: expected {list(first.shape)}, as the first trajectory, got {list(second.shape)}")
+        is_preference = sample_type == "preference"
+        query_token = self.preference_token if is_preference else self.similarity_token
+        query_head = self.preference_head if is_preference else self.similarity_head
+        second_tokens = self._trajectory_tokens(second, "B")
+        query_tokens = query_token.expand(len(text), -1, -1)
+        hidden = self._encode(torch.cat([text_token, first_tokens, second_tokens, query_tokens], dim=1))
+        of_first, of_second = hidden[:, 1:-1].chunk(2, dim=1)
+        query = query_head(hidden[:, -1]).squeeze(-1)
+        return Scores(*self._frame_scores(of_first), *self._frame_scores(of_second), query)
+
+    def _trajectory_tokens(self, video: Tensor, which: Literal["A", "B"]) -> Tensor:
+        """[B, T, Dv] -> [B, T, D], or [B, 2T, D] with a progress token behind each frame."""
+        frames = self.video_proj(video)
+        first_embedding = self.first_embedding_A if which == "A" else self.first_embedding_B
+        frames = torch.cat([frames[:, :1] + first_embedding, frames[:, 1:]], dim=1)
+        if not self.config.use_per_frame_progress_token:
+            return frames
+        batch_size, num_frames, width = frames.shape
+        progress_token = self.prog_token_A if which == "A" else self.prog_token_B
+        progress_tokens = progress_token[:, :num_frames].expand(batch_size, -1, -1)
+        return torch.stack([frames, progress_tokens], dim=2).reshape(batch_size, 2 * num_frames, width)
+
+    def _encode(self, tokens: Tensor) -> Tensor:
+        """[B, L, D] -> [B, L, D]."""
+        mask = None
+        if self.config.causal_mask:
+            mask = nn.Transformer.generate_square_subsequent_mask(tokens.shape[1], device=tokens.device)
+        return self.transformer(tokens, mask=mask)
+
+    def _frame_scores(self, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        """Progress [B, T, K] and success [B, T] logits from one trajectory's tokens."""
+        read = hidden[:, 1::2] if self.config.use_per_frame_progress_token else hidden
+        return self.progress_head(read), self.success_head(read).squeeze(-1)
+
+
+def progress_of(logits: Tensor) -> Tensor:
+    """Progress [..., T] in 0..1 of logits [..., T, K]: the bins' mean under the softmax; of one output its sigmoid."""
+    if logits.shape[-1] == 1:
+        return logits.squeeze(-1).sigmoid()
+    bins = torch.linspace(0, 1, logits.shape[-1], device=logits.device)
+    return (logits.softmax(dim=-1) * bins).sum(dim=-1)
+
+
+def load(folder: str | Path) -> UpstreamRewind:
+    """The network of a ReWiND checkpoint folder with its weights, on the CPU. Raises CheckpointError, TypeError."""
+    checkpoint = load_checkpoint(folder)
+    if not isinstance(checkpoint, RewindCheckpoint):
+        raise TypeError(f"{folder}: expected a ReWiND checkpoint, got {type(checkpoint).__name__}")
+    network = UpstreamRewind(checkpoint.config)
+    network.load_state_dict(checkpoint.network, strict=True)
+    return network.eval().requires_grad_(False)
