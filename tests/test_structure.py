@@ -33,8 +33,8 @@ EXCEPTIONS = {
     "examples/evaluate_demo_checkpoint.py": {"rfm"},
     "benchmarks/bench.py": {"rfm", "rfm_export"},  # the engine without a server, and what is served
     "benchmarks/contestants.py": {"rfm"},
-    "benchmarks/peers/fastapi_server.py": {"rfm"},  # the peers score with our engine, or weights
-    "benchmarks/peers/litserve_server.py": {"rfm"},
+    "benchmarks/perf_analyzer.py": {"rfm"},
+    "benchmarks/peers/litserve_server.py": {"rfm"},  # the peers score with our engine, or weights
     "benchmarks/peers/mosec_server.py": {"rfm"},
     "benchmarks/peers/message.py": {"rfm"},
     "benchmarks/peers/upstream_forward.py": {"rfm"},

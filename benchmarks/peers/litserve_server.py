@@ -71,7 +71,8 @@ def main() -> None:
     arguments = parser.parse_args()
     batching = {"max_batch_size": MAX_BATCH_SIZE, "batch_timeout": BATCH_TIMEOUT_S}
     api = RewardAPI(arguments.checkpoint, arguments.threads, **batching)
-    server = litserve.LitServer(api, accelerator="cpu", timeout=REQUEST_TIMEOUT_S, fast_queue=True)
+    # Its fast_queue is not asked for: 0.2.19 ignores it.
+    server = litserve.LitServer(api, accelerator="cpu", timeout=REQUEST_TIMEOUT_S)
     signal.signal(signal.SIGTERM, _interrupt)
     try:
         server.run(

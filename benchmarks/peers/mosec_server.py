@@ -8,6 +8,7 @@ request that cannot be read fails its batch, as mosec has it.
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import warnings
 from collections.abc import Mapping, Sequence
@@ -53,6 +54,7 @@ def main() -> None:
         "MOSEC_LOG_LEVEL": "error",
         "MOSEC_TIMEOUT": str(REQUEST_TIMEOUT_MS),
     }
+    logging.getLogger(mosec.log.MOSEC_LOG_NAME).setLevel(logging.ERROR)  # its own level is read before
     server = mosec.Server()
     settings = {"PEER_CHECKPOINT": arguments.checkpoint, "PEER_THREADS": str(arguments.threads)}
     server.append_worker(RewardWorker, max_batch_size=MAX_BATCH_SIZE, max_wait_time=MAX_WAIT_MS, env=[settings])
