@@ -34,8 +34,13 @@ def has_numbers(row: RowScores) -> bool:
     return all(np.isfinite(array).all() for array in arrays) and (row.query is None or bool(np.isfinite(row.query)))
 
 
-def checked(rows: Sequence[RowScores]) -> list[RowScores | RewardError]:
-    """The rows, with an error in place of one that has a score that is no number."""
+def checked(rows: Sequence[RowScores], batch: RowScores | None = None) -> list[RowScores | RewardError]:
+    """The rows, with an error in place of one that has a score that is no number.
+
+    batch: all scores that the rows are parts of, padding included; if it has numbers alone, so has every row
+    """
+    if batch is not None and has_numbers(batch):
+        return list(rows)
     failed = InferenceFailedError("the network gave a score that is not finite")
     return [row if has_numbers(row) else failed for row in rows]
 

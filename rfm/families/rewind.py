@@ -54,12 +54,13 @@ class RewindFamily:
         first = frame_scores(output.first_progress, output.first_success)
         firsts = [part_of(first, (index, slice(row.num_first))) for index, row in enumerate(rows)]
         if output.query is None:
-            return checked([RowScores([scores]) for scores in firsts])
+            return checked([RowScores([scores]) for scores in firsts], RowScores([first]))
         second = frame_scores(output.second_progress, output.second_success)
         seconds = [part_of(second, (index, slice(row.num_second))) for index, row in enumerate(rows)]
         logits, probabilities = output.query.float().tolist(), output.query.sigmoid().float().tolist()
         queries = [logits[i] if row.is_similarity else probabilities[i] for i, row in enumerate(rows)]
-        return checked([RowScores([*pair], query) for *pair, query in zip(firsts, seconds, queries, strict=True)])
+        scored = [RowScores([*pair], query) for *pair, query in zip(firsts, seconds, queries, strict=True)]
+        return checked(scored, RowScores([first, second], sum(logits)))
 
     def _embedded(self, samples: Sequence[Sample]) -> list[Sample | RewardError]:
         """The samples with embeddings in place of raw frames."""
