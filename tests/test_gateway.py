@@ -54,6 +54,7 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
+from rfm_client.status import read_status
 
 Json: TypeAlias = dict[str, Any]
 Array: TypeAlias = npt.NDArray[Any]
@@ -684,7 +685,6 @@ BAD_SAMPLES: dict[str, tuple[Any, list[Any], str]] = {
     ),
     "a task that is a number": (but(task=5), TASK_AT, "expected text, got int"),
     "frames without a task": (of_frames(BLACK, task=None), TASK_AT, "expected a task sentence with frames, got ''"),
-    "metadata that are a list": (but(metadata=[]), ["trajectory", "metadata"], "expected an object, got list"),
     "too many frames": (but(video_embeddings=np.ones((17, 48))), ["num_frames"], "expected at most 16 .*, got 17"),
     "a sliver": (of_frames(np.ones((1, 2, 200, 3), int)), ["frames"], "expected frames at most 50 times as long .*"),
     "names of images": (of_frames(["0.png", "1.png"]), [*FRAMES_AT, 0], NO_FILES),
@@ -807,6 +807,12 @@ FORMS_REFUSED: dict[str, tuple[dict[str, str], list[Any], str]] = {
     "no sample": ({"use_frame_steps": "true"}, ["samples"], "expected at least one sample, got none"),
     "a gap": (FORM | {"sample_2": FORM["sample_0"]}, ["sample_1"], "expected a sample, got none, but sample_2"),
     "no first": ({"sample_1": FORM["sample_0"]}, ["sample_0"], "expected a sample, got none, but sample_1"),
+    "another spelling": (FORM | {"sample_01": "{}"}, ["sample_01"], "expected sample_0, sample_1 and so on, got .*"),
+    "steps that are none": (
+        FORM | {"use_frame_steps": "yes"},
+        ["use_frame_steps"],
+        "expected true or false, got 'yes'",
+    ),
     "no JSON": (FORM | {"sample_1": "{"}, ["sample_1"], "expected JSON, got: .*"),
     "no object": (FORM | {"sample_1": "5"}, ["samples", 1], "expected an object, got int"),
     "a part that was not sent": (
@@ -823,18 +829,58 @@ def test_a_bad_form_is_refused(tiny: Gateway, form: dict[str, str], path: list[A
     check_refused(response, (path, message))
 
 
+ONE_SAMPLE = (None, FORM["sample_0"])
+LOST_PARTS: dict[str, tuple[list[tuple[str, Any]], list[Any], str]] = {
+    "one field twice": ([("sample_0", ONE_SAMPLE)] * 2, ["sample_0"], "expected one part of this name, got several"),
+    "one file twice": (
+        [("sample_0", ONE_SAMPLE), *[("a", ("a.npy", npy(np.ones((3, 2)))))] * 2],
+        ["a"],
+        "expected one part of this name, got several",
+    ),
+    "a sample as a file": (
+        [("sample_0", ONE_SAMPLE), ("sample_1", ("sample_1", FORM["sample_0"]))],
+        ["sample_1"],
+        "expected a form field, got a file",
+    ),
+    "steps as a file": (
+        [("sample_0", ONE_SAMPLE), ("use_frame_steps", ("use_frame_steps", "true"))],
+        ["use_frame_steps"],
+        "expected a form field, got a file",
+    ),
+}
+
+
+@pytest.mark.parametrize(("parts", "path", "message"), LOST_PARTS.values(), ids=LOST_PARTS)
+def test_no_part_is_lost_silently(tiny: Gateway, parts: list[tuple[str, Any]], path: list[Any], message: str) -> None:
+    check_refused(requests.post(f"{tiny.url}/evaluate_batch_npy", files=parts), (path, message))
+
+
+@pytest.mark.parametrize("steps", [1, "1", "True", 0, "0", None, "", "yes", 2, 0.5, []], ids=repr)
+def test_steps_are_a_boolean_or_refused(tiny: Gateway, steps: Any) -> None:
+    response = requests.post(
+        f"{tiny.url}/evaluate_batch", dumped({"samples": [progress(FIRST)], "use_frame_steps": steps})
+    )
+    if steps in ("yes", 2, 0.5) or steps == []:
+        check_refused(response, (["use_frame_steps"], "expected true or false, got .*"))
+        return
+    meant = steps is not None and str(steps).lower() in ("1", "true")
+    assert answered(response) == answered(ask_json(tiny, [progress(FIRST)], use_frame_steps=meant))
+
+
 MULTIPART = "multipart/form-data; boundary=b"
 NAMED = b'--b\r\nContent-Disposition: form-data; name="sample_0"\r\n\r\n'
 NAMELESS = b"--b\r\nContent-Disposition: form-data\r\n\r\nx\r\n--b--\r\n"
+NO_FORM = "content-type: expected multipart/form-data with a boundary"
 NO_END = "body: expected its last boundary at its end, got none"
 UNREADABLE: dict[str, tuple[int, str, str | None, bytes]] = {
-    "JSON": (415, "content-type: expected multipart/form-data, got application/json", "application/json", b"[]"),
-    "no content type": (415, "content-type: expected multipart/form-data, got none", None, b"[]"),
-    "no boundary": (400, "Missing boundary in multipart.", "multipart/form-data", NAMED),
+    "JSON": (415, f"{NO_FORM}, got application/json", "application/json", b"[]"),
+    "no content type": (415, f"{NO_FORM}, got none", None, b"[]"),
+    "no boundary": (415, f"{NO_FORM}, got multipart/form-data", "multipart/form-data", NAMED),
     "no multipart": (400, NO_END, MULTIPART, b"hello"),
     "nothing": (400, NO_END, MULTIPART, b""),
     "no name": (400, 'The Content-Disposition header field "name" must be provided.', MULTIPART, NAMELESS),
     "cut off": (400, NO_END, MULTIPART, NAMED + FORM["sample_0"].encode() + b"\r\n" + NAMED + b'{"sample'),
+    "cut off in a boundary": (400, NO_END, MULTIPART, NAMED + FORM["sample_0"].encode() + b"\r\n--"),
 }
 
 
@@ -929,7 +975,7 @@ def paused(triton: Triton) -> Iterator[None]:
 def test_no_score_in_time_is_a_504(triton: Triton, strict: Gateway, ask: Ask) -> None:
     assert answered(ask(strict, [progress(FIRST)]))
     with paused(triton):
-        assert "1 s" in failure(ask(strict, [progress(FIRST)]), 504)
+        assert "no answer within" in failure(ask(strict, [progress(FIRST)]), 504)
     assert answered(ask(strict, [progress(FIRST)]))
 
 
@@ -1101,6 +1147,18 @@ def test_files_that_do_not_fit_are_refused(shelf: tuple[Gateway, Path]) -> None:
     )
 
 
+def test_many_images_are_refused_before_they_fill_the_memory(triton: Triton, tmp_path: Path) -> None:
+    folder = tmp_path / "shelf"
+    folder.mkdir()
+    Image.fromarray(np.zeros((600, 600, 3), np.uint8)).save(folder / "black.png")  # a megabyte, when it is decoded
+    limits = ("--allow-folder", str(folder), "--max-body-mib", "2")
+    with running(triton.endpoints, tmp_path, FILM, *limits) as gateway:
+        response = ask_json(gateway, [of_frames(["black.png"] * 3)])
+        check_refused(
+            response, (["samples", 0, *FRAMES_AT], "expected images of at most 2097152 bytes, got larger ones")
+        )
+
+
 # What is told of the server
 
 
@@ -1118,7 +1176,10 @@ def test_gpu_status_counts_each_request_once(request: pytest.FixtureRequest, nam
     for _ in range(3):
         answered(ask_json(gateway, [sample]))
     assert work_done(gateway)[0] == count + 3
-    assert work_done(gateway)[1] > busy_s
+    parts = {"tiny": [TINY], "film": [FILM, f"{FILM}_encoder"], "video": [f"{VIDEO}_frames"]}[name]
+    status = read_status(gateway.triton_url, metrics_url=request.getfixturevalue("triton").endpoints.metrics_url)
+    computed_s = sum(m.compute_ms for m in status.models if m.name in parts) / 1e3
+    assert busy_s < work_done(gateway)[1] == pytest.approx(computed_s, rel=0.01)
     assert [work_done(other) for other in others] == of_others
     status = requests.get(f"{gateway.url}/gpu_status").json()
     (stats,) = status.pop("gpu_stats").values()
@@ -1127,6 +1188,15 @@ def test_gpu_status_counts_each_request_once(request: pytest.FixtureRequest, nam
     assert began_s - 1 <= stats["last_used"] <= time.time() + 1  # Triton's clock is coarser
     assert 0 <= stats["utilization"] <= 1
     assert 0 < stats["memory_used_bytes"] < stats["memory_total_bytes"]
+
+
+def test_scoring_is_healthy_without_triton_s_metrics(triton: Triton, tmp_path: Path) -> None:
+    nowhere = f"http://127.0.0.1:{free_port()}/metrics"
+    with running(triton.endpoints, tmp_path, TINY, "--metrics-url", nowhere) as gateway:
+        healthy = {"status": "healthy", "available_gpus": None, "total_gpus": None}
+        assert requests.get(f"{gateway.url}/health").json() == healthy
+        assert requests.get(f"{gateway.url}/model_info").json()["num_gpus"] is None
+        assert "metrics" in failure(requests.get(f"{gateway.url}/gpu_status"), 503)
 
 
 def test_health_has_asked_every_model(film: Gateway) -> None:

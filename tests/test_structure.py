@@ -52,6 +52,7 @@ EXTRAS = {
     "typer": {"cli", "gateway"},
     "fastapi": {"gateway"},
     "starlette": {"gateway"},
+    "python_multipart": {"gateway"},
     "pydantic": {"gateway"},
     "pydantic_core": {"gateway"},
     "uvicorn": {"gateway"},

@@ -89,7 +89,9 @@ class Device:
 
 @dataclass(frozen=True)
 class DeviceWork:
-    """Of one model on one device, all its versions together. requests: answered; compute_s: seconds of its batches"""
+    """Of one model on one device, all its versions together. requests: answered; compute_s: their
+    computing, in seconds; a batch counts for each of its requests
+    """
 
     requests: int
     compute_s: float

@@ -77,7 +77,8 @@ class BatchModel(Generic[Question, Answer]):
             questions = [question for part in asked if isinstance(part, list) for question in part]
             started_s = time.perf_counter()
             answers = iter(self.answer(questions))
-            self.answer_s = (time.perf_counter() - started_s) / max(len(questions), 1)
+            if questions:
+                self.answer_s = (time.perf_counter() - started_s) / len(questions)
             answered = [part if isinstance(part, RewardError) else [next(answers) for _ in part] for part in asked]
             return [self._response(*parts) for parts in zip(requests, inputs, answered, strict=True)]
         except Exception:  # noqa: BLE001  the request boundary: whatever happened, every request is answered

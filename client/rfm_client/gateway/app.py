@@ -25,9 +25,9 @@ from starlette.requests import ClientDisconnect
 from rfm_client import errors
 from rfm_client.async_client import DEFAULT_MODEL, DEFAULT_TIMEOUT_S, AsyncRewardClient
 from rfm_client.gateway import schema
-from rfm_client.gateway.body import Batch, read_json, read_multipart
+from rfm_client.gateway.body import RETRY_AFTER, Batch, BodyLimits, read_json, read_multipart
 from rfm_client.gateway.folder import AllowedFolder
-from rfm_client.gateway.observe import RETRY_AFTER_S, Metrics, Observed
+from rfm_client.gateway.observe import Metrics, Observed
 from rfm_client.gateway.scoring import Scorer
 from rfm_client.gateway.state import State
 
@@ -78,7 +78,7 @@ class GatewaySettings:
 
 def create_app(settings: GatewaySettings) -> FastAPI:
     """The application. Raises OSError for a folder that is not there, ValueError for a URL that is none."""
-    folder = AllowedFolder(settings.folder)
+    folder = AllowedFolder(settings.folder, settings.max_body_bytes)
     metrics = Metrics()
     client = AsyncRewardClient(
         settings.triton_url,
@@ -100,7 +100,7 @@ def create_app(settings: GatewaySettings) -> FastAPI:
             CORSMiddleware, allow_origins=settings.cors_origins, allow_methods=["GET", "POST"], allow_headers=["*"]
         )
     state = State(client, settings.triton_url, settings.metrics_url, settings.model)
-    for router in (_health(state), _guarded(settings, Scorer(client, folder), state, metrics)):
+    for router in (_health(state), _guarded(settings, Scorer(client, folder, settings.timeout_s), state, metrics)):
         app.include_router(router)
     _answer_errors(app)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]  # FastAPI's way to extend it
@@ -111,6 +111,7 @@ def _guarded(settings: GatewaySettings, scorer: Scorer, state: State, metrics: M
     """Everything that the key guards."""
     guards = [] if settings.api_key is None else [Depends(_key_check(settings.api_key))]
     router = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
+    limits = BodyLimits(settings.max_body_bytes)
 
     async def score(batch: Batch) -> Response:
         answer = await scorer.evaluate(batch)
@@ -126,9 +127,10 @@ def _guarded(settings: GatewaySettings, scorer: Scorer, state: State, metrics: M
     )
     async def evaluate_batch(request: Request) -> Response:
         """Score samples that come as JSON."""
-        with _in_time(settings.timeout_s):
-            batch = await read_json(request, settings.max_body_bytes)
-        return await score(batch)
+        with limits.admitted(request) as limited:
+            with anyio.fail_after(settings.timeout_s):
+                batch = await read_json(limited)
+            return await score(batch)
 
     @router.post(
         "/evaluate_batch_npy",
@@ -140,10 +142,10 @@ def _guarded(settings: GatewaySettings, scorer: Scorer, state: State, metrics: M
         """Score samples whose arrays come as .npy files: fields `sample_0`, `sample_1`, ... hold each sample as JSON,
         in which `{"__numpy_file__": name}` stands for the array in the part of that name.
         """
-        with _in_time(settings.timeout_s):
-            async with read_multipart(request, settings.max_body_bytes) as batch:
-                pass  # its arrays are in memory
-        return await score(batch)
+        with limits.admitted(request) as limited:
+            with anyio.fail_after(settings.timeout_s):
+                batch = await read_multipart(limited)
+            return await score(batch)
 
     @router.get("/gpu_status", responses=_failures(502, 503, 504))
     async def gpu_status() -> schema.GpuStatus:
@@ -193,10 +195,6 @@ def _failures(*codes: int) -> dict[int | str, dict[str, Any]]:
     return {code: {"model": schema.Failure} for code in codes}
 
 
-def _in_time(timeout_s: float) -> Any:
-    return anyio.fail_after(timeout_s)
-
-
 def _key_check(key: str) -> Callable[..., None]:
     """A dependency that refuses requests without the key."""
     expected = key.encode()
@@ -230,7 +228,7 @@ def _answer_errors(app: FastAPI) -> None:
     @app.exception_handler(errors.RewardError)
     async def failed(_request: Request, error: errors.RewardError) -> JSONResponse:
         code = next((code for kind, code in _STATUS_OF.items() if isinstance(error, kind)), 500)
-        return JSONResponse({"detail": str(error)}, code, {"Retry-After": RETRY_AFTER_S} if code == 503 else None)
+        return JSONResponse({"detail": str(error)}, code, RETRY_AFTER if code == 503 else None)
 
     @app.exception_handler(StarletteHTTPException)
     async def refused(_request: Request, error: StarletteHTTPException) -> JSONResponse:

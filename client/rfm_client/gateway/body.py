@@ -5,14 +5,16 @@ from __future__ import annotations
 
 import re
 import reprlib
-from collections.abc import AsyncIterator, Mapping
-from contextlib import asynccontextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 from fastapi import HTTPException, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails, from_json
+from python_multipart.multipart import parse_options_header
 from starlette.datastructures import UploadFile
 from starlette.types import Message
 
@@ -20,15 +22,16 @@ from rfm_client.gateway import schema
 from rfm_client.gateway.npy import Upload
 from rfm_client.off_loop import off_loop
 
+NPY_ENDPOINT = "/evaluate_batch_npy"
 MAX_PARTS = 10_000  # files, and fields, of one multipart request
-TOO_LARGE = 413
-UNREADABLE = 400
+MAX_JSON_BYTES = 32 * 2**20  # in memory it is up to thirty times as large; arrays have a better way
+HELD_BODIES = 4
+RETRY_AFTER = {"Retry-After": "1"}
 
-_LAST_BOUNDARY = b"--"  # of multipart, behind its name
-_TAIL_BYTES = 16
-
+_ANY_SAMPLE_FIELD = re.compile(r"sample_[0-9]+")
 _SAMPLE_FIELD = re.compile(r"sample_(0|[1-9][0-9]{0,5})")
 _STEPS_FIELD = "use_frame_steps"
+_FLAGS = {"true": True, "1": True, "false": False, "0": False, "": False}
 _TAG_ERRORS = ("union_tag_invalid", "union_tag_not_found")
 _EXPECTED = {  # pydantic's kind of error, and what a field of it is
     "string_type": "text",
@@ -38,12 +41,12 @@ _EXPECTED = {  # pydantic's kind of error, and what a field of it is
 }
 
 
+@dataclass(frozen=True)
 class Batch:
-    """samples: at least one; use_frame_steps: whether progress samples are scored frame by frame."""
+    """samples: at least one; use_frame_steps: whether progress samples are scored frame by frame"""
 
-    def __init__(self, samples: list[schema.Sample], *, use_frame_steps: bool) -> None:
-        self.samples = samples
-        self.use_frame_steps = use_frame_steps
+    samples: list[schema.Sample]
+    use_frame_steps: bool
 
 
 def invalid(loc: tuple[str | int, ...], message: str, kind: str = "value_error") -> RequestValidationError:
@@ -51,62 +54,107 @@ def invalid(loc: tuple[str | int, ...], message: str, kind: str = "value_error")
     return RequestValidationError([{"type": kind, "loc": ["body", *loc], "msg": message}])
 
 
-async def read_json(request: Request, max_bytes: int) -> Batch:
+async def read_json(request: Request) -> Batch:
     """The samples of a JSON request. Raises RequestValidationError, HTTPException."""
-    body = await _limited(request, max_bytes).body()
-    document, num_bytes = await off_loop(len(body), _parsed, body), len(body)
+    body = await request.body()
+    document = await off_loop(len(body), _parsed, body)
     samples, use_frame_steps = _unwrapped(document)
-    return Batch(await off_loop(num_bytes, _checked, samples, {}), use_frame_steps=use_frame_steps)
+    return Batch(await off_loop(len(body), _checked, samples, {}), use_frame_steps)
 
 
-@asynccontextmanager
-async def read_multipart(request: Request, max_bytes: int) -> AsyncIterator[Batch]:
-    """The samples of a multipart request; its files are on disk, but for small ones, as long as the context lasts.
+async def read_multipart(request: Request) -> Batch:
+    """The samples of a multipart request, whose files lie on disk, but for small ones, until they are arrays.
 
     Raises RequestValidationError, HTTPException.
     """
-    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if kind != "multipart/form-data":
-        raise HTTPException(415, f"content-type: expected multipart/form-data, got {kind or 'none'}")
-    limited = _limited(request, max_bytes, ending=_LAST_BOUNDARY)
-    async with limited.form(max_files=MAX_PARTS, max_fields=MAX_PARTS, max_part_size=max_bytes) as form:
+    async with request.form(max_files=MAX_PARTS, max_fields=MAX_PARTS, max_part_size=MAX_JSON_BYTES) as form:
         uploads: dict[str, Upload] = {}
         fields: dict[str, str] = {}
         for name, value in form.multi_items():
-            if isinstance(value, UploadFile):
-                uploads[name] = value
-            else:
+            if name in uploads or name in fields:
+                raise invalid((name,), "expected one part of this name, got several")
+            if not isinstance(value, UploadFile):
                 fields[name] = value
-        samples = [_field(fields, name) for name in _sample_fields(fields)]
-        num_bytes = sum(upload.size or 0 for upload in uploads.values())
-        checked = await off_loop(num_bytes, _checked, samples, uploads)
-        yield Batch(checked, use_frame_steps=fields.get(_STEPS_FIELD, "").strip().lower() == "true")
+            elif name == _STEPS_FIELD or _ANY_SAMPLE_FIELD.fullmatch(name):
+                raise invalid((name,), "expected a form field, got a file")
+            else:
+                uploads[name] = value
+        json_bytes = sum(map(len, fields.values()))
+        if json_bytes > MAX_JSON_BYTES:
+            raise HTTPException(413, f"body: expected at most {MAX_JSON_BYTES} bytes of JSON, got more")
+        num_bytes = json_bytes + sum(upload.size or 0 for upload in uploads.values())
+        return await off_loop(num_bytes, _of_form, fields, uploads)
 
 
-def _limited(request: Request, max_bytes: int, *, ending: bytes = b"") -> Request:
-    """The request, which raises 413 as soon as more than ``max_bytes`` are announced or have come, and 400 if it does
-    not end as it must: what is left out of it may be a sample.
+def _of_form(fields: Mapping[str, str], uploads: Mapping[str, Upload]) -> Batch:
+    samples = [_field(fields, name) for name in _sample_fields(fields)]
+    return Batch(_checked(samples, uploads), _flag(fields.get(_STEPS_FIELD, False)))
+
+
+class BodyLimits:
+    """How much the requests may bring: ``max_bytes`` each, MAX_JSON_BYTES of JSON, and HELD_BODIES such bodies at a
+    time, all together.
     """
-    announced = request.headers.get("content-length", "")
-    too_large = HTTPException(TOO_LARGE, f"body: expected at most {max_bytes} bytes, got more")
-    if announced.isdecimal() and int(announced) > max_bytes:
-        raise too_large
-    come, tail = 0, b""
 
-    async def receive() -> Message:
-        nonlocal come, tail
-        message = await request.receive()
-        part = message.get("body", b"")
-        come += len(part)
-        if come > max_bytes:
+    def __init__(self, max_bytes: int) -> None:
+        self._max_bytes = max_bytes
+        self._held_bytes = 0
+
+    @contextmanager
+    def admitted(self, request: Request) -> Iterator[Request]:
+        """The request, whose body counts as held as long as the context lasts. Reading it raises HTTPException: 413 as
+        soon as too much is announced or has come, 503 if all requests together hold too much, 400 if a multipart body
+        does not end as it must: what was cut off may be a sample; 415 if it is to be multipart and is not.
+        """
+        ending = _ending(request)
+        most = self._max_bytes if ending else min(self._max_bytes, MAX_JSON_BYTES)
+        too_large = HTTPException(413, f"body: expected at most {most} bytes, got more")
+        announced = request.headers.get("content-length", "")
+        if announced.isdecimal() and int(announced) > most:
             raise too_large
-        tail = (tail + part[-_TAIL_BYTES:])[-_TAIL_BYTES:]
-        is_last = message["type"] == "http.request" and not message.get("more_body", False)
-        if is_last and not tail.rstrip(b"\r\n").endswith(ending):
-            raise HTTPException(UNREADABLE, "body: expected its last boundary at its end, got none")
-        return message
+        come, tail = 0, b""
 
-    return Request(request.scope, receive)
+        async def receive() -> Message:
+            nonlocal come, tail
+            message = await request.receive()
+            part = message.get("body", b"")
+            come += len(part)
+            self._held_bytes += len(part)
+            if come > most:
+                raise too_large
+            if self._held_bytes > HELD_BODIES * self._max_bytes:
+                raise HTTPException(503, "body: expected room for it, got none: others hold it", RETRY_AFTER)
+            tail = (tail + part[-len(ending) - 2 :])[-len(ending) - 2 :]  # behind it a line may end
+            is_last = message["type"] == "http.request" and not message.get("more_body", False)
+            if is_last and not tail.rstrip(b"\r\n").endswith(ending):
+                raise HTTPException(400, "body: expected its last boundary at its end, got none")
+            return message
+
+        try:
+            yield Request(request.scope, receive)
+        finally:
+            self._held_bytes -= come
+
+
+def _ending(request: Request) -> bytes:
+    """With what the body of a multipart request ends; empty for the JSON endpoint."""
+    if not request.url.path.endswith(NPY_ENDPOINT):
+        return b""
+    kind, options = parse_options_header(request.headers.get("content-type", ""))
+    if kind != b"multipart/form-data" or not options.get(b"boundary"):
+        raise HTTPException(
+            415, f"content-type: expected multipart/form-data with a boundary, got {kind.decode() or 'none'}"
+        )
+    return b"--" + options[b"boundary"] + b"--"
+
+
+def _flag(value: Any) -> bool:
+    """A boolean as JSON or a form writes it. Raises RequestValidationError."""
+    if value is None:
+        return False
+    if isinstance(value, (bool, int, str)) and str(value).strip().lower() in _FLAGS:
+        return _FLAGS[str(value).strip().lower()]
+    raise invalid((_STEPS_FIELD,), f"expected true or false, got {reprlib.repr(value)}")
 
 
 def _parsed(body: bytes) -> Any:
@@ -120,8 +168,7 @@ def _unwrapped(document: Any) -> tuple[list[Any], bool]:
     """The samples of each form that the evaluation server took or was said to take, and use_frame_steps."""
     use_frame_steps = False
     if isinstance(document, dict):
-        steps = document.get(_STEPS_FIELD, False)
-        use_frame_steps = steps is True or str(steps).lower() == "true"
+        use_frame_steps = _flag(document.get(_STEPS_FIELD, False))
         others = [value for key, value in document.items() if key != _STEPS_FIELD]
         if "sample_type" in document:
             document = [document]
@@ -138,7 +185,12 @@ def _unwrapped(document: Any) -> tuple[list[Any], bool]:
 
 def _sample_fields(fields: Mapping[str, str]) -> list[str]:
     """``sample_0``, ``sample_1`` and so on, without a gap: one left out would shift the answers of the others."""
-    numbers = sorted(int(match[1]) for match in map(_SAMPLE_FIELD.fullmatch, fields) if match)
+    numbers = []
+    for name in filter(_ANY_SAMPLE_FIELD.fullmatch, fields):
+        if not _SAMPLE_FIELD.fullmatch(name):
+            raise invalid((name,), "expected sample_0, sample_1 and so on, got another spelling")
+        numbers.append(int(name.partition("_")[2]))
+    numbers.sort()
     for expected, number in enumerate(numbers):
         if number != expected:
             raise invalid((f"sample_{expected}",), f"expected a sample, got none, but sample_{number}", "missing")

@@ -89,12 +89,12 @@ def gateway_command(triton: str, metrics_url: str, model: str, host: str, port: 
 
 def _key(file: Path | None) -> str | None:
     try:
-        key = os.environ.get(API_KEY_VARIABLE) if file is None else file.read_text().strip()
+        key = os.environ.get(API_KEY_VARIABLE) if file is None else file.read_text()
     except (OSError, UnicodeDecodeError) as error:
         raise typer.BadParameter(f"--api-key-file: expected a text file, got {error}") from None
-    if key is not None and not key:
+    if key is not None and not key.strip():
         raise typer.BadParameter("key: expected at least one character, got none")
-    return key
+    return None if key is None else key.strip()
 
 
 def _is_loopback(host: str) -> bool:

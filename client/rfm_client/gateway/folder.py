@@ -14,24 +14,34 @@ from rfm_client.samples import Trajectory, UInt8Array
 
 
 class AllowedFolder:
-    """The folder that requests may name files of. None: they may name none."""
+    """The folder that requests may name files of. None: they may name none.
 
-    def __init__(self, folder: Path | None) -> None:
+    max_bytes: of the images of one trajectory, when they are decoded
+    """
+
+    def __init__(self, folder: Path | None, max_bytes: int) -> None:
+        self._max_bytes = max_bytes
         self._folder = None if folder is None else folder.resolve(strict=True)
 
     def frames(self, names: Sequence[str]) -> UInt8Array:
         """uint8 [T, H, W, 3], the images of these names. Raises InvalidSampleError."""
         from PIL import Image
 
-        images = []
+        images: list[UInt8Array] = []
+        num_bytes = 0
         for index, name in enumerate(names):
             where = f"frames.{index}"
             file = self._file(name, where)
             try:
                 with Image.open(file) as image:
+                    num_bytes += image.width * image.height * 3
+                    if num_bytes > self._max_bytes:
+                        break
                     images.append(np.asarray(image.convert("RGB")))
             except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
                 raise InvalidSampleError.at(where, "an image file", name) from None
+        if num_bytes > self._max_bytes:
+            raise InvalidSampleError.at("frames", f"images of at most {self._max_bytes} bytes", "larger ones")
         if len({image.shape for image in images}) > 1:
             raise InvalidSampleError.at("frames", "images of one size", "different ones")
         return np.stack(images)

@@ -9,8 +9,9 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, gene
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-RETRY_AFTER_S = "1"
-EVALUATIONS = ("/evaluate_batch", "/evaluate_batch_npy")
+from rfm_client.gateway.body import NPY_ENDPOINT, RETRY_AFTER
+
+EVALUATIONS = ("/evaluate_batch", NPY_ENDPOINT)
 ENDPOINTS = (*EVALUATIONS, "/gpu_status", "/health", "/model_info", "/metrics")
 REJECTIONS = {401: "key", 408: "slow", 413: "size", 415: "format", 422: "invalid", 503: "unavailable", 504: "deadline"}
 
@@ -72,7 +73,7 @@ class Observed:
         try:
             if is_evaluation and self._in_flight >= self._max_in_flight:
                 refused = {"detail": f"expected at most {self._max_in_flight} evaluations at a time, got more"}
-                await JSONResponse(refused, 503, {"Retry-After": RETRY_AFTER_S})(scope, receive, send_counted)
+                await JSONResponse(refused, 503, RETRY_AFTER)(scope, receive, send_counted)
                 return
             self._count(is_evaluation, 1)
             try:

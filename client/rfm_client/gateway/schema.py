@@ -101,9 +101,8 @@ class Trajectory(BaseModel):
     embeddings_path: str | None = Field(
         None, description="Name of a .npy or .npz file of embeddings in the folder that the gateway may read."
     )
-    data_source: str | None = None
-    data_gen_strategy: str | None = None
-    metadata: dict[str, Any] | None = None
+    data_source: Any = None
+    metadata: Any = None
 
 
 class ProgressSample(BaseModel):
@@ -143,7 +142,7 @@ class SimilaritySample(BaseModel):
     sample_type: Literal["similarity"]
     ref_trajectory: Trajectory = Field(validation_alias=AliasChoices("ref_trajectory", "reference_trajectory"))
     sim_trajectory: Trajectory = Field(validation_alias=AliasChoices("sim_trajectory", "traj_sim_trajectory"))
-    data_gen_strategy: str | None = None
+    data_gen_strategy: Any = None
 
     @property
     def named_trajectories(self) -> dict[str, Trajectory]:
@@ -190,9 +189,9 @@ class SimilarityOutputs(BaseModel):
 
     sim_score_ref_sim: list[float] = Field(description="Raw score of sim_trajectory against ref_trajectory.")
     task: list[str | None]
-    data_source: list[str | None]
-    data_gen_strategy: list[str | None]
-    metadata: list[dict[str, Any] | None]
+    data_source: list[Any]
+    data_gen_strategy: list[Any]
+    metadata: list[Any]
 
 
 class EvaluateBatchAnswer(BaseModel):
@@ -251,8 +250,8 @@ class Health(BaseModel):
     """A server whose every model has answered a request just now."""
 
     status: Literal["healthy"]
-    available_gpus: int
-    total_gpus: int
+    available_gpus: int | None = Field(description="As total_gpus.")
+    total_gpus: int | None = Field(description="Devices that models run on; null: Triton's metrics cannot be read.")
 
 
 class ModelInformation(BaseModel):
@@ -260,6 +259,6 @@ class ModelInformation(BaseModel):
 
     model_path: str | None = Field(description="Hub id, or name of the folder, that was exported.")
     model_version: str | None = Field(description="Version in the model repository.")
-    num_gpus: int
+    num_gpus: int | None
     experiment_config: dict[str, Any] = Field(description="The network's configuration.")
     model_architecture: dict[str, Any] = Field(description="Class and numbers of parameters.")

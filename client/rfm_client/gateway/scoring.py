@@ -9,14 +9,16 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
+from fastapi.exceptions import RequestValidationError
 
 from rfm_client.async_client import AsyncRewardClient
+from rfm_client.deadline import Deadline
 from rfm_client.errors import InvalidSampleError, ModelNotFoundError, RewardError
 from rfm_client.gateway import schema
 from rfm_client.gateway.body import Batch, invalid
 from rfm_client.gateway.folder import AllowedFolder
 from rfm_client.model_info import ModelInfo
-from rfm_client.off_loop import off_loop
+from rfm_client.off_loop import MIN_BYTES, off_loop
 from rfm_client.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.samples import (
     Float32Array,
@@ -56,21 +58,23 @@ class Served:
 class Scorer:
     """Asks the server behind ``client``."""
 
-    def __init__(self, client: AsyncRewardClient, folder: AllowedFolder) -> None:
+    def __init__(self, client: AsyncRewardClient, folder: AllowedFolder, timeout_s: float) -> None:
         self._client = client
         self._folder = folder
+        self._timeout_s = timeout_s
 
     async def evaluate(self, batch: Batch) -> schema.EvaluateBatchAnswer:
         """The answer to a batch, whole: one that lacked a sample would shift the others', or be read as a reward of 0.
 
         Raises RequestValidationError for samples that cannot be scored, all of them told, and ServerError.
         """
-        served = await self._served(batch.samples)
+        deadline = Deadline(self._timeout_s)
+        served = await self._served(batch.samples, deadline)
         num_bytes = sum(_num_bytes(sample) for sample in batch.samples)
-        texts = await self._texts(batch.samples, served)
+        texts = await self._texts(batch.samples, served, deadline)
         steps = FRAME_STEPS if batch.use_frame_steps else 0
         samples = await off_loop(num_bytes, self._samples, batch.samples, served, texts, steps)
-        results = await self._client.evaluate(samples, return_errors=True)
+        results = await self._client.evaluate(samples, return_errors=True, timeout_s=deadline.remaining_s())
         failed = {index: result for index, result in enumerate(results) if isinstance(result, RewardError)}
         refused = {i: error for i, error in failed.items() if isinstance(error, InvalidSampleError)}
         if refused:
@@ -80,25 +84,25 @@ class Scorer:
         group = served.frames.frames_per_value if served.frames is not None and not steps else 1
         return _answer(batch.samples, results, group)  # type: ignore[arg-type]  # no errors among them
 
-    async def _served(self, samples: Sequence[schema.Sample]) -> Served:
+    async def _served(self, samples: Sequence[schema.Sample], deadline: Deadline) -> Served:
         """Asks about the model for frames only if a sample may need it: what is not served is asked for every time."""
         trajectories = [t for sample in samples for t in sample.named_trajectories.values()]
         has_embeddings = any(_has_embeddings(trajectory) for trajectory in trajectories)
-        embeddings = await self._model_info(frames=False) if has_embeddings else None
+        embeddings = await self._model_info(deadline, frames=False) if has_embeddings else None
         has_frames = any(trajectory.frames is not None for trajectory in trajectories)
         needs_frames = has_frames and not (embeddings is not None and all(map(_has_embeddings, trajectories)))
-        frames = await self._model_info(frames=True) if needs_frames else None
+        frames = await self._model_info(deadline, frames=True) if needs_frames else None
         if embeddings is None and frames is None:  # is the other one served, or none at all?
-            await self._client.model_info(frames=not needs_frames)
+            await self._client.model_info(frames=not needs_frames, timeout_s=deadline.remaining_s())
         return Served(embeddings, frames)
 
-    async def _model_info(self, *, frames: bool) -> ModelInfo | None:
+    async def _model_info(self, deadline: Deadline, *, frames: bool) -> ModelInfo | None:
         try:
-            return await self._client.model_info(frames=frames)
+            return await self._client.model_info(frames=frames, timeout_s=deadline.remaining_s())
         except ModelNotFoundError:
             return None
 
-    async def _texts(self, samples: Sequence[schema.Sample], served: Served) -> Texts:
+    async def _texts(self, samples: Sequence[schema.Sample], served: Served, deadline: Deadline) -> Texts:
         """Embeddings of the tasks that come without one, by task; empty if there is no encoder."""
         tasks = {
             first.task
@@ -108,14 +112,14 @@ class Scorer:
         if not tasks or served.embeddings is None:
             return {}
         try:
-            return dict(zip(tasks, await asyncio.gather(*map(self._text, tasks)), strict=True))
+            return dict(zip(tasks, await asyncio.gather(*(self._text(task, deadline) for task in tasks)), strict=True))
         except ModelNotFoundError:
             return {}
 
-    async def _text(self, task: str) -> Float32Array | InvalidSampleError:
+    async def _text(self, task: str, deadline: Deadline) -> Float32Array | InvalidSampleError:
         blank = np.zeros((1, _TEXT_FRAME_PX, _TEXT_FRAME_PX, 3), np.uint8)
         try:
-            encoded = await self._client.encode(Trajectory(frames=blank, task=task))
+            encoded = await self._client.encode(Trajectory(frames=blank, task=task), timeout_s=deadline.remaining_s())
         except InvalidSampleError as error:  # of one task; the others' samples are told of theirs
             return error
         assert encoded.text_embedding is not None
@@ -200,7 +204,11 @@ def _has_embeddings(trajectory: schema.Trajectory) -> bool:
 
 
 def _num_bytes(sample: schema.Sample) -> int:
-    arrays = (a for t in sample.named_trajectories.values() for a in (t.frames, t.video_embeddings))
+    """Of its arrays; files that it names may have any size."""
+    trajectories = sample.named_trajectories.values()
+    if any(isinstance(t.frames, list) or t.embeddings_path is not None for t in trajectories):
+        return MIN_BYTES
+    arrays = (array for t in trajectories for array in (t.frames, t.video_embeddings))
     return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
 
 
@@ -222,14 +230,14 @@ def _check_width(where: str, array: Float32Array, width: int | None) -> None:
         raise InvalidSampleError.at(where, f"{axes}{width}]", str(list(array.shape)))
 
 
-def _refused(errors: Mapping[int, InvalidSampleError]) -> Exception:
+def _refused(errors: Mapping[int, InvalidSampleError]) -> RequestValidationError:
     """One error that tells of all samples that cannot be scored, each at its field as the caller named it."""
     told: list[Any] = []
     for index, error in errors.items():
         where, _, message = str(error).partition(": ")
         path: list[str | int] = [int(word) if word.isdecimal() else _SIDES.get(word, word) for word in where.split(".")]
         told += invalid(("samples", index, *path), message).errors()
-    return type(invalid((), ""))(told)
+    return RequestValidationError(told)
 
 
 def _answer(samples: Sequence[schema.Sample], results: Sequence[Result], group: int) -> schema.EvaluateBatchAnswer:

@@ -5,12 +5,11 @@ from __future__ import annotations
 
 import asyncio
 import time
-from typing import Any
 
 import numpy as np
 
 from rfm_client.async_client import AsyncRewardClient
-from rfm_client.errors import ModelNotFoundError, RewardError, ServerUnavailableError
+from rfm_client.errors import ModelNotFoundError, RewardError, ServerError, ServerUnavailableError
 from rfm_client.gateway import schema
 from rfm_client.model_info import ModelInfo
 from rfm_client.samples import Trajectory
@@ -19,6 +18,7 @@ from rfm_client.status import Device, ServerStatus, read_status
 CANARY_TIMEOUT_S = 5.0
 CANARY_KEPT_S = 1.0  # so that probes, which need no key, do not keep the models busy
 STATUS_TIMEOUT_S = 5.0
+MS_PER_S = 1e3
 _CANARY_FRAMES = 2
 _CANARY_PX = 64
 
@@ -34,6 +34,7 @@ class State:
         self._asking = asyncio.Lock()
         self._asked_s = -CANARY_KEPT_S
         self._problem: str | None = None
+        self._num_devices: int | None = None
 
     async def gpu_status(self) -> schema.GpuStatus:
         """Raises ServerError."""
@@ -47,11 +48,11 @@ class State:
         async with self._asking:
             if time.monotonic() - self._asked_s >= CANARY_KEPT_S:
                 self._problem = await self._ask_all()
+                self._num_devices = await self._count_devices() if self._problem is None else None
                 self._asked_s = time.monotonic()
-            problem = self._problem
+            problem, devices = self._problem, self._num_devices
         if problem is not None:
             raise ServerUnavailableError(problem)
-        devices = (await self.gpu_status()).total_gpus
         return schema.Health(status="healthy", available_gpus=devices, total_gpus=devices)
 
     async def model_info(self) -> schema.ModelInformation:
@@ -61,11 +62,10 @@ class State:
         parts = info.network.get("parameters", {})
         total = sum(parts.values())
         kind = info.network.get("class")
-        status = await self.gpu_status()
         return schema.ModelInformation(
             model_path=info.source,
             model_version=max(info.versions, key=int, default=None),
-            num_gpus=status.total_gpus,
+            num_gpus=await self._count_devices(),
             experiment_config={"model": info.network.get("config", {})},
             model_architecture={
                 "model_class": kind,
@@ -76,6 +76,13 @@ class State:
                 "architecture_summary": [{"name": name, "parameters": count} for name, count in parts.items()],
             },
         )
+
+    async def _count_devices(self) -> int | None:
+        """None where the metrics cannot be read: scoring needs them not."""
+        try:
+            return (await self.gpu_status()).total_gpus
+        except ServerError:
+            return None
 
     async def _infos(self) -> list[ModelInfo]:
         """Of the models for embeddings and for raw frames, as far as they are served."""
@@ -112,8 +119,11 @@ def _canary(info: ModelInfo) -> Trajectory:
 
 
 def _gpu_status(status: ServerStatus, model: str) -> schema.GpuStatus:
-    gpus = [device for device in status.devices if device.name != "CPU"]
-    devices = [device for device in gpus if device.work] or list(status.devices)
+    served = {name for device in status.devices for name in device.work}
+    # An ensemble's work is that of its parts: it is left out, and a request counted where it is scored.
+    scorer = model if model in served else f"{model}_frames"
+    parts = {scorer, f"{model}_encoder"}
+    devices = [device for device in status.devices if parts & device.work.keys()] or list(status.devices)
     if not devices:
         raise ServerUnavailableError(status.metrics_error or f"{status.metrics_url}: no device is told of")
     is_waiting = any(entry.requests_pending for entry in status.models)
@@ -122,8 +132,8 @@ def _gpu_status(status: ServerStatus, model: str) -> schema.GpuStatus:
         str(number): schema.GpuStats(
             device=device.name,
             status="processing" if is_waiting else "ready",
-            total_requests=_requests(device, model),
-            total_processing_time=sum(work.compute_s for work in _models_alone(device, model)),
+            total_requests=device.work[scorer].requests if scorer in device.work else 0,
+            total_processing_time=sum(_busy_s(status, device, name) for name in parts),
             last_used=last_used,
             utilization=device.utilization,
             memory_used_bytes=device.memory_used_bytes,
@@ -141,11 +151,10 @@ def _gpu_status(status: ServerStatus, model: str) -> schema.GpuStatus:
     )
 
 
-def _requests(device: Device, model: str) -> int:
-    """A request for raw frames of a ReWiND checkpoint passes its encoder and its scorer: it is counted at the last."""
-    work = device.work.get(model) or device.work.get(f"{model}_frames")
-    return 0 if work is None else work.requests
-
-
-def _models_alone(device: Device, model: str) -> list[Any]:
-    return [work for name, work in device.work.items() if name in (model, f"{model}_encoder", f"{model}_frames")]
+def _busy_s(status: ServerStatus, device: Device, model: str) -> float:
+    """Seconds of a model's batches on one device: of all that Triton tells, the share that its requests had there."""
+    on_all = sum(each.work[model].compute_s for each in status.devices if model in each.work)
+    if model not in device.work or not on_all:
+        return 0.0
+    batches_s = sum(entry.compute_ms for entry in status.models if entry.name == model) / MS_PER_S
+    return batches_s * device.work[model].compute_s / on_all
