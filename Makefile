@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed
 
-.PHONY: demo test check parity format model_repository clean
+.PHONY: demo test check parity bench perf format model_repository clean
 
 demo: $(INSTALLED)
 	$(BIN)/python examples/demo.py
@@ -22,6 +22,15 @@ check: $(INSTALLED)
 # Every reference case through Triton: how far are the scores from the original's?
 parity: $(INSTALLED)
 	$(BIN)/python tests/parity.py
+
+# This server beside the bare engine, the FastAPI server's design, LitServe and mosec, in one run.
+bench: $(INSTALLED)
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[bench]"
+	$(BIN)/python benchmarks/bench.py
+
+# Triton's own perf_analyzer on the committed repository.
+perf: $(INSTALLED)
+	$(BIN)/python benchmarks/perf_analyzer.py
 
 format: $(INSTALLED)
 	$(BIN)/ruff check --fix .
