@@ -13,7 +13,7 @@ from fastapi.exceptions import RequestValidationError
 
 from rfm_client.async_client import AsyncRewardClient
 from rfm_client.deadline import Deadline
-from rfm_client.errors import InvalidSampleError, ModelNotFoundError, RewardError
+from rfm_client.errors import DeadlineExceededError, InvalidSampleError, ModelNotFoundError, RewardError
 from rfm_client.gateway import schema
 from rfm_client.gateway.body import Batch, invalid
 from rfm_client.gateway.folder import AllowedFolder
@@ -69,6 +69,12 @@ class Scorer:
         Raises RequestValidationError for samples that cannot be scored, all of them told, and ServerError.
         """
         deadline = Deadline(self._timeout_s)
+        try:
+            return await self._evaluate(batch, deadline)
+        except DeadlineExceededError as error:  # which tells what was left for one of several calls
+            raise deadline.exceeded("Triton") from error
+
+    async def _evaluate(self, batch: Batch, deadline: Deadline) -> schema.EvaluateBatchAnswer:
         served = await self._served(batch.samples, deadline)
         num_bytes = sum(_num_bytes(sample) for sample in batch.samples)
         texts = await self._texts(batch.samples, served, deadline)
