@@ -16,6 +16,7 @@ from rfm.collate.images import FRAMES_PER_GROUP, Normalisation, QwenImages, Smol
 from rfm.collate.prompts import SPECIAL_TOKENS
 from rfm.collate.vlm import QwenCollator, SmolCollator, VlmCollator, VlmRow
 from rfm.family import RowScores, checked, frame_scores, part_of
+from rfm.models.linear import speed_up
 from rfm.models.vlm import SMOL, VlmBatch, VlmConfig
 from rfm_client import FrameScores, InvalidSampleError, RewardError, Sample
 
@@ -29,6 +30,7 @@ class VlmFamily:
 
     def __init__(self, network: Any, collator: VlmCollator, device: torch.device) -> None:
         self.network = network.to(device).eval()
+        speed_up(self.network)
         self.collator = collator
         self.device = device
         self._dtype = next(network.parameters()).dtype

@@ -22,6 +22,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from rfm.collate import as_tensor
+from rfm.models.linear import speed_up
 from rfm_client import InferenceFailedError, InvalidSampleError, RewardError, Trajectory
 from rfm_client.resize import FrameSize
 from rfm_client.samples import Float32Array, UInt8Array
@@ -112,6 +113,8 @@ class Encoders:
         self.image_model = image_model.eval()
         self.preprocessor = preprocessor
         self.text_model = text_model.eval()
+        for model in (image_model, text_model):
+            speed_up(model)
         self.tokenizer = tokenizer
 
     @classmethod

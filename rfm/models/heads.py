@@ -6,17 +6,19 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from rfm.models.linear import Linear
+
 
 class PredictionHead(nn.Sequential):
     """[..., D] hidden states -> [..., n] logits. The indices 0, 1 and 4 are the names in checkpoints."""
 
     def __init__(self, hidden_dim: int, num_outputs: int) -> None:
         super().__init__(
-            nn.Linear(hidden_dim, hidden_dim // 2),
+            Linear(hidden_dim, hidden_dim // 2),
             nn.LayerNorm(hidden_dim // 2),
             nn.GELU(),
             nn.Dropout(),  # holds its index; serving never trains
-            nn.Linear(hidden_dim // 2, num_outputs),
+            Linear(hidden_dim // 2, num_outputs),
         )
 
 

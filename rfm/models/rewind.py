@@ -19,6 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from rfm.models.heads import PredictionHead
+from rfm.models.linear import Linear, linear
 
 FEED_FORWARD_RATIO = 4
 
@@ -93,7 +94,7 @@ class RewindOutput:
 
 
 class SelfAttention(nn.Module):
-    """Multi-head attention of some tokens [B, Q, D] to all of their row [B, L, D] -> [B, Q, D].
+    """Multi-head attention of some tokens [B, Q, D] to all of their row [B, L, D], and the tokens themselves added.
 
     Parameters are named as nn.MultiheadAttention's.
     """
@@ -103,7 +104,7 @@ class SelfAttention(nn.Module):
         self.num_heads = num_heads
         self.in_proj_weight = nn.Parameter(torch.empty(3 * hidden_dim, hidden_dim))
         self.in_proj_bias = nn.Parameter(torch.zeros(3 * hidden_dim))
-        self.out_proj = nn.Linear(hidden_dim, hidden_dim)
+        self.out_proj = Linear(hidden_dim, hidden_dim)
         nn.init.xavier_uniform_(self.in_proj_weight)
 
     def forward(self, asking: Tensor, x: Tensor, mask: Tensor | None) -> Tensor:
@@ -111,14 +112,14 @@ class SelfAttention(nn.Module):
             part.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for part in self._projected(asking, x)
         )
         attended = F.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
-        return self.out_proj(attended.transpose(1, 2).flatten(2))
+        return linear(attended.transpose(1, 2).flatten(2), self.out_proj.weight, self.out_proj.bias, plus=asking)
 
     def _projected(self, asking: Tensor, x: Tensor) -> tuple[Tensor, ...]:
         weight, bias, width = self.in_proj_weight, self.in_proj_bias, x.shape[-1]
         if asking is x:
-            return F.linear(x, weight, bias).chunk(3, dim=-1)
-        queries = F.linear(asking, weight[:width], bias[:width])
-        return (queries, *F.linear(x, weight[width:], bias[width:]).chunk(2, dim=-1))
+            return linear(x, weight, bias).chunk(3, dim=-1)
+        queries = linear(asking, weight[:width], bias[:width])
+        return (queries, *linear(x, weight[width:], bias[width:]).chunk(2, dim=-1))
 
 
 class EncoderLayer(nn.Module):
@@ -128,13 +129,14 @@ class EncoderLayer(nn.Module):
         super().__init__()
         self.self_attn = SelfAttention(hidden_dim, num_heads)
         self.norm1 = nn.LayerNorm(hidden_dim)
-        self.linear1 = nn.Linear(hidden_dim, FEED_FORWARD_RATIO * hidden_dim)
-        self.linear2 = nn.Linear(FEED_FORWARD_RATIO * hidden_dim, hidden_dim)
+        self.linear1 = Linear(hidden_dim, FEED_FORWARD_RATIO * hidden_dim)
+        self.linear2 = Linear(FEED_FORWARD_RATIO * hidden_dim, hidden_dim)
         self.norm2 = nn.LayerNorm(hidden_dim)
 
     def forward(self, asking: Tensor, x: Tensor, mask: Tensor | None) -> Tensor:
-        asking = self.norm1(asking + self.self_attn(asking, x, mask))
-        return self.norm2(asking + self.linear2(F.relu(self.linear1(asking))))
+        asking = self.norm1(self.self_attn(asking, x, mask))
+        grown = linear(asking, self.linear1.weight, self.linear1.bias, relu=True)
+        return self.norm2(linear(grown, self.linear2.weight, self.linear2.bias, plus=asking))
 
 
 class Encoder(nn.Module):
@@ -160,8 +162,8 @@ class RewindTransformer(nn.Module):
         super().__init__()
         self.config = config
         width = config.hidden_dim
-        self.video_proj = nn.Linear(config.video_feature_dim, width)
-        self.text_proj = nn.Linear(config.text_feature_dim, width)
+        self.video_proj = Linear(config.video_feature_dim, width)
+        self.text_proj = Linear(config.text_feature_dim, width)
         self.first_embedding_A = nn.Parameter(torch.randn(1, 1, width))
         self.first_embedding_B = nn.Parameter(torch.randn(1, 1, width))
         if config.use_per_frame_progress_token:

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: MIT
+"""Linear layers. Large float32 ones on the CPU are computed by oneDNN, which torch itself asks only for bfloat16.
+
+torch's own choice, MKL, leaves processors that are not Intel's far below what they can do: on an AMD EPYC with AVX-512
+oneDNN is 2 to 3 times as fast (docs/performance.md). The operation is the one that torch.compile puts in.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+WORTH_ONEDNN = 1 << 16  # weights; below, to begin costs more than is gained, and much more at each new shape
+
+
+class Linear(nn.Linear):
+    """``nn.Linear`` whose product is ``linear``'s."""
+
+    def forward(self, input: Tensor) -> Tensor:  # noqa: A002  nn.Linear's name
+        return linear(input, self.weight, self.bias)
+
+
+def linear(x: Tensor, weight: Tensor, bias: Tensor | None, *, relu: bool = False, plus: Tensor | None = None) -> Tensor:
+    """``x @ weight.T + bias``: [..., K], [N, K] and [N] -> [..., N]; then ReLU, or ``plus`` [..., N] added."""
+    if _by_onednn(x, weight):
+        onednn = torch.ops.mkldnn._linear_pointwise
+        if plus is not None:
+            return onednn.binary(x, plus, weight, bias, "add")
+        return onednn.default(x, weight, bias, "relu" if relu else "none", [], "")
+    product = F.linear(x, weight, bias)
+    if plus is not None:
+        return product + plus
+    return F.relu(product) if relu else product
+
+
+def speed_up(network: nn.Module) -> None:
+    """Puts ``Linear`` in place of every ``nn.Linear``, with the same parameters."""
+    for module in network.modules():
+        for name, child in module.named_children():
+            if type(child) is nn.Linear:
+                with torch.device("meta"):
+                    faster = Linear(child.in_features, child.out_features, child.bias is not None)
+                faster.weight, faster.bias = child.weight, child.bias
+                setattr(module, name, faster)
+
+
+def _by_onednn(x: Tensor, weight: Tensor) -> bool:
+    """It has no gradient."""
+    return (
+        x.device.type == "cpu"
+        and x.dtype is torch.float32
+        and weight.dtype is torch.float32
+        and weight.numel() >= WORTH_ONEDNN
+        and x.numel() > 0
+        and not torch.is_grad_enabled()
+        and torch.backends.mkldnn.is_available()
+    )

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: MIT
+"""Linear layers: oneDNN's products are those of ``nn.Linear``, and training still has its gradients."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from rfm.models import linear as module
+from rfm.models.linear import WORTH_ONEDNN, Linear, linear, speed_up
+
+LARGE, SMALL = (512, 256), (32, 16)  # [N, K] on either side of WORTH_ONEDNN
+
+
+@pytest.mark.parametrize("shape", [LARGE, SMALL], ids=["large", "small"])
+@pytest.mark.parametrize("leading", [(1,), (33,), (5, 7), (0, 7)], ids=str)
+@pytest.mark.parametrize("bias", [True, False])
+def test_products_are_those_of_torch(shape: tuple[int, int], leading: tuple[int, ...], bias: bool) -> None:
+    torch.manual_seed(0)
+    weight = torch.randn(shape) / shape[1] ** 0.5
+    offset = torch.randn(shape[0]) if bias else None
+    x, plus = torch.randn(*leading, shape[1]), torch.randn(*leading, shape[0])
+    expected = F.linear(x, weight, offset)
+    with torch.inference_mode():
+        torch.testing.assert_close(linear(x, weight, offset), expected, rtol=0, atol=1e-5)
+        torch.testing.assert_close(linear(x, weight, offset, relu=True), expected.relu(), rtol=0, atol=1e-5)
+        torch.testing.assert_close(linear(x, weight, offset, plus=plus), expected + plus, rtol=0, atol=1e-5)
+
+
+def test_parts_of_a_weight_and_views_of_an_input() -> None:
+    torch.manual_seed(0)
+    weight, x = torch.randn(1536, 512) / 512**0.5, torch.randn(4, 9, 2, 512)
+    with torch.inference_mode():
+        actual = linear(x[:, 1::2, 1], weight[512:], None)
+    torch.testing.assert_close(actual, F.linear(x[:, 1::2, 1], weight[512:]), rtol=0, atol=1e-5)
+
+
+def test_large_float32_products_without_gradients_are_onednns(monkeypatch: pytest.MonkeyPatch) -> None:
+    def asked(weight: torch.Tensor, dtype: torch.dtype = torch.float32) -> bool:
+        return module._by_onednn(torch.zeros(3, weight.shape[1], dtype=dtype), weight.to(dtype))
+
+    with torch.inference_mode():
+        assert torch.zeros(LARGE).numel() >= WORTH_ONEDNN > torch.zeros(SMALL).numel()
+        assert asked(torch.zeros(LARGE))
+        assert not asked(torch.zeros(SMALL))
+        assert not asked(torch.zeros(LARGE), torch.bfloat16)
+        monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
+        assert not asked(torch.zeros(LARGE))
+
+
+def test_training_has_its_gradients() -> None:
+    layer = Linear(512, 256)
+    layer(torch.randn(2, 512)).sum().backward()
+    assert layer.weight.grad is not None and layer.weight.grad.abs().sum() > 0
+
+
+def test_speed_up_keeps_parameters_and_numbers() -> None:
+    torch.manual_seed(0)
+    network = nn.Sequential(nn.Linear(256, 512), nn.Sequential(nn.GELU(), nn.Linear(512, 256, bias=False))).eval()
+    names, x = list(network.state_dict()), torch.randn(7, 256)
+    weight, expected = network[0].weight, network(x)
+    speed_up(network)
+    assert list(network.state_dict()) == names
+    assert network[0].weight is weight
+    assert [type(layer) for layer in network.modules()].count(Linear) == 2
+    with torch.inference_mode():
+        torch.testing.assert_close(network(x), expected, rtol=0, atol=1e-5)
