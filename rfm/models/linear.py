@@ -17,7 +17,8 @@ WORTH_ONEDNN = 1 << 16  # weights; below, to begin costs more than is gained, an
 class Linear(nn.Linear):
     """``nn.Linear`` whose product is ``linear``'s."""
 
-    def forward(self, input: Tensor) -> Tensor:  # noqa: A002  nn.Linear's name
+    def forward(self, input: Tensor) -> Tensor:
+        """[..., K] -> [..., N]."""
         return linear(input, self.weight, self.bias)
 
 
