@@ -38,16 +38,18 @@ def test_parts_of_a_weight_and_views_of_an_input() -> None:
 
 
 def test_large_float32_products_without_gradients_are_onednns(monkeypatch: pytest.MonkeyPatch) -> None:
-    def asked(weight: torch.Tensor, dtype: torch.dtype = torch.float32) -> bool:
-        return module._by_onednn(torch.zeros(3, weight.shape[1], dtype=dtype), weight.to(dtype))
+    rows = WORTH_ONEDNN // (LARGE[0] * LARGE[1])
 
+    def asked(rows: int, dtype: torch.dtype = torch.float32) -> bool:
+        return module._by_onednn(torch.zeros(rows, LARGE[1], dtype=dtype), torch.zeros(LARGE, dtype=dtype))
+
+    assert not asked(rows)
     with torch.inference_mode():
-        assert torch.zeros(LARGE).numel() >= WORTH_ONEDNN > torch.zeros(SMALL).numel()
-        assert asked(torch.zeros(LARGE))
-        assert not asked(torch.zeros(SMALL))
-        assert not asked(torch.zeros(LARGE), torch.bfloat16)
+        assert asked(rows)
+        assert not asked(rows - 1)
+        assert not asked(rows, torch.bfloat16)
         monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
-        assert not asked(torch.zeros(LARGE))
+        assert not asked(rows)
 
 
 def test_training_has_its_gradients() -> None:

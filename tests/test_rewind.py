@@ -19,6 +19,7 @@ from rfm.config import DEFAULT_TOKEN_BUDGET
 from rfm.engine import Engine, Outcome
 from rfm.families.rewind import RewindFamily
 from rfm.models.heads import PredictionHead, progress_from_logits
+from rfm.models.packing import Packing, rounded_up
 from rfm.models.rewind import RewindConfig, RewindTransformer
 from rfm_client import (
     InferenceFailedError,
@@ -169,7 +170,9 @@ def test_frames_beyond_max_len_are_taken_without_progress_tokens() -> None:
 def test_the_token_budget_bounds_every_forward() -> None:
     network = build(BASE)
     sizes: list[int] = []
-    network.transformer.register_forward_hook(lambda _m, inputs, _o: sizes.append(inputs[0].shape[:2].numel()))
+    network.transformer.register_forward_hook(
+        lambda _m, inputs, _o: sizes.append(inputs[1].num_rows * inputs[1].longest)
+    )
     engine_of(network, token_budget=100).evaluate(samples_for(BASE) * 5)
     assert max(sizes) <= 100
     assert len(sizes) < 30
@@ -239,27 +242,55 @@ def test_prefixes_are_sampled_as_the_original_samples_them() -> None:
     ]  # fmt: skip
 
 
-def test_a_batch_is_padded_and_masked() -> None:
-    collator = RewindCollator(replace(BASE, use_per_frame_progress_token=False))
+def test_rows_of_all_kinds_are_packed_into_one_batch() -> None:
+    collator = RewindCollator(BASE)
     samples: Sequence[Sample] = [
         PreferenceSample(trajectory(0, 1), trajectory(1, 3)),
+        ProgressSample(trajectory(4, 2)),
         SimilaritySample(trajectory(2, 2), trajectory(3, 1)),
     ]
     batch = collator.collate([row for sample in samples for row in collator.rows(sample)])
-    assert batch.first.shape == (2, 2, 12)
-    assert batch.second is not None
-    assert batch.second.shape == (2, 3, 12)
-    assert batch.token_mask is not None
-    # [text] [A A] [B B B] [query]
-    assert batch.token_mask.int().tolist() == [[1, 1, 0, 1, 1, 1, 1], [1, 1, 1, 1, 0, 0, 1]]
+    # [text] [A a] [B b B b B b] [query] | [text] [A a A a] | [text] [A a A a] [B b] [query]
+    assert batch.text_at.tolist() == [0, 10, 15]
+    assert batch.frame_at.tolist() == [1, 3, 5, 7, 11, 13, 16, 18, 20]
+    assert batch.query_at.tolist() == [9, 22]
+    assert batch.read_at[:11].tolist() == [2, 4, 6, 8, 12, 14, 17, 19, 21, 9, 22]
+    assert batch.place.tolist() == [0, 8, 9, 10, 0, 1, 0, 1, 8]
+    assert batch.first_starts.tolist() == [0, 4, 6]
+    assert batch.second_starts.tolist() == [1, 8]
+    assert batch.shown is None
     assert batch.is_similarity is not None
     assert batch.is_similarity.tolist() == [False, True]
+    expected = np.concatenate([t.positions for sample in samples for t in sample.trajectories])
+    np.testing.assert_array_equal(batch.video[:9].numpy(), expected)
 
 
-def test_a_batch_of_equal_lengths_has_no_mask() -> None:
+def test_frames_that_many_rows_show_are_in_a_batch_once() -> None:
     collator = RewindCollator(BASE)
-    rows = [row for seed in range(3) for row in collator.rows(ProgressSample(trajectory(seed, 4)))]
-    assert collator.collate(rows).token_mask is None
+    same = trajectory(1, 3)
+    samples: Sequence[Sample] = [ProgressSample(trajectory(0, 5), frame_steps=4), PreferenceSample(same, same)]
+    batch = collator.collate([row for sample in samples for row in collator.rows(sample)])
+    assert len(batch.video) == rounded_up(5 + 3)
+    assert batch.shown is not None
+    assert batch.shown.tolist() == [*prefix_indices(5, 4).flatten(), 5, 6, 7, 5, 6, 7]
+
+
+def test_packed_tokens_are_padded_for_attention_alone() -> None:
+    packing = Packing.of(np.array([2, 3, 1]))
+    packed = torch.arange(1.0, 7.0)[:, None]
+    padded = packing.padded(packed)
+    assert padded.squeeze(-1).tolist() == [[1, 2, 0], [3, 4, 5], [6, 0, 0]]
+    assert torch.equal(packing.packed(padded)[:6], packed)
+    assert packing.mask is not None
+    assert packing.mask[:, 0, 0].int().tolist() == [[1, 1, 0], [1, 1, 1], [1, 0, 0]]
+    assert Packing.of(np.array([4, 4])).mask is None
+
+
+def test_counts_are_rounded_up_to_one_of_few() -> None:
+    counts = range(1, 5000)
+    assert all(count <= rounded_up(count) <= count * 17 / 16 for count in counts)
+    assert [rounded_up(count) for count in (1, 31, 32, 33, 65, 1056, 1089)] == [1, 31, 32, 34, 68, 1088, 1152]
+    assert len({rounded_up(count) for count in counts}) < 160
 
 
 def test_discrete_progress_is_read_in_float32() -> None:

@@ -86,8 +86,13 @@ class Questions:
         length = self._length()
         tasks = [self._task(which) for _, _, which in _SINGLES]
         video = self._joined([self._video(c, how, t, length) for (c, how, _), t in zip(_SINGLES, tasks, strict=True)])
-        output = learner.network(RewindBatch(self.texts[torch.cat(tasks)], video.embeddings))
-        return _frame_losses(output.first_progress, output.first_success, video)
+        num_frames = np.tile([length, 0], (len(video.embeddings), 1))
+        output = learner.network(
+            RewindBatch.of(
+                learner.network.config, self.texts[torch.cat(tasks)], video.embeddings.flatten(0, 1), num_frames
+            )
+        )
+        return _frame_losses(output.progress, output.success, video)
 
     def _pair_losses(self, learner: Learner) -> dict[str, Tensor]:
         lengths = self._length(), self._length()
@@ -111,10 +116,20 @@ class Questions:
         labels = labels.repeat_interleave(num_groups)
         texts = self.texts[self.groups.task.repeat(len(labels) // num_groups)]
         is_similarity = torch.arange(len(labels)) >= len(_PREFERENCES) * num_groups
-        batch = RewindBatch(texts, first.embeddings, second.embeddings, None, is_similarity)
+        lengths = [first.progress.shape[1], second.progress.shape[1]]
+        batch = RewindBatch.of(
+            learner.network.config,
+            texts,
+            torch.cat([first.embeddings, second.embeddings], dim=1).flatten(0, 1),
+            np.tile(lengths, (len(labels), 1)),
+            is_similarity=is_similarity,
+        )
         output = learner.network(batch)
-        losses = _frame_losses(output.first_progress, output.first_success, first)
-        for name, loss in _frame_losses(output.second_progress, output.second_success, second).items():
+        progress, success = (
+            scores.unflatten(0, (len(labels), -1)).split(lengths, dim=1) for scores in (output.progress, output.success)
+        )
+        losses = _frame_losses(progress[0], success[0], first)
+        for name, loss in _frame_losses(progress[1], success[1], second).items():
             losses[name] = (losses[name] + loss) / 2
         answers = F.binary_cross_entropy_with_logits(output.query, labels, reduction="none")
         return losses | {"preference": answers[~is_similarity].mean(), "similarity": answers[is_similarity].mean()}
@@ -155,10 +170,11 @@ def drawn_verb(random: np.random.Generator) -> str:
 
 def _frame_losses(progress_logits: Tensor, success_logits: Tensor, video: _Video) -> dict[str, Tensor]:
     bins = progress_logits.shape[-1]
-    targets = _two_hot(video.progress, bins).flatten(0, 1)
+    targets = _two_hot(video.progress, bins)
     weight = torch.tensor(_SUCCESS_POSITIVE_WEIGHT)
-    success = F.binary_cross_entropy_with_logits(success_logits, video.success, pos_weight=weight)
-    return {"progress": F.cross_entropy(progress_logits.flatten(0, 1), targets), "success": success}
+    success = F.binary_cross_entropy_with_logits(success_logits.flatten(), video.success.flatten(), pos_weight=weight)
+    progress = F.cross_entropy(progress_logits.reshape(-1, bins), targets.flatten(0, 1))
+    return {"progress": progress, "success": success}
 
 
 def _two_hot(progress: Tensor, bins: int) -> Tensor:

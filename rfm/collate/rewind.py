@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Samples -> rows -> padded batches for the ReWiND transformer.
+"""Samples -> rows -> packed batches for the ReWiND transformer.
 
 A row is one token sequence of one forward: a sample is one row, and in dense mode one row per frame.
 """
@@ -12,13 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
 
 from rfm.collate import as_tensor
+from rfm.models.packing import rounded_up
 from rfm.models.rewind import RewindBatch, RewindConfig
 from rfm_client import InvalidSampleError, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.samples import Float32Array
-from rfm_client.wire import pad_stack
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +42,15 @@ class Row:
     def num_second(self) -> int:
         """Frames of the second trajectory in the row, 0 without one."""
         return 0 if self.second is None else len(self.second)
+
+    @property
+    def videos(self) -> tuple[Float32Array, ...]:
+        """The first trajectory, and the second if there is one."""
+        return (self.first,) if self.second is None else (self.first, self.second)
+
+    def shown(self, video: Float32Array) -> npt.NDArray[np.int64]:
+        """int64 [T], the frames of one of ``videos`` that are in the row."""
+        return np.arange(len(video)) if self.picked is None else self.picked
 
 
 def prefix_indices(num_frames: int, frame_steps: int) -> npt.NDArray[np.int64]:
@@ -74,30 +82,31 @@ class RewindCollator:
         return [Row(text, videos[0], videos[1], isinstance(sample, SimilaritySample))]
 
     def collate(self, rows: Sequence[Row]) -> RewindBatch:
-        """A batch of rows that all have, or all lack, a second trajectory."""
-        firsts = [row.first if row.picked is None else row.first[row.picked] for row in rows]
-        seconds = [row.second for row in rows if row.second is not None]
-        return RewindBatch(
-            text=as_tensor(np.stack([row.text for row in rows])),
-            first=as_tensor(pad_stack(firsts)),
-            second=as_tensor(pad_stack(seconds)) if seconds else None,
-            token_mask=self._token_mask(firsts, seconds),
-            is_similarity=torch.tensor([row.is_similarity for row in rows]) if seconds else None,
+        """One batch of rows of any kinds. Frames that several rows show are in it once."""
+        videos: dict[int, Float32Array] = {}
+        starts: dict[int, int] = {}
+        num_frames = 0
+        for row in rows:
+            for video in row.videos:
+                if id(video) not in videos:
+                    videos[id(video)], starts[id(video)] = video, num_frames
+                    num_frames += len(video)
+        frames = np.zeros((rounded_up(num_frames), self.config.video_feature_dim), np.float32)
+        np.concatenate(list(videos.values()), out=frames[:num_frames])
+        lengths = np.array([(row.num_first, row.num_second) for row in rows], np.int64)
+        shown = None
+        if lengths.sum() != num_frames or any(row.picked is not None for row in rows):
+            of_rows = [starts[id(video)] + row.shown(video) for row in rows for video in row.videos]
+            shown = as_tensor(np.concatenate(of_rows))
+        questions = [row.is_similarity for row in rows if row.second is not None]
+        return RewindBatch.of(
+            self.config,
+            as_tensor(np.stack([row.text for row in rows])),
+            as_tensor(frames),
+            lengths,
+            shown=shown,
+            is_similarity=torch.tensor(questions) if any(questions) else None,
         )
-
-    def _token_mask(self, firsts: Sequence[Float32Array], seconds: Sequence[Float32Array]) -> Tensor | None:
-        """bool [B, L], false at the tokens of padding frames; None when no row is padded."""
-        always = torch.ones(len(firsts), 1, dtype=torch.bool)
-        mask = [always]
-        for videos in (firsts, seconds):
-            lengths = torch.tensor([len(video) for video in videos])
-            if len(videos):
-                frames = torch.arange(int(lengths.max())) < lengths[:, None]
-                mask.append(frames.repeat_interleave(self.config.tokens_per_frame, dim=1))
-        if seconds:
-            mask.append(always)
-        joined = torch.cat(mask, dim=1)
-        return None if bool(joined.all()) else joined
 
     def _text(self, trajectory: Trajectory) -> Float32Array:
         width = self.config.text_feature_dim

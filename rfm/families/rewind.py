@@ -36,31 +36,36 @@ class RewindFamily:
         return outcomes
 
     def lengths(self, row: Row) -> tuple[int, ...]:
-        """Frames of each trajectory."""
-        return (row.num_first,) if row.second is None else (row.num_first, row.num_second)
+        """Tokens of the row."""
+        return (self.network.config.num_tokens(row.num_first, row.num_second),)
 
     def num_tokens(self, lengths: Sequence[int]) -> int:
-        """Tokens of a row of these trajectories."""
-        return self.network.config.num_tokens(lengths[0], lengths[1] if len(lengths) > 1 else 0)
+        """Tokens of the row."""
+        return lengths[0]
 
     def collate(self, rows: Sequence[Row]) -> RewindBatch:
-        """Rows that all have, or all lack, a second trajectory."""
+        """Rows of any kinds."""
         return self.collator.collate(rows)
 
     @torch.inference_mode()
     def score(self, rows: Sequence[Row], batch: RewindBatch) -> list[RowScores | RewardError]:
         """One forward pass."""
         output = self.network(batch.to(self.device))
-        first = frame_scores(output.first_progress, output.first_success)
-        firsts = [part_of(first, (index, slice(row.num_first))) for index, row in enumerate(rows)]
-        if output.query is None:
-            return checked([RowScores([scores]) for scores in firsts], RowScores([first]))
-        second = frame_scores(output.second_progress, output.second_success)
-        seconds = [part_of(second, (index, slice(row.num_second))) for index, row in enumerate(rows)]
+        frames = frame_scores(output.progress, output.success)
         logits, probabilities = output.query.float().tolist(), output.query.sigmoid().float().tolist()
-        queries = [logits[i] if row.is_similarity else probabilities[i] for i, row in enumerate(rows)]
-        scored = [RowScores([*pair], query) for *pair, query in zip(firsts, seconds, queries, strict=True)]
-        return checked(scored, RowScores([first, second], sum(logits)))
+        questions = iter(zip(logits, probabilities, strict=True))
+        scored: list[RowScores] = []
+        start = 0
+        for row in rows:
+            middle, end = start + row.num_first, start + row.num_first + row.num_second
+            of_trajectories = [part_of(frames, slice(start, middle))]
+            query = None
+            if row.second is not None:
+                of_trajectories.append(part_of(frames, slice(middle, end)))
+                query = next(questions)[0 if row.is_similarity else 1]
+            scored.append(RowScores(of_trajectories, query))
+            start = end
+        return checked(scored, RowScores([frames], sum(logits)))
 
     def _embedded(self, samples: Sequence[Sample]) -> list[Sample | RewardError]:
         """The samples with embeddings in place of raw frames."""

@@ -2,7 +2,8 @@
 """Linear layers. Large float32 ones on the CPU are computed by oneDNN, which torch itself asks only for bfloat16.
 
 torch's own choice, MKL, leaves processors that are not Intel's far below what they can do: on an AMD EPYC with AVX-512
-oneDNN is 2 to 3 times as fast (docs/performance.md). The operation is the one that torch.compile puts in.
+oneDNN is 2 to 3 times as fast (docs/performance.md). The operation is the one that torch.compile puts in. It is made
+for each shape, which takes a while the first time: callers see to it that shapes are few (``packing.rounded_up``).
 """
 
 from __future__ import annotations
@@ -11,15 +12,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-WORTH_ONEDNN = 1 << 16  # weights; below, to begin costs more than is gained, and much more at each new shape
+WORTH_ONEDNN = 1 << 21  # multiplications; of fewer, to begin costs more than is gained
 
 
 class Linear(nn.Linear):
     """``nn.Linear`` whose product is ``linear``'s."""
 
-    def forward(self, input: Tensor) -> Tensor:
+    def forward(self, input: Tensor, *, relu: bool = False, plus: Tensor | None = None) -> Tensor:
         """[..., K] -> [..., N]."""
-        return linear(input, self.weight, self.bias)
+        return linear(input, self.weight, self.bias, relu=relu, plus=plus)
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None, *, relu: bool = False, plus: Tensor | None = None) -> Tensor:
@@ -52,8 +53,7 @@ def _by_onednn(x: Tensor, weight: Tensor) -> bool:
         x.device.type == "cpu"
         and x.dtype is torch.float32
         and weight.dtype is torch.float32
-        and weight.numel() >= WORTH_ONEDNN
-        and x.numel() > 0
+        and x.numel() * len(weight) >= WORTH_ONEDNN
         and not torch.is_grad_enabled()
         and torch.backends.mkldnn.is_available()
     )

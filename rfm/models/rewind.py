@@ -14,12 +14,15 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from rfm.models.heads import PredictionHead
 from rfm.models.linear import Linear, linear
+from rfm.models.packing import Packing, rounded_up, starts
 
 FEED_FORWARD_RATIO = 4
 
@@ -61,98 +64,138 @@ class RewindConfig:
 
 @dataclass(frozen=True)
 class RewindBatch:
-    """Rows of one kind, padded to their longest.
+    """Rows of any lengths and kinds, packed. F frames of all rows' trajectories, Q rows of two trajectories.
 
     text: float32 [B, Dt]
-    first, second: float32 [B, T, Dv]; second is None in rows of one trajectory
-    token_mask: bool [B, L], false at padding; None when there is none
-    is_similarity: bool [B], asks for similarity rather than preference; None in rows of one trajectory
+    video: float32 [V, Dv], embeddings of frames; as many as F, or more that mean nothing, unless ``shown`` tells
+    shown: int64 [F], which of ``video`` each frame of a row is (dense mode shows one in many rows); None: in order
+    is_similarity: bool [Q], asks for similarity rather than preference; None: all ask for preference
+    packing: where tokens lie; ``*_at`` are positions in its packed tokens
+    text_at, frame_at, query_at: int64 [B], [F], [Q]
+    place: int64 [F], each frame's number in its trajectory, and max_len more in a second one
+    first_starts, second_starts: int64, those of the F frames that begin a first or second trajectory
+    read_at: int64 [F + Q + room], the tokens whose outputs are read: each frame's last, then the queries
     """
 
     text: Tensor
-    first: Tensor
-    second: Tensor | None = None
-    token_mask: Tensor | None = None
-    is_similarity: Tensor | None = None
+    video: Tensor
+    shown: Tensor | None
+    is_similarity: Tensor | None
+    packing: Packing
+    text_at: Tensor
+    frame_at: Tensor
+    query_at: Tensor
+    place: Tensor
+    first_starts: Tensor
+    second_starts: Tensor
+    read_at: Tensor
+
+    @classmethod
+    def of(
+        cls,
+        config: RewindConfig,
+        text: Tensor,
+        video: Tensor,
+        num_frames: npt.NDArray[np.int64],
+        *,
+        shown: Tensor | None = None,
+        is_similarity: Tensor | None = None,
+    ) -> RewindBatch:
+        """Rows whose trajectories have int64 [B, 2] frames; the second has 0 in rows of one."""
+        first, both = num_frames[:, 0], num_frames.sum(axis=1)
+        has_query = num_frames[:, 1] > 0
+        step = config.tokens_per_frame
+        num_tokens = 1 + step * both + has_query
+        text_at = starts(num_tokens)
+        query_at = (text_at + num_tokens - 1)[has_query]
+        in_row: npt.NDArray[np.int64] = np.arange(both.sum()) - np.repeat(starts(both), both)
+        frame_at = np.repeat(text_at, both) + 1 + step * in_row
+        lengths_of_first = np.repeat(first, both)
+        is_second = in_row >= lengths_of_first
+        place = np.where(is_second, in_row - lengths_of_first + config.max_len, in_row)
+        second_starts = (starts(both) + first)[has_query]
+        read_at = np.zeros(rounded_up(len(frame_at) + len(query_at)), np.int64)
+        read_at[: len(frame_at)] = frame_at + step - 1
+        read_at[len(frame_at) : len(frame_at) + len(query_at)] = query_at
+        positions = (text_at, frame_at, query_at, place, starts(both), second_starts, read_at)
+        packing = Packing.of(num_tokens)
+        return cls(text, video, shown, is_similarity, packing, *map(torch.from_numpy, positions))
 
     def to(self, device: torch.device) -> RewindBatch:
         """The batch on ``device``."""
-        tensors: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
-        moved: dict[str, Any] = {name: None if t is None else t.to(device) for name, t in tensors.items()}
+        parts: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
+        moved: dict[str, Any] = {name: None if part is None else part.to(device) for name, part in parts.items()}
         return RewindBatch(**moved)
 
 
 @dataclass(frozen=True)
 class RewindOutput:
-    """Raw scores of a RewindBatch: progress logits [B, T, K], success logits [B, T], query logits [B]."""
+    """Raw scores of a RewindBatch: progress logits [F, K], success logits [F], query logits [Q]."""
 
-    first_progress: Tensor
-    first_success: Tensor
-    second_progress: Tensor | None = None
-    second_success: Tensor | None = None
-    query: Tensor | None = None
+    progress: Tensor
+    success: Tensor
+    query: Tensor
 
 
 class SelfAttention(nn.Module):
-    """Multi-head attention of some tokens [B, Q, D] to all of their row [B, L, D], and the tokens themselves added.
+    """Multi-head attention of packed tokens [N, D] to those of their row; parameters named as nn.MultiheadAttention's.
 
-    Parameters are named as nn.MultiheadAttention's.
+    ``out_proj`` is left to the layer, which needs it of some tokens alone.
     """
 
-    def __init__(self, hidden_dim: int, num_heads: int) -> None:
+    def __init__(self, config: RewindConfig) -> None:
         super().__init__()
-        self.num_heads = num_heads
-        self.in_proj_weight = nn.Parameter(torch.empty(3 * hidden_dim, hidden_dim))
-        self.in_proj_bias = nn.Parameter(torch.zeros(3 * hidden_dim))
-        self.out_proj = Linear(hidden_dim, hidden_dim)
+        width = config.hidden_dim
+        self.num_heads = config.num_attention_heads
+        self.is_causal = config.causal_mask
+        self.in_proj_weight = nn.Parameter(torch.empty(3 * width, width))
+        self.in_proj_bias = nn.Parameter(torch.zeros(3 * width))
+        self.out_proj = Linear(width, width)
         nn.init.xavier_uniform_(self.in_proj_weight)
 
-    def forward(self, asking: Tensor, x: Tensor, mask: Tensor | None) -> Tensor:
-        queries, keys, values = (
-            part.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for part in self._projected(asking, x)
-        )
-        attended = F.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
-        return linear(attended.transpose(1, 2).flatten(2), self.out_proj.weight, self.out_proj.bias, plus=asking)
-
-    def _projected(self, asking: Tensor, x: Tensor) -> tuple[Tensor, ...]:
-        weight, bias, width = self.in_proj_weight, self.in_proj_bias, x.shape[-1]
-        if asking is x:
-            return linear(x, weight, bias).chunk(3, dim=-1)
-        queries = linear(asking, weight[:width], bias[:width])
-        return (queries, *linear(x, weight[width:], bias[width:]).chunk(2, dim=-1))
+    def forward(self, x: Tensor, packing: Packing) -> Tensor:
+        """[N, D] -> [N, D]. What lies behind the end of a row is never looked at."""
+        padded = packing.padded(linear(x, self.in_proj_weight, self.in_proj_bias))
+        parts = padded.chunk(3, dim=-1)
+        queries, keys, values = (part.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for part in parts)
+        mask = None if self.is_causal else packing.mask
+        attended = F.scaled_dot_product_attention(queries, keys, values, attn_mask=mask, is_causal=self.is_causal)
+        return packing.packed(attended.transpose(1, 2).flatten(2))
 
 
 class EncoderLayer(nn.Module):
     """Post-norm transformer layer with a ReLU feed-forward; parameters named as nn.TransformerEncoderLayer's."""
 
-    def __init__(self, hidden_dim: int, num_heads: int) -> None:
+    def __init__(self, config: RewindConfig) -> None:
         super().__init__()
-        self.self_attn = SelfAttention(hidden_dim, num_heads)
-        self.norm1 = nn.LayerNorm(hidden_dim)
-        self.linear1 = Linear(hidden_dim, FEED_FORWARD_RATIO * hidden_dim)
-        self.linear2 = Linear(FEED_FORWARD_RATIO * hidden_dim, hidden_dim)
-        self.norm2 = nn.LayerNorm(hidden_dim)
+        width = config.hidden_dim
+        self.self_attn = SelfAttention(config)
+        self.norm1 = nn.LayerNorm(width)
+        self.linear1 = Linear(width, FEED_FORWARD_RATIO * width)
+        self.linear2 = Linear(FEED_FORWARD_RATIO * width, width)
+        self.norm2 = nn.LayerNorm(width)
 
-    def forward(self, asking: Tensor, x: Tensor, mask: Tensor | None) -> Tensor:
-        asking = self.norm1(self.self_attn(asking, x, mask))
-        grown = linear(asking, self.linear1.weight, self.linear1.bias, relu=True)
-        return self.norm2(linear(grown, self.linear2.weight, self.linear2.bias, plus=asking))
+    def forward(self, x: Tensor, packing: Packing, read_at: Tensor | None = None) -> Tensor:
+        """[N, D] -> [N, D], or [R, D]: of the tokens ``read_at``, int64 [R], alone."""
+        attended = self.self_attn(x, packing)
+        if read_at is not None:
+            attended, x = attended[read_at], x[read_at]
+        x = self.norm1(self.self_attn.out_proj(attended, plus=x))
+        return self.norm2(self.linear2(self.linear1(x, relu=True), plus=x))
 
 
 class Encoder(nn.Module):
-    """A stack of EncoderLayer, the last of which is computed for those tokens alone that are read."""
+    """A stack of EncoderLayer, the last of which is computed of those tokens alone that are read."""
 
     def __init__(self, config: RewindConfig) -> None:
         super().__init__()
-        layer = (config.hidden_dim, config.num_attention_heads)
-        self.layers = nn.ModuleList(EncoderLayer(*layer) for _ in range(config.num_layers))
+        self.layers = nn.ModuleList(EncoderLayer(config) for _ in range(config.num_layers))
 
-    def forward(self, x: Tensor, mask: Tensor | None, read: Tensor) -> Tensor:
-        """[B, L, D] -> [B, R, D], the tokens at the positions ``read``, int64 [R]."""
+    def forward(self, x: Tensor, packing: Packing, read_at: Tensor) -> Tensor:
+        """[N, D] -> [R, D], the tokens at int64 [R]."""
         for layer in self.layers[:-1]:
-            x = layer(x, x, mask)
-        mask_of_read = mask if mask is None or mask.shape[-2] == 1 else mask[..., read, :]
-        return self.layers[-1](x[:, read], x, mask_of_read)
+            x = layer(x, packing)
+        return self.layers[-1](x, packing, read_at)
 
 
 class RewindTransformer(nn.Module):
@@ -180,69 +223,40 @@ class RewindTransformer(nn.Module):
             self.similarity_head = PredictionHead(width, 1)
 
     def forward(self, batch: RewindBatch) -> RewindOutput:
-        """Raw scores; those at padding positions mean nothing."""
-        text = self.text_proj(batch.text).unsqueeze(1)
+        """Raw scores."""
+        hidden = self.transformer(self._tokens(batch), batch.packing, batch.read_at)
+        num_frames, num_queries = len(batch.frame_at), len(batch.query_at)
+        query = self._query_scores(hidden[num_frames : num_frames + num_queries], batch)
+        progress, success = self.progress_head(hidden), self.success_head(hidden).squeeze(-1)
+        return RewindOutput(progress[:num_frames], success[:num_frames], query)
+
+    def _tokens(self, batch: RewindBatch) -> Tensor:
+        """[N + room, D], what the transformer reads."""
+        text = self.text_proj(batch.text)
+        frames = self.video_proj(batch.video)
+        frames = frames[: len(batch.frame_at)] if batch.shown is None else frames[batch.shown]
+        frames[batch.first_starts] += self.first_embedding_A[0]
+        tokens = batch.packing.empty(self.config.hidden_dim, text)
         if self.config.use_per_frame_progress_token:
-            text = text + self.text_position_embedding
-        tokens = [text, self._trajectory_tokens(batch.first, second=False)]
-        if batch.second is not None:
-            tokens += [self._trajectory_tokens(batch.second, second=True), self._query_tokens(batch)]
-        x = torch.cat(tokens, dim=1)
-        num_frames = [video.shape[1] for video in (batch.first, batch.second) if video is not None]
-        read = self._read_positions(sum(num_frames), x)
-        hidden = self.transformer(x, self._attention_mask(batch, x.shape[1]), read)
-
-        parts = hidden.split([*num_frames, len(read) - sum(num_frames)], dim=1)
-        first_progress, first_success = self._frame_scores(parts[0])
-        if batch.second is None:
-            return RewindOutput(first_progress, first_success)
-        second_progress, second_success = self._frame_scores(parts[1])
-        query = self._query_scores(parts[2].squeeze(1), batch)
-        return RewindOutput(first_progress, first_success, second_progress, second_success, query)
-
-    def _trajectory_tokens(self, video: Tensor, *, second: bool) -> Tensor:
-        """[B, T, Dv] -> [B, T, D], or [B, 2T, D] with a progress token behind each frame."""
-        frames = self.video_proj(video)
-        frames[:, :1] += self.first_embedding_B if second else self.first_embedding_A
-        if not self.config.use_per_frame_progress_token:
-            return frames
-        progress_tokens = self.prog_token_B if second else self.prog_token_A
-        interleaved = torch.stack([frames, progress_tokens[:, : video.shape[1]].expand_as(frames)], dim=2)
-        return interleaved.flatten(1, 2)
+            text = text + self.text_position_embedding[0]
+            of_places = torch.cat([self.prog_token_A[0], self.prog_token_B[0]])
+            tokens[batch.frame_at + 1] = of_places[batch.place]
+        if len(batch.query_at):
+            frames[batch.second_starts] += self.first_embedding_B[0]
+            tokens[batch.query_at] = self._query_tokens(batch)
+        tokens[batch.text_at] = text
+        tokens[batch.frame_at] = frames
+        return tokens
 
     def _query_tokens(self, batch: RewindBatch) -> Tensor:
-        """[B, 1, D]: the token whose output answers the row's question."""
-        if not self.config.has_similarity:
-            return self.preference_token.expand(len(batch.text), -1, -1)
-        assert batch.is_similarity is not None
-        return torch.where(batch.is_similarity[:, None, None], self.similarity_token, self.preference_token)
+        """[Q or 1, D]: the tokens whose outputs answer the rows' questions."""
+        if batch.is_similarity is None:
+            return self.preference_token[0]
+        return torch.where(batch.is_similarity[:, None], self.similarity_token[0], self.preference_token[0])
 
     def _query_scores(self, hidden: Tensor, batch: RewindBatch) -> Tensor:
-        """[B] logits of the query tokens' [B, D]."""
+        """[Q] logits of the query tokens' [Q, D]."""
         preference = self.preference_head(hidden).squeeze(-1)
-        if not self.config.has_similarity:
+        if batch.is_similarity is None:
             return preference
-        assert batch.is_similarity is not None
         return torch.where(batch.is_similarity, self.similarity_head(hidden).squeeze(-1), preference)
-
-    def _frame_scores(self, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Progress [B, T, K] and success [B, T] logits from the tokens that carry the frames' states, [B, T, D]."""
-        return self.progress_head(hidden), self.success_head(hidden).squeeze(-1)
-
-    def _read_positions(self, num_frames: int, x: Tensor) -> Tensor:
-        """int64, the tokens of [B, L, D] whose outputs are read: the last of each frame's, and the query."""
-        step = self.config.tokens_per_frame
-        positions = torch.arange(num_frames, device=x.device) * step + step
-        has_query = x.shape[1] > 1 + num_frames * step
-        return F.pad(positions, (0, 1), value=x.shape[1] - 1) if has_query else positions
-
-    def _attention_mask(self, batch: RewindBatch, length: int) -> Tensor | None:
-        """bool, broadcastable to [B, heads, L, L], true where a token may look; None: everywhere.
-
-        Padding is never looked at, so a row's scores are those it has alone.
-        """
-        keys = None if batch.token_mask is None else batch.token_mask[:, None, None, :]
-        if not self.config.causal_mask:
-            return keys
-        causal = torch.ones(length, length, dtype=torch.bool, device=batch.text.device).tril()
-        return causal if keys is None else causal & keys
