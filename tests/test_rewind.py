@@ -160,6 +160,19 @@ def test_a_result_does_not_depend_on_its_neighbours(config: RewindConfig, token_
         np.testing.assert_allclose(numbers(outcome), alone[index], rtol=0, atol=TOLERANCE)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_no_mix_of_lengths_and_types_changes_a_result(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    samples = samples_for(BASE)
+    samples += [ProgressSample(trajectory(t, t), frame_steps=3) for t in (2, 5)]
+    engine = engine_of(build(BASE))
+    alone = [numbers(engine.evaluate([sample])[0]) for sample in samples]
+    for size in range(1, 60):
+        chosen = random.integers(0, len(samples), size)
+        for index, outcome in zip(chosen, engine.evaluate([samples[i] for i in chosen]), strict=True):
+            np.testing.assert_allclose(numbers(outcome), alone[index], rtol=0, atol=TOLERANCE)
+
+
 def test_frames_beyond_max_len_are_taken_without_progress_tokens() -> None:
     config = replace(BASE, use_per_frame_progress_token=False)
     (outcome,) = engine_of(build(config)).evaluate([ProgressSample(trajectory(0, 3 * config.max_len))])
@@ -273,6 +286,18 @@ def test_frames_that_many_rows_show_are_in_a_batch_once() -> None:
     assert len(batch.video) == rounded_up(5 + 3)
     assert batch.shown is not None
     assert batch.shown.tolist() == [*prefix_indices(5, 4).flatten(), 5, 6, 7, 5, 6, 7]
+
+
+@pytest.mark.parametrize("lengths", [(5,), (33, 33), (7, 7, 7), (2, 9, 1), (33, 34), (34, 33)], ids=str)
+def test_what_is_padded_and_packed_again_is_the_same(lengths: tuple[int, ...]) -> None:
+    """Also where the room behind the tokens makes them as many as the padded rows' (33 and 34: 67 in 68)."""
+    packing = Packing.of(np.array(lengths))
+    packed = torch.randn(len(packing.at), 3)
+    padded = packing.padded(packed)
+    assert padded.shape == (len(lengths), max(lengths), 3)
+    rows = packed[: sum(lengths)].split(lengths)
+    assert all(torch.equal(row, of_batch[: len(row)]) for row, of_batch in zip(rows, padded, strict=True))
+    assert torch.equal(packing.packed(padded)[: sum(lengths)], packed[: sum(lengths)])
 
 
 def test_packed_tokens_are_padded_for_attention_alone() -> None:

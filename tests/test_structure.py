@@ -40,13 +40,14 @@ EXCEPTIONS = {
     "benchmarks/peers/upstream_forward.py": {"rfm"},
 }
 CLIENT_LAYERS = (  # imports point left
-    "errors", "samples", "results", "wire", "resize", "model_info", "off_loop", "shared_memory", "transport",
-    "deadline", "servers", "in_flight", "packing", "fit", "async_client", "loop_thread", "client",
+    "errors", "samples", "results", "wire", "resize", "model_info", "off_loop", "deadline", "shared_memory", "transport",
+    "servers", "in_flight", "packing", "fit", "async_client", "loop_thread", "client",
 )  # fmt: skip
 LIGHT = {"numpy", "tritonclient", "aiohttp", "typing_extensions"}  # the last for type checkers only
 # What only an extra brings, and which files need it.
 EXTRAS = {
     "av": {"video.py"},
+    "async_timeout": {"deadline.py"},  # Python 3.10 only
     "PIL": {"resize.py", "gateway"},
     "gymnasium": {"gym.py"},
     "typer": {"cli", "gateway"},

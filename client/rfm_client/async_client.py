@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Coroutine, Iterable, Mapping, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Literal, TypedDict, cast, overload
 
@@ -206,7 +206,7 @@ class AsyncRewardClient:
             except RewardError as error:
                 outcomes.update(zip(group, _for_each(error, len(group)), strict=True))
                 return
-            await asyncio.gather(*(ask_part(model, part) for part in parts(sent, group, limit)))
+            await _together([ask_part(model, part) for part in parts(sent, group, limit)])
 
         async def ask_part(model: str, part: Sequence[int]) -> None:
             answers = await self._ask(model, [sent[index] for index in part], outputs, deadline)
@@ -215,7 +215,7 @@ class AsyncRewardClient:
                     answer if isinstance(answer, RewardError) else with_frame_indices(answer, fits[index].frame_indices)
                 )
 
-        await asyncio.gather(*(ask_group(model, group) for model, group in groups(sent, self._model)))
+        await _together([ask_group(model, group) for model, group in groups(sent, self._model)])
         return [outcomes[index] for index in range(len(samples))]
 
     async def _fitted(
@@ -269,6 +269,14 @@ class AsyncRewardClient:
         if model not in self._model_infos:
             self._model_infos[model] = await self._servers.model_info(model, deadline)
         return self._model_infos[model]
+
+
+async def _together(calls: Sequence[Coroutine[None, None, None]]) -> None:
+    """All of them; one alone, as most are, without a task of its own."""
+    if len(calls) == 1:
+        await calls[0]
+    else:
+        await asyncio.gather(*calls)
 
 
 def _for_each(error: RewardError, count: int) -> list[Result | RewardError]:

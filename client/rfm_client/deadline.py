@@ -3,7 +3,13 @@
 
 from __future__ import annotations
 
+import sys
 import time
+
+if sys.version_info >= (3, 11):
+    from asyncio import timeout as timeout
+else:
+    from async_timeout import timeout as timeout
 
 from rfm_client.errors import DeadlineExceededError
 

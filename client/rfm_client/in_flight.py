@@ -7,7 +7,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from rfm_client.deadline import Deadline
+from rfm_client.deadline import Deadline, timeout
 
 MAX_BYTES = 256 * 2**20  # of inputs; they are held several times over while they are written to a socket
 _UNIT_BYTES = 2**20
@@ -30,10 +30,10 @@ class InFlight:
         Raises DeadlineExceededError if there is no room in time.
         """
         units = min(1 + num_bytes // _UNIT_BYTES, MAX_BYTES // _UNIT_BYTES)
-        left_s = deadline.remaining_s()
         try:
-            await asyncio.wait_for(self._enter(units), left_s)
-        except asyncio.TimeoutError:
+            async with timeout(deadline.remaining_s()):
+                await self._enter(units)
+        except asyncio.TimeoutError:  # in Python 3.10 not the built-in one
             raise deadline.exceeded() from None
         try:
             yield

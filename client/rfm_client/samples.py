@@ -187,13 +187,13 @@ def _checked_floats(where: str, values: Any, axes: tuple[str, ...]) -> Float32Ar
         array = as_array(values)
     except ValueError:  # lists of unequal length
         raise InvalidSampleError.at(where, expected, "rows of unequal length") from None
-    got = f"{array.dtype} {list(array.shape)}"
     if array.dtype.kind not in "fiu" or array.ndim != len(axes):
-        raise InvalidSampleError.at(where, expected, got)
+        raise InvalidSampleError.at(where, expected, f"{array.dtype} {list(array.shape)}")
     if 0 in array.shape:
-        raise InvalidSampleError.at(where, f"{expected} without an empty axis", got)
-    with np.errstate(over="ignore"):  # what does not fit becomes Inf and is refused below
-        array = array.astype(np.float32, copy=False)
+        raise InvalidSampleError.at(where, f"{expected} without an empty axis", f"{array.dtype} {list(array.shape)}")
+    if array.dtype != np.float32:
+        with np.errstate(over="ignore"):  # what does not fit becomes Inf and is refused below
+            array = array.astype(np.float32)
     finite = np.isfinite(array)
     if not finite.all():
         position = np.argwhere(~finite)[0].tolist()

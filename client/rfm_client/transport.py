@@ -10,13 +10,14 @@ import re
 from collections.abc import AsyncIterator, Awaitable, Collection, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, Protocol, TypeVar
 
 import numpy.typing as npt
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
 from rfm_client import errors
+from rfm_client.deadline import timeout
 from rfm_client.model_info import ModelInfo
 from rfm_client.off_loop import off_loop
 from rfm_client.shared_memory import Region, SharedMemory
@@ -107,6 +108,7 @@ class _TritonTransport:
         self.url = url
         self._address = address
         self._shared_memory = SharedMemory(self) if shared_memory else None
+        self._requested = cache(lambda name: self._triton.InferRequestedOutput(name))
 
     async def infer(self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float) -> Answer:
         return await self._call(self._infer(model, inputs, outputs), timeout_s)
@@ -146,8 +148,7 @@ class _TritonTransport:
             regions = {largest: region} if region is not None else {}
             through_socket = 0 if regions else inputs[largest].nbytes
             tensors = await off_loop(through_socket, self._inputs, inputs, regions)
-            requested = [self._triton.InferRequestedOutput(name) for name in outputs]
-            answer = await self._client.infer(model, tensors, outputs=requested)
+            answer = await self._client.infer(model, tensors, outputs=[self._requested(name) for name in outputs])
         return Answer(_outputs(answer, outputs), self._model_version(answer))
 
     @asynccontextmanager
@@ -184,10 +185,11 @@ class _TritonTransport:
         """``bad_request``: what a 400 means; Triton answers it for an unknown model too."""
         try:
             # Not by a deadline of gRPC: Triton 2.51 overlooks that one has passed, but not that a call is cancelled.
-            return await asyncio.wait_for(call, timeout_s)
+            async with timeout(timeout_s):
+                return await call
         except InferenceServerException as error:
             raise _mapped(error, bad_request) from error
-        except (asyncio.TimeoutError, TimeoutError) as error:
+        except (asyncio.TimeoutError, TimeoutError) as error:  # in Python 3.10 two
             raise errors.DeadlineExceededError(f"{self.url}: no answer in time") from error
         except self.protocol_errors as error:
             hint = "no answer of an HTTP server (is it the gRPC port? then grpc://)"

@@ -10,7 +10,7 @@ requests of different callers, lengths and sample types into one batch.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Literal, TypeAlias
@@ -64,6 +64,7 @@ class SampleType(IntEnum):
     SIMILARITY = 2
 
 
+_VALUES = frozenset(SampleType)
 _SAMPLE_TYPES = {
     ProgressSample: SampleType.PROGRESS,
     PreferenceSample: SampleType.PREFERENCE,
@@ -145,7 +146,8 @@ def encode_samples(samples: Sequence[Sample]) -> Tensors:
         tensors[TASK] = np.array([[text.task.encode()] for text in texts], np.object_)
     else:
         tensors[VIDEO_EMBEDDINGS] = pad_stack(positions)
-        tensors[TEXT_EMBEDDING] = np.stack([text.text_embedding for text in texts if text.text_embedding is not None])
+        embeddings = [text.text_embedding for text in texts if text.text_embedding is not None]
+        tensors[TEXT_EMBEDDING] = embeddings[0][np.newaxis] if len(embeddings) == 1 else np.stack(embeddings)
     return tensors
 
 
@@ -200,26 +202,7 @@ def num_positions(inputs: Mapping[str, npt.NDArray[Any]]) -> int:
 
 def encode_results(results: Sequence[Result], num_positions: int, outputs: Collection[str]) -> Tensors:
     """The requested outputs of one request of ``num_positions`` = P; what a result lacks is NaN, never 0."""
-    columns: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in outputs}
-    for result in results:
-        scores = _frame_scores(result)
-        row: dict[str, npt.NDArray[Any] | list[float]] = {
-            PROGRESS: np.concatenate([s.progress for s in scores]),
-            SUCCESS: np.concatenate([s.success for s in scores]),
-            PREFERENCE: [result.preference if isinstance(result, PreferenceResult) else np.nan],
-            SIMILARITY: [result.similarity if isinstance(result, SimilarityResult) else np.nan],
-        }
-        if TIMING_MS in columns and result.timing is not None:
-            row[TIMING_MS] = [result.timing.collate_ms, result.timing.forward_ms]
-        if PROGRESS_LOGITS in columns:
-            row[PROGRESS_LOGITS] = np.concatenate([s.progress_logits for s in scores if s.progress_logits is not None])
-        for name, column in columns.items():
-            column.append(np.asarray(row[name], np.float32))
-    by_frame = (PROGRESS, SUCCESS, PROGRESS_LOGITS)
-    return {
-        name: pad_stack(column, num_positions, fill=np.nan) if name in by_frame else np.stack(column)
-        for name, column in columns.items()
-    }
+    return {name: _ENCODERS[name](results, num_positions) for name in outputs}
 
 
 def decode_results(
@@ -255,6 +238,41 @@ def _num_frames(sample: Sample) -> tuple[int, int]:
     return lengths[0], lengths[1] if len(lengths) > 1 else 0
 
 
+def _encode_frames(field: str) -> Callable[[Sequence[Result], int], Float32Array]:
+    """Of one score a frame: [B, P, ...]."""
+
+    def encode(results: Sequence[Result], num_positions: int) -> Float32Array:
+        rows = [[getattr(scores, field) for scores in _frame_scores(result)] for result in results]
+        joined = [parts[0] if len(parts) == 1 else np.concatenate(parts) for parts in rows]
+        return pad_stack(joined, num_positions, fill=np.nan)
+
+    return encode
+
+
+def _encode_question(field: str) -> Callable[[Sequence[Result], int], Float32Array]:
+    """Of one score a sample of one type: [B, 1]."""
+
+    def encode(results: Sequence[Result], _num_positions: int) -> Float32Array:
+        return np.array([[getattr(result, field, np.nan)] for result in results], np.float32)
+
+    return encode
+
+
+def _encode_timing(results: Sequence[Result], _num_positions: int) -> Float32Array:
+    timings = [result.timing for result in results if result.timing is not None]
+    return np.array([[timing.collate_ms, timing.forward_ms] for timing in timings], np.float32)
+
+
+_ENCODERS = {
+    PROGRESS: _encode_frames("progress"),
+    SUCCESS: _encode_frames("success"),
+    PROGRESS_LOGITS: _encode_frames("progress_logits"),
+    PREFERENCE: _encode_question("preference"),
+    SIMILARITY: _encode_question("similarity"),
+    TIMING_MS: _encode_timing,
+}
+
+
 def _located(decode: Any, tensors: Mapping[str, npt.NDArray[Any]], row: int) -> Any:
     try:
         return decode(tensors, row)
@@ -268,7 +286,7 @@ def _decode_sample(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> Sample:
     sample_type = int(tensors[SAMPLE_TYPE][row, 0])
     lengths = tensors[NUM_FRAMES][row].tolist()
     frame_steps = int(tensors[FRAME_STEPS][row, 0])
-    if sample_type not in tuple(SampleType):
+    if sample_type not in _VALUES:
         known = ", ".join(f"{t.value} ({t.name.lower()})" for t in SampleType)
         raise InvalidSampleError.at(SAMPLE_TYPE, f"one of {known}", str(sample_type))
     if sample_type == SampleType.PROGRESS:
@@ -320,20 +338,19 @@ def _frame_scores(result: Result) -> tuple[FrameScores, ...]:
 def _decode_result(
     tensors: Mapping[str, npt.NDArray[Any]], row: int, sample: Sample, model_version: str | None
 ) -> Result:
-    bounds = np.cumsum([0, *_num_frames(sample)])
-    asked = isinstance(sample, ProgressSample)
-    first, second = (_scores_between(tensors, row, slice(*bounds[i : i + 2]), asked) for i in range(2))
+    num_first, num_second = _num_frames(sample)
+    first = _scores_between(tensors, row, slice(0, num_first), isinstance(sample, ProgressSample))
     timing = BatchTiming(*tensors[TIMING_MS][row].tolist()) if TIMING_MS in tensors else None
     of_request: dict[str, Any] = {"timing": timing, "model_version": model_version}
+    if isinstance(sample, ProgressSample):
+        progress, success, logits = first.progress, first.success, first.progress_logits
+        return ProgressResult(progress=progress, success=success, progress_logits=logits, **of_request)
+    second = _scores_between(tensors, row, slice(num_first, num_first + num_second), False)
     if isinstance(sample, PreferenceSample):
         preference = float(_present(tensors, PREFERENCE, row, slice(0, 1))[0])
         return PreferenceResult(preference=preference, first=first, second=second, **of_request)
-    if isinstance(sample, SimilaritySample):
-        similarity = float(_present(tensors, SIMILARITY, row, slice(0, 1))[0])
-        return SimilarityResult(similarity=similarity, reference=first, other=second, **of_request)
-    return ProgressResult(
-        progress=first.progress, success=first.success, progress_logits=first.progress_logits, **of_request
-    )
+    similarity = float(_present(tensors, SIMILARITY, row, slice(0, 1))[0])
+    return SimilarityResult(similarity=similarity, reference=first, other=second, **of_request)
 
 
 def _scores_between(
@@ -355,7 +372,7 @@ def _present(
     if scores.ndim < 2 or row >= len(scores):
         raise InferenceFailedError(f"{name}: expected scores of sample {row}, got an array {list(scores.shape)}")
     part: Float32Array = scores[row, positions]
-    not_told = may_lack and count > 0 and np.isnan(part).all()
-    if len(part) != count or not (np.isfinite(part).all() or not_told):
+    is_told = len(part) == count and bool(np.isfinite(part).all())
+    if not is_told and not (may_lack and len(part) == count > 0 and np.isnan(part).all()):
         raise InferenceFailedError(f"{name}: expected {count} finite scores, got {part.tolist()}")
     return part

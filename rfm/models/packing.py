@@ -72,7 +72,8 @@ class Packing:
     def packed(self, padded: Tensor) -> Tensor:
         """[B, L, D] -> [N + room, D]."""
         rows = padded.flatten(0, 1)
-        return rows if len(rows) == len(self.at) else rows[self.at]
+        is_packed = self.mask is None and len(rows) == len(self.at)
+        return rows if is_packed else rows[self.at]
 
 
 def starts(lengths: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
