@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Samples -> rows -> padded batches, one module for each kind of checkpoint."""
+"""Samples -> rows -> batches, one module for each kind of checkpoint."""
 
 from __future__ import annotations
 
