@@ -52,7 +52,7 @@ class Family(Protocol[Row, Batch]):
         """Each sample's rows (in dense mode one a frame), or why this checkpoint cannot score it."""
 
     def lengths(self, row: Row) -> tuple[int, ...]:
-        """What of a row is padded, each to the longest of its batch. Rows of unlike counts share no batch."""
+        """What decides which rows share a batch: similar lengths do. Rows of unlike counts share none."""
 
     def num_tokens(self, lengths: Sequence[int]) -> int:
         """Tokens of a row of these lengths."""

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -41,7 +43,7 @@ def test_large_float32_products_without_gradients_are_onednns(monkeypatch: pytes
     rows = WORTH_ONEDNN // (LARGE[0] * LARGE[1])
 
     def asked(rows: int, dtype: torch.dtype = torch.float32) -> bool:
-        return module._by_onednn(torch.zeros(rows, LARGE[1], dtype=dtype), torch.zeros(LARGE, dtype=dtype))
+        return module._by_onednn(torch.zeros(rows, LARGE[1], dtype=dtype), torch.zeros(LARGE, dtype=dtype), None)
 
     assert not asked(rows)
     with torch.inference_mode():
@@ -50,6 +52,24 @@ def test_large_float32_products_without_gradients_are_onednns(monkeypatch: pytes
         assert not asked(rows, torch.bfloat16)
         monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
         assert not asked(rows)
+
+
+@pytest.mark.parametrize("options", [{}, {"relu": True}, {"plus": torch.zeros(64, 256)}], ids=["", "relu", "plus"])
+def test_what_is_no_number_stays_none(options: dict[str, Any]) -> None:
+    """Or a broken weight would give finite scores, which are wrong."""
+    for weight_value, bias_value in ((float("nan"), 0.0), (0.0, float("nan")), (float("inf"), float("-inf"))):
+        weight, bias = torch.zeros(256, 512), torch.zeros(256)
+        weight[7, 3], bias[7] = weight_value, bias_value
+        with torch.inference_mode():
+            product = linear(torch.ones(64, 512), weight, bias, **options)
+        assert product[:, 7].isnan().all()
+        assert product.isnan().sum() == 64
+
+
+def test_a_bias_with_gaps() -> None:
+    weight, bias, x = torch.randn(256, 512) / 512**0.5, torch.randn(512)[::2], torch.randn(64, 512)
+    with torch.inference_mode():
+        torch.testing.assert_close(linear(x, weight, bias), F.linear(x, weight, bias), rtol=0, atol=1e-5)
 
 
 def test_training_has_its_gradients() -> None:

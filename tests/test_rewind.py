@@ -20,7 +20,7 @@ from rfm.engine import Engine, Outcome
 from rfm.families.rewind import RewindFamily
 from rfm.models.heads import PredictionHead, progress_from_logits
 from rfm.models.packing import Packing, rounded_up
-from rfm.models.rewind import RewindConfig, RewindTransformer
+from rfm.models.rewind import RewindBatch, RewindConfig, RewindTransformer
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,
@@ -276,6 +276,13 @@ def test_rows_of_all_kinds_are_packed_into_one_batch() -> None:
     assert batch.is_similarity.tolist() == [False, True]
     expected = np.concatenate([t.positions for sample in samples for t in sample.trajectories])
     np.testing.assert_array_equal(batch.video[:9].numpy(), expected)
+
+
+@pytest.mark.parametrize("num_frames", [[9, 0], [1, 9]], ids=str)
+def test_more_frames_than_progress_tokens_are_refused(num_frames: list[int]) -> None:
+    frames = torch.zeros(sum(num_frames), 12)
+    with pytest.raises(ValueError, match="num_frames: expected at most 8, got 9"):
+        RewindBatch.of(BASE, torch.zeros(1, 6), frames, np.array([num_frames]))
 
 
 def test_frames_that_many_rows_show_are_in_a_batch_once() -> None:

@@ -230,7 +230,7 @@ class _TritonTransport:
 
 
 class GrpcTransport(_TritonTransport):
-    """gRPC: a call that runs out of time, or is cancelled, is cancelled on the server too."""
+    """gRPC: a call that runs out of time, or is cancelled, is cancelled on the server too (if it has not begun)."""
 
     _first_process: int | None = None  # that used gRPC
 

@@ -259,7 +259,7 @@ def _encode_question(field: str) -> Callable[[Sequence[Result], int], Float32Arr
 
 
 def _encode_timing(results: Sequence[Result], _num_positions: int) -> Float32Array:
-    timings = [result.timing for result in results if result.timing is not None]
+    timings = [result.timing or BatchTiming(np.nan, np.nan) for result in results]
     return np.array([[timing.collate_ms, timing.forward_ms] for timing in timings], np.float32)
 
 

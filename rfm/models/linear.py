@@ -3,7 +3,7 @@
 
 torch's own choice, MKL, leaves processors that are not Intel's far below what they can do: on an AMD EPYC with AVX-512
 oneDNN is 2 to 3 times as fast (docs/performance.md). The operation is the one that torch.compile puts in. It is made
-for each shape, which takes a while the first time: callers see to it that shapes are few (``packing.rounded_up``).
+for each shape, which takes a while the first time: ReWiND's tokens come in few shapes (``packing.rounded_up``).
 """
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ class Linear(nn.Linear):
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None, *, relu: bool = False, plus: Tensor | None = None) -> Tensor:
     """``x @ weight.T + bias``: [..., K], [N, K] and [N] -> [..., N]; then ReLU, or ``plus`` [..., N] added."""
-    if _by_onednn(x, weight):
+    if _by_onednn(x, weight, bias):
         onednn = torch.ops.mkldnn._linear_pointwise
         if plus is not None:
             return onednn.binary(x, plus, weight, bias, "add")
-        return onednn.default(x, weight, bias, "relu" if relu else "none", [], "")
+        product = onednn.default(x, weight, bias, "none", [], "")
+        return product.relu_() if relu else product  # oneDNN's own ReLU makes 0 of NaN, which would hide it
     product = F.linear(x, weight, bias)
     if plus is not None:
         return product + plus
@@ -47,13 +48,14 @@ def speed_up(network: nn.Module) -> None:
                 setattr(module, name, faster)
 
 
-def _by_onednn(x: Tensor, weight: Tensor) -> bool:
-    """It has no gradient."""
+def _by_onednn(x: Tensor, weight: Tensor, bias: Tensor | None) -> bool:
+    """It has no gradient, and reads the bias as if its numbers lay side by side."""
     return (
         x.device.type == "cpu"
         and x.dtype is torch.float32
         and weight.dtype is torch.float32
         and x.numel() * len(weight) >= WORTH_ONEDNN
+        and (bias is None or bias.is_contiguous())
         and not torch.is_grad_enabled()
         and torch.backends.mkldnn.is_available()
     )

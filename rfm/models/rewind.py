@@ -101,7 +101,12 @@ class RewindBatch:
         shown: Tensor | None = None,
         is_similarity: Tensor | None = None,
     ) -> RewindBatch:
-        """Rows whose trajectories have int64 [B, 2] frames; the second has 0 in rows of one."""
+        """Rows whose trajectories have int64 [B, 2] frames; the second has 0 in rows of one.
+
+        Raises ValueError for a trajectory of more frames than there are progress tokens.
+        """
+        if config.max_frames is not None and num_frames.max() > config.max_frames:
+            raise ValueError(f"num_frames: expected at most {config.max_frames}, got {num_frames.max()}")
         first, both = num_frames[:, 0], num_frames.sum(axis=1)
         has_query = num_frames[:, 1] > 0
         step = config.tokens_per_frame

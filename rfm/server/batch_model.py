@@ -23,7 +23,7 @@ THREADS_PARAMETER = "torch_threads"  # parameters of config.pbtxt; rfm_export wr
 BUDGET_PARAMETER = "token_budget"
 DTYPE_PARAMETER = "dtype"  # empty: as the checkpoint and the device decide
 
-WORTH_ASKING_S = 10e-3
+WORTH_ASKING_S = 10e-3  # for one answer
 
 _CANCELLED = RewardError("cancelled by the client")  # nobody waits for the answer, so no forward is spent on it
 
