@@ -1,16 +1,17 @@
 # make demo    a first look: serves a small trained checkpoint, scores clips, draws their curves
 # make test    everything that CI runs: lint, types, generated files, tests
+# make ops-check    what runs around the server: alerts, dashboards, containers, Kubernetes
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed
 
-.PHONY: demo test check parity bench perf format model_repository clean
+.PHONY: demo test check parity bench bench-full perf format model_repository clean ops-check ops-tools
 
 demo: $(INSTALLED)
 	$(BIN)/python examples/demo.py
 
-test: check
+test: check ops-tools
 	$(BIN)/pytest
 
 check: $(INSTALLED)
@@ -28,9 +29,36 @@ bench: $(INSTALLED)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[bench]"
 	$(BIN)/python benchmarks/bench.py
 
-# Triton's own perf_analyzer on the committed repository.
+# All loads (half an hour), and the engine without a server: beside the original's forward, and as the work grows.
+bench-full: $(INSTALLED)
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[bench]"
+	$(BIN)/python benchmarks/forward.py
+	$(BIN)/python benchmarks/bench.py --full
+
+# Triton's own perf_analyzer on checkpoints of both sizes.
 perf: $(INSTALLED)
-	$(BIN)/python benchmarks/perf_analyzer.py
+	$(BIN)/python benchmarks/perf_analyzer.py --size small
+	$(BIN)/python benchmarks/perf_analyzer.py --size default
+
+# What docker/ holds, as far as it can be checked without a container engine or a cluster: alerts and recording rules on
+# made-up series, they and the dashboard on a live Prometheus and Triton; Dockerfile and compose file; Kubernetes.
+ops-check: ops-tools
+	$(BIN)/pytest tests/test_monitoring.py tests/test_docker.py tests/test_kubernetes.py
+
+# Programs of Debian and Ubuntu that tests run. Prometheus is unpacked into $(VENV): installed, it starts a service.
+AS_ROOT = $(shell if [ "$$(id -u)" = 0 ]; then :; elif sudo -n true 2>/dev/null; then echo sudo -n; else echo false; fi)
+MISSING = { echo "make ops-tools: expected $(1) in PATH, got none; install it (Debian, Ubuntu: $(2))" >&2; exit 1; }
+
+ops-tools: $(INSTALLED)
+	@test -x $(BIN)/promtool || { command -v promtool && command -v prometheus; } >/dev/null || \
+	  { $(AS_ROOT) apt-get update -qq; cd $(VENV) && apt-get -qq -o APT::Sandbox::User=root download prometheus && \
+	  dpkg-deb --fsys-tarfile prometheus_*.deb | \
+	  tar -x -C bin --strip-components=3 ./usr/bin/prometheus ./usr/bin/promtool && rm prometheus_*.deb; } || \
+	  $(call MISSING,prometheus and promtool,apt-get install prometheus)
+	@docker compose version >/dev/null 2>&1 || command -v docker-compose >/dev/null || \
+	  { $(AS_ROOT) apt-get update -qq && \
+	  $(AS_ROOT) apt-get install --yes -qq --no-install-recommends docker-compose; } || \
+	  $(call MISSING,docker-compose,apt-get install docker-compose)
 
 format: $(INSTALLED)
 	$(BIN)/ruff check --fix .

@@ -1,0 +1,406 @@
+# SPDX-License-Identifier: MIT
+"""The Kubernetes manifests: built by kubectl's kustomize, checked against schemas and policies, and against the programs.
+
+Kubernetes' own schemas come with kubernetes-validate; those of PodMonitor and of KServe's objects are excerpts
+(``custom_resource_schemas.json`` says of what). What only a cluster can tell is not tested here.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+import importlib.metadata
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import jsonschema
+import kubernetes_validate
+import pytest
+import yaml
+from referencing import Registry, Resource
+from typer.main import get_command
+
+from rfm.cli import app
+from rfm.server.installation import find_installation
+from rfm.server.process import KILL_AFTER_S, Endpoints, TritonServer
+from rfm_client.cli.commands import app as client_app
+from rfm_client.gateway.command import STOP_WITHIN_S
+
+ROOT = Path(__file__).parents[1]
+KUBERNETES = ROOT / "docker" / "kubernetes"
+BIN = Path(sys.executable).parent
+PROMETHEUS = yaml.safe_load((ROOT / "docker" / "prometheus" / "prometheus.yml").read_text())
+OVERLAYS = ("overlays/cpu", "overlays/gpu")
+SETS = (*OVERLAYS, "kserve")
+RELEASES = ("1.31", "1.37")  # the oldest that the manifests are for, and the newest known
+CUSTOM = ("monitoring.coreos.com/", "serving.kserve.io/")
+VOLUMES = {"configMap", "csi", "downwardAPI", "emptyDir", "ephemeral", "persistentVolumeClaim", "projected", "secret"}
+PORT_OPTIONS = {
+    "http": "http_port",
+    "http1": "http_port",
+    "grpc": "grpc_port",
+    "metrics": "metrics_port",
+    "gateway": "port",
+}
+
+STUB = "triton_python_b\n"  # as the kernel cuts it
+
+Object = dict[str, Any]
+
+
+@functools.cache
+def _built(folder: str) -> str:
+    command = [BIN / "kubectl", "kustomize", KUBERNETES / folder]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
+def built(folder: str, *kinds: str) -> list[Object]:
+    """What ``kubectl apply -k`` would send; of the kinds alone, if any are named."""
+    return [found for found in yaml.safe_load_all(_built(folder)) if not kinds or found["kind"] in kinds]
+
+
+def named(folder: str, kind: str, name: str) -> Object:
+    (found,) = (found for found in built(folder, kind) if found["metadata"]["name"] == name)
+    return found
+
+
+def pod_of(workload: Object) -> Object:
+    """The pod's specification."""
+    return workload["spec"] if workload["kind"] == "ServingRuntime" else workload["spec"]["template"]["spec"]
+
+
+def container_of(workload: Object) -> Object:
+    (container,) = pod_of(workload)["containers"]
+    return container
+
+
+def workloads(*folders: str) -> list[Any]:
+    """Everything that makes pods, as parameters."""
+    return [
+        pytest.param(workload, id=f"{folder}-{workload['metadata']['name']}")
+        for folder in folders
+        for workload in built(folder, "Deployment", "ServingRuntime")
+    ]
+
+
+def parameters(command: Any, words: list[str]) -> dict[str, Any]:
+    """What the real command line reads ``words`` as; it runs nothing."""
+    name, *arguments = words
+    return command.commands[name].make_context(name, arguments).params
+
+
+def selected(selector: dict[str, str], folder: str) -> list[Object]:
+    """Deployments whose pods have these labels."""
+    deployments = built(folder, "Deployment")
+    return [one for one in deployments if selector.items() <= one["spec"]["template"]["metadata"]["labels"].items()]
+
+
+def validate(manifest: Object, release: str) -> None:
+    if not manifest["apiVersion"].startswith(CUSTOM):
+        kubernetes_validate.validate(manifest, release, strict=True)
+        return
+    folder = f"v{kubernetes_validate.latest_version()}-local-strict"
+    core = json.loads(
+        (files("kubernetes_validate") / "kubernetes-json-schema" / folder / "_definitions.json").read_text()
+    )
+    excerpt = json.loads((Path(__file__).parent / "custom_resource_schemas.json").read_text())
+    schema = {"$ref": f"#/$defs/{manifest['kind']}", **excerpt}
+    registry = Registry().with_resource(core["$id"], Resource.from_contents(core))
+    jsonschema.Draft202012Validator(schema, registry=registry).validate(manifest)
+
+
+@pytest.mark.parametrize("release", RELEASES)
+@pytest.mark.parametrize("folder", SETS)
+def test_every_manifest_fits_its_schema(folder: str, release: str) -> None:
+    for manifest in built(folder):
+        validate(manifest, release)
+
+
+@pytest.mark.parametrize("folder", SETS)
+def test_a_misspelt_field_is_found(folder: str) -> None:
+    for manifest in built(folder):
+        if "spec" in manifest:
+            manifest["spec"]["replica"] = 1
+            with pytest.raises(jsonschema.ValidationError, match="'replica' was unexpected"):
+                validate(manifest, RELEASES[-1])
+    for workload in built(folder, "Deployment", "ServingRuntime"):
+        container_of(workload)["livenessProbe"]["periodSecond"] = 1
+        with pytest.raises(jsonschema.ValidationError, match="'periodSecond' was unexpected"):
+            validate(workload, RELEASES[-1])
+
+
+def violations(pod: Object) -> Iterator[str]:
+    """What the pod security standard "restricted" forbids, and a root file system that can be written."""
+    around = pod.get("securityContext", {})
+    yield from (key for key in ("hostNetwork", "hostPID", "hostIPC") if pod.get(key))
+    yield from (f"sysctls {one}" for one in around.get("sysctls", []))
+    yield from (kind for volume in pod.get("volumes", []) for kind in set(volume) - {"name"} - VOLUMES)
+    for container in [*pod["containers"], *pod.get("initContainers", [])]:
+        inside = container.get("securityContext", {})
+        context = {**around, **inside}
+        yield from (key for key in ("privileged", "procMount", "seLinuxOptions", "appArmorProfile") if context.get(key))
+        yield from ("hostPort" for port in container.get("ports", []) if port.get("hostPort"))
+        capabilities = inside.get("capabilities", {})
+        if capabilities.get("drop") != ["ALL"] or set(capabilities.get("add", [])) - {"NET_BIND_SERVICE"}:
+            yield "capabilities"
+        if inside.get("allowPrivilegeEscalation") is not False:
+            yield "allowPrivilegeEscalation"
+        if context.get("runAsNonRoot") is not True or context.get("runAsUser") == 0:
+            yield "root"
+        if context.get("seccompProfile", {}).get("type") not in ("RuntimeDefault", "Localhost"):
+            yield "seccompProfile"
+        if inside.get("readOnlyRootFilesystem") is not True:
+            yield "readOnlyRootFilesystem"
+
+
+@pytest.mark.parametrize("workload", workloads(*SETS))
+def test_pods_are_restricted(workload: Object) -> None:
+    assert list(violations(pod_of(workload))) == []
+
+
+@pytest.mark.parametrize(
+    ("loosen", "found"),
+    [
+        (lambda pod: pod.update(hostNetwork=True), "hostNetwork"),
+        (lambda pod: pod["volumes"].append({"name": "node", "hostPath": {"path": "/"}}), "hostPath"),
+        (lambda pod: pod["securityContext"].pop("runAsNonRoot"), "root"),
+        (lambda pod: pod["securityContext"].pop("seccompProfile"), "seccompProfile"),
+        (lambda pod: pod["containers"][0]["securityContext"].pop("capabilities"), "capabilities"),
+        (lambda pod: pod["containers"][0]["securityContext"].update(privileged=True), "privileged"),
+        (
+            lambda pod: pod["containers"][0]["securityContext"].pop("allowPrivilegeEscalation"),
+            "allowPrivilegeEscalation",
+        ),
+        (lambda pod: pod["containers"][0]["securityContext"].update(runAsUser=0), "root"),
+    ],
+)
+def test_a_loosened_pod_is_not(loosen: Callable[[Object], object], found: str) -> None:
+    pod = copy.deepcopy(pod_of(named("overlays/cpu", "Deployment", "rfm-triton")))
+    loosen(pod)
+    assert list(violations(pod)) == [found]
+
+
+def test_namespaces_say_that_pods_are_restricted() -> None:
+    for folder in SETS:
+        (namespace,) = built(folder, "Namespace")
+        modes = ("warn", "audit") if folder == "kserve" else ("enforce", "warn", "audit")
+        labels = namespace["metadata"]["labels"]
+        assert {labels[f"pod-security.kubernetes.io/{mode}"] for mode in modes} == {"restricted"}
+        assert {one["metadata"].get("namespace") for one in built(folder)} == {None, namespace["metadata"]["name"]}
+
+
+@pytest.mark.parametrize("workload", workloads(*SETS))
+def test_containers_have_limits_probes_and_the_release_s_image(workload: Object) -> None:
+    container = container_of(workload)
+    on_gpu = "nvidia.com/gpu" in container["resources"]["limits"]
+    variants = ("", "-cpu") if container["args"][0] == "gateway" else ("",) if on_gpu else ("-cpu",)
+    release = f"registry.example.com/rfm-triton:{importlib.metadata.version('rfm-triton')}"
+    assert container["image"] in [release + variant for variant in variants]
+    resources = container["resources"]
+    assert resources["requests"]["memory"] and resources["limits"]["memory"] and resources["requests"]["cpu"]
+    for kind in ("startupProbe", "readinessProbe", "livenessProbe"):
+        probe = container[kind]
+        assert probe["periodSeconds"] and probe["timeoutSeconds"]
+        ports = {port[key] for port in container["ports"] for key in ("name", "containerPort")}
+        assert "exec" in probe or probe["httpGet"]["port"] in ports
+    mounts = {mount["name"] for mount in container["volumeMounts"]}
+    assert mounts == {volume["name"] for volume in pod_of(workload)["volumes"]}
+
+
+def test_a_gpu_is_asked_for_where_there_is_one() -> None:
+    cpu, gpu = (pod_of(named(folder, "Deployment", "rfm-triton")) for folder in OVERLAYS)
+    assert gpu["containers"][0]["resources"]["limits"]["nvidia.com/gpu"] == "1"
+    assert gpu["tolerations"] == [{"key": "nvidia.com/gpu", "operator": "Exists", "effect": "NoSchedule"}]
+    assert "nvidia.com/gpu" not in cpu["containers"][0]["resources"]["limits"] and "tolerations" not in cpu
+    threads = {"name": "OMP_NUM_THREADS", "value": cpu["containers"][0]["resources"]["limits"]["cpu"]}
+    assert threads in cpu["containers"][0]["env"]
+
+
+@pytest.mark.parametrize("workload", workloads(*SETS))
+def test_arguments_are_those_of_the_program(workload: Object) -> None:
+    container = container_of(workload)
+    assert container["command"] == ["rfm"]
+    given = parameters(get_command(app), container["args"])
+    assert given["host"] == "0.0.0.0"
+    for port in container["ports"]:
+        if port["name"] != "status":  # not yet an option
+            assert given[PORT_OPTIONS[port["name"]]] == port["containerPort"]
+    if container["args"][0] == "gateway":
+        return
+    is_kserve = workload["kind"] == "ServingRuntime"
+    mounts = {mount["name"]: mount["mountPath"] for mount in container["volumeMounts"] if mount.get("readOnly")}
+    assert str(given["repository"]) == ("/mnt/models" if is_kserve else f"{mounts['repository']}/model_repository")
+    canary = container["livenessProbe"]["exec"]["command"]
+    assert canary[0] == "rfm-client"
+    asked = parameters(get_command(client_app), canary[1:])
+    assert asked["timeout"] < container["livenessProbe"]["timeoutSeconds"]
+    assert urlsplit(asked["urls"][0]).port in [port["containerPort"] for port in container["ports"]]
+
+
+@pytest.mark.parametrize("workload", workloads(*SETS))
+def test_keys_are_files_that_others_cannot_read(workload: Object) -> None:
+    container, pod = container_of(workload), pod_of(workload)
+    (secret,) = (volume for volume in pod["volumes"] if "secret" in volume)
+    (mount,) = (mount for mount in container["volumeMounts"] if mount["name"] == secret["name"])
+    given = parameters(get_command(app), container["args"])
+    file = given["api_key_file"] if container["args"][0] == "gateway" else given["admin_key_file"]
+    assert file.parent == Path(mount["mountPath"])
+    if workload["kind"] == "Deployment":
+        assert secret["secret"]["defaultMode"] == 0o400
+        assert pod["securityContext"]["fsGroup"] == pod["securityContext"]["runAsGroup"]
+    command = f"create secret generic {secret['secret']['secretName']} --from-literal={file.name}="
+    assert command in (KUBERNETES / "README.md").read_text()
+
+
+@pytest.mark.parametrize("workload", workloads(*OVERLAYS))
+def test_requests_in_flight_have_time_to_end(workload: Object) -> None:
+    sleep_s = container_of(workload)["lifecycle"]["preStop"]["sleep"]["seconds"]
+    stops_within_s = STOP_WITHIN_S if container_of(workload)["args"][0] == "gateway" else KILL_AFTER_S
+    assert pod_of(workload)["terminationGracePeriodSeconds"] > sleep_s + stops_within_s
+    assert workload["spec"]["strategy"]["rollingUpdate"] == {"maxSurge": 1, "maxUnavailable": 0}
+    startup = container_of(workload)["startupProbe"]
+    deadline_s = workload["spec"].get("progressDeadlineSeconds", 600)
+    assert startup["periodSeconds"] * startup["failureThreshold"] < deadline_s
+
+
+@pytest.mark.parametrize("folder", OVERLAYS)
+def test_selectors_find_their_pods(folder: str) -> None:
+    for deployment in built(folder, "Deployment"):
+        labels = deployment["spec"]["selector"]["matchLabels"]
+        assert [one["metadata"]["name"] for one in selected(labels, folder)] == [deployment["metadata"]["name"]]
+        for spread in pod_of(deployment)["topologySpreadConstraints"]:
+            assert spread["labelSelector"]["matchLabels"] == labels
+        for kind in ("PodDisruptionBudget", "PodMonitor"):
+            assert named(folder, kind, deployment["metadata"]["name"])["spec"]["selector"]["matchLabels"] == labels
+    for service in built(folder, "Service"):
+        (deployment,) = selected(service["spec"]["selector"], folder)
+        names = {port["name"] for port in container_of(deployment)["ports"]}
+        assert {port["targetPort"] for port in service["spec"]["ports"]} <= names
+    for monitor in built(folder, "PodMonitor"):
+        (deployment,) = selected(monitor["spec"]["selector"]["matchLabels"], folder)
+        jobs = [job["job_name"] for job in PROMETHEUS["scrape_configs"]]
+        names = {port["name"] for port in container_of(deployment)["ports"]}
+        for endpoint in monitor["spec"]["podMetricsEndpoints"]:
+            assert endpoint["port"] in names
+            (relabeling,) = endpoint["relabelings"]
+            assert relabeling["targetLabel"] == "job" and relabeling["replacement"] in jobs  # which the alerts name
+
+
+@pytest.mark.parametrize("folder", OVERLAYS)
+def test_policies_open_the_ports_that_there_are(folder: str) -> None:
+    default = named(folder, "NetworkPolicy", "default")["spec"]
+    assert default["podSelector"] == {} and default["policyTypes"] == ["Ingress", "Egress"] and "ingress" not in default
+    assert {port["port"] for rule in default["egress"] for port in rule["ports"]} == {53}
+    for deployment in built(folder, "Deployment"):
+        policy = named(folder, "NetworkPolicy", deployment["metadata"]["name"])["spec"]
+        assert selected(policy["podSelector"]["matchLabels"], folder) == [deployment]
+        opened = {port["port"] for rule in policy["ingress"] for port in rule["ports"]}
+        assert opened == {port["containerPort"] for port in container_of(deployment)["ports"]}
+        assert all(rule["from"] for rule in policy["ingress"])
+
+
+@pytest.mark.parametrize("folder", OVERLAYS)
+def test_the_gateway_reaches_triton(folder: str) -> None:
+    gateway = parameters(get_command(app), container_of(named(folder, "Deployment", "rfm-gateway"))["args"])
+    urls = [urlsplit(gateway["triton"]), urlsplit(gateway["metrics_url"])]
+    service = named(folder, "Service", "rfm-triton")
+    assert {url.hostname for url in urls} == {service["metadata"]["name"]}
+    wanted = {url.port for url in urls}
+    assert wanted <= {port["port"] for port in service["spec"]["ports"]}
+    (way_out,) = named(folder, "NetworkPolicy", "rfm-gateway")["spec"]["egress"]
+    labels = named(folder, "Deployment", "rfm-gateway")["spec"]["selector"]["matchLabels"]
+    ways_in = named(folder, "NetworkPolicy", "rfm-triton")["spec"]["ingress"]
+    (way_in,) = (way for way in ways_in if way["from"] == [{"podSelector": {"matchLabels": labels}}])
+    assert wanted == {port["port"] for port in way_out["ports"]} == {port["port"] for port in way_in["ports"]}
+
+
+@pytest.mark.parametrize("folder", OVERLAYS)
+def test_the_autoscaler_s_metric_is_recorded_and_handed_on(folder: str) -> None:
+    scaler = named(folder, "HorizontalPodAutoscaler", "rfm-triton")["spec"]
+    target = scaler["scaleTargetRef"]
+    assert "replicas" not in named(folder, target["kind"], target["name"])["spec"]
+    (metric,) = scaler["metrics"]
+    (rule,) = yaml.safe_load((KUBERNETES / "monitoring" / "prometheus-adapter.yaml").read_text())["rules"]["custom"]
+    assert rule["name"]["as"] == metric["pods"]["metric"]["name"]
+    series = rule["seriesQuery"].partition("{")[0]
+    assert re.search(rule["name"]["matches"], series)
+    groups = (yaml.safe_load(file.read_text())["groups"] for file in (ROOT / "docker/prometheus/rules").glob("*.yml"))
+    recorded = {
+        one["record"]: one["expr"] for group in groups for part in group for one in part["rules"] if "record" in one
+    }
+    assert " by " not in recorded[series]  # that would drop the labels namespace and pod
+
+
+def test_kserve_s_objects_know_each_other() -> None:
+    (runtime,), (service,) = built("kserve", "ServingRuntime"), built("kserve", "InferenceService")
+    (claim,) = built("kserve", "PersistentVolumeClaim")
+    model = service["spec"]["predictor"]["model"]
+    assert model["runtime"] == runtime["metadata"]["name"]
+    assert model["modelFormat"]["name"] in [known["name"] for known in runtime["spec"]["supportedModelFormats"]]
+    assert model["protocolVersion"] in runtime["spec"]["protocolVersions"]
+    assert urlsplit(model["storageUri"]).netloc == claim["metadata"]["name"]
+
+
+def test_what_the_readme_applies_is_there() -> None:
+    applied = re.findall(r"-k docker/kubernetes/([\w/]+)", (KUBERNETES / "README.md").read_text())
+    assert set(applied) == set(SETS)
+
+
+class DemoServer(TritonServer):
+    """The demo's ``rfm`` alone, whose model processes can be killed."""
+
+    def kill_model(self) -> None:
+        """Kills the process of every instance."""
+        assert self._process is not None
+        killed = []
+        for comm in Path("/proc").glob("[0-9]*/comm"):
+            with suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile; it was not ours
+                process_id = int(comm.parent.name)
+                if comm.read_text() == STUB and os.getpgid(process_id) == self._process.pid:
+                    os.kill(process_id, signal.SIGKILL)
+                    killed.append(process_id)
+        assert killed
+
+    def stop(self) -> int:
+        if self._process is not None:
+            os.killpg(self._process.pid, signal.SIGKILL)  # with a dead model process it would wait its time out
+        return super().stop()
+
+
+@pytest.fixture
+def demo_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[DemoServer]:
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    shutil.copytree(ROOT / "model_repository" / "rfm", tmp_path / "model_repository" / "rfm")
+    with (
+        (tmp_path / "tritonserver.log").open("wb") as log,
+        DemoServer(tmp_path / "model_repository", Endpoints.free(), find_installation(), log=log) as server,
+    ):
+        yield server
+
+
+def test_the_probes_tell_a_living_model_from_a_dead_one(demo_server: DemoServer) -> None:
+    container = container_of(named("overlays/cpu", "Deployment", "rfm-triton"))
+    for probe in ("startupProbe", "readinessProbe"):
+        with urllib.request.urlopen(demo_server.endpoints.http_url + container[probe]["httpGet"]["path"]) as answer:
+            assert answer.status == 200
+    program, *words = container["livenessProbe"]["exec"]["command"]
+    words[words.index("--url=grpc://127.0.0.1:8001")] = f"--url={demo_server.endpoints.grpc_url}"
+    alive = subprocess.run([BIN / program, *words], capture_output=True, text=True)
+    assert (alive.returncode, alive.stderr) == (0, "")
+    demo_server.kill_model()
+    words[words.index("--timeout=30")] = "--timeout=3"  # it is asked again until then
+    dead = subprocess.run([BIN / program, *words], capture_output=True, text=True)
+    assert dead.returncode != 0
+    assert "is not healthy" in dead.stderr
