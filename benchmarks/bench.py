@@ -35,10 +35,11 @@ from rfm.models.rewind import RewindConfig, RewindTransformer
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
+DEMO = ROOT / "model_repository"
 BARE = "bare engine"
 BARE_BATCH_SIZES = (1, 8, 32)
 PEERS = tuple(PEER_SCRIPTS)
-UNIFORM, MIXED = (16, 16), (1, 16)
+UNIFORM, MIXED, AS_LONG_AS_MIXED = (16, 16), (1, 16), (8, 9)
 PACKAGES = ("torch", "numpy", "tritonclient", "nvidia-pytriton", "fastapi", "uvicorn", "litserve", "mosec")
 
 DEFAULT_SIZE = RewindConfig(  # upstream's defaults
@@ -68,12 +69,15 @@ class Scenario:
 QUICK = (
     Scenario("1 caller", Load(1, 0, UNIFORM), ("gRPC",), with_peers=True),
     Scenario("32 callers", Load(32, 0, UNIFORM), ("gRPC", "gateway"), with_peers=True),
-    Scenario("32 callers, mixed lengths and types", Load(32, 0, MIXED, mixed=True)),
+    Scenario("32 callers, 8 or 9 frames", Load(32, 0, AS_LONG_AS_MIXED)),
+    Scenario("32 callers, 1 to 16 frames, all types", Load(32, 0, MIXED, mixed=True)),
 )
 FULL = (
     *QUICK,
     Scenario("8 callers", Load(8, 0, UNIFORM), ("gRPC", "HTTP", SHARED_MEMORY, "gateway"), with_peers=True),
     Scenario("128 callers", Load(128, 0, UNIFORM), ("gRPC", "HTTP", SHARED_MEMORY, "gateway"), with_peers=True),
+    Scenario("2 callers, 32 samples each", Load(2, 0, UNIFORM, together=32), ("gRPC", "gateway"), with_peers=True),
+    Scenario("8 callers, 8 raw frames of 256 x 256", Load(8, 0, (8, 8), frame_px=256), ("gRPC", "HTTP", SHARED_MEMORY)),
     Scenario("Poisson, half of the bare engine's rate", Load(0, 0, UNIFORM, rate_per_s=0.5), with_peers=True),
 )
 
@@ -96,13 +100,15 @@ def main() -> None:
     rows: list[dict[str, object]] = []
     with TemporaryDirectory(prefix="rfm-bench-") as folder:
         for size in arguments.sizes:
-            checkpoint = _checkpoint(size, Path(folder), arguments.threads)
-            bare = BareEngine(checkpoint)
-            with contestants(checkpoint, bare.widths, PEERS, threads, Path(folder) / "logs") as callers:
+            measured = checkpoint(size, Path(folder), arguments.threads)
+            bare = BareEngine(measured)
+            with contestants(measured, bare.widths, PEERS, threads, Path(folder) / "logs") as callers:
                 for scenario in scenarios:
+                    if scenario.load.frame_px and measured.encoders is None:
+                        continue
                     load = replace(scenario.load, seconds=arguments.seconds)
                     rows += _rounds(size, replace(scenario, load=load), bare, callers, arguments.rounds, console)
-    results = {"machine": _machine(), "threads": threads, "rounds": arguments.rounds, "measurements": rows}
+    results = {"machine": machine(), "threads": threads, "rounds": arguments.rounds, "measurements": rows}
     arguments.output.mkdir(parents=True, exist_ok=True)
     (arguments.output / "results.json").write_text(json.dumps(results, indent=1) + "\n")
     report.write(results, arguments.output)
@@ -138,21 +144,25 @@ def _rounds(
     return rows
 
 
-def _checkpoint(size: str, folder: Path, threads: int) -> Checkpoint:
-    """The demo's, or one of the default size with random weights."""
-    small = ROOT / "model_repository" / "rfm" / "1" / "checkpoint"
+def checkpoint(size: str, folder: Path, threads: int) -> Checkpoint:
+    """The demo's, served as it is there, or one of the default size with random weights."""
+    repository = folder / f"repository_{size}"
     if size == "small":
-        source = small
+        versions = DEMO / "rfm" / "1", DEMO / "rfm_encoder" / "1"
+        source, encoders = versions[0] / "checkpoint", (versions[1] / "image_encoder", versions[1] / "text_encoder")
+        images, texts = map(str, encoders)
+        serve = replace(ServeConfig.from_yaml(DEMO / "serve.yaml"), image_encoder=images, text_encoder=texts)
     else:
         torch.manual_seed(0)
-        source = folder / size
+        source, encoders = folder / size, None
         save(RewindCheckpoint(DEFAULT_SIZE, RewindTransformer(DEFAULT_SIZE).state_dict()), source)
-    repository = folder / f"repository_{size}"
-    rfm_export.export(source, repository, ServeConfig(num_gpus=0, torch_threads=threads))
-    return Checkpoint(size, source, repository)
+        serve = ServeConfig(num_gpus=0, torch_threads=threads)
+    rfm_export.export(source, repository, serve)
+    return Checkpoint(size, source, repository, encoders)
 
 
-def _machine() -> dict[str, object]:
+def machine() -> dict[str, object]:
+    """What the results are of."""
     cpu = next((line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")), "")
     commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False).stdout
     return {

@@ -18,6 +18,7 @@ from load import SHARED_MEMORY, Load, Measured, samples
 
 from rfm.demo import served
 from rfm.engine import Engine
+from rfm.models.encoders import Encoders
 from rfm.server.process import Endpoints
 from rfm_client.gateway.command import gateway_command
 
@@ -28,11 +29,12 @@ HERE = Path(__file__).parent
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """name: of its size; folder: the checkpoint; repository: it, exported"""
+    """name: of its size; folder: the checkpoint; repository: it, exported; encoders: folders of its two, if any"""
 
     name: str
     folder: Path
     repository: Path
+    encoders: tuple[Path, Path] | None = None
 
 
 class Callers:
@@ -61,7 +63,8 @@ class BareEngine:
     """``Engine.evaluate`` in this process: what no server around it can beat."""
 
     def __init__(self, checkpoint: Checkpoint) -> None:
-        self.engine = Engine.from_checkpoint(checkpoint.folder)
+        encoders = Encoders.from_pretrained(*checkpoint.encoders) if checkpoint.encoders else None
+        self.engine = Engine.from_checkpoint(checkpoint.folder, encoders=encoders)
         config = self.engine.family.network.config
         self.widths = config.video_feature_dim, config.text_feature_dim
 

@@ -23,16 +23,20 @@ from peers.clients import Ask
 
 from rfm_client import (
     AsyncRewardClient,
+    PreferenceResult,
     PreferenceSample,
     ProgressResult,
     ProgressSample,
+    Result,
     Sample,
     SimilaritySample,
     Trajectory,
 )
 
 NUM_SAMPLES = 256
+NUM_FILMED = 16
 IN_FLIGHT = 4096  # more than any load has under way, so that no client holds samples back
+KEEP_ALIVE_S = 3.0  # the peers close a connection that is idle for 5 seconds, perhaps just when it is used again
 MS_PER_S = 1e3
 PEERS = {
     "FastAPI, JSON": clients.fastapi_json,
@@ -50,6 +54,7 @@ class Load:
 
     callers: at a time, in the closed loop; rate_per_s: samples a second of the open loop; one of them is 0
     frames: fewest and most of a trajectory; mixed: all three sample types in turn, else progress alone
+    together: samples of one call; frame_px: height and width of raw frames, 0: embeddings
     """
 
     callers: int
@@ -57,11 +62,13 @@ class Load:
     frames: tuple[int, int]
     mixed: bool = False
     rate_per_s: float = 0.0
+    together: int = 1
+    frame_px: int = 0
 
 
 @dataclass(frozen=True)
 class Measured:
-    """samples_per_s: answered; failed: samples that were not; latencies in milliseconds"""
+    """samples_per_s: answered; failed: samples that were not; latencies of calls, in milliseconds"""
 
     samples_per_s: float
     failed: int
@@ -74,13 +81,16 @@ def samples(load: Load, video_dim: int, text_dim: int) -> list[Sample]:
     random = np.random.default_rng(0)
 
     def trajectory(num_frames: int) -> Trajectory:
+        if load.frame_px:
+            frames = random.integers(0, 256, (num_frames, load.frame_px, load.frame_px, 3), np.uint8)
+            return Trajectory(frames=frames, task="put the block in the bowl")
         return Trajectory(
             video_embeddings=random.standard_normal((num_frames, video_dim), np.float32),
             text_embedding=random.standard_normal(text_dim, np.float32),
         )
 
     made: list[Sample] = []
-    for index in range(NUM_SAMPLES):
+    for index in range(NUM_FILMED if load.frame_px else NUM_SAMPLES):
         num_frames = int(random.integers(load.frames[0], load.frames[1] + 1))
         kind = index % 3 if load.mixed and num_frames > 1 else 0
         if kind == 0:
@@ -93,22 +103,27 @@ def samples(load: Load, video_dim: int, text_dim: int) -> list[Sample]:
 
 @asynccontextmanager
 async def connected(way: str, url: str) -> AsyncIterator[Ask]:
-    """A function that asks about one sample."""
+    """A function that asks about samples together."""
     if way in PEERS:
-        async with aiohttp.ClientSession(connector=aiohttp.TCPConnector(limit=0)) as session:
+        async with aiohttp.ClientSession(
+            connector=aiohttp.TCPConnector(limit=0, keepalive_timeout=KEEP_ALIVE_S)
+        ) as session:
             yield PEERS[way](session, url)
         return
     async with AsyncRewardClient(
         url, shared_memory=way == SHARED_MEMORY, max_in_flight=IN_FLIGHT, retry=False
     ) as client:
 
-        async def ask(sample: Sample) -> float:
-            result = await client.score(sample)
-            if isinstance(result, ProgressResult):
-                return result.last_progress
-            return result.preference if isinstance(sample, PreferenceSample) else result.similarity  # type: ignore[union-attr]
+        async def ask(samples: Sequence[Sample]) -> list[float]:
+            return [_score(result) for result in await client.evaluate(samples)]
 
         yield ask
+
+
+def _score(result: Result) -> float:
+    if isinstance(result, ProgressResult):
+        return result.last_progress
+    return result.preference if isinstance(result, PreferenceResult) else result.similarity
 
 
 async def measure(ask: Ask, load: Load, asked: Sequence[Sample]) -> Measured:
@@ -118,18 +133,17 @@ async def measure(ask: Ask, load: Load, asked: Sequence[Sample]) -> Measured:
     started_s = time.perf_counter()
     end_s = started_s + load.seconds
 
-    async def answered(sample: Sample, due_s: float) -> None:
+    async def answered(index: int, due_s: float) -> None:
         nonlocal failed
         try:
-            await ask(sample)
+            await ask([asked[(index * load.together + i) % len(asked)] for i in range(load.together)])
             latencies_s.append(time.perf_counter() - due_s)
-        except Exception:  # noqa: BLE001  whatever it was, the sample has no score, and is counted
-            failed += 1
+        except Exception:  # noqa: BLE001  whatever it was, the samples have no scores, and are counted
+            failed += load.together
 
-    async def call(first: int) -> None:
-        index = first
+    async def call(index: int) -> None:
         while time.perf_counter() < end_s:
-            await answered(asked[index % len(asked)], time.perf_counter())
+            await answered(index, time.perf_counter())
             index += load.callers
 
     if load.rate_per_s:
@@ -138,13 +152,13 @@ async def measure(ask: Ask, load: Load, asked: Sequence[Sample]) -> Measured:
         calls = []
         for index, moment_s in enumerate(due_s.tolist()):
             await asyncio.sleep(max(moment_s - time.perf_counter(), 0))
-            calls.append(asyncio.create_task(answered(asked[index % len(asked)], moment_s)))
+            calls.append(asyncio.create_task(answered(index, moment_s)))
         await asyncio.gather(*calls)
     else:
         await asyncio.gather(*map(call, range(load.callers)))
     took_s = time.perf_counter() - started_s
     p50, p99 = np.percentile(latencies_s, [50, 99]) * MS_PER_S if latencies_s else (float("nan"),) * 2
-    return Measured(len(latencies_s) / took_s, failed, float(p50), float(p99))
+    return Measured(len(latencies_s) * load.together / took_s, failed, float(p50), float(p99))
 
 
 async def main(way: str, url: str, video_dim: int, text_dim: int) -> None:
@@ -154,7 +168,7 @@ async def main(way: str, url: str, video_dim: int, text_dim: int) -> None:
             load = Load(**json.loads(line))
             asked = samples(load, video_dim, text_dim)
             for sample in asked[:3]:  # connections are made, and each type has been answered once
-                await ask(sample)
+                await ask([sample])
             print(json.dumps(asdict(await measure(ask, load, asked))), flush=True)
 
 

@@ -71,7 +71,7 @@ def main() -> None:
 def _computed_ms(url: str, model: str) -> Callable[[], float]:
     """Milliseconds that the checkpoint's models have computed so far; an ensemble's time is that of its parts."""
     client = tritonclient.grpc.InferenceServerClient(url.removeprefix("grpc://"))
-    served = {entry.name for entry in client.get_model_repository_index().models}
+    served = {entry.name for entry in client.get_inference_statistics().model_stats}
     parts = {model, f"{model}_encoder"} & served or {f"{model}_frames"}
 
     def read() -> float:

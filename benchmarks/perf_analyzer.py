@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Triton's own perf_analyzer on a repository: concurrency sweep and Poisson rates, all sample types, mixed lengths.
+"""Triton's own perf_analyzer: concurrency sweep and Poisson rates, all sample types, mixed lengths.
 
-    python benchmarks/perf_analyzer.py --repository model_repository
+    python benchmarks/perf_analyzer.py --size small
 
-The program is that of the tritonclient 2.51.0 wheel, unless one is named. For the ratio the bare engine is measured
-before each run, in this process. In NVIDIA's SDK container the line that each run prints works as it stands, with the
-input file that it names.
+The program is that of the tritonclient 2.51.0 wheel, unless one is named. For the ratios the bare engine is measured
+before each run, in this process, and our own generator (load.py) after it.
 """
 
 from __future__ import annotations
@@ -17,12 +16,14 @@ import shlex
 import subprocess
 import sys
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import torch
-from contestants import BareEngine, Checkpoint
+from bench import RESULTS, checkpoint
+from contestants import BareEngine, Callers
 from load import Load, samples
 from rich.console import Console
 
@@ -31,78 +32,94 @@ from rfm.server.installation import find_installation
 from rfm_client.perf_input import write_perf_analyzer_input
 from rfm_client.show import table
 
-ROOT = Path(__file__).parents[1]
 WHEEL = "tritonclient==2.51.0"
 LIBRARIES = ("libcudart.so.12", "libb64.so.0d")  # the wheel of tritonserver has them under other names
 WINDOW_MS = 3000
 ANY_SPREAD = 999  # per cent between windows; what is wanted is three windows, not their agreement
-KINDS = {"progress, 16 frames": Load(1, 1, (16, 16)), "mixed types, 1 to 16 frames": Load(1, 1, (1, 16), mixed=True)}
+SECONDS = WINDOW_MS / 1e3
+KINDS = {
+    "progress, 16 frames": Load(1, SECONDS, (16, 16)),
+    "all types, 1 to 16 frames": Load(1, SECONDS, (1, 16), mixed=True),
+}
 US_PER_MS = 1e3
 
 
 def main() -> None:
     """Measures, writes a CSV file a run, and prints a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repository", type=Path, default=ROOT / "model_repository")
-    parser.add_argument("--model", default="rfm", help="name under which the checkpoint was exported")
+    parser.add_argument("--size", default="small", choices=["default", "small"], help="of the checkpoint")
     parser.add_argument("--perf-analyzer", type=Path, help="program; else that of the wheel, which is fetched")
     parser.add_argument("--concurrency", type=int, nargs="+", default=[1, 8, 32])
-    parser.add_argument("--poisson", type=float, nargs="*", default=[0.5], help="rates, as shares of the bare engine's")
-    parser.add_argument("--threads", type=int, default=0, help="of torch, in the bare engine; 0: torch's choice")
-    parser.add_argument("--output", type=Path, default=ROOT / "benchmarks" / "results" / "perf_analyzer")
+    parser.add_argument("--poisson", type=float, nargs="*", default=[0.3], help="rates, as shares of the bare engine's")
+    parser.add_argument("--output", type=Path, default=RESULTS / "perf_analyzer")
     arguments = parser.parse_args()
 
-    arguments.output.mkdir(parents=True, exist_ok=True)
-    if arguments.threads:
-        torch.set_num_threads(arguments.threads)
-    version = max((path for path in (arguments.repository / arguments.model).glob("[0-9]*")), key=lambda p: int(p.name))
-    bare = BareEngine(Checkpoint("", version / "checkpoint", arguments.repository))
-    rows = []
+    output = arguments.output / arguments.size
+    output.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix="rfm-perf-") as folder:
         program, environment = _program(arguments.perf_analyzer, Path(folder))
-        with served(arguments.repository, arguments.output / "triton.log") as endpoints:
+        measured = checkpoint(arguments.size, Path(folder), threads=0)
+        bare = BareEngine(measured)
+        rows = []
+        with served(measured.repository, Path(folder) / "triton.log") as endpoints, ExitStack() as stack:
+            callers = Callers("gRPC", endpoints.grpc_url, bare.widths)
+            stack.callback(callers.close)
             for kind, load in KINDS.items():
-                requests = arguments.output / f"{kind.replace(', ', '_').replace(' ', '_')}.json"
+                requests = Path(folder) / f"{_file_name(kind)}.json"
                 write_perf_analyzer_input(requests, samples(load, *bare.widths))
-                command = [
-                    str(program),
-                    "-m",
-                    arguments.model,
-                    "-i",
-                    "grpc",
-                    "-u",
-                    endpoints.grpc_url.partition("://")[2],
-                ]
+                command = [str(program), "-m", "rfm", "-i", "grpc", "-u", endpoints.grpc_url.partition("://")[2]]
                 command += ["--input-data", str(requests), "--async", "-p", str(WINDOW_MS), "--max-trials", "3"]
                 command += ["--stability-percentage", str(ANY_SPREAD)]
-                runs = {f"{n} at a time": ["--concurrency-range", str(n)] for n in arguments.concurrency}
-                for name, options in (*runs.items(), *((f"Poisson, {s:g}", [f"{s}"]) for s in arguments.poisson)):
-                    ceiling = max(bare.measure(_long(load), size).samples_per_s for size in (8, 32))
-                    if name.startswith("Poisson"):
-                        rate = float(options[0]) * ceiling
-                        options = ["--request-rate-range", f"{rate:.0f}", "--request-distribution", "poisson"]
-                    file = arguments.output / f"{requests.stem}_{name.replace(', ', '_').replace(' ', '_')}.csv"
-                    rows.append((kind, name, *_run([*command, *options], file, environment, ceiling)))
-    columns = ("requests", "load", "inferences/s", "of the bare engine", "p50 ms", "p99 ms", "queue ms", "compute ms")
-    Console(width=140).print(table(f"perf_analyzer, {arguments.repository}", columns, rows))
+                for name, options, asked in _runs(load, bare, arguments.concurrency, arguments.poisson):
+                    ceiling = max(bare.measure(load, size).samples_per_s for size in (8, 32))
+                    file = output / f"{_file_name(kind)}_{_file_name(name)}.csv"
+                    of_run = _run([*command, *options], file, environment)
+                    rows.append((kind, name, *_cells(of_run, ceiling, callers.measure(asked).samples_per_s)))
+    columns = (
+        "requests",
+        "load",
+        "inferences/s",
+        "of the bare engine",
+        "of our generator",
+        *("p50 ms", "p99 ms", "queue ms", "compute ms"),
+    )
+    console = Console(width=150, record=True)
+    console.print(table(f"perf_analyzer, {arguments.size} checkpoint", columns, rows))
+    (output / "summary.txt").write_text(console.export_text())
 
 
-def _long(load: Load) -> Load:
-    return Load(load.callers, WINDOW_MS / 1e3, load.frames, load.mixed)
+def _runs(
+    load: Load, bare: BareEngine, concurrency: Sequence[int], poisson: Sequence[float]
+) -> Iterator[tuple[str, list[str], Load]]:
+    """Name, perf_analyzer's options and our generator's load of each."""
+    for number in concurrency:
+        yield f"{number} at a time", ["--concurrency-range", str(number)], replace(load, callers=number)
+    for share in poisson:
+        rate = share * max(bare.measure(load, size).samples_per_s for size in (8, 32))
+        options = ["--request-rate-range", f"{rate:.0f}", "--request-distribution", "poisson"]
+        yield f"Poisson, {share:g}", options, replace(load, callers=0, rate_per_s=rate)
 
 
-def _run(command: list[str], file: Path, environment: Mapping[str, str], ceiling: float) -> tuple[str, ...]:
-    """A row of the table."""
+def _file_name(text: str) -> str:
+    return text.replace(", ", "_").replace(" ", "_")
+
+
+def _run(command: Sequence[str], file: Path, environment: Mapping[str, str]) -> Mapping[str, str]:
+    """The line of perf_analyzer's CSV file."""
     words = [*command, "-f", str(file)]
     print(shlex.join(words), file=sys.stderr)
     done = subprocess.run(words, env={**os.environ, **environment}, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"perf_analyzer: expected to measure, got {done.stdout[-1000:]}{done.stderr[-1000:]}")
-    measured = next(csv.DictReader(file.open()))
+    return next(csv.DictReader(file.open()))
+
+
+def _cells(measured: Mapping[str, str], ceiling: float, by_our_generator: float) -> tuple[str, ...]:
     rate = float(measured["Inferences/Second"])
     compute_us = sum(float(measured[f"Server Compute {part}"]) for part in ("Input", "Infer", "Output"))
     times_us = [float(measured[name]) for name in ("p50 latency", "p99 latency", "Server Queue")]
-    return (f"{rate:.0f}", f"{rate / ceiling:.2f}", *(f"{us / US_PER_MS:.1f}" for us in (*times_us, compute_us)))
+    ratios = (rate / ceiling, rate / by_our_generator)
+    return (f"{rate:.0f}", *(f"{r:.2f}" for r in ratios), *(f"{us / US_PER_MS:.1f}" for us in (*times_us, compute_us)))
 
 
 def _program(given: Path | None, folder: Path) -> tuple[Path, dict[str, str]]:

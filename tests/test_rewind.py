@@ -354,3 +354,14 @@ def test_the_gpu_gives_the_numbers_of_the_cpu(config: RewindConfig) -> None:
     on_cpu, on_gpu = (engine_of(build(config), device=device).evaluate(samples) for device in ("cpu", "cuda"))
     for left, right in zip(on_cpu, on_gpu, strict=True):
         np.testing.assert_allclose(numbers(left), numbers(right), rtol=0, atol=1e-4)
+
+
+def test_half_precision_scores_are_near_those_of_float32() -> None:
+    """ReWiND in bfloat16, where somebody asks for it."""
+    checkpoint = goldens.config("c1_t1_disc10").checkpoint
+    in_float32, in_bfloat16 = (Engine.from_checkpoint(checkpoint, dtype=dtype) for dtype in (None, torch.bfloat16))
+    samples = [ProgressSample(random_trajectory(seed, 1 + seed)) for seed in range(8)]
+    for exact, near in zip(in_float32.evaluate(samples), in_bfloat16.evaluate(samples), strict=True):
+        assert isinstance(exact, ProgressResult) and isinstance(near, ProgressResult)
+        assert near.progress.dtype == np.float32
+        assert 0 < np.abs(near.progress - exact.progress).max() < 0.02

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""How a caller asks each peer about one sample: functions for a load generator.
+"""How a caller asks each peer: functions for a load generator.
 
-Each factory takes a session and the server's address, and gives a coroutine function from a sample of embeddings to
-the progress at its last frame, its preference or its similarity. Failures are raised.
+Each factory takes a session and the server's address, and gives a coroutine function from samples of embeddings, which
+are asked about together, to the progress at the last frame, the preference or the similarity of each. Failures are
+raised.
 """
 
 from __future__ import annotations
 
+import asyncio
 import io
 import json
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import aiohttp
@@ -18,7 +20,7 @@ import numpy as np
 
 from rfm_client import PreferenceSample, ProgressSample, Sample, Trajectory
 
-Ask: TypeAlias = Callable[[Sample], Awaitable[float]]
+Ask: TypeAlias = Callable[[Sequence[Sample]], Awaitable[list[float]]]
 
 _MSGPACK = {"Content-Type": "application/msgpack"}
 
@@ -26,15 +28,11 @@ _MSGPACK = {"Content-Type": "application/msgpack"}
 def fastapi_json(session: aiohttp.ClientSession, base_url: str) -> Ask:
     """Asks the FastAPI evaluation server, or the gateway, with numbers as JSON."""
 
-    async def ask(sample: Sample) -> float:
-        fields = {
-            name: {"video_embeddings": _video(trajectory).tolist(), "text_embedding": _text(trajectory).tolist()}
-            for name, trajectory in _named(sample).items()
-        }
-        body = {"samples": [{"sample_type": _kind(sample), **fields}]}
-        async with session.post(f"{base_url}/evaluate_batch", json=body) as answer:
+    async def ask(samples: Sequence[Sample]) -> list[float]:
+        described = [{"sample_type": _kind(sample), **_as_lists(sample)} for sample in samples]
+        async with session.post(f"{base_url}/evaluate_batch", json={"samples": described}) as answer:
             answer.raise_for_status()
-            return _score(sample, await answer.json())
+            return _scores(samples, await answer.json())
 
     return ask
 
@@ -42,10 +40,10 @@ def fastapi_json(session: aiohttp.ClientSession, base_url: str) -> Ask:
 def fastapi_npy(session: aiohttp.ClientSession, base_url: str) -> Ask:
     """Asks the FastAPI evaluation server with .npy files in a form."""
 
-    async def ask(sample: Sample) -> float:
-        async with session.post(f"{base_url}/evaluate_batch_npy", data=_form(sample)) as answer:
+    async def ask(samples: Sequence[Sample]) -> list[float]:
+        async with session.post(f"{base_url}/evaluate_batch_npy", data=_form(samples)) as answer:
             answer.raise_for_status()
-            return _score(sample, await answer.json())
+            return _scores(samples, await answer.json())
 
     return ask
 
@@ -64,9 +62,9 @@ def mosec(session: aiohttp.ClientSession, base_url: str) -> Ask:
 
 
 def _by_msgpack(session: aiohttp.ClientSession, url: str) -> Ask:
-    """Asks with a message as ``message`` describes it."""
+    """Asks with a message a sample, as ``message`` describes it."""
 
-    async def ask(sample: Sample) -> float:
+    async def ask_one(sample: Sample) -> float:
         videos = [_video(trajectory) for trajectory in sample.trajectories]
         message = {
             "type": _kind(sample),
@@ -82,6 +80,9 @@ def _by_msgpack(session: aiohttp.ClientSession, url: str) -> Ask:
         if isinstance(sample, ProgressSample):
             return float(np.frombuffer(scores["progress"][0], np.float32)[-1])
         return float(scores["query"])
+
+    async def ask(samples: Sequence[Sample]) -> list[float]:
+        return list(await asyncio.gather(*map(ask_one, samples)))
 
     return ask
 
@@ -111,26 +112,40 @@ def _text(trajectory: Trajectory) -> np.ndarray:
     return trajectory.text_embedding
 
 
-def _form(sample: Sample) -> aiohttp.FormData:
+def _arrays(sample: Sample) -> Iterator[tuple[str, str, np.ndarray]]:
+    """Each array, with the names of its trajectory and of its own."""
+    for name, trajectory in _named(sample).items():
+        yield name, "video_embeddings", _video(trajectory)
+        yield name, "text_embedding", _text(trajectory)
+
+
+def _as_lists(sample: Sample) -> dict[str, dict[str, Any]]:
+    lists: dict[str, dict[str, Any]] = {}
+    for name, kind, array in _arrays(sample):
+        lists.setdefault(name, {})[kind] = array.tolist()
+    return lists
+
+
+def _form(samples: Sequence[Sample]) -> aiohttp.FormData:
     """A request of the multipart endpoint."""
     form = aiohttp.FormData()
-    described: dict[str, Any] = {"sample_type": _kind(sample)}
-    for name, trajectory in _named(sample).items():
-        described[name] = {}
-        for kind, array in (("video_embeddings", _video(trajectory)), ("text_embedding", _text(trajectory))):
-            key = f"sample_0_{name}_{kind}"
+    for index, sample in enumerate(samples):
+        described: dict[str, Any] = {"sample_type": _kind(sample)}
+        for name, kind, array in _arrays(sample):
+            key = f"sample_{index}_{name}_{kind}"
             file = io.BytesIO()
             np.save(file, array)
             form.add_field(key, file.getvalue(), filename=f"{key}.npy", content_type="application/octet-stream")
-            described[name][kind] = {"__numpy_file__": key}
-    form.add_field("sample_0", json.dumps(described))
+            described.setdefault(name, {})[kind] = {"__numpy_file__": key}
+        form.add_field(f"sample_{index}", json.dumps(described))
     return form
 
 
-def _score(sample: Sample, outputs: Mapping[str, Any]) -> float:
-    """From an answer of the evaluation server."""
-    if isinstance(sample, ProgressSample):
-        return float(outputs["outputs_progress"]["progress_pred"][0][-1])
-    if isinstance(sample, PreferenceSample):
-        return float(outputs["outputs_preference"]["prediction_probs"][0])
-    return float(outputs["outputs_similarity"]["sim_score_ref_sim"][0])
+def _scores(samples: Sequence[Sample], outputs: Mapping[str, Any]) -> list[float]:
+    """From an answer of the evaluation server, which has the samples of each type in a list of their own."""
+    told = {
+        "progress": (values[-1] for values in (outputs["outputs_progress"] or {}).get("progress_pred", ())),
+        "preference": iter((outputs["outputs_preference"] or {}).get("prediction_probs", ())),
+        "similarity": iter((outputs["outputs_similarity"] or {}).get("sim_score_ref_sim", ())),
+    }
+    return [float(next(told[_kind(sample)])) for sample in samples]

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: MIT
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import goldens
+import pytest
+from conftest import random_trajectory, serve_config
+from typer.testing import CliRunner
+
+import rfm_export
+from rfm.cli import app
+from rfm.config import ServeConfig
+from rfm.demo import served
+from rfm_client import RewardClient
+from rfm_export import ExportError, tune
+from rfm_export.tune import Setting, Sweep, Trial, quickest, write_setting
+
+ONE, TWO, FOUR = Setting(1, 4, 64), Setting(2, 2, 64), Setting(4, 1, 64)
+
+
+@pytest.fixture(scope="module")
+def repository(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("tuned") / "model_repository"
+    config = goldens.config("c1_t1_disc10")
+    rfm_export.export(config.checkpoint, folder, serve_config(config))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("trials", "expected"),
+    [
+        ([Trial(ONE, 100.0, 7.0), Trial(TWO, 200.0, 9.0)], TWO),
+        ([Trial(ONE, 200.0, 9.0), Trial(TWO, 100.0, 7.0)], ONE),
+        ([Trial(ONE, 98.0, 7.0), Trial(TWO, 100.0, 9.0)], ONE),
+        ([Trial(ONE, 90.0, 7.0), Trial(TWO, 98.0, 8.0), Trial(FOUR, 100.0, 9.0)], TWO),
+    ],
+    ids=["faster", "faster with fewer", "as fast, and one caller waits less", "of those that are as fast"],
+)
+def test_the_quickest_of_the_fastest_settings_is_best(trials: list[Trial], expected: Setting) -> None:
+    assert quickest(trials).setting == expected
+
+
+def test_every_setting_is_served_and_measured(repository: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tune, "BATCH_SIZES", (8, 64))
+    before = {file: file.read_bytes() for file in repository.rglob("*") if file.is_file()}
+    told: list[str] = []
+    best = Sweep(repository, "rfm", callers=4, seconds=0.3, rounds=1, tell=told.append).best()
+    cores = len(os.sched_getaffinity(0))
+    settings = [Setting(count, cores // count, 64) for count in (1, 2, 4, 8, 16, 32, 64) if count <= cores]
+    assert best in [*settings, *(Setting(s.instances, s.torch_threads, 8) for s in settings)]
+    assert len(told) == len(settings) + 1  # of the two batch sizes one is the repository's
+    assert {file: file.read_bytes() for file in repository.rglob("*") if file.is_file()} == before
+
+
+def test_the_command_writes_what_export_reads(
+    repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Sweep, "best", lambda self: TWO)  # measured above
+    config, output = tmp_path / "serve.yaml", tmp_path / "tuned.yaml"
+    config.write_text("num_gpus: 0\ninstances: 1\n")
+    words = ["tune", "--repository", str(repository), "--config", str(config), "--output", str(output)]
+    assert CliRunner().invoke(app, words).exit_code == 0
+    expected = ServeConfig(num_gpus=0, instances=2, torch_threads=2, batch_size=64)
+    assert ServeConfig.from_yaml(output) == expected
+
+
+def test_without_a_configuration_only_the_measured_keys_are_written(tmp_path: Path) -> None:
+    write_setting(FOUR, tmp_path / "tuned.yaml", None)
+    assert ServeConfig.from_yaml(tmp_path / "tuned.yaml") == ServeConfig(instances=4, torch_threads=1, batch_size=64)
+
+
+def test_what_is_no_repository_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match=r"expected an exported repository, got no model of one"):
+        Sweep(tmp_path, "rfm").best()
+
+
+def test_two_instances_score_as_one(repository: Path, tmp_path: Path) -> None:
+    config = goldens.config("c1_t1_disc10")
+    rfm_export.export(config.checkpoint, tmp_path / "two", replace(serve_config(config), instances=2, torch_threads=0))
+    trajectories = [random_trajectory(seed, 5) for seed in range(8)]
+    answers = []
+    for folder in (repository, tmp_path / "two"):
+        with served(folder, tmp_path / "triton.log") as endpoints, RewardClient(endpoints.grpc_url) as client:
+            answers.append([client.progress(trajectory).last_progress for trajectory in trajectories])
+    assert answers[0] == pytest.approx(answers[1], abs=1e-5)
