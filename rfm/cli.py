@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,13 +14,17 @@ from rich.console import Console
 
 from rfm.checkpoint import CheckpointError
 from rfm.config import ConfigError, ServeConfig
+from rfm.server.admin_key import AdminKeyError, take_key
 from rfm.server.installation import ServerStartError, find_installation
 from rfm.server.process import Endpoints, TritonServer
+from rfm.server.supervisor import Supervisor
 from rfm_client import RewardError
 from rfm_client.gateway.command import gateway, gateway_command
+from rfm_export.models_command import AdminKeyFile
+from rfm_export.models_command import app as models_app
 
 EXIT_FAILED = 1
-WHEEL_WARNING = "the wheel's Triton 2.51 has known remote vulnerabilities and open admin APIs: use NVIDIA's container"
+ACCEPTED_WARNING = "a Triton with known remote vulnerabilities is accepted: use NVIDIA's container 26.07 or newer"
 
 app = typer.Typer(
     name="rfm",
@@ -87,9 +92,31 @@ def serve(
     gateway_port: Annotated[
         int | None, typer.Option(help="Port of the FastAPI evaluation server's endpoints, too (see rfm gateway).")
     ] = None,
+    status_port: Annotated[
+        int | None, typer.Option(help="Port that tells of rfm serve itself: /live, /ready and /metrics.")
+    ] = None,
+    admin_key_file: AdminKeyFile = None,
+    grpc_certificate: Annotated[
+        str | None, typer.Option(help="Serve gRPC with TLS, by this certificate (PEM); HTTP then only on 127.0.0.1.")
+    ] = None,
+    grpc_key: Annotated[str | None, typer.Option(help="The certificate's key (PEM).")] = None,
+    grpc_client_ca: Annotated[
+        str | None, typer.Option(help="Authorities (PEM) of gRPC's clients, which then need a certificate.")
+    ] = None,
+    accept_known_vulnerabilities: Annotated[
+        bool,
+        typer.Option("--accept-known-vulnerabilities", help="Let others reach a Triton that is known to have some."),
+    ] = False,
     tritonserver: TritonPath = None,
+    more_arguments: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="-- --OPTION=VALUE...", help="More of tritonserver's options.", show_default=False),
+    ] = None,
 ) -> None:
-    """Run tritonserver on a model repository until it is told to stop."""
+    """Run tritonserver on a model repository until it is told to stop.
+
+    Its models, logging and tracing are changed with the admin key alone; without one there is none that anybody knows.
+    """
     settings = _serve_config(
         config,
         server_url=host,
@@ -97,25 +124,76 @@ def serve(
         grpc_port=grpc_port,
         metrics_port=metrics_port,
         gateway_port=gateway_port,
+        status_port=status_port,
+        grpc_certificate=grpc_certificate,
+        grpc_key=grpc_key,
+        grpc_client_ca=grpc_client_ca,
     )
     try:
+        if accept_known_vulnerabilities and not settings.is_loopback:
+            typer.echo(f"rfm: warning: {settings.host} is no loopback address, and {ACCEPTED_WARNING}", err=True)
         installation = find_installation(tritonserver)
-        if installation.wheel is not None and not settings.is_loopback:
-            typer.echo(f"rfm: warning: {settings.host} is no loopback address, and {WHEEL_WARNING}", err=True)
         endpoints = Endpoints.of(settings)
         companion = None
         if settings.gateway_port is not None:
             companion = gateway_command(
-                endpoints.grpc_url, endpoints.metrics_url, settings.name, settings.host, settings.gateway_port
+                endpoints.grpc_url if endpoints.grpc_tls is None else endpoints.http_url,  # it needs no certificate
+                endpoints.metrics_url,
+                settings.name,
+                settings.host,
+                settings.gateway_port,
             )
-        server = TritonServer(repository, endpoints, installation, http_threads=settings.max_workers)
-        status = server.run(companion)
-    except ServerStartError as error:
+        server = TritonServer(
+            repository,
+            endpoints,
+            installation,
+            http_threads=settings.max_workers,
+            admin_key=take_key(admin_key_file, os.environ),
+            accepts_known_vulnerabilities=accept_known_vulnerabilities,
+            more_arguments=more_arguments or (),
+            ends_with_parent=True,
+        )
+        supervisor = Supervisor(
+            server,
+            gateway=companion,
+            status_port=settings.status_port,
+            canary_s=settings.canary_s,
+            hang_s=settings.hang_s,
+            say=lambda line: typer.echo(f"rfm: {line}", err=True),
+        )
+        status = supervisor.run()
+    except (AdminKeyError, ServerStartError) as error:
         _fail(str(error))
     raise typer.Exit(status)
 
 
+@app.command()
+def tune(
+    repository: Repository,
+    output: Annotated[Path, typer.Option(help="YAML file for the best settings, for rfm export --config.")],
+    config: Config = None,
+    callers: Annotated[int, typer.Option(min=1, help="At a time, with one sample each.")] = 32,
+    frames: Annotated[bool, typer.Option("--frames", help="Send raw frames instead of embeddings.")] = False,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement.")] = 3.0,
+    rounds: Annotated[int, typer.Option(min=1, help="How often each setting is measured.")] = 3,
+    tritonserver: TritonPath = None,
+) -> None:
+    """Try how many instances and threads, and what batches, serve a repository best on this machine."""
+    from rfm_export import ExportError
+    from rfm_export.tune import Sweep, write_setting
+
+    name = _serve_config(config).name
+    sweep = Sweep(repository, name, callers, seconds, rounds, frames, tritonserver, typer.echo)
+    try:
+        setting = sweep.best()
+        write_setting(setting, output, config)
+    except (ExportError, ServerStartError, RewardError, OSError) as error:
+        _fail(str(error))
+    typer.echo(f"{output}: {setting}")
+
+
 app.command()(gateway)
+app.add_typer(models_app, name="models")
 
 
 @app.command()

@@ -3,13 +3,15 @@
 
 from __future__ import annotations
 
+import ipaddress
+import re
 import types
 import typing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import yaml
+from rfm.plain_yaml import read_yaml
 
 if TYPE_CHECKING:
     import torch
@@ -17,7 +19,10 @@ if TYPE_CHECKING:
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_TOKEN_BUDGET = 16_384
 MAX_PORT = 65_535
-_PORTS = ("server_port", "grpc_port", "metrics_port", "gateway_port")
+MAX_OF_A_MACHINE = 4096  # GPUs, instances, threads
+MAX_INT32 = 2**31 - 1
+MAX_NAME = 100  # characters; it becomes the name of a folder
+_PORTS = ("server_port", "grpc_port", "metrics_port", "gateway_port", "status_port")
 _DTYPES = ("float32", "bfloat16", "float16")
 
 
@@ -43,11 +48,21 @@ class ServeConfig:
     name: of the model in the repository; raw frames are scored by ``<name>_frames``
     image_encoder, text_encoder: folders or Hugging Face ids of a ReWiND checkpoint's encoders
     base_model: folder or id of a vision-language checkpoint's base model; else the one that the checkpoint names
-    dtype: float32, bfloat16 or float16 of a vision-language network; null: the checkpoint's on a GPU, else float32
+    dtype: float32, bfloat16 or float16 of the network (not of ReWiND's encoders); null: float32, and a vision-language
+        checkpoint's own on a GPU
     token_budget: the most tokens, padding included, of one forward pass
-    torch_threads: CPU threads of each model instance; 0: torch's choice
+    instances: of each model, on each GPU or on the CPU; ``rfm tune`` measures what serves fastest
+    torch_threads: CPU threads of each model instance; 0: on the CPU all instances of a model share its cores
     grpc_port, metrics_port: Triton's other two ports
     gateway_port: of the FastAPI evaluation server's endpoints before it; null: there are none
+    status_port: of what ``rfm serve`` tells of itself; null: there is none
+    max_queue_size: requests that may wait for a model; more are refused at once
+    queue_timeout_ms: the longest that a request may wait; then it is refused. A request may ask for less
+    grpc_certificate, grpc_key: files (PEM) to serve gRPC with TLS; HTTP, which Triton cannot encrypt, is then open on
+        127.0.0.1 alone
+    grpc_client_ca: file (PEM) of who may vouch for gRPC's clients, which then need a certificate
+    canary_s: how often ``rfm serve`` asks each model whether it answers
+    hang_s: how long a model may work on one batch, or answer nobody, before ``rfm serve`` loads it anew
     """
 
     model_path: str | None = None
@@ -62,30 +77,48 @@ class ServeConfig:
     base_model: str | None = None
     dtype: str | None = None
     token_budget: int = DEFAULT_TOKEN_BUDGET
+    instances: int = 1
     torch_threads: int = 0
     grpc_port: int = 8001
     metrics_port: int = 8002
     gateway_port: int | None = None
+    status_port: int | None = None
+    max_queue_size: int = 1024
+    queue_timeout_ms: int = 5000
+    grpc_certificate: str | None = None
+    grpc_key: str | None = None
+    grpc_client_ca: str | None = None
+    canary_s: int = 2
+    hang_s: int = 30
 
     def __post_init__(self) -> None:
-        _at_least(1, self, "batch_size", "max_workers", "token_budget", *_PORTS)
+        _at_least(1, self, "batch_size", "max_workers", "token_budget", "instances", *_PORTS)
+        _at_least(1, self, "max_queue_size", "queue_timeout_ms", "canary_s", "hang_s")
         _at_least(0, self, "num_gpus", "torch_threads")
+        _at_most(MAX_OF_A_MACHINE, self, "num_gpus", "instances", "torch_threads", "max_workers")
+        _at_most(MAX_INT32, self, "batch_size", "token_budget", "max_queue_size", "queue_timeout_ms")
         if self.dtype not in (None, *_DTYPES):
             raise ConfigError(f"dtype: expected one of {', '.join(_DTYPES)} or null, got {self.dtype!r}")
         ports = {name: getattr(self, name) for name in _PORTS if getattr(self, name) is not None}
         if max(ports.values()) > MAX_PORT or len(set(ports.values())) < len(ports):
             raise ConfigError(f"ports: expected different ones up to {MAX_PORT}, got {ports}")
+        if (self.grpc_certificate is None) != (self.grpc_key is None):
+            raise ConfigError("grpc_certificate, grpc_key: expected both or none, got one")
+        if self.grpc_client_ca is not None and self.grpc_certificate is None:
+            raise ConfigError("grpc_client_ca: expected with grpc_certificate and grpc_key, got it alone")
         if ":" in self.host:
             raise ConfigError(f"server_url: expected an address without port (server_port), got {self.server_url!r}")
-        if not self.name.replace("_", "").replace("-", "").isalnum():
-            raise ConfigError(f"name: expected letters, digits, _ and -, got {self.name!r}")
+        if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_-]*", self.name):
+            raise ConfigError(f"name: expected letters, digits, _ and -, got {self.name!r:.200}")
+        if len(self.name) > MAX_NAME:
+            raise ConfigError(f"name: expected at most {MAX_NAME} characters, got {len(self.name)}")
 
     @classmethod
     def from_yaml(cls, file: str | Path) -> ServeConfig:
         """Reads the file. Raises ConfigError for what is not YAML, unknown keys and values of the wrong type."""
         try:
-            content = yaml.safe_load(Path(file).read_text())
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            content = read_yaml(Path(file))
+        except (OSError, ValueError) as error:
             raise ConfigError(f"{file}: expected a YAML file, got {error}") from error
         if content is None:
             content = {}
@@ -96,7 +129,7 @@ class ServeConfig:
             if key not in types_of:
                 raise ConfigError(f"{file}: {key}: expected one of {', '.join(types_of)}, got an unknown key")
             if not _fits(value, types_of[key]):
-                raise ConfigError(f"{file}: {key}: expected {_name(types_of[key])}, got {value!r}")
+                raise ConfigError(f"{file}: {key}: expected {_name(types_of[key])}, got {value!r:.200}")
         try:
             return cls(**content)
         except ConfigError as error:
@@ -119,7 +152,15 @@ class ServeConfig:
     @property
     def is_loopback(self) -> bool:
         """Whether only this machine can reach it."""
-        return self.host.startswith("127.")
+        return is_loopback(self.host)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address is of this machine alone; a name is not."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def _at_least(least: int, config: ServeConfig, *keys: str) -> None:
@@ -127,6 +168,13 @@ def _at_least(least: int, config: ServeConfig, *keys: str) -> None:
         value = getattr(config, key)
         if value is not None and value < least:
             raise ConfigError(f"{key}: expected at least {least}, got {value}")
+
+
+def _at_most(most: int, config: ServeConfig, *keys: str) -> None:
+    for key in keys:
+        value = getattr(config, key)
+        if value is not None and value > most:
+            raise ConfigError(f"{key}: expected at most {most}, got {value}")
 
 
 def _fits(value: Any, expected: Any) -> bool:

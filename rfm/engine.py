@@ -16,6 +16,7 @@ import torch
 
 from rfm import checkpoint as checkpoints
 from rfm.config import DEFAULT_TOKEN_BUDGET
+from rfm.execution import Execution
 from rfm.families.rewind import RewindFamily
 from rfm.families.vlm import VlmFamily
 from rfm.families.vqa import VqaFamily
@@ -53,7 +54,6 @@ class Engine:
     def __init__(self, family: Family[Any, Any], *, token_budget: int = DEFAULT_TOKEN_BUDGET) -> None:
         self.family = family
         self.token_budget = token_budget
-        self.out_of_memory_count = 0
 
     @classmethod
     def from_checkpoint(
@@ -70,7 +70,7 @@ class Engine:
 
         encoders: of a ReWiND checkpoint, for samples of raw frames
         base_model: of a vision-language checkpoint, as in ``rfm.checkpoint.load``
-        dtype: of a vision-language network; None: the checkpoint's on a GPU, float32 on the CPU
+        dtype: of the network; None: float32, and a vision-language checkpoint's own on a GPU
         """
         folder = checkpoints.find(source)
         own = folder / PROCESSOR_FOLDER
@@ -101,20 +101,23 @@ class Engine:
         """
         on = torch.device(device)
         if isinstance(checkpoint, checkpoints.RewindCheckpoint):
-            return cls(RewindFamily(checkpoint.build(), encoders=encoders, device=on), token_budget=token_budget)
+            family = RewindFamily(checkpoint.build(), encoders=encoders, device=on, dtype=dtype or torch.float32)
+            return cls(family, token_budget=token_budget)
         if dtype is None and on.type == "cpu":
             dtype = torch.float32
-        family = VqaFamily if checkpoint.config.generates_text else VlmFamily
+        vlm_family = VqaFamily if checkpoint.config.generates_text else VlmFamily
         processor = processor or checkpoint.config.base_model_id
-        return cls(family.of(checkpoint, processor, on, dtype), token_budget=token_budget)
+        return cls(vlm_family.of(checkpoint, processor, on, dtype), token_budget=token_budget)
 
-    def evaluate(self, samples: Sequence[Sample]) -> list[Outcome]:
+    def evaluate(self, samples: Sequence[Sample], execution: Execution | None = None) -> list[Outcome]:
         """The result of each sample, or the error of one that has none; neighbours make no difference.
 
+        execution: what it took is added to it
         InvalidSampleError: this checkpoint cannot score the sample.
         InferenceFailedError: the network gave something that is no number, or the sample does not fit in memory.
         """
         started_s = time.perf_counter()
+        execution = execution or Execution()
         outcomes: dict[int, Outcome] = {}
         rows: list[Any] = []
         rows_of: dict[int, slice] = {}
@@ -125,8 +128,11 @@ class Engine:
                 continue
             rows_of[index] = slice(len(rows), len(rows) + len(sample_rows))
             rows += sample_rows
-        scores, forward_s = self._scores(rows)
-        timing = BatchTiming((time.perf_counter() - started_s - forward_s) * 1e3, forward_s * 1e3)
+        scores, forward_s = self._scores(rows, execution)
+        collate_s = time.perf_counter() - started_s - forward_s
+        execution.collate_s += collate_s
+        execution.forward_s += forward_s
+        timing = BatchTiming(collate_s * 1e3, forward_s * 1e3)
         for index, of_sample in rows_of.items():
             outcomes[index] = _outcome(samples[index], scores[of_sample], timing)
         return [outcomes[index] for index in range(len(samples))]
@@ -138,13 +144,13 @@ class Engine:
         expected = f"at most {self.token_budget} tokens (token_budget of this server)"
         return InvalidSampleError.at("num_frames", expected, f"{longest} tokens")
 
-    def _scores(self, rows: Sequence[Any]) -> tuple[list[RowScores | RewardError], float]:
+    def _scores(self, rows: Sequence[Any], execution: Execution) -> tuple[list[RowScores | RewardError], float]:
         """Each row's scores, and the seconds spent in forward passes. The next batch is collated meanwhile."""
         scores: dict[int, RowScores | RewardError] = {}
         forward_s = 0.0
         for part, batch in self._collated(rows, list(self._micro_batches(rows))):
             started_s = time.perf_counter()
-            scores.update(zip(part, self._score([rows[i] for i in part], batch), strict=True))
+            scores.update(zip(part, self._score([rows[i] for i in part], batch, execution), strict=True))
             forward_s += time.perf_counter() - started_s
         return [scores[index] for index in range(len(rows))], forward_s
 
@@ -160,19 +166,22 @@ class Engine:
                 yield part, batch
                 batch = coming.result() if coming is not None else None
 
-    def _score(self, rows: Sequence[Any], batch: Any) -> Sequence[RowScores | RewardError]:
+    def _score(self, rows: Sequence[Any], batch: Any, execution: Execution) -> Sequence[RowScores | RewardError]:
         """One forward; out of memory, its halves; a row that does not fit alone is an error of its own."""
         try:
-            return self.family.score(rows, batch)
+            scores = self.family.score(rows, batch)
+            execution.add_forward(*self.family.occupancy(batch))
+            return scores
         except torch.OutOfMemoryError:
-            self.out_of_memory_count += 1
-            _log.warning("out of memory with %d rows (%d times so far)", len(rows), self.out_of_memory_count)
+            execution.out_of_memory_count += 1
+            _log.warning("out of memory with %d rows", len(rows))
         if torch.cuda.is_available():
             torch.cuda.empty_cache()
         if len(rows) == 1:
             return [InferenceFailedError("the sample does not fit in the device's memory")]
         half = len(rows) // 2
-        return [s for part in (rows[:half], rows[half:]) for s in self._score(part, self.family.collate(part))]
+        halves = (rows[:half], rows[half:])
+        return [s for part in halves for s in self._score(part, self.family.collate(part), execution)]
 
     def _micro_batches(self, rows: Sequence[Any]) -> Iterator[list[int]]:
         """Indices of the rows of each forward: one kind, similar lengths, within the token budget."""

@@ -60,6 +60,9 @@ class Family(Protocol[Row, Batch]):
     def collate(self, rows: Sequence[Row]) -> Batch:
         """One batch, on the CPU; may run while the device computes."""
 
+    def occupancy(self, batch: Batch) -> tuple[int, int]:
+        """Tokens of the batch's rows, and of its forward pass, padding included."""
+
     def score(self, rows: Sequence[Row], batch: Batch) -> list[RowScores | RewardError]:
         """One forward pass, read back to the CPU; an error for a row that has no scores."""
 

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -140,7 +141,7 @@ def test_a_bad_sample_fails_alone_or_is_raised_with_its_place(served: Served, pr
     with served.client(protocol) as client:
         outcomes = client.evaluate([*samples, too_long, "a string"], return_errors=True)  # type: ignore[list-item]
         good = client.evaluate(samples)
-        with pytest.raises(InvalidSampleError, match=r"^samples\[5\]\.num_frames: expected at most 16 .*, got 20$"):
+        with pytest.raises(InvalidSampleError, match=r"^samples\[5\]\.num_frames: expected at most 16 .*, got 20 \(request \S+\)$"):
             client.evaluate([*samples, too_long])
     for outcome, expected in zip(outcomes[:5], good, strict=True):
         assert_same(outcome, expected)
@@ -232,11 +233,11 @@ def test_requests_in_flight_are_bounded(served: Served) -> None:
             self.url = self.inner.url
             self.now = self.most = 0
 
-        async def infer(self, *arguments: object) -> object:
+        async def infer(self, *arguments: object, **options: object) -> object:
             self.now += 1
             self.most = max(self.most, self.now)
             try:
-                return await self.inner.infer(*arguments)  # type: ignore[arg-type]
+                return await self.inner.infer(*arguments, **options)  # type: ignore[arg-type]
             finally:
                 self.now -= 1
 
@@ -429,9 +430,9 @@ def test_submitting_while_it_is_closed_leaves_no_future_open(served: Served) -> 
 
 def test_embeddings_of_another_width_are_told_in_our_words(served: Served, protocol: str) -> None:
     with served.client(protocol) as client:
-        with pytest.raises(InvalidSampleError, match=r"^video_embeddings: expected \[-1,768\], got \[2,5\]$"):
+        with pytest.raises(InvalidSampleError, match=r"^video_embeddings: expected \[-1,768\], got \[2,5\] \(request \S+\)$"):
             client.progress(random_trajectory(0, 2, 5, 384))
-        with pytest.raises(InvalidSampleError, match=r"^text_embedding: expected \[384\], got \[7\]$"):
+        with pytest.raises(InvalidSampleError, match=r"^text_embedding: expected \[384\], got \[7\] \(request \S+\)$"):
             client.progress(random_trajectory(0, 2, 768, 7))
 
 
@@ -497,8 +498,8 @@ def test_a_score_that_is_missing_fails_alone(served: Served) -> None:
     class Losing(GrpcTransport):
         """A real transport that loses the progress of one sample in answers to several."""
 
-        async def infer(self, model: str, inputs: wire.Tensors, *arguments: object) -> Answer:
-            answer = await super().infer(model, inputs, *arguments)  # type: ignore[arg-type]
+        async def infer(self, model: str, inputs: wire.Tensors, *rest: Any, **options: Any) -> Answer:
+            answer = await super().infer(model, inputs, *rest, **options)
             lost = inputs[wire.VIDEO_EMBEDDINGS].sum(axis=(1, 2)) == marked
             progress = np.where(lost[:, None], np.nan, answer.tensors[wire.PROGRESS])
             return replace(answer, tensors={**answer.tensors, wire.PROGRESS: progress})

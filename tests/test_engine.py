@@ -36,6 +36,9 @@ class Pipelined:
     def collate(self, rows: Sequence[int]) -> Any:
         self.collated[rows[0]].set()
 
+    def occupancy(self, batch: Any) -> tuple[int, int]:
+        return 1, 1
+
     def score(self, rows: Sequence[int], batch: Any) -> list[RowScores | RewardError]:
         if rows[0] + 1 < len(self.collated):
             assert self.collated[rows[0] + 1].wait(WAIT_S)

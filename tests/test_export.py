@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 from __future__ import annotations
 
+import hashlib
 import re
 import shutil
 from dataclasses import replace
@@ -19,6 +20,7 @@ from rfm.cli import app
 from rfm.config import ServeConfig
 from rfm.models.rewind import RewindTransformer
 from rfm_export import ExportDiffersError, ExportError
+from rfm_export.about import Origin
 
 EMBEDDINGS = goldens.config("c1_t1_disc10")
 FRAMES = goldens.config("enc_c1_t1_disc10")
@@ -270,3 +272,39 @@ def test_the_exported_network_has_every_weight(exported: Path) -> None:
 
     loaded = checkpoints.load(exported / "rfm" / "1" / "checkpoint")
     assert loaded.network.keys() == RewindTransformer(loaded.config).state_dict().keys()
+
+
+def parameter(repository: Path, model: str, name: str) -> str:
+    return str(read(repository, model).parameters[name].string_value)
+
+
+def test_models_tell_their_weights_by_the_files_digest(exported: Path) -> None:
+    """That of an ensemble is of its parts' files, one after the other."""
+
+    def digest(*folders: str) -> str:
+        files = (file for folder in folders for file in sorted((exported / folder).rglob("*.safetensors")))
+        return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
+
+    expected = {"rfm": digest("rfm"), "film": digest("film"), "film_encoder": digest("film_encoder")}
+    expected["film_frames"] = digest("film_encoder", "film")
+    assert len(set(expected.values())) == len(expected)
+    assert {name: parameter(exported, name, "weights_digest") for name in expected} == expected
+
+
+def test_check_notices_other_weights(exported: Path, tmp_path: Path) -> None:
+    repository = shutil.copytree(exported, tmp_path / "repository")
+    weights = repository / "film_encoder" / "1" / "text_encoder" / "model.safetensors"
+    content = bytearray(weights.read_bytes())
+    content[-1] ^= 1
+    weights.write_bytes(content)
+    assert rfm_export.check(repository, serve_config(FRAMES, "film")) == [
+        f"{repository}/film_encoder/config.pbtxt: differs from what `rfm export` generates",
+        f"{repository}/film_frames/config.pbtxt: differs from what `rfm export` generates",
+    ]
+
+
+def test_a_checkpoint_of_the_hub_tells_its_commit(tmp_path: Path) -> None:
+    snapshot = tmp_path / "models--org--name" / "snapshots" / "0123abcd"
+    assert Origin.of("org/name@best", snapshot) == Origin("org/name@best", "0123abcd")
+    snapshot.mkdir(parents=True)
+    assert Origin.of(snapshot, snapshot) == Origin("snapshots/0123abcd", "")

@@ -328,7 +328,7 @@ class SlowConnection(GrpcTransport):
         self.held: dict[int, Future[None]] = {}
         self.lengths: list[int] = []
 
-    async def infer(self, model: str, inputs: wire.Tensors, outputs: Any, timeout_s: float) -> Answer:
+    async def infer(self, model: str, inputs: wire.Tensors, outputs: Any, timeout_s: float, **_id: str) -> Answer:
         length = int(inputs[wire.NUM_FRAMES].max())
         self.lengths.append(length)
         if length in self.held:

@@ -17,14 +17,17 @@ import shutil
 import signal
 import subprocess
 import sys
-import urllib.request
+import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import dataclass
+from http import HTTPStatus
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import httpx
 import jsonschema
 import kubernetes_validate
 import pytest
@@ -33,9 +36,7 @@ from referencing import Registry, Resource
 from typer.main import get_command
 
 from rfm.cli import app
-from rfm.server.installation import find_installation
-from rfm.server.process import KILL_AFTER_S, Endpoints, TritonServer
-from rfm_client.cli.commands import app as client_app
+from rfm.server.process import KILL_AFTER_S, Endpoints
 from rfm_client.gateway.command import STOP_WITHIN_S
 
 ROOT = Path(__file__).parents[1]
@@ -52,10 +53,11 @@ PORT_OPTIONS = {
     "http1": "http_port",
     "grpc": "grpc_port",
     "metrics": "metrics_port",
+    "status": "status_port",
     "gateway": "port",
 }
-
-STUB = "triton_python_b\n"  # as the kernel cuts it
+PATIENCE_S = 60.0
+POLL_S = 0.02
 
 Object = dict[str, Any]
 
@@ -211,10 +213,7 @@ def test_containers_have_limits_probes_and_the_release_s_image(workload: Object)
     resources = container["resources"]
     assert resources["requests"]["memory"] and resources["limits"]["memory"] and resources["requests"]["cpu"]
     for kind in ("startupProbe", "readinessProbe", "livenessProbe"):
-        probe = container[kind]
-        assert probe["periodSeconds"] and probe["timeoutSeconds"]
-        ports = {port[key] for port in container["ports"] for key in ("name", "containerPort")}
-        assert "exec" in probe or probe["httpGet"]["port"] in ports
+        assert container[kind]["periodSeconds"] and container[kind]["timeoutSeconds"]
     mounts = {mount["name"] for mount in container["volumeMounts"]}
     assert mounts == {volume["name"] for volume in pod_of(workload)["volumes"]}
 
@@ -234,19 +233,18 @@ def test_arguments_are_those_of_the_program(workload: Object) -> None:
     assert container["command"] == ["rfm"]
     given = parameters(get_command(app), container["args"])
     assert given["host"] == "0.0.0.0"
-    for port in container["ports"]:
-        if port["name"] != "status":  # not yet an option
-            assert given[PORT_OPTIONS[port["name"]]] == port["containerPort"]
-    if container["args"][0] == "gateway":
+    ports = {port["name"]: port["containerPort"] for port in container["ports"]}
+    assert ports == {name: given[PORT_OPTIONS[name]] for name in ports}
+    is_gateway = container["args"][0] == "gateway"
+    for kind in ("startupProbe", "readinessProbe", "livenessProbe"):
+        if "httpGet" in container[kind]:
+            port = container[kind]["httpGet"]["port"]
+            assert ports.get(port, port) == given["port" if is_gateway else "status_port"]
+    if is_gateway:
         return
     is_kserve = workload["kind"] == "ServingRuntime"
     mounts = {mount["name"]: mount["mountPath"] for mount in container["volumeMounts"] if mount.get("readOnly")}
     assert str(given["repository"]) == ("/mnt/models" if is_kserve else f"{mounts['repository']}/model_repository")
-    canary = container["livenessProbe"]["exec"]["command"]
-    assert canary[0] == "rfm-client"
-    asked = parameters(get_command(client_app), canary[1:])
-    assert asked["timeout"] < container["livenessProbe"]["timeoutSeconds"]
-    assert urlsplit(asked["urls"][0]).port in [port["containerPort"] for port in container["ports"]]
 
 
 @pytest.mark.parametrize("workload", workloads(*SETS))
@@ -288,14 +286,16 @@ def test_selectors_find_their_pods(folder: str) -> None:
         (deployment,) = selected(service["spec"]["selector"], folder)
         names = {port["name"] for port in container_of(deployment)["ports"]}
         assert {port["targetPort"] for port in service["spec"]["ports"]} <= names
+    jobs, scraped = [job["job_name"] for job in PROMETHEUS["scrape_configs"]], []
     for monitor in built(folder, "PodMonitor"):
         (deployment,) = selected(monitor["spec"]["selector"]["matchLabels"], folder)
-        jobs = [job["job_name"] for job in PROMETHEUS["scrape_configs"]]
         names = {port["name"] for port in container_of(deployment)["ports"]}
         for endpoint in monitor["spec"]["podMetricsEndpoints"]:
             assert endpoint["port"] in names
             (relabeling,) = endpoint["relabelings"]
-            assert relabeling["targetLabel"] == "job" and relabeling["replacement"] in jobs  # which the alerts name
+            assert relabeling["targetLabel"] == "job"
+            scraped.append(relabeling["replacement"])
+    assert sorted(scraped) == sorted(jobs)  # which the alerts name
 
 
 @pytest.mark.parametrize("folder", OVERLAYS)
@@ -358,49 +358,88 @@ def test_what_the_readme_applies_is_there() -> None:
     assert set(applied) == set(SETS)
 
 
-class DemoServer(TritonServer):
-    """The demo's ``rfm`` alone, whose model processes can be killed."""
+def with_values(arguments: list[str], values: dict[str, Any]) -> list[str]:
+    """The same options, with other values."""
+    options = (word.partition("=") for word in arguments)
+    return [f"{name}={values[name]}" if has_value else name for name, has_value, _ in options]
 
-    def kill_model(self) -> None:
-        """Kills the process of every instance."""
-        assert self._process is not None
-        killed = []
-        for comm in Path("/proc").glob("[0-9]*/comm"):
-            with suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile; it was not ours
-                process_id = int(comm.parent.name)
-                if comm.read_text() == STUB and os.getpgid(process_id) == self._process.pid:
-                    os.kill(process_id, signal.SIGKILL)
-                    killed.append(process_id)
-        assert killed
 
-    def stop(self) -> int:
-        if self._process is not None:
-            os.killpg(self._process.pid, signal.SIGKILL)  # with a dead model process it would wait its time out
-        return super().stop()
+def eventually(is_so: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not is_so():
+        assert time.monotonic() < deadline_s
+        time.sleep(POLL_S)
+
+
+@dataclass(frozen=True)
+class Probed:
+    """What a pod's container runs, on ports of this machine."""
+
+    status_port: int
+    container: Object
+
+    def passes(self, kind: str) -> bool:
+        """As the kubelet asks."""
+        get = self.container[kind]["httpGet"]
+        assert get["port"] == "status"
+        try:
+            return httpx.get(f"http://127.0.0.1:{self.status_port}{get['path']}").status_code == HTTPStatus.OK
+        except httpx.TransportError:
+            return False
+
+    def run_kserve_s_liveness_probe(self) -> None:
+        """Raises CalledProcessError if it does not pass. Knative sends an httpGet to no port but that of requests."""
+        container = container_of(named("kserve", "ServingRuntime", "rfm-triton"))
+        program, *words, script = container["livenessProbe"]["exec"]["command"]
+        assert program == "python"
+        port = parameters(get_command(app), container["args"])["status_port"]
+        subprocess.run([sys.executable, *words, script.replace(f":{port}/", f":{self.status_port}/")], check=True)
 
 
 @pytest.fixture
-def demo_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[DemoServer]:
+def probed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Probed]:
+    """The demo's ``rfm`` alone."""
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     shutil.copytree(ROOT / "model_repository" / "rfm", tmp_path / "model_repository" / "rfm")
-    with (
-        (tmp_path / "tritonserver.log").open("wb") as log,
-        DemoServer(tmp_path / "model_repository", Endpoints.free(), find_installation(), log=log) as server,
-    ):
-        yield server
-
-
-def test_the_probes_tell_a_living_model_from_a_dead_one(demo_server: DemoServer) -> None:
+    (tmp_path / "admin-key").write_text("key")
     container = container_of(named("overlays/cpu", "Deployment", "rfm-triton"))
-    for probe in ("startupProbe", "readinessProbe"):
-        with urllib.request.urlopen(demo_server.endpoints.http_url + container[probe]["httpGet"]["path"]) as answer:
-            assert answer.status == 200
-    program, *words = container["livenessProbe"]["exec"]["command"]
-    words[words.index("--url=grpc://127.0.0.1:8001")] = f"--url={demo_server.endpoints.grpc_url}"
-    alive = subprocess.run([BIN / program, *words], capture_output=True, text=True)
-    assert (alive.returncode, alive.stderr) == (0, "")
-    demo_server.kill_model()
-    words[words.index("--timeout=30")] = "--timeout=3"  # it is asked again until then
-    dead = subprocess.run([BIN / program, *words], capture_output=True, text=True)
-    assert dead.returncode != 0
-    assert "is not healthy" in dead.stderr
+    endpoints, status_port = Endpoints.free(), Endpoints.free().http_port
+    values = {
+        "--repository": tmp_path / "model_repository",
+        "--host": endpoints.host,
+        "--http-port": endpoints.http_port,
+        "--grpc-port": endpoints.grpc_port,
+        "--metrics-port": endpoints.metrics_port,
+        "--status-port": status_port,
+        "--admin-key-file": tmp_path / "admin-key",
+    }
+    command = [BIN / container["command"][0], *with_values(container["args"], values)]
+    with (tmp_path / "log").open("wb") as log, subprocess.Popen(command, stdout=log, stderr=log) as process:
+        try:
+            yield Probed(status_port, container)
+        finally:
+            process.terminate()
+    assert process.returncode == 0
+
+
+def kill_model(repository: Path) -> None:
+    """Kills each of its processes."""
+    model_file = f"{repository}/rfm/1/model.py"
+    killed = []
+    for command in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):  # it has ended meanwhile
+            if model_file in command.read_text():
+                killed.append(command)
+                os.kill(int(command.parent.name), signal.SIGKILL)
+    assert killed
+
+
+def test_the_probes_tell_a_living_model_from_a_dead_one(probed: Probed, tmp_path: Path) -> None:
+    eventually(lambda: probed.passes("livenessProbe"))
+    assert not probed.passes("startupProbe")  # it loads
+    eventually(lambda: probed.passes("startupProbe") and probed.passes("readinessProbe"))
+    kill_model(tmp_path / "model_repository")
+    eventually(lambda: not probed.passes("readinessProbe"))
+    assert probed.passes("livenessProbe")
+    probed.run_kserve_s_liveness_probe()
+    eventually(lambda: probed.passes("readinessProbe"))  # rfm serve has healed it

@@ -14,7 +14,7 @@ import torch
 from conftest import random_trajectory
 from torch import Tensor, nn
 
-from rfm.collate.rewind import RewindCollator, prefix_indices
+from rfm.collate.rewind import MAX_EMBEDDING, RewindCollator, prefix_indices
 from rfm.config import DEFAULT_TOKEN_BUDGET
 from rfm.engine import Engine, Outcome
 from rfm.families.rewind import RewindFamily
@@ -238,8 +238,12 @@ def test_what_the_checkpoint_cannot_take_fails_alone(sample: Sample, message: st
 
 
 def test_a_score_that_is_no_number_is_an_error() -> None:
-    huge = Trajectory(video_embeddings=np.full((2, 12), 3e38, np.float32), text_embedding=np.ones(6, np.float32))
-    failed, good = engine_of(build(BASE)).evaluate([ProgressSample(huge), ProgressSample(trajectory(0, 2))])
+    huge = Trajectory(
+        video_embeddings=np.full((2, 12), MAX_EMBEDDING, np.float32), text_embedding=np.ones(6, np.float32)
+    )
+    network = build(BASE)
+    network.video_proj.weight.data *= 1e14  # so that the largest embedding overflows
+    failed, good = engine_of(network).evaluate([ProgressSample(huge), ProgressSample(trajectory(0, 2))])
     assert isinstance(failed, InferenceFailedError)
     assert isinstance(good, ProgressResult)
 

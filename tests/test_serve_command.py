@@ -164,14 +164,14 @@ def test_a_program_that_cannot_run_is_named(tmp_path: Path) -> None:
         server.start()
 
 
-def test_the_wheel_on_an_open_address_is_warned_of() -> None:
+def test_a_known_vulnerable_triton_on_an_open_address_is_warned_of() -> None:
     result = subprocess.run(
-        [str(RFM), "serve", "--repository", "/nowhere", "--host", "0.0.0.0"],
+        [str(RFM), "serve", "--repository", "/nowhere", "--host", "0.0.0.0", "--accept-known-vulnerabilities"],
         capture_output=True,
         text=True,
         check=False,
     )
-    assert result.stderr.startswith("rfm: warning: 0.0.0.0 is no loopback address, and the wheel's Triton")
+    assert result.stderr.startswith("rfm: warning: 0.0.0.0 is no loopback address, and a Triton with known")
 
 
 def test_a_plain_tritonserver_serves_the_repository_too(tmp_path: Path) -> None:

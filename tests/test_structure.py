@@ -33,6 +33,7 @@ EXCEPTIONS = {
     "examples/evaluate_demo_checkpoint.py": {"rfm"},
     "benchmarks/bench.py": {"rfm", "rfm_export"},  # the engine without a server, and what is served
     "benchmarks/contestants.py": {"rfm"},
+    "benchmarks/forward.py": {"rfm"},
     "benchmarks/perf_analyzer.py": {"rfm"},
     "benchmarks/peers/litserve_server.py": {"rfm"},  # the peers score with our engine, or weights
     "benchmarks/peers/mosec_server.py": {"rfm"},
@@ -40,7 +41,7 @@ EXCEPTIONS = {
     "benchmarks/peers/upstream_forward.py": {"rfm"},
 }
 CLIENT_LAYERS = (  # imports point left
-    "errors", "samples", "results", "wire", "resize", "model_info", "off_loop", "deadline", "shared_memory", "transport",
+    "errors", "samples", "results", "wire", "resize", "model_info", "off_loop", "deadline", "access", "shared_memory", "transport",
     "servers", "in_flight", "packing", "fit", "async_client", "loop_thread", "client",
 )  # fmt: skip
 LIGHT = {"numpy", "tritonclient", "aiohttp", "typing_extensions"}  # the last for type checkers only

@@ -21,6 +21,7 @@ from rfm import checkpoint as checkpoints
 from rfm.checkpoint import CheckpointError, VlmCheckpoint
 from rfm.collate.images import Normalisation, QwenImages, fitted_size
 from rfm.engine import Engine
+from rfm.execution import Execution
 from rfm.families.vlm import VlmFamily
 from rfm_client import (
     InferenceFailedError,
@@ -236,9 +237,10 @@ def test_out_of_memory_halves_the_batch_and_is_counted(monkeypatch: pytest.Monke
         return score(rows, batch)
 
     monkeypatch.setattr(engine.family, "score", refusing)
-    for result, other in zip(engine.evaluate(samples), expected, strict=True):
+    execution = Execution()
+    for result, other in zip(engine.evaluate(samples, execution), expected, strict=True):
         assert_close(result, other, 1e-5)
-    assert engine.out_of_memory_count == 2  # 5 rows, then the 3 of them
+    assert execution.out_of_memory_count == 2  # 5 rows, then the 3 of them
 
 
 def test_a_sample_that_does_not_fit_in_memory_fails_alone(monkeypatch: pytest.MonkeyPatch) -> None:

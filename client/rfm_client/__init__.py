@@ -11,6 +11,7 @@ with RewardClient("grpc://localhost:8001") as client:
 from rfm_client.async_client import AsyncRewardClient
 from rfm_client.client import RewardClient
 from rfm_client.errors import (
+    AccessDeniedError,
     DeadlineExceededError,
     InferenceFailedError,
     InvalidSampleError,
@@ -40,6 +41,7 @@ from rfm_client.samples import (
 )
 
 __all__ = [
+    "AccessDeniedError",
     "AsyncRewardClient",
     "BatchTiming",
     "DeadlineExceededError",

@@ -4,11 +4,16 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine, Iterable, Mapping, Sequence
+import itertools
+import secrets
+from collections.abc import Coroutine, Iterable, Iterator, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Literal, TypedDict, cast, overload
 
 from rfm_client import wire
+from rfm_client.access import Access, AccessOptions
 from rfm_client.deadline import Deadline
 from rfm_client.errors import DeadlineExceededError, InferenceFailedError, InvalidSampleError, RewardError
 from rfm_client.fit import FittedSample, fitted, whole, with_frame_indices
@@ -28,11 +33,12 @@ DEFAULT_MODEL = "rfm"
 DEFAULT_TIMEOUT_S = 60.0
 DEFAULT_IN_FLIGHT = 128  # twice the usual batch: while one is scored, the next one gathers
 READY_POLL_S = 0.2
+_ID_BYTES = 8  # of chance in the ids of a call's requests
 
 _SCORES = (wire.PROGRESS, wire.SUCCESS, wire.PREFERENCE, wire.SIMILARITY)
 
 
-class ClientOptions(TypedDict, total=False):
+class ClientOptions(AccessOptions, total=False):
     """How a client works.
 
     model: name under which the checkpoint was exported (``rfm``); raw frames go to ``<model>_frames``
@@ -40,6 +46,7 @@ class ClientOptions(TypedDict, total=False):
     retry: ask again what failed because a server was down, restarting or full, until the time is up (True)
     max_in_flight: requests under way at a time (128); more wait their turn
     shared_memory: large inputs go through memory that client and server map, if both are on one host (False)
+    ca_file, client_certificate, client_key, headers, api_key: as Access has them
     """
 
     model: str
@@ -59,6 +66,7 @@ class CallOptions(TypedDict, total=False):
         scored, evenly from the first to the last; the result's ``frame_indices`` tells which (None: all)
     resize: frames are made as small as the checkpoint reads them before they are sent (needs Pillow); ReWiND's scores
         differ slightly from those of the frames as they are
+    request_id: with which the ids of the call's requests begin, in errors and in the server's log (None: a random one)
     """
 
     timeout_s: float | None
@@ -66,6 +74,16 @@ class CallOptions(TypedDict, total=False):
     timing: bool
     subsample: bool
     resize: bool
+    request_id: str | None
+
+
+@dataclass(frozen=True)
+class _Asking:
+    """What the requests of one call share. request_ids: one for each"""
+
+    deadline: Deadline
+    outputs: Sequence[str]
+    request_ids: Iterator[str]
 
 
 class AsyncRewardClient:
@@ -73,8 +91,8 @@ class AsyncRewardClient:
 
     Arrays of samples must not change while a call is awaited: they are sent as they are when it is their turn.
 
-    urls: ``grpc://host:8001`` or ``http://host:8000``, one or several. The server with the fewest requests under way
-        is asked; one that fails is left out until it is ready again.
+    urls: ``grpc://host:8001`` or ``http://host:8000``, with TLS ``grpcs://`` or ``https://``, one or several. The
+        server with the fewest requests under way is asked; one that fails is left out until it is ready again.
     transports: instead of connections to ``urls``, for tests and unusual networks
     """
 
@@ -88,7 +106,8 @@ class AsyncRewardClient:
         _check_known(options, ClientOptions)
         urls = [urls] if isinstance(urls, str) else urls
         shared_memory = options.get("shared_memory", False)
-        transports = transports or [connect(url, shared_memory=shared_memory) for url in urls]
+        access = Access.of(options)
+        transports = transports or [connect(url, shared_memory=shared_memory, access=access) for url in urls]
         self._model = options.get("model", DEFAULT_MODEL)
         self._timeout_s = options.get("timeout_s", DEFAULT_TIMEOUT_S)
         self._servers = Servers(transports, retry=options.get("retry", True))
@@ -145,7 +164,9 @@ class AsyncRewardClient:
                 raise outcome
         return cast("list[Result]", outcomes)
 
-    async def encode(self, trajectory: Trajectory, *, timeout_s: float | None = None) -> Trajectory:
+    async def encode(
+        self, trajectory: Trajectory, *, timeout_s: float | None = None, request_id: str | None = None
+    ) -> Trajectory:
         """The trajectory with embeddings of its frames and its task in place of the frames, for a checkpoint that is
         served with encoders. What is asked often is then encoded once. Raises RewardError.
         """
@@ -153,9 +174,9 @@ class AsyncRewardClient:
             raise InvalidSampleError.at("trajectory", "frames", "video_embeddings")
         tensors = await off_loop(trajectory.frames.nbytes, wire.encode_frames, trajectory)
         outputs = (wire.VIDEO_EMBEDDINGS, wire.TEXT_EMBEDDING)
-        deadline = self._deadline(timeout_s)
+        deadline, name = self._deadline(timeout_s), next(_request_ids(request_id))
         async with self._in_flight.room(trajectory.frames.nbytes, deadline):
-            answer = await self._servers.infer(f"{self._model}_encoder", tensors, outputs, deadline)
+            answer = await self._servers.infer(f"{self._model}_encoder", tensors, outputs, deadline, request_id=name)
         return wire.decode_embeddings(answer.tensors, trajectory)
 
     async def is_ready(self, *, timeout_s: float | None = None) -> bool:
@@ -195,8 +216,10 @@ class AsyncRewardClient:
 
     async def _outcomes(self, samples: Sequence[Sample], options: CallOptions) -> list[Result | RewardError]:
         _check_known(options, CallOptions)
-        deadline = self._deadline(options.get("timeout_s"))
-        outputs = _outputs(options)
+        asking = _Asking(
+            self._deadline(options.get("timeout_s")), _outputs(options), _request_ids(options.get("request_id"))
+        )
+        deadline = asking.deadline
         fits, outcomes = await self._fitted(samples, options, deadline)
         sent = {index: fit.sample for index, fit in fits.items()}
 
@@ -209,7 +232,7 @@ class AsyncRewardClient:
             await _together([ask_part(model, part) for part in parts(sent, group, limit)])
 
         async def ask_part(model: str, part: Sequence[int]) -> None:
-            answers = await self._ask(model, [sent[index] for index in part], outputs, deadline)
+            answers = await self._ask(model, [sent[index] for index in part], asking)
             for index, answer in zip(part, answers, strict=True):
                 outcomes[index] = (
                     answer if isinstance(answer, RewardError) else with_frame_indices(answer, fits[index].frame_indices)
@@ -238,26 +261,28 @@ class AsyncRewardClient:
                 failed[index] = error
         return fits, failed
 
-    async def _ask(
-        self, model: str, samples: Sequence[Sample], outputs: Sequence[str], deadline: Deadline
-    ) -> Sequence[Result | RewardError]:
+    async def _ask(self, model: str, samples: Sequence[Sample], asking: _Asking) -> Sequence[Result | RewardError]:
         """One request. It fails whole if one sample cannot be scored; then each sample is asked about alone."""
+        request_id = next(asking.request_ids)
         try:
-            answer = await self._infer(model, samples, outputs, deadline)
+            answer = await self._infer(model, samples, asking, request_id)
             return wire.decode_results(answer.tensors, samples, answer.model_version)
         except (InvalidSampleError, InferenceFailedError) as error:
+            error.request_id = request_id
             if len(samples) == 1:
                 return [error]
         except RewardError as error:
             return _for_each(error, len(samples))
-        alone = await asyncio.gather(*(self._ask(model, [sample], outputs, deadline) for sample in samples))
+        alone = await asyncio.gather(*(self._ask(model, [sample], asking) for sample in samples))
         return [outcome for (outcome,) in alone]
 
-    async def _infer(self, model: str, samples: Sequence[Sample], outputs: Sequence[str], deadline: Deadline) -> Answer:
+    async def _infer(self, model: str, samples: Sequence[Sample], asking: _Asking, request_id: str) -> Answer:
         num_bytes = padded_bytes(samples)
-        async with self._in_flight.room(num_bytes, deadline):  # arrays are made in turn, so that they do not pile up
+        async with self._in_flight.room(
+            num_bytes, asking.deadline
+        ):  # arrays are made in turn, so that they do not pile up
             tensors = await off_loop(num_bytes, wire.encode_samples, samples)
-            return await self._servers.infer(model, tensors, outputs, deadline)
+            return await self._servers.infer(model, tensors, asking.outputs, asking.deadline, request_id=request_id)
 
     def _deadline(self, timeout_s: float | None) -> Deadline:
         """That of a call which begins now; None: the client's."""
@@ -283,9 +308,9 @@ def _for_each(error: RewardError, count: int) -> list[Result | RewardError]:
     """One error of its own for each sample that shares the failure; they may be raised apart."""
     copies: list[Result | RewardError] = []
     for _ in range(count):
-        copy = type(error)(str(error))
-        copy.__cause__ = error
-        copies.append(copy)
+        one = copy(error)
+        one.__cause__ = error
+        copies.append(one)
     return copies
 
 
@@ -294,6 +319,14 @@ def _check_known(options: Mapping[str, object], known: type[ClientOptions] | typ
     unknown = sorted(options.keys() - known.__annotations__)
     if unknown:
         raise TypeError(f"options: expected some of {', '.join(known.__annotations__)}, got {', '.join(unknown)}")
+
+
+def _request_ids(prefix: str | None) -> Iterator[str]:
+    """Of the requests of one call, which begin alike. Raises ValueError for a prefix that is none."""
+    if prefix is not None and not wire.REQUEST_ID.fullmatch(prefix):
+        raise ValueError(f"request_id: expected 1 to 64 letters, digits or any of ._:/+=@-, got {prefix!r}")
+    prefix = prefix or secrets.token_hex(_ID_BYTES)
+    return (f"{prefix}-{number}" for number in itertools.count(1))
 
 
 def _outputs(options: CallOptions) -> tuple[str, ...]:

@@ -89,11 +89,13 @@ class RewardClient:
         future.add_done_callback(lambda _done: self)  # until then the client stays, whoever else has forgotten it
         return future
 
-    def encode(self, trajectory: Trajectory, *, timeout_s: float | None = None) -> Trajectory:
+    def encode(
+        self, trajectory: Trajectory, *, timeout_s: float | None = None, request_id: str | None = None
+    ) -> Trajectory:
         """The trajectory with embeddings of its frames and its task in place of the frames, for a checkpoint that is
         served with encoders. What is asked often is then encoded once. Raises RewardError.
         """
-        return self._loop.wait(self._client.encode(trajectory, timeout_s=timeout_s))
+        return self._loop.wait(self._client.encode(trajectory, timeout_s=timeout_s, request_id=request_id))
 
     def is_ready(self, *, timeout_s: float | None = None) -> bool:
         """Whether a server answers and has the model ready, for embeddings or for raw frames."""

@@ -7,6 +7,7 @@
         +-- ServerUnavailableError    no connection, not ready, or its queue is full
         +-- DeadlineExceededError     no answer within the time that the caller gave
         +-- ModelNotFoundError        the server does not serve a model of that name
+        +-- AccessDeniedError         server and client do not trust each other: certificate, key, or TLS on one side
         +-- InferenceFailedError      the server tried and failed; its log has the reason
 
 No error is ever replaced by a number.
@@ -16,7 +17,20 @@ from __future__ import annotations
 
 
 class RewardError(Exception):
-    """Base of every error that this library raises."""
+    """Base of every error that this library raises.
+
+    request_id: by which the server's log knows the request that failed, told behind the message; None: none was sent
+    """
+
+    request_id: str | None = None
+
+    @property
+    def message(self) -> str:
+        """What is wrong, without the request's id."""
+        return super().__str__()
+
+    def __str__(self) -> str:
+        return self.message if self.request_id is None else f"{self.message} (request {self.request_id})"
 
 
 class InvalidSampleError(RewardError, ValueError):
@@ -29,7 +43,9 @@ class InvalidSampleError(RewardError, ValueError):
 
     def inside(self, where: str) -> InvalidSampleError:
         """The same error, seen from the object that holds the field: ``where.field: ...``."""
-        return type(self)(f"{where}.{self}")
+        located = type(self)(f"{where}.{self.message}")
+        located.request_id = self.request_id
+        return located
 
 
 class ServerError(RewardError):
@@ -46,6 +62,10 @@ class DeadlineExceededError(ServerError, TimeoutError):
 
 class ModelNotFoundError(ServerError):
     """The server does not serve the model that was asked for."""
+
+
+class AccessDeniedError(ServerError):
+    """One side refuses the other: a certificate or key is missing or another, or only one of them speaks TLS."""
 
 
 class InferenceFailedError(ServerError):

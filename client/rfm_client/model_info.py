@@ -15,6 +15,8 @@ MAX_FRAMES_PARAMETER = "max_frames"  # parameters of config.pbtxt; empty: no lim
 FRAME_SIZE_PARAMETER = "frame_size"
 FRAMES_PER_VALUE_PARAMETER = "frames_per_value"
 SOURCE_PARAMETER = "source"
+REVISION_PARAMETER = "revision"
+DIGEST_PARAMETER = "weights_digest"
 NETWORK_PARAMETER = "network"
 
 
@@ -30,6 +32,8 @@ class ModelInfo:
     progress_bins: K of a discrete checkpoint; None: continuous
     frames_per_value: frames that share their scores; 2 where a vision-language model sees a trajectory as a video
     source: which checkpoint was exported: its Hub id, or the end of its path; None: it does not say
+    revision: the commit of the Hub that was exported; None: it was a folder
+    weights_digest: 16 hex digits that tell the exported weights from others; None: it does not say
     network: its class, its configuration (config), and how many numbers each part of it has (parameters)
     """
 
@@ -43,6 +47,8 @@ class ModelInfo:
     progress_bins: int | None
     frames_per_value: int = 1
     source: str | None = None
+    revision: str | None = None
+    weights_digest: str | None = None
     network: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
@@ -67,5 +73,7 @@ class ModelInfo:
             progress_bins=last_dims.get(wire.PROGRESS_LOGITS),
             frames_per_value=int(parameters.get(FRAMES_PER_VALUE_PARAMETER) or 1),
             source=parameters.get(SOURCE_PARAMETER) or None,
+            revision=parameters.get(REVISION_PARAMETER) or None,
+            weights_digest=parameters.get(DIGEST_PARAMETER) or None,
             network=json.loads(parameters.get(NETWORK_PARAMETER) or "{}"),
         )

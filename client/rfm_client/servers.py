@@ -12,7 +12,13 @@ from contextlib import contextmanager
 from typing import TypeVar
 
 from rfm_client.deadline import Deadline
-from rfm_client.errors import DeadlineExceededError, InferenceFailedError, ServerUnavailableError
+from rfm_client.errors import (
+    AccessDeniedError,
+    DeadlineExceededError,
+    InferenceFailedError,
+    RewardError,
+    ServerUnavailableError,
+)
 from rfm_client.model_info import ModelInfo
 from rfm_client.transport import Answer, Transport
 from rfm_client.wire import Tensors
@@ -44,9 +50,19 @@ class Servers:
     def __str__(self) -> str:
         return ", ".join(server.transport.url for server in self._servers)
 
-    async def infer(self, model: str, inputs: Tensors, outputs: Collection[str], deadline: Deadline) -> Answer:
-        """The named ``outputs`` of ``model`` for ``inputs``. Raises RewardError."""
-        return await self._ask(model, lambda server, left_s: server.infer(model, inputs, outputs, left_s), deadline)
+    async def infer(
+        self, model: str, inputs: Tensors, outputs: Collection[str], deadline: Deadline, *, request_id: str
+    ) -> Answer:
+        """The named ``outputs`` of ``model`` for ``inputs``. Raises RewardError, which names the request."""
+
+        def ask(server: Transport, left_s: float) -> Awaitable[Answer]:
+            return server.infer(model, inputs, outputs, left_s, request_id=request_id)
+
+        try:
+            return await self._ask(model, ask, deadline)
+        except RewardError as error:
+            error.request_id = request_id
+            raise
 
     async def model_info(self, model: str, deadline: Deadline) -> ModelInfo:
         """What a server tells of ``model``. Raises RewardError."""
@@ -91,7 +107,7 @@ class Servers:
             except DeadlineExceededError as error:  # perhaps it hangs
                 self._leave_out(server, model)
                 raise deadline.exceeded(server.transport.url) from error
-            except InferenceFailedError:
+            except (AccessDeniedError, InferenceFailedError):
                 self._leave_out(server, model)
                 failed_inside.add(server)
                 if not self._retry or len(failed_inside) == len(self._servers):

@@ -1,20 +1,26 @@
 # SPDX-License-Identifier: MIT
-"""The state of a Triton server: its models, what they have done, and the machine. Read-only."""
+"""The state of a Triton server: its models, what they have done, and the machine. Read-only.
+
+Where the repository's index needs a key (``rfm serve``), the models are those that are loaded.
+"""
 
 from __future__ import annotations
 
 import re
+import ssl
 import textwrap
 import time
 import urllib.request
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from http.client import HTTPException
 from typing import Any
 
 from tritonclient.utils import InferenceServerException
 
-from rfm_client.errors import DeadlineExceededError, InferenceFailedError, ServerUnavailableError
+from rfm_client.access import Access, is_denied
+from rfm_client.errors import AccessDeniedError, DeadlineExceededError, InferenceFailedError, ServerUnavailableError
 from rfm_client.transport import split_url
 
 METRICS_PORT = 8002
@@ -26,6 +32,7 @@ _DEVICE_METRIC = re.compile("nv_(cpu|gpu)_(utilization|memory_used_bytes|memory_
 _REQUESTS_METRIC = "nv_inference_request_success_total"
 _COMPUTE_METRIC = "nv_inference_compute_infer_duration_us_total"
 _SAMPLED_METRIC = "nv_cpu_memory_used_bytes"
+_RESTRICTED = "is restricted, expecting header"  # what Triton says over HTTP and gRPC
 _SAMPLING_S = 2.5  # Triton looks at the machine every two seconds; until the first time it tells zeros
 _POLL_S = 0.2
 _REASON_CHARACTERS = 120
@@ -117,26 +124,35 @@ class _Metrics:
     error: str | None = None
 
 
-def read_status(url: str, *, metrics_url: str | None = None, timeout_s: float = 60.0) -> ServerStatus:
-    """The state of the server at ``grpc://host:port`` or ``http://host:port``.
+def read_status(
+    url: str, *, metrics_url: str | None = None, timeout_s: float = 60.0, access: Access | None = None
+) -> ServerStatus:
+    """The state of the server at ``grpc://host:port`` or ``http://host:port``, or with TLS ``grpcs://`` or ``https://``.
 
     metrics_url: where it shows its metrics; None: port METRICS_PORT of the same host. What only they tell is missing
         if they cannot be read.
+    access: certificates, and what is shown with each request, but not to the metrics
 
-    Raises ServerUnavailableError, DeadlineExceededError, and InferenceFailedError for what is no Triton server.
+    Raises ServerUnavailableError, AccessDeniedError, DeadlineExceededError, and InferenceFailedError for what is no
+    Triton server.
     """
     scheme, address = split_url(url)
     try:
-        server = (_ask_grpc if scheme == "grpc" else _ask_http)(address, timeout_s)
+        ask = _ask_grpc if scheme.startswith("grpc") else _ask_http
+        server = ask(scheme, address, timeout_s, access or Access())
         metrics_url = metrics_url or f"http://{address.rpartition(':')[0]}:{METRICS_PORT}/metrics"
         metrics = _read_metrics(metrics_url, timeout_s)
         models = tuple(_models(server, metrics))
     except InferenceServerException as error:
+        if is_denied(error):
+            raise AccessDeniedError(f"{url}: access denied: {error.message()}") from error
         in_time = "DEADLINE_EXCEEDED" not in str(error.status())
         kind = ServerUnavailableError if in_time else DeadlineExceededError
         raise kind(f"{url}: {error.message()}") from error
     except TimeoutError as error:
         raise DeadlineExceededError(f"{url}: no answer within {timeout_s:g} s") from error
+    except ssl.SSLError as error:
+        raise AccessDeniedError(f"{url}: access denied: {error}") from error
     except (OSError, EOFError, HTTPException) as error:
         raise ServerUnavailableError(f"{url}: {error}") from error
     except (ValueError, LookupError, TypeError, AttributeError) as error:  # reading what is no answer of Triton
@@ -154,30 +170,55 @@ class _Server:
     statistics: list[dict[str, Any]]
 
 
-def _ask_http(address: str, timeout_s: float) -> _Server:
+def _ask_http(scheme: str, address: str, timeout_s: float, access: Access) -> _Server:
     import tritonclient.http
 
-    client = tritonclient.http.InferenceServerClient(address, connection_timeout=timeout_s, network_timeout=timeout_s)
+    client = tritonclient.http.InferenceServerClient(
+        address, connection_timeout=timeout_s, network_timeout=timeout_s, **access.http_options(scheme)
+    )
+    access.show_with_each_request(client)
     try:
         version = client.get_server_metadata()["version"]
         statistics = client.get_inference_statistics()["model_stats"]
-        return _Server(version, client.is_server_ready(), client.get_model_repository_index(), statistics)
+        index = _if_open(client.get_model_repository_index) or _index(statistics, client.is_model_ready)
+        return _Server(version, client.is_server_ready(), index, statistics)
     finally:
         client.close()
 
 
-def _ask_grpc(address: str, timeout_s: float) -> _Server:
+def _ask_grpc(scheme: str, address: str, timeout_s: float, access: Access) -> _Server:
     import tritonclient.grpc
 
-    client = tritonclient.grpc.InferenceServerClient(address)
+    client = tritonclient.grpc.InferenceServerClient(address, **access.grpc_options(scheme))
+    access.show_with_each_request(client)
     as_json = {"as_json": True, "client_timeout": timeout_s}
     try:
         version = client.get_server_metadata(**as_json)["version"]
-        index = client.get_model_repository_index(**as_json).get("models", [])
         statistics = client.get_inference_statistics(**as_json).get("model_stats", [])
+        index = _if_open(partial(client.get_model_repository_index, **as_json)).get("models")
+        index = index or _index(statistics, partial(client.is_model_ready, client_timeout=timeout_s))
         return _Server(version, client.is_server_ready(client_timeout=timeout_s), index, statistics)
     finally:
         client.close()
+
+
+def _if_open(ask: Callable[[], Any]) -> Any:
+    """The answer; nothing where only a key would give it."""
+    try:
+        return ask()
+    except InferenceServerException as error:
+        if _RESTRICTED not in (error.message() or ""):
+            raise
+        return {}
+
+
+def _index(statistics: list[dict[str, Any]], is_ready: Callable[[str, str], bool]) -> list[dict[str, Any]]:
+    """As the repository's index has it, of what is loaded."""
+    keys = sorted((entry["name"], int(entry["version"])) for entry in statistics)
+    return [
+        {"name": name, "version": str(version), "state": "READY" if is_ready(name, str(version)) else "UNAVAILABLE"}
+        for name, version in keys
+    ]
 
 
 def _models(server: _Server, metrics: _Metrics) -> list[ModelStatus]:

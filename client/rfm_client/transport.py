@@ -7,6 +7,7 @@ import asyncio
 import io
 import os
 import re
+import ssl
 from collections.abc import AsyncIterator, Awaitable, Collection, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ import numpy.typing as npt
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
 from rfm_client import errors
+from rfm_client.access import SECURE_SCHEMES, Access, is_denied
 from rfm_client.deadline import timeout
 from rfm_client.model_info import ModelInfo
 from rfm_client.off_loop import off_loop
@@ -41,7 +43,7 @@ _STATUS_ERRORS: dict[str, type[errors.RewardError]] = {
 _LOST_REGION = "Unable to find shared memory region"
 # Triton answers these with other statuses, but the sample is not at fault and another try may succeed.
 _UNAVAILABLE = re.compile(f"{_LOST_REGION}|has no available versions|Stub process .* is not healthy")
-_URL = re.compile(r"(?P<scheme>grpc|http)://(?P<address>[^/]+:(?P<port>[0-9]{1,5}))/?")
+_URL = re.compile(r"(?P<scheme>grpcs?|https?)://(?P<address>[^/]+:(?P<port>[0-9]{1,5}))/?")
 MAX_PORT = 65535
 _REQUEST_ID = re.compile(r"^\[request id: [^\]]*\] ")
 _WRONG_SHAPE = re.compile(  # behind the batch axis, which the caller did not make
@@ -50,6 +52,7 @@ _WRONG_SHAPE = re.compile(  # behind the batch axis, which the caller did not ma
 _IN_ENSEMBLE = re.compile(r"^in ensemble '[^']*', ")  # what Triton puts before a message; the caller knows the model
 
 _UNBOUNDED = -1
+_US_PER_S = 1_000_000
 _GRPC_OPTIONS = {
     "grpc.max_send_message_length": _UNBOUNDED,
     "grpc.max_receive_message_length": _UNBOUNDED,
@@ -71,8 +74,10 @@ class Transport(Protocol):
 
     url: str
 
-    async def infer(self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float) -> Answer:
-        """The named ``outputs`` of ``model`` for ``inputs``."""
+    async def infer(
+        self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
+    ) -> Answer:
+        """The named ``outputs`` of ``model`` for ``inputs``. request_id: what the server calls the request"""
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
         """What the server tells of ``model``. ModelNotFoundError when it is not served."""
@@ -84,34 +89,42 @@ class Transport(Protocol):
         """Closes the connection."""
 
 
-def connect(url: str, *, shared_memory: bool = False) -> Transport:
-    """The transport for ``grpc://host:port`` or ``http://host:port``. It connects when it is first used.
+def connect(url: str, *, shared_memory: bool = False, access: Access | None = None) -> Transport:
+    """The transport for ``grpc://host:port`` or ``http://host:port``, or with TLS ``grpcs://`` or ``https://``.
+
+    It connects when it is first used. Raises ValueError.
 
     shared_memory: large inputs go through memory that the server, on the same host, maps too
+    access: certificates, and what is shown with each request
     """
-    scheme, address = split_url(url)
-    return (GrpcTransport if scheme == "grpc" else HttpTransport)(url, address, shared_memory=shared_memory)
+    kind = GrpcTransport if split_url(url)[0].startswith("grpc") else HttpTransport
+    return kind(url, access or Access(), shared_memory=shared_memory)
 
 
 def split_url(url: str) -> tuple[str, str]:
-    """``grpc`` or ``http``, and ``host:port``. Raises ValueError."""
+    """``grpc``, ``http``, ``grpcs`` or ``https``, and ``host:port``. Raises ValueError."""
     match = _URL.fullmatch(url)
     if match is None or int(match["port"]) > MAX_PORT:
-        raise ValueError(f"url: expected grpc://host:port or http://host:port, got {url!r}")
+        raise ValueError(f"url: expected grpc://host:port or http://host:port, or grpcs:// or https://, got {url!r}")
     return match["scheme"], match["address"]
 
 
 class _TritonTransport:
     """What gRPC and HTTP have in common: tritonclient's asyncio clients are the same but for a few options."""
 
-    def __init__(self, url: str, address: str, *, shared_memory: bool) -> None:
+    def __init__(self, url: str, access: Access, *, shared_memory: bool) -> None:
         self.url = url
-        self._address = address
+        self._scheme, self._address = split_url(url)
+        self._access = access
+        if access.uses_tls and not self._is_secure:
+            raise ValueError(f"url: expected grpcs:// or https:// with certificates, got {url}")
         self._shared_memory = SharedMemory(self) if shared_memory else None
         self._requested = cache(lambda name: self._triton.InferRequestedOutput(name))
 
-    async def infer(self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float) -> Answer:
-        return await self._call(self._infer(model, inputs, outputs), timeout_s)
+    async def infer(
+        self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
+    ) -> Answer:
+        return await self._call(self._infer(model, inputs, outputs, request_id, timeout_s), timeout_s)
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
         async def ask() -> ModelInfo:
@@ -142,13 +155,20 @@ class _TritonTransport:
     async def unregister_region(self, name: str) -> None:
         await self._client.unregister_system_shared_memory(name)
 
-    async def _infer(self, model: str, inputs: Tensors, outputs: Collection[str]) -> Answer:
+    async def _infer(
+        self, model: str, inputs: Tensors, outputs: Collection[str], request_id: str, timeout_s: float
+    ) -> Answer:
         largest = max(inputs, key=lambda name: inputs[name].nbytes)
         async with self._lent(inputs[largest]) as region:
             regions = {largest: region} if region is not None else {}
             through_socket = 0 if regions else inputs[largest].nbytes
             tensors = await off_loop(through_socket, self._inputs, inputs, regions)
-            answer = await self._client.infer(model, tensors, outputs=[self._requested(name) for name in outputs])
+            requested = [self._requested(name) for name in outputs]
+            # Whoever waits in Triton's queue for longer is dropped there, over HTTP too: nobody waits for the answer.
+            waits_us = max(int(timeout_s * _US_PER_S), 1)
+            answer = await self._client.infer(
+                model, tensors, outputs=requested, request_id=request_id, timeout=waits_us
+            )
         return Answer(_outputs(answer, outputs), self._model_version(answer))
 
     @asynccontextmanager
@@ -188,18 +208,26 @@ class _TritonTransport:
             async with timeout(timeout_s):
                 return await call
         except InferenceServerException as error:
+            if is_denied(error):
+                raise errors.AccessDeniedError(f"{self.url}: access denied: {error.message()}") from error
             raise _mapped(error, bad_request) from error
         except (asyncio.TimeoutError, TimeoutError) as error:  # in Python 3.10 two
             raise errors.DeadlineExceededError(f"{self.url}: no answer in time") from error
         except self.protocol_errors as error:
             hint = "no answer of an HTTP server (is it the gRPC port? then grpc://)"
             raise errors.InferenceFailedError(f"{self.url}: {hint}: {type(error).__name__}") from error
+        except self.access_errors as error:
+            raise errors.AccessDeniedError(f"{self.url}: access denied: {error}") from error
         except self.connection_errors as error:
             raise errors.ServerUnavailableError(
                 f"{self.url}: no connection: {error or type(error).__name__}"
             ) from error
         except (ValueError, LookupError, TypeError) as error:  # while reading what is no answer of a KServe server
             raise errors.InferenceFailedError(f"{self.url}: the answer cannot be read: {error!r}") from error
+
+    @property
+    def _is_secure(self) -> bool:
+        return self._scheme in SECURE_SCHEMES
 
     # What differs. A module is imported when it is first needed; a client belongs to the event loop that runs then.
 
@@ -217,6 +245,10 @@ class _TritonTransport:
 
     @property
     def protocol_errors(self) -> tuple[type[Exception], ...]:
+        return ()
+
+    @property
+    def access_errors(self) -> tuple[type[Exception], ...]:
         return ()
 
     async def registered_regions(self) -> list[str]:
@@ -248,7 +280,11 @@ class GrpcTransport(_TritonTransport):
                 f"gRPC was used in process {process}, which forked this one: "
                 "have multiprocessing start its processes by spawn or forkserver"
             )
-        return self._triton.InferenceServerClient(self._address, channel_args=list(_GRPC_OPTIONS.items()))
+        client = self._triton.InferenceServerClient(
+            self._address, channel_args=list(_GRPC_OPTIONS.items()), **self._access.grpc_options(self._scheme)
+        )
+        self._access.show_with_each_request(client)
+        return client
 
     async def registered_regions(self) -> list[str]:
         answer = await self._client.get_system_shared_memory_status(as_json=True)
@@ -274,7 +310,9 @@ class HttpTransport(_TritonTransport):
 
     @cached_property
     def _client(self) -> Any:
-        client = self._triton.InferenceServerClient(self._address, conn_limit=0, conn_timeout=None)
+        secure = {"ssl": True, "ssl_context": self._access.ssl_context} if self._is_secure else {}
+        client = self._triton.InferenceServerClient(self._address, conn_limit=0, conn_timeout=None, **secure)
+        self._access.show_with_each_request(client)
         post = client._post
 
         async def post_stream(request_uri: str, request_body: str | bytes, headers: Any, query_params: Any) -> Any:
@@ -296,6 +334,12 @@ class HttpTransport(_TritonTransport):
         import aiohttp
 
         return (aiohttp.ClientResponseError,)
+
+    @property
+    def access_errors(self) -> tuple[type[Exception], ...]:
+        import aiohttp
+
+        return (aiohttp.ClientSSLError, ssl.SSLError)
 
     async def registered_regions(self) -> list[str]:
         return [region["name"] for region in await self._client.get_system_shared_memory_status()]

@@ -10,6 +10,7 @@ requests of different callers, lengths and sample types into one batch.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -52,6 +53,9 @@ PREFERENCE = "preference"
 SIMILARITY = "similarity"
 PROGRESS_LOGITS = "progress_logits"
 TIMING_MS = "timing_ms"
+
+REQUEST_ID = re.compile(r"[\w.:/+=@-]{1,64}", re.ASCII)  # what a request's id may be
+CANARY_PREFIX = "rfm-canary"  # of the request ids of health probes, which no metric of a model counts
 
 VARIABLE = -1  # a dimension that differs from request to request
 

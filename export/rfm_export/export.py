@@ -10,19 +10,20 @@ from typing import Any
 
 import torch
 from google.protobuf.text_format import ParseError
+from safetensors import SafetensorError
 
 from rfm import checkpoint as checkpoints
 from rfm.checkpoint import Checkpoint, RewindCheckpoint, VlmCheckpoint
-from rfm.checkpoint.files import read_json
+from rfm.checkpoint.content import read_json
 from rfm.config import ServeConfig
 from rfm.engine import PROCESSOR_FOLDER, Engine
 from rfm.families.vlm import load_collator, save_processor
 from rfm.models.encoders import PREPROCESSOR_CONFIG, Encoders, ImagePreprocessor
 from rfm_client.resize import FrameSize
-from rfm_export.about import about, told_source
+from rfm_export.about import Origin, about, tell_weights
 from rfm_export.errors import ExportError
 from rfm_export.layout import GeneratedModel, encoder_name, frames_name, rewind_models, vlm_models
-from rfm_export.publish import next_version, publish, read_config, staging
+from rfm_export.publish import alone, next_version, publish, read_config, staging
 from rfm_export.verify import probes, verify
 
 CHECKPOINT_FOLDER = "checkpoint"
@@ -56,22 +57,32 @@ def export(source: str | Path, repository: Path, serve: ServeConfig) -> int:
     The staged files are loaded and compared with the original before anything in the repository changes.
     Raises CheckpointError, ExportError.
     """
-    checkpoint = checkpoints.load(source, base_model=serve.base_model)
-    version = next_version(repository, [serve.name, encoder_name(serve.name), frames_name(serve.name)])
-    if isinstance(checkpoint, RewindCheckpoint):
-        plan = _rewind_plan(checkpoint, serve, version, source)
-    else:
-        plan = _vlm_plan(checkpoint, serve, version, source)
-    _check_replaceable(repository, plan.models, serve)
-    with staging(repository) as folder:
-        for path, content in (item for model in plan.models for item in model.files().items()):
-            (folder / path).parent.mkdir(parents=True, exist_ok=True)
-            (folder / path).write_bytes(content)
-        plan.write(folder)
+    folder = checkpoints.find(source)
+    checkpoint = checkpoints.load(folder, base_model=serve.base_model)
+    checkpoints.check(folder, checkpoint)
+    origin = Origin.of(source, folder)
+    with alone(repository), staging(repository) as staged:
+        version = next_version(repository, [serve.name, encoder_name(serve.name), frames_name(serve.name)])
+        if isinstance(checkpoint, RewindCheckpoint):
+            plan = _rewind_plan(checkpoint, serve, version, origin)
+        else:
+            plan = _vlm_plan(checkpoint, serve, version, origin, folder)
+        _check_replaceable(repository, plan.models, serve)
+        _stage(plan, staged)
         samples = probes(checkpoint.config, with_embeddings=plan.embeddings, with_frames=plan.frames)
-        verify(plan.original, lambda: plan.exported(folder), samples)
-        publish(repository, folder, plan.models)
+        verify(plan.original, lambda: plan.exported(staged), samples)
+        publish(repository, staged, plan.models)
     return version
+
+
+def _stage(plan: _Plan, staged: Path) -> None:
+    try:
+        plan.write(staged)
+        for path, content in _generated(plan.models, staged).items():
+            (staged / path).parent.mkdir(parents=True, exist_ok=True)
+            (staged / path).write_bytes(content)
+    except (OSError, SafetensorError) as error:  # the latter of a full disk, too
+        raise ExportError(f"{staged}: expected room for the exported files, got: {error}") from error
 
 
 def check(repository: Path, serve: ServeConfig) -> list[str]:
@@ -84,14 +95,21 @@ def check(repository: Path, serve: ServeConfig) -> list[str]:
     version = max(versions)
     checkpoint = checkpoints.load(repository / scorer / str(version) / CHECKPOINT_FOLDER)
     frame_size = _exported_frame_size(repository / encoder_name(serve.name) / str(version))
-    models = _models(checkpoint, serve, version, frame_size, told_source(config))
+    models = _models(checkpoint, serve, version, frame_size, Origin.told(config))
     differences = []
-    for path, content in (i for model in models for i in model.files().items()):
+    for path, content in _generated(models, repository).items():
         if not (repository / path).is_file():
             differences.append(f"{repository / path}: is missing")
         elif (repository / path).read_bytes() != content:
             differences.append(f"{repository / path}: differs from what `rfm export` generates")
     return differences
+
+
+def _generated(models: Sequence[GeneratedModel], repository: Path) -> dict[str, bytes]:
+    """Contents of the generated files by path in the repository, where the models' weights lie."""
+    for model in models:
+        tell_weights(model.config, model.version, repository)
+    return {path: content for model in models for path, content in model.files().items()}
 
 
 def load_encoders(checkpoint: RewindCheckpoint, serve: ServeConfig) -> Encoders | None:
@@ -127,16 +145,16 @@ def _exported_frame_size(encoder: Path) -> FrameSize | None:
 
 
 def _models(
-    checkpoint: Checkpoint, serve: ServeConfig, version: int, frame_size: FrameSize | None, source: str | Path
+    checkpoint: Checkpoint, serve: ServeConfig, version: int, frame_size: FrameSize | None, origin: Origin
 ) -> list[GeneratedModel]:
-    told = about(checkpoint, source)
+    told = about(checkpoint, origin)
     num_gpus = torch.cuda.device_count() if serve.num_gpus is None else serve.num_gpus
     if isinstance(checkpoint, VlmCheckpoint):
         return vlm_models(checkpoint.config, serve, told, num_gpus=num_gpus, version=version)
     return rewind_models(checkpoint.config, serve, told, num_gpus=num_gpus, version=version, frame_size=frame_size)
 
 
-def _rewind_plan(checkpoint: RewindCheckpoint, serve: ServeConfig, version: int, source: str | Path) -> _Plan:
+def _rewind_plan(checkpoint: RewindCheckpoint, serve: ServeConfig, version: int, origin: Origin) -> _Plan:
     encoders = load_encoders(checkpoint, serve)
 
     def of_scorer(folder: Path) -> Path:
@@ -156,7 +174,7 @@ def _rewind_plan(checkpoint: RewindCheckpoint, serve: ServeConfig, version: int,
         return Engine.from_checkpoint(of_scorer(folder), encoders=saved)
 
     return _Plan(
-        models=_models(checkpoint, serve, version, encoders.preprocessor.frame_size if encoders else None, source),
+        models=_models(checkpoint, serve, version, encoders.preprocessor.frame_size if encoders else None, origin),
         write=write,
         original=lambda: Engine.of(checkpoint, encoders=encoders),
         exported=exported,
@@ -165,8 +183,8 @@ def _rewind_plan(checkpoint: RewindCheckpoint, serve: ServeConfig, version: int,
     )
 
 
-def _vlm_plan(checkpoint: VlmCheckpoint, serve: ServeConfig, version: int, source: str | Path) -> _Plan:
-    folder = checkpoints.find(source)
+def _vlm_plan(checkpoint: VlmCheckpoint, serve: ServeConfig, version: int, origin: Origin, folder: Path) -> _Plan:
+    """folder: the checkpoint's."""
     processor: str | Path = serve.base_model or checkpoint.config.base_model_id
     if serve.base_model is None and (folder / PROCESSOR_FOLDER).is_dir():
         processor = folder / PROCESSOR_FOLDER
@@ -181,7 +199,7 @@ def _vlm_plan(checkpoint: VlmCheckpoint, serve: ServeConfig, version: int, sourc
 
     device = "cuda" if torch.cuda.is_available() and serve.num_gpus != 0 else "cpu"
     return _Plan(
-        models=_models(checkpoint, serve, version, None, source),
+        models=_models(checkpoint, serve, version, None, origin),
         write=write,
         original=lambda: Engine.of(checkpoint, processor=processor, device=device, dtype=serve.torch_dtype),
         exported=lambda folder: Engine.from_checkpoint(of_scorer(folder), device=device, dtype=serve.torch_dtype),

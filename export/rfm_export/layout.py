@@ -26,6 +26,7 @@ from rfm_client.model_info import (
     MAX_FRAMES_PARAMETER,
 )
 from rfm_client.resize import FrameSize
+from rfm_export.about import about_encoders
 from rfm_export.pbtxt import Interface, Warmup, ensemble_config, python_config, render
 
 CONFIG_FILE = "config.pbtxt"
@@ -102,7 +103,9 @@ def rewind_models(
         )
     ]
     if frame_size is not None:
-        encoder = Interface(encoder_name(serve.name), wire.encoder_inputs(), wire.encoder_outputs(*dims))
+        encoder = Interface(
+            encoder_name(serve.name), wire.encoder_inputs(), wire.encoder_outputs(*dims), about_encoders(about)
+        )
         frames = Interface(
             frames_name(serve.name), wire.frame_inputs(), outputs, {**_limits(limit, frame_size), **about}
         )

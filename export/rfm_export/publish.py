@@ -3,10 +3,15 @@
 
 New version folders appear whole (written aside, then renamed) and are not served until the configurations,
 replaced one by one, name them. The order in which that happens keeps every intermediate state consistent.
+
+A model has one configuration for all its versions, which tells the checkpoint of the newest. So each version folder
+keeps the one that it was exported with, for the day when it is served again (``rollout``).
 """
 
 from __future__ import annotations
 
+import fcntl
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -15,22 +20,51 @@ from pathlib import Path
 
 from tritonclient.grpc import model_config_pb2 as pb
 
+from rfm_export.errors import ExportError
 from rfm_export.layout import CONFIG_FILE, WARMUP_FOLDER, GeneratedModel
 from rfm_export.pbtxt import parse, render, serving_versions
 
 
 @contextmanager
-def staging(repository: Path) -> Iterator[Path]:
-    """A folder on the repository's file system, gone afterwards: beside it, or in it where it is a mount point."""
+def alone(repository: Path) -> Iterator[None]:
+    """Nobody else changes the repository meanwhile, where its file system has locks; what those left that were killed
+    is gone. Raises ExportError if somebody does.
+    """
     repository.mkdir(parents=True, exist_ok=True)
-    repository = repository.resolve()
-    beside = repository.parent.stat().st_dev == repository.stat().st_dev
-    parent = repository.parent if beside else repository
-    folder = Path(tempfile.mkdtemp(prefix=f".{repository.name}.export-", dir=parent))
+    descriptor = os.open(repository, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # given back when the process ends, however it ends
+    except BlockingIOError:
+        os.close(descriptor)
+        raise ExportError(f"{repository}: expected no other export or rollout at work, got one") from None
+    except OSError:  # no locks here
+        pass
+    else:
+        prefix, parent = _scratch_place(repository)
+        for left in [path for path in parent.iterdir() if path.name.startswith(prefix)]:
+            shutil.rmtree(left, ignore_errors=True)
+    try:
+        yield
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def staging(repository: Path) -> Iterator[Path]:
+    """A folder on the repository's file system, gone afterwards."""
+    prefix, parent = _scratch_place(repository)
+    folder = Path(tempfile.mkdtemp(prefix=prefix, dir=parent))
     try:
         yield folder
     finally:
         shutil.rmtree(folder)
+
+
+def _scratch_place(repository: Path) -> tuple[str, Path]:
+    """Of staging folders, how their names begin and where they lie: beside the repository, or in a mounted one."""
+    repository = repository.resolve()
+    beside = repository.parent.stat().st_dev == repository.stat().st_dev
+    return f".{repository.name}.export-", repository.parent if beside else repository
 
 
 def next_version(repository: Path, names: Sequence[str]) -> int:
@@ -44,6 +78,21 @@ def read_config(repository: Path, name: str) -> pb.ModelConfig:
     return parse((repository / name / CONFIG_FILE).read_text())
 
 
+def config_of(repository: Path, name: str, version: int) -> pb.ModelConfig:
+    """The configuration to serve one version of a model with. Raises OSError, ParseError."""
+    kept = repository / name / str(version) / CONFIG_FILE
+    current = read_config(repository, name)
+    if version in current.version_policy.specific.versions and not kept.exists():  # of an export that kept none
+        return serving_versions(current, [version])
+    return serving_versions(parse(kept.read_text()), [version])
+
+
+def replace_config(repository: Path, config: pb.ModelConfig, scratch: Path) -> None:
+    """Readers see the old configuration or the new, never a part; ``scratch`` is on the same file system."""
+    (scratch / CONFIG_FILE).write_text(render(config))
+    (scratch / CONFIG_FILE).replace(repository / config.name / CONFIG_FILE)
+
+
 def publish(repository: Path, staged: Path, models: Sequence[GeneratedModel]) -> None:
     """Moves the staged models into the repository.
 
@@ -51,6 +100,11 @@ def publish(repository: Path, staged: Path, models: Sequence[GeneratedModel]) ->
     ensembles switch to the new one, then the old one goes.
     """
     replaced = [model for model in models if (repository / model.name).exists()]
+    for model in models:
+        (staged / model.name / str(model.version) / CONFIG_FILE).write_text(render(model.config))
+    _settle(staged)
+    for model in replaced:
+        _keep_config(repository, model.name, staged)
     for model in models:
         if model not in replaced:
             (staged / model.name).rename(repository / model.name)
@@ -64,12 +118,27 @@ def publish(repository: Path, staged: Path, models: Sequence[GeneratedModel]) ->
     parts = [model for model in replaced if not model.is_ensemble]
     for model in parts:
         served = read_config(repository, model.name).version_policy.specific.versions
-        _replace_config(repository, serving_versions(model.config, sorted({*served, model.version})), staged)
+        replace_config(repository, serving_versions(model.config, sorted({*served, model.version})), staged)
     for model in (*(model for model in replaced if model.is_ensemble), *parts):
-        _replace_config(repository, model.config, staged)
+        replace_config(repository, model.config, staged)
 
 
-def _replace_config(repository: Path, config: pb.ModelConfig, scratch: Path) -> None:
-    """Readers see the old configuration or the new, never a part; ``scratch`` is on the same file system."""
-    (scratch / CONFIG_FILE).write_text(render(config))
-    (scratch / CONFIG_FILE).replace(repository / config.name / CONFIG_FILE)
+def _settle(staged: Path) -> None:
+    """Brings all files to the disk: a power cut leaves none of them half there. Raises ExportError for a link."""
+    for path in (staged, *staged.rglob("*")):
+        if path.is_symlink():
+            raise ExportError(f"{path}: expected a file or folder, got a link")
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def _keep_config(repository: Path, name: str, scratch: Path) -> None:
+    """For a version whose export kept none."""
+    current = read_config(repository, name)
+    kept = repository / name / str(max(current.version_policy.specific.versions)) / CONFIG_FILE
+    if not kept.exists():
+        (scratch / CONFIG_FILE).write_text(render(current))
+        (scratch / CONFIG_FILE).replace(kept)

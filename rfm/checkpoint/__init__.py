@@ -11,7 +11,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TypeAlias
 
-from rfm.checkpoint.files import NETWORK_CONFIG, CheckpointError, best_tag, find, read_json, read_run_config
+from rfm.checkpoint.content import CheckpointError, is_there, read_json, read_run_config
+from rfm.checkpoint.files import NETWORK_CONFIG, best_tag, check_finite, check_links, find
 from rfm.checkpoint.rewind import RewindCheckpoint, load_rewind, save_rewind
 from rfm.checkpoint.vlm import ADAPTER_CONFIG, VlmCheckpoint, load_vlm, save_vlm
 from rfm.models.vlm import BACKBONES
@@ -24,6 +25,7 @@ __all__ = [
     "RewindCheckpoint",
     "VlmCheckpoint",
     "best_tag",
+    "check",
     "find",
     "load",
     "read_run_config",
@@ -37,9 +39,21 @@ def load(source: str | Path, *, base_model: str | None = None) -> Checkpoint:
     base_model: folder or id of a vision-language checkpoint's backbone; else the one that the checkpoint names
     """
     folder = find(source)
-    if (folder / ADAPTER_CONFIG).is_file() or _model_type(folder) in BACKBONES:
+    if is_there(folder / ADAPTER_CONFIG) or _model_type(folder) in BACKBONES:
         return load_vlm(folder, base_model)
     return load_rewind(folder)
+
+
+def check(folder: Path, checkpoint: Checkpoint) -> None:
+    """Raises CheckpointError for what is refused before a checkpoint of ``folder`` is served, beyond what ``load``
+    refuses: links that lead out of it, and weights that are no numbers.
+    """
+    check_links(folder)
+    if isinstance(checkpoint, RewindCheckpoint):
+        for weights in (checkpoint.network, checkpoint.image_encoder, checkpoint.text_encoder):
+            check_finite(weights)
+    else:
+        check_finite(checkpoint.weights)
 
 
 def save(checkpoint: Checkpoint, folder: Path) -> None:
@@ -52,4 +66,5 @@ def save(checkpoint: Checkpoint, folder: Path) -> None:
 
 def _model_type(folder: Path) -> str | None:
     config = folder / NETWORK_CONFIG
-    return read_json(config).get("model_type") if config.is_file() else None
+    told = read_json(config).get("model_type") if is_there(config) else None
+    return told if isinstance(told, str) else None

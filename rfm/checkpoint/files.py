@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""The files of a checkpoint: where it is, its weights, its configurations. Nothing in them is executed."""
+"""The files of a checkpoint: where it is, its weights, what its names and numbers may be."""
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-from safetensors import SafetensorError
-from safetensors.torch import load_file
+import torch
 from torch import Tensor
+
+from rfm.checkpoint.content import CheckpointError, cut, is_there, listed, read_json, read_tensors, shown
 
 WEIGHTS = "model.safetensors"
 WEIGHTS_INDEX = "model.safetensors.index.json"
@@ -20,6 +19,7 @@ NETWORK_CONFIG = "config.json"
 RUN_CONFIG = "config.yaml"
 
 _BEST_TAG = re.compile(r"best-.*?-(-?\d+\.\d+)-step-\d+")
+MAX_COUNT = 2**20  # of frames: longer than any trajectory
 _PICKLES = ("*.bin", "*.pt", "*.pth", "*.ckpt", "*.pkl")
 _CONVERT = (
     "python -c \"import torch, safetensors.torch as s; weights = torch.load('{file}', map_location='cpu', "
@@ -27,19 +27,19 @@ _CONVERT = (
 )
 
 
-class CheckpointError(Exception):
-    """A checkpoint that cannot be loaded: what is wrong with which file, and what to do about it."""
-
-
 def find(source: str | Path) -> Path:
     """The local folder of a checkpoint, fetched from the Hub if need be. An existing path wins over an id."""
-    path = Path(source).expanduser()
-    if str(source) and path.is_dir():
-        return path
+    expected = "a folder that exists or a Hugging Face id org/name[@tag]"
+    try:
+        path = Path(source).expanduser()
+        if str(source) and path.is_dir():
+            return path
+    except (OSError, RuntimeError) as error:
+        got = f"{shown(str(source))}: {type(error).__name__}"
+        raise CheckpointError(f"checkpoint: expected {expected}, got {got}") from error
     repo_id, _, tag = str(source).partition("@")
-    if not re.fullmatch(r"[\w.-]+/[\w.-]+", repo_id):
-        expected = "a folder that exists or a Hugging Face id org/name[@tag]"
-        raise CheckpointError(f"checkpoint: expected {expected}, got {str(source)!r}")
+    if not re.fullmatch(r"\w[\w.-]*/\w[\w.-]*", repo_id):
+        raise CheckpointError(f"checkpoint: expected {expected}, got {shown(str(source))}")
     return _fetch(repo_id, tag or None)
 
 
@@ -52,56 +52,55 @@ def best_tag(tags: Iterable[str]) -> str | None:
 def find_run_config(folder: Path) -> Path | None:
     """config.yaml in the checkpoint's folder or its parent."""
     candidates = (folder / RUN_CONFIG, folder.resolve().parent / RUN_CONFIG)
-    return next((file for file in candidates if file.is_file()), None)
+    return next((file for file in candidates if is_there(file)), None)
 
 
 def check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> None:
-    """Raises CheckpointError unless both have the same names and shapes."""
+    """Raises CheckpointError unless both have the same names, shapes and kinds of numbers."""
     check_keys(expected.keys(), got.keys())
     for name, tensor in got.items():
         if tensor.shape != expected[name].shape:
             raise CheckpointError(f"{name}: expected {list(expected[name].shape)}, got {list(tensor.shape)}")
+        if tensor.is_floating_point() != expected[name].is_floating_point():
+            raise CheckpointError(f"{name}: expected numbers like {expected[name].dtype}, got {tensor.dtype}")
 
 
-def read_run_config(file: Path) -> dict[str, Any]:
-    """config.yaml as plain mappings, lists and scalars, whatever Python objects its tags ask for."""
-    try:
-        config = yaml.load(file.read_text(), Loader=_PlainLoader)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise CheckpointError(f"{file}: expected YAML, got {error}") from error
-    if not isinstance(config, dict):
-        raise CheckpointError(f"{file}: expected a mapping, got {type(config).__name__}")
-    return config
+def check_finite(weights: Mapping[str, Tensor]) -> None:
+    """Raises CheckpointError for a weight that is no number: every score would be none."""
+    for name, tensor in weights.items():
+        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
+            at = (~torch.isfinite(tensor)).nonzero()[0].tolist()
+            raise CheckpointError(f"{name}: expected finite weights, got {tensor[tuple(at)].item()} at {at}")
+
+
+def check_links(folder: Path) -> None:
+    """Raises CheckpointError for a link in ``folder``, or one level below, to somewhere else.
+
+    Those of the Hub's cache lead from ``snapshots/<commit>`` to ``blobs`` beside it.
+    """
+    home = folder.resolve()
+    snapshots = next((path for path in home.parents if path.name == "snapshots"), None)
+    allowed = home if snapshots is None or not (snapshots.parent / "blobs").is_dir() else snapshots.parent
+    for file in (*folder.glob("*"), *folder.glob("*/*")):
+        if file.is_symlink() and not file.resolve().is_relative_to(allowed):
+            raise CheckpointError(f"{file}: expected a file of the checkpoint, got a link to {file.resolve()}")
 
 
 def trained_frames(run: Mapping[str, Any], file: Path) -> int | None:
     """The most frames of a trajectory in training, as config.yaml tells it; None if it does not."""
     data = run.get("data") or {}
     if not isinstance(data, dict):
-        raise CheckpointError(f"{file}: data: expected a mapping, got {data!r}")
+        raise CheckpointError(f"{file}: data: expected a mapping, got {shown(data)}")
     return frame_count(data.get("max_frames"), f"{file}: data.max_frames")
 
 
 def frame_count(frames: Any, where: str) -> int | None:
     """The value if it is a count of frames, or None. Raises CheckpointError."""
     if frames is not None and (type(frames) is not int or frames < 1):
-        raise CheckpointError(f"{where}: expected a whole number of at least 1, got {frames!r}")
+        raise CheckpointError(f"{where}: expected a whole number of at least 1, got {shown(frames)}")
+    if frames is not None and frames > MAX_COUNT:
+        raise CheckpointError(f"{where}: expected at most {MAX_COUNT}, got {shown(frames)}")
     return frames
-
-
-class _PlainLoader(yaml.SafeLoader):
-    """SafeLoader that reads nodes tagged as Python objects as the plain data that they hold."""
-
-
-def _plain(loader: yaml.SafeLoader, _suffix: str, node: yaml.Node) -> Any:
-    if isinstance(node, yaml.MappingNode):
-        return loader.construct_mapping(node, deep=True)
-    if isinstance(node, yaml.SequenceNode):
-        return loader.construct_sequence(node, deep=True)
-    return node.value
-
-
-_PlainLoader.add_multi_constructor("tag:yaml.org,2002:python/", _plain)
 
 
 def _fetch(repo_id: str, tag: str | None) -> Path:
@@ -119,9 +118,9 @@ def _fetch(repo_id: str, tag: str | None) -> Path:
 
 def read_weights(folder: Path) -> dict[str, Tensor]:
     """All tensors of model.safetensors or of the shards that its index names. Raises CheckpointError."""
-    if (folder / WEIGHTS).is_file():
+    if is_there(folder / WEIGHTS):
         return read_tensors(folder / WEIGHTS)
-    if (folder / WEIGHTS_INDEX).is_file():
+    if is_there(folder / WEIGHTS_INDEX):
         return _read_shards(folder / WEIGHTS_INDEX)
     pickles = sorted(file for pattern in _PICKLES for file in folder.glob(pattern))
     if pickles:
@@ -138,33 +137,14 @@ def _read_shards(index: Path) -> dict[str, Tensor]:
     if not isinstance(weight_map, dict):
         raise CheckpointError(f"{index}: expected a weight_map, got none")
     weights: dict[str, Tensor] = {}
-    for name in sorted(set(weight_map.values())):
-        if Path(name).name != name:
-            raise CheckpointError(f"{index}: expected names of files beside it, got {name!r}")
-        if not (index.parent / name).is_file():
+    for name in dict.fromkeys(map(str, weight_map.values())):
+        if Path(name).name != name or not name.endswith(".safetensors"):
+            raise CheckpointError(f"{index}: expected names of files beside it, got {shown(name)}")
+        if not is_there(index.parent / name):
             raise CheckpointError(f"{index}: names the shard {name}, which is not there")
         weights |= read_tensors(index.parent / name)
     check_keys(weight_map.keys(), weights.keys())
     return weights
-
-
-def read_tensors(file: Path) -> dict[str, Tensor]:
-    """All tensors of one safetensors file. Raises CheckpointError."""
-    try:
-        return load_file(file)
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{file}: expected a safetensors file, got {error}") from error
-
-
-def read_json(file: Path) -> dict[str, Any]:
-    """A JSON object. Raises CheckpointError."""
-    try:
-        content = json.loads(file.read_text())
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"{file}: expected JSON, got {error}") from error
-    if not isinstance(content, dict):
-        raise CheckpointError(f"{file}: expected a JSON object, got {type(content).__name__}")
-    return content
 
 
 def take_prefix(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
@@ -177,8 +157,9 @@ def check_keys(expected: Iterable[str], got: Iterable[str]) -> None:
     """Raises CheckpointError that lists the missing and the unexpected."""
     missing, unexpected = sorted(set(expected) - set(got)), sorted(set(got) - set(expected))
     if missing or unexpected:
-        raise CheckpointError(f"{WEIGHTS}: missing keys: {missing or 'none'}; unexpected keys: {unexpected or 'none'}")
+        told = [listed(names) if names else "none" for names in (missing, unexpected)]
+        raise CheckpointError(f"{WEIGHTS}: missing keys: {told[0]}; unexpected keys: {told[1]}")
 
 
 def _listing(folder: Path) -> str:
-    return ", ".join(sorted(path.name for path in folder.iterdir())) or "nothing"
+    return cut(", ".join(sorted(path.name for path in folder.iterdir()))) or "nothing"

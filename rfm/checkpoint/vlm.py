@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Vision-language checkpoints: full weights, or LoRA weights that are merged into their base here.
 
-Names of weights become those of VlmRewardModel, by one rename table per form. LoRA: W + alpha / r * B A
-(https://arxiv.org/abs/2106.09685).
+Names of weights become those of VlmRewardModel, by one rename table per form.
 """
 
 from __future__ import annotations
@@ -19,19 +18,27 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from rfm.checkpoint.content import (
+    CheckpointError,
+    cut,
+    expecting,
+    is_there,
+    listed,
+    read_json,
+    read_run_config,
+    read_tensors,
+    shown,
+)
 from rfm.checkpoint.files import (
     NETWORK_CONFIG,
     RUN_CONFIG,
     WEIGHTS,
-    CheckpointError,
     check_shapes,
     find_run_config,
-    read_json,
-    read_run_config,
-    read_tensors,
     read_weights,
     trained_frames,
 )
+from rfm.checkpoint.lora import LORA_NAME, merged, scaling
 from rfm.models.vlm import BACKBONES, SMOL, VlmConfig, VlmRewardModel, build_backbone
 
 VQA = "vqa"  # value of model.model_type of checkpoints that generate text
@@ -54,10 +61,8 @@ _GENERATOR: _Renames = (  # as transformers saves the whole model of Qwen2.5-VL
 )
 _UNUSED = ("lm_head.weight", "model.lm_head.weight")  # makes text, which no reward head reads
 
-_LORA_NAME = re.compile(r"(?P<module>.+)\.lora_(?P<side>[AB])(\.default)?\.weight")
-_BASE_LAYER = ".base_layer."
-# Fields of adapter_config.json that would make the merged weight another one.
-_UNSUPPORTED_LORA = ("use_dora", "use_rslora", "lora_bias", "alpha_pattern", "rank_pattern", "fan_in_fan_out")
+_LAYER_COUNTS = ("num_hidden_layers", "num_layers", "depth")
+MAX_LAYERS = 1024
 
 
 @dataclass(frozen=True)
@@ -74,33 +79,41 @@ class VlmCheckpoint:
         """
         wanted = dtype or self.config.torch_dtype
         _check_transformers(self.config)
-        backbone = build_backbone(self.config, wanted, attention)
-        network = backbone if self.config.generates_text else VlmRewardModel(self.config, backbone)
-        check_shapes(network.state_dict(), self.weights)
+        network = self._network(wanted, attention)
         # Parameters only: rotary frequencies stay float32, as in the original.
         network.load_state_dict({k: v.to(wanted) for k, v in self.weights.items()}, strict=True, assign=True)
         return network.eval().requires_grad_(False)
+
+    def check(self) -> None:
+        """Raises CheckpointError unless the weights are those of the network; no memory is taken for it before."""
+        _check_layers(self.config.backbone)
+        with expecting("a backbone that transformers can make", NETWORK_CONFIG), torch.device("meta"):
+            network = self._network(self.config.torch_dtype, "sdpa")
+        check_shapes(network.state_dict(), self.weights)
+
+    def _network(self, dtype: torch.dtype, attention: str | None) -> nn.Module:
+        backbone = build_backbone(self.config, dtype, attention)
+        return backbone if self.config.generates_text else VlmRewardModel(self.config, backbone)
 
 
 def load_vlm(folder: Path, base_model: str | None = None) -> VlmCheckpoint:
     """The checkpoint in a local folder; ``base_model`` as in ``rfm.checkpoint.load``. Raises CheckpointError."""
     run = _run_config(folder)
-    if (folder / ADAPTER_CONFIG).is_file():
-        backbone, weights = _adapted(folder, base_model or _base_model_id(folder, run))
-    else:
-        backbone, weights = read_json(folder / NETWORK_CONFIG), read_weights(folder)
-        if any(_LORA_NAME.fullmatch(name) for name in weights):
-            peft = run.get("peft") or {}
-            weights = _merged(_renamed(weights, _LORA_INSIDE), _scaling(folder / RUN_CONFIG, peft))
-        weights = _renamed(weights, _SMOL if backbone["model_type"] == SMOL else _FULL)
-    config = _vlm_config(folder, backbone, run, weights)
-    if config.generates_text:
-        weights = _renamed(weights, _GENERATOR)
-        if LANGUAGE_HEAD not in weights and backbone.get("tie_word_embeddings", True):
-            weights[LANGUAGE_HEAD] = weights[EMBEDDING]
-    else:
-        weights = {name: tensor for name, tensor in weights.items() if name not in _UNUSED}
-    return VlmCheckpoint(config, weights)
+    with expecting("a vision-language checkpoint", folder):
+        if is_there(folder / ADAPTER_CONFIG):
+            backbone, weights = _adapted(folder, base_model or _base_model_id(folder, run))
+        else:
+            backbone, weights = _whole(folder, run)
+        config = _vlm_config(folder, backbone, run, weights)
+        if config.generates_text:
+            weights = _renamed(weights, _GENERATOR)
+            if LANGUAGE_HEAD not in weights and backbone.get("tie_word_embeddings", True):
+                weights[LANGUAGE_HEAD] = weights[EMBEDDING]
+        else:
+            weights = {name: tensor for name, tensor in weights.items() if name not in _UNUSED}
+    checkpoint = VlmCheckpoint(config, weights)
+    checkpoint.check()
+    return checkpoint
 
 
 def save_vlm(checkpoint: VlmCheckpoint, folder: Path) -> None:
@@ -117,7 +130,11 @@ def save_vlm(checkpoint: VlmCheckpoint, folder: Path) -> None:
 
 def _run_config(folder: Path) -> dict[str, Any]:
     file = find_run_config(folder)
-    return {} if file is None else read_run_config(file)
+    run = {} if file is None else read_run_config(file)
+    for section in ("model", "data", "training", "peft"):
+        if not isinstance(run.get(section) or {}, dict):
+            raise CheckpointError(f"{file}: {section}: expected a mapping, got {shown(run[section])}")
+    return run
 
 
 def _base_model_id(folder: Path, run: Mapping[str, Any]) -> str:
@@ -138,11 +155,11 @@ def _vlm_config(
     model, data, training = (run.get(section) or {} for section in ("model", "data", "training"))
     family = backbone.get("model_type")
     if family not in BACKBONES:
-        raise CheckpointError(f"{folder}: model_type: expected one of {', '.join(BACKBONES)}, got {family}")
+        raise CheckpointError(f"{folder}: model_type: expected one of {', '.join(BACKBONES)}, got {shown(family)}")
     generates_text = model.get("model_type", "default") == VQA
     if model.get("model_type", "default") not in ("default", VQA) or (generates_text and family == SMOL):
         expected = "default (or vqa of a Qwen backbone)"
-        raise CheckpointError(f"{folder}: model.model_type: expected {expected}, got {model['model_type']}")
+        raise CheckpointError(f"{folder}: model.model_type: expected {expected}, got {shown(model['model_type'])}")
     for name in ("progress_head.4.weight", "frame_pool_attn.weight"):
         if name not in weights and not generates_text:
             raise CheckpointError(f"{folder}: expected reward heads, got no {name}")
@@ -201,6 +218,25 @@ def _renamed(weights: Mapping[str, Tensor], renames: _Renames) -> dict[str, Tens
     return {rename(name): tensor for name, tensor in weights.items()}
 
 
+def _whole(folder: Path, run: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Configuration of the backbone, and all weights, LoRA's merged."""
+    backbone, weights = read_json(folder / NETWORK_CONFIG), read_weights(folder)
+    if any(LORA_NAME.fullmatch(name) for name in weights):
+        weights = merged(_renamed(weights, _LORA_INSIDE), scaling(folder / RUN_CONFIG, run.get("peft") or {}))
+    return backbone, _renamed(weights, _SMOL if backbone["model_type"] == SMOL else _FULL)
+
+
+def _check_layers(config: Any) -> None:
+    """Raises CheckpointError for so many layers that making them would not end."""
+    inner = config.values() if isinstance(config, dict) else config if isinstance(config, list) else ()
+    for part in inner:
+        _check_layers(part)
+    for name in _LAYER_COUNTS if isinstance(config, dict) else ():
+        count = config.get(name)
+        if isinstance(count, (int, float)) and count > MAX_LAYERS:
+            raise CheckpointError(f"{NETWORK_CONFIG}: {name}: expected at most {MAX_LAYERS}, got {shown(count)}")
+
+
 def _adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Configuration of the base model's backbone, and its weights with the adapter merged into them."""
     adapter_config = read_json(folder / ADAPTER_CONFIG)
@@ -208,14 +244,16 @@ def _adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, T
     config, base = _read_base(base_model)
     if EMBEDDING not in adapter:
         raise CheckpointError(f"{folder / ADAPTER_WEIGHTS}: expected the embedding of the special tokens, got none")
-    factors = {name: tensor for name, tensor in adapter.items() if _LORA_NAME.fullmatch(name)}
+    factors = {name: tensor for name, tensor in adapter.items() if LORA_NAME.fullmatch(name)}
     replaced = {name: tensor for name, tensor in adapter.items() if name not in factors}
     unknown = sorted(replaced.keys() - base.keys())
     if unknown:
-        raise CheckpointError(f"{folder / ADAPTER_WEIGHTS}: expected weights of {base_model}, got also {unknown}")
+        raise CheckpointError(
+            f"{folder / ADAPTER_WEIGHTS}: expected weights of {base_model}, got also {listed(unknown)}"
+        )
     config["text_config"]["vocab_size"] = len(replaced[EMBEDDING])
-    merged = _merged(base | replaced | factors, _scaling(folder / ADAPTER_CONFIG, adapter_config))
-    return config, merged | read_tensors(folder / CUSTOM_HEADS)
+    whole = merged(base | replaced | factors, scaling(folder / ADAPTER_CONFIG, adapter_config))
+    return config, whole | read_tensors(folder / CUSTOM_HEADS)
 
 
 def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -223,46 +261,16 @@ def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     import transformers
 
     try:
-        config = transformers.AutoConfig.from_pretrained(base_model)
+        config = transformers.AutoConfig.from_pretrained(base_model, trust_remote_code=False)  # else it asks the user
         if config.model_type not in BACKBONES:
             known = ", ".join(BACKBONES)
             raise CheckpointError(f"base model {base_model}: expected one of {known}, got {config.model_type}")
         network, loaded = getattr(transformers, BACKBONES[config.model_type]).from_pretrained(
             base_model, use_safetensors=True, dtype="auto", output_loading_info=True
         )
-    except (OSError, ValueError) as error:
+    except (OSError, RecursionError, ValueError) as error:
         hint = "name its folder with --base-model"
-        raise CheckpointError(f"base model {base_model}: cannot be had: {error} ({hint})") from error
+        raise CheckpointError(f"base model {base_model}: cannot be had: {cut(str(error))} ({hint})") from error
     if loaded["missing_keys"]:
         raise CheckpointError(f"base model {base_model}: missing keys: {sorted(loaded['missing_keys'])}")
     return config.to_dict(), {f"model.{name}": tensor for name, tensor in network.state_dict().items()}
-
-
-def _scaling(file: Path, config: Mapping[str, Any]) -> float:
-    """alpha / r of a LoRA configuration."""
-    unsupported = [name for name in _UNSUPPORTED_LORA if config.get(name)]
-    if unsupported:
-        raise CheckpointError(f"{file}: expected plain LoRA, got {', '.join(unsupported)}")
-    try:
-        return float(config["lora_alpha"]) / float(config["r"])
-    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-        raise CheckpointError(f"{file}: expected lora_alpha and r of the LoRA weights, got {error!r}") from error
-
-
-def _merged(weights: Mapping[str, Tensor], scaling: float) -> dict[str, Tensor]:
-    """The weights with each pair of LoRA factors added to the weight that it belongs to."""
-    factors: dict[str, dict[str, Tensor]] = {}
-    merged: dict[str, Tensor] = {}
-    for name, tensor in weights.items():
-        match = _LORA_NAME.fullmatch(name)
-        if match:
-            factors.setdefault(match["module"], {})[match["side"]] = tensor
-        else:
-            merged[name.replace(_BASE_LAYER, ".")] = tensor
-    for module, pair in factors.items():
-        base = merged.get(f"{module}.weight")
-        if base is None or pair.keys() != {"A", "B"}:
-            raise CheckpointError(f"{module}: expected a weight and LoRA factors A and B, got {sorted(pair)}")
-        update = scaling * (pair["B"].float() @ pair["A"].float())
-        merged[f"{module}.weight"] = (base.float() + update).to(base.dtype)
-    return merged

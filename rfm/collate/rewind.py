@@ -19,6 +19,8 @@ from rfm.models.rewind import RewindBatch, RewindConfig
 from rfm_client import InvalidSampleError, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.samples import Float32Array
 
+MAX_EMBEDDING = 1e6  # thousands of times what an encoder gives
+
 
 @dataclass(frozen=True, eq=False)
 class Row:
@@ -114,6 +116,7 @@ class RewindCollator:
         if text is None or text.shape != (width,):
             got = "None" if text is None else str(list(text.shape))
             raise InvalidSampleError.at("text_embedding", f"float32 [{width}]", got)
+        _check_range("text_embedding", text)
         return text
 
     def _video(self, trajectory: Trajectory, frame_steps: int) -> Float32Array:
@@ -127,4 +130,12 @@ class RewindCollator:
             where, count = ("frame_steps", frame_steps) if frame_steps else ("num_frames", len(video))
             expected = f"at most {limit} (max_len of this checkpoint, which has per-frame progress tokens)"
             raise InvalidSampleError.at(where, expected, str(count))
+        _check_range("video_embeddings", video)
         return video
+
+
+def _check_range(where: str, embeddings: Float32Array) -> None:
+    """Raises InvalidSampleError for values with which the network's own would overflow."""
+    largest = max(float(embeddings.max()), -float(embeddings.min()))
+    if largest > MAX_EMBEDDING:
+        raise InvalidSampleError.at(where, f"values from {-MAX_EMBEDDING:g} to {MAX_EMBEDDING:g}", f"{largest:g}")

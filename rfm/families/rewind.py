@@ -17,12 +17,23 @@ from rfm_client import InvalidSampleError, ProgressSample, RewardError, Sample, 
 
 
 class RewindFamily:
-    """A ReWiND network on a device; encoders are needed only for samples of raw frames."""
+    """A ReWiND network on a device; encoders are needed only for samples of raw frames.
 
-    def __init__(self, network: RewindTransformer, *, encoders: Encoders | None, device: torch.device) -> None:
-        self.network = network.to(device).eval()
+    dtype: of the network; its encoders keep theirs. Others than float32 move scores by more than 1e-5
+    """
+
+    def __init__(
+        self,
+        network: RewindTransformer,
+        *,
+        encoders: Encoders | None,
+        device: torch.device,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        self.network = network.to(device, dtype).eval()
         self.encoders = encoders.to(device) if encoders is not None else None
         self.device = device
+        self.dtype = dtype
         self.collator = RewindCollator(network.config)
 
     def rows(self, samples: Sequence[Sample]) -> list[list[Row] | RewardError]:
@@ -47,10 +58,14 @@ class RewindFamily:
         """Rows of any kinds."""
         return self.collator.collate(rows)
 
+    def occupancy(self, batch: RewindBatch) -> tuple[int, int]:
+        """Of packed tokens, which everything but attention is computed of; a few behind the last mean nothing."""
+        return batch.packing.num_tokens, len(batch.packing.at)
+
     @torch.inference_mode()
     def score(self, rows: Sequence[Row], batch: RewindBatch) -> list[RowScores | RewardError]:
         """One forward pass."""
-        output = self.network(batch.to(self.device))
+        output = self.network(batch.to(self.device, self.dtype))
         frames = frame_scores(output.progress, output.success)
         logits, probabilities = output.query.float().tolist(), output.query.sigmoid().float().tolist()
         questions = iter(zip(logits, probabilities, strict=True))

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from rfm.checkpoint import CheckpointError, VlmCheckpoint
-from rfm.checkpoint.files import read_json
+from rfm.checkpoint.content import read_json
 from rfm.collate.images import FRAMES_PER_GROUP, Normalisation, QwenImages, SmolImages
 from rfm.collate.prompts import SPECIAL_TOKENS
 from rfm.collate.vlm import QwenCollator, SmolCollator, VlmCollator, VlmRow
@@ -65,6 +65,11 @@ class VlmFamily:
         """Conversations of any kind; here their pixels are made."""
         return self.collator.collate(rows)
 
+    def occupancy(self, batch: VlmBatch) -> tuple[int, int]:
+        """Of conversations, padded to the longest; to be continued, before what is generated."""
+        mask = batch.inputs["attention_mask"]
+        return int(mask.sum()), mask.numel()
+
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch) -> list[RowScores | RewardError]:
         """One forward pass."""
@@ -98,7 +103,7 @@ def load_collator(checkpoint: VlmCheckpoint, processor: str | Path) -> VlmCollat
     from transformers.utils.hub import cached_file
 
     try:
-        tokenizer = AutoTokenizer.from_pretrained(str(processor), use_fast=True)
+        tokenizer = AutoTokenizer.from_pretrained(str(processor), use_fast=True, trust_remote_code=False)
         preprocessor = read_json(Path(str(cached_file(str(processor), PREPROCESSOR_CONFIG))))
         if tokenizer.chat_template is None:
             tokenizer.chat_template = read_json(Path(str(cached_file(str(processor), CHAT_TEMPLATE))))["chat_template"]

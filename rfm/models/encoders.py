@@ -9,6 +9,7 @@ N images, C = 3 channels, H x W pixels, T frames, L tokens, Dv and Dt widths of 
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from rfm.collate import as_tensor
+from rfm.execution import Execution
 from rfm.models.linear import speed_up
 from rfm_client import InferenceFailedError, InvalidSampleError, RewardError, Trajectory
 from rfm_client.resize import FrameSize
@@ -142,7 +144,7 @@ class Encoders:
             _load_model(image_source, image_weights),
             ImagePreprocessor.from_config(preprocessor_config, f"{image_source}/{PREPROCESSOR_CONFIG}"),
             _load_model(text_source, text_weights),
-            AutoTokenizer.from_pretrained(str(text_source), use_fast=True),
+            AutoTokenizer.from_pretrained(str(text_source), use_fast=True, trust_remote_code=False),
         )
 
     def save_pretrained(self, image_folder: Path, text_folder: Path) -> None:
@@ -181,8 +183,15 @@ class Encoders:
         """Dt."""
         return int(self.text_model.config.hidden_size)
 
-    def encode(self, trajectories: Sequence[Trajectory]) -> list[Trajectory | RewardError]:
-        """Trajectories of embeddings for trajectories of frames and task, or the error of one that has none."""
+    def encode(
+        self, trajectories: Sequence[Trajectory], execution: Execution | None = None
+    ) -> list[Trajectory | RewardError]:
+        """Trajectories of embeddings for trajectories of frames and task, or the error of one that has none.
+
+        execution: what it took is added to it; its tokens are those of images, which have no padding, and of tasks
+        """
+        execution = execution or Execution()
+        began_s, collated_s = time.perf_counter(), execution.collate_s
         outcomes: dict[int, Trajectory | RewardError] = {}
         for index, trajectory in enumerate(trajectories):
             try:
@@ -192,29 +201,38 @@ class Encoders:
                 outcomes[index] = error
         good = [index for index in range(len(trajectories)) if index not in outcomes]
         if good:
-            videos = self.encode_frames([trajectories[index].positions for index in good])
-            texts = self.encode_tasks([trajectories[index].task for index in good])
+            videos = self.encode_frames([trajectories[index].positions for index in good], execution)
+            texts = self.encode_tasks([trajectories[index].task for index in good], execution)
             for index, video, text in zip(good, videos, texts, strict=True):
                 outcomes[index] = _embedded(video, text)
+        execution.forward_s += time.perf_counter() - began_s - (execution.collate_s - collated_s)
         return [outcomes[index] for index in range(len(trajectories))]
 
     @torch.inference_mode()
-    def encode_frames(self, videos: Sequence[UInt8Array]) -> list[Float32Array]:
+    def encode_frames(self, videos: Sequence[UInt8Array], execution: Execution | None = None) -> list[Float32Array]:
         """uint8 [T, H, W, 3] of any T, H, W each -> float32 [T, Dv] each."""
-        batches = self._crop_batches(videos)
-        embeddings = torch.cat([self.image_model(pixel_values=batch).pooler_output for batch in batches])
+        execution = execution or Execution()
+        embeddings = []
+        for batch in self._crop_batches(videos, execution):
+            output = self.image_model(pixel_values=batch)
+            embeddings.append(output.pooler_output)
+            num_tokens = output.last_hidden_state.shape[:2].numel()
+            execution.add_forward(num_tokens, num_tokens)
         lengths = [len(video) for video in videos]
-        return [part.float().cpu().numpy() for part in embeddings.split(lengths)]
+        return [part.float().cpu().numpy() for part in torch.cat(embeddings).split(lengths)]
 
     @torch.inference_mode()
-    def encode_tasks(self, tasks: Sequence[str]) -> Float32Array:
+    def encode_tasks(self, tasks: Sequence[str], execution: Execution | None = None) -> Float32Array:
         """float32 [B, Dt] of B tasks."""
-        tokens = self._tokenize(list(tasks), padding=True, return_tensors="pt").to(self.text_model.device)
+        tokens = self._tokenize(list(tasks), padding=True, return_tensors="pt")
+        if execution is not None:
+            execution.add_forward(int(tokens["attention_mask"].sum()), tokens["attention_mask"].numel())
+        tokens = tokens.to(self.text_model.device)
         hidden = self.text_model(**tokens).last_hidden_state
         mask = tokens["attention_mask"].unsqueeze(-1).to(hidden.dtype)
         return ((hidden * mask).sum(dim=1) / mask.sum(dim=1)).float().cpu().numpy()
 
-    def _crop_batches(self, videos: Sequence[UInt8Array]) -> Iterator[Tensor]:
+    def _crop_batches(self, videos: Sequence[UInt8Array], execution: Execution) -> Iterator[Tensor]:
         """The crops of all videos' frames, in order, at most IMAGES_PER_FORWARD of them in memory."""
         waiting: list[Tensor] = []
         for video in videos:
@@ -223,7 +241,9 @@ class Encoders:
                 if sum(map(len, waiting)) + len(images) > IMAGES_PER_FORWARD:
                     yield torch.cat(waiting).to(self.image_model.device)
                     waiting = []
+                started_s = time.perf_counter()
                 waiting.append(self.preprocessor(images))  # on the CPU: nowhere else is uint8 resized antialiased
+                execution.collate_s += time.perf_counter() - started_s
         yield torch.cat(waiting).to(self.image_model.device)
 
     def _check_task(self, task: str) -> None:
@@ -263,13 +283,14 @@ def _load_model(source: str | Path, weights: Mapping[str, Tensor] | None) -> Any
 
     with TemporaryDirectory() as folder:
         if weights is not None:
-            AutoConfig.from_pretrained(str(source)).save_pretrained(folder)
+            AutoConfig.from_pretrained(str(source), trust_remote_code=False).save_pretrained(folder)
             tensors = {name: tensor.contiguous() for name, tensor in weights.items()}
             save_file(tensors, Path(folder) / "model.safetensors", metadata={"format": "pt"})
         try:
             model, loaded = AutoModel.from_pretrained(
                 str(source) if weights is None else folder,
                 use_safetensors=True,
+                trust_remote_code=False,  # None would ask the user
                 dtype=torch.float32,
                 output_loading_info=True,
             )

@@ -126,10 +126,11 @@ class RewindBatch:
         packing = Packing.of(num_tokens)
         return cls(text, video, shown, is_similarity, packing, *map(torch.from_numpy, positions))
 
-    def to(self, device: torch.device) -> RewindBatch:
-        """The batch on ``device``."""
+    def to(self, device: torch.device, dtype: torch.dtype) -> RewindBatch:
+        """The batch on ``device``, with embeddings of ``dtype``."""
         parts: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
         moved: dict[str, Any] = {name: None if part is None else part.to(device) for name, part in parts.items()}
+        moved |= {name: moved[name].to(dtype) for name in ("text", "video")}
         return RewindBatch(**moved)
 
 

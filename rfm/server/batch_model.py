@@ -6,14 +6,20 @@ from __future__ import annotations
 import json
 import math
 import time
-import traceback
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import torch
 
-from rfm_client import InvalidSampleError, RewardError
+from rfm.execution import Execution
+from rfm.server.asked import CANCELLED, SAMPLE_TYPES, SCORED, Asked, CancelledError
+from rfm.server.metrics import Counted, Metrics
+from rfm.server.poison import NO_DIGEST, Poison, digest
+from rfm.server.request_log import RequestLog
+from rfm.server.weights import check_digest
+from rfm_client import InferenceFailedError, InvalidSampleError, RewardError, Trajectory, wire
+from rfm_client.model_info import DIGEST_PARAMETER, NETWORK_PARAMETER, REVISION_PARAMETER, SOURCE_PARAMETER
 from rfm_client.wire import Tensors
 
 Question = TypeVar("Question")
@@ -24,8 +30,6 @@ BUDGET_PARAMETER = "token_budget"
 DTYPE_PARAMETER = "dtype"  # empty: as the checkpoint and the device decide
 
 WORTH_ASKING_S = 10e-3  # for one answer
-
-_CANCELLED = RewardError("cancelled by the client")  # nobody waits for the answer, so no forward is spent on it
 
 
 class BatchModel(Generic[Question, Answer]):
@@ -42,14 +46,27 @@ class BatchModel(Generic[Question, Answer]):
         config = json.loads(args["model_config"])
         settings = {name: value["string_value"] for name, value in config["parameters"].items()}
         self.input_names = [spec["name"] for spec in config["input"]]
-        threads = int(settings[THREADS_PARAMETER])
-        if threads:
-            torch.set_num_threads(threads)
         on_gpu = args["model_instance_kind"] == "GPU"
+        sharing = 1 if on_gpu else sum(group["count"] for group in config["instance_group"])
+        torch.set_num_threads(int(settings[THREADS_PARAMETER]) or max(torch.get_num_threads() // sharing, 1))
         device = torch.device("cuda", int(args["model_instance_device_id"])) if on_gpu else torch.device("cpu")
         if on_gpu:
             torch.cuda.set_device(device)  # some kernels launch on the current device, whatever their tensors'
-        self.load(Path(args["model_repository"], args["model_version"]), device, settings)
+        version = Path(args["model_repository"], args["model_version"])
+        check_digest(version, settings.get(DIGEST_PARAMETER, ""))
+        self.load(version, device, settings)
+        model = {"model": args["model_name"], "version": args["model_version"]}
+        labels = {**model, "device": str(device), "instance": args["model_instance_name"]}
+        self._log = RequestLog(model)
+        self._metrics = Metrics(labels, _checkpoint(settings), _sample_types(self.input_names))
+        self._poison = Poison.of_this_process(args["model_name"], max(config["max_batch_size"], 1))
+        # Each instance answers them before anybody else is let in.
+        self._num_warmups = sum(max(warmup.get("count", 1), 1) for warmup in config.get("model_warmup", []))
+
+    def finalize(self) -> None:
+        """Called once by Triton when the model is unloaded."""
+        self._poison.close()
+        self._metrics.close()
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
         """Loads the weights in the folder ``version`` onto ``device``."""
@@ -59,8 +76,8 @@ class BatchModel(Generic[Question, Answer]):
         """The questions of one request. Raises InvalidSampleError."""
         raise NotImplementedError
 
-    def answer(self, questions: Sequence[Question]) -> Sequence[Answer | RewardError]:
-        """One answer, or error, a question."""
+    def answer(self, questions: Sequence[Question], execution: Execution) -> Sequence[Answer | RewardError]:
+        """One answer, or error, a question. ``execution`` is told what they took."""
         raise NotImplementedError
 
     def encode(self, answers: Sequence[Answer], tensors: Tensors, outputs: Collection[str]) -> Tensors:
@@ -69,50 +86,98 @@ class BatchModel(Generic[Question, Answer]):
 
     def execute(self, requests: Sequence[Any]) -> list[Any]:
         """Called by Triton with the requests of one batch; gives one response each."""
+        batch: list[Asked[Question]] = [Asked(request, self._is_counted(request)) for request in requests]
+        self._metrics.at_work_on(sum(asked.is_counted for asked in batch))
+        try:
+            return self._responses(batch)
+        finally:
+            self._metrics.at_work_on(0)
+
+    def _is_counted(self, request: Any) -> bool:
+        """Whether it is neither a health probe nor one of the requests with which Triton warms the model up."""
+        request_id: str = request.request_id()
+        if not request_id and self._num_warmups:
+            self._num_warmups -= 1
+            return False
+        return not request_id.startswith(wire.CANARY_PREFIX)
+
+    def _responses(self, batch: Sequence[Asked[Question]]) -> list[Any]:
+        execution = Execution()
+        try:
+            for asked in batch:
+                self._read(asked)
+            answers = self._answers([asked for asked in batch if asked.error is None], execution)
+            responses = [self._response(asked, answers) for asked in batch]
+        except Exception as error:  # noqa: BLE001  the request boundary: whatever happened, every request is answered
+            if len(batch) > 1:  # find out whose fault it is, and serve the others
+                self._log.tell_of_batch(batch, error)
+                return [response for asked in batch for response in self._responses([asked])]
+            batch[0].error = InferenceFailedError("scoring failed; the server's log has the reason")
+            batch[0].error.__cause__ = error
+            execution = Execution()
+            responses = [_failure(batch[0].error)]
+        for asked in batch:
+            if asked.error is not None:
+                self._log.tell(asked)
+        self._metrics.add(_counted([asked for asked in batch if asked.is_counted], execution))
+        return responses
+
+    def _read(self, asked: Asked[Question]) -> None:
         import triton_python_backend_utils as pb_utils
 
+        asked.error = None
+        asked.tensors = {
+            name: pb_utils.get_input_tensor_by_name(asked.request, name).as_numpy() for name in self.input_names
+        }
+        asked.num_samples = len(asked.tensors[wire.NUM_FRAMES])
         try:
-            inputs = [{} if self._is_cancelled(request) else self._inputs(request) for request in requests]
-            asked = [self._decoded(tensors) if tensors else _CANCELLED for tensors in inputs]
-            questions = [question for part in asked if isinstance(part, list) for question in part]
-            started_s = time.perf_counter()
-            answers = iter(self.answer(questions))
-            if questions:
-                self.answer_s = (time.perf_counter() - started_s) / len(questions)
-            answered = [part if isinstance(part, RewardError) else [next(answers) for _ in part] for part in asked]
-            return [self._response(*parts) for parts in zip(requests, inputs, answered, strict=True)]
-        except Exception:  # noqa: BLE001  the request boundary: whatever happened, every request is answered
-            pb_utils.Logger.log_error(traceback.format_exc())
-        if len(requests) > 1:  # find out whose fault it is, and serve the others
-            return [response for request in requests for response in self.execute([request])]
-        return [_failure("scoring failed; the server's log has the reason", pb_utils.TritonError.INTERNAL)]
-
-    def _is_cancelled(self, request: Any) -> bool:
-        """Asked only where an answer costs much more than to ask Triton's process, which takes 0.1 ms a request."""
-        return self.answer_s >= WORTH_ASKING_S and bool(request.is_cancelled())
-
-    def _inputs(self, request: Any) -> Tensors:
-        import triton_python_backend_utils as pb_utils
-
-        return {name: pb_utils.get_input_tensor_by_name(request, name).as_numpy() for name in self.input_names}
-
-    def _decoded(self, tensors: Tensors) -> list[Question] | RewardError:
-        try:
-            return self.decode(tensors)
+            asked.questions = self.decode(asked.tensors)
         except InvalidSampleError as error:
-            return error
+            asked.error = error
+        # Asked only where an answer costs much more than to ask Triton's process, which takes 0.1 ms a request.
+        if self.answer_s >= WORTH_ASKING_S and asked.request.is_cancelled():
+            asked.error = CancelledError("cancelled by the client")
 
-    def _response(self, request: Any, tensors: Tensors, answers: RewardError | Sequence[Answer | RewardError]) -> Any:
+    def _answers(
+        self, batch: Sequence[Asked[Question]], execution: Execution
+    ) -> dict[Asked[Question], Sequence[Answer | RewardError]]:
+        """Those of each request. All are answered together, but for those that may be poison."""
+        digests = {asked: digest(asked.tensors) if asked.is_counted else NO_DIGEST for asked in batch}
+        together = []
+        answers: dict[Asked[Question], Sequence[Answer | RewardError]] = {}
+        for asked, told in digests.items():
+            try:
+                self._poison.check(told)
+            except InvalidSampleError as error:
+                asked.error = error
+                continue
+            if self._poison.is_suspect(told):
+                with self._poison.at_work_on([told]):
+                    answers |= self._answered([asked], execution)
+            else:
+                together.append(asked)
+        with self._poison.at_work_on([digests[asked] for asked in together]):
+            return answers | self._answered(together, execution)
+
+    def _answered(
+        self, batch: Sequence[Asked[Question]], execution: Execution
+    ) -> dict[Asked[Question], Sequence[Answer | RewardError]]:
+        questions = [question for asked in batch for question in asked.questions]
+        started_s = time.perf_counter()
+        answers = iter(self.answer(questions, execution) if questions else ())
+        if questions:
+            self.answer_s = (time.perf_counter() - started_s) / len(questions)
+        return {asked: [next(answers) for _ in asked.questions] for asked in batch}
+
+    def _response(
+        self, asked: Asked[Question], answers: Mapping[Asked[Question], Sequence[Answer | RewardError]]
+    ) -> Any:
         import triton_python_backend_utils as pb_utils
 
-        error = answers if isinstance(answers, RewardError) else _first_error(answers)
-        if error is _CANCELLED:
-            return _failure(str(error), pb_utils.TritonError.CANCELLED)
-        if error is not None:
-            invalid = isinstance(error, InvalidSampleError)
-            code = pb_utils.TritonError.INVALID_ARG if invalid else pb_utils.TritonError.INTERNAL
-            return _failure(str(error), code)
-        outputs = self.encode(answers, tensors, request.requested_output_names())  # type: ignore[arg-type]
+        asked.error = asked.error or _first_error(answers[asked])
+        if asked.error is not None:
+            return _failure(asked.error)
+        outputs = self.encode(answers[asked], asked.tensors, asked.request.requested_output_names())  # type: ignore[arg-type]
         return pb_utils.InferenceResponse([pb_utils.Tensor(name, array) for name, array in outputs.items()])
 
 
@@ -126,7 +191,36 @@ def _first_error(answers: Sequence[Any]) -> RewardError | None:
     return None
 
 
-def _failure(message: str, code: Any) -> Any:
+def _failure(error: Exception) -> Any:
     import triton_python_backend_utils as pb_utils
 
-    return pb_utils.InferenceResponse(error=pb_utils.TritonError(message, code))
+    code = pb_utils.TritonError.INTERNAL
+    if isinstance(error, InvalidSampleError):
+        code = pb_utils.TritonError.INVALID_ARG
+    elif isinstance(error, CancelledError):
+        code = pb_utils.TritonError.CANCELLED
+    return pb_utils.InferenceResponse(error=pb_utils.TritonError(str(error), code))
+
+
+def _counted(batch: Sequence[Asked[Any]], execution: Execution) -> Counted:
+    counted = Counted(execution=execution)
+    for asked in batch:
+        for sample_type, count in asked.sample_types.items():
+            counted.samples[sample_type, asked.outcome] += count
+        if asked.outcome == SCORED:
+            counted.num_frames += asked.num_frames
+        if asked.outcome != CANCELLED:
+            counted.num_executed += len(asked.questions)
+    return counted
+
+
+def _sample_types(input_names: Sequence[str]) -> list[str]:
+    """What a model with these inputs can be asked about."""
+    of_samples = wire.SAMPLE_TYPE in input_names
+    return [name for kind, name in SAMPLE_TYPES.items() if issubclass(kind, Trajectory) != of_samples]
+
+
+def _checkpoint(settings: Mapping[str, str]) -> dict[str, str]:
+    """Which checkpoint a model serves, as rfm_export tells it; of its network the class."""
+    told = {name: settings.get(name, "") for name in (SOURCE_PARAMETER, REVISION_PARAMETER, DIGEST_PARAMETER)}
+    return {**told, "network": json.loads(settings.get(NETWORK_PARAMETER) or "{}").get("class", "")}

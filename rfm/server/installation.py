@@ -18,6 +18,7 @@ from pathlib import Path
 
 EXECUTABLE = "tritonserver"
 WHEEL = "nvidia-pytriton"
+WHEEL_VERSION = "2.51.0"  # of its Triton
 _BACKEND_FILES = ("libtriton_python.so", "triton_python_backend_utils.py")
 _STUB = "triton_python_backend_stub"
 

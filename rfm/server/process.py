@@ -11,40 +11,47 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from http.client import HTTPException
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import IO
 
 import tritonclient.http
 from tritonclient.utils import InferenceServerException
 
 from rfm.config import DEFAULT_HOST, ServeConfig
+from rfm.server import leftovers
+from rfm.server.admin_key import http_headers, new_key, restrictions
+from rfm.server.arguments import check_arguments
+from rfm.server.exposure import GrpcTls, check_before_start, check_version, size_limits
 from rfm.server.installation import Installation, ServerStartError
+from rfm.server.repository_api import one_line
+from rfm.server.stubs import SHARED_MEMORY
 
 POLL_S = 0.1
 EXIT_TIMEOUT_S = 10  # Triton waits this long for requests in flight, and for a stub that is dead
 KILL_AFTER_S = 2 * EXIT_TIMEOUT_S
-SHARED_MEMORY = Path("/dev/shm")
+NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # a `load` would load all versions anew: their folders have changed
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass(frozen=True)
 class Endpoints:
-    """Addresses of one server."""
+    """Addresses of one server. grpc_tls: gRPC is encrypted; HTTP cannot be, and then listens on 127.0.0.1 alone"""
 
     host: str = DEFAULT_HOST
     http_port: int = 8000
     grpc_port: int = 8001
     metrics_port: int = 8002
+    grpc_tls: GrpcTls | None = None
 
     @classmethod
     def of(cls, config: ServeConfig) -> Endpoints:
         """The endpoints that a configuration names."""
-        return cls(config.host, config.server_port, config.grpc_port, config.metrics_port)
+        return cls(config.host, config.server_port, config.grpc_port, config.metrics_port, GrpcTls.of(config))
 
     @classmethod
     def free(cls) -> Endpoints:
@@ -58,12 +65,17 @@ class Endpoints:
     @property
     def http_url(self) -> str:
         """For RewardClient, over HTTP."""
-        return f"http://{self.host}:{self.http_port}"
+        return f"http://{self.http_host}:{self.http_port}"
+
+    @property
+    def http_host(self) -> str:
+        """Where HTTP listens."""
+        return self.host if self.grpc_tls is None else DEFAULT_HOST
 
     @property
     def grpc_url(self) -> str:
         """For RewardClient, over gRPC."""
-        return f"grpc://{self.host}:{self.grpc_port}"
+        return f"{'grpc' if self.grpc_tls is None else 'grpcs'}://{self.host}:{self.grpc_port}"
 
     @property
     def metrics_url(self) -> str:
@@ -72,11 +84,16 @@ class Endpoints:
 
     def check_free(self) -> None:
         """Raises ServerStartError for a port that is taken or an address that is not this machine's."""
-        for name, port in (("HTTP", self.http_port), ("gRPC", self.grpc_port), ("metrics", self.metrics_port)):
+        listening = (
+            ("HTTP", self.http_host, self.http_port),
+            ("gRPC", self.host, self.grpc_port),
+            ("metrics", self.host, self.metrics_port),
+        )
+        for name, host, port in listening:
             try:
-                socket.create_server((self.host, port)).close()
+                socket.create_server((host, port)).close()
             except (OSError, OverflowError) as error:
-                expected = f"a free port of this machine at {self.host}:{port}"
+                expected = f"a free port of this machine at {host}:{port}"
                 number = getattr(error, "errno", None)
                 reason = os.strerror(number) if number and number > 0 else str(error)
                 raise ServerStartError(f"{name}: expected {expected}, got: {reason}") from error
@@ -87,6 +104,10 @@ class TritonServer:
 
     http_threads: threads that read HTTP requests; None: Triton's choice
     log: where Triton's log goes; None: this process's standard output and error
+    admin_key: what requests to the restricted APIs must show (``admin_key``); None: a new one, known to this alone
+    ends_with_parent: it is killed when the thread that starts it ends, be it by kill -9
+    accepts_known_vulnerabilities: it may be reached from elsewhere although its Triton has some
+    more_arguments: of tritonserver, such as ``--trace-config=...``; none that are set here
     """
 
     def __init__(
@@ -97,66 +118,76 @@ class TritonServer:
         *,
         http_threads: int | None = None,
         log: IO[bytes] | None = None,
+        admin_key: str | None = None,
+        accepts_known_vulnerabilities: bool = False,
+        more_arguments: Sequence[str] = (),
+        ends_with_parent: bool = False,
     ) -> None:
         self.endpoints = endpoints
         self._repository = repository
         self._installation = installation
         self._http_threads = http_threads
         self._log = log
-        self._region_prefix = f"rfm_{os.getpid()}_{secrets.token_hex(4)}_"
+        self._admin_key = admin_key or new_key()
+        self._accepts_known_vulnerabilities = accepts_known_vulnerabilities
+        self._more_arguments = tuple(more_arguments)
+        self._ends_with_parent = ends_with_parent
+        self._region_prefix = f"{leftovers.owned(leftovers.REGION_PREFIX, '_')}{secrets.token_hex(4)}_"
         self._backends: Path | None = None
         self._process: subprocess.Popen[bytes] | None = None
-        self._companion: subprocess.Popen[bytes] | None = None
 
-    def run(self, companion: Sequence[str] | None = None) -> int:
-        """Serves until the server ends or this process is told to (STOP_SIGNALS); gives Triton's exit status.
+    @property
+    def models(self) -> list[str]:
+        """Of the repository."""
+        return sorted(file.parent.name for file in self._repository.glob("*/config.pbtxt"))
 
-        companion: command line of a program that runs as long as the server is ready; if it ends, so does the server
-        """
-        told_to_stop = False
+    @property
+    def pid(self) -> int:
+        """Of the process that was started last."""
+        assert self._process is not None  # started
+        return self._process.pid
 
-        def stop(number: int, _frame: FrameType | None) -> None:
-            nonlocal told_to_stop
-            told_to_stop = True
-            if self._companion is not None:  # it answers what it has begun, and then the server is stopped
-                self._companion.terminate()
-            elif self._process is not None:
-                self._process.send_signal(signal.SIGTERM if number == signal.SIGHUP else number)
+    @property
+    def exit_status(self) -> int | None:
+        """None: it runs."""
+        assert self._process is not None  # started
+        return self._process.poll()
 
-        previous = {number: signal.signal(number, stop) for number in STOP_SIGNALS}
-        try:
-            self.start()
-            if told_to_stop:  # before there was a process to pass it to
-                return self.stop()
-            self.wait_ready()
-            if companion is None or told_to_stop:
-                return self._wait()
-            self._companion = subprocess.Popen(companion, stdin=subprocess.DEVNULL, start_new_session=True)
-            return self._wait_with(self._companion, lambda: told_to_stop)
-        except ServerStartError:
-            status = self.stop()
-            if told_to_stop:  # while it was still loading
-                return status
-            raise
-        finally:
-            for number, handler in previous.items():
-                signal.signal(number, handler)
+    @property
+    def admin_key(self) -> str:
+        """What its restricted APIs ask for."""
+        return self._admin_key
+
+    def signal(self, number: int) -> None:
+        """Sends a signal to the process, if it runs."""
+        if self._process is not None:
+            self._process.send_signal(number)
+
+    def kill(self) -> None:
+        """Ends the process and its children at once."""
+        with suppress(ProcessLookupError):
+            os.killpg(self.pid, signal.SIGKILL)
 
     def start(self) -> None:
         """Starts the process. Raises ServerStartError for what can be seen to be wrong before."""
-        models = sorted(file.parent.name for file in self._repository.glob("*/config.pbtxt"))
+        models = self.models
         if not models:
             raise ServerStartError(f"repository: expected a folder of models, got {self._repository}")
+        own = self._arguments(models)
+        check_arguments(self._more_arguments, own)
+        self._check_exposure()
         self.endpoints.check_free()
-        self._backends = Path(tempfile.mkdtemp(prefix="rfm-backends-"))
-        arguments = [*self._arguments(models), *self._installation.lay_out_backends(self._backends)]
+        self._backends = Path(tempfile.mkdtemp(prefix=leftovers.owned(leftovers.BACKENDS_PREFIX.rstrip("-"), "-")))
+        arguments = [*own, *self._installation.lay_out_backends(self._backends)]
+        arguments += [*size_limits(self._installation, self._more_arguments), *self._more_arguments]
         try:
             self._process = subprocess.Popen(
                 [self._installation.executable, *arguments],
-                env={**os.environ, **self._installation.environment},
+                env={**os.environ, **self._installation.environment, **NO_BYTECODE},
                 stdin=subprocess.DEVNULL,
                 stdout=self._log,
                 stderr=self._log,
+                preexec_fn=leftovers.ending_with_parent() if self._ends_with_parent else None,
                 start_new_session=True,  # a Ctrl-C in the terminal reaches it once, through us
             )
         except OSError as error:
@@ -167,18 +198,22 @@ class TritonServer:
     def wait_ready(self) -> None:
         """Returns when every model is ready. Raises ServerStartError with the reason of one that is not."""
         assert self._process is not None  # started
-        client = tritonclient.http.InferenceServerClient(f"{self.endpoints.host}:{self.endpoints.http_port}")
+        client = tritonclient.http.InferenceServerClient(f"{self.endpoints.http_host}:{self.endpoints.http_port}")
         try:
             while self._process.poll() is None:
                 try:
-                    index = client.get_model_repository_index()
+                    index = client.get_model_repository_index(headers=http_headers(self._admin_key))
                 except (OSError, EOFError, HTTPException, InferenceServerException):
                     time.sleep(POLL_S)  # Triton answers nothing while it loads
                     continue
                 failed = [model for model in index if model.get("state") != "READY"]
                 if not failed:
+                    version = client.get_server_metadata().get("version", "")
+                    check_version(self.endpoints.host, version, accepted=self._accepts_known_vulnerabilities)
                     return
-                reasons = "; ".join(f"{m['name']}: {_one_line(m.get('reason', 'not loaded'))}" for m in failed)
+                reasons = "; ".join(
+                    f"{m['name']}: {one_line(m.get('reason', 'not loaded')) or 'unknown'}" for m in failed
+                )
                 raise ServerStartError(f"models: expected all to be ready, got {reasons}")
             raise ServerStartError(f"tritonserver: expected to run, got exit status {self._process.returncode}")
         finally:
@@ -217,10 +252,10 @@ class TritonServer:
             "--model-control-mode=explicit",
             *(f"--load-model={model}" for model in models),
             "--disable-auto-complete-config",
-            "--strict-readiness=true",
+            "--strict-readiness=false",  # else one version that cannot be loaded makes all not ready
             "--exit-on-error=false",  # so that the reason of each model that fails can be asked for
             f"--exit-timeout-secs={EXIT_TIMEOUT_S}",
-            f"--http-address={endpoints.host}",
+            f"--http-address={endpoints.http_host}",
             f"--http-port={endpoints.http_port}",
             f"--grpc-address={endpoints.host}",
             f"--grpc-port={endpoints.grpc_port}",
@@ -228,20 +263,14 @@ class TritonServer:
             f"--metrics-port={endpoints.metrics_port}",
             f"--backend-config=python,shm-region-prefix-name={self._region_prefix}",
             *([f"--http-thread-count={self._http_threads}"] if self._http_threads else []),
+            *(endpoints.grpc_tls.arguments() if endpoints.grpc_tls else []),
+            *restrictions(self._admin_key),
         ]
 
-    def _wait_with(self, companion: subprocess.Popen[bytes], is_told_to_stop: Callable[[], bool]) -> int:
-        """Waits for the server and its companion, and ends the one when the other has ended."""
-        assert self._process is not None  # started
-        try:
-            while self._process.poll() is None and companion.poll() is None:
-                time.sleep(POLL_S)
-        finally:
-            _end(companion)
-        status = self.stop()
-        if not is_told_to_stop() and companion.returncode not in (0, -signal.SIGTERM):
-            raise ServerStartError(f"gateway: expected to run, got exit status {companion.returncode}")
-        return status
+    def _check_exposure(self) -> None:
+        check_before_start(self.endpoints.host, self._installation, accepted=self._accepts_known_vulnerabilities)
+        if self.endpoints.grpc_tls is not None:
+            self.endpoints.grpc_tls.check()
 
     def _wait(self) -> int:
         """Waits for the server to end and clears away what it leaves; gives its exit status."""
@@ -257,20 +286,3 @@ class TritonServer:
             shutil.rmtree(self._backends, ignore_errors=True)
         for region in SHARED_MEMORY.glob(f"{self._region_prefix}*"):
             region.unlink(missing_ok=True)
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """Gracefully, by force after KILL_AFTER_S."""
-    if process.poll() is None:
-        process.terminate()
-    try:
-        process.wait(KILL_AFTER_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
-
-
-def _one_line(reason: str) -> str:
-    """What happened; the lines behind it are where."""
-    lines = reason.strip().splitlines()
-    return lines[0].strip() if lines else "unknown"

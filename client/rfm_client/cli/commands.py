@@ -48,16 +48,23 @@ def _tell_version(asked: bool) -> None:
 
 @app.callback()
 def main(
+    context: typer.Context,
+    ca_file: options.CaFile = None,
+    client_certificate: options.ClientCertificate = None,
+    client_key: options.ClientKey = None,
+    api_key_file: options.ApiKeyFile = None,
     version: Annotated[
         bool, typer.Option("--version", is_eager=True, callback=_tell_version, help="Tell the version and end.")
     ] = False,
 ) -> None:
     """Asks a served reward model about videos, and its server how it is."""
     logging.basicConfig(format="rfm-client: %(message)s", level=logging.WARNING)  # the client tells of retries
+    context.obj = options.read_access(ca_file, client_certificate, client_key, api_key_file)
 
 
 @app.command(cls=OneLineCommand, epilog=EXIT_CODES)
 def score(
+    context: typer.Context,
     videos: Annotated[
         list[str], typer.Argument(metavar="VIDEO...", help="Videos, .npy or .npz files, or URLs of videos.")
     ],
@@ -97,7 +104,7 @@ def score(
     if 0 < frame_steps < MIN_FRAME_STEPS:
         expected = f"expected 0 or at least {MIN_FRAME_STEPS}, got {frame_steps}"
         raise typer.BadParameter(expected, param_hint="--frame-steps")
-    server = Server(urls, model, timeout)
+    server = Server(urls, model, timeout, context.obj)
     question = Question(task, fps, max_frames, frame_steps, subsample, resize)
     outcomes = scoring.score_all(server, videos, question)
     scored = [outcome for outcome in outcomes if isinstance(outcome, Scored)]
@@ -119,6 +126,7 @@ def score(
 
 @app.command(cls=OneLineCommand, epilog=EXIT_CODES)
 def compare(
+    context: typer.Context,
     first: Annotated[str, typer.Argument(metavar="FIRST", help="Video, .npy or .npz file, or URL of a video.")],
     second: Annotated[str, typer.Argument(metavar="SECOND", help="The other one.")],
     urls: options.Urls,
@@ -136,7 +144,7 @@ def compare(
     from rfm_client import show
 
     options.check_outputs(json, plot)
-    server = Server(urls, model, timeout)
+    server = Server(urls, model, timeout, context.obj)
     question = Question(task, fps, max_frames, subsample=subsample, resize=resize)
     comparison = scoring.compare(server, (first, second), question)
     for source, scores, _ in comparison.sides:
@@ -151,6 +159,7 @@ def compare(
 
 @app.command(cls=OneLineCommand, epilog=EXIT_CODES)
 def status(
+    context: typer.Context,
     urls: options.Urls,
     metrics_url: Annotated[
         str | None, typer.Option(help="Where the server shows its metrics (http://<its host>:8002/metrics).")
@@ -166,7 +175,7 @@ def status(
     if metrics_url is not None and len(urls) > 1:
         raise typer.BadParameter("expected one --url with it, got several", param_hint="--metrics-url")
     with options.usage_errors("--url"):
-        statuses = [read_status(url, metrics_url=metrics_url, timeout_s=timeout) for url in urls]
+        statuses = [read_status(url, metrics_url=metrics_url, timeout_s=timeout, access=context.obj) for url in urls]
     if json != STANDARD_OUTPUT:
         _print(*(table for status in statuses for table in status_tables(status)))
     if json is not None:
@@ -175,6 +184,7 @@ def status(
 
 @app.command(cls=OneLineCommand, epilog=EXIT_CODES)
 def wait(
+    context: typer.Context,
     urls: options.Urls,
     model: options.Model = DEFAULT_MODEL,
     timeout: Annotated[float, typer.Option(min=options.MIN_TIMEOUT_S, help="Seconds to wait at most.")] = 120.0,
@@ -183,13 +193,14 @@ def wait(
     from rfm_client.client import RewardClient
 
     with options.usage_errors("--url"):
-        client = RewardClient(urls, model=model)
+        client = RewardClient(urls, model=model, **context.obj.options)
     with client:
         client.wait_ready(timeout)
 
 
 @app.command(cls=OneLineCommand, epilog=EXIT_CODES)
 def sample(
+    context: typer.Context,
     urls: options.Urls,
     kind: Kind = toy.SampleKind.progress,
     model: options.Model = DEFAULT_MODEL,
@@ -204,7 +215,7 @@ def sample(
     from rfm_client.show import scores_table
 
     options.check_outputs(json, None)
-    server = Server(urls, model, timeout)
+    server = Server(urls, model, timeout, context.obj)
     made_up = _toy(kind, num_samples, num_frames, use_frames, seed)
     with server.connected() as client:
         samples = made_up.samples(client)
@@ -223,6 +234,7 @@ def sample(
 
 @app.command(cls=OneLineCommand, epilog=EXIT_CODES)
 def bench_input(
+    context: typer.Context,
     output: Annotated[Path, typer.Option(help="JSON file to write.")],
     urls: options.Urls,
     kind: Kind = toy.SampleKind.progress,
@@ -237,11 +249,21 @@ def bench_input(
     from rfm_client.perf_input import write_perf_analyzer_input
 
     made_up = _toy(kind, num_samples, num_frames, use_frames, seed)
-    with Server(urls, model, timeout).connected() as client:
+    with Server(urls, model, timeout, context.obj).connected() as client:
         write_perf_analyzer_input(output, made_up.samples(client))
     protocol, address = split_url(urls[0])
     name = f"{model}_frames" if use_frames else model
-    arguments = ["perf_analyzer", "-m", name, "-i", protocol, "-u", address, "--input-data", str(output)]
+    arguments = [
+        "perf_analyzer",
+        "-m",
+        name,
+        "-i",
+        protocol.removesuffix("s"),
+        "-u",
+        address,
+        "--input-data",
+        str(output),
+    ]
     typer.echo(shlex.join([*arguments, "--async", "--concurrency-range", "1:16:5"]))
 
 

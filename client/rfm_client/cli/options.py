@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -14,6 +14,7 @@ import typer
 from typer.core import TyperCommand
 
 from rfm_client import errors
+from rfm_client.access import Access
 from rfm_client.async_client import DEFAULT_MODEL, DEFAULT_TIMEOUT_S
 from rfm_client.client import RewardClient
 
@@ -53,8 +54,19 @@ Urls = Annotated[
         envvar="RFM_URL",
         default_factory=lambda: [DEFAULT_URL],
         show_default=DEFAULT_URL,
-        help="grpc://host:8001 or http://host:8000. Again for more servers of the same checkpoint.",
+        help="grpc://host:8001 or http://host:8000, with TLS grpcs:// or https://. Again for more servers of the same "
+        "checkpoint.",
     ),
+]
+CaFile = Annotated[
+    Path | None, typer.Option(envvar="RFM_CA_FILE", help="Authorities (PEM) to trust; else the system's.")
+]
+ClientCertificate = Annotated[
+    Path | None, typer.Option(envvar="RFM_CLIENT_CERTIFICATE", help="By which a server knows this client (PEM).")
+]
+ClientKey = Annotated[Path | None, typer.Option(envvar="RFM_CLIENT_KEY", help="The certificate's key (PEM).")]
+ApiKeyFile = Annotated[
+    Path | None, typer.Option(envvar="RFM_API_KEY_FILE", help="File with the key that requests show as Bearer.")
 ]
 Model = Annotated[str, typer.Option("--model", help="Name under which the checkpoint was exported.")]
 TimeoutS = Annotated[
@@ -102,12 +114,13 @@ class Server:
     urls: list[str]
     model: str = DEFAULT_MODEL
     timeout_s: float = DEFAULT_TIMEOUT_S
+    access: Access = field(default_factory=Access)
 
     @contextmanager
     def connected(self) -> Iterator[RewardClient]:
         """A client of a server that answers and serves the model; one that does not is told at once, not waited for."""
         with usage_errors("--url"):
-            client = RewardClient(self.urls, model=self.model, timeout_s=self.timeout_s)
+            client = RewardClient(self.urls, model=self.model, timeout_s=self.timeout_s, **self.access.options)
         with client:
             self._check()
             yield client
@@ -115,13 +128,25 @@ class Server:
     def _check(self) -> None:
         problems = []
         for url in self.urls:
-            with RewardClient(url, model=self.model, timeout_s=self.timeout_s, retry=False) as client:
+            with RewardClient(
+                url, model=self.model, timeout_s=self.timeout_s, retry=False, **self.access.options
+            ) as client:
                 try:
                     _check_served(client)
                     return
                 except errors.RewardError as error:
                     problems.append(error)
         raise problems[0]
+
+
+def read_access(ca_file: Path | None, certificate: Path | None, key: Path | None, key_file: Path | None) -> Access:
+    """Reads the files. Raises typer.BadParameter."""
+    with usage_errors("--ca-file, --client-certificate, --client-key, --api-key-file"):
+        try:
+            api_key = None if key_file is None else key_file.read_text().strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ValueError(f"expected a text file, got {error}") from None
+        return Access(ca_file, certificate, key, api_key=api_key)
 
 
 def exit_code(error: BaseException) -> ExitCode:

@@ -7,7 +7,7 @@ import logging
 import secrets
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,11 +23,12 @@ from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.requests import ClientDisconnect
 
 from rfm_client import errors
+from rfm_client.access import Access
 from rfm_client.async_client import DEFAULT_MODEL, DEFAULT_TIMEOUT_S, AsyncRewardClient
 from rfm_client.gateway import schema
 from rfm_client.gateway.body import RETRY_AFTER, Batch, BodyLimits, read_json, read_multipart
 from rfm_client.gateway.folder import AllowedFolder
-from rfm_client.gateway.observe import Metrics, Observed
+from rfm_client.gateway.observe import REQUEST_ID_HEADER, Metrics, Observed
 from rfm_client.gateway.scoring import Scorer
 from rfm_client.gateway.state import State
 
@@ -45,6 +46,7 @@ _STATUS_OF = {  # of an answer, by what went wrong behind it
     errors.ModelNotFoundError: 503,
     errors.DeadlineExceededError: 504,
     errors.InferenceFailedError: 502,
+    errors.AccessDeniedError: 502,  # the gateway's own credentials, not the caller's
 }
 
 logger = logging.getLogger("rfm_client.gateway")
@@ -54,7 +56,8 @@ logger = logging.getLogger("rfm_client.gateway")
 class GatewaySettings:
     """How a gateway works.
 
-    triton_url: ``grpc://host:port`` or ``http://host:port``
+    triton_url: ``grpc://host:port`` or ``http://host:port``, or with TLS ``grpcs://`` or ``https://``
+    access: certificates, and what Triton is shown
     metrics_url: of Triton's metrics; None: port 8002 of the same host
     model: name under which the checkpoint was exported
     timeout_s: the longest that a request may take to arrive, and then to be scored
@@ -66,6 +69,7 @@ class GatewaySettings:
     """
 
     triton_url: str
+    access: Access = field(default_factory=Access)
     metrics_url: str | None = None
     model: str = DEFAULT_MODEL
     timeout_s: float = DEFAULT_TIMEOUT_S
@@ -86,6 +90,7 @@ def create_app(settings: GatewaySettings) -> FastAPI:
         timeout_s=settings.timeout_s,
         retry=False,  # whoever asks is told at once, and decides
         max_in_flight=settings.max_in_flight,
+        **settings.access.options,
     )
 
     @asynccontextmanager
@@ -97,9 +102,13 @@ def create_app(settings: GatewaySettings) -> FastAPI:
     app.add_middleware(Observed, metrics=metrics, max_in_flight=settings.max_in_flight)
     if settings.cors_origins:
         app.add_middleware(
-            CORSMiddleware, allow_origins=settings.cors_origins, allow_methods=["GET", "POST"], allow_headers=["*"]
+            CORSMiddleware,
+            allow_origins=settings.cors_origins,
+            allow_methods=["GET", "POST"],
+            allow_headers=["*"],
+            expose_headers=[REQUEST_ID_HEADER],
         )
-    state = State(client, settings.triton_url, settings.metrics_url, settings.model)
+    state = State(client, settings.triton_url, settings.metrics_url, settings.model, settings.access)
     for router in (_health(state), _guarded(settings, Scorer(client, folder, settings.timeout_s), state, metrics)):
         app.include_router(router)
     _answer_errors(app)
@@ -113,8 +122,8 @@ def _guarded(settings: GatewaySettings, scorer: Scorer, state: State, metrics: M
     router = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
     limits = BodyLimits(settings.max_body_bytes)
 
-    async def score(batch: Batch) -> Response:
-        answer = await scorer.evaluate(batch)
+    async def score(request: Request, batch: Batch) -> Response:
+        answer = await scorer.evaluate(batch, request.state.request_id)
         for sample in batch.samples:
             metrics.samples.labels(sample.sample_type).inc()
         return Response(answer.model_dump_json(), media_type="application/json")
@@ -130,7 +139,7 @@ def _guarded(settings: GatewaySettings, scorer: Scorer, state: State, metrics: M
         with limits.admitted(request) as limited:
             with anyio.fail_after(settings.timeout_s):
                 batch = await read_json(limited)
-            return await score(batch)
+            return await score(request, batch)
 
     @router.post(
         "/evaluate_batch_npy",
@@ -145,7 +154,7 @@ def _guarded(settings: GatewaySettings, scorer: Scorer, state: State, metrics: M
         with limits.admitted(request) as limited:
             with anyio.fail_after(settings.timeout_s):
                 batch = await read_multipart(limited)
-            return await score(batch)
+            return await score(request, batch)
 
     @router.get("/gpu_status", responses=_failures(502, 503, 504))
     async def gpu_status() -> schema.GpuStatus:
@@ -203,9 +212,14 @@ def _key_check(key: str) -> Callable[..., None]:
         in_header: Annotated[str | None, Depends(_KEY_HEADER)],
         in_bearer: Annotated[HTTPAuthorizationCredentials | None, Depends(_KEY_BEARER)],
     ) -> None:
-        given = in_header or (in_bearer.credentials if in_bearer is not None else "")
-        if not secrets.compare_digest(given.encode(), expected):
-            raise HTTPException(401, "key: expected X-API-Key or Authorization: Bearer, got another or none")
+        given = (in_header or "", in_bearer.credentials if in_bearer is not None else "")
+        matches = [secrets.compare_digest(each.encode(), expected) for each in given]  # both, in the same time
+        if not any(matches):
+            raise HTTPException(
+                401,
+                "key: expected X-API-Key or Authorization: Bearer, got another or none",
+                {"WWW-Authenticate": "Bearer"},
+            )
 
     return check
 
@@ -235,8 +249,8 @@ def _answer_errors(app: FastAPI) -> None:
         return JSONResponse({"detail": error.detail}, error.status_code, error.headers)
 
     @app.exception_handler(Exception)
-    async def unexpected(_request: Request, error: Exception) -> JSONResponse:
-        logger.error("unexpected", exc_info=error)
+    async def unexpected(request: Request, error: Exception) -> JSONResponse:
+        logger.error("request %s: unexpected", request.state.request_id, exc_info=error)
         return JSONResponse({"detail": "the gateway failed; its log has the reason"}, 500)
 
 

@@ -8,9 +8,11 @@ import logging
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+from rfm_client.access import Access, check_certificate
 
 API_KEY_VARIABLE = "RFM_GATEWAY_API_KEY"
 KEEP_ALIVE_S = 30
@@ -20,7 +22,9 @@ logger = logging.getLogger("rfm_client.gateway")
 
 
 def gateway(
-    triton: Annotated[str, typer.Option(help="grpc://host:port or http://host:port of Triton.")],
+    triton: Annotated[
+        str, typer.Option(help="grpc://host:port or http://host:port of Triton, with TLS grpcs:// or https://.")
+    ],
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port to listen on.")] = 8000,
     metrics_url: Annotated[
@@ -36,6 +40,15 @@ def gateway(
         Path | None,
         typer.Option(help=f"File with the key that requests must show; else {API_KEY_VARIABLE}.", show_default=False),
     ] = None,
+    certificate: Annotated[
+        Path | None, typer.Option(help="Serve HTTPS with this certificate (PEM), and its --key.", show_default=False)
+    ] = None,
+    key: Annotated[Path | None, typer.Option(help="The certificate's key (PEM).", show_default=False)] = None,
+    triton_ca_file: Annotated[
+        Path | None, typer.Option(help="Authorities (PEM) that Triton is trusted by; else the system's.")
+    ] = None,
+    triton_certificate: Annotated[Path | None, typer.Option(help="By which Triton knows the gateway (PEM).")] = None,
+    triton_key: Annotated[Path | None, typer.Option(help="That certificate's key (PEM).")] = None,
     cors_origin: Annotated[
         list[str] | None, typer.Option(help="Origin from which browsers may ask. Again for more.", show_default=False)
     ] = None,
@@ -51,8 +64,9 @@ def gateway(
     except ModuleNotFoundError as error:
         raise typer.BadParameter(f'the gateway needs {error.name}: pip install "rfm-client[gateway]"') from None
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    key = _key(api_key_file)
+    api_key = _key(api_key_file)
     try:
+        tls = _tls(certificate, key)
         settings = GatewaySettings(
             triton_url=triton,
             metrics_url=metrics_url,
@@ -60,14 +74,15 @@ def gateway(
             timeout_s=timeout,
             max_body_bytes=max_body_mib * MIB,
             max_in_flight=max_in_flight,
-            api_key=key,
+            api_key=api_key,
+            access=Access(triton_ca_file, triton_certificate, triton_key),
             cors_origins=tuple(cors_origin or ()),
             folder=allow_folder,
         )
         app = create_app(settings)
     except (ValueError, OSError) as error:
         raise typer.BadParameter(str(error)) from None
-    if key is None and not _is_loopback(host):
+    if api_key is None and not _is_loopback(host):
         logger.warning("%s is no loopback address, and no key is asked for: whoever reaches it may use it", host)
     uvicorn.run(
         app,
@@ -77,6 +92,7 @@ def gateway(
         log_config=None,
         timeout_keep_alive=KEEP_ALIVE_S,
         timeout_graceful_shutdown=STOP_WITHIN_S,
+        **tls,
     )
 
 
@@ -85,6 +101,16 @@ def gateway_command(triton: str, metrics_url: str, model: str, host: str, port: 
     options = {"triton": triton, "metrics-url": metrics_url, "model": model, "host": host, "port": port}
     words = (word for name, value in options.items() for word in (f"--{name}", str(value)))
     return [sys.executable, "-m", "rfm_client.gateway", *words]
+
+
+def _tls(certificate: Path | None, key: Path | None) -> dict[str, Any]:
+    """Arguments of uvicorn. Raises ValueError for what it could not serve."""
+    if certificate is None and key is None:
+        return {}
+    if certificate is None or key is None:
+        raise ValueError("--certificate, --key: expected both or none, got one")
+    check_certificate(certificate, key, "--certificate, --key")
+    return {"ssl_certfile": certificate, "ssl_keyfile": key}
 
 
 def _key(file: Path | None) -> str | None:

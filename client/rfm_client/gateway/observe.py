@@ -3,17 +3,23 @@
 
 from __future__ import annotations
 
+import secrets
 import time
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rfm_client.gateway.body import NPY_ENDPOINT, RETRY_AFTER
+from rfm_client.wire import CANARY_PREFIX, REQUEST_ID
 
 EVALUATIONS = ("/evaluate_batch", NPY_ENDPOINT)
 ENDPOINTS = (*EVALUATIONS, "/gpu_status", "/health", "/model_info", "/metrics")
 REJECTIONS = {401: "key", 408: "slow", 413: "size", 415: "format", 422: "invalid", 503: "unavailable", 504: "deadline"}
+
+REQUEST_ID_HEADER = "X-Request-ID"
+_ID_BYTES = 8  # of chance, where a request comes without an id
 
 _BUCKETS_S = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0)
 
@@ -47,7 +53,7 @@ class Metrics:
 
 
 class Observed:
-    """ASGI middleware: times and counts every request, and refuses evaluations beyond ``max_in_flight``."""
+    """ASGI middleware: names, times and counts every request, and refuses evaluations beyond ``max_in_flight``."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics, max_in_flight: int) -> None:
         self._app = app
@@ -61,12 +67,15 @@ class Observed:
             await self._app(scope, receive, send)
             return
         started_s = time.perf_counter()
+        request_id = _request_id(scope)
+        scope.setdefault("state", {})["request_id"] = request_id
         code = 500  # if nothing is answered
 
         async def send_counted(message: Message) -> None:
             nonlocal code
             if message["type"] == "http.response.start":
                 code = message["status"]
+                MutableHeaders(scope=message)[REQUEST_ID_HEADER] = request_id
             await send(message)
 
         is_evaluation = scope["path"] in EVALUATIONS
@@ -91,3 +100,11 @@ class Observed:
         if is_evaluation:
             self._in_flight += change
             self._metrics.in_flight.set(self._in_flight)
+
+
+def _request_id(scope: Scope) -> str:
+    """The caller's, unless it is none that a log could hold, or hides the request from metrics; else a new one."""
+    given = Headers(scope=scope).get(REQUEST_ID_HEADER, "")
+    if REQUEST_ID.fullmatch(given) and not given.startswith(CANARY_PREFIX):
+        return given
+    return secrets.token_hex(_ID_BYTES)

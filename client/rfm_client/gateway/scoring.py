@@ -63,24 +63,26 @@ class Scorer:
         self._folder = folder
         self._timeout_s = timeout_s
 
-    async def evaluate(self, batch: Batch) -> schema.EvaluateBatchAnswer:
+    async def evaluate(self, batch: Batch, request_id: str) -> schema.EvaluateBatchAnswer:
         """The answer to a batch, whole: one that lacked a sample would shift the others', or be read as a reward of 0.
 
         Raises RequestValidationError for samples that cannot be scored, all of them told, and ServerError.
         """
         deadline = Deadline(self._timeout_s)
         try:
-            return await self._evaluate(batch, deadline)
+            return await self._evaluate(batch, deadline, request_id)
         except DeadlineExceededError as error:  # which tells what was left for one of several calls
             raise deadline.exceeded("Triton") from error
 
-    async def _evaluate(self, batch: Batch, deadline: Deadline) -> schema.EvaluateBatchAnswer:
+    async def _evaluate(self, batch: Batch, deadline: Deadline, request_id: str) -> schema.EvaluateBatchAnswer:
         served = await self._served(batch.samples, deadline)
         num_bytes = sum(_num_bytes(sample) for sample in batch.samples)
-        texts = await self._texts(batch.samples, served, deadline)
+        texts = await self._texts(batch.samples, served, deadline, request_id)
         steps = FRAME_STEPS if batch.use_frame_steps else 0
         samples = await off_loop(num_bytes, self._samples, batch.samples, served, texts, steps)
-        results = await self._client.evaluate(samples, return_errors=True, timeout_s=deadline.remaining_s())
+        results = await self._client.evaluate(
+            samples, return_errors=True, timeout_s=deadline.remaining_s(), request_id=request_id
+        )
         failed = {index: result for index, result in enumerate(results) if isinstance(result, RewardError)}
         refused = {i: error for i, error in failed.items() if isinstance(error, InvalidSampleError)}
         if refused:
@@ -108,7 +110,9 @@ class Scorer:
         except ModelNotFoundError:
             return None
 
-    async def _texts(self, samples: Sequence[schema.Sample], served: Served, deadline: Deadline) -> Texts:
+    async def _texts(
+        self, samples: Sequence[schema.Sample], served: Served, deadline: Deadline, request_id: str
+    ) -> Texts:
         """Embeddings of the tasks that come without one, by task; empty if there is no encoder."""
         tasks = {
             first.task
@@ -118,14 +122,17 @@ class Scorer:
         if not tasks or served.embeddings is None:
             return {}
         try:
-            return dict(zip(tasks, await asyncio.gather(*(self._text(task, deadline) for task in tasks)), strict=True))
+            texts = await asyncio.gather(*(self._text(task, deadline, request_id) for task in tasks))
+            return dict(zip(tasks, texts, strict=True))
         except ModelNotFoundError:
             return {}
 
-    async def _text(self, task: str, deadline: Deadline) -> Float32Array | InvalidSampleError:
+    async def _text(self, task: str, deadline: Deadline, request_id: str) -> Float32Array | InvalidSampleError:
         blank = np.zeros((1, _TEXT_FRAME_PX, _TEXT_FRAME_PX, 3), np.uint8)
         try:
-            encoded = await self._client.encode(Trajectory(frames=blank, task=task), timeout_s=deadline.remaining_s())
+            encoded = await self._client.encode(
+                Trajectory(frames=blank, task=task), timeout_s=deadline.remaining_s(), request_id=request_id
+            )
         except InvalidSampleError as error:  # of one task; the others' samples are told of theirs
             return error
         assert encoded.text_embedding is not None
@@ -240,7 +247,7 @@ def _refused(errors: Mapping[int, InvalidSampleError]) -> RequestValidationError
     """One error that tells of all samples that cannot be scored, each at its field as the caller named it."""
     told: list[Any] = []
     for index, error in errors.items():
-        where, _, message = str(error).partition(": ")
+        where, _, message = error.message.partition(": ")
         path: list[str | int] = [int(word) if word.isdecimal() else _SIDES.get(word, word) for word in where.split(".")]
         told += invalid(("samples", index, *path), message).errors()
     return RequestValidationError(told)

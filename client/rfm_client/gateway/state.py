@@ -8,12 +8,14 @@ import time
 
 import numpy as np
 
+from rfm_client.access import Access
 from rfm_client.async_client import AsyncRewardClient
 from rfm_client.errors import ModelNotFoundError, RewardError, ServerError, ServerUnavailableError
 from rfm_client.gateway import schema
 from rfm_client.model_info import ModelInfo
 from rfm_client.samples import Trajectory
 from rfm_client.status import Device, ServerStatus, read_status
+from rfm_client.wire import CANARY_PREFIX
 
 CANARY_TIMEOUT_S = 5.0
 CANARY_KEPT_S = 1.0  # so that probes, which need no key, do not keep the models busy
@@ -26,11 +28,14 @@ _CANARY_PX = 64
 class State:
     """Asks the server at ``url``, whose metrics are at ``metrics_url``, about ``model``."""
 
-    def __init__(self, client: AsyncRewardClient, url: str, metrics_url: str | None, model: str) -> None:
+    def __init__(
+        self, client: AsyncRewardClient, url: str, metrics_url: str | None, model: str, access: Access | None = None
+    ) -> None:
         self._client = client
         self._url = url
         self._metrics_url = metrics_url
         self._model = model
+        self._access = access
         self._asking = asyncio.Lock()
         self._asked_s = -CANARY_KEPT_S
         self._problem: str | None = None
@@ -39,7 +44,11 @@ class State:
     async def gpu_status(self) -> schema.GpuStatus:
         """Raises ServerError."""
         status = await asyncio.to_thread(
-            read_status, self._url, metrics_url=self._metrics_url, timeout_s=STATUS_TIMEOUT_S
+            read_status,
+            self._url,
+            metrics_url=self._metrics_url,
+            timeout_s=STATUS_TIMEOUT_S,
+            access=self._access,
         )
         return _gpu_status(status, self._model)
 
@@ -102,7 +111,7 @@ class State:
         """Asks every model for a score of next to nothing; the reason of the first that has none to give."""
         try:
             for info in await self._infos():
-                await self._client.progress(_canary(info), timeout_s=CANARY_TIMEOUT_S)
+                await self._client.progress(_canary(info), timeout_s=CANARY_TIMEOUT_S, request_id=CANARY_PREFIX)
         except RewardError as error:
             return str(error)
         return None

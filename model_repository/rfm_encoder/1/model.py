@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from rfm.execution import Execution
 from rfm.models.encoders import Encoders
 from rfm.server.batch_model import BatchModel
 from rfm_client import RewardError, Trajectory, wire
@@ -23,8 +24,8 @@ class TritonPythonModel(BatchModel[Trajectory, Trajectory]):
     def decode(self, tensors: wire.Tensors) -> list[Trajectory]:
         return wire.decode_trajectories(tensors)
 
-    def answer(self, questions: Sequence[Trajectory]) -> list[Trajectory | RewardError]:
-        return self.encoders.encode(questions)
+    def answer(self, questions: Sequence[Trajectory], execution: Execution) -> list[Trajectory | RewardError]:
+        return self.encoders.encode(questions, execution)
 
     def encode(self, answers: Sequence[Trajectory], tensors: wire.Tensors, outputs: Collection[str]) -> wire.Tensors:
         return wire.encode_trajectories(answers, wire.num_positions(tensors), outputs)

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from rfm.engine import Engine, Outcome
+from rfm.execution import Execution
 from rfm.server.batch_model import BUDGET_PARAMETER, DTYPE_PARAMETER, BatchModel
 from rfm_client import Result, Sample, wire
 
@@ -27,8 +28,8 @@ class TritonPythonModel(BatchModel[Sample, Result]):
     def decode(self, tensors: wire.Tensors) -> list[Sample]:
         return wire.decode_samples(tensors)
 
-    def answer(self, questions: Sequence[Sample]) -> list[Outcome]:
-        return self.engine.evaluate(questions)
+    def answer(self, questions: Sequence[Sample], execution: Execution) -> list[Outcome]:
+        return self.engine.evaluate(questions, execution)
 
     def encode(self, answers: Sequence[Result], tensors: wire.Tensors, outputs: Collection[str]) -> wire.Tensors:
         return wire.encode_results(answers, wire.num_positions(tensors), outputs)

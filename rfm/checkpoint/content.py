@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: MIT
+"""What one file of a checkpoint holds. Whoever wrote it may lie: it is read in bounded memory and time, or refused."""
+
+from __future__ import annotations
+
+import json
+import reprlib
+import stat
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+
+from rfm.plain_yaml import read_yaml
+
+MAX_JSON_BYTES = 2**24
+MAX_HEADER_BYTES = 2**24  # of a safetensors file: a hundred for each tensor
+
+_LENGTH = struct.Struct("<Q")  # of a safetensors file's header
+_DTYPES = ("F64", "F32", "F16", "BF16", "I64", "I32", "I16", "I8", "U8", "BOOL")
+_LFS_POINTER = b"version https://git-lfs"
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+# What libraries raise of content that they did not expect.
+_MISFITS = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
+
+_short = reprlib.Repr()
+_short.maxstring = _short.maxother = 100
+_MAX_LISTED = 20
+
+
+class CheckpointError(Exception):
+    """A checkpoint that cannot be loaded: what is wrong with which file, and what to do about it."""
+
+
+@contextmanager
+def expecting(what: str, where: object) -> Iterator[None]:
+    """Turns whatever code raises of content that does not fit into a CheckpointError."""
+    try:
+        yield
+    except _MISFITS as error:
+        raise CheckpointError(f"{where}: expected {what}, got {type(error).__name__}: {cut(str(error))}") from error
+
+
+def shown(value: object) -> str:
+    """The value as an error tells it: on one line, and not long."""
+    try:
+        return _short.repr(value)
+    except ValueError:  # a number of more digits than Python writes out
+        return f"a huge {type(value).__name__}"
+
+
+def cut(text: str, most: int = 1000) -> str:
+    """The text, or its beginning, on one line."""
+    line = " ".join(text[: most + 1].split())
+    return line if len(text) <= most else f"{line}..."
+
+
+def listed(names: Sequence[str]) -> str:
+    """As Python writes a list; the first of many names."""
+    more = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
+    return cut(repr(list(names[:_MAX_LISTED])), 4000) + more
+
+
+def is_there(file: Path) -> bool:
+    """Whether there is such a file. Raises CheckpointError for what is there and cannot be read as one."""
+    try:
+        kind = stat.S_IFMT(file.stat().st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        if file.is_symlink():
+            raise CheckpointError(f"{file}: expected a file, got a link that leads nowhere") from None
+        return False
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{file}: expected a file, got: {error}") from error
+    if kind != stat.S_IFREG:  # to open a pipe would be to wait for its writer
+        raise CheckpointError(f"{file}: expected a file, got {_KINDS.get(kind, 'something else')}")
+    return True
+
+
+def read_json(file: Path) -> dict[str, Any]:
+    """A JSON object. Raises CheckpointError."""
+    _require(file)
+    try:
+        with file.open("rb") as stream:
+            text = stream.read(MAX_JSON_BYTES + 1)
+        if len(text) > MAX_JSON_BYTES:
+            raise CheckpointError(f"{file}: expected at most {MAX_JSON_BYTES} bytes of JSON, got more")
+        content = json.loads(text, object_pairs_hook=_once)
+    except (OSError, ValueError, RecursionError) as error:
+        raise CheckpointError(f"{file}: expected JSON, got {cut(str(error))}") from error
+    if not isinstance(content, dict):
+        raise CheckpointError(f"{file}: expected a JSON object, got {type(content).__name__}")
+    return content
+
+
+def read_run_config(file: Path) -> dict[str, Any]:
+    """config.yaml as plain mappings, lists and scalars, whatever Python objects its tags ask for."""
+    _require(file)
+    try:
+        config = read_yaml(file, _PlainLoader)
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{file}: expected YAML, got {cut(str(error))}") from error
+    if not isinstance(config, dict):
+        raise CheckpointError(f"{file}: expected a mapping, got {type(config).__name__}")
+    return config
+
+
+def read_tensors(file: Path) -> dict[str, Tensor]:
+    """All tensors of one safetensors file. Raises CheckpointError."""
+    _require(file)
+    try:
+        _check_header(file)
+        return load_file(file)
+    except (OSError, SafetensorError, *_MISFITS) as error:
+        raise CheckpointError(f"{file}: expected a safetensors file, got {cut(str(error))}") from error
+
+
+def _require(file: Path) -> None:
+    if not is_there(file):
+        raise CheckpointError(f"{file}: expected a file, got none")
+
+
+def _check_header(file: Path) -> None:
+    """What the library's own check of offsets and sizes leaves out. Raises ValueError, OSError, RecursionError."""
+    with file.open("rb") as content:
+        start = content.read(len(_LFS_POINTER))
+        if start == _LFS_POINTER:
+            raise ValueError("Git LFS's note of where it is; `git lfs pull` fetches it")
+        if len(start) < _LENGTH.size:
+            raise ValueError(f"only {len(start)} bytes")
+        (length,) = _LENGTH.unpack_from(start)
+        if length > min(MAX_HEADER_BYTES, file.stat().st_size - _LENGTH.size):
+            raise ValueError(f"one whose header would be {length} bytes long")
+        content.seek(_LENGTH.size)
+        header = json.loads(content.read(length), object_pairs_hook=_once)
+    for name, tensor in header.items() if isinstance(header, dict) else ():
+        dtype = tensor.get("dtype") if isinstance(tensor, dict) and name != "__metadata__" else _DTYPES[0]
+        if dtype not in _DTYPES:
+            raise ValueError(f"{shown(name)} of type {shown(dtype)}, which is none of {', '.join(_DTYPES)}")
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object in which no key stands twice."""
+    content: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in content:
+            raise ValueError(f"the key {shown(name)} twice")
+        content[name] = value
+    return content
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """SafeLoader that reads nodes tagged as Python objects as the plain data that they hold."""
+
+
+def _plain(loader: yaml.SafeLoader, _suffix: str, node: yaml.Node) -> Any:
+    if isinstance(node, yaml.MappingNode):
+        return loader.construct_mapping(node, deep=True)
+    if isinstance(node, yaml.SequenceNode):
+        return loader.construct_sequence(node, deep=True)
+    return node.value
+
+
+_PlainLoader.add_multi_constructor("tag:yaml.org,2002:python/", _plain)

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: MIT
+"""YAML files of others: plain values, in bounded memory and time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+MAX_YAML_BYTES = 2**18  # a training run's config.yaml has a few thousand
+MAX_YAML_VALUES = 100_000  # with every alias and merge key written out
+MAX_DIGITS = 100
+
+# What PyYAML raises beside its own errors: of `!!timestamp x`, `!!bool x`, `!!int ""`, 5000 digits, 1000 brackets.
+_MISREAD = (yaml.YAMLError, ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
+
+
+def read_yaml(file: Path, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
+    """The one document in the file. Raises OSError, and ValueError for what is no YAML, or more than is bearable."""
+    with file.open("rb") as content:
+        text = content.read(MAX_YAML_BYTES + 1)
+    if len(text) > MAX_YAML_BYTES:
+        raise ValueError(f"more than {MAX_YAML_BYTES} bytes")
+    try:
+        reading = loader(text)
+        try:
+            node = reading.get_single_node()
+            if node is None:
+                return None
+            if _num_values(node, {}) > MAX_YAML_VALUES:
+                raise ValueError(f"aliases that stand for more than {MAX_YAML_VALUES} values")
+            return reading.construct_document(node)
+        finally:
+            reading.dispose()
+    except _MISREAD as error:
+        raise ValueError(str(error) or type(error).__name__) from error
+
+
+def _num_values(node: yaml.Node, known: dict[int, int | None]) -> int:
+    """Of a node with its aliases written out. Raises ValueError for a node inside itself and a key told twice."""
+    if id(node) in known:
+        count = known[id(node)]
+        if count is None:
+            raise ValueError("a value that is inside itself")
+        return count
+    if node.tag.endswith(":int") and len(node.value) > MAX_DIGITS:
+        raise ValueError(f"a number of {len(node.value)} digits")
+    known[id(node)] = None
+    children: list[yaml.Node] = []
+    if isinstance(node, yaml.SequenceNode):
+        children = node.value
+    elif isinstance(node, yaml.MappingNode):
+        keys = Counter((key.tag, key.value) for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        twice = [name for (_, name), count in keys.items() if count > 1]
+        if twice:
+            raise ValueError(f"the key {twice[0]!r} twice")
+        children = [part for pair in node.value for part in pair]
+    known[id(node)] = total = 1 + sum(_num_values(child, known) for child in children)
+    return total

@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: MIT
+"""Requests that kill the model process: told by what it was working on when it died, and refused for a while.
+
+Each model process keeps a journal, a small file in shared memory, of the batch that it is working on. It outlives the
+process. The next process of the model reads the journals of the dead: what stands in one is a suspect, which is worked
+on alone from then on, so that no neighbour is blamed for it. A suspect that is survived is none any more; one that
+was there twice when a process died is refused for POISON_S.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import mmap
+import os
+import struct
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.errors import InvalidSampleError
+
+POISON_S = 600.0
+DEATHS = 2  # after which a request is refused
+DIGEST_BYTES = 8
+NO_DIGEST = bytes(DIGEST_BYTES)  # of what is no suspect whatever happens
+SUFFIX = "_batch"
+
+_FOLDER = Path("/dev/shm")
+_SAMPLED_BYTES = 2**14  # of each tensor: a digest shall cost microseconds, whatever the size
+_BLOCK_BYTES = 2**9
+_HEADER = struct.Struct("<QQdQ")  # process id, requests refused, when the batch was begun (0: idle), its requests
+_STUB_REGION = 2  # which argument of a model process names its shared memory
+_ZOMBIE = "Z"
+
+
+def digest(tensors: Mapping[str, npt.NDArray[Any]]) -> bytes:
+    """8 bytes that tell a request's inputs from others; of large tensors shape and an even sample of the content."""
+    told = hashlib.sha1(usedforsecurity=False)
+    for name in sorted(tensors):
+        array = tensors[name]
+        told.update(f"{name}{array.shape}".encode())
+        told.update(_sampled(array))
+    return told.digest()[:DIGEST_BYTES]
+
+
+class Journal:
+    """A model process' record of the batch it is working on, in ``file``."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        with file.open("r+b") as content:
+            self._memory = mmap.mmap(content.fileno(), 0)
+
+    @classmethod
+    def create(cls, file: Path, capacity: int) -> Journal:
+        """This process', for batches of up to ``capacity`` requests."""
+        file.write_bytes(_HEADER.pack(os.getpid(), 0, 0.0, 0) + bytes(DIGEST_BYTES * capacity))
+        return cls(file)
+
+    @classmethod
+    def open(cls, file: Path) -> Journal | None:
+        """None: there is none."""
+        try:
+            return cls(file)
+        except (OSError, ValueError):  # gone, or not written yet
+            return None
+
+    @property
+    def pid(self) -> int:
+        """Whose it is."""
+        return int(self._header[0])
+
+    @property
+    def num_refused(self) -> int:
+        """Requests that were refused as poison."""
+        return int(self._header[1])
+
+    @property
+    def busy_s(self) -> float:
+        """For how long the batch is worked on, or has been begun when the process died; 0: there is none."""
+        begun_s = self._header[2]
+        return max(time.monotonic() - begun_s, 0.0) if begun_s else 0.0  # the clock is the same in all processes
+
+    @property
+    def digests(self) -> list[bytes]:
+        """Of the batch."""
+        count = self._header[3] if self._header[2] else 0
+        places = range(_HEADER.size, _HEADER.size + DIGEST_BYTES * count, DIGEST_BYTES)
+        return [self._memory[place : place + DIGEST_BYTES] for place in places]
+
+    @contextmanager
+    def at_work_on(self, digests: Sequence[bytes]) -> Iterator[None]:
+        """Within it, the batch is these requests."""
+        content = b"".join(digests)
+        self._memory[_HEADER.size : _HEADER.size + len(content)] = content
+        self._write(time.monotonic(), len(digests))
+        try:
+            yield
+        finally:
+            self._write(0.0, 0)
+
+    def count_refused(self) -> None:
+        """One more."""
+        _HEADER.pack_into(self._memory, 0, self.pid, self.num_refused + 1, *self._header[2:])
+
+    def forget(self, unsuspected: bytes) -> None:
+        """Takes a request out of the batch."""
+        for number, known in enumerate(self.digests):
+            if known == unsuspected:
+                place = _HEADER.size + DIGEST_BYTES * number
+                self._memory[place : place + DIGEST_BYTES] = NO_DIGEST
+
+    def close(self) -> None:
+        """Removes the file."""
+        self._memory.close()
+        self.file.unlink(missing_ok=True)
+
+    @property
+    def _header(self) -> tuple[Any, ...]:
+        return _HEADER.unpack_from(self._memory)
+
+    def _write(self, begun_s: float, count: int) -> None:
+        _HEADER.pack_into(self._memory, 0, self.pid, self.num_refused, begun_s, count)
+
+
+class Poison:
+    """What one model process knows of requests that kill it.
+
+    file: its own journal
+    others: journals of the model's processes, from which those of the dead are read
+    """
+
+    def __init__(self, file: Path, others: Iterable[Path], capacity: int) -> None:
+        self._dead = [journal for other in others if (journal := _of_the_dead(other))]
+        self._deaths = Counter(told for journal in self._dead for told in journal.digests if told != NO_DIGEST)
+        self._until_s = time.monotonic() + POISON_S
+        self._journal = Journal.create(file, capacity)
+
+    @classmethod
+    def of_this_process(cls, model: str, capacity: int) -> Poison:
+        """That of the process that runs, which Triton has started for ``model``."""
+        region = os.fsdecode(Path("/proc/self/cmdline").read_bytes().split(b"\0")[_STUB_REGION])
+        others = _FOLDER.glob(f"{region.rpartition('_')[0]}_*_{model}{SUFFIX}")  # the same server's
+        return cls(_FOLDER / f"{region}_{model}{SUFFIX}", others, capacity)
+
+    def is_suspect(self, told: bytes) -> bool:
+        """Whether a process has died while it worked on this request."""
+        return self._deaths[told] > 0 if self._deaths else False
+
+    def check(self, told: bytes) -> None:
+        """Raises InvalidSampleError for a request that is refused."""
+        if self.is_suspect(told) and self._deaths[told] >= DEATHS and time.monotonic() < self._until_s:
+            self._journal.count_refused()
+            got = f"one that has ended its process {self._deaths[told]} times"
+            until = f"it is refused for {POISON_S / 60:g} minutes"
+            raise InvalidSampleError(f"request: expected one that the model survives, got {got}: {until}")
+
+    @contextmanager
+    def at_work_on(self, digests: Sequence[bytes]) -> Iterator[None]:
+        """Within it, these requests are worked on. If it ends, none of them is a suspect any more."""
+        try:
+            with self._journal.at_work_on(digests):
+                yield
+        finally:
+            for told in digests if self._deaths else ():
+                if self._deaths.pop(told, 0):
+                    for journal in self._dead:
+                        journal.forget(told)
+
+    def close(self) -> None:
+        """The process ends as it should."""
+        self._journal.close()
+
+
+def _of_the_dead(file: Path) -> Journal | None:
+    """A journal that tells of suspects. One that tells of nothing, or no more, is removed."""
+    journal = Journal.open(file)
+    if journal is None or _is_alive(journal.pid):
+        return None
+    if not 0 < journal.busy_s < POISON_S:
+        with suppress(OSError):
+            journal.close()
+        return None
+    return journal
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        stat = Path("/proc", str(pid), "stat").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return stat.rpartition(")")[2].split()[0] != _ZOMBIE
+
+
+def _sampled(array: npt.NDArray[Any]) -> bytes | memoryview:
+    """The content, or blocks of it at even distances."""
+    if array.dtype == np.object_:
+        return b"\0".join(bytes(item) for item in array.ravel())
+    content = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+    if content.nbytes <= _SAMPLED_BYTES:
+        return content.data
+    blocks = content[-(content.nbytes // _BLOCK_BYTES) * _BLOCK_BYTES :].reshape(-1, _BLOCK_BYTES)
+    step = -(-len(blocks) * _BLOCK_BYTES // _SAMPLED_BYTES)
+    return np.ascontiguousarray(blocks[::step]).data

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: MIT
+"""How soon something that has ended is started again, and when that is given up."""
+
+from __future__ import annotations
+
+import time
+
+from rfm.server.installation import ServerStartError
+
+STEADY_S = 60.0  # whatever has run for so long is no part of a crash loop
+MOST = 5  # restarts in a row
+LONGEST_PAUSE_S = 10.0
+_FIRST_PAUSE_S = 0.5
+
+
+class CrashLoopError(ServerStartError):
+    """Something ends again and again."""
+
+
+class Restarts:
+    """Of one process. The first comes at once; those that follow close behind one another come after longer pauses."""
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._row = 0
+        self._started_s = time.monotonic()
+
+    def started(self) -> None:
+        """It runs now."""
+        self._started_s = time.monotonic()
+
+    def pause_s(self, reason: str) -> float:
+        """How long to wait before the next start, now that it has ended. Raises CrashLoopError when it is one."""
+        if time.monotonic() - self._started_s >= STEADY_S:
+            self._row = 0
+        self._row += 1
+        if self._row > MOST:
+            got = f"{self._row} ends, each within {STEADY_S:g} s of a start; the last: {reason}"
+            raise CrashLoopError(f"{self._what}: expected to run, got {got}")
+        return 0.0 if self._row == 1 else min(_FIRST_PAUSE_S * 2.0 ** (self._row - 2), LONGEST_PAUSE_S)

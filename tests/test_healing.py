@@ -1,0 +1,446 @@
+# SPDX-License-Identifier: MIT
+"""Faults that ``rfm serve`` survives: dead and hung processes, poison, more requests than can be served."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from rfm.server import leftovers, poison, restarts
+from rfm.server.installation import find_installation
+from rfm.server.process import SHARED_MEMORY, Endpoints, TritonServer
+from rfm.server.restarts import CrashLoopError, Restarts
+from rfm.server.stubs import Stub, StubWatch, is_alive
+from rfm_client import (
+    InvalidSampleError,
+    ProgressSample,
+    RewardClient,
+    ServerUnavailableError,
+    Trajectory,
+)
+
+ROOT = Path(__file__).parents[1]
+RFM = Path(sys.executable).parent / "rfm"
+PATIENCE_S = 60.0
+TRUTH_S = 5.0
+CALLERS = 16
+TOLERANCE = 1e-5
+MODEL = "rfm"
+MARK = 7.0  # in the text embedding of a sample that a model of this test dies of
+DEADLY = f"""
+
+_answer = TritonPythonModel.answer
+
+
+def deadly(self, questions, execution):
+    import os
+
+    marked = [q for q in questions if q.trajectories[0].text_embedding[0] == {MARK}]
+    if marked:
+        os._exit(1)
+    return _answer(self, questions, execution)
+
+
+TritonPythonModel.answer = deadly
+"""
+SLOW = f"""
+
+_answer = TritonPythonModel.answer
+
+
+def slow(self, questions, execution):
+    import time
+
+    time.sleep(0.5 * sum(q.trajectories[0].text_embedding[0] == {MARK} for q in questions))
+    return _answer(self, questions, execution)
+
+
+TritonPythonModel.answer = slow
+"""
+
+
+def make_repository(
+    folder: Path, *, more_code: str = "", instances: int = 1, queue: dict[str, int] | None = None
+) -> Path:
+    """The demo's ``rfm`` on one thread, changed as a test needs it."""
+    repository = folder / "model_repository"
+    shutil.copytree(ROOT / "model_repository" / MODEL, repository / MODEL, ignore=shutil.ignore_patterns("__pycache__"))
+    model = repository / MODEL / "1" / "model.py"
+    model.write_text(model.read_text() + more_code)
+    config = repository / MODEL / "config.pbtxt"
+    text = config.read_text()
+    changes = {r"count: \d+": f"count: {instances}", r'("torch_threads"\s+value {\s+string_value: )"\d+"': r'\1"1"'}
+    changes |= {rf"{name}: \d+": f"{name}: {value}" for name, value in (queue or {}).items()}
+    for pattern, wanted in changes.items():
+        text, count = re.subn(pattern, wanted, text)
+        assert count == 1, pattern
+    config.write_text(text)
+    return repository
+
+
+def trajectory(seed: int, num_frames: int = 8, mark: float = 0.0) -> Trajectory:
+    random = np.random.default_rng(seed)
+    text = random.standard_normal(32, np.float32)
+    text[0] = mark
+    return Trajectory(video_embeddings=random.standard_normal((num_frames, 64), np.float32), text_embedding=text)
+
+
+def wait_for(is_so: Callable[[], Any], within_s: float = PATIENCE_S) -> float:
+    """Seconds until it was so."""
+    started_s = time.monotonic()
+    while not is_so():
+        assert time.monotonic() - started_s < within_s
+        time.sleep(0.02)
+    return time.monotonic() - started_s
+
+
+def children(pid: int, program: str) -> list[int]:
+    return [
+        int(word) for word in subprocess.run(["pgrep", "-P", str(pid), program], stdout=subprocess.PIPE).stdout.split()
+    ]
+
+
+@dataclass
+class Serving:
+    """An ``rfm serve`` that runs."""
+
+    process: subprocess.Popen[bytes]
+    endpoints: Endpoints
+    status_url: str
+    log: Path
+
+    def ready(self) -> httpx.Response | None:
+        try:
+            return httpx.get(f"{self.status_url}/ready")
+        except httpx.TransportError:
+            return None
+
+    def is_ready(self) -> bool:
+        answer = self.ready()
+        return answer is not None and answer.status_code == 200
+
+    def wait_ready(self, is_so: bool = True, within_s: float = PATIENCE_S) -> float:
+        return wait_for(lambda: self.is_ready() is is_so or self.process.poll() is not None, within_s)
+
+    @property
+    def triton(self) -> int:
+        (pid,) = children(self.process.pid, "tritonserver")
+        return pid
+
+    @property
+    def stubs(self) -> list[Stub]:
+        return [stub for stub in StubWatch(self.triton, PATIENCE_S).of_model(MODEL) if is_alive(stub.pid)]
+
+    def client(self, **options: Any) -> RewardClient:
+        return RewardClient(self.endpoints.grpc_url, **options)
+
+    def metric(self, name: str, **labels: str) -> float:
+        text = httpx.get(f"{self.status_url}/metrics").text
+        samples = [sample for family in text_string_to_metric_families(text) for sample in family.samples]
+        return sum(
+            sample.value for sample in samples if sample.name == name and labels.items() <= sample.labels.items()
+        )
+
+    @property
+    def said(self) -> list[str]:
+        return [line for line in self.log.read_text(errors="replace").splitlines() if line.startswith("rfm: ")]
+
+
+@contextmanager
+def serving(repository: Path, *more: str) -> Iterator[Serving]:
+    """Within it, the repository is served. Nothing of it may be left behind."""
+    endpoints, status_port = Endpoints.free(), Endpoints.free().http_port
+    ports = {"http": endpoints.http_port, "grpc": endpoints.grpc_port, "metrics": endpoints.metrics_port}
+    options = [f"--{name}-port={port}" for name, port in (ports | {"status": status_port}).items()]
+    log = repository.parent / "rfm.log"
+    with log.open("wb") as lines:
+        process = subprocess.Popen(
+            [RFM, "serve", "--repository", repository, *options, *more], stdout=lines, stderr=lines
+        )
+    served = Serving(process, endpoints, f"http://127.0.0.1:{status_port}", log)
+    try:
+        yield served
+    finally:
+        if process.poll() is None:
+            process.terminate()
+        process.wait(PATIENCE_S)
+    assert not list(SHARED_MEMORY.glob(f"*_rfm_{process.pid}_*"))
+    assert not list(Path(tempfile.gettempdir()).glob(f"rfm-backends-{process.pid}-*"))
+
+
+@pytest.fixture(scope="module")
+def references() -> list[np.ndarray[Any, Any]]:
+    """What the engine answers, without Triton."""
+    from rfm.engine import Engine
+
+    engine = Engine.from_checkpoint(ROOT / "model_repository" / MODEL / "1" / "checkpoint")
+    return [result.progress for result in engine.evaluate([ProgressSample(trajectory(n)) for n in range(CALLERS)])]  # type: ignore[union-attr]
+
+
+class Callers:
+    """16 threads that ask without pause, with the client's default retries, and compare what they get."""
+
+    def __init__(self, client: RewardClient, references: list[np.ndarray[Any, Any]]) -> None:
+        self._client = client
+        self._references = references
+        self._stop = threading.Event()
+        self.answered = [0] * CALLERS
+        self.wrong: list[int] = []
+        self.lost: list[Exception] = []
+        self._threads = [threading.Thread(target=self._ask, args=(number,)) for number in range(CALLERS)]
+
+    def _ask(self, number: int) -> None:
+        while not self._stop.is_set():
+            try:
+                progress = self._client.progress(trajectory(number)).progress
+                if np.abs(progress - self._references[number]).max() > TOLERANCE:
+                    self.wrong.append(number)
+                self.answered[number] += 1
+            except Exception as error:  # noqa: BLE001  whatever it is, it is lost
+                self.lost.append(error)
+
+    def wait_for_all(self) -> None:
+        """Each is answered twice more: the second answer is to a question that was asked from now on."""
+        before = list(self.answered)
+        wait_for(lambda: self.lost or all(now > then + 1 for now, then in zip(self.answered, before, strict=True)))
+
+    def __enter__(self) -> Callers:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        for thread in self._threads:
+            thread.join()
+
+
+def test_dead_and_hung_processes_are_healed_and_no_call_is_lost(
+    tmp_path: Path, references: list[np.ndarray[Any, Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def kill_a_stub(served: Serving) -> None:
+        served.stubs[0].kill()
+
+    def stop_a_stub(served: Serving) -> None:
+        os.kill(served.stubs[0].pid, signal.SIGSTOP)
+
+    def kill_triton(served: Serving) -> None:
+        os.kill(served.triton, signal.SIGKILL)
+
+    faults: dict[Callable[[Serving], None], str] = {kill_a_stub: MODEL, stop_a_stub: MODEL, kill_triton: "triton"}
+    with serving(make_repository(tmp_path, instances=2)) as served:
+        load_s = served.wait_ready()
+        assert httpx.get(f"{served.status_url}/live").status_code == 200
+        assert httpx.get(f"{served.status_url}/other").status_code == 404
+        with served.client() as client, Callers(client, references) as callers:
+            for fault, what in faults.items():
+                callers.wait_for_all()
+                before = served.metric("rfm_serve_restarts_total", what=what)
+                fault(served)
+                told_s = served.wait_ready(False, TRUTH_S)
+                answer = served.ready()
+                assert answer is not None
+                assert answer.json()["models"][MODEL]["reason"]
+                assert served.metric("rfm_serve_ready", model=MODEL) == 0
+                back_s = told_s + served.wait_ready(True, 10 + 2 * load_s + 5)
+                callers.wait_for_all()
+                assert served.metric("rfm_serve_restarts_total", what=what) == before + 1
+                with capsys.disabled():
+                    print(f"\n{fault.__name__}: not ready after {told_s:.1f} s, back after {back_s:.1f} s", end="")
+        with capsys.disabled():
+            print(f"; the first start took {load_s:.1f} s; {sum(callers.answered)} answers, ", end="")
+            print(f"{len(callers.wrong)} wrong, {len(callers.lost)} lost")
+        assert callers.lost == []
+        assert callers.wrong == []
+        assert served.metric("rfm_serve_canary_seconds_count", model=MODEL) > 3
+    assert served.process.returncode == 0
+    assert len(served.said) == 3, served.said
+
+
+def test_a_server_that_is_killed_leaves_nothing_running_and_the_next_removes_the_rest(tmp_path: Path) -> None:
+    endpoints, port = Endpoints.free(), Endpoints.free().http_port
+    ports = {
+        "http": endpoints.http_port,
+        "grpc": endpoints.grpc_port,
+        "metrics": endpoints.metrics_port,
+        "status": port,
+    }
+    command = [RFM, "serve", "--repository", make_repository(tmp_path / "killed")]
+    killed = subprocess.Popen(
+        [*command, *(f"--{name}-port={number}" for name, number in ports.items())],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        served = Serving(killed, endpoints, f"http://127.0.0.1:{port}", tmp_path / "none")
+        served.wait_ready()
+        started = [served.triton, *(stub.pid for stub in served.stubs)]
+        assert len(started) == 2
+    finally:
+        killed.kill()
+        killed.wait(PATIENCE_S)
+    wait_for(lambda: not any(is_alive(pid) for pid in started))
+    left = list(SHARED_MEMORY.glob(f"*_rfm_{killed.pid}_*"))
+    assert left
+    with serving(make_repository(tmp_path / "next")) as served:
+        wait_for(lambda: not any(path.exists() for path in left))
+        served.wait_ready()
+        assert list(SHARED_MEMORY.glob(f"*_rfm_{served.process.pid}_*"))
+        leftovers.clear()
+        assert list(SHARED_MEMORY.glob(f"*_rfm_{served.process.pid}_*"))  # it lives
+    assert any(f"removed {left[0]}" in line for line in served.said)
+    assert not list(Path(tempfile.gettempdir()).glob(f"rfm-backends-{killed.pid}-*"))
+
+
+def test_a_request_that_kills_the_model_twice_is_refused_and_its_neighbours_are_served(
+    tmp_path: Path, references: list[np.ndarray[Any, Any]]
+) -> None:
+    with serving(make_repository(tmp_path, more_code=DEADLY)) as served:
+        served.wait_ready()
+        with served.client() as client, Callers(client, references) as callers:
+            callers.wait_for_all()
+            with pytest.raises(InvalidSampleError, match="request: expected one that the model survives, got one that"):
+                client.progress(trajectory(99, mark=MARK))  # sent again and again, until it is refused
+            served.wait_ready()
+            callers.wait_for_all()
+            with pytest.raises(InvalidSampleError, match="ended its process 2 times: it is refused for 10 minutes"):
+                client.progress(trajectory(99, mark=MARK))
+        assert (callers.lost, callers.wrong) == ([], [])
+        assert served.metric("rfm_serve_restarts_total", what=MODEL) == 2
+        wait_for(lambda: served.metric("rfm_serve_poison_refused_total") == 2)
+
+
+def test_a_crash_loop_ends_with_its_reason(tmp_path: Path) -> None:
+    program = tmp_path / "tritonserver"
+    program.write_text("#!/bin/sh\nexec sleep 0.1\n")
+    program.chmod(0o755)
+    with serving(make_repository(tmp_path), "--tritonserver", str(program)) as served:
+        assert served.process.wait(PATIENCE_S) == 1
+    assert served.said[-1] == "rfm: tritonserver: expected to run, got exit status 0"  # it never ran: no loop
+
+
+def test_a_server_that_is_killed_again_and_again_is_given_up(tmp_path: Path) -> None:
+    with serving(make_repository(tmp_path)) as served:
+        served.wait_ready()
+        killed: set[int] = set()
+
+        def kill() -> bool:
+            for pid in children(served.process.pid, "tritonserver"):
+                if pid not in killed:
+                    os.kill(pid, signal.SIGKILL)
+                    killed.add(pid)
+            return served.process.poll() is not None
+
+        wait_for(kill)
+    assert served.process.returncode == 1
+    wanted = r"rfm: tritonserver: expected to run, got 6 ends, each within 60 s of a start; the last: .*exit status -9"
+    assert re.fullmatch(wanted, served.said[-1]), served.said
+    assert len(killed) == restarts.MOST + 1
+
+
+def test_what_ran_for_long_is_no_part_of_a_crash_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    ends = Restarts("gateway")
+    assert [ends.pause_s("why") for _ in range(restarts.MOST)] == [0, 0.5, 1, 2, 4]
+    monkeypatch.setattr(restarts, "STEADY_S", 0.0)
+    assert ends.pause_s("why") == 0
+    monkeypatch.undo()
+    for _ in range(restarts.MOST - 1):
+        ends.pause_s("why")
+    with pytest.raises(CrashLoopError, match="gateway: expected to run, got 6 ends, each within 60 s"):
+        ends.pause_s("why")
+
+
+def test_a_full_queue_refuses_at_once_and_a_long_wait_is_cut_short(tmp_path: Path) -> None:
+    queue = {"max_queue_size": 4, "default_timeout_microseconds": 1_500_000}
+    repository = make_repository(tmp_path, more_code=SLOW, queue=queue | {"max_batch_size": 2})
+    with (
+        (tmp_path / "log").open("wb") as log,
+        TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+        RewardClient(server.endpoints.grpc_url, retry=False) as client,
+        RewardClient(server.endpoints.http_url, retry=False) as over_http,
+        RewardClient(server.endpoints.grpc_url) as patient,
+        ThreadPoolExecutor(64) as pool,
+    ):
+        slow = trajectory(0, mark=MARK)
+        client.progress(slow)
+
+        def ask(which: RewardClient) -> tuple[float, Exception | None]:
+            started_s = time.monotonic()
+            try:
+                which.progress(slow)
+                return time.monotonic() - started_s, None
+            except ServerUnavailableError as error:
+                return time.monotonic() - started_s, error
+
+        outcomes = [future.result() for future in [pool.submit(ask, which) for which in (client, over_http) * 12]]
+        full = [took_s for took_s, error in outcomes if error is not None and "maximum queue size" in str(error)]
+        late = [took_s for took_s, error in outcomes if error is not None and "timeout expired" in str(error)]
+        served = [took_s for took_s, error in outcomes if error is None]
+        assert len(full) + len(late) + len(served) == len(outcomes)
+        assert len(full) >= len(outcomes) - 2 - 4 - 2  # one batch is worked on, four wait, and one more batch may begin
+        assert served
+        assert max(served) < PATIENCE_S / 4
+        assert sorted(full)[len(full) // 2] < max(served)  # they did not wait for anybody
+        # Who tries again is served in the end.
+        assert [future.result()[1] for future in [pool.submit(ask, patient) for _ in range(12)]] == [None] * 12
+
+
+def test_a_journal_outlives_its_process_and_tells_what_it_was_working_on(tmp_path: Path) -> None:
+    tensors = {"a": np.arange(100_000, dtype=np.float32), "task": np.array([[b"stack"]], np.object_)}
+    first = poison.digest(tensors)
+    assert first == poison.digest({name: array.copy() for name, array in tensors.items()})
+    changed = dict(tensors, a=tensors["a"].copy())
+    changed["a"] += 1
+    others = [poison.digest(changed), poison.digest(dict(tensors, task=np.array([[b"sort"]], np.object_)))]
+    assert len({first, *others}) == 3
+
+    def die(name: str) -> None:
+        """A process that dies while it works on two requests."""
+        code = "import os, sys; from pathlib import Path; from rfm.server.poison import Poison; folder = Path(sys.argv[1])\n"
+        code += "poison = Poison(folder / sys.argv[2], sorted(folder.glob('*_batch')), 4)\n"
+        code += "with poison.at_work_on([bytes.fromhex(word) for word in sys.argv[3:]]): os._exit(1)"
+        words = [told.hex() for told in (first, others[0])]
+        subprocess.run([sys.executable, "-c", code, tmp_path, name, *words], check=False, timeout=PATIENCE_S)
+
+    die("1_batch")
+    one = poison.Poison(tmp_path / "2_batch", tmp_path.glob("1_batch"), 4)
+    assert [one.is_suspect(told) for told in (first, *others)] == [True, True, False]
+    one.check(first)
+    with one.at_work_on([others[0]]):
+        pass
+    assert [one.is_suspect(told) for told in (first, *others)] == [True, False, False]
+    one.close()
+    die("3_batch")
+    two = poison.Poison(tmp_path / "4_batch", sorted(tmp_path.glob("*_batch")), 4)
+    with pytest.raises(InvalidSampleError, match="ended its process 2 times"):
+        two.check(first)
+    two.check(others[0])  # once: it was survived meanwhile
+    assert two.is_suspect(others[0])
+    two.close()
+
+
+def test_the_status_port_names_a_taken_port(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with serving(make_repository(tmp_path), f"--status-port={port}") as served:
+            assert served.process.wait(PATIENCE_S) == 1
+    assert served.said == [f"rfm: status: expected a free port at 127.0.0.1:{port}, got: Address already in use"]
