@@ -6,7 +6,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed
 
-.PHONY: demo test check parity bench bench-full perf format model_repository clean ops-check ops-tools
+.PHONY: demo test check parity rollout bench bench-full perf chaos chaos-full soak format model_repository clean ops-check ops-tools audit
 
 demo: $(INSTALLED)
 	$(BIN)/python examples/demo.py
@@ -24,6 +24,10 @@ check: $(INSTALLED)
 parity: $(INSTALLED)
 	$(BIN)/python tests/parity.py
 
+# Two versions take turns while 32 callers ask: is a request lost?
+rollout: $(INSTALLED)
+	$(BIN)/python tests/rollout.py
+
 # This server beside the bare engine, the FastAPI server's design, LitServe and mosec, in one run.
 bench: $(INSTALLED)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[bench]"
@@ -39,6 +43,22 @@ bench-full: $(INSTALLED)
 perf: $(INSTALLED)
 	$(BIN)/python benchmarks/perf_analyzer.py --size small
 	$(BIN)/python benchmarks/perf_analyzer.py --size default
+
+# Faults while callers ask: processes killed and stopped, full memory and disks, overload, broken requests, killed exports.
+chaos: $(INSTALLED)
+	$(BIN)/python tests/chaos.py
+	$(BIN)/python tests/fuzz.py
+	$(BIN)/python tests/kill_export.py --kills 10
+
+# The same with 100 killed exports. A quarter of an hour.
+chaos-full: $(INSTALLED)
+	$(BIN)/python tests/chaos.py
+	$(BIN)/python tests/fuzz.py
+	$(BIN)/python tests/kill_export.py --kills 100
+
+# Half an hour at half of what can be served: do memory and latency stay?
+soak: $(INSTALLED)
+	$(BIN)/python tests/chaos.py --soak
 
 # What docker/ holds, as far as it can be checked without a container engine or a cluster: alerts and recording rules on
 # made-up series, they and the dashboard on a live Prometheus and Triton; Dockerfile and compose file; Kubernetes.
@@ -59,6 +79,12 @@ ops-tools: $(INSTALLED)
 	  { $(AS_ROOT) apt-get update -qq && \
 	  $(AS_ROOT) apt-get install --yes -qq --no-install-recommends docker-compose; } || \
 	  $(call MISSING,docker-compose,apt-get install docker-compose)
+
+# Known vulnerabilities of the pinned packages, as PyPI tells them: a report, which needs the network.
+audit: $(INSTALLED)
+	$(PYTHON) -m venv $(VENV)/audit
+	$(VENV)/audit/bin/pip install --quiet --disable-pip-version-check pip-audit
+	$(VENV)/audit/bin/pip-audit --requirement constraints.txt --no-deps --disable-pip
 
 format: $(INSTALLED)
 	$(BIN)/ruff check --fix .

@@ -56,8 +56,9 @@ class ServeConfig:
     grpc_port, metrics_port: Triton's other two ports
     gateway_port: of the FastAPI evaluation server's endpoints before it; null: there are none
     status_port: of what ``rfm serve`` tells of itself; null: there is none
-    max_queue_size: requests that may wait for a model; more are refused at once
-    queue_timeout_ms: the longest that a request may wait; then it is refused. A request may ask for less
+    max_queue_size: requests that may wait for a model; more are refused at once; null: any number
+    queue_timeout_ms: the longest that a request may wait; then it is refused. A request may ask for less; null: any
+        time. Both make Triton before 26.08 miss requests for half a second at a time where a model has one instance
     grpc_certificate, grpc_key: files (PEM) to serve gRPC with TLS; HTTP, which Triton cannot encrypt, is then open on
         127.0.0.1 alone
     grpc_client_ca: file (PEM) of who may vouch for gRPC's clients, which then need a certificate
@@ -83,8 +84,8 @@ class ServeConfig:
     metrics_port: int = 8002
     gateway_port: int | None = None
     status_port: int | None = None
-    max_queue_size: int = 1024
-    queue_timeout_ms: int = 5000
+    max_queue_size: int | None = None
+    queue_timeout_ms: int | None = None
     grpc_certificate: str | None = None
     grpc_key: str | None = None
     grpc_client_ca: str | None = None

@@ -141,7 +141,9 @@ def test_a_bad_sample_fails_alone_or_is_raised_with_its_place(served: Served, pr
     with served.client(protocol) as client:
         outcomes = client.evaluate([*samples, too_long, "a string"], return_errors=True)  # type: ignore[list-item]
         good = client.evaluate(samples)
-        with pytest.raises(InvalidSampleError, match=r"^samples\[5\]\.num_frames: expected at most 16 .*, got 20 \(request \S+\)$"):
+        with pytest.raises(
+            InvalidSampleError, match=r"^samples\[5\]\.num_frames: expected at most 16 .*, got 20 \(request \S+\)$"
+        ):
             client.evaluate([*samples, too_long])
     for outcome, expected in zip(outcomes[:5], good, strict=True):
         assert_same(outcome, expected)
@@ -430,7 +432,9 @@ def test_submitting_while_it_is_closed_leaves_no_future_open(served: Served) -> 
 
 def test_embeddings_of_another_width_are_told_in_our_words(served: Served, protocol: str) -> None:
     with served.client(protocol) as client:
-        with pytest.raises(InvalidSampleError, match=r"^video_embeddings: expected \[-1,768\], got \[2,5\] \(request \S+\)$"):
+        with pytest.raises(
+            InvalidSampleError, match=r"^video_embeddings: expected \[-1,768\], got \[2,5\] \(request \S+\)$"
+        ):
             client.progress(random_trajectory(0, 2, 5, 384))
         with pytest.raises(InvalidSampleError, match=r"^text_embedding: expected \[384\], got \[7\] \(request \S+\)$"):
             client.progress(random_trajectory(0, 2, 768, 7))

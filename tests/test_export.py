@@ -68,10 +68,20 @@ def test_the_scorers_configuration_is_the_wire_contract(exported: Path) -> None:
         "timing_ms": ("FP32", [2]),
     }
     assert [tensor.name for tensor in config.input if tensor.allow_ragged_batch] == ["video_embeddings"]
-    assert config.HasField("dynamic_batching")
-    assert config.dynamic_batching == pb.ModelDynamicBatching()  # a delay would cost every lone request
+    batching = config.dynamic_batching
+    assert not batching.max_queue_delay_microseconds  # a delay would cost every lone request
+    assert not batching.HasField("default_queue_policy")  # with one, Triton 2.51 at times misses requests for 0.5 s
     assert not config.HasField("sequence_batching")
     assert [warmup.name for warmup in config.model_warmup] == ["progress", "preference", "similarity"]
+
+
+def test_a_queue_is_bounded_where_the_configuration_says_so(tmp_path: Path) -> None:
+    config = goldens.config("c1_t1_disc10")
+    serve = replace(serve_config(config), max_queue_size=7, queue_timeout_ms=250)
+    rfm_export.export(config.checkpoint, tmp_path, serve)
+    policy = read(tmp_path, "rfm").dynamic_batching.default_queue_policy
+    assert (policy.max_queue_size, policy.default_timeout_microseconds) == (7, 250_000)
+    assert policy.timeout_action == pb.ModelQueuePolicy.REJECT and policy.allow_timeout_override
 
 
 def test_a_continuous_checkpoint_has_no_progress_logits(tmp_path: Path) -> None:
@@ -240,7 +250,7 @@ def test_check_names_what_differs(tmp_path: Path) -> None:
     shutil.copytree(REPOSITORY, repository)
     (repository / "rfm" / "1" / "model.py").write_text("# changed\n")
     (repository / "rfm_frames" / "config.pbtxt").unlink()
-    differences = rfm_export.check(repository, ServeConfig(num_gpus=0))
+    differences = rfm_export.check(repository, ServeConfig.from_yaml(REPOSITORY / "serve.yaml"))
     assert differences == [
         f"{repository}/rfm/1/model.py: differs from what `rfm export` generates",
         f"{repository}/rfm_frames/config.pbtxt: is missing",

@@ -79,7 +79,7 @@ TritonPythonModel.answer = slow
 
 
 def make_repository(
-    folder: Path, *, more_code: str = "", instances: int = 1, queue: dict[str, int] | None = None
+    folder: Path, *, more_code: str = "", instances: int = 1, batch_size: int = 64, queue: str = ""
 ) -> Path:
     """The demo's ``rfm`` on one thread, changed as a test needs it."""
     repository = folder / "model_repository"
@@ -89,7 +89,8 @@ def make_repository(
     config = repository / MODEL / "config.pbtxt"
     text = config.read_text()
     changes = {r"count: \d+": f"count: {instances}", r'("torch_threads"\s+value {\s+string_value: )"\d+"': r'\1"1"'}
-    changes |= {rf"{name}: \d+": f"{name}: {value}" for name, value in (queue or {}).items()}
+    changes |= {r"max_batch_size: \d+": f"max_batch_size: {batch_size}"}
+    changes |= {r"dynamic_batching {\n}": f"dynamic_batching {{ default_queue_policy {{ {queue} }} }}"} if queue else {}
     for pattern, wanted in changes.items():
         text, count = re.subn(pattern, wanted, text)
         assert count == 1, pattern
@@ -370,8 +371,8 @@ def test_what_ran_for_long_is_no_part_of_a_crash_loop(monkeypatch: pytest.Monkey
 
 
 def test_a_full_queue_refuses_at_once_and_a_long_wait_is_cut_short(tmp_path: Path) -> None:
-    queue = {"max_queue_size": 4, "default_timeout_microseconds": 1_500_000}
-    repository = make_repository(tmp_path, more_code=SLOW, queue=queue | {"max_batch_size": 2})
+    queue = "max_queue_size: 4 default_timeout_microseconds: 1500000 allow_timeout_override: true"
+    repository = make_repository(tmp_path, more_code=SLOW, batch_size=2, queue=queue)
     with (
         (tmp_path / "log").open("wb") as log,
         TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,

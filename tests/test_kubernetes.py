@@ -36,6 +36,7 @@ from referencing import Registry, Resource
 from typer.main import get_command
 
 from rfm.cli import app
+from rfm.server import admin_key
 from rfm.server.process import KILL_AFTER_S, Endpoints
 from rfm_client.gateway.command import STOP_WITHIN_S
 
@@ -56,7 +57,7 @@ PORT_OPTIONS = {
     "status": "status_port",
     "gateway": "port",
 }
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 POLL_S = 0.02
 
 Object = dict[str, Any]
@@ -243,11 +244,11 @@ def test_arguments_are_those_of_the_program(workload: Object) -> None:
     if is_gateway:
         return
     is_kserve = workload["kind"] == "ServingRuntime"
-    mounts = {mount["name"]: mount["mountPath"] for mount in container["volumeMounts"] if mount.get("readOnly")}
+    mounts = {mount["name"]: mount["mountPath"] for mount in container["volumeMounts"]}
     assert str(given["repository"]) == ("/mnt/models" if is_kserve else f"{mounts['repository']}/model_repository")
 
 
-@pytest.mark.parametrize("workload", workloads(*SETS))
+@pytest.mark.parametrize("workload", workloads(*OVERLAYS))
 def test_keys_are_files_that_others_cannot_read(workload: Object) -> None:
     container, pod = container_of(workload), pod_of(workload)
     (secret,) = (volume for volume in pod["volumes"] if "secret" in volume)
@@ -255,10 +256,20 @@ def test_keys_are_files_that_others_cannot_read(workload: Object) -> None:
     given = parameters(get_command(app), container["args"])
     file = given["api_key_file"] if container["args"][0] == "gateway" else given["admin_key_file"]
     assert file.parent == Path(mount["mountPath"])
-    if workload["kind"] == "Deployment":
-        assert secret["secret"]["defaultMode"] == 0o400
-        assert pod["securityContext"]["fsGroup"] == pod["securityContext"]["runAsGroup"]
-    command = f"create secret generic {secret['secret']['secretName']} --from-literal={file.name}="
+    assert secret["secret"]["defaultMode"] == 0o400
+    assert pod["securityContext"]["fsGroup"] == pod["securityContext"]["runAsGroup"]
+    assert_readme_creates(secret["secret"]["secretName"], file.name)
+
+
+def test_kserve_s_key_is_a_variable() -> None:
+    container = container_of(named("kserve", "ServingRuntime", "rfm-triton"))
+    assert parameters(get_command(app), container["args"])["admin_key_file"] is None
+    (key,) = (one["valueFrom"]["secretKeyRef"] for one in container["env"] if one["name"] == admin_key.VARIABLE)
+    assert_readme_creates(key["name"], key["key"])
+
+
+def assert_readme_creates(secret: str, key: str) -> None:
+    command = f"create secret generic {secret} --from-literal={key}="
     assert command in (KUBERNETES / "README.md").read_text()
 
 
@@ -375,11 +386,14 @@ def eventually(is_so: Callable[[], bool]) -> None:
 class Probed:
     """What a pod's container runs, on ports of this machine."""
 
-    status_port: int
     container: Object
+    process: subprocess.Popen[bytes]
+    status_port: int
+    log: Path
 
     def passes(self, kind: str) -> bool:
         """As the kubelet asks."""
+        assert self.process.poll() is None, self.log.read_text()
         get = self.container[kind]["httpGet"]
         assert get["port"] == "status"
         try:
@@ -401,7 +415,9 @@ def probed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Probed]:
     """The demo's ``rfm`` alone."""
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     shutil.copytree(ROOT / "model_repository" / "rfm", tmp_path / "model_repository" / "rfm")
-    (tmp_path / "admin-key").write_text("key")
+    key, log = tmp_path / "admin-key", tmp_path / "log"
+    key.write_text("0123456789abcdef" * 4)
+    key.chmod(0o400)
     container = container_of(named("overlays/cpu", "Deployment", "rfm-triton"))
     endpoints, status_port = Endpoints.free(), Endpoints.free().http_port
     values = {
@@ -411,15 +427,15 @@ def probed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Probed]:
         "--grpc-port": endpoints.grpc_port,
         "--metrics-port": endpoints.metrics_port,
         "--status-port": status_port,
-        "--admin-key-file": tmp_path / "admin-key",
+        "--admin-key-file": key,
     }
     command = [BIN / container["command"][0], *with_values(container["args"], values)]
-    with (tmp_path / "log").open("wb") as log, subprocess.Popen(command, stdout=log, stderr=log) as process:
+    with log.open("wb") as lines, subprocess.Popen(command, stdout=lines, stderr=lines) as process:
         try:
-            yield Probed(status_port, container)
+            yield Probed(container, process, status_port, log)
         finally:
             process.terminate()
-    assert process.returncode == 0
+    assert process.returncode == 0, log.read_text()
 
 
 def kill_model(repository: Path) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""docker/prometheus and docker/grafana before the real thing: Prometheus scrapes a served Triton and the gateway."""
+"""docker/prometheus and docker/grafana before the real thing: Prometheus scrapes `rfm serve`, Triton and gateway."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -27,10 +27,8 @@ import torch
 import yaml
 from conftest import random_trajectory
 
-from rfm.server.installation import find_installation
-from rfm.server.process import Endpoints, TritonServer
+from rfm.server.process import Endpoints
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, RewardClient, RewardError, Trajectory
-from rfm_client.gateway.command import gateway_command
 
 ROOT = Path(__file__).parents[1]
 PROMETHEUS = ROOT / "docker" / "prometheus"
@@ -45,7 +43,7 @@ TOO_MANY_FRAMES = 100  # for it
 GATEWAY_CALLERS = 4
 METRIC = re.compile(r"\b(?:up|ALERTS|(?:nv|rfm)[_:][a-z0-9_:]+)\b")
 NEEDS_GPU = "nv_gpu_"
-OF_RFM_SERVE = "rfm_serve_"  # its status port, which is not started here
+MODEL = "rfm"  # whose process dies
 PROGRAMS = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
 
 Json: TypeAlias = dict[str, Any]
@@ -86,7 +84,6 @@ class Monitored:
     """A Prometheus, and what it scrapes."""
 
     url: str
-    repository: Path
 
     def get(self, path: str, **parameters: str) -> Any:
         answer = httpx.get(f"{self.url}/api/v1/{path}", params=parameters).json()
@@ -110,15 +107,15 @@ def eventually(ask: Callable[[], Any]) -> Any:
 
 
 @contextmanager
-def running(command: list[str], log: Path, ready_url: str) -> Iterator[None]:
-    """A process that answers at ``ready_url``, and is ended."""
+def running(command: list[str], log: Path, *ready_urls: str) -> Iterator[None]:
+    """A process that answers at ``ready_urls``, and is ended."""
     with log.open("wb") as lines:
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=lines, stderr=lines)
 
     def is_ready() -> bool:
         assert process.poll() is None, log.read_text()
         try:
-            return httpx.get(ready_url).is_success
+            return all(httpx.get(url).is_success for url in ready_urls)
         except httpx.TransportError:  # it does not listen yet
             return False
 
@@ -163,12 +160,12 @@ def load_triton(url: str, is_over: threading.Event) -> None:
                 client.progress(embedded(seed, TOO_MANY_FRAMES))
             except InvalidSampleError:
                 pass
-            except RewardError:  # of a model whose process a test has killed
+            except RewardError:  # of a model whose process was killed
                 is_over.wait(0.1)
 
 
 def load_gateway(url: str, is_over: threading.Event) -> None:
-    """More at a time than it takes, and something that is no request."""
+    """Several requests at a time, and something that is no request."""
     video, text = embedded(0, 8).video_embeddings, embedded(0, 8).text_embedding
     assert video is not None and text is not None
     trajectory = {"video_embeddings": video.tolist(), "text_embedding": text.tolist()}
@@ -197,34 +194,36 @@ def loaded(endpoints: Endpoints, gateway_url: str) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def monitored(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Monitored]:
+    """Once all is scraped, a model's process dies: what was never started again is in no metric."""
     folder = tmp_path_factory.mktemp("monitored")
     repository = shutil.copytree(ROOT / "model_repository", folder / "model_repository")
-    others = Endpoints.free()
-    host, gateway_port, port = others.host, others.http_port, others.grpc_port
-    gateway_url, url = f"http://{host}:{gateway_port}", f"http://{host}:{port}"
+    triton, others = Endpoints.free(), Endpoints.free()
+    host, gateway_port, status_port, port = others.host, others.http_port, others.grpc_port, others.metrics_port
+    ports = {"http": triton.http_port, "grpc": triton.grpc_port, "metrics": triton.metrics_port}
+    ports |= {"gateway": gateway_port, "status": status_port}
+    options = [f"--{name}-port={number}" for name, number in ports.items()]
+    serve = [program("rfm"), "serve", f"--repository={repository}", *options]
+    targets = {
+        "triton": f"{host}:{triton.metrics_port}",
+        "gateway": f"{host}:{gateway_port}",
+        "rfm-serve": f"{host}:{status_port}",
+    }
+    prometheus = [
+        program("prometheus"),
+        f"--config.file={write_configuration(folder, targets)}",
+        f"--storage.tsdb.path={folder / 'data'}",
+        f"--web.listen-address={host}:{port}",
+    ]
+    served_urls = [f"http://{host}:{status_port}/ready", f"http://{host}:{gateway_port}/metrics"]
+    monitored = Monitored(f"http://{host}:{port}")
     with (
-        (folder / "triton.log").open("wb") as log,
-        TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+        running(serve, folder / "rfm.log", *served_urls),
+        running(prometheus, folder / "prometheus.log", f"{monitored.url}/-/ready"),
+        loaded(triton, f"http://{host}:{gateway_port}"),
     ):
-        triton = server.endpoints
-        targets = {
-            "triton": f"{host}:{triton.metrics_port}",
-            "gateway": f"{host}:{gateway_port}",
-            "rfm-serve": f"{host}:{others.metrics_port}",
-        }
-        gateway = gateway_command(triton.grpc_url, triton.metrics_url, "rfm", host, gateway_port)
-        prometheus = [
-            program("prometheus"),
-            f"--config.file={write_configuration(folder, targets)}",
-            f"--storage.tsdb.path={folder / 'data'}",
-            f"--web.listen-address={host}:{port}",
-        ]
-        with (
-            running([*gateway, "--max-in-flight", "1"], folder / "gateway.log", f"{gateway_url}/metrics"),
-            running(prometheus, folder / "prometheus.log", f"{url}/-/ready"),
-            loaded(triton, gateway_url),
-        ):
-            yield Monitored(url, repository)
+        assert eventually(lambda: monitored.query(f'rfm_serve_canary_ok{{model="{MODEL}"}} == 1'))
+        kill_model(repository)
+        yield monitored
 
 
 def test_prometheus_takes_the_configuration_and_the_rules() -> None:
@@ -286,10 +285,10 @@ def test_grafana_finds_its_data_source_where_the_dashboard_looks_for_it() -> Non
         assert part["datasource"] == {"type": "prometheus", "uid": source["uid"]}
 
 
-def test_triton_and_the_gateway_are_scraped(monitored: Monitored) -> None:
+def test_triton_the_gateway_and_rfm_serve_are_scraped(monitored: Monitored) -> None:
     def up() -> bool:
         told = {entry["metric"]["job"]: entry["value"][1] for entry in monitored.query("up")}
-        return told == {"triton": "1", "gateway": "1", "rfm-serve": "0"}
+        return told == {"triton": "1", "gateway": "1", "rfm-serve": "1"}
 
     assert eventually(up), monitored.get("targets")
 
@@ -319,7 +318,7 @@ def test_every_query_of_the_dashboard_gives_data(monitored: Monitored, expressio
     for name, value in {"$model": ".*", "$version": ".*", "$__rate_interval": INTERVALS["1m"]}.items():
         expression = expression.replace(name, value)
     assert "$" not in expression
-    if OF_RFM_SERVE in expression or (NEEDS_GPU in expression and not torch.cuda.is_available()):
+    if NEEDS_GPU in expression and not torch.cuda.is_available():
         assert monitored.query(expression) == []
     else:
         assert eventually(lambda: monitored.query(expression))
@@ -340,31 +339,26 @@ def test_every_metric_of_an_alert_is_there(monitored: Monitored, rule: Json) -> 
     assert wanted
     if not torch.cuda.is_available():
         wanted = {name for name in wanted if NEEDS_GPU not in name}
-    wanted = {name for name in wanted if OF_RFM_SERVE not in name}
     assert eventually(lambda: wanted <= set(monitored.get("label/__name__/values")))
 
 
-def test_a_dead_model_process_is_noticed(monitored: Monitored) -> None:
-    """The last test: nothing starts that process again."""
-
-    def states(name: str) -> set[tuple[str, str]]:
-        alerts = monitored.get("alerts")["alerts"]
-        return {(alert["labels"]["model"], alert["state"]) for alert in alerts if alert["labels"]["alertname"] == name}
-
-    assert not states("RfmModelProcessDead")
-    model_file = f"{monitored.repository}/rfm/1/model.py"
-    stubs = [int(entry.parent.name) for entry in Path("/proc").glob("[0-9]*/cmdline") if model_file in read(entry)]
-    assert stubs
-    for stub in stubs:
-        os.kill(stub, signal.SIGKILL)
-    assert eventually(lambda: ("rfm", "pending") in states("RfmModelProcessDead"))
-    assert ("rfm", "pending") in states("RfmErrorRatio")
-    assert {model for model, _ in states("RfmModelProcessDead")} == {"rfm"}
-    assert not states("RfmModelNotReady")  # which Triton 2.51 does not notice
+def test_a_dead_model_process_is_noticed_and_healed(monitored: Monitored) -> None:
+    """The fixture has killed it."""
+    name = f'{{alertname="RfmCanaryFailing", alertstate="pending", model="{MODEL}"}}'
+    assert eventually(lambda: monitored.query(f"last_over_time(ALERTS{name}[10m])"))
+    assert eventually(lambda: monitored.query(f'rfm_serve_restarts_total{{what="{MODEL}"}} == 1'))
+    assert eventually(lambda: monitored.query(f'rfm_serve_ready{{model="{MODEL}"}} == 1'))
+    assert eventually(lambda: not monitored.query(f"ALERTS{name}"))
+    assert not monitored.query('{alertname="RfmModelProcessDead", alertstate="firing"}')
 
 
-def read(file: Path) -> str:
-    try:
-        return file.read_text()
-    except OSError:  # it has ended
-        return ""
+def kill_model(repository: Path) -> None:
+    """Kills each of its processes."""
+    model_file = f"{repository}/{MODEL}/1/model.py"
+    killed = []
+    for command in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):  # it has ended meanwhile
+            if model_file in command.read_text():
+                killed.append(command)
+                os.kill(int(command.parent.name), signal.SIGKILL)
+    assert killed

@@ -51,11 +51,14 @@ def python_config(
     config.backend = "python"
     for spec, tensor in zip(interface.inputs, config.input, strict=True):
         tensor.allow_ragged_batch = spec.ragged
+    config.dynamic_batching.SetInParent()
     queue = config.dynamic_batching.default_queue_policy  # and no delay: Triton before 26.08 decays with both
-    queue.max_queue_size = serve.max_queue_size
-    queue.timeout_action = pb.ModelQueuePolicy.REJECT
-    queue.default_timeout_microseconds = serve.queue_timeout_ms * US_PER_MS
-    queue.allow_timeout_override = True  # by shorter ones
+    if serve.max_queue_size is not None:
+        queue.max_queue_size = serve.max_queue_size
+    if serve.queue_timeout_ms is not None:
+        queue.timeout_action = pb.ModelQueuePolicy.REJECT
+        queue.default_timeout_microseconds = serve.queue_timeout_ms * US_PER_MS
+        queue.allow_timeout_override = True  # by shorter ones
     group = config.instance_group.add(count=serve.instances, kind=pb.ModelInstanceGroup.KIND_CPU)
     if num_gpus:
         group.kind = pb.ModelInstanceGroup.KIND_GPU

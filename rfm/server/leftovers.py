@@ -19,7 +19,9 @@ BACKENDS_PREFIX = "rfm-backends-"
 REGION_PREFIX = "triton_python_backend_shm_region_rfm"
 
 _PR_SET_PDEATHSIG = 1
-_OWNED = re.compile(r"(?:triton_python_backend_shm_region_)?rfm[_-](?:backends-)?(?P<pid>\d+)[_-](?P<namespace>[0-9a-f]+)[_-]")
+_OWNED = re.compile(
+    r"(?:triton_python_backend_shm_region_)?rfm[_-](?:backends-)?(?P<pid>\d+)[_-](?P<namespace>[0-9a-f]+)[_-]"
+)
 
 _prctl = ctypes.CDLL(None).prctl
 
