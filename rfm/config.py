@@ -58,7 +58,7 @@ class ServeConfig:
     status_port: of what ``rfm serve`` tells of itself; null: there is none
     max_queue_size: requests that may wait for a model; more are refused at once; null: any number
     queue_timeout_ms: the longest that a request may wait; then it is refused. A request may ask for less; null: any
-        time. Both make Triton before 26.08 miss requests for half a second at a time where a model has one instance
+        time. With either, Triton 2.51 misses requests for half a second at a time where a model has one instance
     grpc_certificate, grpc_key: files (PEM) to serve gRPC with TLS; HTTP, which Triton cannot encrypt, is then open on
         127.0.0.1 alone
     grpc_client_ca: file (PEM) of who may vouch for gRPC's clients, which then need a certificate

@@ -40,6 +40,7 @@ from rfm_client import (
     Trajectory,
     wire,
 )
+from rfm_client.access import Access
 from rfm_client.deadline import Deadline
 from rfm_client.fit import evenly_spaced
 from rfm_client.in_flight import MAX_BYTES, InFlight
@@ -511,7 +512,7 @@ def test_a_score_that_is_missing_fails_alone(served: Served) -> None:
     url = served.url("grpc")
     samples = [ProgressSample(random_trajectory(seed, 3)) for seed in range(4)]
     marked = wire.encode_samples(samples[2:3])[wire.VIDEO_EMBEDDINGS].sum(axis=(1, 2))[0]
-    transport = Losing(url, url.removeprefix("grpc://"), shared_memory=False)
+    transport = Losing(url, Access(), shared_memory=False)
     with RewardClient("", transports=[transport], model=MODEL) as client:
         outcomes = client.evaluate(samples, return_errors=True)
     assert [type(outcome) for outcome in outcomes] == [ProgressResult] * 2 + [InferenceFailedError, ProgressResult]
@@ -545,9 +546,18 @@ assert client.is_ready()
 @pytest.mark.parametrize(
     ("urls", "message"),
     [
-        ("localhost:8001", "url: expected grpc://host:port or http://host:port, got 'localhost:8001'"),
-        ("grpc://localhost", "url: expected grpc://host:port or http://host:port, got 'grpc://localhost'"),
-        (["grpc://a:1", "ftp://b:2"], "url: expected grpc://host:port or http://host:port, got 'ftp://b:2'"),
+        (
+            "localhost:8001",
+            "url: expected grpc://host:port or http://host:port, or grpcs:// or https://, got 'localhost:8001'",
+        ),
+        (
+            "grpc://localhost",
+            "url: expected grpc://host:port or http://host:port, or grpcs:// or https://, got 'grpc://localhost'",
+        ),
+        (
+            ["grpc://a:1", "ftp://b:2"],
+            "url: expected grpc://host:port or http://host:port, or grpcs:// or https://, got 'ftp://b:2'",
+        ),
         ([], "url: expected at least one, got none"),
     ],
     ids=str,

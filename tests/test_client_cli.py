@@ -579,8 +579,14 @@ def test_an_interrupt_ends_it_without_a_traceback(words: list[str]) -> None:
 USAGE: dict[str, tuple[list[str], str]] = {
     "no videos": (["score"], "Missing argument"),
     "unknown option": (["score", "a.mp4", "--what"], "No such option"),
-    "url": (["sample", "--url", "localhost:8001"], "expected grpc://host:port or http://host:port, got"),
-    "status url": (["status", "--url", "localhost:8001"], "expected grpc://host:port or http://host:port, got"),
+    "url": (
+        ["sample", "--url", "localhost:8001"],
+        "expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
+    ),
+    "status url": (
+        ["status", "--url", "localhost:8001"],
+        "expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
+    ),
     "json over a video": (["score", "--json", "a.mp4", "b.mp4"], "expected a .json file or -, got a.mp4"),
     "json nowhere": (["status", "--json", "/nowhere/a.json"], "expected a folder at /nowhere, got none"),
     "picture": (["score", "a.mp4", "--plot", "a.gif"], "expected a file that ends in .png, .pdf, .svg, got a.gif"),
@@ -589,7 +595,10 @@ USAGE: dict[str, tuple[list[str], str]] = {
     "one array": (["score", "a.mp4", "b.mp4", "--npy", "a.npy"], "expected a folder for 2 videos, got a.npy"),
     "lengths": (["sample", "--num-frames", "8-4"], "expected a length (8), several (4,8,16) or a range (4-16)"),
     "dense": (["score", "a.mp4", "--frame-steps", "1"], "expected 0 or at least 2, got 1"),
-    "port": (["status", "--url", "http://localhost:99999"], "expected grpc://host:port or http://host:port, got"),
+    "port": (
+        ["status", "--url", "http://localhost:99999"],
+        "expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
+    ),
     "long": (["sample", "--num-frames", "10000"], "expected a length (8), several (4,8,16) or a range (4-16)"),
     "no length": (["sample", "--num-frames", "0"], "expected a length (8), several (4,8,16) or a range (4-16)"),
     "metrics": (

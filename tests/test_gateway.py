@@ -1335,7 +1335,10 @@ def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed(trito
 
 
 BAD_OPTIONS: dict[str, tuple[list[str], str]] = {
-    "no URL": (["--triton", "localhost:8001"], "url: expected grpc://host:port or http://host:port, got"),
+    "no URL": (
+        ["--triton", "localhost:8001"],
+        "url: expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
+    ),
     "no folder": (["--allow-folder", "nowhere"], "No such file or directory"),
     "no key file": (["--api-key-file", "nowhere"], "--api-key-file: expected a text file, got"),
     "an empty key": (["--api-key-file", os.devnull], "key: expected at least one character, got none"),

@@ -28,6 +28,7 @@ from rfm_client import (
     Trajectory,
     wire,
 )
+from rfm_client.access import Access
 from rfm_client.gym import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
 from rfm_client.samples import UInt8Array
 from rfm_client.transport import Answer, GrpcTransport
@@ -324,7 +325,7 @@ class SlowConnection(GrpcTransport):
     """To the real server; a question whose longest trajectory has a length that is held waits until it is let go."""
 
     def __init__(self, url: str) -> None:
-        super().__init__(url, url.removeprefix("grpc://"), shared_memory=False)
+        super().__init__(url, Access(), shared_memory=False)
         self.held: dict[int, Future[None]] = {}
         self.lengths: list[int] = []
 

@@ -336,9 +336,7 @@ def test_rfm_serve_takes_the_key_of_the_environment_and_options_of_tritonserver(
     assert "COMPUTE_START" in trace.read_text()
 
 
-@pytest.mark.parametrize(
-    "argument", ["--http-port=1", "--http-po=1", "--model-store=/", "--grpc-restricted-protocol=a:b=c"]
-)
+@pytest.mark.parametrize("argument", ["--http-port=1", "--http-po=1", "--model-store=/"])
 def test_options_that_rfm_serve_sets_are_refused(argument: str) -> None:
     with pytest.raises(
         ServerStartError, match=f"expected an option that rfm serve leaves open, got {argument.split('=')[0]}$"

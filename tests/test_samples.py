@@ -253,7 +253,7 @@ def test_every_error_is_a_reward_error() -> None:
     import rfm_client
 
     errors = [getattr(rfm_client, name) for name in rfm_client.__all__ if name.endswith("Error")]
-    assert len(errors) == 7
+    assert len(errors) == 8
     assert all(issubclass(error, RewardError) for error in errors)
 
 

@@ -24,15 +24,17 @@ _KEPT = {
     "--grpc-server-key",
     "--grpc-root-cert",
 }
+# May be given again, for other APIs: Triton refuses to start with two keys for one.
+_REPEATED = {"--http-restricted-api", "--grpc-restricted-protocol"}
 _ARGUMENT = re.compile(r"(--[a-z][a-z0-9-]+)=.*")
 
 
 def check_arguments(more: Sequence[str], own: Sequence[str]) -> None:
     """Raises ServerStartError for one that ``own`` has, also if it is abbreviated, or that is no ``--option=value``."""
-    kept = {argument.partition("=")[0] for argument in own} | _KEPT
+    kept = {argument.partition("=")[0] for argument in own} - _REPEATED | _KEPT
     for argument in more:
         match = _ARGUMENT.fullmatch(argument)
         if match is None:
             raise ServerStartError(f"tritonserver: expected --option=value, got {argument.partition('=')[0]}")
-        if any(option.startswith(match[1]) for option in kept):
+        if match[1] not in _REPEATED and any(option.startswith(match[1]) for option in kept):
             raise ServerStartError(f"tritonserver: expected an option that rfm serve leaves open, got {match[1]}")

@@ -54,6 +54,8 @@ class Supervisor:
         for path in leftovers.clear():
             self._say(f"removed {path}, which a server left that was killed")
         self._status.tell(dict.fromkeys(self._server.models, "it is loaded"))
+        for what in ("triton", *self._server.models, *(() if self._gateway is None else ("gateway",))):
+            self._status.restarts.labels(what)  # 0, so that already the first is an increase
         previous = {number: signal.signal(number, self._stop) for number in STOP_SIGNALS}
         port, host = self._status_port, self._server.endpoints.host
         try:

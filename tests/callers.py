@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: MIT
+"""Callers for the fault suite: they ask a server on and on, compare every answer, and count what became of each call."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import threading
+import time
+from array import array
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import numpy as np
+
+from rfm.engine import Engine
+from rfm_client import (
+    AsyncRewardClient,
+    PreferenceResult,
+    PreferenceSample,
+    ProgressResult,
+    ProgressSample,
+    RewardError,
+    Sample,
+    ServerUnavailableError,
+    SimilaritySample,
+    Trajectory,
+)
+
+TOLERANCE = 1e-5
+PATIENCE_S = 60.0
+PAUSE_S = 0.1  # of a caller that was refused
+VIDEO_DIM, TEXT_DIM = 64, 32  # of the demo's checkpoint
+MOST_FRAMES = 32
+NUM_SAMPLES = 48
+
+FULL = re.compile("maximum queue size|timeout expired")  # a queue: no room in it, or none in time
+
+Numbers = np.ndarray[Any, np.dtype[np.float32]]
+Ask = Callable[[Sample], Awaitable[Numbers]]
+Connect = Callable[[], AbstractAsyncContextManager[Ask]]
+
+
+class RefusedError(Exception):
+    """The caller was told at once that this call is not answered."""
+
+
+@dataclass(frozen=True)
+class Exam:
+    """Samples, and what the engine answers without a server."""
+
+    samples: Sequence[Sample]
+    expected: Sequence[Numbers]
+
+    @classmethod
+    def of(cls, checkpoint: Path, samples: Sequence[Sample]) -> Exam:
+        """What this checkpoint says of the samples."""
+        outcomes = Engine.from_checkpoint(checkpoint).evaluate(samples)
+        return cls(samples, [numbers(outcome) for outcome in outcomes])
+
+    def is_right(self, number: int, got: Numbers) -> bool:
+        """Whether an answer is the engine's; NaN never is."""
+        expected = self.expected[number]
+        return got.shape == expected.shape and bool(np.abs(got - expected).max() <= TOLERANCE)
+
+
+def trajectory(random: np.random.Generator, num_frames: int) -> Trajectory:
+    """Of noise."""
+    return Trajectory(
+        video_embeddings=random.standard_normal((num_frames, VIDEO_DIM), np.float32),
+        text_embedding=random.standard_normal(TEXT_DIM, np.float32),
+    )
+
+
+def mixed_samples() -> list[Sample]:
+    """All types, several lengths."""
+    random = np.random.default_rng(0)
+    samples: list[Sample] = []
+    for index in range(NUM_SAMPLES):
+        num_frames = int(random.integers(1, MOST_FRAMES // 2 + 1))
+        first, second = trajectory(random, num_frames), trajectory(random, MOST_FRAMES // 2 - num_frames + 1)
+        kinds = (ProgressSample(first), PreferenceSample(first, second), SimilaritySample(first, second))
+        samples.append(kinds[index % len(kinds)])
+    return samples
+
+
+def progress_samples() -> list[Sample]:
+    """Of one type, several lengths."""
+    random = np.random.default_rng(1)
+    return [ProgressSample(trajectory(random, 1 + index % MOST_FRAMES)) for index in range(NUM_SAMPLES)]
+
+
+def numbers(result: object) -> Numbers:
+    """All scores of a result, one after the other."""
+    if isinstance(result, ProgressResult):
+        return np.concatenate([result.progress, result.success])
+    if isinstance(result, PreferenceResult):
+        return np.concatenate([[result.preference], result.first.progress, result.second.progress])
+    if isinstance(result, RewardError):
+        raise result
+    return np.concatenate([[result.similarity], result.reference.progress, result.other.progress])  # type: ignore[attr-defined]
+
+
+def direct(url: str, **options: Any) -> Connect:
+    """The client, of these options. Without retries, calls that a queue turns away count as refused."""
+
+    @asynccontextmanager
+    async def connect() -> AsyncIterator[Ask]:
+        async with AsyncRewardClient(url, **options) as client:
+
+            async def ask(sample: Sample) -> Numbers:
+                try:
+                    return numbers(await client.score(sample))
+                except ServerUnavailableError as error:
+                    if not options.get("retry", True) and FULL.search(str(error)):
+                        raise RefusedError from error
+                    raise
+
+            yield ask
+
+    return connect
+
+
+def through_gateway(url: str) -> Connect:
+    """A caller of the FastAPI server: progress samples as JSON. What answers 503, or breaks off, has refused."""
+
+    @asynccontextmanager
+    async def connect() -> AsyncIterator[Ask]:
+        connector, timeout = aiohttp.TCPConnector(limit=0), aiohttp.ClientTimeout(PATIENCE_S)
+        async with aiohttp.ClientSession(connector=connector, timeout=timeout) as session:
+
+            async def ask(sample: Sample) -> Numbers:
+                try:
+                    async with session.post(f"{url}/evaluate_batch", json={"samples": [_in_json(sample)]}) as answer:
+                        if answer.status == 503:
+                            raise RefusedError
+                        answer.raise_for_status()
+                        outputs = await answer.json()
+                except (aiohttp.ClientConnectionError, aiohttp.ClientPayloadError) as error:
+                    raise RefusedError from error
+                progress, success = outputs["outputs_progress"]["progress_pred"], outputs["outputs_success"]
+                return np.array([*progress[0], *success["success_probs"][0]], np.float32)
+
+            yield ask
+
+    return connect
+
+
+def _in_json(sample: Sample) -> dict[str, Any]:
+    (only,) = sample.trajectories
+    assert only.video_embeddings is not None
+    assert only.text_embedding is not None
+    arrays = {"video_embeddings": only.video_embeddings.tolist(), "text_embedding": only.text_embedding.tolist()}
+    return {"sample_type": "progress", "trajectory": arrays}
+
+
+@dataclass
+class Tally:
+    """What became of calls. Times in seconds; a latency counts from when its call was due."""
+
+    exam: Exam
+    asked: int = 0
+    answered: int = 0
+    wrong: int = 0
+    lost: list[str] = field(default_factory=list)
+    ended_s: array[float] = field(default_factory=lambda: array("d"))  # of answered calls, by time.perf_counter
+    latencies_s: array[float] = field(default_factory=lambda: array("d"))
+    refusals_s: array[float] = field(default_factory=lambda: array("d"))  # from the call to its refusal
+
+    @property
+    def refused(self) -> int:
+        """Calls."""
+        return len(self.refusals_s)
+
+    @property
+    def p99_s(self) -> float:
+        """Of answered calls."""
+        return float(np.percentile(self.latencies_s, 99))
+
+    async def call(self, ask: Ask, number: int, due_s: float) -> bool:
+        """Asks, and counts; whether there was an answer."""
+        number %= len(self.exam.samples)
+        self.asked += 1
+        started_s = time.perf_counter()
+        try:
+            got = await ask(self.exam.samples[number])
+        except RefusedError:
+            self.refusals_s.append(time.perf_counter() - started_s)
+            return False
+        except Exception as error:  # noqa: BLE001  whatever it is, the call is lost
+            self.lost.append(repr(error))
+            return False
+        self.ended_s.append(time.perf_counter())
+        self.latencies_s.append(self.ended_s[-1] - due_s)
+        self.answered += 1
+        self.wrong += not self.exam.is_right(number, got)
+        return True
+
+    def __add__(self, other: Tally) -> Tally:
+        return Tally(
+            self.exam,
+            self.asked + other.asked,
+            self.answered + other.answered,
+            self.wrong + other.wrong,
+            self.lost + other.lost,
+            self.ended_s + other.ended_s,
+            self.latencies_s + other.latencies_s,
+            self.refusals_s + other.refusals_s,
+        )
+
+
+class Callers:
+    """So many callers, each with one call at a time, in a thread of their own. A context manager.
+
+    interval_s: a caller's calls are due so far apart; 0: it asks again at once
+    """
+
+    def __init__(self, connect: Connect, exam: Exam, count: int, *, interval_s: float = 0.0) -> None:
+        self.tally = Tally(exam)
+        self._connect = connect
+        self._interval_s = interval_s
+        self._answered = [0] * count
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._call_all()))
+
+    async def _call_all(self) -> None:
+        async with self._connect() as ask:
+            await asyncio.gather(*(self._call(ask, caller) for caller in range(len(self._answered))))
+
+    async def _call(self, ask: Ask, caller: int) -> None:
+        number = caller
+        due_s = time.perf_counter() + self._interval_s * caller / len(self._answered)
+        while not self._stop.is_set():
+            if self._interval_s:
+                await asyncio.sleep(max(due_s - time.perf_counter(), 0))
+            else:
+                due_s = time.perf_counter()
+            if await self.tally.call(ask, number, due_s):
+                self._answered[caller] += 1
+            else:
+                await asyncio.sleep(PAUSE_S)
+            due_s += self._interval_s
+            number += len(self._answered) + 1
+
+    def wait_for_all(self) -> None:
+        """Returns when each has been answered twice more: the second answer is to a question that was asked from now on."""
+        before, until_s = list(self._answered), time.monotonic() + PATIENCE_S
+        while not all(now > then + 1 for now, then in zip(self._answered, before, strict=True)):
+            assert time.monotonic() < until_s, "callers are not answered"
+            time.sleep(0.02)
+
+    def __enter__(self) -> Callers:
+        self._thread.start()
+        self.wait_for_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+def closed_loop(connect: Connect, exam: Exam, callers: int, seconds: float) -> Tally:
+    """What became of the calls of so many callers in so many seconds."""
+    with Callers(connect, exam, callers) as asking:
+        time.sleep(seconds)
+    return asking.tally
+
+
+async def open_loop(connect: Connect, exam: Exam, rate_per_s: float, seconds: float) -> tuple[Tally, float]:
+    """Calls at random moments (Poisson), however long they take; with how late the latest of them was made."""
+    tally, calls, latest_s = Tally(exam), set(), 0.0
+    random = np.random.default_rng(0)
+    async with connect() as ask:
+        await ask(exam.samples[0])  # it is connected
+        due_s = time.perf_counter() + np.cumsum(random.exponential(1 / rate_per_s, int(rate_per_s * seconds)))
+        for number, moment_s in enumerate(due_s.tolist()):
+            await asyncio.sleep(max(moment_s - time.perf_counter(), 0))
+            latest_s = max(latest_s, time.perf_counter() - moment_s)
+            call = asyncio.create_task(tally.call(ask, number, moment_s))
+            calls.add(call)
+            call.add_done_callback(calls.discard)
+        await asyncio.gather(*calls)
+    return tally, latest_s

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: MIT
+"""Four times as many requests as can be served: what is accepted is answered soon, what is not is told at once."""
+
+from __future__ import annotations
+
+import asyncio
+
+import httpx
+import numpy as np
+from callers import Callers, Exam, closed_loop, direct, open_loop, through_gateway, trajectory
+from chaos_site import CHECKPOINT, Row, Site
+from prometheus_client.parser import text_string_to_metric_families
+
+from rfm_client import ProgressSample, Sample
+
+MAX_QUEUE_SIZE = 64
+# Two instances: with one, a Triton before 26.08 that has a bounded queue serves a batch each half second once it is full.
+SETTINGS = {"max_queue_size": MAX_QUEUE_SIZE, "batch_size": 2, "instances": 2}
+FACTOR = 4
+CALIBRATION_S = 6.0
+CALLERS = 8
+CROWD = 200  # callers of the gateway at a time
+CROWD_S = 5.0
+TOLD_S = 0.1
+P99_FACTOR = 3
+FRAMES, FRAME_STEPS = 32, 16  # each sample is 32 sequences: so much work that the caller beside it has little
+
+
+def heavy_samples() -> list[Sample]:
+    """Of much work and few bytes."""
+    random = np.random.default_rng(2)
+    return [ProgressSample(trajectory(random, FRAMES), frame_steps=FRAME_STEPS) for _ in range(16)]
+
+
+def overload(site: Site, seconds: float) -> list[Row]:
+    """Over gRPC for so long, and then through the gateway, which counts whom it refuses."""
+    exam = Exam.of(CHECKPOINT, heavy_samples())
+    url = site.served.endpoints.grpc_url
+    impatient = direct(url, retry=False, max_in_flight=4096)
+    unloaded_s = closed_loop(impatient, exam, 1, CALIBRATION_S).p99_s
+    capacity_per_s = closed_loop(impatient, exam, CALLERS, CALIBRATION_S).answered / CALIBRATION_S
+    before = _failures(site)
+    tally, latest_s = asyncio.run(open_loop(impatient, exam, FACTOR * capacity_per_s, seconds))
+    queue_s = MAX_QUEUE_SIZE / (tally.answered / seconds)  # as fast as it was worked on meanwhile
+    most_s = P99_FACTOR * unloaded_s + queue_s
+    refusals_ms = 1e3 * np.percentile(tally.refusals_s or [0.0], [99, 100])
+    told = (
+        f"{capacity_per_s:.0f}/s can be served, {tally.answered / seconds:.0f}/s were; "
+        f"p99 {1e3 * tally.p99_s:.0f} ms of {1e3 * most_s:.0f} allowed (unloaded {1e3 * unloaded_s:.0f}, "
+        f"queue {1e3 * queue_s:.0f}); refusals told in p99 {refusals_ms[0]:.0f} ms, max {refusals_ms[1]:.0f} ms "
+        f"(callers were up to {1e3 * latest_s:.0f} ms late themselves); Triton counts {_failures(site) - before:.0f}"
+    )
+    row = Row.of(f"{FACTOR} x overload for {seconds:g} s", tally, told=told)
+    row.expect(tally.p99_s <= most_s, f"p99 of accepted calls: {tally.p99_s:.2f} s; allowed: {most_s:.2f} s")
+    row.expect(tally.refused > 0, "nobody was refused")
+    told_s = max(tally.refusals_s, default=0) - latest_s  # the callers' own delay, on the processors that serve too
+    row.expect(told_s <= TOLD_S, f"a refusal was told after {refusals_ms[1]:.0f} ms")
+    return [row, _through_gateway(site)]
+
+
+def _through_gateway(site: Site) -> Row:
+    """More callers than the queue takes; every refusal is in the gateway's metrics."""
+    before = _rejections(site)
+    with Callers(through_gateway(site.gateway_url), site.progress, CROWD) as callers:
+        asyncio.run(asyncio.sleep(CROWD_S))
+    counted = _rejections(site) - before
+    row = Row.of(f"{CROWD} callers of the gateway", callers.tally, told=f"its metrics count {counted:.0f} refused")
+    row.expect(counted == callers.tally.refused, f"the gateway counts {counted:.0f} refused calls")
+    return row
+
+
+def _rejections(site: Site) -> float:
+    return _sum(f"{site.gateway_url}/metrics", "rfm_gateway_rejections_total", reason="unavailable")
+
+
+def _failures(site: Site) -> float:
+    return _sum(site.served.endpoints.metrics_url, "nv_inference_request_failure")
+
+
+def _sum(url: str, name: str, **labels: str) -> float:
+    families = text_string_to_metric_families(httpx.get(url).text)
+    samples = [sample for family in families for sample in family.samples]
+    return sum(
+        sample.value
+        for sample in samples
+        if sample.name.removesuffix("_total") == name.removesuffix("_total") and labels.items() <= sample.labels.items()
+    )
