@@ -14,6 +14,7 @@ import torch
 
 from rfm.execution import Execution
 from rfm.server.asked import CANCELLED, SAMPLE_TYPES, SCORED, Asked, CancelledError
+from rfm.server.leftovers import end_with_triton
 from rfm.server.metrics import Counted, Metrics
 from rfm.server.poison import NO_DIGEST, Poison, digest
 from rfm.server.request_log import RequestLog
@@ -43,6 +44,7 @@ class BatchModel(Generic[Question, Answer]):
 
     def initialize(self, args: Mapping[str, str]) -> None:
         """Called once by Triton when the model is loaded."""
+        end_with_triton()
         config = json.loads(args["model_config"])
         settings = {name: value["string_value"] for name, value in config["parameters"].items()}
         self.input_names = [spec["name"] for spec in config["input"]]

@@ -9,6 +9,8 @@ import re
 import shutil
 import signal
 import tempfile
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,6 +21,7 @@ BACKENDS_PREFIX = "rfm-backends-"
 REGION_PREFIX = "triton_python_backend_shm_region_rfm"
 
 _PR_SET_PDEATHSIG = 1
+_WATCH_INTERVAL_S = 1.0
 _OWNED = re.compile(
     r"(?:triton_python_backend_shm_region_)?rfm[_-](?:backends-)?(?P<pid>\d+)[_-](?P<namespace>[0-9a-f]+)[_-]"
 )
@@ -41,6 +44,18 @@ def ending_with_parent() -> Callable[[], None]:
             os._exit(1)
 
     return bind
+
+
+def end_with_triton() -> None:
+    """For a model process: it ends when Triton has, however that ended, and whatever it waits for."""
+    triton = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == triton:
+            time.sleep(_WATCH_INTERVAL_S)
+        os._exit(1)
+
+    threading.Thread(target=watch, name="rfm-end-with-triton", daemon=True).start()
 
 
 def clear() -> list[Path]:
