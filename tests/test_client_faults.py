@@ -43,12 +43,8 @@ class OneModelServer(TritonServer):
 
     def __init__(self, repository: Path, endpoints: Endpoints, *arguments: str) -> None:
         log = (repository.parent / "tritonserver.log").open("ab")
-        super().__init__(repository, endpoints, find_installation(), log=log)
+        super().__init__(repository, endpoints, find_installation(), log=log, more_arguments=arguments)
         self._own_log = log
-        self._more_arguments = arguments
-
-    def _arguments(self, models: list[str]) -> list[str]:  # type: ignore[override]
-        return [*super()._arguments(models), *self._more_arguments]
 
     def signal(self, number: signal.Signals) -> None:
         assert self._process is not None

@@ -482,7 +482,7 @@ def test_after_an_error_delta_pays_what_was_missed(client: RewardClient, late: L
     env.reset(seed=0)
     late.hold(1)
     late.connection.held[2].set_exception(ServerUnavailableError("the server is restarting"))
-    with pytest.raises(ServerUnavailableError, match=r"^the server is restarting$"):
+    with pytest.raises(ServerUnavailableError, match=r"^the server is restarting \(request \w+-\d+\)$"):
         env.step(PUSH_RIGHT)
     reward = env.step(PUSH_RIGHT)[1]
     first, _, newest = progress(client, camera.films[0], range(3))
