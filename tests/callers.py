@@ -38,7 +38,7 @@ VIDEO_DIM, TEXT_DIM = 64, 32  # of the demo's checkpoint
 MOST_FRAMES = 32
 NUM_SAMPLES = 48
 
-FULL = re.compile("maximum queue size|timeout expired")  # a queue: no room in it, or none in time
+FULL = re.compile("maximum queue size")  # of a queue with no room
 
 Numbers = np.ndarray[Any, np.dtype[np.float32]]
 Ask = Callable[[Sample], Awaitable[Numbers]]

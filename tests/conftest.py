@@ -2,7 +2,10 @@
 from __future__ import annotations
 
 import functools
+import os
+import signal
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -98,3 +101,15 @@ def random_trajectory(seed: int, num_frames: int, video_dim: int = 768, text_dim
         video_embeddings=random.standard_normal((num_frames, video_dim), np.float32),
         text_embedding=random.standard_normal(text_dim, np.float32),
     )
+
+
+def kill_model(repository: Path, model: str = "rfm") -> None:
+    """Kills each process of a model that a server of ``repository`` runs."""
+    model_file = f"{repository}/{model}/1/model.py"
+    killed = []
+    for command in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):  # it has ended meanwhile
+            if model_file in command.read_text():
+                killed.append(command)
+                os.kill(int(command.parent.name), signal.SIGKILL)
+    assert killed

@@ -11,15 +11,12 @@ import copy
 import functools
 import importlib.metadata
 import json
-import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from importlib.resources import files
@@ -32,6 +29,7 @@ import jsonschema
 import kubernetes_validate
 import pytest
 import yaml
+from conftest import kill_model
 from referencing import Registry, Resource
 from typer.main import get_command
 
@@ -436,18 +434,6 @@ def probed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Probed]:
         finally:
             process.terminate()
     assert process.returncode == 0, log.read_text()
-
-
-def kill_model(repository: Path) -> None:
-    """Kills each of its processes."""
-    model_file = f"{repository}/rfm/1/model.py"
-    killed = []
-    for command in Path("/proc").glob("[0-9]*/cmdline"):
-        with suppress(OSError):  # it has ended meanwhile
-            if model_file in command.read_text():
-                killed.append(command)
-                os.kill(int(command.parent.name), signal.SIGKILL)
-    assert killed
 
 
 def test_the_probes_tell_a_living_model_from_a_dead_one(probed: Probed, tmp_path: Path) -> None:

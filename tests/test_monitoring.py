@@ -8,14 +8,13 @@ import math
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -25,7 +24,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from conftest import random_trajectory
+from conftest import kill_model, random_trajectory
 
 from rfm.server.process import Endpoints
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, RewardClient, RewardError, Trajectory
@@ -350,15 +349,3 @@ def test_a_dead_model_process_is_noticed_and_healed(monitored: Monitored) -> Non
     assert eventually(lambda: monitored.query(f'rfm_serve_ready{{model="{MODEL}"}} == 1'))
     assert eventually(lambda: not monitored.query(f"ALERTS{name}"))
     assert not monitored.query('{alertname="RfmModelProcessDead", alertstate="firing"}')
-
-
-def kill_model(repository: Path) -> None:
-    """Kills each of its processes."""
-    model_file = f"{repository}/{MODEL}/1/model.py"
-    killed = []
-    for command in Path("/proc").glob("[0-9]*/cmdline"):
-        with suppress(OSError):  # it has ended meanwhile
-            if model_file in command.read_text():
-                killed.append(command)
-                os.kill(int(command.parent.name), signal.SIGKILL)
-    assert killed

@@ -10,7 +10,9 @@ keeps the one that it was exported with, for the day when it is served again (``
 
 from __future__ import annotations
 
+import errno
 import fcntl
+import logging
 import os
 import shutil
 import tempfile
@@ -23,6 +25,8 @@ from tritonclient.grpc import model_config_pb2 as pb
 from rfm_export.errors import ExportError
 from rfm_export.layout import CONFIG_FILE, WARMUP_FOLDER, GeneratedModel
 from rfm_export.pbtxt import parse, render, serving_versions
+
+_log = logging.getLogger(__name__)
 
 
 @contextmanager
@@ -37,8 +41,11 @@ def alone(repository: Path) -> Iterator[None]:
     except BlockingIOError:
         os.close(descriptor)
         raise ExportError(f"{repository}: expected no other export or rollout at work, got one") from None
-    except OSError:  # no locks here
-        pass
+    except OSError as error:
+        if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL):
+            os.close(descriptor)
+            raise
+        _log.warning("%s: expected a file system with locks, got: %s: nothing keeps others out", repository, error)
     else:
         prefix, parent = _scratch_place(repository)
         for left in [path for path in parent.iterdir() if path.name.startswith(prefix)]:
