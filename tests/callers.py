@@ -30,6 +30,7 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
+from rfm_client.gateway.scoring import FRAME_STEPS
 
 TOLERANCE = 1e-5
 PATIENCE_S = 60.0
@@ -135,7 +136,7 @@ def through_gateway(url: str) -> Connect:
 
             async def ask(sample: Sample) -> Numbers:
                 try:
-                    async with session.post(f"{url}/evaluate_batch", json={"samples": [_in_json(sample)]}) as answer:
+                    async with session.post(f"{url}/evaluate_batch", json=_in_json(sample)) as answer:
                         if answer.status == 503:
                             raise RefusedError
                         answer.raise_for_status()
@@ -151,11 +152,15 @@ def through_gateway(url: str) -> Connect:
 
 
 def _in_json(sample: Sample) -> dict[str, Any]:
+    """The body that asks for it."""
     (only,) = sample.trajectories
+    assert isinstance(sample, ProgressSample)
+    assert sample.frame_steps in (0, FRAME_STEPS)
     assert only.video_embeddings is not None
     assert only.text_embedding is not None
     arrays = {"video_embeddings": only.video_embeddings.tolist(), "text_embedding": only.text_embedding.tolist()}
-    return {"sample_type": "progress", "trajectory": arrays}
+    samples = [{"sample_type": "progress", "trajectory": arrays}]
+    return {"samples": samples, "use_frame_steps": sample.frame_steps > 0}
 
 
 @dataclass

@@ -43,8 +43,9 @@ def chaos(folder: Path, overload_s: float) -> list[Row]:
     with site(folder / "faults") as served:
         for name, fault in FAULTS.items():
             rows += survive(name, lambda fault=fault: fault(served))  # type: ignore[misc]
+        rows += survive("overload of the gateway", lambda: overload.of_gateway(served, overload_s))
     with site(folder / "overload", **overload.SETTINGS) as served:
-        rows += survive("overload", lambda: overload.overload(served, overload_s))
+        rows += survive("overload of gRPC", lambda: overload.of_grpc(served, overload_s))
     for name, inside in mounts.FAULTS.items():
         rows += survive(name, lambda inside=inside: mounts.run(inside, folder))  # type: ignore[misc]
     return rows

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import httpx
 from callers import Callers, Connect, Exam, Tally, direct, mixed_samples, progress_samples
-from test_healing import ROOT, Serving, serving, wait_for
+from rfm_serve import ROOT, Serving, serving, wait_for
 
 import rfm_export
 from rfm.config import ServeConfig

@@ -16,10 +16,11 @@ from contextlib import ExitStack, contextmanager, suppress
 import httpx
 from callers import Callers, direct, through_gateway
 from chaos_site import BACK_S, CALLERS, CHECKPOINT, Row, Site
-from test_healing import MODEL, RFM, TRUTH_S, children, is_alive, wait_for
+from rfm_serve import MODEL, RFM, TRUTH_S, children, wait_for
 
 import rfm_export
 from rfm.config import ServeConfig
+from rfm.server.stubs import is_alive
 from rfm_client import RewardClient
 from rfm_client.shared_memory import FOLDER
 from rfm_export.publish import read_config

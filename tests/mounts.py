@@ -15,7 +15,7 @@ from pathlib import Path
 from callers import Callers, Exam, direct, progress_samples
 from chaos_site import BACK_S, CHECKPOINT, Row, site
 from faults import SHARING
-from test_healing import RFM
+from rfm_serve import RFM
 
 import rfm_export
 from rfm.config import ServeConfig

@@ -4,14 +4,18 @@
 from __future__ import annotations
 
 import asyncio
+import time
+from collections.abc import Callable
 
 import httpx
 import numpy as np
-from callers import Callers, Exam, closed_loop, direct, open_loop, through_gateway, trajectory
+from callers import Callers, Connect, Exam, closed_loop, direct, open_loop, through_gateway, trajectory
 from chaos_site import CHECKPOINT, Row, Site
 from prometheus_client.parser import text_string_to_metric_families
 
 from rfm_client import ProgressSample, Sample
+from rfm_client.gateway.app import DEFAULT_MAX_IN_FLIGHT
+from rfm_client.gateway.scoring import FRAME_STEPS
 
 MAX_QUEUE_SIZE = 64
 # Two instances: with one, a Triton before 26.08 that has a bounded queue serves a batch each half second once it is full.
@@ -23,7 +27,7 @@ CROWD = 200  # callers of the gateway at a time
 CROWD_S = 5.0
 TOLD_S = 0.1
 P99_FACTOR = 3
-FRAMES, FRAME_STEPS = 32, 16  # each sample is 32 sequences: so much work that the caller beside it has little
+FRAMES = 32  # each sample is 32 sequences: so much work that the caller beside it has little
 
 
 def heavy_samples() -> list[Sample]:
@@ -32,36 +36,50 @@ def heavy_samples() -> list[Sample]:
     return [ProgressSample(trajectory(random, FRAMES), frame_steps=FRAME_STEPS) for _ in range(16)]
 
 
-def overload(site: Site, seconds: float) -> list[Row]:
-    """Over gRPC for so long, and then through the gateway, which counts whom it refuses."""
+def of_grpc(site: Site, seconds: float) -> list[Row]:
+    """Triton's own queue turns away what it has no room for; and what the gateway says of that."""
+    connect = direct(site.served.endpoints.grpc_url, retry=False, max_in_flight=4096)
+    row, _ = _overload("gRPC", connect, MAX_QUEUE_SIZE, lambda: _failures(site), seconds)
+    return [row, _crowd(site)]
+
+
+def of_gateway(site: Site, seconds: float) -> list[Row]:
+    """The gateway turns away what is more than it takes at a time, and counts it, whatever Triton does."""
+    connect = through_gateway(site.gateway_url)
+    row, counted = _overload("the gateway", connect, DEFAULT_MAX_IN_FLIGHT, lambda: _rejections(site), seconds)
+    row.expect(counted == row.refused, f"the gateway counts {counted:.0f} refused calls")
+    return [row]
+
+
+def _overload(door: str, connect: Connect, room: int, count: Callable[[], float], seconds: float) -> tuple[Row, float]:
+    """FACTOR times what can be served, for so long; with how many more refusals are counted."""
     exam = Exam.of(CHECKPOINT, heavy_samples())
-    url = site.served.endpoints.grpc_url
-    impatient = direct(url, retry=False, max_in_flight=4096)
-    unloaded_s = closed_loop(impatient, exam, 1, CALIBRATION_S).p99_s
-    capacity_per_s = closed_loop(impatient, exam, CALLERS, CALIBRATION_S).answered / CALIBRATION_S
-    before = _failures(site)
-    tally, latest_s = asyncio.run(open_loop(impatient, exam, FACTOR * capacity_per_s, seconds))
-    queue_s = MAX_QUEUE_SIZE / capacity_per_s
+    unloaded_s = closed_loop(connect, exam, 1, CALIBRATION_S).p99_s
+    capacity_per_s = closed_loop(connect, exam, CALLERS, CALIBRATION_S).answered / CALIBRATION_S
+    before = count()
+    tally, latest_s = asyncio.run(open_loop(connect, exam, FACTOR * capacity_per_s, seconds))
+    counted = count() - before
+    queue_s = room / capacity_per_s
     most_s = P99_FACTOR * unloaded_s + queue_s
     refusals_ms = 1e3 * np.percentile(tally.refusals_s or [0.0], [99, 100])
     told = (
         f"{capacity_per_s:.0f}/s can be served, {tally.answered / seconds:.0f}/s were; "
         f"p99 {1e3 * tally.p99_s:.0f} ms of {1e3 * most_s:.0f} allowed (unloaded {1e3 * unloaded_s:.0f}, "
         f"queue {1e3 * queue_s:.0f}); refusals told in p99 {refusals_ms[0]:.0f} ms, max {refusals_ms[1]:.0f} ms "
-        f"(callers were up to {1e3 * latest_s:.0f} ms late themselves); Triton counts {_failures(site) - before:.0f}"
+        f"(callers were up to {1e3 * latest_s:.0f} ms late themselves); metrics count {counted:.0f}"
     )
-    row = Row.of(f"{FACTOR} x overload for {seconds:g} s", tally, told=told)
+    row = Row.of(f"{FACTOR} x overload of {door} for {seconds:g} s", tally, told=told)
     row.expect(tally.p99_s <= most_s, f"p99 of accepted calls: {tally.p99_s:.2f} s; allowed: {most_s:.2f} s")
     row.expect(tally.refused > 0, "nobody was refused")
     row.expect(max(tally.refusals_s, default=0) <= TOLD_S, f"a refusal was told after {refusals_ms[1]:.0f} ms")
-    return [row, _through_gateway(site)]
+    return row, counted
 
 
-def _through_gateway(site: Site) -> Row:
-    """More callers than the queue takes; every refusal is in the gateway's metrics."""
+def _crowd(site: Site) -> Row:
+    """More callers of the gateway than Triton's queue takes; every refusal is in the gateway's metrics."""
     before = _rejections(site)
     with Callers(through_gateway(site.gateway_url), site.progress, CROWD) as callers:
-        asyncio.run(asyncio.sleep(CROWD_S))
+        time.sleep(CROWD_S)
     counted = _rejections(site) - before
     row = Row.of(f"{CROWD} callers of the gateway", callers.tally, told=f"its metrics count {counted:.0f} refused")
     row.expect(counted == callers.tally.refused, f"the gateway counts {counted:.0f} refused calls")
