@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """This server, the bare engine and what one would take instead: same weights, same samples, one run.
 
-    python benchmarks/bench.py            # five minutes
-    python benchmarks/bench.py --full     # all loads
+    python benchmarks/bench.py            # eight minutes
+    python benchmarks/bench.py --full     # all loads, half an hour
 
 Rounds are interleaved: in each, every contestant is measured once, so that a machine that drifts hits all alike; ratios
 within a round are what is compared. Writes JSON, Markdown and pictures.
@@ -100,15 +100,16 @@ def main() -> None:
     rows: list[dict[str, object]] = []
     with TemporaryDirectory(prefix="rfm-bench-") as folder:
         for size in arguments.sizes:
-            measured = checkpoint(size, Path(folder), arguments.threads)
+            measured = checkpoint(size, Path(folder), threads)
             bare = BareEngine(measured)
-            with contestants(measured, bare.widths, PEERS, threads, Path(folder) / "logs") as callers:
+            with contestants(measured, bare.widths, PEERS, Path(folder) / "logs") as callers:
                 for scenario in scenarios:
                     if scenario.load.frame_px and measured.encoders is None:
                         continue
                     load = replace(scenario.load, seconds=arguments.seconds)
                     rows += _rounds(size, replace(scenario, load=load), bare, callers, arguments.rounds, console)
-    results = {"machine": machine(), "threads": threads, "rounds": arguments.rounds, "measurements": rows}
+    of_run = {"threads": threads, "rounds": arguments.rounds, "seconds": arguments.seconds}
+    results = {"machine": machine(), **of_run, "measurements": rows}
     arguments.output.mkdir(parents=True, exist_ok=True)
     (arguments.output / "results.json").write_text(json.dumps(results, indent=1) + "\n")
     report.write(results, arguments.output)
@@ -152,13 +153,14 @@ def checkpoint(size: str, folder: Path, threads: int) -> Checkpoint:
         source, encoders = versions[0] / "checkpoint", (versions[1] / "image_encoder", versions[1] / "text_encoder")
         images, texts = map(str, encoders)
         serve = replace(ServeConfig.from_yaml(DEMO / "serve.yaml"), image_encoder=images, text_encoder=texts)
+        serve = replace(serve, torch_threads=max(1, threads // serve.instances))
     else:
         torch.manual_seed(0)
         source, encoders = folder / size, None
         save(RewindCheckpoint(DEFAULT_SIZE, RewindTransformer(DEFAULT_SIZE).state_dict()), source)
         serve = ServeConfig(num_gpus=0, torch_threads=threads)
     rfm_export.export(source, repository, serve)
-    return Checkpoint(size, source, repository, encoders)
+    return Checkpoint(size, source, repository, serve.instances, serve.torch_threads, encoders)
 
 
 def machine() -> dict[str, object]:

@@ -24,16 +24,22 @@ from rfm_client.gateway.command import gateway_command
 
 PEER_SCRIPTS = {"FastAPI": "fastapi_server.py", "LitServe": "litserve_server.py", "mosec": "mosec_server.py"}
 START_S = 120
+WARM_UPS = 3  # as callers of a server ask three times before the clock starts
 HERE = Path(__file__).parent
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """name: of its size; folder: the checkpoint; repository: it, exported; encoders: folders of its two, if any"""
+    """name: of its size; folder: the checkpoint; repository: it, exported; encoders: folders of its two, if any
+
+    instances: model processes of every server but FastAPI's; threads: of torch, of each
+    """
 
     name: str
     folder: Path
     repository: Path
+    instances: int
+    threads: int
     encoders: tuple[Path, Path] | None = None
 
 
@@ -71,6 +77,8 @@ class BareEngine:
     def measure(self, load: Load, batch_size: int) -> Measured:
         """One batch after the other, of the load's samples."""
         asked = samples(load, *self.widths)
+        for _ in range(WARM_UPS):
+            self.engine.evaluate([asked[i % len(asked)] for i in range(batch_size)])
         latencies_s = []
         start, started_s = 0, time.perf_counter()
         while time.perf_counter() - started_s < load.seconds:
@@ -87,7 +95,7 @@ class BareEngine:
 
 @contextmanager
 def contestants(
-    checkpoint: Checkpoint, widths: tuple[int, int], peers: Sequence[str], threads: int, log_folder: Path
+    checkpoint: Checkpoint, widths: tuple[int, int], peers: Sequence[str], log_folder: Path
 ) -> Iterator[Mapping[str, Callers]]:
     """Callers by name, of this server over each of its ways and of the peers, all of the same checkpoint."""
     log_folder.mkdir(parents=True, exist_ok=True)
@@ -103,8 +111,9 @@ def contestants(
             "gateway": f"http://127.0.0.1:{gateway_port}",
         }
         for peer, port in zip(peers, peer_ports, strict=True):
-            options = ["--checkpoint", str(checkpoint.folder), "--port", str(port), "--threads", str(threads)]
-            command = [sys.executable, str(HERE / "peers" / PEER_SCRIPTS[peer]), *options]
+            options = {"checkpoint": checkpoint.folder, "port": port, **_processes(peer, checkpoint)}
+            words = [f"--{name}={value}" for name, value in options.items()]
+            command = [sys.executable, str(HERE / "peers" / PEER_SCRIPTS[peer]), *words]
             stack.enter_context(_running(command, port, log_folder / f"{peer}_{checkpoint.name}.log"))
             ways = ["FastAPI, JSON", "FastAPI, npy"] if peer == "FastAPI" else [peer]
             urls |= dict.fromkeys(ways, f"http://127.0.0.1:{port}")
@@ -113,6 +122,13 @@ def contestants(
             callers[way] = Callers(way, url, widths)
             stack.callback(callers[way].close)
         yield callers
+
+
+def _processes(peer: str, checkpoint: Checkpoint) -> Mapping[str, int]:
+    """As many as this server has; the FastAPI design has one replica a device, which takes all threads."""
+    if peer == "FastAPI":
+        return {"threads": checkpoint.threads * checkpoint.instances}
+    return {"threads": checkpoint.threads, "workers": checkpoint.instances}
 
 
 def _ports(count: int) -> list[int]:

@@ -27,8 +27,9 @@ def write(results: Mapping[str, Any], folder: Path) -> None:
         "",
         f"{machine['cpu']}, {machine['cores']} cores; Python {machine['python']}; {versions}; "
         f"commit {machine['commit'][:12]}; {machine['date']}. {results['threads']} torch threads; medians of "
-        f"{results['rounds']} interleaved rounds, with the smallest and largest. Ratios: medians of those within a "
-        "round. Callers run on the same cores.",
+        f"{results['rounds']} interleaved rounds of {results['seconds']:g} s, with the smallest and largest. Ratios: "
+        "medians of those within a round. Callers run on the same cores. LitServe and mosec run this project's engine "
+        "in as many processes as Triton does, and wait up to 1 ms for a batch to fill.",
     ]
     rows: Sequence[Row] = results["measurements"]
     for size in dict.fromkeys(row["size"] for row in rows):

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Samples/s of a served vision-language checkpoint at batch 1, 8 and 32, with 8 frames of 256 x 256.
+"""Samples/s of a served vision-language checkpoint, 1, 8 and 32 samples asked together, 8 frames of 256 x 256 each.
 
     python benchmarks/vlm_throughput.py grpc://localhost:8001 --metrics http://localhost:8002/metrics
 
-Medians of interleaved rounds; collate and forward time as the server tells them; the share of the time that the
+Medians of interleaved rounds; collate and forward time of the last sample's batch, as the server tells them (the client
+cuts requests at 8 MiB, so 8 and 32 samples are several); the share of the time that the
 GPU computes as Triton's metrics tell it. Writes benchmarks/results/vlm_throughput.json.
 """
 
@@ -22,7 +23,7 @@ import numpy as np
 
 from rfm_client import ProgressSample, RewardClient, Trajectory
 
-BATCHES = (1, 8, 32)
+TOGETHER = (1, 8, 32)
 FRAMES, SIZE_PX = 8, 256
 RESULTS = Path(__file__).parent / "results"
 
@@ -48,29 +49,29 @@ def main() -> None:
         ProgressSample(
             Trajectory(frames=random.integers(0, 256, (FRAMES, SIZE_PX, SIZE_PX, 3), np.uint8), task=f"task {index}")
         )
-        for index in range(max(BATCHES))
+        for index in range(max(TOGETHER))
     ]
-    measured: dict[int, list[dict[str, float]]] = {batch: [] for batch in BATCHES}
+    measured: dict[int, list[dict[str, float]]] = {count: [] for count in TOGETHER}
     with RewardClient(options.url, model=options.model, timeout_s=600) as client:
         client.evaluate(samples)  # warm
         for _ in range(options.rounds):
-            for batch in BATCHES:
+            for count in TOGETHER:
                 started_s = time.perf_counter()
-                results = client.evaluate(samples[:batch], timing=True)
+                results = client.evaluate(samples[:count], timing=True)
                 elapsed_s = time.perf_counter() - started_s
                 timing = results[-1].timing
                 assert timing is not None
-                measured[batch].append(
+                measured[count].append(
                     {
-                        "samples_per_s": batch / elapsed_s,
-                        "collate_ms": timing.collate_ms,
-                        "forward_ms": timing.forward_ms,
+                        "samples_per_s": count / elapsed_s,
+                        "last_batch_collate_ms": timing.collate_ms,
+                        "last_batch_forward_ms": timing.forward_ms,
                         "gpu_busy": max(gpu_utilisation(options.metrics), default=float("nan")),
                     }
                 )
     medians = {
-        batch: {name: statistics.median(row[name] for row in rows) for name in rows[0]}
-        for batch, rows in measured.items()
+        count: {name: statistics.median(row[name] for row in rows) for name in rows[0]}
+        for count, rows in measured.items()
     }
     report = {"machine": options.machine, "frames": FRAMES, "size_px": SIZE_PX, "rounds": measured, "medians": medians}
     RESULTS.mkdir(exist_ok=True)

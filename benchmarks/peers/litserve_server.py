@@ -21,7 +21,7 @@ from rfm.engine import Engine, Outcome
 from rfm_client import Sample
 
 MAX_BATCH_SIZE = 64
-BATCH_TIMEOUT_S = 0.002  # 0 would spin on the queue, which another process holds
+BATCH_TIMEOUT_S = 0.001  # 0 would spin on the queue, which another process holds
 REQUEST_TIMEOUT_S = 60
 MIME_TYPE = "application/msgpack"
 
@@ -67,12 +67,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--checkpoint", required=True, help="checkpoint folder")
     parser.add_argument("--port", type=int, default=8201)
-    parser.add_argument("--threads", type=int, default=1, help="of torch")
+    parser.add_argument("--threads", type=int, default=1, help="of torch, in each worker")
+    parser.add_argument("--workers", type=int, default=1, help="inference processes")
     arguments = parser.parse_args()
     batching = {"max_batch_size": MAX_BATCH_SIZE, "batch_timeout": BATCH_TIMEOUT_S}
     api = RewardAPI(arguments.checkpoint, arguments.threads, **batching)
     # Its fast_queue is not asked for: 0.2.19 ignores it.
-    server = litserve.LitServer(api, accelerator="cpu", timeout=REQUEST_TIMEOUT_S)
+    server = litserve.LitServer(api, accelerator="cpu", workers_per_device=arguments.workers, timeout=REQUEST_TIMEOUT_S)
     signal.signal(signal.SIGTERM, _interrupt)
     try:
         server.run(

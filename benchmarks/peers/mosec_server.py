@@ -22,7 +22,7 @@ from mosec.mixin import MsgpackMixin
 from rfm.engine import Engine
 
 MAX_BATCH_SIZE = 64
-MAX_WAIT_MS = 2
+MAX_WAIT_MS = 1  # the least that it takes
 REQUEST_TIMEOUT_MS = 60_000
 
 
@@ -46,7 +46,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--checkpoint", required=True, help="checkpoint folder")
     parser.add_argument("--port", type=int, default=8202)
-    parser.add_argument("--threads", type=int, default=1, help="of torch")
+    parser.add_argument("--threads", type=int, default=1, help="of torch, in each worker")
+    parser.add_argument("--workers", type=int, default=1, help="inference processes")
     arguments = parser.parse_args()
     os.environ |= {  # mosec reads its own settings from here
         "MOSEC_ADDRESS": "127.0.0.1",
@@ -57,7 +58,13 @@ def main() -> None:
     logging.getLogger(mosec.log.MOSEC_LOG_NAME).setLevel(logging.ERROR)  # its own level is read before
     server = mosec.Server()
     settings = {"PEER_CHECKPOINT": arguments.checkpoint, "PEER_THREADS": str(arguments.threads)}
-    server.append_worker(RewardWorker, max_batch_size=MAX_BATCH_SIZE, max_wait_time=MAX_WAIT_MS, env=[settings])
+    server.append_worker(
+        RewardWorker,
+        num=arguments.workers,
+        max_batch_size=MAX_BATCH_SIZE,
+        max_wait_time=MAX_WAIT_MS,
+        env=[settings] * arguments.workers,
+    )
     server.run()
 
 
