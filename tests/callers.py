@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import re
 import threading
 import time
@@ -48,6 +49,10 @@ Connect = Callable[[], AbstractAsyncContextManager[Ask]]
 
 class RefusedError(Exception):
     """The caller was told at once that this call is not answered."""
+
+
+class BrokenOffError(Exception):
+    """The connection ended before the answer."""
 
 
 @dataclass(frozen=True)
@@ -127,22 +132,26 @@ def direct(url: str, **options: Any) -> Connect:
 
 
 def through_gateway(url: str) -> Connect:
-    """A caller of the FastAPI server: progress samples as JSON. What answers 503, or breaks off, has refused."""
+    """A caller of the FastAPI server: progress samples as JSON. A 503 is a refusal."""
 
     @asynccontextmanager
     async def connect() -> AsyncIterator[Ask]:
+        bodies: dict[int, bytes] = {}  # by sample: callers of an overloaded server have no time to make them
         connector, timeout = aiohttp.TCPConnector(limit=0), aiohttp.ClientTimeout(PATIENCE_S)
-        async with aiohttp.ClientSession(connector=connector, timeout=timeout) as session:
+        headers = {"Content-Type": "application/json"}
+        async with aiohttp.ClientSession(connector=connector, timeout=timeout, headers=headers) as session:
 
             async def ask(sample: Sample) -> Numbers:
+                if id(sample) not in bodies:
+                    bodies[id(sample)] = _body(sample)
                 try:
-                    async with session.post(f"{url}/evaluate_batch", json=_in_json(sample)) as answer:
+                    async with session.post(f"{url}/evaluate_batch", data=bodies[id(sample)]) as answer:
                         if answer.status == 503:
                             raise RefusedError
                         answer.raise_for_status()
                         outputs = await answer.json()
                 except (aiohttp.ClientConnectionError, aiohttp.ClientPayloadError) as error:
-                    raise RefusedError from error
+                    raise BrokenOffError from error
                 progress, success = outputs["outputs_progress"]["progress_pred"], outputs["outputs_success"]
                 return np.array([*progress[0], *success["success_probs"][0]], np.float32)
 
@@ -151,8 +160,8 @@ def through_gateway(url: str) -> Connect:
     return connect
 
 
-def _in_json(sample: Sample) -> dict[str, Any]:
-    """The body that asks for it."""
+def _body(sample: Sample) -> bytes:
+    """Of the request that asks for it."""
     (only,) = sample.trajectories
     assert isinstance(sample, ProgressSample)
     assert sample.frame_steps in (0, FRAME_STEPS)
@@ -160,7 +169,7 @@ def _in_json(sample: Sample) -> dict[str, Any]:
     assert only.text_embedding is not None
     arrays = {"video_embeddings": only.video_embeddings.tolist(), "text_embedding": only.text_embedding.tolist()}
     samples = [{"sample_type": "progress", "trajectory": arrays}]
-    return {"samples": samples, "use_frame_steps": sample.frame_steps > 0}
+    return json.dumps({"samples": samples, "use_frame_steps": sample.frame_steps > 0}).encode()
 
 
 @dataclass
@@ -171,6 +180,7 @@ class Tally:
     asked: int = 0
     answered: int = 0
     wrong: int = 0
+    broken_off: int = 0
     lost: list[str] = field(default_factory=list)
     ended_s: array[float] = field(default_factory=lambda: array("d"))  # of answered calls, by time.perf_counter
     latencies_s: array[float] = field(default_factory=lambda: array("d"))
@@ -196,6 +206,9 @@ class Tally:
         except RefusedError:
             self.refusals_s.append(time.perf_counter() - started_s)
             return False
+        except BrokenOffError:
+            self.broken_off += 1
+            return False
         except Exception as error:  # noqa: BLE001  whatever it is, the call is lost
             self.lost.append(repr(error))
             return False
@@ -211,6 +224,7 @@ class Tally:
             self.asked + other.asked,
             self.answered + other.answered,
             self.wrong + other.wrong,
+            self.broken_off + other.broken_off,
             self.lost + other.lost,
             self.ended_s + other.ended_s,
             self.latencies_s + other.latencies_s,
@@ -268,11 +282,13 @@ class Callers:
         self._thread.join()
 
 
-def closed_loop(connect: Connect, exam: Exam, callers: int, seconds: float) -> Tally:
-    """What became of the calls of so many callers in so many seconds."""
+def closed_loop(connect: Connect, exam: Exam, callers: int, seconds: float) -> tuple[Tally, float]:
+    """What became of the calls of so many callers, and how many were answered a second."""
     with Callers(connect, exam, callers) as asking:
+        first, started_s = asking.tally.answered, time.perf_counter()
         time.sleep(seconds)
-    return asking.tally
+        rate_per_s = (asking.tally.answered - first) / (time.perf_counter() - started_s)
+    return asking.tally, rate_per_s
 
 
 async def open_loop(connect: Connect, exam: Exam, rate_per_s: float, seconds: float) -> tuple[Tally, float]:

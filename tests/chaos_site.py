@@ -25,12 +25,16 @@ KEY = "the-key-of-this-run"
 
 @dataclass
 class Row:
-    """What became of the calls of one scenario. recovery_s: to readiness; told: what else there is to say"""
+    """What became of the calls of one scenario.
+
+    broken_off: calls whose connection ended; recovery_s: to readiness; told: what else there is to say
+    """
 
     name: str
     asked: int = 0
     answered: int = 0
     refused: int = 0
+    broken_off: int = 0
     lost: int = 0
     wrong: int = 0
     recovery_s: float | None = None
@@ -38,12 +42,16 @@ class Row:
     broken: list[str] = field(default_factory=list)
 
     @classmethod
-    def of(cls, name: str, tally: Tally, recovery_s: float | None = None, told: str = "") -> Row:
-        """From what was counted. Every call must be accounted for, none lost, no answer wrong."""
-        row = cls(name, tally.asked, tally.answered, tally.refused, len(tally.lost), tally.wrong, recovery_s, told)
+    def of(
+        cls, name: str, tally: Tally, recovery_s: float | None = None, told: str = "", *, breaks_off: bool = False
+    ) -> Row:
+        """From what was counted. Every call must be accounted for, none lost or (unless told so) broken off or wrong."""
+        counts = tally.asked, tally.answered, tally.refused, tally.broken_off, len(tally.lost), tally.wrong
+        row = cls(name, *counts, recovery_s, told)
         row.expect(tally.lost == [], f"{row.lost} calls were lost, such as {tally.lost[:1]}")
+        row.expect(breaks_off or tally.broken_off == 0, f"{tally.broken_off} calls were broken off")
         row.expect(tally.wrong == 0, f"{tally.wrong} answers were wrong")
-        row.expect(tally.asked == tally.answered + tally.refused + len(tally.lost), "calls are not accounted for")
+        row.expect(tally.asked == sum(counts[1:-1]), "calls are not accounted for")
         return row
 
     def expect(self, is_so: bool, otherwise: str) -> None:
@@ -57,7 +65,7 @@ class Row:
         recovery = "-" if self.recovery_s is None else f"{self.recovery_s:.1f}"
         return [
             self.name,
-            *map(str, (self.asked, self.answered, self.refused, self.lost, self.wrong)),
+            *map(str, (self.asked, self.answered, self.refused, self.broken_off, self.lost, self.wrong)),
             recovery,
             self.told,
         ]
@@ -69,6 +77,7 @@ class Site:
 
     served: Serving
     gateway_url: str
+    checkpoint: Path
     repository: Path
     key_file: Path
     start_s: float
@@ -97,10 +106,10 @@ class Site:
 
 
 @contextmanager
-def site(folder: Path, **settings: int) -> Iterator[Site]:
-    """``rfm serve`` with a gateway, on the demo's checkpoint exported with these settings."""
+def site(folder: Path, checkpoint: Path = CHECKPOINT, **settings: int) -> Iterator[Site]:
+    """``rfm serve`` with a gateway, on a checkpoint exported with these settings."""
     repository, key_file = folder / "model_repository", folder / "key"
-    rfm_export.export(CHECKPOINT, repository, ServeConfig(num_gpus=0, torch_threads=1, **settings))
+    rfm_export.export(checkpoint, repository, ServeConfig(num_gpus=0, torch_threads=1, **settings))
     key_file.touch(0o600)
     key_file.write_text(KEY)
     port = Endpoints.free().http_port
@@ -108,7 +117,8 @@ def site(folder: Path, **settings: int) -> Iterator[Site]:
     with serving(repository, f"--gateway-port={port}", f"--admin-key-file={key_file}") as served:
         served.wait_ready()
         start_s = time.monotonic() - started_s
-        mixed, progress = (Exam.of(CHECKPOINT, samples) for samples in (mixed_samples(), progress_samples()))
-        found = Site(served, f"http://127.0.0.1:{port}", repository, key_file, start_s, mixed, progress)
+        mixed, progress = (Exam.of(checkpoint, samples) for samples in (mixed_samples(), progress_samples()))
+        url = f"http://127.0.0.1:{port}"
+        found = Site(served, url, checkpoint, repository, key_file, start_s, mixed, progress)
         found.wait_gateway()
         yield found

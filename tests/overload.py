@@ -5,14 +5,31 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import httpx
 import numpy as np
-from callers import Callers, Connect, Exam, closed_loop, direct, open_loop, through_gateway, trajectory
-from chaos_site import CHECKPOINT, Row, Site
+import torch
+from callers import (
+    MOST_FRAMES,
+    TEXT_DIM,
+    VIDEO_DIM,
+    Callers,
+    Connect,
+    Exam,
+    closed_loop,
+    direct,
+    open_loop,
+    through_gateway,
+    trajectory,
+)
+from chaos_site import Row, Site, site
 from prometheus_client.parser import text_string_to_metric_families
 
+from rfm.checkpoint import RewindCheckpoint, save
+from rfm.models.rewind import RewindConfig, RewindTransformer
 from rfm_client import ProgressSample, Sample
 from rfm_client.gateway.app import DEFAULT_MAX_IN_FLIGHT
 from rfm_client.gateway.scoring import FRAME_STEPS
@@ -27,35 +44,58 @@ CROWD = 200  # callers of the gateway at a time
 CROWD_S = 5.0
 TOLD_S = 0.1
 P99_FACTOR = 3
-FRAMES = 32  # each sample is 32 sequences: so much work that the caller beside it has little
+LARGE = RewindConfig(  # much work and few bytes: callers beside the server take little of the machine
+    video_feature_dim=VIDEO_DIM,
+    text_feature_dim=TEXT_DIM,
+    hidden_dim=512,
+    num_layers=4,
+    num_attention_heads=8,
+    max_len=MOST_FRAMES,
+    causal_mask=True,
+    use_per_frame_progress_token=True,
+    progress_bins=10,
+    has_similarity=True,
+)
+
+
+@contextmanager
+def large_site(folder: Path, **settings: int) -> Iterator[Site]:
+    """What is overloaded: a checkpoint of random weights."""
+    torch.manual_seed(0)
+    checkpoint = folder / "checkpoint"
+    save(RewindCheckpoint(LARGE, RewindTransformer(LARGE).state_dict()), checkpoint)
+    with site(folder, checkpoint, **settings) as served:
+        yield served
 
 
 def heavy_samples() -> list[Sample]:
-    """Of much work and few bytes."""
+    """As many sequences each as they have frames."""
     random = np.random.default_rng(2)
-    return [ProgressSample(trajectory(random, FRAMES), frame_steps=FRAME_STEPS) for _ in range(16)]
+    return [ProgressSample(trajectory(random, MOST_FRAMES), frame_steps=FRAME_STEPS) for _ in range(16)]
 
 
 def of_grpc(site: Site, seconds: float) -> list[Row]:
     """Triton's own queue turns away what it has no room for; and what the gateway says of that."""
     connect = direct(site.served.endpoints.grpc_url, retry=False, max_in_flight=4096)
-    row, _ = _overload("gRPC", connect, MAX_QUEUE_SIZE, lambda: _failures(site), seconds)
+    row, _ = _overload(site, "gRPC", connect, MAX_QUEUE_SIZE, lambda: _failures(site), seconds)
     return [row, _crowd(site)]
 
 
 def of_gateway(site: Site, seconds: float) -> list[Row]:
     """The gateway turns away what is more than it takes at a time, and counts it, whatever Triton does."""
     connect = through_gateway(site.gateway_url)
-    row, counted = _overload("the gateway", connect, DEFAULT_MAX_IN_FLIGHT, lambda: _rejections(site), seconds)
+    row, counted = _overload(site, "the gateway", connect, DEFAULT_MAX_IN_FLIGHT, lambda: _rejections(site), seconds)
     row.expect(counted == row.refused, f"the gateway counts {counted:.0f} refused calls")
     return [row]
 
 
-def _overload(door: str, connect: Connect, room: int, count: Callable[[], float], seconds: float) -> tuple[Row, float]:
+def _overload(
+    site: Site, door: str, connect: Connect, room: int, count: Callable[[], float], seconds: float
+) -> tuple[Row, float]:
     """FACTOR times what can be served, for so long; with how many more refusals are counted."""
-    exam = Exam.of(CHECKPOINT, heavy_samples())
-    unloaded_s = closed_loop(connect, exam, 1, CALIBRATION_S).p99_s
-    capacity_per_s = closed_loop(connect, exam, CALLERS, CALIBRATION_S).answered / CALIBRATION_S
+    exam = Exam.of(site.checkpoint, heavy_samples())
+    unloaded_s = closed_loop(connect, exam, 1, CALIBRATION_S)[0].p99_s
+    _, capacity_per_s = closed_loop(connect, exam, CALLERS, CALIBRATION_S)
     before = count()
     tally, latest_s = asyncio.run(open_loop(connect, exam, FACTOR * capacity_per_s, seconds))
     counted = count() - before

@@ -43,8 +43,8 @@ def soak(site: Site, minutes: float) -> int:
     """Prints the course and its slopes; 1 if a bound was broken."""
     gateway = through_gateway(site.gateway_url)
     rates = [
-        closed_loop(site.direct, site.mixed, CALLERS, CAPACITY_S).answered / CAPACITY_S / CALLERS,
-        closed_loop(gateway, site.progress, OF_GATEWAY, CAPACITY_S).answered / CAPACITY_S / OF_GATEWAY,
+        closed_loop(site.direct, site.mixed, CALLERS, CAPACITY_S)[1] / CALLERS,
+        closed_loop(gateway, site.progress, OF_GATEWAY, CAPACITY_S)[1] / OF_GATEWAY,
     ]
     halves_s = [2 / rate * 2 for rate in rates]  # both kinds share what can be served, and half of it is asked for
     course = Course()
@@ -79,7 +79,7 @@ def _report(course: Course, tally: Tally, minutes: float) -> int:
     memory, memory_error = course.slope(course.memory_mib)
     p99, p99_error = course.slope(course.p99_ms)
     rise, most = p99 * minutes, MOST_RISE * float(np.median(course.p99_ms))
-    lost, wrong = len(tally.lost), tally.wrong
+    lost, wrong = len(tally.lost) + tally.broken_off, tally.wrong
     print(f"asked {tally.asked}, answered {tally.answered}, refused {tally.refused}, lost {lost}, wrong {wrong}")
     print(f"memory: {memory:+.3f} ± {memory_error:.3f} MiB/min (allowed: {MOST_MIB_PER_MIN:.3f})")
     print(f"p99: {p99:+.3f} ± {p99_error:.3f} ms/min, {rise:+.1f} ms in all (flat: {most:.1f} ms, or chance)")
