@@ -6,7 +6,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed
 
-.PHONY: demo test check parity rollout bench bench-full perf chaos chaos-full soak format model_repository clean ops-check ops-tools audit
+.PHONY: demo test check parity rollout bench bench-full perf chaos chaos-full soak format model_repository clean \
+  ops-check ops-tools audit lock
 
 demo: $(INSTALLED)
 	$(BIN)/python examples/demo.py
@@ -86,11 +87,23 @@ audit: $(INSTALLED)
 	$(VENV)/audit/bin/pip install --quiet --disable-pip-version-check pip-audit
 	$(VENV)/audit/bin/pip-audit --strict --requirement constraints.txt --no-deps --disable-pip
 
+# Writes docker/requirements.txt: hashes of what the image installs, for constraints.txt as it is. Needs the network.
+lock:
+	$(PYTHON) -m venv $(VENV)/lock
+	$(VENV)/lock/bin/pip install --quiet --disable-pip-version-check uv
+	{ echo '# What the image installs beside torch, in the versions of constraints.txt, with the hashes of all files.'; \
+	  echo '# Made by: make lock'; \
+	  echo '# Not here: torch, whose build and so whose hash depends on TORCH_INDEX, and what only torch needs.'; \
+	  printf 'torch\nrfm-client\n' | $(VENV)/lock/bin/uv pip compile --quiet --no-python-downloads --no-header \
+	  --no-annotate --universal --python-version 3.10 --generate-hashes --constraints constraints.txt --excludes - \
+	  --extra gateway --extra encoders --extra vlm client/pyproject.toml pyproject.toml; } > $(VENV)/lock/requirements.txt
+	mv $(VENV)/lock/requirements.txt docker/requirements.txt
+
 format: $(INSTALLED)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Trains the demo's checkpoint anew and exports it as version 1. Takes half an hour.
+# Trains the demo's checkpoint anew and exports it as version 1. Takes a quarter of an hour.
 model_repository: $(INSTALLED)
 	rm -rf build/demo_checkpoint
 	$(BIN)/python examples/train_demo_checkpoint.py build/demo_checkpoint

@@ -1,7 +1,8 @@
 #!/bin/sh
 # SPDX-License-Identifier: MIT
-# Installs what serving needs, in the versions of constraints.txt, with the python3 in PATH. The image is built with it,
-# and a test runs it.
+# Installs what serving needs, in the versions of constraints.txt, with the python3 in PATH. What docker/requirements.txt
+# names must also have one of its hashes; torch's own would depend on TORCH_INDEX. The image is built with it, and a test
+# runs it.
 #
 #   install.sh wheels FOLDER                   builds this checkout's wheels, of the client and of the server
 #   install.sh torch ENVIRONMENT               makes the environment and puts PyTorch into it
@@ -41,9 +42,9 @@ install_torch() {
 }
 
 install_packages() { # by file: a wheel of this name on an index would not be ours
-    client=$(echo "$2"/rfm_client-*.whl)
-    server=$(echo "$2"/rfm_triton-*.whl)
-    install_into "$1" "${client}[gateway]" "${server}[encoders,vlm]"
+    # Anew what came with torch: of what is installed already pip compares no hash.
+    install_into "$1" --no-deps --require-hashes --force-reinstall --requirement "$root/docker/requirements.txt"
+    install_into "$1" --no-deps "$2"/rfm_client-*.whl "$2"/rfm_triton-*.whl
     python3 -m pip --python "$1/bin/python" check --disable-pip-version-check
 }
 

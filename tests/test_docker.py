@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import os
 import re
@@ -11,6 +12,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import venv
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,6 +26,7 @@ import pytest
 import yaml
 from conftest import serve_config
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 import rfm_export
@@ -36,7 +39,10 @@ DOCKERFILE = (DOCKER / "Dockerfile").read_text()
 COMPOSE = yaml.safe_load((DOCKER / "compose.yaml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 BIN = Path(sys.executable).parent
+LOCK = DOCKER / "requirements.txt"
 COPIED = re.compile(r"^COPY ([^-].*) (/source\S*)$", re.MULTILINE)
+MOUNTED = re.compile(r"--mount=type=bind,source=([^,\s]+),target=(/source[^,\s]+)")
+HASHES = re.compile(r"( --hash=sha256:[0-9a-f]{64})+")
 STEP = re.compile(r"/source/docker/install\.sh ([a-z]+ /.*)$", re.MULTILINE)
 VARIABLE = re.compile(r"\$\{(\w+):-(.*?)\}")
 OURS = {"rfm-client", "rfm-triton"}
@@ -85,20 +91,26 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> Image:
     for sources, target in COPIED.findall(DOCKERFILE):
         for source in sources.split():
             copy(ROOT / source, root / target.lstrip("/"))
+    for source, target in MOUNTED.findall(DOCKERFILE):
+        copy(ROOT / source, (root / target.lstrip("/")).parent)
     steps = STEP.findall(DOCKERFILE)
     assert [step.split()[0] for step in steps] == ["wheels", "torch", "packages"]
     for step in steps:
         words = [root / word.lstrip("/") if word.startswith("/") else word for word in step.split()]
-        done = subprocess.run(
-            ["sh", root / "source" / "docker" / "install.sh", *words],
-            env={**environment_of_pip(), "PATH": f"{BIN}:{SYSTEM_PATH}"},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        done = install(root / "source", *words)
         assert done.returncode == 0, done.stderr
     path = f"{root / 'opt/rfm/bin'}:{triton_in(root)}:{SYSTEM_PATH}"
     return Image(root, {"PATH": path, "HOME": str(root), "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1"})
+
+
+def install(source: Path, *words: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["sh", source / "docker" / "install.sh", *words],
+        env={**environment_of_pip(), "PATH": f"{BIN}:{SYSTEM_PATH}"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 def copy(source: Path, target: Path) -> None:
@@ -127,6 +139,44 @@ def triton_in(root: Path) -> Path:
     program.write_text(f'#!/bin/sh\n{shlex.join(words)} "$@"\n')
     program.chmod(0o755)
     return program.parent
+
+
+def entries(file: Path) -> dict[str, str]:
+    """Each requirement in a file, with the options after it, which pip lets stand on lines of their own."""
+    lines = re.sub(r" *\\\n *", " ", file.read_text()).splitlines()
+    parts = [line.partition(" --") for line in lines if not line.startswith("#")]
+    return {requirement: space + options for requirement, space, options in parts}
+
+
+def pins(file: Path, python: str | None = None) -> dict[str, SpecifierSet]:
+    """The versions in a file, for a Python as 3.12, or for this one."""
+    environment = {"python_version": python, "python_full_version": f"{python}.0"} if python else None
+    requirements = [Requirement(entry) for entry in entries(file)]
+    return {
+        canonicalize_name(pin.name): pin.specifier
+        for pin in requirements
+        if pin.marker is None or pin.marker.evaluate(environment)
+    }
+
+
+def needed(*roots: str, without: str) -> set[str]:
+    """The packages that what is installed here says it needs, their extras too, but what only ``without`` needs."""
+    found: set[tuple[str, str]] = set()
+    waiting = [Requirement(root) for root in roots]
+    while waiting:
+        requirement = waiting.pop()
+        name = canonicalize_name(requirement.name)
+        new = {(name, extra) for extra in {"", *requirement.extras}} - found
+        if name == without or not new:
+            continue
+        found |= new
+        further = [Requirement(text) for text in importlib.metadata.requires(name) or []]
+        waiting += [
+            need
+            for need in further
+            if need.marker is None or any(need.marker.evaluate({"extra": extra}) for _, extra in new)
+        ]
+    return {name for name, _ in found}
 
 
 def compose_words(profile: str) -> list[str]:
@@ -166,8 +216,44 @@ def test_the_dockerfile_is_clean() -> None:
 
 def test_the_context_is_what_the_dockerfile_copies() -> None:
     copied = re.findall(r"^COPY (?:--chmod=\d+ )?([^-].*) /\S+$", DOCKERFILE, re.MULTILINE)
+    used = {source for sources in copied for source in sources.split()}
+    used |= {source for source, _ in MOUNTED.findall(DOCKERFILE)}
     allowed = re.findall(r"^!(.+)$", (ROOT / ".dockerignore").read_text(), re.MULTILINE)
-    assert sorted({source for sources in copied for source in sources.split()}) == sorted(allowed)
+    assert sorted(used) == sorted(allowed)
+
+
+@pytest.mark.parametrize("python", ["3.10", "3.11", "3.12"])
+def test_the_lock_has_the_versions_of_the_constraints(python: str) -> None:
+    locked, constrained = pins(LOCK, python), pins(ROOT / "constraints.txt", python)
+    assert locked == {name: constrained.get(name) for name in locked}, "make lock"
+
+
+def test_the_lock_names_all_that_the_image_needs_beside_torch() -> None:
+    roots = ("rfm-client[gateway]", "rfm-triton[encoders,vlm]")
+    assert set(pins(LOCK)) == needed(*roots, without="torch") - OURS, "make .venv/installed lock"
+
+
+def test_the_lock_has_hashes_of_all_and_no_address() -> None:
+    assert [entry for entry, options in entries(LOCK).items() if not HASHES.fullmatch(options)] == []
+    assert "://" not in LOCK.read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [(f" --hash=sha256:{'0' * 64}", "DO NOT MATCH THE HASHES"), ("", "Hashes are required in --require-hashes mode")],
+    ids=["another", "none"],
+)
+def test_a_package_without_its_hash_is_not_installed(tmp_path: Path, options: str, message: str) -> None:
+    for name in ("constraints.txt", "docker/install.sh"):
+        copy(ROOT / name, (tmp_path / name).parent)
+    requirement = next(iter(entries(LOCK)))
+    (tmp_path / "docker" / LOCK.name).write_text(f"{requirement}{options}\n")
+    environment = tmp_path / "environment"
+    venv.create(environment)
+    done = install(tmp_path, "packages", environment, tmp_path)
+    assert done.returncode == 1
+    assert message in done.stderr
+    assert list(environment.glob("lib/python*/site-packages/*")) == []
 
 
 def test_the_image_holds_what_serving_needs_in_locked_versions_and_nothing_else(image: Image) -> None:
@@ -177,10 +263,7 @@ def test_the_image_holds_what_serving_needs_in_locked_versions_and_nothing_else(
         "import importlib.metadata as m, json; print(json.dumps({d.name: d.version for d in m.distributions()}))",
     )
     installed = {canonicalize_name(name): version for name, version in json.loads(listed.stdout).items()}
-    locked = [Requirement(line) for line in (ROOT / "constraints.txt").read_text().splitlines() if line[:1] not in "#"]
-    versions = {
-        canonicalize_name(pin.name): pin.specifier for pin in locked if pin.marker is None or pin.marker.evaluate()
-    }
+    versions = pins(ROOT / "constraints.txt")
     assert set(installed) >= OURS
     assert not NOT_FOR_SERVING & set(installed)
     for name, version in installed.items():
