@@ -140,7 +140,7 @@ def serve(
                 endpoints.grpc_url if endpoints.grpc_tls is None else endpoints.http_url,  # it needs no certificate
                 endpoints.metrics_url,
                 settings.name,
-                settings.host,
+                endpoints.http_host,  # it has no TLS either
                 settings.gateway_port,
             )
         server = TritonServer(

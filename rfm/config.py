@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import re
 import types
 import typing
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rfm.plain_yaml import read_yaml
+from rfm_client.access import is_loopback as is_loopback
 
 if TYPE_CHECKING:
     import torch
@@ -154,14 +154,6 @@ class ServeConfig:
     def is_loopback(self) -> bool:
         """Whether only this machine can reach it."""
         return is_loopback(self.host)
-
-
-def is_loopback(host: str) -> bool:
-    """Whether an address is of this machine alone; a name is not."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def _at_least(least: int, config: ServeConfig, *keys: str) -> None:

@@ -42,6 +42,7 @@ TOLERANCE = 1e-5
 KEY = "a-key-that-only-tests-know"
 TRITON_GATE = "triton-grpc-protocol-gate"  # gRPC metadata that Triton was told to ask for
 GATED = "inference,health,metadata,model-config,statistics"
+PUBLIC_HOST = "127.0.0.2"  # stands for an address that others reach
 AT_ONCE_S = 20.0  # far less than the client would retry
 
 
@@ -70,11 +71,11 @@ def papers(tmp_path_factory: pytest.TempPathFactory) -> Papers:
     authority = trustme.CA()
     authority.cert_pem.write_to_path(made.ca)
     trustme.CA().cert_pem.write_to_path(made.other_ca)
-    for identity, certificate, key in (
-        ("127.0.0.1", made.certificate, made.key),
-        ("client", made.client_certificate, made.client_key),
+    for identities, certificate, key in (
+        (("127.0.0.1", PUBLIC_HOST), made.certificate, made.key),
+        (("client",), made.client_certificate, made.client_key),
     ):
-        issued = authority.issue_cert(identity)
+        issued = authority.issue_cert(*identities)
         issued.private_key_pem.write_to_path(key)
         for number, part in enumerate(issued.cert_chain_pems):
             part.write_to_path(certificate, append=number > 0)
@@ -120,10 +121,20 @@ def secure(repository: Path, papers: Papers, tmp_path_factory: pytest.TempPathFa
 
 
 @pytest.fixture(scope="module")
-def mutual(repository: Path, papers: Papers, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Endpoints]:
+def gateway_port() -> int:
+    """Of the gateway beside ``mutual``."""
+    return Endpoints.free().http_port
+
+
+@pytest.fixture(scope="module")
+def mutual(
+    repository: Path, papers: Papers, gateway_port: int, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Endpoints]:
     """``rfm serve`` with TLS and certificates of clients, and a gateway beside."""
-    endpoints = replace(Endpoints.free(), grpc_tls=GrpcTls(papers.certificate, papers.key, papers.ca))
+    tls = GrpcTls(papers.certificate, papers.key, papers.ca)
+    endpoints = replace(Endpoints.free(), host=PUBLIC_HOST, grpc_tls=tls)
     words = ["--grpc-certificate", papers.certificate, "--grpc-key", papers.key, "--grpc-client-ca", papers.ca]
+    words += ["--host", PUBLIC_HOST, "--gateway-port", str(gateway_port)]
     log = tmp_path_factory.mktemp("mutual") / "log"
     with log.open("wb") as output:
         process = subprocess.Popen([*command(repository, endpoints), *words], stdout=output, stderr=output)
@@ -209,6 +220,14 @@ def test_http_beside_tls_listens_on_loopback_alone(papers: Papers) -> None:
     arguments = TritonServer(REPOSITORY, endpoints, find_installation())._arguments(["rfm"])
     assert {"--http-address=127.0.0.1", "--grpc-address=10.0.0.1", "--grpc-use-ssl=true"} <= set(arguments)
     assert endpoints.http_url == "http://127.0.0.1:8000"
+
+
+def test_the_gateway_beside_tls_listens_on_loopback_alone(mutual: Endpoints, gateway_port: int) -> None:
+    """Else whoever has no certificate would be served by it, in the clear."""
+    with httpx.Client(transport=httpx.HTTPTransport(retries=10)) as caller:  # it starts after Triton
+        assert caller.get(f"http://127.0.0.1:{gateway_port}/health", timeout=AT_ONCE_S).json()["status"] == "healthy"
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection((PUBLIC_HOST, gateway_port), AT_ONCE_S)
 
 
 def test_tls_on_one_side_alone_gives_no_connection(mutual: Endpoints, papers: Papers) -> None:
@@ -519,6 +538,7 @@ def test_an_older_triton_that_listens_elsewhere_is_stopped(repository: Path, tmp
     [
         ("127.0.0.1", "2.51.0", False, True),
         ("127.0.0.2", "2.51.0", False, True),
+        ("localhost", "2.51.0", False, True),
         ("10.0.0.1", "2.51.0", True, True),
         ("10.0.0.1", "2.51.0", False, False),
         ("127.evil.example", "2.51.0", False, False),

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import re
 import ssl
 from collections.abc import Mapping
@@ -23,6 +24,14 @@ _NO_TRUST = re.compile(  # how gRPC tells why TLS did not come about, and Triton
 )
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*")
 _VALUE = re.compile("[!-~]([ -~]*[!-~])?")  # visible ASCII; blanks inside
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address is of this machine alone; of names only ``localhost`` is."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 class AccessOptions(TypedDict, total=False):

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import logging
 import os
 import sys
@@ -12,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rfm_client.access import Access, check_certificate
+from rfm_client.access import Access, check_certificate, is_loopback
 
 API_KEY_VARIABLE = "RFM_GATEWAY_API_KEY"
 KEEP_ALIVE_S = 30
@@ -82,7 +81,7 @@ def gateway(
         app = create_app(settings)
     except (ValueError, OSError) as error:
         raise typer.BadParameter(str(error)) from None
-    if api_key is None and not _is_loopback(host):
+    if api_key is None and not is_loopback(host):
         logger.warning("%s is no loopback address, and no key is asked for: whoever reaches it may use it", host)
     uvicorn.run(
         app,
@@ -121,10 +120,3 @@ def _key(file: Path | None) -> str | None:
     if key is not None and not key.strip():
         raise typer.BadParameter("key: expected at least one character, got none")
     return None if key is None else key.strip()
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
