@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -25,7 +25,6 @@ from rfm.models.encoders import Encoders
 from rfm_client import (
     BatchTiming,
     FrameScores,
-    InferenceFailedError,
     InvalidSampleError,
     PreferenceResult,
     PreferenceSample,
@@ -40,8 +39,6 @@ from rfm_client import (
 Outcome: TypeAlias = Result | RewardError
 
 PROCESSOR_FOLDER = "processor"  # in an exported vision-language checkpoint: its tokenizer and image preprocessing
-
-_log = logging.getLogger(__name__)
 
 
 class Engine:
@@ -118,20 +115,21 @@ class Engine:
         """
         started_s = time.perf_counter()
         execution = execution or Execution()
+        before = replace(execution)
         outcomes: dict[int, Outcome] = {}
         rows: list[Any] = []
         rows_of: dict[int, slice] = {}
-        for index, sample_rows in enumerate(self.family.rows(samples)):
+        for index, sample_rows in enumerate(self.family.rows(samples, execution)):
             error = sample_rows if isinstance(sample_rows, RewardError) else self._over_budget(sample_rows)
             if isinstance(sample_rows, RewardError) or error is not None:
                 outcomes[index] = error  # type: ignore[assignment]
                 continue
             rows_of[index] = slice(len(rows), len(rows) + len(sample_rows))
             rows += sample_rows
-        scores, forward_s = self._scores(rows, execution)
+        scores = self._scores(rows, execution)
+        forward_s = execution.forward_s - before.forward_s  # of encoders, too
         collate_s = time.perf_counter() - started_s - forward_s
-        execution.collate_s += collate_s
-        execution.forward_s += forward_s
+        execution.collate_s = before.collate_s + collate_s
         timing = BatchTiming(collate_s * 1e3, forward_s * 1e3)
         for index, of_sample in rows_of.items():
             outcomes[index] = _outcome(samples[index], scores[of_sample], timing)
@@ -144,15 +142,14 @@ class Engine:
         expected = f"at most {self.token_budget} tokens (token_budget of this server)"
         return InvalidSampleError.at("num_frames", expected, f"{longest} tokens")
 
-    def _scores(self, rows: Sequence[Any], execution: Execution) -> tuple[list[RowScores | RewardError], float]:
-        """Each row's scores, and the seconds spent in forward passes. The next batch is collated meanwhile."""
+    def _scores(self, rows: Sequence[Any], execution: Execution) -> list[RowScores | RewardError]:
+        """Each row's scores. While a batch is in its forward pass the next is collated."""
         scores: dict[int, RowScores | RewardError] = {}
-        forward_s = 0.0
         for part, batch in self._collated(rows, list(self._micro_batches(rows))):
             started_s = time.perf_counter()
             scores.update(zip(part, self._score([rows[i] for i in part], batch, execution), strict=True))
-            forward_s += time.perf_counter() - started_s
-        return [scores[index] for index in range(len(rows))], forward_s
+            execution.forward_s += time.perf_counter() - started_s
+        return [scores[index] for index in range(len(rows))]
 
     def _collated(self, rows: Sequence[Any], parts: Sequence[list[int]]) -> Iterator[tuple[list[int], Any]]:
         """Each part with its batch. While one is scored the next is collated, in a thread; the first needs none."""
@@ -167,21 +164,15 @@ class Engine:
                 batch = coming.result() if coming is not None else None
 
     def _score(self, rows: Sequence[Any], batch: Any, execution: Execution) -> Sequence[RowScores | RewardError]:
-        """One forward; out of memory, its halves; a row that does not fit alone is an error of its own."""
-        try:
-            scores = self.family.score(rows, batch)
-            execution.add_forward(*self.family.occupancy(batch))
+        """Of one forward pass. batch: of all rows"""
+
+        def forward(part: Sequence[Any]) -> Sequence[RowScores | RewardError]:
+            of_part = batch if part is rows else self.family.collate(part)
+            scores = self.family.score(part, of_part)
+            execution.add_tokens(*self.family.occupancy(of_part))
             return scores
-        except torch.OutOfMemoryError:
-            execution.out_of_memory_count += 1
-            _log.warning("out of memory with %d rows", len(rows))
-        if torch.cuda.is_available():
-            torch.cuda.empty_cache()
-        if len(rows) == 1:
-            return [InferenceFailedError("the sample does not fit in the device's memory")]
-        half = len(rows) // 2
-        halves = (rows[:half], rows[half:])
-        return [s for part in halves for s in self._score(part, self.family.collate(part), execution)]
+
+        return execution.run(forward, rows)
 
     def _micro_batches(self, rows: Sequence[Any]) -> Iterator[list[int]]:
         """Indices of the rows of each forward: one kind, similar lengths, within the token budget."""

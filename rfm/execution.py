@@ -3,7 +3,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import torch
+
+from rfm_client import InferenceFailedError
+
+Output = TypeVar("Output")
+
+_log = logging.getLogger(__name__)
+
+
+def _nothing() -> None:
+    pass
 
 
 @dataclass
@@ -14,6 +29,7 @@ class Execution:
     forward_s: seconds in forward passes, with what it takes to read their results
     num_tokens, num_slots: tokens of the rows that were scored, and of the forward passes, padding included
     out_of_memory_count: forward passes that did not fit in memory; their halves were tried again
+    on_forward: called after each forward pass, one that did not fit included
     """
 
     collate_s: float = 0.0
@@ -21,9 +37,28 @@ class Execution:
     num_tokens: int = 0
     num_slots: int = 0
     out_of_memory_count: int = 0
+    on_forward: Callable[[], None] = field(default=_nothing, compare=False, repr=False)
 
-    def add_forward(self, num_tokens: int, num_slots: int) -> None:
-        """Counts the tokens of one more forward pass."""
+    def run(self, forward: Callable[[Any], Sequence[Output]], rows: Any) -> list[Output | InferenceFailedError]:
+        """What a forward pass gives for each of ``rows``: a sequence, or a tensor of them.
+
+        Out of memory, its halves are tried; a row that does not fit alone is an error of its own.
+        """
+        try:
+            return list(forward(rows))
+        except torch.OutOfMemoryError:
+            self.out_of_memory_count += 1
+            _log.warning("out of memory with %d rows", len(rows))
+        finally:
+            self.on_forward()
+        torch.cuda.empty_cache()  # nothing where there is no GPU
+        if len(rows) == 1:
+            return [InferenceFailedError("the sample does not fit in the device's memory")]
+        half = len(rows) // 2
+        return [*self.run(forward, rows[:half]), *self.run(forward, rows[half:])]
+
+    def add_tokens(self, num_tokens: int, num_slots: int) -> None:
+        """Counts those of one more forward pass."""
         self.num_tokens += num_tokens
         self.num_slots += num_slots
 

@@ -10,6 +10,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 from torch import Tensor
 
+from rfm.execution import Execution
 from rfm.models.heads import progress_from_logits
 from rfm_client import FrameScores, InferenceFailedError, RewardError, Sample
 
@@ -48,8 +49,11 @@ def checked(rows: Sequence[RowScores], batch: RowScores | None = None) -> list[R
 class Family(Protocol[Row, Batch]):
     """A network on a device, and how samples become its batches. A row is one token sequence of a forward."""
 
-    def rows(self, samples: Sequence[Sample]) -> list[list[Row] | RewardError]:
-        """Each sample's rows (in dense mode one a frame), or why this checkpoint cannot score it."""
+    def rows(self, samples: Sequence[Sample], execution: Execution) -> list[list[Row] | RewardError]:
+        """Each sample's rows (in dense mode one a frame), or why this checkpoint cannot score it.
+
+        execution: what forward passes for it took is added to it
+        """
 
     def lengths(self, row: Row) -> tuple[int, ...]:
         """What decides which rows share a batch: similar lengths do. Rows of unlike counts share none."""

@@ -3,17 +3,30 @@ from __future__ import annotations
 
 import json
 import shutil
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import goldens
 import numpy as np
 import pytest
 import torch
-from conftest import rewind_of
+from conftest import load_engine, rewind_of
 from safetensors.torch import load_file, save_file
+from torch import Tensor
 
+from rfm.execution import Execution
 from rfm.models.encoders import PREPROCESSOR_CONFIG, Encoders, ImagePreprocessor
-from rfm_client import InvalidSampleError, RewardError, Trajectory
+from rfm_client import (
+    BatchTiming,
+    InferenceFailedError,
+    InvalidSampleError,
+    ProgressResult,
+    ProgressSample,
+    RewardError,
+    Trajectory,
+)
 
 NAME = "enc_c1_t1_disc10"
 # The original's embeddings, of images and of texts.
@@ -84,6 +97,85 @@ def test_a_task_that_is_too_long_fails_alone(encoders: Encoders) -> None:
     assert str(failed).startswith("task: expected at most 32 tokens (limit of the text encoder), got ")
     assert not isinstance(first, RewardError)
     assert not isinstance(last, RewardError)
+
+
+def film(seed: int, num_frames: int, task: str = "lift the cup") -> Trajectory:
+    return Trajectory(frames=np.random.default_rng(seed).integers(0, 256, (num_frames, 40, 40, 3), np.uint8), task=task)
+
+
+def refuse(model: torch.nn.Module, is_too_large: Callable[[Tensor], bool], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The CPU has no memory of a device that could run out: the model refuses what it is given in its place."""
+    forward = model.forward
+
+    def refusing(*arguments: Tensor, **named: Tensor) -> Any:
+        if is_too_large(next(iter((*arguments, *named.values())))):
+            raise torch.OutOfMemoryError("made up")
+        return forward(*arguments, **named)
+
+    monkeypatch.setattr(model, "forward", refusing)
+
+
+def test_out_of_memory_halves_images_and_tasks_and_is_counted(
+    encoders: Encoders, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    films = [film(0, 3), film(1, 2, "push the red button"), film(2, 70)]
+    expected = encoders.encode(films)
+    refuse(encoders.image_model, lambda images: len(images) > 20, monkeypatch)
+    refuse(encoders.text_model, lambda tokens: len(tokens) > 1, monkeypatch)
+    execution, passes = Execution(), []
+    execution.on_forward = lambda: passes.append(None)
+    for encoded, other in zip(encoders.encode(films, execution), expected, strict=True):
+        assert isinstance(encoded, Trajectory)
+        assert isinstance(other, Trajectory)
+        np.testing.assert_allclose(encoded.positions, other.positions, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(encoded.text_embedding, other.text_embedding, rtol=0, atol=1e-5)
+    assert execution.out_of_memory_count == 3 + 2  # images: 64 and its halves; tasks: all three and the last two
+    assert len(passes) == 3 + 2 + (1 + 4 + 1) + 3  # ... and what fitted: 5, four times 16 and 6 images; each task
+
+
+def test_a_film_that_does_not_fit_in_memory_fails_alone(encoders: Encoders, monkeypatch: pytest.MonkeyPatch) -> None:
+    white = Trajectory(frames=np.full((3, 40, 40, 3), 255, np.uint8), task="lift the cup")
+    white_pixel = encoders.preprocessor(torch.full((1, 40, 40, 3), 255, dtype=torch.uint8))[0, 0].max()
+    refuse(encoders.image_model, lambda images: bool((images[:, 0].amin(dim=(1, 2)) == white_pixel).any()), monkeypatch)
+    first, failed, last = encoders.encode([film(0, 3), white, film(0, 3)])
+    assert isinstance(failed, InferenceFailedError)
+    assert str(failed) == "the sample does not fit in the device's memory"
+    assert isinstance(first, Trajectory)
+    assert isinstance(last, Trajectory)
+    np.testing.assert_allclose(first.positions, last.positions, rtol=0, atol=1e-5)
+
+
+def test_a_task_that_does_not_fit_in_memory_fails_alone(encoders: Encoders, monkeypatch: pytest.MonkeyPatch) -> None:
+    refuse(encoders.text_model, lambda tokens: tokens.shape[1] > 10, monkeypatch)
+    first, failed, last = encoders.encode([film(0, 2), film(1, 2, "lift the cup " * 5), film(2, 2)])
+    assert isinstance(failed, InferenceFailedError)
+    assert isinstance(first, Trajectory)
+    assert isinstance(last, Trajectory)
+
+
+def test_what_the_encoders_take_is_forward_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock that says that each of their forward passes takes an hour."""
+    engine = load_engine(NAME)
+    encoders = rewind_of(NAME).encoders
+    assert encoders is not None
+    hours = [0]
+    seconds = time.perf_counter
+    monkeypatch.setattr(time, "perf_counter", lambda: seconds() + 3600 * hours[0])
+    for model in (encoders.image_model, encoders.text_model):
+
+        def passing(*arguments: Any, forward: Any = model.forward, **named: Any) -> Any:
+            hours[0] += 1
+            return forward(*arguments, **named)
+
+        monkeypatch.setattr(model, "forward", passing)
+    execution = Execution()
+    (result,) = engine.evaluate([ProgressSample(film(0, 3))], execution)
+    assert isinstance(result, ProgressResult)
+    assert result.timing is not None
+    assert hours == [2]
+    assert execution.forward_s == pytest.approx(2 * 3600, abs=60)
+    assert execution.collate_s < 60
+    assert result.timing == BatchTiming(execution.collate_s * 1e3, execution.forward_s * 1e3)
 
 
 def test_special_tokens_in_a_task_are_text(encoders: Encoders) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from conftest import random_trajectory
 
 from rfm.engine import Engine
+from rfm.execution import Execution
 from rfm.family import RowScores
 from rfm_client import FrameScores, ProgressResult, ProgressSample, RewardError, Sample
 
@@ -24,7 +25,7 @@ class Pipelined:
         self.collated = [threading.Event() for _ in range(batches)]
         self.scored = 0
 
-    def rows(self, samples: Sequence[Sample]) -> list[list[int] | RewardError]:
+    def rows(self, samples: Sequence[Sample], execution: Execution) -> list[list[int] | RewardError]:
         return [[index] for index in range(len(samples))]
 
     def lengths(self, row: int) -> tuple[int, ...]:
@@ -50,7 +51,9 @@ class Pipelined:
 def test_the_next_batch_is_collated_while_the_current_one_runs() -> None:
     family = Pipelined(batches=4)
     samples = [ProgressSample(random_trajectory(0, 1))] * 4
-    outcomes = Engine(family, token_budget=1).evaluate(samples)
-    assert family.scored == 4
+    passes: list[int] = []
+    execution = Execution(on_forward=lambda: passes.append(family.scored))
+    outcomes = Engine(family, token_budget=1).evaluate(samples, execution)
+    assert passes == [1, 2, 3, 4]
     results = [outcome for outcome in outcomes if isinstance(outcome, ProgressResult)]
     assert [result.progress[0] for result in results] == [0, 1, 2, 3]

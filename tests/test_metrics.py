@@ -325,15 +325,19 @@ def test_raw_frames_are_counted_where_they_are_encoded_and_where_they_are_scored
 
 def test_health_probes_and_warm_up_are_not_counted(running: Running) -> None:
     before = running.scrape()
+    blank = Trajectory(
+        video_embeddings=np.zeros((2, WIDTHS[0]), np.float32), text_embedding=np.zeros(WIDTHS[1], np.float32)
+    )
+    blank_film = Trajectory(frames=np.zeros((2, 64, 64, 3), np.uint8), task="canary")
     with running.client() as client:
         for _ in range(3):
-            client.progress(trajectory(0, 3), request_id=wire.CANARY_PREFIX)
-            client.encode(film(), request_id=f"{wire.CANARY_PREFIX}-probe")
+            client.progress(blank, request_id=wire.CANARY_PREFIX)
+            client.encode(blank_film, request_id=f"{wire.CANARY_PREFIX}-probe")
         with pytest.raises(InvalidSampleError):
-            client.evaluate([too_long()], request_id=wire.CANARY_PREFIX)
+            client.evaluate([too_long()], request_id=wire.CANARY_PREFIX)  # no probe asks that
         ask_raw(running, sample_type=0, count=2)  # without an id, as warm-up; but that is over
         client.encode(film())
-    running.after(MODEL, {"progress scored": 2}, before)
+    running.after(MODEL, {"progress scored": 2, "progress refused": 1}, before)
     after = running.after(f"{MODEL}_encoder", {"encode scored": 1}, before)
     for name, change in {"batch_samples": 1, "forward_seconds": 1, "collate_seconds": 1}.items():
         counts = [scraped.value(f"rfm_{name}_count", model=MODEL) for scraped in (before, after)]

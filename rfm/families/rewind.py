@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from rfm.collate.rewind import RewindCollator, Row
+from rfm.execution import Execution
 from rfm.family import RowScores, checked, frame_scores, part_of
 from rfm.models.encoders import Encoders
 from rfm.models.rewind import RewindBatch, RewindTransformer
@@ -36,10 +37,10 @@ class RewindFamily:
         self.dtype = dtype
         self.collator = RewindCollator(network.config)
 
-    def rows(self, samples: Sequence[Sample]) -> list[list[Row] | RewardError]:
+    def rows(self, samples: Sequence[Sample], execution: Execution) -> list[list[Row] | RewardError]:
         """Each sample's rows, or its error; the frames of all samples are encoded together."""
         outcomes: list[list[Row] | RewardError] = []
-        for sample in self._embedded(samples):
+        for sample in self._embedded(samples, execution):
             try:
                 outcomes.append(sample if isinstance(sample, RewardError) else self.collator.rows(sample))
             except InvalidSampleError as error:
@@ -82,7 +83,7 @@ class RewindFamily:
             start = end
         return checked(scored, RowScores([frames], sum(logits)))
 
-    def _embedded(self, samples: Sequence[Sample]) -> list[Sample | RewardError]:
+    def _embedded(self, samples: Sequence[Sample], execution: Execution) -> list[Sample | RewardError]:
         """The samples with embeddings in place of raw frames."""
         embedded: list[Sample | RewardError] = list(samples)
         raw = {i: _joined(sample) for i, sample in enumerate(samples) if sample.trajectories[0].frames is not None}
@@ -90,7 +91,7 @@ class RewindFamily:
             missing = InvalidSampleError.at("frames", "video_embeddings (no encoders are loaded)", "frames")
             return [missing if index in raw else sample for index, sample in enumerate(samples)]
         if raw and self.encoders is not None:
-            for index, encoded in zip(raw, self.encoders.encode(list(raw.values())), strict=True):
+            for index, encoded in zip(raw, self.encoders.encode(list(raw.values()), execution), strict=True):
                 if isinstance(encoded, Trajectory):
                     embedded[index] = _with_embeddings(samples[index], encoded)
                 else:

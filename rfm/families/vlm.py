@@ -15,6 +15,7 @@ from rfm.checkpoint.content import read_json
 from rfm.collate.images import FRAMES_PER_GROUP, Normalisation, QwenImages, SmolImages
 from rfm.collate.prompts import SPECIAL_TOKENS
 from rfm.collate.vlm import QwenCollator, SmolCollator, VlmCollator, VlmRow
+from rfm.execution import Execution
 from rfm.family import RowScores, checked, frame_scores, part_of
 from rfm.models.linear import speed_up
 from rfm.models.vlm import SMOL, VlmBatch, VlmConfig
@@ -43,8 +44,8 @@ class VlmFamily:
         collator = load_collator(checkpoint, processor)
         return cls(checkpoint.build(dtype), collator, device)
 
-    def rows(self, samples: Sequence[Sample]) -> list[list[VlmRow] | RewardError]:
-        """Each sample's conversations, or its error."""
+    def rows(self, samples: Sequence[Sample], execution: Execution) -> list[list[VlmRow] | RewardError]:
+        """Each sample's conversations, or its error; that takes no forward pass."""
         outcomes: list[list[VlmRow] | RewardError] = []
         for sample in samples:
             try:

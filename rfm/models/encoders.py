@@ -12,6 +12,7 @@ import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -209,28 +210,37 @@ class Encoders:
         return [outcomes[index] for index in range(len(trajectories))]
 
     @torch.inference_mode()
-    def encode_frames(self, videos: Sequence[UInt8Array], execution: Execution | None = None) -> list[Float32Array]:
-        """uint8 [T, H, W, 3] of any T, H, W each -> float32 [T, Dv] each."""
+    def encode_frames(
+        self, videos: Sequence[UInt8Array], execution: Execution | None = None
+    ) -> list[Float32Array | InferenceFailedError]:
+        """uint8 [T, H, W, 3] of any T, H, W each -> float32 [T, Dv] each, or why there is none."""
         execution = execution or Execution()
-        embeddings = []
-        for batch in self._crop_batches(videos, execution):
-            output = self.image_model(pixel_values=batch)
-            embeddings.append(output.pooler_output)
+
+        def forward(crops: Tensor) -> list[Tensor]:
+            output = self.image_model(pixel_values=crops.to(self.image_model.device))
             num_tokens = output.last_hidden_state.shape[:2].numel()
-            execution.add_forward(num_tokens, num_tokens)
-        lengths = [len(video) for video in videos]
-        return [part.float().cpu().numpy() for part in torch.cat(embeddings).split(lengths)]
+            execution.add_tokens(num_tokens, num_tokens)
+            return list(output.pooler_output.clone())  # as a view it would keep the states of all tokens
+
+        batches = self._crop_batches(videos, execution)
+        images = iter([image for crops in batches for image in execution.run(forward, crops)])
+        return [_of_video(list(islice(images, len(video)))) for video in videos]
 
     @torch.inference_mode()
-    def encode_tasks(self, tasks: Sequence[str], execution: Execution | None = None) -> Float32Array:
-        """float32 [B, Dt] of B tasks."""
-        tokens = self._tokenize(list(tasks), padding=True, return_tensors="pt")
-        if execution is not None:
-            execution.add_forward(int(tokens["attention_mask"].sum()), tokens["attention_mask"].numel())
-        tokens = tokens.to(self.text_model.device)
-        hidden = self.text_model(**tokens).last_hidden_state
-        mask = tokens["attention_mask"].unsqueeze(-1).to(hidden.dtype)
-        return ((hidden * mask).sum(dim=1) / mask.sum(dim=1)).float().cpu().numpy()
+    def encode_tasks(
+        self, tasks: Sequence[str], execution: Execution | None = None
+    ) -> list[Float32Array | InferenceFailedError]:
+        """float32 [Dt] of each task, or why there is none."""
+        execution = execution or Execution()
+
+        def forward(part: list[str]) -> list[Float32Array]:
+            tokens = self._tokenize(part, padding=True, return_tensors="pt").to(self.text_model.device)
+            hidden = self.text_model(**tokens).last_hidden_state
+            execution.add_tokens(int(tokens["attention_mask"].sum()), tokens["attention_mask"].numel())
+            mask = tokens["attention_mask"].unsqueeze(-1).to(hidden.dtype)
+            return list(((hidden * mask).sum(dim=1) / mask.sum(dim=1)).float().cpu().numpy())
+
+        return execution.run(forward, list(tasks))
 
     def _crop_batches(self, videos: Sequence[UInt8Array], execution: Execution) -> Iterator[Tensor]:
         """The crops of all videos' frames, in order, at most IMAGES_PER_FORWARD of them in memory."""
@@ -239,12 +249,12 @@ class Encoders:
             for start in range(0, len(video), IMAGES_PER_FORWARD):
                 images = as_tensor(video[start : start + IMAGES_PER_FORWARD])
                 if sum(map(len, waiting)) + len(images) > IMAGES_PER_FORWARD:
-                    yield torch.cat(waiting).to(self.image_model.device)
+                    yield torch.cat(waiting)
                     waiting = []
                 started_s = time.perf_counter()
                 waiting.append(self.preprocessor(images))  # on the CPU: nowhere else is uint8 resized antialiased
                 execution.collate_s += time.perf_counter() - started_s
-        yield torch.cat(waiting).to(self.image_model.device)
+        yield torch.cat(waiting)
 
     def _check_task(self, task: str) -> None:
         """Raises InvalidSampleError for a task longer than the text encoder reads; it is never cut silently."""
@@ -260,7 +270,21 @@ class Encoders:
         return self.tokenizer(text, split_special_tokens=True, verbose=False, **options)
 
 
-def _embedded(video: Float32Array, text: Float32Array) -> Trajectory | RewardError:
+def _of_video(images: Sequence[Tensor | InferenceFailedError]) -> Float32Array | InferenceFailedError:
+    """float32 [T, Dv] from each frame's."""
+    for image in images:
+        if isinstance(image, InferenceFailedError):
+            return image
+    return torch.stack(images).float().cpu().numpy()  # type: ignore[arg-type]  # all are tensors
+
+
+def _embedded(
+    video: Float32Array | InferenceFailedError, text: Float32Array | InferenceFailedError
+) -> Trajectory | RewardError:
+    if isinstance(video, InferenceFailedError):
+        return video
+    if isinstance(text, InferenceFailedError):
+        return text
     if not (np.isfinite(video).all() and np.isfinite(text).all()):
         return InferenceFailedError("an encoder gave an embedding that is not finite")
     return Trajectory(video_embeddings=video, text_embedding=text)

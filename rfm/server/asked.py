@@ -42,6 +42,7 @@ class Asked(Generic[Question]):
     is_counted: whether metrics count it
     num_samples: known when its tensors are read
     questions: none unless it could be decoded
+    num_executed: questions that were worked on
     error: why it has no answer; None: it has, or may have one
     """
 
@@ -50,6 +51,7 @@ class Asked(Generic[Question]):
     tensors: Tensors = field(default_factory=dict)
     num_samples: int = 1
     questions: list[Question] = field(default_factory=list)
+    num_executed: int = 0
     error: Exception | None = None
 
     @property

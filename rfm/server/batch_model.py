@@ -13,7 +13,8 @@ from typing import Any, Generic, TypeVar
 import torch
 
 from rfm.execution import Execution
-from rfm.server.asked import CANCELLED, SAMPLE_TYPES, SCORED, Asked, CancelledError
+from rfm.server.asked import SAMPLE_TYPES, SCORED, Asked, CancelledError
+from rfm.server.canary import blank_question
 from rfm.server.leftovers import end_with_triton
 from rfm.server.metrics import Counted, Metrics
 from rfm.server.poison import NO_DIGEST, Poison, digest
@@ -62,6 +63,7 @@ class BatchModel(Generic[Question, Answer]):
         self._log = RequestLog(model)
         self._metrics = Metrics(labels, _checkpoint(settings), _sample_types(self.input_names))
         self._poison = Poison.of_this_process(args["model_name"], max(config["max_batch_size"], 1))
+        self._blank = digest(blank_question(config))
         # Each instance answers them before anybody else is let in.
         self._num_warmups = sum(max(warmup.get("count", 1), 1) for warmup in config.get("model_warmup", []))
 
@@ -88,15 +90,15 @@ class BatchModel(Generic[Question, Answer]):
 
     def execute(self, requests: Sequence[Any]) -> list[Any]:
         """Called by Triton with the requests of one batch; gives one response each."""
-        batch: list[Asked[Question]] = [Asked(request, self._is_counted(request)) for request in requests]
+        batch: list[Asked[Question]] = [Asked(request, self._is_from_a_caller(request)) for request in requests]
         self._metrics.at_work_on(sum(asked.is_counted for asked in batch))
         try:
             return self._responses(batch)
         finally:
             self._metrics.at_work_on(0)
 
-    def _is_counted(self, request: Any) -> bool:
-        """Whether it is neither a health probe nor one of the requests with which Triton warms the model up."""
+    def _is_from_a_caller(self, request: Any) -> bool:
+        """Whether it is neither one of the requests with which Triton warms the model up nor says it is a probe."""
         request_id: str = request.request_id()
         if not request_id and self._num_warmups:
             self._num_warmups -= 1
@@ -104,7 +106,7 @@ class BatchModel(Generic[Question, Answer]):
         return not request_id.startswith(wire.CANARY_PREFIX)
 
     def _responses(self, batch: Sequence[Asked[Question]]) -> list[Any]:
-        execution = Execution()
+        execution = Execution(on_forward=self._poison.renew)
         try:
             for asked in batch:
                 self._read(asked)
@@ -127,11 +129,13 @@ class BatchModel(Generic[Question, Answer]):
     def _read(self, asked: Asked[Question]) -> None:
         import triton_python_backend_utils as pb_utils
 
-        asked.error = None
+        asked.error, asked.num_executed = None, 0
         asked.tensors = {
             name: pb_utils.get_input_tensor_by_name(asked.request, name).as_numpy() for name in self.input_names
         }
         asked.num_samples = len(asked.tensors[wire.NUM_FRAMES])
+        if asked.request_id and not asked.is_counted:  # anybody can say to be a probe; a probe asks the blank question
+            asked.is_counted = digest(asked.tensors) != self._blank
         try:
             asked.questions = self.decode(asked.tensors)
         except InvalidSampleError as error:
@@ -164,6 +168,8 @@ class BatchModel(Generic[Question, Answer]):
     def _answered(
         self, batch: Sequence[Asked[Question]], execution: Execution
     ) -> dict[Asked[Question], Sequence[Answer | RewardError]]:
+        for asked in batch:
+            asked.num_executed = len(asked.questions)
         questions = [question for asked in batch for question in asked.questions]
         started_s = time.perf_counter()
         answers = iter(self.answer(questions, execution) if questions else ())
@@ -211,8 +217,7 @@ def _counted(batch: Sequence[Asked[Any]], execution: Execution) -> Counted:
             counted.samples[sample_type, asked.outcome] += count
         if asked.outcome == SCORED:
             counted.num_frames += asked.num_frames
-        if asked.outcome != CANCELLED:
-            counted.num_executed += len(asked.questions)
+        counted.num_executed += asked.num_executed
     return counted
 
 

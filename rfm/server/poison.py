@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Requests that kill the model process: told by what it was working on when it died, and refused for a while.
 
-Each model process keeps a journal, a small file in shared memory, of the batch that it is working on. It outlives the
-process. The next process of the model reads the journals of the dead: what stands in one is a suspect, which is worked
-on alone from then on, so that no neighbour is blamed for it. A suspect that is survived is none any more; one that
-was there twice when a process died is refused for POISON_S.
+Each model process keeps a journal, a small file in shared memory, of the batch that it is working on, and of when that
+batch last got on, by which a process that hangs is known. The journal outlives the process. The next process of the
+model reads the journals of the dead: what stands in one is a suspect, which is worked on alone from then on, so that no
+neighbour is blamed for it. A suspect that is survived is none any more; one that was there twice when a process died is
+refused for POISON_S.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import mmap
 import os
+import re
 import struct
 import time
 from collections import Counter
@@ -34,7 +36,7 @@ SUFFIX = "_batch"
 _FOLDER = Path("/dev/shm")
 _SAMPLED_BYTES = 2**14  # of each tensor: a digest shall cost microseconds, whatever the size
 _BLOCK_BYTES = 2**9
-_HEADER = struct.Struct("<QQdQ")  # process id, requests refused, when the batch was begun (0: idle), its requests
+_HEADER = struct.Struct("<QQdQ")  # process id, requests refused, when the batch last got on (0: idle), its requests
 _STUB_REGION = 2  # which argument of a model process names its shared memory
 _ZOMBIE = "Z"
 
@@ -83,9 +85,9 @@ class Journal:
 
     @property
     def busy_s(self) -> float:
-        """For how long the batch is worked on, or has been begun when the process died; 0: there is none."""
-        begun_s = self._header[2]
-        return max(time.monotonic() - begun_s, 0.0) if begun_s else 0.0  # the clock is the same in all processes
+        """How long ago the batch was begun or last got on, be the process dead or alive; 0: there is none."""
+        since_s = self._header[2]
+        return max(time.monotonic() - since_s, 0.0) if since_s else 0.0  # the clock is the same in all processes
 
     @property
     def digests(self) -> list[bytes]:
@@ -104,6 +106,10 @@ class Journal:
             yield
         finally:
             self._write(0.0, 0)
+
+    def renew(self) -> None:
+        """The batch has got on."""
+        self._write(time.monotonic(), self._header[3])
 
     def count_refused(self) -> None:
         """One more."""
@@ -125,8 +131,8 @@ class Journal:
     def _header(self) -> tuple[Any, ...]:
         return _HEADER.unpack_from(self._memory)
 
-    def _write(self, begun_s: float, count: int) -> None:
-        _HEADER.pack_into(self._memory, 0, self.pid, self.num_refused, begun_s, count)
+    def _write(self, since_s: float, count: int) -> None:
+        _HEADER.pack_into(self._memory, 0, self.pid, self.num_refused, since_s, count)
 
 
 class Poison:
@@ -146,8 +152,7 @@ class Poison:
     def of_this_process(cls, model: str, capacity: int) -> Poison:
         """That of the process that runs, which Triton has started for ``model``."""
         region = os.fsdecode(Path("/proc/self/cmdline").read_bytes().split(b"\0")[_STUB_REGION])
-        others = _FOLDER.glob(f"{region.rpartition('_')[0]}_*_{model}{SUFFIX}")  # the same server's
-        return cls(_FOLDER / f"{region}_{model}{SUFFIX}", others, capacity)
+        return cls(_FOLDER / f"{region}_{model}{SUFFIX}", journals(_FOLDER, region, model), capacity)
 
     def is_suspect(self, told: bytes) -> bool:
         """Whether a process has died while it worked on this request."""
@@ -173,9 +178,22 @@ class Poison:
                     for journal in self._dead:
                         journal.forget(told)
 
+    def renew(self) -> None:
+        """What is worked on has got on."""
+        self._journal.renew()
+
     def close(self) -> None:
         """The process ends as it should."""
         self._journal.close()
+
+
+def journals(folder: Path, region: str, model: str) -> list[Path]:
+    """Those of the model's processes, of the server whose process has the shared memory ``region``.
+
+    Regions of one server differ behind the last underscore, and names of models may hold any number of them.
+    """
+    name = re.compile(rf"{re.escape(region.rpartition('_')[0])}_[^_]+_{re.escape(model)}{SUFFIX}")
+    return [file for file in folder.iterdir() if name.fullmatch(file.name)]
 
 
 def _of_the_dead(file: Path) -> Journal | None:

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from http.client import HTTPException
 from types import TracebackType
@@ -17,14 +18,16 @@ from rfm.server.admin_key import VARIABLE, http_headers
 from rfm_client.transport import split_url
 from rfm_client.wire import CANARY_PREFIX, Tensors
 
-READY = "READY"
+READY, LOADING, UNLOADING = "READY", "LOADING", "UNLOADING"
 POLL_S = 0.1
 CONNECT_S = 10.0
 ANSWER_S = 1800.0  # of one request: a load answers when the model is warmed up
 FINISH_S = 600.0  # requests in flight on a version that is taken out
 
 _FORBIDDEN = "403"
-_GOING = ("READY", "UNLOADING")
+_GOING = (READY, UNLOADING)
+_NOT_LOADED = "not loaded"  # Triton tells no state
+_UNAVAILABLE, _UNLOADED = "UNAVAILABLE", "unloaded"
 
 
 class RepositoryApiError(Exception):
@@ -39,6 +42,16 @@ class ModelVersion:
     version: int | None
     state: str
     reason: str
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether it answers requests, as far as the server knows."""
+        return self.state == READY
+
+    @property
+    def is_unloaded(self) -> bool:
+        """Whether it is not loaded because nobody wants it to be. One that failed has another reason."""
+        return self.state == _NOT_LOADED or (self.state, self.reason) == (_UNAVAILABLE, _UNLOADED)
 
 
 class RepositoryApi:
@@ -56,26 +69,25 @@ class RepositoryApi:
 
     def index(self) -> list[ModelVersion]:
         """Everything in the repository, by name and version."""
-        entries = self._ask(self._client.get_model_repository_index, headers=self._headers)
-        versions = [
-            ModelVersion(
-                entry["name"],
-                int(entry["version"]) if entry.get("version") else None,
-                entry.get("state", "not loaded"),
-                one_line(entry.get("reason", "")),
-            )
-            for entry in entries
-        ]
-        return sorted(versions, key=lambda entry: (entry.name, entry.version or 0))
+        return versions_of(self._ask(self._client.get_model_repository_index, headers=self._headers))
 
     def ready_versions(self, model: str) -> list[int]:
         """Those that are served now."""
-        ready = (entry for entry in self.index() if entry.name == model and entry.state == READY)
+        ready = (entry for entry in self.index() if entry.name == model and entry.is_ready)
         return [entry.version for entry in ready if entry.version is not None]
 
-    def load(self, model: str) -> None:
-        """Has the server serve what the model's configuration file says; what was served before stays if that fails."""
-        self._ask(self._client.load_model, model, headers=self._headers)
+    def config(self, model: str, version: int) -> dict[str, Any]:
+        """With which it was loaded."""
+        config: dict[str, Any] = self._ask(self._client.get_model_config, model, str(version), headers=self._headers)
+        return config
+
+    def load(self, model: str, config: Mapping[str, Any] | None = None) -> None:
+        """Has the server serve what the model's configuration says; what was served before stays if that fails.
+
+        config: instead of the one in the model's file
+        """
+        instead = None if config is None else json.dumps(config)
+        self._ask(self._client.load_model, model, headers=self._headers, config=instead)
 
     def unload(self, model: str) -> None:
         """Has the server forget the model, after the requests that it is working on."""
@@ -92,7 +104,7 @@ class RepositoryApi:
         raise RepositoryApiError(f"{model}: expected its old versions to finish within {FINISH_S:g} s, got no end")
 
     def infer(self, model: str, version: int, inputs: Tensors, outputs: Collection[str]) -> Tensors:
-        """What one version answers. It counts as a health probe, not as work."""
+        """What one version answers. By its id it is told from callers' requests in logs."""
         tensors = []
         for name, array in inputs.items():
             tensors.append(tritonclient.http.InferInput(name, array.shape, np_to_triton_dtype(array.dtype)))
@@ -127,6 +139,20 @@ class RepositoryApi:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._client.close()
+
+
+def versions_of(index: Iterable[Mapping[str, str]]) -> list[ModelVersion]:
+    """The entries of a server's index, by name and version."""
+    versions = [
+        ModelVersion(
+            entry["name"],
+            int(entry["version"]) if entry.get("version") else None,
+            entry.get("state", _NOT_LOADED),
+            one_line(entry.get("reason", "")),
+        )
+        for entry in index
+    ]
+    return sorted(versions, key=lambda entry: (entry.name, entry.version or 0))
 
 
 def one_line(reason: str) -> str:
