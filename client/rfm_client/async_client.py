@@ -15,7 +15,13 @@ from typing import TYPE_CHECKING, Literal, TypedDict, cast, overload
 from rfm_client import wire
 from rfm_client.access import Access, AccessOptions
 from rfm_client.deadline import Deadline
-from rfm_client.errors import DeadlineExceededError, InferenceFailedError, InvalidSampleError, RewardError
+from rfm_client.errors import (
+    DeadlineExceededError,
+    InferenceFailedError,
+    InvalidSampleError,
+    ModelNotFoundError,
+    RewardError,
+)
 from rfm_client.fit import FittedSample, fitted, whole, with_frame_indices
 from rfm_client.in_flight import InFlight
 from rfm_client.model_info import ModelInfo
@@ -193,13 +199,17 @@ class AsyncRewardClient:
                 raise DeadlineExceededError(f"{self._servers}: {names}: not ready within {timeout_s:g} s")
             await asyncio.sleep(READY_POLL_S)
 
-    async def model_info(self, *, frames: bool = False, timeout_s: float | None = None) -> ModelInfo:
+    async def model_info(
+        self, *, frames: bool = False, refresh: bool = False, timeout_s: float | None = None
+    ) -> ModelInfo:
         """What the server tells of the model for embeddings or, ``frames``, for raw frames.
 
-        It is asked for once. Raises ModelNotFoundError if it is not served.
+        refresh: ask even if it is known. What is known is forgotten when another version of the model answers.
+
+        Raises ModelNotFoundError if it is not served.
         """
         name = f"{self._model}_frames" if frames else self._model
-        return await self._model_info(name, self._deadline(timeout_s))
+        return await self._model_info(name, self._deadline(timeout_s), refresh=refresh)
 
     async def close(self) -> None:
         """Closes the connections and gives shared memory back."""
@@ -282,7 +292,11 @@ class AsyncRewardClient:
             num_bytes, asking.deadline
         ):  # arrays are made in turn, so that they do not pile up
             tensors = await off_loop(num_bytes, wire.encode_samples, samples)
-            return await self._servers.infer(model, tensors, asking.outputs, asking.deadline, request_id=request_id)
+            answer = await self._servers.infer(model, tensors, asking.outputs, asking.deadline, request_id=request_id)
+        known = self._model_infos.get(model)
+        if known is not None and known.versions and answer.model_version not in known.versions:
+            del self._model_infos[model]
+        return answer
 
     def _deadline(self, timeout_s: float | None) -> Deadline:
         """That of a call which begins now; None: the client's."""
@@ -290,9 +304,13 @@ class AsyncRewardClient:
             raise RuntimeError("this AsyncRewardClient is closed")
         return Deadline(self._timeout_s if timeout_s is None else timeout_s)
 
-    async def _model_info(self, model: str, deadline: Deadline) -> ModelInfo:
-        if model not in self._model_infos:
-            self._model_infos[model] = await self._servers.model_info(model, deadline)
+    async def _model_info(self, model: str, deadline: Deadline, *, refresh: bool = False) -> ModelInfo:
+        if refresh or model not in self._model_infos:
+            try:
+                self._model_infos[model] = await self._servers.model_info(model, deadline)
+            except ModelNotFoundError:
+                self._model_infos.pop(model, None)
+                raise
         return self._model_infos[model]
 
 

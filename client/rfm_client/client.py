@@ -105,12 +105,14 @@ class RewardClient:
         """Returns as soon as ``is_ready``. Raises DeadlineExceededError."""
         self._loop.wait(self._client.wait_ready(timeout_s))
 
-    def model_info(self, *, frames: bool = False, timeout_s: float | None = None) -> ModelInfo:
+    def model_info(self, *, frames: bool = False, refresh: bool = False, timeout_s: float | None = None) -> ModelInfo:
         """What the server tells of the model for embeddings or, ``frames``, for raw frames.
+
+        refresh: ask even if it is known. What is known is forgotten when another version of the model answers.
 
         Raises ModelNotFoundError if it is not served.
         """
-        return self._loop.wait(self._client.model_info(frames=frames, timeout_s=timeout_s))
+        return self._loop.wait(self._client.model_info(frames=frames, refresh=refresh, timeout_s=timeout_s))
 
     def close(self) -> None:
         """Cancels what is under way, closes the connections and gives shared memory back."""

@@ -16,6 +16,7 @@ from rfm_client.errors import (
     AccessDeniedError,
     DeadlineExceededError,
     InferenceFailedError,
+    ModelNotFoundError,
     RewardError,
     ServerUnavailableError,
 )
@@ -37,8 +38,8 @@ class Servers:
     """Asks one of several servers, for one event loop.
 
     retry: what fails because a server is down, restarting or full is asked again, elsewhere at once or, when there is
-        no other, after pauses that grow, until the deadline; what fails inside a server is asked once of each other
-        one. A score depends on the request alone, so asking twice is safe.
+        no other, after pauses that grow, until the deadline; what a server lacks, denies or fails at is asked once of
+        each other one. A score depends on the request alone, so asking twice is safe.
     """
 
     def __init__(self, transports: Sequence[Transport], *, retry: bool) -> None:
@@ -95,33 +96,37 @@ class Servers:
     async def _ask(
         self, model: str, ask: Callable[[Transport, float], Awaitable[Answered]], deadline: Deadline
     ) -> Answered:
-        failed_inside: set[_Server] = set()
+        refusals: dict[_Server, RewardError] = {}
         for attempt in itertools.count():
-            server = self._least_busy(failed_inside)
+            server = self._least_busy(refusals)
             left_s = deadline.remaining_s()
             try:
                 with server.asked():
                     answer = await ask(server.transport, left_s)
                 server.failures = 0
+                for other in refusals:  # not before: what all refuse is no fault of one
+                    self._leave_out(other, model)
                 return answer
             except DeadlineExceededError as error:  # perhaps it hangs
                 self._leave_out(server, model)
                 raise deadline.exceeded(server.transport.url) from error
-            except (AccessDeniedError, InferenceFailedError):
-                self._leave_out(server, model)
-                failed_inside.add(server)
-                if not self._retry or len(failed_inside) == len(self._servers):
+            except (AccessDeniedError, InferenceFailedError, ModelNotFoundError) as error:
+                refusals[server] = error
+                if not self._retry:
+                    self._leave_out(server, model)
                     raise
+                if len(refusals) == len(self._servers):
+                    break
             except ServerUnavailableError as error:
                 if not server.failures and self._retry:
                     logger.warning("%s: trying again: %s", server.transport.url, error)
                 self._leave_out(server, model)
-                has_other = any(not other.is_left_out for other in self._servers if other is not server)
+                has_other = any(not other.is_left_out for other in self._servers if other not in {server, *refusals})
                 pause_s = 0.0 if has_other else _pause_s(attempt, LONGEST_RETRY_PAUSE_S)
                 if not self._retry or deadline.ends_within(pause_s):
                     raise
                 await asyncio.sleep(pause_s)
-        raise AssertionError("the loop above ends by returning or raising")
+        raise min(refusals.values(), key=lambda error: isinstance(error, ModelNotFoundError))  # only if all said so
 
     def _least_busy(self, avoided: Collection[_Server]) -> _Server:
         def rank(server: _Server) -> tuple[bool, bool, int, int]:

@@ -89,7 +89,10 @@ class Scorer:
             raise _refused(refused)
         for error in failed.values():
             raise error
-        group = served.frames.frames_per_value if served.frames is not None and not steps else 1
+        group = 1
+        if served.frames is not None and not steps:  # of the version that has answered, perhaps another than before
+            info = await self._client.model_info(frames=True, timeout_s=deadline.remaining_s())
+            group = info.frames_per_value
         return _answer(batch.samples, results, group)  # type: ignore[arg-type]  # no errors among them
 
     async def _served(self, samples: Sequence[schema.Sample], deadline: Deadline) -> Served:

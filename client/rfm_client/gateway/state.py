@@ -10,6 +10,7 @@ import numpy as np
 
 from rfm_client.access import Access
 from rfm_client.async_client import AsyncRewardClient
+from rfm_client.deadline import Deadline, timeout
 from rfm_client.errors import ModelNotFoundError, RewardError, ServerError, ServerUnavailableError
 from rfm_client.gateway import schema
 from rfm_client.model_info import ModelInfo
@@ -17,8 +18,8 @@ from rfm_client.samples import Trajectory
 from rfm_client.status import Device, ServerStatus, read_status
 from rfm_client.wire import CANARY_PREFIX
 
-CANARY_TIMEOUT_S = 5.0
-CANARY_KEPT_S = 1.0  # so that probes, which need no key, do not keep the models busy
+HEALTH_TIMEOUT_S = 3.5  # of all that is asked; with HEALTH_KEPT_S less than the 5 s within which it is to be true
+HEALTH_KEPT_S = 1.0  # so that probes, which need no key, do not keep the models busy
 STATUS_TIMEOUT_S = 5.0
 MS_PER_S = 1e3
 _CANARY_FRAMES = 2
@@ -37,7 +38,7 @@ class State:
         self._model = model
         self._access = access
         self._asking = asyncio.Lock()
-        self._asked_s = -CANARY_KEPT_S
+        self._asked_s = -HEALTH_KEPT_S
         self._problem: str | None = None
         self._num_devices: int | None = None
 
@@ -53,11 +54,12 @@ class State:
         return _gpu_status(status, self._model)
 
     async def health(self) -> schema.Health:
-        """Raises ServerUnavailableError with the reason when a model does not answer."""
+        """Within HEALTH_TIMEOUT_S. Raises ServerUnavailableError with the reason when a model does not answer."""
         async with self._asking:
-            if time.monotonic() - self._asked_s >= CANARY_KEPT_S:
-                self._problem = await self._ask_all()
-                self._num_devices = await self._count_devices() if self._problem is None else None
+            if time.monotonic() - self._asked_s >= HEALTH_KEPT_S:
+                deadline = Deadline(HEALTH_TIMEOUT_S)
+                self._problem = await self._ask_all(deadline)
+                self._num_devices = await self._count_devices(deadline) if self._problem is None else None
                 self._asked_s = time.monotonic()
             problem, devices = self._problem, self._num_devices
         if problem is not None:
@@ -66,15 +68,15 @@ class State:
 
     async def model_info(self) -> schema.ModelInformation:
         """Raises ServerError."""
-        infos = await self._infos()
-        info = infos[0]
+        deadline = Deadline(STATUS_TIMEOUT_S)
+        info = (await self._infos(deadline))[0]
         parts = info.network.get("parameters", {})
         total = sum(parts.values())
         kind = info.network.get("class")
         return schema.ModelInformation(
             model_path=info.source,
             model_version=max(info.versions, key=int, default=None),
-            num_gpus=await self._count_devices(),
+            num_gpus=await self._count_devices(deadline),
             experiment_config={"model": info.network.get("config", {})},
             model_architecture={
                 "model_class": kind,
@@ -86,20 +88,22 @@ class State:
             },
         )
 
-    async def _count_devices(self) -> int | None:
+    async def _count_devices(self, deadline: Deadline) -> int | None:
         """None where the metrics cannot be read: scoring needs them not."""
         try:
-            return (await self.gpu_status()).total_gpus
-        except ServerError:
+            async with timeout(deadline.remaining_s()):
+                return (await self.gpu_status()).total_gpus
+        except (ServerError, asyncio.TimeoutError):  # in Python 3.10 not the built-in one
             return None
 
-    async def _infos(self) -> list[ModelInfo]:
-        """Of the models for embeddings and for raw frames, as far as they are served."""
+    async def _infos(self, deadline: Deadline) -> list[ModelInfo]:
+        """Of the models for embeddings and for raw frames, as far as they are served now: another version may be."""
         infos = []
         missing = None
         for frames in (False, True):
             try:
-                infos.append(await self._client.model_info(frames=frames, timeout_s=STATUS_TIMEOUT_S))
+                left_s = deadline.remaining_s()
+                infos.append(await self._client.model_info(frames=frames, refresh=True, timeout_s=left_s))
             except ModelNotFoundError as error:
                 missing = error
         if not infos:
@@ -107,11 +111,13 @@ class State:
             raise missing
         return infos
 
-    async def _ask_all(self) -> str | None:
+    async def _ask_all(self, deadline: Deadline) -> str | None:
         """Asks every model for a score of next to nothing; the reason of the first that has none to give."""
         try:
-            for info in await self._infos():
-                await self._client.progress(_canary(info), timeout_s=CANARY_TIMEOUT_S, request_id=CANARY_PREFIX)
+            infos = await self._infos(deadline)
+            left_s = deadline.remaining_s()
+            canaries = [self._client.progress(_canary(i), timeout_s=left_s, request_id=CANARY_PREFIX) for i in infos]
+            await asyncio.gather(*canaries)
         except RewardError as error:
             return str(error)
         return None
