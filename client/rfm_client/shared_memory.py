@@ -20,7 +20,7 @@ import mmap
 import os
 import re
 import uuid
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Coroutine
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
@@ -29,12 +29,13 @@ import numpy as np
 import numpy.typing as npt
 from tritonclient.utils import InferenceServerException
 
+from rfm_client.deadline import timeout
 from rfm_client.off_loop import off_loop
 
 FOLDER = Path("/dev/shm")
 MIN_SHARED_BYTES = 64 * 2**10  # smaller inputs are quicker in the request itself
 MIN_REGION_BYTES = 2**20
-UNREGISTER_TIMEOUT_S = 2.0
+ANSWER_TIMEOUT_S = 2.0  # of a server that is to unmap a region, or to tell which it maps
 _PREFIX = "rfm-client-"
 _LOCK_SUFFIX = ".lock"
 _REGION_NAME = re.compile(rf"{_PREFIX}(?P<owner>[0-9a-f]{{32}})-\d+")
@@ -63,10 +64,11 @@ class RegionServer(Protocol):
 
 
 class Region:
-    """Memory that a server maps too. Taken by one request at a time."""
+    """Memory that a server maps too. Taken by one request at a time. number: counts up, by when it was registered"""
 
-    def __init__(self, name: str, byte_size: int) -> None:
-        self.name = name
+    def __init__(self, owner: str, number: int, byte_size: int) -> None:
+        self.name = name = f"{_PREFIX}{owner}-{number}"
+        self.number = number
         self.byte_size = byte_size
         descriptor = os.open(FOLDER / name, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_CLOEXEC, 0o600)
         try:
@@ -98,7 +100,8 @@ class SharedMemory:
         self._is_usable = True
         self._has_reclaimed = False
         self._free: list[Region] = []
-        self._known: dict[str, Region] = {}
+        self._known: set[Region] = set()  # that the server may map
+        self._tasks: set[asyncio.Task[None]] = set()  # what a call has begun, and goes on if the call is cancelled
 
     @asynccontextmanager
     async def lend(self, array: npt.NDArray[Any]) -> AsyncIterator[Region | None]:
@@ -107,26 +110,30 @@ class SharedMemory:
         if region is None:
             yield None
             return
-        # A call that is cancelled now leaves a thread that still writes: nobody else may ever get this region.
-        await off_loop(array.nbytes, region.write, array)
+        writing = self._begin(self._fill(region, array))
         try:
+            await asyncio.shield(writing)
             yield region
         finally:
-            # After a call that is cancelled from here on, the server may still read it, for an answer that is dropped.
-            if region.name in self._known:
-                self._free.append(region)
+            # After a call that is cancelled, the server may still read it, for an answer that is dropped.
+            if writing.done():
+                self._release(region)
+            else:  # a thread still writes
+                writing.add_done_callback(lambda _: self._release(region))
 
-    def forget(self) -> None:
-        """The server no longer knows any region: it was started anew."""
-        self._free.clear()
-        self._known.clear()
+    def forget(self, region: Region) -> None:
+        """The server does not know it: it was started anew since, and does not know those from before it either."""
+        self._known = {known for known in self._known if known.number > region.number}
+        self._free = [free for free in self._free if free in self._known]
 
     async def close(self) -> None:
         """Gives all regions back. One that a cancelled request still uses is left to the next client."""
         try:
-            await asyncio.gather(*(self._unregister(region) for region in self._known.values()))
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+            await asyncio.gather(*map(self._unregister, set(self._known)))
         finally:
-            self.forget()
+            self._known.clear()
+            self._free.clear()
             if self._lock is not None:
                 (FOLDER / f"{_PREFIX}{self._id}{_LOCK_SUFFIX}").unlink(missing_ok=True)
                 os.close(self._lock)
@@ -140,7 +147,7 @@ class SharedMemory:
             return region
         try:
             if self._free:  # all too small; so there are no more regions than requests at a time
-                await self._unregister(self._free.pop())
+                await asyncio.shield(self._begin(self._give_up(self._free.pop(0))))
             return await self._new_region(max(MIN_REGION_BYTES, 1 << (byte_size - 1).bit_length()))
         except InferenceServerException as error:
             reason = error.message() or "no reason given"
@@ -157,27 +164,55 @@ class SharedMemory:
         try:
             if self._lock is None:
                 self._lock = _hold_lock(self._id)
-            region = Region(f"{_PREFIX}{self._id}-{next(self._numbers)}", byte_size)
+            region = Region(self._id, next(self._numbers), byte_size)
         except (OSError, ImportError) as error:
             raise _LocalError(error) from error
-        self._known[region.name] = region  # even if registering is cancelled, so that it is given back in the end
+        self._known.add(region)
         try:
             await self._server.register_region(region.name, byte_size)
-        except InferenceServerException:
-            del self._known[region.name]
+        except BaseException:  # the server may have mapped it all the same
+            self._begin(self._drop(region))
             raise
         finally:
             region.unlink()
-        if not self._has_reclaimed:  # not before it is known that the server has the same /dev/shm
-            await self._reclaim()
-            self._has_reclaimed = True
         return region
 
+    def _begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+    async def _fill(self, region: Region, array: npt.NDArray[Any]) -> None:
+        if not self._has_reclaimed:  # not before it is known that the server has the same /dev/shm
+            self._has_reclaimed = True
+            with self._unanswered():
+                await self._reclaim()
+        await off_loop(array.nbytes, region.write, array)
+
+    def _release(self, region: Region) -> None:
+        if region in self._known:
+            self._free.append(region)
+
+    async def _give_up(self, region: Region) -> None:
+        """It is free again if the server keeps it."""
+        await self._unregister(region)
+        self._release(region)
+
+    async def _drop(self, region: Region) -> None:
+        """Of one that nobody has used: a server that does not answer does not map it, as its name is gone."""
+        await self._unregister(region)
+        self._known.discard(region)
+
     async def _unregister(self, region: Region) -> None:
-        with suppress(InferenceServerException, asyncio.TimeoutError, *self._server.connection_errors):
-            # It may be in use by a cancelled request, or nobody there to be told.
-            await asyncio.wait_for(self._server.unregister_region(region.name), UNREGISTER_TIMEOUT_S)
-            self._known.pop(region.name, None)
+        """It stays known if a cancelled request still uses it, or nobody is there to be told."""
+        with self._unanswered():
+            async with timeout(ANSWER_TIMEOUT_S):
+                await self._server.unregister_region(region.name)
+            self._known.discard(region)
+
+    def _unanswered(self) -> suppress:
+        return suppress(InferenceServerException, asyncio.TimeoutError, *self._server.connection_errors)
 
     async def _reclaim(self) -> None:
         """Takes back what clients left that were killed."""
@@ -186,11 +221,12 @@ class SharedMemory:
                 for leftover in FOLDER.glob(f"{file.name.removesuffix(_LOCK_SUFFIX)}-*"):
                     leftover.unlink(missing_ok=True)
                 file.unlink(missing_ok=True)
-        for name in await self._server.registered_regions():
-            match = _REGION_NAME.fullmatch(name)
-            if match and not (FOLDER / f"{_PREFIX}{match['owner']}{_LOCK_SUFFIX}").exists():
-                with suppress(InferenceServerException):  # a request of the dead client still uses it
-                    await self._server.unregister_region(name)
+        async with timeout(ANSWER_TIMEOUT_S):
+            for name in await self._server.registered_regions():
+                match = _REGION_NAME.fullmatch(name)
+                if match and not (FOLDER / f"{_PREFIX}{match['owner']}{_LOCK_SUFFIX}").exists():
+                    with suppress(InferenceServerException):  # a request of the dead client still uses it
+                        await self._server.unregister_region(name)
 
 
 class _LocalError(Exception):

@@ -180,8 +180,8 @@ class _TritonTransport:
             try:
                 yield region
             except InferenceServerException as error:
-                if _LOST_REGION in (error.message() or ""):
-                    self._shared_memory.forget()
+                if region is not None and _LOST_REGION in (error.message() or ""):
+                    self._shared_memory.forget(region)
                 raise
 
     def _inputs(self, inputs: Tensors, regions: Mapping[str, Region]) -> list[Any]:
