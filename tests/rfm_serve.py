@@ -17,7 +17,7 @@ import httpx
 from prometheus_client.parser import text_string_to_metric_families
 
 from rfm.server.process import SHARED_MEMORY, Endpoints
-from rfm.server.stubs import Stub, StubWatch, is_alive
+from rfm.server.stubs import Stub, StubWatch
 from rfm_client import RewardClient
 
 ROOT = Path(__file__).parents[1]
@@ -71,7 +71,15 @@ class Serving:
 
     @property
     def stubs(self) -> list[Stub]:
-        return [stub for stub in StubWatch(self.triton, PATIENCE_S).of_model(MODEL) if is_alive(stub.pid)]
+        return self.stubs_of(MODEL)
+
+    def stubs_of(self, model: str) -> list[Stub]:
+        return [stub for stub in StubWatch(self.triton, PATIENCE_S).of_model(model) if stub.is_alive]
+
+    def reasons(self) -> dict[str, str]:
+        """Why models are not ready, of all that it knows; empty: they are."""
+        answer = self.ready()
+        return {} if answer is None else {name: told["reason"] for name, told in answer.json()["models"].items()}
 
     def client(self, **options: Any) -> RewardClient:
         return RewardClient(self.endpoints.grpc_url, **options)

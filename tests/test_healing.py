@@ -268,16 +268,50 @@ def test_a_server_that_is_killed_again_and_again_is_given_up(tmp_path: Path) -> 
     assert len(killed) == restarts.MOST + 1
 
 
+class Clock:
+    """A ``time`` module whose time passes when the test says so."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+
 def test_what_ran_for_long_is_no_part_of_a_crash_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock()
+    monkeypatch.setattr(restarts, "time", clock)
     ends = Restarts("gateway")
-    assert [ends.pause_s("why") for _ in range(restarts.MOST)] == [0, 0.5, 1, 2, 4]
-    monkeypatch.setattr(restarts, "STEADY_S", 0.0)
-    assert ends.pause_s("why") == 0
-    monkeypatch.undo()
+
+    def run(duration_s: float) -> float:
+        ends.started()
+        clock.now_s += duration_s
+        return ends.pause_s("why")
+
+    assert [run(1.0) for _ in range(restarts.MOST)] == [0, 0.5, 1, 2, 4]
+    assert run(restarts.STEADY_S) == 0
     for _ in range(restarts.MOST - 1):
-        ends.pause_s("why")
+        run(1.0)
     with pytest.raises(CrashLoopError, match="gateway: expected to run, got 6 ends, each within 60 s"):
-        ends.pause_s("why")
+        run(1.0)
+
+
+@pytest.mark.parametrize("attempt_s", [1.0, 2 * restarts.STEADY_S])
+def test_starts_that_fail_are_a_crash_loop_however_long_it_ran_before(
+    monkeypatch: pytest.MonkeyPatch, attempt_s: float
+) -> None:
+    clock = Clock()
+    monkeypatch.setattr(restarts, "time", clock)
+    ends = Restarts("tritonserver")
+    ends.started()
+    clock.now_s += 5 * restarts.STEADY_S
+    pauses = []
+    for _ in range(restarts.MOST):
+        pauses.append(ends.pause_s("it does not start"))
+        clock.now_s += attempt_s
+    assert pauses == [0, 0.5, 1, 2, 4]
+    with pytest.raises(CrashLoopError, match="the last: it does not start"):
+        ends.pause_s("it does not start")
 
 
 def test_a_full_queue_refuses_at_once_and_a_long_wait_is_cut_short(tmp_path: Path) -> None:

@@ -94,20 +94,22 @@ class Canary:
         if waiting_since_s is None or self._answer in (Verdict.DEAD, Verdict.BROKEN):
             return self._answer
         waited_s = time.monotonic() - waiting_since_s
+        last_success_s: float | None = 0.0
         if waited_s > LATE_S / 2:
-            waited_s = min(waited_s, time.monotonic() - self._last_success_s())
+            last_success_s = self._last_success_s()
+            waited_s = min(waited_s, time.monotonic() - (last_success_s or 0.0))
         slowest_s = LATE_FACTOR * max(self._took_s, default=0.0)
-        if waited_s > max(self._hang_s, slowest_s):
+        if waited_s > max(self._hang_s, slowest_s) and last_success_s is not None:
             return Verdict.HUNG
         return Verdict.LATE if waited_s > max(LATE_S, slowest_s) else self._answer
 
-    def _last_success_s(self) -> float:
-        """When the model was last seen to have answered anybody."""
+    def _last_success_s(self) -> float | None:
+        """When the model was last seen to have answered anybody; None: Triton does not tell, so it is not the model."""
         try:
             versions = self._http.get_json(f"/v2/models/{self.model}/stats")["model_stats"]
             count = [version["inference_stats"]["success"].get("count", 0) for version in versions]
         except NO_ANSWER:
-            return self._last_success[1] if self._last_success else 0.0  # no news
+            return None
         if self._last_success is None or self._last_success[0] != count:
             self._last_success = count, (time.monotonic() if self._last_success else 0.0)
         return self._last_success[1]

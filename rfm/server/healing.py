@@ -8,14 +8,13 @@ import time
 from collections.abc import Sequence
 
 from rfm.server.canary import Canary, Verdict
-from rfm.server.http import NO_ANSWER, Http
+from rfm.server.inquiry import Config
 from rfm.server.process import TritonServer
 from rfm.server.repository_api import RepositoryApi, RepositoryApiError
 from rfm.server.restarts import CrashLoopError, Restarts
 from rfm.server.status import READY, Status
-from rfm.server.stubs import Stub, StubWatch, is_alive
+from rfm.server.stubs import Stub, StubWatch
 
-LIVE_TIMEOUT_S = 3.0  # of Triton itself
 DRAIN_S = 2.0  # for what the model's other processes are working on
 POLL_S = 0.1
 JUDGE_INTERVAL_S = 0.5
@@ -36,8 +35,9 @@ class ModelHealth:
         self._watch = watch
         self._status = status
         self._restarts = Restarts(f"model {self.model}")
+        self._restarts.started()
         self._healing: threading.Thread | None = None
-        self._is_closed = False
+        self._closed = threading.Event()
         self._judged_s = 0.0
         self._verdict = Verdict.UNKNOWN
         self._trouble = ""  # why it was not loaded
@@ -45,19 +45,28 @@ class ModelHealth:
 
     def close(self) -> None:
         """Asks it no more, and leaves it as it is."""
-        self._is_closed = True
+        self._closed.set()
         self._canary.stop()
 
     @property
     def reason(self) -> str:
         """Why it is not ready; READY if it is."""
-        if self._is_healing:
+        if self.is_healing:
             return f"it is loaded anew{f', after: {self._trouble}' if self._trouble else ''}"
         return READY if self._verdict is Verdict.LIVE else self._verdict.value
 
-    def look(self, died: str | None) -> str | None:
-        """Heals the model if need be, in a thread, and then tells why. ``died``: how one of its processes has."""
-        if self._is_healing:
+    @property
+    def is_healing(self) -> bool:
+        """Whether it is loaded anew."""
+        return self._healing is not None and self._healing.is_alive()
+
+    def look(self, died: str | None, config: Config) -> str | None:
+        """Heals the model if need be, in a thread, and then tells why.
+
+        died: how one of its processes has
+        config: of what it served when it was last ready
+        """
+        if self.is_healing:
             return None
         if time.monotonic() - self._judged_s >= JUDGE_INTERVAL_S:
             self._verdict, self._judged_s = self._canary.verdict(), time.monotonic()
@@ -66,21 +75,25 @@ class ModelHealth:
             return None
         why = died or self._verdict.value
         self._status.tell_canary(self.model, is_ok=False)
-        self._healing = threading.Thread(target=self._heal, args=(why,), name=f"rfm-heal-{self.model}", daemon=True)
+        self._healing = threading.Thread(
+            target=self._heal, args=(why, config), name=f"rfm-heal-{self.model}", daemon=True
+        )
         self._healing.start()
         return why
 
-    @property
-    def _is_healing(self) -> bool:
-        return self._healing is not None and self._healing.is_alive()
-
-    def _heal(self, why: str) -> None:
-        """Returns when the model is loaded anew."""
+    def _heal(self, why: str, config: Config) -> None:
+        """Returns when the model is loaded anew: just what it served before, whatever its configuration file says."""
+        served: Config | None = None
         self._trouble = ""
-        while not self._is_closed:
+        while True:
             try:
-                time.sleep(self._restarts.pause_s(self._trouble or why))
-                self._reload()
+                if self._closed.wait(self._restarts.pause_s(self._trouble or why)):
+                    return
+                with RepositoryApi(self._server.endpoints.http_url, self._server.admin_key) as api:
+                    served = served or self._served(api, config)
+                    if served is None:  # somebody has unloaded it meanwhile
+                        return
+                    self._reload(api, served)
                 break
             except RepositoryApiError as error:
                 self._trouble = str(error)
@@ -91,33 +104,30 @@ class ModelHealth:
         self._verdict = Verdict.UNKNOWN
         self._canary.reset()
 
-    def _reload(self) -> None:
-        """Ensembles that the model is a part of are unloaded and loaded with it."""
-        if not self._triton_answers():
-            self._server.kill()  # which is seen, and it is started again
-            return
-        old = self._watch.of_model(self.model)
-        with RepositoryApi(self._server.endpoints.http_url, self._server.admin_key) as api:
-            api.unload(self.model)
-            self._end(old)
-            # Triton 2.51 never finishes to unload a model of which a request met a dead process. A load does not mind.
-            api.load(self.model)
+    def _served(self, api: RepositoryApi, last: Config) -> Config | None:
+        """The configuration of the versions that it serves, and of no others: a rollout may just have changed it."""
+        versions = [entry for entry in api.index() if entry.name == self.model]
+        ready = [entry.version for entry in versions if entry.is_ready and entry.version is not None]
+        if not ready:
+            return None if all(entry.is_unloaded for entry in versions) else last
+        return {**api.config(self.model, max(ready)), "version_policy": {"specific": {"versions": ready}}}
 
-    def _triton_answers(self) -> bool:
-        try:
-            endpoints = self._server.endpoints
-            Http(endpoints.http_host, endpoints.http_port).request("GET", "/v2", LIVE_TIMEOUT_S)
-        except NO_ANSWER:
-            return False
-        return True
+    def _reload(self, api: RepositoryApi, served: Config) -> None:
+        """Ensembles that the model is a part of are unloaded and loaded with it, as they were."""
+        old = self._watch.of_model(self.model)
+        api.unload(self.model)
+        self._end(old)
+        if not self._closed.is_set():  # else Triton may be another
+            # Triton 2.51 never finishes to unload a model of which a request met a dead process. A load does not mind.
+            api.load(self.model, served)
 
     def _end(self, old: Sequence[Stub]) -> None:
         """Returns when none of them lives: not even those that Triton keeps, with their share of a GPU's memory."""
         deadline_s = time.monotonic() + DRAIN_S
-        while any(is_alive(stub.pid) for stub in old) and time.monotonic() < deadline_s:
+        while any(stub.is_alive for stub in old) and time.monotonic() < deadline_s:
             time.sleep(POLL_S)
         for stub in old:
-            if is_alive(stub.pid):
+            if stub.is_alive:
                 stub.kill()
                 if self._verdict is not Verdict.HUNG and stub.journal is not None:
                     stub.journal.close()  # what it was working on is not why it ends

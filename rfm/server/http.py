@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import http.client
 import json
+from collections.abc import Mapping
 from typing import Any
 
 PROBE_TIMEOUT_S = 1.0  # of what Triton answers by itself
@@ -17,19 +18,34 @@ class Http:
     def __init__(self, host: str, port: int) -> None:
         self._address = host, port
 
-    def request(self, method: str, path: str, timeout_s: float, body: bytes | None = None) -> tuple[int, str]:
+    def request(
+        self,
+        method: str,
+        path: str,
+        timeout_s: float,
+        body: bytes | None = None,
+        *,
+        headers: Mapping[str, str] | None = None,
+    ) -> tuple[int, str]:
         """Status and content of the answer."""
         connection = http.client.HTTPConnection(*self._address, timeout=timeout_s)
         try:
-            connection.request(method, path, body)
+            connection.request(method, path, body, headers or {})
             answer = connection.getresponse()
             return answer.status, answer.read().decode(errors="replace")
         finally:
             connection.close()
 
-    def get_json(self, path: str, timeout_s: float = PROBE_TIMEOUT_S) -> Any:
+    def get_json(
+        self,
+        path: str,
+        timeout_s: float = PROBE_TIMEOUT_S,
+        *,
+        method: str = "GET",
+        headers: Mapping[str, str] | None = None,
+    ) -> Any:
         """The content of an answer that is JSON."""
-        status, text = self.request("GET", path, timeout_s)
+        status, text = self.request(method, path, timeout_s, headers=headers)
         if status != http.client.OK:
             raise ValueError(f"{path}: {status} {text}")
         return json.loads(text)

@@ -135,6 +135,7 @@ class TritonServer:
         self._region_prefix = f"{leftovers.owned(leftovers.REGION_PREFIX, '_')}{secrets.token_hex(4)}_"
         self._backends: Path | None = None
         self._process: subprocess.Popen[bytes] | None = None
+        self._loading: frozenset[str] = frozenset()  # what it was told to load at its start
 
     @property
     def models(self) -> list[str]:
@@ -171,6 +172,7 @@ class TritonServer:
     def start(self) -> None:
         """Starts the process. Raises ServerStartError for what can be seen to be wrong before."""
         models = self.models
+        self._loading = frozenset(models)
         if not models:
             raise ServerStartError(f"repository: expected a folder of models, got {self._repository}")
         own = self._arguments(models)
@@ -206,7 +208,7 @@ class TritonServer:
                 except (OSError, EOFError, HTTPException, InferenceServerException):
                     time.sleep(POLL_S)  # Triton answers nothing while it loads
                     continue
-                failed = [model for model in index if model.get("state") != "READY"]
+                failed = [model for model in index if model.get("state") != "READY" and model["name"] in self._loading]
                 if not failed:
                     version = client.get_server_metadata().get("version", "")
                     check_version(self.endpoints.host, version, accepted=self._accepts_known_vulnerabilities)

@@ -23,16 +23,20 @@ class Restarts:
     def __init__(self, what: str) -> None:
         self._what = what
         self._row = 0
-        self._started_s = time.monotonic()
+        self._running_since_s: float | None = None  # None: it has ended
 
     def started(self) -> None:
         """It runs now."""
-        self._started_s = time.monotonic()
+        self._running_since_s = time.monotonic()
 
     def pause_s(self, reason: str) -> float:
-        """How long to wait before the next start, now that it has ended. Raises CrashLoopError when it is one."""
-        if time.monotonic() - self._started_s >= STEADY_S:
+        """How long to wait before the next start, now that it has ended, or could not be started.
+
+        Raises CrashLoopError when it is one.
+        """
+        if self._running_since_s is not None and time.monotonic() - self._running_since_s >= STEADY_S:
             self._row = 0
+        self._running_since_s = None  # what is no start that succeeded does not count, however long it took
         self._row += 1
         if self._row > MOST:
             got = f"{self._row} ends, each within {STEADY_S:g} s of a start; the last: {reason}"

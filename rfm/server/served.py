@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The models of a Triton that runs: which of them are ready, and healing for those that are not."""
+"""The models of a Triton that runs: which there are, which of them are ready, and healing for those that are not."""
 
 from __future__ import annotations
 
@@ -8,16 +8,19 @@ import time
 from rfm.server.canary import Canary, can_be_asked
 from rfm.server.healing import ModelHealth
 from rfm.server.http import Http
+from rfm.server.inquiry import Config, Inquiry, Told
 from rfm.server.process import TritonServer
+from rfm.server.repository_api import LOADING, UNLOADING
+from rfm.server.repository_api import READY as LOADED
 from rfm.server.status import READY, Status
 from rfm.server.stubs import StubWatch
 
 LOOK_INTERVAL_S = 0.3
-CONFIG_TIMEOUT_S = 10.0
+NOT_LOADED = "it is not loaded"
 
 
 class Served:
-    """Looks after the models of a server that is ready.
+    """Looks after the models of a server that is ready, be they loaded at its start or later.
 
     canary_s, hang_s: as Supervisor has them
     """
@@ -25,53 +28,100 @@ class Served:
     def __init__(self, server: TritonServer, status: Status, canary_s: float, hang_s: float) -> None:
         self._server = server
         self._status = status
-        self._http = Http(server.endpoints.http_host, server.endpoints.http_port)
+        self._canary_s = canary_s
         self._hang_s = hang_s
+        self._http = Http(server.endpoints.http_host, server.endpoints.http_port)
         self._watch = StubWatch(server.pid, hang_s)
+        self._inquiry = Inquiry(server)
+        self._told: Told | None = None
+        self._models: dict[str, Config] = {}
+        self._health: dict[str, ModelHealth] = {}  # of those that have processes of ours
+        self._leaving: set[str] = set()
         self._looked_s = 0.0
         self._num_refused: dict[int, int] = {}  # by process
         self._killed: dict[int, str] = {}  # processes that hung, and how
-        configs = {name: self._http.get_json(f"/v2/models/{name}/config", CONFIG_TIMEOUT_S) for name in server.models}
-        self._ensembles = {
-            name: [step["model_name"] for step in config["ensemble_scheduling"]["step"]]
-            for name, config in configs.items()
-            if "ensemble_scheduling" in config
-        }
-        self._models = [self._health(name, canary_s) for name, config in configs.items() if can_be_asked(config)]
+        self._inquiry.start()
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether Triton itself does not answer."""
+        return self._inquiry.is_silent
 
     def look(self) -> list[tuple[str, str]]:
         """Heals what needs to be, and tells which models, and why. Raises CrashLoopError."""
-        if time.monotonic() - self._looked_s < LOOK_INTERVAL_S:
+        told = self._inquiry.told
+        if told is None or time.monotonic() - self._looked_s < LOOK_INTERVAL_S:
             return []
         self._looked_s = time.monotonic()
+        if told is not self._told:
+            self._told = told
+            self._watch.tell(told.in_state(LOADED), told.in_state(LOADING, UNLOADING), told.asked_s)
+            self._keep_up(told)
         died = {stub.model: self._killed.pop(stub.pid, "its process is dead") for stub in self._watch.dead()}
         for stub, how in self._watch.hung():
-            self._killed[stub.pid] = how
-            stub.kill()
-        healed = [(model.model, why) for model in self._models if (why := model.look(died.get(model.model)))]
-        for model in self._models:
-            if model.crash_loop is not None:
-                raise model.crash_loop
+            if stub.model in self._health:
+                self._killed[stub.pid] = how
+                stub.kill()
+        healed = [
+            (model, why)
+            for model, health in self._health.items()
+            if (why := health.look(died.get(model), self._models[model]))
+        ]
+        for health in self._health.values():
+            if health.crash_loop is not None:
+                raise health.crash_loop
         self._count_refused()
-        self._status.tell(self._reasons())
+        self._status.tell({model: self._reason(model, told) for model in self._models})
         return healed
 
     def close(self) -> None:
         """Looks after them no more."""
-        for model in self._models:
-            model.close()
+        self._inquiry.close()
+        for health in self._health.values():
+            health.close()
 
-    def _health(self, name: str, canary_s: float) -> ModelHealth:
-        canary = Canary(self._http, name, canary_s, self._hang_s, self._status.canary_seconds.labels(name).observe)
+    def _keep_up(self, told: Told) -> None:
+        """Takes in what was loaded, and leaves out what somebody unloaded, once that was seen twice in a row."""
+        for model, config in told.configs.items():
+            if told.is_unloaded(model):
+                continue
+            if model not in self._models:
+                self._status.restarts.labels(model)  # 0, so that already the first is an increase
+            self._models[model] = config
+            if model not in self._health and can_be_asked(config):
+                self._health[model] = self._healthy(model)
+        leaving = {model for model in self._models if self._is_unloaded(model, told)}
+        for model in leaving & self._leaving:
+            del self._models[model]
+            if model in self._health:
+                self._health.pop(model).close()
+        self._leaving = leaving
+
+    def _is_unloaded(self, model: str, told: Told) -> bool:
+        """Whether somebody wanted that. Triton says the same of what is loaded anew, and of what that is a part of."""
+        if model in self._health and self._health[model].is_healing:
+            return False
+        parts = _parts(self._models[model])
+        return told.is_unloaded(model) and all(told.has(*part) or part[0] not in self._models for part in parts)
+
+    def _healthy(self, model: str) -> ModelHealth:
+        canary = Canary(
+            self._http, model, self._canary_s, self._hang_s, self._status.canary_seconds.labels(model).observe
+        )
         canary.start()
         return ModelHealth(self._server, canary, self._watch, self._status)
 
-    def _reasons(self) -> dict[str, str]:
-        """By model why it is not ready. An ensemble is as ready as its parts."""
-        reasons = {model.model: model.reason for model in self._models}
-        for name, parts in self._ensembles.items():
-            reasons[name] = "; ".join(f"{part}: {reasons[part]}" for part in parts if reasons.get(part, READY) != READY)
-        return reasons
+    def _reason(self, model: str, told: Told) -> str:
+        """Why it is not ready. An ensemble has to be, and all its parts."""
+        if model in self._health:
+            return self._health[model].reason
+        if model not in self._models:
+            return NOT_LOADED
+        parts = dict.fromkeys(part for part, _ in _parts(self._models[model]))
+        reasons = [f"{part}: {why}" for part in parts if (why := self._reason(part, told)) != READY]
+        if reasons:
+            return "; ".join(reasons)
+        return READY if model in told.ready else NOT_LOADED
 
     def _count_refused(self) -> None:
         for stub in self._watch.all:
@@ -79,3 +129,9 @@ class Served:
             if journal is not None:
                 self._status.poison_refused.inc(journal.num_refused - self._num_refused.get(stub.pid, 0))
                 self._num_refused[stub.pid] = journal.num_refused
+
+
+def _parts(config: Config) -> list[tuple[str, int]]:
+    """Models and versions of an ensemble."""
+    steps = config.get("ensemble_scheduling", {}).get("step", ())
+    return [(step["model_name"], int(step["model_version"])) for step in steps]

@@ -4,8 +4,11 @@
 from __future__ import annotations
 
 import json
+import socket
+import sys
 import threading
 from collections.abc import Mapping
+from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -15,7 +18,8 @@ from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, G
 from rfm.server.installation import ServerStartError
 
 READY = ""  # the reason why a model is not ready, of one that is
-REQUEST_TIMEOUT_S = 5.0  # of somebody who sends half a request
+REQUEST_S = 5.0  # from its connection to its answer
+MOST_CONNECTIONS = 16  # one more takes the place of the oldest
 
 _BUCKETS_S = tuple(digit * 10.0**power for power in range(-3, 2) for digit in (1, 2, 5))
 
@@ -25,6 +29,7 @@ class Status:
 
     def __init__(self) -> None:
         self._reasons: Mapping[str, str] = {}
+        self._asked: set[str] = set()  # models that have a canary
         self._registry = CollectorRegistry()
         labelled = {"labelnames": ["model"], "registry": self._registry}
         self._ready = Gauge("rfm_serve_ready", "1: the model is ready.", **labelled)  # type: ignore[arg-type]
@@ -49,13 +54,25 @@ class Status:
         )
 
     def tell(self, reasons: Mapping[str, str]) -> None:
-        """By model why it is not ready; READY for one that is."""
-        self._reasons = dict(reasons)
+        """By model why it is not ready; READY for one that is. There are no other models."""
+        gone, self._reasons = self._reasons.keys() - reasons.keys(), dict(reasons)
         for model, reason in reasons.items():
             self._ready.labels(model).set(reason == READY)
+        for model in gone:
+            self._ready.remove(model)
+        for model in gone & self._asked:
+            self._asked.remove(model)
+            self._canary_ok.remove(model)
+
+    def tell_down(self, reason: str) -> None:
+        """Why none is ready."""
+        self.tell(dict.fromkeys(self._reasons, reason))
+        for model in self._asked:
+            self.tell_canary(model, is_ok=False)
 
     def tell_canary(self, model: str, *, is_ok: bool) -> None:
         """Whether a model's last probe was answered."""
+        self._asked.add(model)
         self._canary_ok.labels(model).set(is_ok)
 
     @property
@@ -81,10 +98,9 @@ class StatusServer:
 
     def __init__(self, host: str, port: int, status: Status) -> None:
         try:
-            self._server = ThreadingHTTPServer((host, port), _handler(status))
+            self._server = _BoundedServer((host, port), _handler(status))
         except OSError as error:
             raise ServerStartError(f"status: expected a free port at {host}:{port}, got: {error.strerror}") from error
-        self._server.daemon_threads = True
         self._thread = threading.Thread(target=self._server.serve_forever, name="rfm-status", daemon=True)
         self._thread.start()
 
@@ -95,10 +111,46 @@ class StatusServer:
         self._thread.join()
 
 
+class _BoundedServer(ThreadingHTTPServer):
+    """Whoever is slow loses the connection, and the thread that it holds: after REQUEST_S, or to somebody else."""
+
+    daemon_threads = True
+    request_queue_size = 8 * MOST_CONNECTIONS  # what is beyond it has to try again after a second
+
+    def __init__(self, *arguments: Any) -> None:
+        self._open: dict[socket.socket, None] = {}  # the oldest first
+        self._lock = threading.Lock()
+        super().__init__(*arguments)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        deadline = threading.Timer(REQUEST_S, _cut, [request])
+        deadline.start()
+        with self._lock:
+            self._open[request] = None
+            if len(self._open) > MOST_CONNECTIONS:
+                oldest = next(iter(self._open))
+                del self._open[oldest]
+                _cut(oldest)
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            deadline.cancel()
+            with self._lock:
+                self._open.pop(request, None)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Who leaves without an answer is no news."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(request, client_address)
+
+
+def _cut(connection: socket.socket) -> None:
+    with suppress(OSError):  # it is closed
+        connection.shutdown(socket.SHUT_RDWR)
+
+
 def _handler(status: Status) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
-        timeout = REQUEST_TIMEOUT_S
-
         def do_GET(self) -> None:
             if self.path == "/live":
                 self._answer(HTTPStatus.OK, b"{}", "application/json")

@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from rfm.server.poison import SUFFIX, Journal
 
-SCAN_INTERVAL_S = 1.0  # for stubs that are new
 CONFIRM_S = 0.3  # one that was unloaded is a zombie for a moment, too
 STOPPED_S = 3.0  # by SIGSTOP, say, before it counts as hung
 
@@ -25,15 +25,41 @@ SHARED_MEMORY = Path("/dev/shm")
 _PROC = Path("/proc")
 _PROGRAM = b"triton_python_backend_stub"
 _ZOMBIE, _STOPPED = "Z", "T"
+_PARENT, _STARTED = 1, 19  # places in what _stat gives
+_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 @dataclass(frozen=True)
 class Stub:
-    """One model process."""
+    """One model process. started_ticks: by the kernel's clock; no other process of this id has it"""
 
     pid: int
+    started_ticks: int
     model: str
+    version: int
     region: str  # name of its shared memory
+
+    @property
+    def serves(self) -> tuple[str, int]:
+        """Model and version."""
+        return self.model, self.version
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether it has not ended."""
+        return self.state not in (None, _ZOMBIE)
+
+    @property
+    def state(self) -> str | None:
+        """As the kernel has it; None: there is no such process."""
+        fields = _stat(self.pid)
+        return fields[0] if fields and int(fields[_STARTED]) == self.started_ticks else None
+
+    @property
+    def started_s(self) -> float:
+        """When, by time.monotonic."""
+        age_s = time.clock_gettime(time.CLOCK_BOOTTIME) - self.started_ticks / _TICKS_PER_S
+        return time.monotonic() - age_s
 
     @property
     def journal(self) -> Journal | None:
@@ -42,38 +68,55 @@ class Stub:
 
     def kill(self) -> None:
         """Ends it at once, whatever it does."""
-        with suppress(ProcessLookupError):
-            os.kill(self.pid, signal.SIGKILL)
+        if self.is_alive:
+            with suppress(ProcessLookupError):
+                os.kill(self.pid, signal.SIGKILL)
 
 
 class StubWatch:
-    """Sees which stubs of the tritonserver ``triton_pid`` have died, or were stopped.
+    """Sees which stubs of the tritonserver ``triton_pid`` have died, or hang. Those that still load are Triton's.
 
-    hang_s: what one batch may take before its stub counts as hung
+    hang_s: what one forward pass may take before its stub counts as hung
     """
 
     def __init__(self, triton_pid: int, hang_s: float) -> None:
         self._triton_pid = triton_pid
         self._hang_s = hang_s
-        self._stubs: dict[int, Stub] = {}
-        self._scanned_s = 0.0
-        self._since: dict[tuple[int, str], float] = {}  # pid and state: when it was first seen so
-        self._buried: set[int] = set()
+        self._stubs: set[Stub] = set()
+        self._loaded: set[Stub] = set()
+        self._watched: set[Stub] = set()
+        self._buried: set[Stub] = set()
+        self._since: dict[tuple[Stub, str], float] = {}  # stub and state: when it was first seen so
+        self._lock = threading.Lock()
+
+    def tell(self, ready: Collection[tuple[str, int]], going: Collection[tuple[str, int]], asked_s: float) -> None:
+        """Which versions of which models were ready at ``asked_s``, and which were on their way to or from that.
+
+        The stubs of a version that is ready have loaded. A version that is loaded once more stays ready meanwhile, so
+        its new stubs have loaded when the old ones are gone.
+        """
+        self._scan()
+        with self._lock:
+            self._loaded &= self._stubs
+            old = {stub.serves for stub in self._loaded}
+            new = {stub for stub in self._stubs if stub.serves in ready and stub.serves not in old}
+            self._loaded |= {stub for stub in new if stub.started_s < asked_s}
+            self._watched = {stub for stub in self._loaded if stub.serves not in going}
 
     def dead(self) -> list[Stub]:
         """Those that have died and were not buried."""
         self._look()
-        return [stub for stub in self.all if self._has_been(stub, _ZOMBIE, CONFIRM_S)]
+        return [stub for stub in self._now_watched if self._has_been(stub, _ZOMBIE, CONFIRM_S)]
 
     def hung(self) -> list[tuple[Stub, str]]:
         """Those that are alive and get nowhere, and why."""
         found = []
-        for stub in self.all:
+        for stub in self._now_watched:
             journal = stub.journal
             if self._has_been(stub, _STOPPED, STOPPED_S):
                 found.append((stub, f"stopped for {STOPPED_S:g} s"))
-            elif journal is not None and journal.busy_s > self._hang_s:
-                found.append((stub, f"at work on one batch for {self._hang_s:g} s"))
+            elif journal is not None and journal.busy_s > self._hang_s and stub.is_alive:
+                found.append((stub, f"at work on one forward pass for {self._hang_s:g} s"))
         return found
 
     def of_model(self, model: str) -> list[Stub]:
@@ -84,56 +127,44 @@ class StubWatch:
     @property
     def all(self) -> list[Stub]:
         """Those that are known."""
-        return list(self._stubs.values())
+        with self._lock:
+            return list(self._stubs)
 
     def bury(self, stubs: Iterable[Stub]) -> None:
         """Stubs that are of no more interest."""
-        for stub in stubs:
-            self._buried.add(stub.pid)
-            self._stubs.pop(stub.pid, None)
+        with self._lock:
+            self._buried.update(stubs)
+            self._stubs -= self._buried
+            self._loaded -= self._buried
+            self._watched -= self._buried
+
+    @property
+    def _now_watched(self) -> list[Stub]:
+        with self._lock:
+            return list(self._watched)
 
     def _look(self) -> None:
         now_s = time.monotonic()
-        if now_s - self._scanned_s >= SCAN_INTERVAL_S:
-            self._scan()
-        for pid in list(self._stubs):
-            state = _state(pid)
-            if state is None:  # unloaded
-                del self._stubs[pid]
-            for known in (_ZOMBIE, _STOPPED):
-                if state == known:
-                    self._since.setdefault((pid, known), now_s)
-                else:
-                    self._since.pop((pid, known), None)
+        states = {stub: stub.state for stub in self._now_watched}
+        seen = {(stub, state) for stub, state in states.items() if state in (_ZOMBIE, _STOPPED)}
+        self._since = {key: self._since.get(key, now_s) for key in seen}
 
     def _has_been(self, stub: Stub, state: str, duration_s: float) -> bool:
-        since_s = self._since.get((stub.pid, state))
+        since_s = self._since.get((stub, state))
         return since_s is not None and time.monotonic() - since_s >= duration_s
 
     def _scan(self) -> None:
-        self._scanned_s = time.monotonic()
-        for folder in _PROC.glob("[0-9]*"):
-            pid = int(folder.name)
-            if pid not in self._stubs and pid not in self._buried and _parent(pid) == self._triton_pid:
-                stub = _stub(folder)
-                if stub is not None:
-                    self._stubs[pid] = stub
+        with self._lock:
+            known = {stub for stub in self._stubs if stub.state is not None}  # a zombie tells nothing of itself
+            found = (_stub(folder, self._triton_pid) for folder in _PROC.glob("[0-9]*"))
+            self._buried = {stub for stub in self._buried if stub.state is not None}
+            self._stubs = known | {stub for stub in found if stub is not None} - self._buried
 
 
 def is_alive(pid: int) -> bool:
     """Whether there is a process that has not ended."""
-    return _state(pid) not in (None, _ZOMBIE)
-
-
-def _state(pid: int) -> str | None:
-    """None: there is no such process."""
     fields = _stat(pid)
-    return fields[0] if fields else None
-
-
-def _parent(pid: int) -> int | None:
-    fields = _stat(pid)
-    return int(fields[1]) if fields else None
+    return bool(fields) and fields[0] != _ZOMBIE
 
 
 def _stat(pid: int) -> list[str]:
@@ -144,12 +175,19 @@ def _stat(pid: int) -> list[str]:
         return []
 
 
-def _stub(folder: Path) -> Stub | None:
+def _stub(folder: Path, parent: int) -> Stub | None:
     """Its arguments are .../<model>/<version>/model.py, the name of its shared memory, and others."""
+    pid = int(folder.name)
+    fields = _stat(pid)
+    if not fields or int(fields[_PARENT]) != parent:
+        return None
     try:
         words = (folder / "cmdline").read_bytes().split(b"\0")
     except (FileNotFoundError, ProcessLookupError):
         return None
     if len(words) < 3 or not words[0].endswith(_PROGRAM):
         return None
-    return Stub(int(folder.name), Path(os.fsdecode(words[1])).parent.parent.name, os.fsdecode(words[2]))
+    version = Path(os.fsdecode(words[1])).parent
+    if not version.name.isdecimal():
+        return None
+    return Stub(pid, int(fields[_STARTED]), version.parent.name, int(version.name), os.fsdecode(words[2]))

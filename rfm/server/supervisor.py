@@ -11,6 +11,7 @@ from types import FrameType
 
 from rfm.server import leftovers
 from rfm.server.gateway_process import GatewayProcess
+from rfm.server.inquiry import SILENT_S
 from rfm.server.installation import ServerStartError
 from rfm.server.process import POLL_S, STOP_SIGNALS, TritonServer
 from rfm.server.restarts import Restarts
@@ -81,7 +82,7 @@ class Supervisor:
             if not self._told_to_stop.is_set():  # else it ended since it was told to
                 raise
         finally:
-            self._status.tell(dict.fromkeys(self._status.models, "it is told to stop"))
+            self._status.tell_down("it is told to stop")
             if self._gateway is not None:  # it answers what it has begun, and then the server is stopped
                 self._gateway.stop()
             self._close_served()
@@ -99,7 +100,10 @@ class Supervisor:
 
     def _look(self) -> None:
         """Starts again what has ended. Raises CrashLoopError."""
-        if self._server.exit_status is not None:
+        if self._served is not None and self._served.is_silent:
+            self._server.kill()
+            self._start_again(f"no answer for {SILENT_S:g} s")
+        elif self._server.exit_status is not None:
             self._start_again(f"exit status {self._server.exit_status}")
         if self._gateway is not None and (why := self._gateway.look()):
             self._count("gateway", why)
@@ -112,7 +116,7 @@ class Supervisor:
         while not self._told_to_stop.is_set():
             self._count("triton", why)
             self._close_served()
-            self._status.tell(dict.fromkeys(self._status.models, f"tritonserver is started again, after {why}"))
+            self._status.tell_down(f"tritonserver is started again, after {why}")
             self._server.stop()  # what is left of it
             if self._told_to_stop.wait(self._triton_restarts.pause_s(why)):
                 return

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: MIT
+"""What a Triton says of itself, asked again and again: does it answer at all, and what does it serve?"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Collection, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from http import HTTPStatus
+from typing import Any
+
+from rfm.server.admin_key import http_headers
+from rfm.server.http import NO_ANSWER, Http
+from rfm.server.process import TritonServer
+from rfm.server.repository_api import READY, ModelVersion, versions_of
+
+INTERVAL_S = 1.0
+SILENT_S = 3.0  # without any answer: it has to be started again
+
+_DOOR_TIMEOUT_S = SILENT_S / 2
+_INDEX_TIMEOUT_S = 5.0
+
+Config = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Told:
+    """One answer. asked_s: when it was asked for, by time.monotonic; configs: of each model, when it was last ready"""
+
+    asked_s: float
+    versions: Collection[ModelVersion]
+    configs: Mapping[str, Config]
+    ready: frozenset[str]  # models
+
+    def is_unloaded(self, model: str) -> bool:
+        """Whether it was unloaded because somebody wanted that."""
+        return all(entry.is_unloaded for entry in self.versions if entry.name == model)
+
+    def has(self, model: str, version: int) -> bool:
+        """Whether this version of it is ready; -1: any."""
+        ready = {number for name, number in self.in_state(READY) if name == model}
+        return bool(ready) if version == -1 else version in ready
+
+    def in_state(self, *states: str) -> set[tuple[str, int]]:
+        """Models and versions."""
+        return {(entry.name, entry.version or 0) for entry in self.versions if entry.state in states}
+
+
+class Inquiry:
+    """Asks a server that is ready, in a thread."""
+
+    def __init__(self, server: TritonServer) -> None:
+        endpoints = server.endpoints
+        self._http = Http(endpoints.http_host, endpoints.http_port)
+        # While the threads of HTTP wait for models that are loaded, this one answers still.
+        self._metrics = Http(endpoints.host, endpoints.metrics_port)
+        self._headers = http_headers(server.admin_key)
+        self._configs: dict[str, Config] = {}
+        self._silent_since_s: float | None = None
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._ask_for_ever, name="rfm-inquiry", daemon=True)
+        self.told: Told | None = None  # the latest
+
+    def start(self) -> None:
+        """Asks from now on."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Asks no more."""
+        self._closed.set()
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether it has not answered for SILENT_S."""
+        silent_since_s = self._silent_since_s
+        return silent_since_s is not None and time.monotonic() - silent_since_s >= SILENT_S
+
+    def _ask_for_ever(self) -> None:
+        while not self._closed.is_set():
+            asked_s = time.monotonic()
+            if self._answers(self._http, "/v2") or self._answers(self._metrics, "/metrics"):
+                self._silent_since_s = None
+                with suppress(*NO_ANSWER):  # it is asked again
+                    self.told = self._ask()
+            elif self._silent_since_s is None:
+                self._silent_since_s = asked_s
+            self._closed.wait(INTERVAL_S)
+
+    def _answers(self, door: Http, path: str) -> bool:
+        try:
+            door.request("GET", path, _DOOR_TIMEOUT_S)
+        except NO_ANSWER:
+            return False
+        return True
+
+    def _ask(self) -> Told:
+        asked_s = time.monotonic()
+        path = "/v2/repository/index"
+        versions = versions_of(self._http.get_json(path, _INDEX_TIMEOUT_S, method="POST", headers=self._headers))
+        loaded = sorted({entry.name for entry in versions if entry.is_ready})
+        self._configs |= {model: self._http.get_json(f"/v2/models/{model}/config") for model in loaded}
+        ready = frozenset(model for model in loaded if self._is_ready(self._configs[model]))
+        return Told(asked_s, versions, dict(self._configs), ready)
+
+    def _is_ready(self, config: Config) -> bool:
+        """An ensemble, which nobody else asks, is asked; a model that is not made of others has a canary."""
+        if "ensemble_scheduling" not in config:
+            return True
+        status, _ = self._http.request("GET", f"/v2/models/{config['name']}/ready", _DOOR_TIMEOUT_S)
+        return status == HTTPStatus.OK

@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: MIT
+"""What ``rfm serve`` looks after: the versions and models that are served now, and Triton itself."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import rollout
+from rfm_serve import MODEL, Serving, serving, wait_for
+from test_healing import Callers, make_repository, references, trajectory
+
+from rfm.server import healing
+from rfm.server.canary import Canary, Verdict
+from rfm.server.healing import ModelHealth
+from rfm.server.http import Http
+from rfm.server.installation import find_installation
+from rfm.server.process import Endpoints, TritonServer
+from rfm.server.repository_api import RepositoryApi, RepositoryApiError
+from rfm.server.served import NOT_LOADED, Served
+from rfm.server.status import READY, Status
+from rfm_export.rollout import Rollout
+
+__all__ = ["references"]  # a fixture
+
+KEY = "a-key-that-only-tests-know"
+OTHER = f"{MODEL}_b"
+HANG_S = 3
+DIES_AT_ITS_START = "\n\nimport os\n\nos._exit(1)\n"
+WARMS_UP_SLOWLY = f"""
+
+_answer = TritonPythonModel.answer
+_answered = []
+
+
+def slow(self, questions, execution):
+    import time
+
+    if not _answered:
+        _answered.append(True)
+        time.sleep({2 * HANG_S})
+    return _answer(self, questions, execution)
+
+
+TritonPythonModel.answer = slow
+"""
+
+
+@contextmanager
+def administered(repository: Path, **settings: int) -> Iterator[tuple[Serving, RepositoryApi]]:
+    """The repository is served, with these settings, and ready; and the API that changes what is."""
+    key_file, config = repository.parent / "key", repository.parent / "serve.yaml"
+    key_file.touch(0o600)
+    key_file.write_text(KEY)
+    config.write_text("".join(f"{name}: {value}\n" for name, value in settings.items()))
+    with serving(repository, f"--admin-key-file={key_file}", f"--config={config}") as served:
+        served.wait_ready()
+        with RepositoryApi(served.endpoints.http_url, KEY) as api:
+            yield served, api
+
+
+def change(file: Path, pattern: str, wanted: str) -> None:
+    text, count = re.subn(pattern, wanted, file.read_text())
+    assert count == 1, pattern
+    file.write_text(text)
+
+
+def restarts_of(served: Serving, what: str) -> float:
+    return served.metric("rfm_serve_restarts_total", what=what)
+
+
+def test_what_was_served_is_healed_and_not_what_was_exported_since(tmp_path: Path) -> None:
+    repository, samples = tmp_path / "repository", rollout.questions()
+    rollout.export(rollout.WITH_ENCODERS.checkpoint, repository)
+    expected = rollout.answers(rollout.WITH_ENCODERS.checkpoint, samples)
+    parts = (MODEL, "rfm_encoder", "rfm_frames")
+    with administered(repository) as (served, api):
+        rollout.export(rollout.other_checkpoint(tmp_path / "other"), repository)
+        for stub in served.stubs:
+            stub.kill()
+        served.wait_ready(False)
+        served.wait_ready()
+        assert [api.ready_versions(part) for part in parts] == [[1]] * 3
+        with served.client() as client:
+            for got, wanted in zip(client.evaluate(samples), expected, strict=True):
+                assert rollout.difference(got, wanted) <= rollout.TOLERANCE
+        assert restarts_of(served, MODEL) == 1
+        Rollout(repository, MODEL, api, lambda _: None).to(2)
+        assert [api.ready_versions(part) for part in parts] == [[2]] * 3
+        served.wait_ready()
+        # An ensemble that names a version which is served no more is not ready, though each of its parts is.
+        newer = api.config(MODEL, 2)
+        api.load(MODEL, {**newer, "version_policy": {"specific": {"versions": [1]}}})
+        wait_for(lambda: served.reasons() == {MODEL: READY, "rfm_encoder": READY, "rfm_frames": NOT_LOADED})
+        assert not served.is_ready()
+        api.load(MODEL, newer)
+        served.wait_ready()
+        api.unload("rfm_frames")
+        wait_for(lambda: served.reasons() == {MODEL: READY, "rfm_encoder": READY})
+
+
+def test_a_version_that_loads_and_fails_or_takes_long_costs_the_other_nothing(
+    tmp_path: Path, references: list[np.ndarray[Any, Any]]
+) -> None:
+    repository = make_repository(tmp_path)
+    model = repository / MODEL
+    shutil.copytree(model / "1", model / "2")
+    code = (model / "2" / "model.py").read_text()
+    with administered(repository, hang_s=HANG_S) as (served, api), served.client() as client:
+        change(model / "config.pbtxt", r"versions: 1", "versions: 1 versions: 2")
+        with Callers(client, references) as callers:
+            (model / "2" / "model.py").write_text(code + DIES_AT_ITS_START)
+            with pytest.raises(RepositoryApiError):
+                api.load(MODEL)
+            callers.wait_for_all()
+            (model / "2" / "model.py").write_text(code + WARMS_UP_SLOWLY)
+            started_s = time.monotonic()
+            api.load(MODEL)
+            assert time.monotonic() - started_s > HANG_S
+            callers.wait_for_all()
+        assert (callers.lost, callers.wrong) == ([], [])
+        assert api.ready_versions(MODEL) == [1, 2]
+        assert restarts_of(served, MODEL) == 0
+        # From now on both count.
+        served.wait_ready()
+        (stub,) = [stub for stub in served.stubs if stub.version == 2]
+        wait_for(lambda: stub.kill() or restarts_of(served, MODEL) == 1)
+        served.wait_ready()
+        assert api.ready_versions(MODEL) == [1, 2]
+
+
+def test_models_come_and_go(tmp_path: Path) -> None:
+    repository = make_repository(tmp_path)
+    with administered(repository) as (served, api):
+        shutil.copytree(repository / MODEL, repository / OTHER)
+        change(repository / OTHER / "config.pbtxt", f'name: "{MODEL}"', f'name: "{OTHER}"')
+        api.load(OTHER)
+        wait_for(lambda: served.reasons() == {MODEL: READY, OTHER: READY})
+        heal(served, OTHER, lambda: None)
+        code = repository / OTHER / "1" / "model.py"
+        text = code.read_text()
+        code.write_text(text + "\nraise ValueError('broken')\n")
+        heal(served, OTHER, lambda: wait_for(lambda: "broken" in served.reasons()[OTHER]) and code.write_text(text))
+        api.unload(OTHER)
+        wait_for(lambda: served.reasons() == {MODEL: READY})
+        assert served.metric("rfm_serve_ready", model=OTHER) == 0
+        api.load(OTHER)
+        wait_for(lambda: served.reasons() == {MODEL: READY, OTHER: READY})
+        with served.client(model=OTHER) as client:
+            assert np.isfinite(client.progress(trajectory(0)).progress).all()
+
+
+def heal(served: Serving, model: str, meanwhile: Callable[[], Any]) -> None:
+    before = restarts_of(served, model)
+    (stub,) = served.stubs_of(model)
+    stub.kill()
+    served.wait_ready(False)
+    meanwhile()
+    served.wait_ready()
+    assert restarts_of(served, model) == before + 1
+    assert served.stubs_of(model) != [stub]
+
+
+def test_a_triton_that_does_not_answer_is_started_again(tmp_path: Path) -> None:
+    with serving(make_repository(tmp_path)) as served:
+        served.wait_ready()
+        os.kill(served.triton, signal.SIGSTOP)
+        wait_for(lambda: restarts_of(served, "triton") == 1, 10.0)
+        wait_for(lambda: served.metric("rfm_serve_canary_ok") == served.metric("rfm_serve_ready") == 0, 1.0)
+        served.wait_ready()
+        assert restarts_of(served, MODEL) == 0
+    assert served.said == ["rfm: triton is started again: no answer for 3 s"]
+
+
+def test_what_is_exported_while_triton_starts_does_not_matter(tmp_path: Path) -> None:
+    repository = make_repository(tmp_path)
+    server = TritonServer(repository, Endpoints.free(), find_installation())
+    try:
+        server.start()
+        shutil.copytree(repository / MODEL, repository / OTHER)
+        change(repository / OTHER / "config.pbtxt", f'name: "{MODEL}"', f'name: "{OTHER}"')
+        server.wait_ready()
+    finally:
+        server.stop()
+
+
+def test_a_triton_that_is_gone_is_the_supervisor_s_to_see() -> None:
+    about = Status()
+    about.tell({MODEL: "it is loaded"})
+    server = SimpleNamespace(endpoints=Endpoints.free(), admin_key=KEY, pid=os.getpid())
+    served = Served(server, about, 1.0, 1.0)  # type: ignore[arg-type]
+    try:
+        wait_for(lambda: served.is_silent)
+        assert served.look() == []
+        assert not about.ready[0]
+    finally:
+        served.close()
+
+
+def test_what_is_closed_heals_nothing_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def refuse(*_: object) -> None:
+        asked.append(time.monotonic())
+        raise RepositoryApiError("refused")
+
+    monkeypatch.setattr(healing, "RepositoryApi", refuse)
+    endpoints = Endpoints.free()
+    canary = Canary(Http(endpoints.http_host, endpoints.http_port), MODEL, 1.0, 1.0, lambda _: None)
+    server = SimpleNamespace(endpoints=endpoints, admin_key=KEY)  # nobody is to end it
+    health = ModelHealth(server, canary, SimpleNamespace(), Status())  # type: ignore[arg-type]
+    assert health.look("its process is dead", {}) == "its process is dead"
+    wait_for(lambda: len(asked) == 4)  # the next is 4 s away
+    assert health.reason == "it is loaded anew, after: refused"
+    health.close()
+    wait_for(lambda: not health.is_healing, 1.0)
+    assert len(asked) == 4
+
+
+def test_a_model_of_a_triton_that_tells_nothing_does_not_hang() -> None:
+    """It may be busy with a model that it loads; and if it is not, it is Triton that is started again."""
+    endpoints = Endpoints.free()
+    canary = Canary(Http(endpoints.http_host, endpoints.http_port), MODEL, 0.1, 0.0, lambda _: None)
+    canary.start()
+    try:
+        wait_for(lambda: canary.verdict() is Verdict.LATE)
+    finally:
+        canary.stop()
