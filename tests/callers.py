@@ -274,7 +274,11 @@ class Callers:
 
     def __enter__(self) -> Callers:
         self._thread.start()
-        self.wait_for_all()
+        try:
+            self.wait_for_all()
+        except BaseException:
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -43,9 +43,9 @@ def chaos(folder: Path, overload_s: float) -> list[Row]:
     with site(folder / "faults") as served:
         for name, fault in FAULTS.items():
             rows += survive(name, lambda fault=fault: fault(served))  # type: ignore[misc]
-    with overload.large_site(folder / "overload of the gateway") as served:
-        rows += survive("overload of the gateway", lambda: overload.of_gateway(served, overload_s))
-    with overload.large_site(folder / "overload of gRPC", **overload.SETTINGS) as served:
+    with overload.large_site(folder / "unbounded") as served:
+        rows += survive("overload of a gateway", lambda: overload.of_gateway(served, folder, overload_s))
+    with overload.large_site(folder / "bounded", **overload.SETTINGS) as served:
         rows += survive("overload of gRPC", lambda: overload.of_grpc(served, overload_s))
     for name, inside in mounts.FAULTS.items():
         rows += survive(name, lambda inside=inside: mounts.run(inside, folder))  # type: ignore[misc]

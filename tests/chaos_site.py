@@ -93,16 +93,17 @@ class Site:
         """With the client as it is by default, about samples of all types."""
         return Callers(self.direct, self.mixed, count)
 
-    def wait_gateway(self, within_s: float = 60.0) -> float:
-        """Seconds until the gateway says that it is healthy."""
 
-        def is_healthy() -> bool:
-            try:
-                return httpx.get(f"{self.gateway_url}/health").status_code == 200
-            except httpx.TransportError:
-                return False
+def wait_healthy(gateway_url: str, within_s: float = 60.0) -> float:
+    """Seconds until the gateway says that it is healthy."""
 
-        return wait_for(is_healthy, within_s)
+    def is_healthy() -> bool:
+        try:
+            return httpx.get(f"{gateway_url}/health").status_code == 200
+        except httpx.TransportError:
+            return False
+
+    return wait_for(is_healthy, within_s)
 
 
 @contextmanager
@@ -120,5 +121,5 @@ def site(folder: Path, checkpoint: Path = CHECKPOINT, **settings: int) -> Iterat
         mixed, progress = (Exam.of(checkpoint, samples) for samples in (mixed_samples(), progress_samples()))
         url = f"http://127.0.0.1:{port}"
         found = Site(served, url, checkpoint, repository, key_file, start_s, mixed, progress)
-        found.wait_gateway()
+        wait_healthy(url)
         yield found

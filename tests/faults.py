@@ -15,7 +15,7 @@ from contextlib import ExitStack, contextmanager, suppress
 
 import httpx
 from callers import Callers, direct, through_gateway
-from chaos_site import BACK_S, CALLERS, CHECKPOINT, Row, Site
+from chaos_site import BACK_S, CALLERS, CHECKPOINT, Row, Site, wait_healthy
 from rfm_serve import MODEL, RFM, TRUTH_S, children, wait_for
 
 import rfm_export
@@ -85,7 +85,7 @@ def kill_gateway(site: Site) -> list[Row]:
     ):
         os.kill(pid, signal.SIGKILL)
         wait_for(lambda: not is_alive(pid))
-        back_s = site.wait_gateway()
+        back_s = wait_healthy(site.gateway_url)
         callers.wait_for_all()
         beside.wait_for_all()
     told = "broken off: connections that ended, or were not to be had"

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import asyncio
-import time
+import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +16,6 @@ from callers import (
     MOST_FRAMES,
     TEXT_DIM,
     VIDEO_DIM,
-    Callers,
     Connect,
     Exam,
     closed_loop,
@@ -25,29 +24,31 @@ from callers import (
     through_gateway,
     trajectory,
 )
-from chaos_site import Row, Site, site
+from chaos_site import Row, Site, site, wait_healthy
 from prometheus_client.parser import text_string_to_metric_families
+from rfm_serve import MODEL, PATIENCE_S
 
 from rfm.checkpoint import RewindCheckpoint, save
 from rfm.models.rewind import RewindConfig, RewindTransformer
+from rfm.server.process import Endpoints
 from rfm_client import ProgressSample, Sample
-from rfm_client.gateway.app import DEFAULT_MAX_IN_FLIGHT
+from rfm_client.gateway.command import gateway_command
 from rfm_client.gateway.scoring import FRAME_STEPS
 
-MAX_QUEUE_SIZE = 64
+ROOM = 8  # calls that may wait at a time: about a second
 # Two instances: with one, a Triton before 26.08 that has a bounded queue serves a batch each half second once it is full.
-SETTINGS = {"max_queue_size": MAX_QUEUE_SIZE, "batch_size": 2, "instances": 2}
+SETTINGS = {"max_queue_size": ROOM, "batch_size": 1, "instances": 2}
 FACTOR = 4
 CALIBRATION_S = 6.0
 CALLERS = 8
-CROWD = 200  # callers of the gateway at a time
+CROWD_PER_S = 200.0
 CROWD_S = 5.0
 TOLD_S = 0.1
 P99_FACTOR = 3
 LARGE = RewindConfig(  # much work and few bytes: callers beside the server take little of the machine
     video_feature_dim=VIDEO_DIM,
     text_feature_dim=TEXT_DIM,
-    hidden_dim=512,
+    hidden_dim=1024,
     num_layers=4,
     num_attention_heads=8,
     max_len=MOST_FRAMES,
@@ -77,14 +78,23 @@ def heavy_samples() -> list[Sample]:
 def of_grpc(site: Site, seconds: float) -> list[Row]:
     """Triton's own queue turns away what it has no room for; and what the gateway says of that."""
     connect = direct(site.served.endpoints.grpc_url, retry=False, max_in_flight=4096)
-    row, _ = _overload(site, "gRPC", connect, MAX_QUEUE_SIZE, lambda: _failures(site), seconds)
+    row, _ = _overload(site, "gRPC", connect, ROOM, lambda: _failures(site), seconds)
     return [row, _crowd(site)]
 
 
-def of_gateway(site: Site, seconds: float) -> list[Row]:
-    """The gateway turns away what is more than it takes at a time, and counts it, whatever Triton does."""
-    connect = through_gateway(site.gateway_url)
-    row, counted = _overload(site, "the gateway", connect, DEFAULT_MAX_IN_FLIGHT, lambda: _rejections(site), seconds)
+def of_gateway(site: Site, folder: Path, seconds: float) -> list[Row]:
+    """A gateway turns away what is more than it takes at a time, and counts it, whatever Triton does."""
+    endpoints, port = site.served.endpoints, Endpoints.free().http_port
+    url = f"http://127.0.0.1:{port}"
+    command = gateway_command(endpoints.grpc_url, endpoints.metrics_url, MODEL, "127.0.0.1", port)
+    with (folder / "gateway.log").open("wb") as log:
+        gateway = subprocess.Popen([*command, f"--max-in-flight={ROOM}"], stdout=log, stderr=log)
+    try:
+        wait_healthy(url)
+        row, counted = _overload(site, "a gateway", through_gateway(url), ROOM, lambda: _rejections(url), seconds)
+    finally:
+        gateway.terminate()
+        gateway.wait(PATIENCE_S)
     row.expect(counted == row.refused, f"the gateway counts {counted:.0f} refused calls")
     return [row]
 
@@ -117,17 +127,17 @@ def _overload(
 
 def _crowd(site: Site) -> Row:
     """More callers of the gateway than Triton's queue takes; every refusal is in the gateway's metrics."""
-    before = _rejections(site)
-    with Callers(through_gateway(site.gateway_url), site.progress, CROWD) as callers:
-        time.sleep(CROWD_S)
-    counted = _rejections(site) - before
-    row = Row.of(f"{CROWD} callers of the gateway", callers.tally, told=f"its metrics count {counted:.0f} refused")
-    row.expect(counted == callers.tally.refused, f"the gateway counts {counted:.0f} refused calls")
+    before = _rejections(site.gateway_url)
+    tally, _ = asyncio.run(open_loop(through_gateway(site.gateway_url), site.progress, CROWD_PER_S, CROWD_S))
+    counted = _rejections(site.gateway_url) - before
+    row = Row.of("a crowd through the gateway", tally, told=f"its metrics count {counted:.0f} refused")
+    row.expect(tally.refused > 0, "nobody was refused")
+    row.expect(counted == tally.refused, f"the gateway counts {counted:.0f} refused calls")
     return row
 
 
-def _rejections(site: Site) -> float:
-    return _sum(f"{site.gateway_url}/metrics", "rfm_gateway_rejections_total", reason="unavailable")
+def _rejections(gateway_url: str) -> float:
+    return _sum(f"{gateway_url}/metrics", "rfm_gateway_rejections_total", reason="unavailable")
 
 
 def _failures(site: Site) -> float:
