@@ -16,8 +16,9 @@ from conftest import load_engine, rewind_of
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from rfm.collate.images import PREPROCESSOR_CONFIG
 from rfm.execution import Execution
-from rfm.models.encoders import PREPROCESSOR_CONFIG, Encoders, ImagePreprocessor
+from rfm.models.encoders import Encoders, ImagePreprocessor
 from rfm_client import (
     BatchTiming,
     InferenceFailedError,

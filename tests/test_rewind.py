@@ -14,7 +14,8 @@ import torch
 from conftest import random_trajectory
 from torch import Tensor, nn
 
-from rfm.collate.rewind import MAX_EMBEDDING, RewindCollator, prefix_indices
+from rfm.collate.dense import prefix_indices
+from rfm.collate.rewind import MAX_EMBEDDING, RewindCollator
 from rfm.config import DEFAULT_TOKEN_BUDGET
 from rfm.engine import Engine, Outcome
 from rfm.families.rewind import RewindFamily

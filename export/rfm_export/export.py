@@ -15,10 +15,11 @@ from safetensors import SafetensorError
 from rfm import checkpoint as checkpoints
 from rfm.checkpoint import Checkpoint, RewindCheckpoint, VlmCheckpoint
 from rfm.checkpoint.content import read_json
+from rfm.collate.images import PREPROCESSOR_CONFIG
 from rfm.config import ServeConfig
 from rfm.engine import PROCESSOR_FOLDER, Engine
 from rfm.families.vlm import load_collator, save_processor
-from rfm.models.encoders import PREPROCESSOR_CONFIG, Encoders, ImagePreprocessor
+from rfm.models.encoders import Encoders, ImagePreprocessor
 from rfm_client.resize import FrameSize
 from rfm_export.about import Origin, about, tell_weights
 from rfm_export.errors import ExportError

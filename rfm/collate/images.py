@@ -19,14 +19,15 @@ from torch import Tensor
 
 from rfm_client.samples import UInt8Array
 
+PREPROCESSOR_CONFIG = "preprocessor_config.json"  # beside a model's weights: how its images are made
 MAX_UINT8 = 255
-PIL_BICUBIC = 3
+PIL_BICUBIC = 3  # the value of `resample` in it
 MERGE = 2
 FRAMES_PER_GROUP = 2  # frames that share the patches of one temporal group
 IMAGE_TOKENS = (4, 16_384)  # merged tokens of one image: at least, at most
 VIDEO_TOKENS = (128.0, 768.0)  # of one frame of a video
 VIDEO_TOTAL_TOKENS = 128_000 * 0.9  # of a whole video
-MAX_ASPECT_RATIO = 200
+MAX_QWEN_ASPECT_RATIO = 200
 MAX_VIDEO_SIDE_PX = 480  # longer frames are scaled down before anything else, in video mode
 
 
@@ -77,8 +78,8 @@ def fitted_size(height: int, width: int, factor: int, tokens: tuple[float, float
 
     Raises ValueError for an image over 200 times as long as wide.
     """
-    if max(height, width) / min(height, width) > MAX_ASPECT_RATIO:
-        raise ValueError(f"an image at most {MAX_ASPECT_RATIO} times as long as wide, got {height} x {width}")
+    if max(height, width) / min(height, width) > MAX_QWEN_ASPECT_RATIO:
+        raise ValueError(f"an image at most {MAX_QWEN_ASPECT_RATIO} times as long as wide, got {height} x {width}")
     least, most = (count * factor**2 for count in tokens)
     fitted = [max(factor, round(side / factor) * factor) for side in (height, width)]
     if fitted[0] * fitted[1] > most:

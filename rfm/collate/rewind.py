@@ -14,6 +14,7 @@ import numpy.typing as npt
 import torch
 
 from rfm.collate import as_tensor
+from rfm.collate.dense import prefix_indices
 from rfm.models.packing import rounded_up
 from rfm.models.rewind import RewindBatch, RewindConfig
 from rfm_client import InvalidSampleError, ProgressSample, Sample, SimilaritySample, Trajectory
@@ -53,14 +54,6 @@ class Row:
     def shown(self, video: Float32Array) -> npt.NDArray[np.int64]:
         """int64 [T], the frames of one of ``videos`` that are in the row."""
         return np.arange(len(video)) if self.picked is None else self.picked
-
-
-def prefix_indices(num_frames: int, frame_steps: int) -> npt.NDArray[np.int64]:
-    """Dense mode: int64 [T, K], the frames that stand for each prefix 0..t.
-
-    K positions evenly from 0 to t, truncated to whole frames, as the original server samples them.
-    """
-    return np.stack([np.linspace(0, t, frame_steps).astype(np.int64) for t in range(num_frames)])
 
 
 @dataclass(frozen=True)

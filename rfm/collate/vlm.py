@@ -18,6 +18,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from rfm.collate.dense import prefix_indices
 from rfm.collate.images import FRAMES_PER_GROUP, Grid, QwenImages, SmolImages
 from rfm.collate.prompts import (
     PREFERENCE_TOKEN,
@@ -28,7 +29,6 @@ from rfm.collate.prompts import (
     question,
     text_question,
 )
-from rfm.collate.rewind import prefix_indices
 from rfm.models.vlm import VlmBatch, VlmConfig
 from rfm_client import InvalidSampleError, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.samples import UInt8Array

@@ -12,7 +12,7 @@ import torch
 
 from rfm.checkpoint import CheckpointError, VlmCheckpoint
 from rfm.checkpoint.content import read_json
-from rfm.collate.images import FRAMES_PER_GROUP, Normalisation, QwenImages, SmolImages
+from rfm.collate.images import FRAMES_PER_GROUP, PREPROCESSOR_CONFIG, Normalisation, QwenImages, SmolImages
 from rfm.collate.prompts import SPECIAL_TOKENS
 from rfm.collate.vlm import QwenCollator, SmolCollator, VlmCollator, VlmRow
 from rfm.execution import Execution
@@ -21,7 +21,6 @@ from rfm.models.linear import speed_up
 from rfm.models.vlm import SMOL, VlmBatch, VlmConfig
 from rfm_client import FrameScores, InvalidSampleError, RewardError, Sample
 
-PREPROCESSOR_CONFIG = "preprocessor_config.json"
 CHAT_TEMPLATE = "chat_template.json"
 SMOL_SIZE_PX = 512  # what upstream sets, whatever the base model says; so no image is split
 

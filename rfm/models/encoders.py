@@ -24,6 +24,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from rfm.collate import as_tensor
+from rfm.collate.images import MAX_UINT8, PIL_BICUBIC, PREPROCESSOR_CONFIG
 from rfm.execution import Execution
 from rfm.models.linear import speed_up
 from rfm_client import InferenceFailedError, InvalidSampleError, RewardError, Trajectory
@@ -31,10 +32,7 @@ from rfm_client.resize import FrameSize
 from rfm_client.samples import Float32Array, UInt8Array
 
 IMAGES_PER_FORWARD = 64
-PREPROCESSOR_CONFIG = "preprocessor_config.json"
-PIL_BICUBIC = 3  # the value of `resample` in preprocessor_config.json
-MAX_UINT8 = 255
-MAX_ASPECT_RATIO = 50
+MAX_ENCODER_ASPECT_RATIO = 50
 _LOADING_PROBLEMS = ("missing_keys", "unexpected_keys", "mismatched_keys")  # as transformers tells of a load
 
 
@@ -293,8 +291,8 @@ def _embedded(
 def _check_shape(trajectory: Trajectory) -> None:
     """The shorter side is brought to size; a sliver of an image would become a huge one."""
     height, width = trajectory.positions.shape[1:3]
-    if max(height, width) > MAX_ASPECT_RATIO * min(height, width):
-        expected = f"frames at most {MAX_ASPECT_RATIO} times as long as wide"
+    if max(height, width) > MAX_ENCODER_ASPECT_RATIO * min(height, width):
+        expected = f"frames at most {MAX_ENCODER_ASPECT_RATIO} times as long as wide"
         raise InvalidSampleError.at("frames", expected, f"{height} x {width}")
 
 
