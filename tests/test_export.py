@@ -10,8 +10,10 @@ from typing import Any
 
 import goldens
 import pytest
+import torch
 from conftest import serve_config
 from google.protobuf import text_format
+from safetensors.torch import load_file, save_file
 from tritonclient.grpc import model_config_pb2 as pb
 from typer.testing import CliRunner
 
@@ -210,6 +212,21 @@ def test_an_export_that_differs_from_its_checkpoint_is_not_published(
     with pytest.raises(ExportDiffersError, match="expected the checkpoint's scores, got a difference of"):
         export(EMBEDDINGS, tmp_path / "repository")
     assert list(tmp_path.rglob("*")) == [tmp_path / "repository"]
+
+
+def test_a_checkpoint_that_gives_no_numbers_is_not_published(tmp_path: Path) -> None:
+    """All of its weights are numbers; what the network makes of them is not."""
+    checkpoint = tmp_path / "checkpoint"
+    shutil.copytree(EMBEDDINGS.checkpoint, checkpoint)
+    file = checkpoint / "model.safetensors"
+    weights = load_file(file)
+    weights["progress_head.4.weight"] = torch.full_like(weights["progress_head.4.weight"], torch.finfo().max)
+    file.chmod(0o644)
+    save_file(weights, file, {"format": "pt"})
+    expected = "probe 0: expected scores of the checkpoint, got: the network gave a score that is not finite"
+    with pytest.raises(ExportDiffersError, match=expected):
+        rfm_export.export(checkpoint, tmp_path / "repository", serve_config(EMBEDDINGS))
+    assert list((tmp_path / "repository").iterdir()) == []
 
 
 def test_a_model_keeps_its_inputs_and_outputs(tmp_path: Path) -> None:

@@ -7,4 +7,4 @@ class ExportError(Exception):
 
 
 class ExportDiffersError(ExportError):
-    """The exported model does not give the numbers of its checkpoint; nothing was published."""
+    """The exported model does not give the numbers of its checkpoint, or there are none; nothing was published."""

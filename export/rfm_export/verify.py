@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm.engine import Engine, Outcome
+from rfm.families.vqa import UnreadableAnswerError
 from rfm.models.rewind import RewindConfig
 from rfm.models.vlm import VlmConfig
 from rfm_client import (
     FrameScores,
-    InferenceFailedError,
     PreferenceResult,
     PreferenceSample,
     ProgressResult,
@@ -61,12 +61,15 @@ def probes(config: RewindConfig | VlmConfig, *, with_embeddings: bool, with_fram
 
 
 def verify(original: Callable[[], Engine], exported: Callable[[], Engine], samples: Sequence[Sample]) -> None:
-    """Raises ExportDiffersError unless both engines give the same numbers for every sample; one is made at a time."""
+    """Raises ExportDiffersError unless both engines give the same numbers for every sample; one is made at a time.
+
+    A model that generates text need not give any for random frames, but both must say the same of them.
+    """
     scores = [make().evaluate(samples) for make in (original, exported)]
     for index, (before, after) in enumerate(zip(*scores, strict=True)):
-        if isinstance(before, InferenceFailedError) and repr(before) == repr(after):
-            continue  # a model that generates text said the same of random frames, and it was no answer
-        expected, got = _numbers(before), _numbers(after)
+        if isinstance(before, UnreadableAnswerError) and repr(before) == repr(after):
+            continue
+        expected, got = _numbers(index, "the checkpoint", before), _numbers(index, "the export", after)
         if not np.allclose(got, expected, rtol=0, atol=TOLERANCE, equal_nan=True):
             largest = np.abs(got - expected).max()
             raise ExportDiffersError(
@@ -74,9 +77,9 @@ def verify(original: Callable[[], Engine], exported: Callable[[], Engine], sampl
             )
 
 
-def _numbers(outcome: Outcome) -> npt.NDArray[np.float64]:
+def _numbers(index: int, whose: str, outcome: Outcome) -> npt.NDArray[np.float64]:
     if isinstance(outcome, RewardError):
-        raise ExportDiffersError(f"expected scores, got: {outcome}") from outcome
+        raise ExportDiffersError(f"probe {index}: expected scores of {whose}, got: {outcome}") from outcome
     if isinstance(outcome, ProgressResult):
         return _frame_numbers(outcome)
     if isinstance(outcome, PreferenceResult):

@@ -28,6 +28,10 @@ _ANSWER = re.compile(r"<ans>(.*?)</ans>", re.DOTALL)
 _PREFERENCES = {"A": 1.0, "B": 0.0}
 
 
+class UnreadableAnswerError(InferenceFailedError):
+    """The model has said something else than what it was asked for."""
+
+
 class VqaFamily(VlmFamily):
     """A vision-language model that generates its answers, greedily."""
 
@@ -93,7 +97,7 @@ def _read(text: str, row: VlmRow) -> RowScores | RewardError:
         frames = [FrameScores(progress=_not_told(length), success=_not_told(length)) for length in lengths]
         return RowScores(frames, parse_preference(text))
     except ValueError as error:
-        return InferenceFailedError(f"the model's answer cannot be read: {error}, got {text[:SHOWN_CHARACTERS]!r}")
+        return UnreadableAnswerError(f"the model's answer cannot be read: {error}, got {text[:SHOWN_CHARACTERS]!r}")
 
 
 def _not_told(length: int) -> Float32Array:
