@@ -9,7 +9,7 @@ import stat
 import subprocess
 import urllib.request
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from conftest import load_engine, random_trajectory, serve_config
 from prometheus_client.parser import text_string_to_metric_families
 from rollout import NAME, RFM, WITH_ENCODERS, callers, difference, models
 from test_serve_command import EXIT_S, command, wait_for_http
+from tritonclient.grpc import model_config_pb2 as pb
 from tritonclient.utils import InferenceServerException
 
 import rfm_export
@@ -31,9 +32,12 @@ from rfm.engine import Engine
 from rfm.server.admin_key import VARIABLE, AdminKeyError, take_key
 from rfm.server.installation import ServerStartError, find_installation
 from rfm.server.process import Endpoints, TritonServer
+from rfm.server.repository_api import RepositoryApi, RepositoryApiError
 from rfm_client import ModelNotFoundError, ProgressSample, RewardClient, ServerError
 from rfm_client.status import read_status
+from rfm_export import rollout as rfm_rollout
 from rfm_export.publish import read_config
+from rfm_export.rollout import Rollout, RolloutError
 
 KEY = "a-key-that-only-tests-know"
 PLAIN = goldens.config("c1_t1_disc10")  # embeddings alone
@@ -187,6 +191,104 @@ def test_a_broken_version_is_never_asked_and_the_old_one_stays(
     assert served_versions(running, name) == ["1"]
     with running.client(NAME) as client:
         assert client.is_ready()  # what failed is no reason to ask nobody here
+
+
+def test_a_rollout_that_fails_at_its_end_goes_back_and_loses_no_request(
+    running: Running, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The ensemble has gone over to the new version, and fails the probe."""
+    name, ensemble = "late", "late_frames"
+    rollout.export(WITH_ENCODERS.checkpoint, running.repository, name)
+    running.models("load", name)
+    other, samples = rollout.other_checkpoint(tmp_path / "other"), rollout.questions()
+    rollout.export(other, running.repository, name)
+    expected = {"1": rollout.answers(WITH_ENCODERS.checkpoint, samples), "2": rollout.answers(other, samples)}
+    probe = rfm_rollout.probe
+
+    def failing(server: RepositoryApi, config: pb.ModelConfig, version: int) -> None:
+        if config.name == ensemble:
+            raise RepositoryApiError("made up")
+        probe(server, config, version)
+
+    monkeypatch.setattr(rfm_rollout, "probe", failing)
+    parts = ("late_encoder", "late", ensemble)
+    with callers(running.endpoints.grpc_url, samples, expected, model=name) as tally:
+        with (
+            RepositoryApi(running.endpoints.http_url, KEY) as server,
+            pytest.raises(RolloutError, match=r"made up \(served as before: late_encoder: version 1; late: version 1"),
+        ):
+            Rollout(running.repository, name, server, lambda line: None).to(2)
+        assert [served_versions(running, part) for part in parts] == [["1"]] * 3
+        assert [running.served_by_restart(part) for part in parts] == [[1]] * 3
+    assert (tally.failed, tally.unlike) == ([], [])
+    assert tally.asked == tally.answered > rollout.CALLERS
+    running.models("unload", name)
+
+
+@dataclass
+class GoingAway:
+    """A server that answers until it has loaded ``loads`` models, and again when it was asked ``misses`` times more."""
+
+    served: dict[str, list[int]]
+    loads: int
+    misses: int
+    loaded: list[str] = field(default_factory=list)
+
+    def ready_versions(self, model: str) -> list[int]:
+        return self.served[model]
+
+    def load(self, model: str) -> None:
+        self._answer()
+        self.loaded.append(model)
+
+    def unload(self, model: str) -> None:
+        self._answer()
+        self.loaded.append(f"not {model}")
+
+    def wait_gone(self, model: str, kept: list[int]) -> None:
+        pass
+
+    def _answer(self) -> None:
+        if len(self.loaded) >= self.loads and self.misses:
+            self.misses -= 1
+            raise RepositoryApiError("no answer")
+
+
+@pytest.fixture(scope="module")
+def three_models(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Encoder, scorer and ensemble, of which version 1 is served and version 2 was exported."""
+    repository = tmp_path_factory.mktemp("three") / "repository"
+    rollout.export(WITH_ENCODERS.checkpoint, repository)
+    rollout.export(WITH_ENCODERS.checkpoint, repository)
+    return repository
+
+
+PARTS = ("rfm_encoder", "rfm", "rfm_frames")
+
+
+@pytest.mark.parametrize("loads", range(5))
+@pytest.mark.parametrize("returns", [True, False], ids=["and comes back", "for good"])
+def test_a_server_that_goes_away_leaves_what_a_restart_serves(
+    three_models: Path, monkeypatch: pytest.MonkeyPatch, loads: int, returns: bool
+) -> None:
+    """``rfm_frames`` was not served."""
+    monkeypatch.setattr(rfm_rollout, "probe", lambda *_: None)
+    monkeypatch.setattr(rfm_rollout, "RETURN_S", 60.0 if returns else 0.0)
+    monkeypatch.setattr(rfm_rollout, "POLL_S", 0.0)
+    server = GoingAway({"rfm_encoder": [1], "rfm": [1], "rfm_frames": []}, loads, 9 if returns else 10**9)
+    ensemble = (three_models / "rfm_frames" / "config.pbtxt").read_bytes()
+    with pytest.raises(RolloutError) as caught:
+        Rollout(three_models, NAME, server, lambda line: None).to(2)  # type: ignore[arg-type]
+    assert [list(read_config(three_models, part).version_policy.specific.versions) for part in PARTS[:2]] == [[1], [1]]
+    assert (three_models / "rfm_frames" / "config.pbtxt").read_bytes() == ensemble
+    message = str(caught.value)
+    assert message.startswith("rfm version 2: no answer (")
+    if returns:
+        assert set(server.loaded[loads:]) == {"rfm_encoder", "rfm", "not rfm_frames"}
+        assert message.endswith("(served as before: rfm_encoder: version 1; rfm: version 1; rfm_frames: none)")
+    else:
+        why = "; ".join(f"{part}: no answer" for part in reversed(PARTS))
+        assert message.endswith(f"(expected to serve again what it served, got: {why})")
 
 
 def served_versions(running: Running, model: str) -> list[str]:

@@ -9,14 +9,18 @@ and its scorer (parts), and an ensemble, whose configuration names the versions 
 3. The ensemble goes over to the new version, and Triton finishes what the old one has begun.
 4. Parts serve the new version alone; Triton finishes again.
 
-Whatever fails on the way, the versions that were served before are loaded again with their own configurations. Requests
-that name no version are answered by the highest one that is ready: by the new one from step 1 on, in a rollback from
-step 4 on. Since one configuration holds for all versions of a model, step 1 has Triton load the old version a second
-time, with the new one's: for a moment there must be room for three copies.
+Whatever fails on the way, the versions that were served before are loaded again with their own configurations. Those
+are put back even if the server is gone, so that a restart serves what was served before; a server that comes back
+within RETURN_S is told to load them.
+
+Requests that name no version are answered by the highest one that is ready: by the new one from step 1 on, in a
+rollback from step 4 on. Since one configuration holds for all versions of a model, step 1 has Triton load the old
+version a second time, with the new one's: for a moment there must be room for three copies.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,8 +35,10 @@ from rfm_client import PreferenceSample, ProgressSample, RewardError, Trajectory
 from rfm_export.errors import ExportError
 from rfm_export.layout import CONFIG_FILE, encoder_name, frames_name
 from rfm_export.pbtxt import serving_versions
-from rfm_export.publish import alone, config_of, replace_config, staging
+from rfm_export.publish import alone, config_of, read_config, replace_config, staging
 
+RETURN_S = 120.0
+POLL_S = 1.0
 PROBE_FRAMES = 2
 PROBE_SIZE_PX = 64
 PROBE_SEED = 0
@@ -87,17 +93,18 @@ class Rollout:
         served = {model: self.server.ready_versions(model) for model in models}
         try:
             new = self._configs(models, dict.fromkeys(models, version))
-            old = self._configs(models, {model: max(served[model]) for model in models if served[model]})
+            # Of what is not served the configuration that stands there.
+            old = {model: read_config(self.repository, model) for model in models if not served[model]}
+            old |= self._configs(models, {model: max(served[model]) for model in models if served[model]})
         except (OSError, ParseError) as error:
             raise RolloutError(f"{self.name} version {version}: expected an exported version, got {error}") from error
         try:
             self._switch(new, served, version)
         except (RepositoryApiError, RewardError, OSError) as error:
-            self._go_back(old, served)
-            kept = "; ".join(f"{model}: {_words(versions)}" for model, versions in served.items())
-            raise RolloutError(f"{self.name} version {version}: {error} (served as before: {kept})") from error
+            became = self._go_back(old, served)
+            raise RolloutError(f"{self.name} version {version}: {error} ({became})") from error
         except BaseException:  # told to stop
-            self._go_back(old, served)
+            self.tell(self._go_back(old, served))
             raise
 
     def _switch(self, new: Configs, served: Mapping[str, Sequence[int]], version: int) -> None:
@@ -111,19 +118,38 @@ class Rollout:
             if model not in parts:
                 probe(self.server, new[model], version)
 
-    def _go_back(self, old: Configs, served: Mapping[str, Sequence[int]]) -> None:
+    def _go_back(self, old: Configs, served: Mapping[str, Sequence[int]]) -> str:
+        """What became of it, in words."""
         self.tell("going back")
-        for model in reversed(list(served)):  # the ensemble, while all that it may name is loaded
-            if model in old:
-                self._serve(old[model], served[model])
-            else:
-                self.server.unload(model)
+        ends_s = time.monotonic() + RETURN_S
+        failed: dict[str, str | None] = dict.fromkeys(reversed(list(served)))  # the ensemble before what it names
+        while True:
+            failed = {model: why for model in failed if (why := self._put_back(old[model], served[model]))}
+            if not failed or time.monotonic() >= ends_s:
+                break
+            time.sleep(POLL_S)
+        if failed:
+            why = "; ".join(f"{model}: {error}" for model, error in failed.items())
+            return f"expected to serve again what it served, got: {why}"
+        return f"served as before: {'; '.join(f'{model}: {_words(versions)}' for model, versions in served.items())}"
+
+    def _put_back(self, config: pb.ModelConfig, versions: Sequence[int]) -> str | None:
+        """A model's file and what is served of it. Why that failed: the server is gone, or other models come first."""
+        try:
+            self._write(serving_versions(config, versions) if versions else config)
+            (self.server.load if versions else self.server.unload)(config.name)
+        except (RepositoryApiError, OSError) as error:
+            return str(error)
+        return None
 
     def _serve(self, config: pb.ModelConfig, versions: Sequence[int]) -> None:
-        with staging(self.repository) as scratch:
-            replace_config(self.repository, serving_versions(config, versions), scratch)
+        self._write(serving_versions(config, versions))
         self.tell(f"{config.name}: loading {_words(versions)}")
         self.server.load(config.name)
+
+    def _write(self, config: pb.ModelConfig) -> None:
+        with staging(self.repository) as scratch:
+            replace_config(self.repository, config, scratch)
 
     def _configs(self, models: Sequence[str], versions: Mapping[str, int]) -> dict[str, pb.ModelConfig]:
         return {model: config_of(self.repository, model, versions[model]) for model in models if model in versions}
