@@ -16,10 +16,10 @@ from pathlib import Path
 
 from load import SHARED_MEMORY, Load, Measured, samples
 
-from rfm.demo import served
 from rfm.engine import Engine
 from rfm.models.encoders import Encoders
 from rfm.server.process import Endpoints
+from rfm.server.temporary import served
 from rfm_client.gateway.command import gateway_command
 
 PEER_SCRIPTS = {"FastAPI": "fastapi_server.py", "LitServe": "litserve_server.py", "mosec": "mosec_server.py"}

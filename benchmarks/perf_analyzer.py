@@ -27,8 +27,8 @@ from contestants import BareEngine, Callers
 from load import Load, samples
 from rich.console import Console
 
-from rfm.demo import served
 from rfm.server.installation import find_installation
+from rfm.server.temporary import served
 from rfm_client.perf_input import write_perf_analyzer_input
 from rfm_client.show import table
 

@@ -13,7 +13,8 @@ from typing import Annotated, NamedTuple
 import typer
 from rich.console import Console
 
-from rfm.demo import served, show_metrics, stopped_by_signals
+from rfm.demo import show_metrics
+from rfm.server.temporary import served, stopped_by_signals
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Sample, SimilaritySample, Trajectory
 from rfm_client.show import Panel, plot, scores_table
 from toy_world import Clip, Task, make_clip

@@ -74,7 +74,7 @@ def _evaluator(
         with RewardClient(url) as client:
             yield client.evaluate
     else:
-        from rfm.demo import served
+        from rfm.server.temporary import served
 
         assert repository is not None  # one of the three is given
         with (

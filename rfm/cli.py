@@ -18,6 +18,7 @@ from rfm.server.admin_key import AdminKeyError, take_key
 from rfm.server.installation import ServerStartError, find_installation
 from rfm.server.process import Endpoints, TritonServer
 from rfm.server.supervisor import Supervisor
+from rfm.server.temporary import served, stopped_by_signals
 from rfm_client import RewardError
 from rfm_client.gateway.command import gateway, gateway_command
 from rfm_export.models_command import AdminKeyFile
@@ -185,7 +186,8 @@ def tune(
     name = _serve_config(config).name
     sweep = Sweep(repository, name, callers, seconds, rounds, frames, tritonserver, typer.echo)
     try:
-        setting = sweep.best()
+        with stopped_by_signals():
+            setting = sweep.best()
         write_setting(setting, output, config)
     except (ExportError, ServerStartError, RewardError, OSError) as error:
         _fail(str(error))
@@ -213,7 +215,7 @@ def demo(
     import rfm_export
 
     try:
-        from rfm.demo import score_video, served, show_metrics, stopped_by_signals
+        from rfm.demo import score_video, show_metrics
     except ImportError as error:
         _fail(f'the demo needs {error.name}: pip install "rfm-triton[demo,encoders,triton]"')
     console = Console()

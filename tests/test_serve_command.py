@@ -12,7 +12,6 @@ import socket
 import subprocess
 import sys
 import sysconfig
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,10 +20,12 @@ from typing import Any
 import clip
 import numpy as np
 import pytest
+from rfm_serve import wait_for
 
 from rfm.server import installation
 from rfm.server.installation import ServerStartError, find_installation
 from rfm.server.process import SHARED_MEMORY, Endpoints, TritonServer
+from rfm.server.stubs import is_alive
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 
 REPOSITORY = Path(__file__).parents[1] / "model_repository"
@@ -95,24 +96,31 @@ def test_the_committed_repository_is_served_until_a_signal(number: signal.Signal
     [
         ["serve", "--repository", str(REPOSITORY)],
         ["demo", "--repository", str(REPOSITORY), "--video", "clip.mp4", "--task", clip.TASK],
+        ["tune", "--repository", str(REPOSITORY), "--output", "tuned.yaml"],
     ],
     ids=lambda words: words[0],
 )
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGKILL], ids=lambda number: number.name)
 def test_a_signal_leaves_nothing_running(tmp_path: Path, arguments: list[str], number: signal.Signals) -> None:
     program = tmp_path / "tritonserver"  # a stand-in that never gets ready, so that the moment of the signal is known
-    program.write_text(f"#!/bin/sh\ntouch {tmp_path}/started\nexec sleep 600\n")
+    program.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/pid\nmv {tmp_path}/pid {tmp_path}/started\nexec sleep 600\n")
     program.chmod(0o755)
-    rfm = [str(RFM), *arguments, "--tritonserver", str(program)]
-    backends = set(Path(tempfile.gettempdir()).glob("rfm-*"))
-    process = subprocess.Popen(rfm, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    temporary = tmp_path / "tmp"
+    temporary.mkdir()
+    process = subprocess.Popen(
+        [str(RFM), *arguments, "--tritonserver", str(program)],
+        cwd=tmp_path,
+        env={**os.environ, "TMPDIR": str(temporary)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
     while not (tmp_path / "started").exists():
         assert process.poll() is None
     process.send_signal(number)
     process.wait(EXIT_S)
-    children = subprocess.run(["pgrep", "-f", str(program)], capture_output=True, text=True, check=False).stdout
-    assert children == ""
-    assert set(Path(tempfile.gettempdir()).glob("rfm-*")) <= backends
+    wait_for(lambda: not is_alive(int((tmp_path / "started").read_text())))
+    if number != signal.SIGKILL:  # which leaves folders to the next start
+        assert list(temporary.glob("rfm-*")) == []
 
 
 def test_a_signal_while_it_still_loads_ends_it() -> None:

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: MIT
 from __future__ import annotations
 
+import asyncio
 import os
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import goldens
 import pytest
@@ -13,8 +15,8 @@ from typer.testing import CliRunner
 import rfm_export
 from rfm.cli import app
 from rfm.config import ServeConfig
-from rfm.demo import served
-from rfm_client import RewardClient
+from rfm.server.temporary import served
+from rfm_client import ProgressSample, RewardClient, Sample
 from rfm_export import ExportError, tune
 from rfm_export.tune import Setting, Sweep, Trial, quickest, write_setting
 
@@ -53,6 +55,37 @@ def test_every_setting_is_served_and_measured(repository: Path, monkeypatch: pyt
     assert best in [*settings, *(Setting(s.instances, s.torch_threads, 8) for s in settings)]
     assert len(told) == len(settings) + 1  # of the two batch sizes one is the repository's
     assert {file: file.read_bytes() for file in repository.rglob("*") if file.is_file()} == before
+
+
+class Lagging:
+    """A client of which the clock tells how long it takes: 10 s to connect, and each answer 0.4 s."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now_s = 0.0
+        monkeypatch.setattr(tune, "time", SimpleNamespace(perf_counter=lambda: self.now_s))
+        monkeypatch.setattr(tune, "AsyncRewardClient", lambda *_, **__: self)
+
+    async def __aenter__(self) -> Lagging:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        pass
+
+    async def score(self, sample: Sample) -> None:
+        self.now_s += 0.4 if self.now_s else 10.0
+
+
+@pytest.mark.parametrize(("seconds", "count"), [(1.0, 2), (0.4, 1), (4.2, 10)])
+def test_only_what_is_answered_in_time_is_counted(monkeypatch: pytest.MonkeyPatch, seconds: float, count: int) -> None:
+    Lagging(monkeypatch)
+    latencies_s = asyncio.run(tune._ask("", "rfm", [ProgressSample(random_trajectory(0, 1))], 1, seconds))
+    assert latencies_s == pytest.approx([0.4] * count)
+
+
+def test_too_few_seconds_for_an_answer_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    Lagging(monkeypatch)
+    with pytest.raises(ExportError, match=r"--seconds: expected time for an answer, got none within 0.3 s"):
+        asyncio.run(tune._ask("", "rfm", [ProgressSample(random_trajectory(0, 1))], 1, 0.3))
 
 
 def test_the_command_writes_what_export_reads(

@@ -17,8 +17,7 @@ import yaml
 from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.server.batch_model import THREADS_PARAMETER
-from rfm.server.installation import find_installation
-from rfm.server.process import Endpoints, TritonServer
+from rfm.server.temporary import served
 from rfm_client import AsyncRewardClient, RewardClient, Sample
 from rfm_client.cli.toy import SampleKind, Toy
 from rfm_export.errors import ExportError
@@ -70,7 +69,8 @@ class Sweep:
     def best(self) -> Setting:
         """Instances and threads first, then the size of batches for the best of those.
 
-        Raises ServerStartError, RewardError if it cannot score made-up samples, ExportError if it is no repository.
+        Raises ServerStartError, RewardError if it cannot score made-up samples, ExportError if it is no repository or
+        ``seconds`` are too few for an answer.
         """
         trials = self._trials(self._instances())
         best = quickest(trials)
@@ -108,12 +108,8 @@ class Sweep:
             repository = Path(folder) / "repository"
             shutil.copytree(self.repository.resolve(), repository, copy_function=os.symlink)
             _apply(setting, repository)
-            installation = find_installation(self.tritonserver)
-            with (
-                (Path(folder) / "triton.log").open("wb") as log,
-                TritonServer(repository, Endpoints.free(), installation, log=log) as server,
-            ):
-                url = server.endpoints.grpc_url
+            with served(repository, Path(folder) / "triton.log", self.tritonserver) as endpoints:
+                url = endpoints.grpc_url
                 with RewardClient(url, model=self.name) as client:
                     frames = client.model_info(frames=self.use_frames).max_frames or NUM_FRAMES
                     toy = Toy(SampleKind.progress, NUM_SAMPLES, [min(frames, NUM_FRAMES)], self.use_frames, seed=0)
@@ -137,19 +133,27 @@ def write_setting(setting: Setting, file: Path, config: Path | None) -> None:
 
 
 async def _ask(url: str, model: str, samples: Sequence[Sample], callers: int, seconds: float) -> list[float]:
-    """Latencies in seconds of ``callers`` that each ask about one sample after the other for ``seconds``."""
-    latencies_s: list[float] = []
-    end_s = time.perf_counter() + seconds
+    """Latencies in seconds of ``callers`` that each ask about one sample after the other.
 
-    async def call(first: int) -> None:
+    Of what is answered within ``seconds``, once the client is connected. Raises ExportError if nothing is.
+    """
+    latencies_s: list[float] = []
+
+    async def call(first: int, end_s: float) -> None:
         index = first
         while (asked_s := time.perf_counter()) < end_s:
             await client.score(samples[index % len(samples)])
-            latencies_s.append(time.perf_counter() - asked_s)
+            answered_s = time.perf_counter()
+            if answered_s <= end_s:
+                latencies_s.append(answered_s - asked_s)
             index += callers
 
     async with AsyncRewardClient(url, model=model, max_in_flight=2 * callers) as client:
-        await asyncio.gather(*map(call, range(callers)))
+        await client.score(samples[0])
+        end_s = time.perf_counter() + seconds
+        await asyncio.gather(*(call(first, end_s) for first in range(callers)))
+    if not latencies_s:
+        raise ExportError(f"--seconds: expected time for an answer, got none within {seconds:g} s")
     return latencies_s
 
 
