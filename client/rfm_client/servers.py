@@ -126,6 +126,8 @@ class Servers:
                 if not self._retry or deadline.ends_within(pause_s):
                     raise
                 await asyncio.sleep(pause_s)
+                if deadline.ends_within(0):  # the pause took longer than it should have
+                    raise
         raise min(refusals.values(), key=lambda error: isinstance(error, ModelNotFoundError))  # only if all said so
 
     def _least_busy(self, avoided: Collection[_Server]) -> _Server:
