@@ -22,6 +22,7 @@ from rfm_client import (
 )
 from rfm_client.gateway.body import Batch
 from rfm_client.gateway.folder import AllowedFolder
+from rfm_client.gateway.memory import Memory
 from rfm_client.gateway.schema import SAMPLES
 from rfm_client.gateway.scoring import Scorer
 from rfm_client.gateway.state import State
@@ -102,7 +103,8 @@ def test_the_gateway_tells_of_the_version_that_answers_now() -> None:
             batch = Batch(SAMPLES.validate_python([sample], context={}), False)
             for version, frames_per_value in ((1, 1), (2, 2)):
                 stand.version, stand.frames_per_value = version, frames_per_value
-                answer = await scorer.evaluate(batch, "request")
+                with Memory(2**20).share() as share:
+                    answer = await scorer.evaluate(batch, share, "request")
                 assert answer.outputs_progress is not None
                 assert len(answer.outputs_progress.progress_pred[0]) == NUM_FRAMES // frames_per_value
             stand.version = 3

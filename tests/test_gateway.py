@@ -641,6 +641,10 @@ BAD_ARRAYS: dict[str, dict[str, tuple[Any, str]]] = {
         "more than float32 holds": ([[1e39] * 48], r"expected finite values, got inf at \[0, 0\]"),
         "huge numbers": ([[10**30] * 48], "expected numbers, got something else"),
         "words for numbers": ([["1.0"] * 48], "expected numbers, got something else"),
+        "a word and a row": ([ROW, "a"], "expected numbers, got something else"),
+        "a number and a row": ([ROW, 1.0], "expected rows of equal length, got unequal ones"),
+        "five axes": ([[[[ROW]]]], "expected at most 4 axes, got more"),
+        "nulls": ([[None] * 48], "expected numbers, got something else"),
         "a word": ("1.0", "expected an array, got str"),
         "truths": ([[True] * 48], r"expected float32 \[T, D\], got bool \[1, 48\]"),
         "one axis": (ROW, r"expected float32 \[T, D\], got float64 \[48\]"),
@@ -1159,7 +1163,8 @@ def test_many_images_are_refused_before_they_fill_the_memory(triton: Triton, tmp
     with running(triton.endpoints, tmp_path, FILM, *limits) as gateway:
         response = ask_json(gateway, [of_frames(["black.png"] * 3)])
         check_refused(
-            response, (["samples", 0, *FRAMES_AT], "expected images of at most 2097152 bytes, got larger ones")
+            response,
+            (["samples", 0, *FRAMES_AT], "expected files of at most 2097152 bytes in one request, .*, got more"),
         )
 
 

@@ -26,8 +26,9 @@ from rfm_client import errors
 from rfm_client.access import Access
 from rfm_client.async_client import DEFAULT_MODEL, DEFAULT_TIMEOUT_S, AsyncRewardClient
 from rfm_client.gateway import schema
-from rfm_client.gateway.body import RETRY_AFTER, Batch, BodyLimits, read_json, read_multipart
+from rfm_client.gateway.body import Admitted, Batch, BodyLimits, read_json, read_multipart
 from rfm_client.gateway.folder import AllowedFolder
+from rfm_client.gateway.memory import RETRY_AFTER
 from rfm_client.gateway.observe import REQUEST_ID_HEADER, Metrics, Observed
 from rfm_client.gateway.scoring import Scorer
 from rfm_client.gateway.state import State
@@ -122,8 +123,8 @@ def _guarded(settings: GatewaySettings, scorer: Scorer, state: State, metrics: M
     router = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
     limits = BodyLimits(settings.max_body_bytes)
 
-    async def score(request: Request, batch: Batch) -> Response:
-        answer = await scorer.evaluate(batch, request.state.request_id)
+    async def score(admitted: Admitted, batch: Batch) -> Response:
+        answer = await scorer.evaluate(batch, admitted.share, admitted.request.state.request_id)
         for sample in batch.samples:
             metrics.samples.labels(sample.sample_type).inc()
         return Response(answer.model_dump_json(), media_type="application/json")
@@ -136,10 +137,10 @@ def _guarded(settings: GatewaySettings, scorer: Scorer, state: State, metrics: M
     )
     async def evaluate_batch(request: Request) -> Response:
         """Score samples that come as JSON."""
-        with limits.admitted(request) as limited:
+        with limits.admitted(request) as admitted:
             with anyio.fail_after(settings.timeout_s):
-                batch = await read_json(limited)
-            return await score(request, batch)
+                batch = await read_json(admitted)
+            return await score(admitted, batch)
 
     @router.post(
         "/evaluate_batch_npy",
@@ -151,10 +152,10 @@ def _guarded(settings: GatewaySettings, scorer: Scorer, state: State, metrics: M
         """Score samples whose arrays come as .npy files: fields `sample_0`, `sample_1`, ... hold each sample as JSON,
         in which `{"__numpy_file__": name}` stands for the array in the part of that name.
         """
-        with limits.admitted(request) as limited:
+        with limits.admitted(request) as admitted:
             with anyio.fail_after(settings.timeout_s):
-                batch = await read_multipart(limited)
-            return await score(request, batch)
+                batch = await read_multipart(admitted)
+            return await score(admitted, batch)
 
     @router.get("/gpu_status", responses=_failures(502, 503, 504))
     async def gpu_status() -> schema.GpuStatus:

@@ -19,14 +19,19 @@ from starlette.datastructures import UploadFile
 from starlette.types import Message
 
 from rfm_client.gateway import schema
+from rfm_client.gateway.memory import Memory, Share
 from rfm_client.gateway.npy import Upload
 from rfm_client.off_loop import off_loop
 
 NPY_ENDPOINT = "/evaluate_batch_npy"
 MAX_PARTS = 10_000  # files, and fields, of one multipart request
-MAX_JSON_BYTES = 32 * 2**20  # in memory it is up to thirty times as large; arrays have a better way
+MAX_SAMPLES = 10_000  # of one request
+MAX_JSON_BYTES = 32 * 2**20  # arrays have a better way
+JSON_GROWTH = 32  # times as large is JSON of numbers, at the most, when it is read: see parsed_bytes
 HELD_BODIES = 4
-RETRY_AFTER = {"Retry-After": "1"}
+
+_NUMBER_BYTES, _LIST_BYTES, _TEXT_BYTES, _OBJECT_BYTES = 48, 88, 96, 208  # what Python takes for one, at the most
+_ERROR_BYTES = 2048  # of a field, as it is told
 
 _ANY_SAMPLE_FIELD = re.compile(r"sample_[0-9]+")
 _SAMPLE_FIELD = re.compile(r"sample_(0|[1-9][0-9]{0,5})")
@@ -54,20 +59,26 @@ def invalid(loc: tuple[str | int, ...], message: str, kind: str = "value_error")
     return RequestValidationError([{"type": kind, "loc": ["body", *loc], "msg": message}])
 
 
-async def read_json(request: Request) -> Batch:
+@dataclass(frozen=True)
+class Admitted:
+    """A request whose body is read within the limits, and what it holds of the memory for all."""
+
+    request: Request
+    share: Share
+
+
+async def read_json(admitted: Admitted) -> Batch:
     """The samples of a JSON request. Raises RequestValidationError, HTTPException."""
-    body = await request.body()
-    document = await off_loop(len(body), _parsed, body)
-    samples, use_frame_steps = _unwrapped(document)
-    return Batch(await off_loop(len(body), _checked, samples, {}), use_frame_steps)
+    body = await admitted.request.body()
+    return await off_loop(len(body), _of_json, body, admitted.share)
 
 
-async def read_multipart(request: Request) -> Batch:
+async def read_multipart(admitted: Admitted) -> Batch:
     """The samples of a multipart request, whose files lie on disk, but for small ones, until they are arrays.
 
     Raises RequestValidationError, HTTPException.
     """
-    async with request.form(max_files=MAX_PARTS, max_fields=MAX_PARTS, max_part_size=MAX_JSON_BYTES) as form:
+    async with admitted.request.form(max_files=MAX_PARTS, max_fields=MAX_PARTS, max_part_size=MAX_JSON_BYTES) as form:
         uploads: dict[str, Upload] = {}
         fields: dict[str, str] = {}
         for name, value in form.multi_items():
@@ -83,29 +94,52 @@ async def read_multipart(request: Request) -> Batch:
         if json_bytes > MAX_JSON_BYTES:
             raise HTTPException(413, f"body: expected at most {MAX_JSON_BYTES} bytes of JSON, got more")
         num_bytes = json_bytes + sum(upload.size or 0 for upload in uploads.values())
-        return await off_loop(num_bytes, _of_form, fields, uploads)
+        return await off_loop(num_bytes, _of_form, fields, uploads, admitted.share)
 
 
-def _of_form(fields: Mapping[str, str], uploads: Mapping[str, Upload]) -> Batch:
+def parsed_bytes(json: bytes) -> int:
+    """The most memory that JSON becomes, arrays included. Counting is quicker than reading, and safe."""
+    is_narrow = json.isascii() and b"\\u" not in json  # else one letter may make all of a text four bytes wide
+    return (
+        len(json) * (1 if is_narrow else 4)
+        + json.count(b",") * _NUMBER_BYTES
+        + json.count(b"[") * _LIST_BYTES
+        + json.count(b'"') // 2 * _TEXT_BYTES
+        + json.count(b"{") * _OBJECT_BYTES
+    )
+
+
+def _of_json(body: bytes, share: Share) -> Batch:
+    share.take(parsed_bytes(body))
+    samples, use_frame_steps = _unwrapped(_parsed(body))
+    return Batch(_checked(samples, {}, share), use_frame_steps)
+
+
+def _of_form(fields: Mapping[str, str], uploads: Mapping[str, Upload], share: Share) -> Batch:
+    share.take(sum(parsed_bytes(field.encode()) for field in fields.values()))
     samples = [_field(fields, name) for name in _sample_fields(fields)]
-    return Batch(_checked(samples, uploads), _flag(fields.get(_STEPS_FIELD, False)))
+    return Batch(_checked(samples, uploads, share), _flag(fields.get(_STEPS_FIELD, False)))
 
 
 class BodyLimits:
-    """How much the requests may bring: ``max_bytes`` each, MAX_JSON_BYTES of JSON, and HELD_BODIES such bodies at a
-    time, all together.
+    """How much the requests may bring: ``max_bytes`` each, MAX_JSON_BYTES of JSON, and what is held in memory for all
+    of them together: HELD_BODIES such bodies, where JSON counts as what it becomes, and copies and files are added.
     """
 
     def __init__(self, max_bytes: int) -> None:
         self._max_bytes = max_bytes
-        self._held_bytes = 0
+        self._memory = Memory(max(HELD_BODIES * max_bytes, JSON_GROWTH * min(max_bytes, MAX_JSON_BYTES)))
 
     @contextmanager
-    def admitted(self, request: Request) -> Iterator[Request]:
+    def admitted(self, request: Request) -> Iterator[Admitted]:
         """The request, whose body counts as held as long as the context lasts. Reading it raises HTTPException: 413 as
         soon as too much is announced or has come, 503 if all requests together hold too much, 400 if a multipart body
         does not end as it must: what was cut off may be a sample; 415 if it is to be multipart and is not.
         """
+        with self._memory.share() as share:
+            yield Admitted(self._limited(request, share), share)
+
+    def _limited(self, request: Request, share: Share) -> Request:
         ending = _ending(request)
         most = self._max_bytes if ending else min(self._max_bytes, MAX_JSON_BYTES)
         too_large = HTTPException(413, f"body: expected at most {most} bytes, got more")
@@ -119,21 +153,16 @@ class BodyLimits:
             message = await request.receive()
             part = message.get("body", b"")
             come += len(part)
-            self._held_bytes += len(part)
             if come > most:
                 raise too_large
-            if self._held_bytes > HELD_BODIES * self._max_bytes:
-                raise HTTPException(503, "body: expected room for it, got none: others hold it", RETRY_AFTER)
+            share.take(len(part))
             tail = (tail + part[-len(ending) - 2 :])[-len(ending) - 2 :]  # behind it a line may end
             is_last = message["type"] == "http.request" and not message.get("more_body", False)
             if is_last and not tail.rstrip(b"\r\n").endswith(ending):
                 raise HTTPException(400, "body: expected its last boundary at its end, got none")
             return message
 
-        try:
-            yield Request(request.scope, receive)
-        finally:
-            self._held_bytes -= come
+        return Request(request.scope, receive)
 
 
 def _ending(request: Request) -> bytes:
@@ -204,12 +233,15 @@ def _field(fields: Mapping[str, str], name: str) -> Any:
         raise invalid((name,), f"expected JSON, got: {error}", "json_invalid") from None
 
 
-def _checked(samples: list[Any], uploads: Mapping[str, Upload]) -> list[schema.Sample]:
+def _checked(samples: list[Any], uploads: Mapping[str, Upload], share: Share) -> list[schema.Sample]:
     if not samples:
         raise invalid(("samples",), "expected at least one sample, got none", "too_short")
+    if len(samples) > MAX_SAMPLES:
+        raise invalid(("samples",), f"expected at most {MAX_SAMPLES} samples, got {len(samples)}", "too_long")
     try:
         return schema.SAMPLES.validate_python(samples, context=uploads)
     except ValidationError as error:
+        share.take(error.error_count() * _ERROR_BYTES)
         raise RequestValidationError(
             [_field_error(each) for each in error.errors(include_url=False, include_context=False)]
         ) from None

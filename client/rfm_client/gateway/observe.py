@@ -11,7 +11,8 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from rfm_client.gateway.body import NPY_ENDPOINT, RETRY_AFTER
+from rfm_client.gateway.body import NPY_ENDPOINT
+from rfm_client.gateway.memory import RETRY_AFTER
 from rfm_client.wire import CANARY_PREFIX, REQUEST_ID
 
 EVALUATIONS = ("/evaluate_batch", NPY_ENDPOINT)

@@ -7,7 +7,8 @@ T frames, H x W pixels, D width of a frame embedding, Dt width of a text embeddi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
@@ -26,6 +27,7 @@ from pydantic import (
 from rfm_client.gateway.npy import Upload, read_npy
 
 UPLOAD_KEY = "__numpy_file__"
+MAX_AXES = 4  # of frames, [T, H, W, 3]
 
 _UPLOADED = {
     "type": "object",
@@ -52,6 +54,7 @@ def _array(value: Any, info: ValidationInfo) -> Any:
         return _uploaded(value, info.context or {})
     if not isinstance(value, list):
         raise ValueError(f"expected an array, got {type(value).__name__}")
+    _check_leaves(value)
     try:
         array = np.asarray(value)
     except (ValueError, OverflowError):
@@ -59,6 +62,22 @@ def _array(value: Any, info: ValidationInfo) -> Any:
     if array.dtype.kind not in "biuf":
         raise ValueError("expected numbers, got something else")
     return array
+
+
+def _check_leaves(array: list[Any]) -> None:
+    """Before numpy sees them: from words it would make an array whose every element is as wide as the longest."""
+    for axis in range(MAX_AXES):
+        values: Iterable[Any] = array
+        for _ in range(axis):
+            values = itertools.chain.from_iterable(values)
+        kinds = set(map(type, values))
+        if kinds <= {bool, int, float}:
+            return
+        if not kinds <= {bool, int, float, list}:
+            raise ValueError("expected numbers, got something else")
+        if kinds != {list}:
+            raise ValueError("expected rows of equal length, got unequal ones")
+    raise ValueError(f"expected at most {MAX_AXES} axes, got more")
 
 
 def _frames(value: Any, info: ValidationInfo) -> Any:

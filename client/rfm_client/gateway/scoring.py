@@ -4,55 +4,28 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, TypeAlias
+from collections.abc import Sequence
 
 import numpy as np
-from fastapi.exceptions import RequestValidationError
 
 from rfm_client.async_client import AsyncRewardClient
 from rfm_client.deadline import Deadline
 from rfm_client.errors import DeadlineExceededError, InvalidSampleError, ModelNotFoundError, RewardError
 from rfm_client.gateway import schema
-from rfm_client.gateway.body import Batch, invalid
-from rfm_client.gateway.folder import AllowedFolder
+from rfm_client.gateway.body import Batch
+from rfm_client.gateway.conversion import Conversion, Served, Texts, converted_bytes, has_embeddings, num_bytes, refused
+from rfm_client.gateway.folder import AllowedFolder, NamedFiles
+from rfm_client.gateway.memory import Share
 from rfm_client.model_info import ModelInfo
-from rfm_client.off_loop import MIN_BYTES, off_loop
+from rfm_client.off_loop import off_loop
 from rfm_client.results import PreferenceResult, ProgressResult, Result, SimilarityResult
-from rfm_client.samples import (
-    Float32Array,
-    PreferenceSample,
-    ProgressSample,
-    Sample,
-    SimilaritySample,
-    Trajectory,
-    UInt8Array,
-    as_array,
-    float_frames_to_uint8,
-)
+from rfm_client.samples import Float32Array, Trajectory
 
 FRAME_STEPS = 4  # frames to which the evaluation server samples each prefix
 PREFERRED = 0.5
 CHOSEN_IS_FIRST = 1.0  # the evaluation server's label: the first trajectory, which is the chosen one, is better
 
-_SIDES = {  # what the client calls them
-    "first": "chosen_trajectory",
-    "second": "rejected_trajectory",
-    "reference": "ref_trajectory",
-    "other": "sim_trajectory",
-}
-Texts: TypeAlias = Mapping[str, Float32Array | InvalidSampleError]  # by task; why one cannot be encoded
-
 _TEXT_FRAME_PX = 32  # of the blank frame that goes with a task, where only the task's embedding is wanted
-
-
-@dataclass(frozen=True)
-class Served:
-    """What is served of the checkpoint: for embeddings, and for raw frames; None: it is not."""
-
-    embeddings: ModelInfo | None
-    frames: ModelInfo | None
 
 
 class Scorer:
@@ -63,30 +36,34 @@ class Scorer:
         self._folder = folder
         self._timeout_s = timeout_s
 
-    async def evaluate(self, batch: Batch, request_id: str) -> schema.EvaluateBatchAnswer:
+    async def evaluate(self, batch: Batch, share: Share, request_id: str) -> schema.EvaluateBatchAnswer:
         """The answer to a batch, whole: one that lacked a sample would shift the others', or be read as a reward of 0.
 
-        Raises RequestValidationError for samples that cannot be scored, all of them told, and ServerError.
+        Raises RequestValidationError for samples that cannot be scored, all of them told, HTTPException as ``share``
+        does, and ServerError.
         """
         deadline = Deadline(self._timeout_s)
         try:
-            return await self._evaluate(batch, deadline, request_id)
+            return await self._evaluate(batch, share, deadline, request_id)
         except DeadlineExceededError as error:  # which tells what was left for one of several calls
             raise deadline.exceeded("Triton") from error
 
-    async def _evaluate(self, batch: Batch, deadline: Deadline, request_id: str) -> schema.EvaluateBatchAnswer:
+    async def _evaluate(
+        self, batch: Batch, share: Share, deadline: Deadline, request_id: str
+    ) -> schema.EvaluateBatchAnswer:
         served = await self._served(batch.samples, deadline)
-        num_bytes = sum(_num_bytes(sample) for sample in batch.samples)
         texts = await self._texts(batch.samples, served, deadline, request_id)
         steps = FRAME_STEPS if batch.use_frame_steps else 0
-        samples = await off_loop(num_bytes, self._samples, batch.samples, served, texts, steps)
+        share.take(sum(map(converted_bytes, batch.samples)))
+        conversion = Conversion(served, texts, NamedFiles(self._folder, share), steps)
+        samples = await off_loop(sum(map(num_bytes, batch.samples)), conversion.samples, batch.samples)
         results = await self._client.evaluate(
             samples, return_errors=True, timeout_s=deadline.remaining_s(), request_id=request_id
         )
         failed = {index: result for index, result in enumerate(results) if isinstance(result, RewardError)}
-        refused = {i: error for i, error in failed.items() if isinstance(error, InvalidSampleError)}
-        if refused:
-            raise _refused(refused)
+        unfit = {i: error for i, error in failed.items() if isinstance(error, InvalidSampleError)}
+        if unfit:
+            raise refused(unfit)
         for error in failed.values():
             raise error
         group = 1
@@ -98,10 +75,10 @@ class Scorer:
     async def _served(self, samples: Sequence[schema.Sample], deadline: Deadline) -> Served:
         """Asks about the model for frames only if a sample may need it: what is not served is asked for every time."""
         trajectories = [t for sample in samples for t in sample.named_trajectories.values()]
-        has_embeddings = any(_has_embeddings(trajectory) for trajectory in trajectories)
-        embeddings = await self._model_info(deadline, frames=False) if has_embeddings else None
+        needs_embeddings = any(has_embeddings(trajectory) for trajectory in trajectories)
+        embeddings = await self._model_info(deadline, frames=False) if needs_embeddings else None
         has_frames = any(trajectory.frames is not None for trajectory in trajectories)
-        needs_frames = has_frames and not (embeddings is not None and all(map(_has_embeddings, trajectories)))
+        needs_frames = has_frames and not (embeddings is not None and all(map(has_embeddings, trajectories)))
         frames = await self._model_info(deadline, frames=True) if needs_frames else None
         if embeddings is None and frames is None:  # is the other one served, or none at all?
             await self._client.model_info(frames=not needs_frames, timeout_s=deadline.remaining_s())
@@ -120,7 +97,7 @@ class Scorer:
         tasks = {
             first.task
             for first, *_ in (tuple(sample.named_trajectories.values()) for sample in samples)
-            if _has_embeddings(first) and first.text_embedding is None and first.task and first.task.strip()
+            if has_embeddings(first) and first.text_embedding is None and first.task and first.task.strip()
         }
         if not tasks or served.embeddings is None:
             return {}
@@ -140,120 +117,6 @@ class Scorer:
             return error
         assert encoded.text_embedding is not None
         return encoded.text_embedding
-
-    def _samples(
-        self, samples: Sequence[schema.Sample], served: Served, texts: Texts, frame_steps: int
-    ) -> list[Sample]:
-        converted: list[Sample] = []
-        errors: dict[int, InvalidSampleError] = {}
-        for index, sample in enumerate(samples):
-            try:
-                converted.append(self._sample(sample, served, texts, frame_steps))
-            except InvalidSampleError as error:
-                errors[index] = error
-        if errors:
-            raise _refused(errors)
-        return converted
-
-    def _sample(self, sample: schema.Sample, served: Served, texts: Texts, frame_steps: int) -> Sample:
-        given = sample.named_trajectories
-        by_embeddings = served.embeddings is not None and all(map(_has_embeddings, given.values()))
-        trajectories: list[Trajectory] = []
-        for name, trajectory in given.items():
-            try:
-                if by_embeddings:
-                    needs_text = not trajectories
-                    trajectories.append(self._of_embeddings(trajectory, served.embeddings, texts, needs_text))
-                else:
-                    trajectories.append(self._of_frames(trajectory, served))
-            except InvalidSampleError as error:
-                raise error.inside(name) from None
-        if isinstance(sample, schema.ProgressSample):
-            return ProgressSample(trajectories[0], frame_steps=frame_steps)
-        if isinstance(sample, schema.PreferenceSample):
-            return PreferenceSample(*trajectories)
-        return SimilaritySample(*trajectories)
-
-    def _of_embeddings(
-        self,
-        given: schema.Trajectory,
-        info: ModelInfo | None,
-        texts: Texts,
-        needs_text: bool,
-    ) -> Trajectory:
-        video, text = given.video_embeddings, given.text_embedding
-        if video is None:
-            in_file = self._folder.embeddings(given.embeddings_path or "")
-            video, text = in_file.video_embeddings, in_file.text_embedding if text is None else text
-        if text is None and given.task is not None:
-            text = texts.get(given.task)
-            if isinstance(text, InvalidSampleError):
-                raise text
-        trajectory = Trajectory(video_embeddings=video, text_embedding=text, task=given.task or "")
-        assert info is not None and trajectory.video_embeddings is not None
-        _check_width("video_embeddings", trajectory.video_embeddings, info.video_dim)
-        if trajectory.text_embedding is not None:
-            _check_width("text_embedding", trajectory.text_embedding, info.text_dim)
-        elif needs_text:
-            got = "neither" if not (given.task and given.task.strip()) else "a task, and no encoder is served"
-            raise InvalidSampleError.at("text_embedding", "an embedding, or a task to encode", got)
-        return trajectory
-
-    def _of_frames(self, given: schema.Trajectory, served: Served) -> Trajectory:
-        if given.frames is None:
-            what = "video_embeddings" if _has_embeddings(given) else "neither frames nor video_embeddings"
-            if _has_embeddings(given) and served.embeddings is not None:
-                raise InvalidSampleError.at("video_embeddings", "them in both trajectories or neither", "one of two")
-            raise InvalidSampleError.at("frames", "frames", what)
-        if served.frames is None:
-            raise InvalidSampleError.at(
-                "video_embeddings", "embeddings, since no model for raw frames is served", "frames"
-            )
-        if isinstance(given.frames, list):
-            return Trajectory(frames=self._folder.frames(given.frames), task=given.task or "")
-        return Trajectory(frames=_uint8(given.frames), task=given.task or "")
-
-
-def _has_embeddings(trajectory: schema.Trajectory) -> bool:
-    in_file = trajectory.embeddings_path is not None and trajectory.frames is None
-    return trajectory.video_embeddings is not None or in_file
-
-
-def _num_bytes(sample: schema.Sample) -> int:
-    """Of its arrays; files that it names may have any size."""
-    trajectories = sample.named_trajectories.values()
-    if any(isinstance(t.frames, list) or t.embeddings_path is not None for t in trajectories):
-        return MIN_BYTES
-    arrays = (array for t in trajectories for array in (t.frames, t.video_embeddings))
-    return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
-
-
-def _uint8(frames: Any) -> UInt8Array:
-    """As the evaluation server made images: whole numbers as they are, floats clipped and truncated."""
-    array = as_array(frames)
-    if array.dtype.kind == "f":
-        return float_frames_to_uint8(array)
-    if array.dtype != np.uint8 and array.dtype.kind in "iu" and array.size:
-        if array.min() < 0 or array.max() > 255:
-            raise InvalidSampleError.at("frames", "values in 0..255", f"{array.min()}..{array.max()}")
-        return array.astype(np.uint8)
-    return array  # Trajectory checks the rest
-
-
-def _check_width(where: str, array: Float32Array, width: int | None) -> None:
-    if width is not None and array.shape[-1] != width:
-        axes = "[T, " if array.ndim > 1 else "["
-        raise InvalidSampleError.at(where, f"{axes}{width}]", str(list(array.shape)))
-
-
-def _refused(errors: Mapping[int, InvalidSampleError]) -> RequestValidationError:
-    """One error that tells of all samples that cannot be scored, each at its field as the caller named it."""
-    told: list[Any] = []
-    for index, error in errors.items():
-        where, _, message = error.message.partition(": ")
-        path: list[str | int] = [int(word) if word.isdecimal() else _SIDES.get(word, word) for word in where.split(".")]
-        told += invalid(("samples", index, *path), message).errors()
-    return RequestValidationError(told)
 
 
 def _answer(samples: Sequence[schema.Sample], results: Sequence[Result], group: int) -> schema.EvaluateBatchAnswer:
