@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rfm.config import ServeConfig, is_loopback
+from rfm.config import ServeConfig
 from rfm.server.installation import WHEEL_VERSION, Installation, ServerStartError
-from rfm_client.access import check_authorities, check_certificate
+from rfm_client.access import check_authorities, check_certificate, is_loopback
 
 # NVIDIA's container 26.07. Earlier ones can be crashed, or taken over, by whoever reaches them: docs/security.md
 SECURITY_FLOOR = (2, 71)
