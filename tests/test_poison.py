@@ -71,8 +71,7 @@ def test_a_batch_that_gets_on_is_no_hang_however_long_it_takes(tmp_path: Path) -
     model = repository / "rfm" / "1" / "model.py"
     model.write_text(model.read_text() + SLOW_FORWARD)
     config = tmp_path / "serve.yaml"
-    # A probe waits behind the batch; here it is not what tells a hang.
-    config.write_text(json.dumps({"hang_s": HANG_S, "canary_s": 3600}))
+    config.write_text(json.dumps({"hang_s": HANG_S, "canary_s": 1}))  # a canary waits behind the batch
     sample = ProgressSample(random_trajectory(0, DENSE_FRAMES), frame_steps=4)
     (expected,) = load_engine(PLAIN.name).evaluate([sample])
     assert isinstance(expected, ProgressResult)

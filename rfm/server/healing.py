@@ -70,6 +70,8 @@ class ModelHealth:
             return None
         if time.monotonic() - self._judged_s >= JUDGE_INTERVAL_S:
             self._verdict, self._judged_s = self._canary.verdict(), time.monotonic()
+            if self._verdict is Verdict.HUNG and self._watch.is_getting_on(self.model):
+                self._verdict = Verdict.LATE  # the canary waits behind a long batch
             self._status.tell_canary(self.model, is_ok=self._verdict is Verdict.LIVE)
         if died is None and self._verdict not in _HEALED:
             return None

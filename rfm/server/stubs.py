@@ -119,6 +119,11 @@ class StubWatch:
                 found.append((stub, f"at work on one forward pass for {self._hang_s:g} s"))
         return found
 
+    def is_getting_on(self, model: str) -> bool:
+        """Whether one of the model's stubs is at work, and none of its forward passes takes too long."""
+        journals = [stub.journal for stub in self._now_watched if stub.model == model and stub.is_alive]
+        return any(journal is not None and 0 < journal.busy_s <= self._hang_s for journal in journals)
+
     def of_model(self, model: str) -> list[Stub]:
         """The model's stubs, dead or alive."""
         self._scan()
