@@ -63,7 +63,8 @@ class ServeConfig:
         127.0.0.1 alone
     grpc_client_ca: file (PEM) of who may vouch for gRPC's clients, which then need a certificate
     canary_s: how often ``rfm serve`` asks each model whether it answers
-    hang_s: how long a model may work on one forward pass, or answer nobody, before ``rfm serve`` loads it anew
+    hang_s: how long a model may take to get one forward pass further (one answer in words is one pass), or answer
+        nobody, before ``rfm serve`` loads it anew
     """
 
     model_path: str | None = None

@@ -7,6 +7,7 @@ import json
 import tracemalloc
 from collections.abc import Iterator
 from contextlib import ExitStack
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,11 @@ import pytest
 from fastapi import HTTPException
 from fastapi.exceptions import RequestValidationError
 from PIL import Image
+from starlette.datastructures import UploadFile
 from starlette.requests import Request
 
 from rfm_client.gateway.body import MAX_SAMPLES, BodyLimits, read_json
+from rfm_client.gateway.body import _of_form as of_form
 from rfm_client.gateway.body import _of_json as of_json
 from rfm_client.gateway.conversion import Conversion, Served
 from rfm_client.gateway.folder import AllowedFolder, NamedFiles
@@ -72,6 +75,26 @@ def test_json_takes_no_more_memory_than_it_is_counted_for(body: bytes) -> None:
             _, peak_bytes = tracemalloc.get_traced_memory()
             tracemalloc.stop()
         assert peak_bytes <= share.held_bytes + MIB
+
+
+def test_a_file_of_numbers_is_read_once_however_often_it_is_named() -> None:
+    content = BytesIO()
+    np.save(content, np.zeros((MIB // 8, 1)))
+    sample = {"sample_type": "progress", "trajectory": {"video_embeddings": {"__numpy_file__": "array"}}}
+    fields = {f"sample_{number}": json.dumps(sample) for number in range(40)}
+    upload = UploadFile(content, size=content.tell())
+    with Memory(ROOM_BYTES).share() as share:
+        tracemalloc.start()
+        batch = of_form(fields, {"array": upload}, share)
+        _, peak_bytes = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert peak_bytes <= MIB + share.held_bytes + MIB
+    assert len(batch.samples) == 40
+
+
+def test_a_field_of_letters_that_no_text_has_is_refused() -> None:
+    with Memory(ROOM_BYTES).share() as share, pytest.raises(RequestValidationError, match="expected JSON"):
+        of_form({"sample_0": "\udc00"}, {}, share)
 
 
 def test_words_for_numbers_are_refused_before_numpy_sees_them() -> None:

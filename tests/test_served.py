@@ -26,9 +26,9 @@ from rfm.server.healing import ModelHealth
 from rfm.server.http import Http
 from rfm.server.installation import find_installation
 from rfm.server.process import Endpoints, TritonServer
-from rfm.server.repository_api import RepositoryApi, RepositoryApiError
+from rfm.server.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
 from rfm.server.served import NOT_LOADED, Served
-from rfm.server.status import READY, Status
+from rfm.server.status import NO_REASON, Status
 from rfm_export.rollout import Rollout
 
 __all__ = ["references"]  # a fixture
@@ -101,12 +101,12 @@ def test_what_was_served_is_healed_and_not_what_was_exported_since(tmp_path: Pat
         # An ensemble that names a version which is served no more is not ready, though each of its parts is.
         newer = api.config(MODEL, 2)
         api.load(MODEL, {**newer, "version_policy": {"specific": {"versions": [1]}}})
-        wait_for(lambda: served.reasons() == {MODEL: READY, "rfm_encoder": READY, "rfm_frames": NOT_LOADED})
+        wait_for(lambda: served.reasons() == {MODEL: NO_REASON, "rfm_encoder": NO_REASON, "rfm_frames": NOT_LOADED})
         assert not served.is_ready()
         api.load(MODEL, newer)
         served.wait_ready()
         api.unload("rfm_frames")
-        wait_for(lambda: served.reasons() == {MODEL: READY, "rfm_encoder": READY})
+        wait_for(lambda: served.reasons() == {MODEL: NO_REASON, "rfm_encoder": NO_REASON})
 
 
 def test_a_version_that_loads_and_fails_or_takes_long_costs_the_other_nothing(
@@ -145,17 +145,17 @@ def test_models_come_and_go(tmp_path: Path) -> None:
         shutil.copytree(repository / MODEL, repository / OTHER)
         change(repository / OTHER / "config.pbtxt", f'name: "{MODEL}"', f'name: "{OTHER}"')
         api.load(OTHER)
-        wait_for(lambda: served.reasons() == {MODEL: READY, OTHER: READY})
+        wait_for(lambda: served.reasons() == {MODEL: NO_REASON, OTHER: NO_REASON})
         heal(served, OTHER, lambda: None)
         code = repository / OTHER / "1" / "model.py"
         text = code.read_text()
         code.write_text(text + "\nraise ValueError('broken')\n")
         heal(served, OTHER, lambda: wait_for(lambda: "broken" in served.reasons()[OTHER]) and code.write_text(text))
         api.unload(OTHER)
-        wait_for(lambda: served.reasons() == {MODEL: READY})
+        wait_for(lambda: served.reasons() == {MODEL: NO_REASON})
         assert served.metric("rfm_serve_ready", model=OTHER) == 0
         api.load(OTHER)
-        wait_for(lambda: served.reasons() == {MODEL: READY, OTHER: READY})
+        wait_for(lambda: served.reasons() == {MODEL: NO_REASON, OTHER: NO_REASON})
         with served.client(model=OTHER) as client:
             assert np.isfinite(client.progress(trajectory(0)).progress).all()
 
@@ -225,6 +225,56 @@ def test_what_is_closed_heals_nothing_more(monkeypatch: pytest.MonkeyPatch) -> N
     health.close()
     wait_for(lambda: not health.is_healing, 1.0)
     assert len(asked) == 4
+
+
+class Administered:
+    """A fake of the API, of a server where a load goes wrong, and somebody else loads another version."""
+
+    def __init__(self, state: str, reason: str = "") -> None:
+        self.entry = ModelVersion(MODEL, 1, state, reason)
+        self.asked: list[str] = []
+
+    def __enter__(self) -> Administered:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def index(self) -> list[ModelVersion]:
+        return [self.entry]
+
+    def config(self, model: str, version: int) -> dict[str, Any]:
+        return {"name": model, "of": version}
+
+    def unload(self, model: str) -> None:
+        self.asked.append("unload")
+
+    def load(self, model: str, config: Any) -> None:
+        self.asked.append(f"load {config['of']}")
+        self.entry = ModelVersion(MODEL, 2, "READY", "")
+        raise RepositoryApiError("the weights are damaged")
+
+
+@pytest.mark.parametrize(
+    ("state", "reason", "asked"),
+    [("READY", "", ["unload", "load 1"]), ("UNAVAILABLE", "unloaded", [])],
+    ids=["somebody has loaded another version", "somebody has unloaded it"],
+)
+def test_what_others_did_while_a_model_is_healed_stays(
+    monkeypatch: pytest.MonkeyPatch, state: str, reason: str, asked: list[str]
+) -> None:
+    api = Administered(state, reason)
+    monkeypatch.setattr(healing, "RepositoryApi", lambda *_: api)
+    endpoints = Endpoints.free()
+    canary = Canary(Http(endpoints.http_host, endpoints.http_port), MODEL, 1.0, 1.0, lambda _: None)
+    watch = SimpleNamespace(of_model=lambda _: [], bury=lambda _: None, is_getting_on=lambda _: False)
+    server = SimpleNamespace(endpoints=endpoints, admin_key=KEY)
+    health = ModelHealth(server, canary, watch, Status())  # type: ignore[arg-type]
+    assert health.look("its process is dead", {}) is not None
+    wait_for(lambda: not health.is_healing)
+    assert health.look(None, {}) is None  # not once more
+    assert (api.asked, health.crash_loop) == (asked, None)
+    health.close()
 
 
 def test_a_model_of_a_triton_that_tells_nothing_does_not_hang() -> None:

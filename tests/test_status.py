@@ -14,7 +14,7 @@ from rfm_serve import wait_for
 
 from rfm.server import status
 from rfm.server.process import Endpoints
-from rfm.server.status import MOST_CONNECTIONS, READY, Status, StatusServer
+from rfm.server.status import MOST_CONNECTIONS, NO_REASON, Status, StatusServer
 
 HOST = "127.0.0.1"
 
@@ -74,10 +74,10 @@ def told(about: Status) -> dict[str, float]:
 
 def test_nothing_is_told_of_what_there_was(port: int) -> None:
     about = Status()
-    about.tell({"a": READY, "b": READY, "a_frames": READY})
+    about.tell({"a": NO_REASON, "b": NO_REASON, "a_frames": NO_REASON})
     for model in ("a", "b"):
         about.tell_canary(model, is_ok=True)
-    about.tell({"a": READY, "a_frames": READY})
+    about.tell({"a": NO_REASON, "a_frames": NO_REASON})
     assert told(about) == {"rfm_serve_ready a": 1, "rfm_serve_ready a_frames": 1, "rfm_serve_canary_ok a": 1}
     about.tell_down("tritonserver is started again")
     assert told(about) == {"rfm_serve_ready a": 0, "rfm_serve_ready a_frames": 0, "rfm_serve_canary_ok a": 0}

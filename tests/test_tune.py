@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -82,10 +83,13 @@ def test_only_what_is_answered_in_time_is_counted(monkeypatch: pytest.MonkeyPatc
     assert latencies_s == pytest.approx([0.4] * count)
 
 
-def test_too_few_seconds_for_an_answer_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_setting_that_answers_nobody_in_time_is_the_slowest(monkeypatch: pytest.MonkeyPatch) -> None:
     Lagging(monkeypatch)
-    with pytest.raises(ExportError, match=r"--seconds: expected time for an answer, got none within 0.3 s"):
-        asyncio.run(tune._ask("", "rfm", [ProgressSample(random_trajectory(0, 1))], 1, 0.3))
+    assert asyncio.run(tune._ask("", "rfm", [ProgressSample(random_trajectory(0, 1))], 1, 0.3)) == []
+    slow, slower = Trial(ONE, 0.5, 2000.0), Trial(TWO, 0.0, math.inf)
+    assert quickest([slower, slow]) == slow
+    with pytest.raises(ExportError, match=r"--seconds: expected time for an answer, got none in time with any setting"):
+        quickest([slower, slower])
 
 
 def test_the_command_writes_what_export_reads(

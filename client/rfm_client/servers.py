@@ -128,7 +128,8 @@ class Servers:
                 await asyncio.sleep(pause_s)
                 if deadline.ends_within(0):  # the pause took longer than it should have
                     raise
-        raise min(refusals.values(), key=lambda error: isinstance(error, ModelNotFoundError))  # only if all said so
+        others = [error for error in refusals.values() if not isinstance(error, ModelNotFoundError)]
+        raise (others or list(refusals.values()))[0]
 
     def _least_busy(self, avoided: Collection[_Server]) -> _Server:
         def rank(server: _Server) -> tuple[bool, bool, int, int]:

@@ -55,7 +55,7 @@ PROGRESS_LOGITS = "progress_logits"
 TIMING_MS = "timing_ms"
 
 REQUEST_ID = re.compile(r"[\w.:/+=@-]{1,64}", re.ASCII)  # what a request's id may be
-CANARY_PREFIX = "rfm-canary"  # of the request ids of health probes: one of a blank sample is in no metric of a model
+CANARY_PREFIX = "rfm-canary"  # of the request ids of health probes; a model does not count those for a blank sample
 
 VARIABLE = -1  # a dimension that differs from request to request
 

@@ -137,7 +137,10 @@ class Rollout:
         """A model's file and what is served of it. Why that failed: the server is gone, or other models come first."""
         try:
             self._write(serving_versions(config, versions) if versions else config)
-            (self.server.load if versions else self.server.unload)(config.name)
+            if versions:
+                self.server.load(config.name)
+            else:
+                self.server.unload(config.name)
         except (RepositoryApiError, OSError) as error:
             return str(error)
         return None

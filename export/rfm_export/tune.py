@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import shutil
 import statistics
@@ -117,12 +118,17 @@ class Sweep:
                     client.evaluate(samples)  # whatever is made at first use
                 alone = asyncio.run(_ask(url, self.name, samples, 1, self.seconds))
                 together = asyncio.run(_ask(url, self.name, samples, self.callers, self.seconds))
-        return len(together) / self.seconds, statistics.median(alone) * 1e3
+        return len(together) / self.seconds, statistics.median(alone) * 1e3 if alone else math.inf
 
 
 def quickest(trials: Sequence[Trial]) -> Trial:
-    """Of those that are about as fast as the fastest, the one with the shortest wait for a single caller."""
+    """Of those that are about as fast as the fastest, the one with the shortest wait for a single caller.
+
+    Raises ExportError if none has answered.
+    """
     fastest = max(trial.samples_per_s for trial in trials)
+    if not fastest:
+        raise ExportError("--seconds: expected time for an answer, got none in time with any setting")
     return min((t for t in trials if t.samples_per_s >= AS_FAST * fastest), key=lambda trial: trial.p50_ms)
 
 
@@ -133,9 +139,9 @@ def write_setting(setting: Setting, file: Path, config: Path | None) -> None:
 
 
 async def _ask(url: str, model: str, samples: Sequence[Sample], callers: int, seconds: float) -> list[float]:
-    """Latencies in seconds of ``callers`` that each ask about one sample after the other.
+    """Latencies in seconds of what is answered within ``seconds``, once the client is connected.
 
-    Of what is answered within ``seconds``, once the client is connected. Raises ExportError if nothing is.
+    ``callers`` each ask about one sample after the other.
     """
     latencies_s: list[float] = []
 
@@ -152,8 +158,6 @@ async def _ask(url: str, model: str, samples: Sequence[Sample], callers: int, se
         await client.score(samples[0])
         end_s = time.perf_counter() + seconds
         await asyncio.gather(*(call(first, end_s) for first in range(callers)))
-    if not latencies_s:
-        raise ExportError(f"--seconds: expected time for an answer, got none within {seconds:g} s")
     return latencies_s
 
 

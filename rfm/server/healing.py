@@ -12,7 +12,7 @@ from rfm.server.inquiry import Config
 from rfm.server.process import TritonServer
 from rfm.server.repository_api import RepositoryApi, RepositoryApiError
 from rfm.server.restarts import CrashLoopError, Restarts
-from rfm.server.status import READY, Status
+from rfm.server.status import NO_REASON, Status
 from rfm.server.stubs import Stub, StubWatch
 
 DRAIN_S = 2.0  # for what the model's other processes are working on
@@ -41,6 +41,7 @@ class ModelHealth:
         self._judged_s = 0.0
         self._verdict = Verdict.UNKNOWN
         self._trouble = ""  # why it was not loaded
+        self._is_out = False  # it was unloaded, and not loaded since
         self.crash_loop: CrashLoopError | None = None
 
     def close(self) -> None:
@@ -50,10 +51,10 @@ class ModelHealth:
 
     @property
     def reason(self) -> str:
-        """Why it is not ready; READY if it is."""
+        """Why it is not ready; NO_REASON if it is."""
         if self.is_healing:
             return f"it is loaded anew{f', after: {self._trouble}' if self._trouble else ''}"
-        return READY if self._verdict is Verdict.LIVE else self._verdict.value
+        return NO_REASON if self._verdict is Verdict.LIVE else self._verdict.value
 
     @property
     def is_healing(self) -> bool:
@@ -86,16 +87,15 @@ class ModelHealth:
     def _heal(self, why: str, config: Config) -> None:
         """Returns when the model is loaded anew: just what it served before, whatever its configuration file says."""
         served: Config | None = None
-        self._trouble = ""
+        self._trouble, self._is_out = "", False
         while True:
             try:
                 if self._closed.wait(self._restarts.pause_s(self._trouble or why)):
                     return
                 with RepositoryApi(self._server.endpoints.http_url, self._server.admin_key) as api:
                     served = served or self._served(api, config)
-                    if served is None:  # somebody has unloaded it meanwhile
-                        return
-                    self._reload(api, served)
+                    if served is not None:  # else somebody has unloaded it meanwhile
+                        self._reload(api, served)
                 break
             except RepositoryApiError as error:
                 self._trouble = str(error)
@@ -107,7 +107,7 @@ class ModelHealth:
         self._canary.reset()
 
     def _served(self, api: RepositoryApi, last: Config) -> Config | None:
-        """The configuration of the versions that it serves, and of no others: a rollout may just have changed it."""
+        """The configuration of the versions that it serves, and of no others: a rollout may have changed its file."""
         versions = [entry for entry in api.index() if entry.name == self.model]
         ready = [entry.version for entry in versions if entry.is_ready and entry.version is not None]
         if not ready:
@@ -116,9 +116,13 @@ class ModelHealth:
 
     def _reload(self, api: RepositoryApi, served: Config) -> None:
         """Ensembles that the model is a part of are unloaded and loaded with it, as they were."""
-        old = self._watch.of_model(self.model)
-        api.unload(self.model)
-        self._end(old)
+        if self._is_out and any(entry.is_ready for entry in api.index() if entry.name == self.model):
+            return  # somebody has loaded it meanwhile
+        if not self._is_out:
+            old = self._watch.of_model(self.model)
+            api.unload(self.model)
+            self._is_out = True
+            self._end(old)
         if not self._closed.is_set():  # else Triton may be another
             # Triton 2.51 never finishes to unload a model of which a request met a dead process. A load does not mind.
             api.load(self.model, served)

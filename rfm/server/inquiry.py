@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Any
+from urllib.parse import quote
 
 from rfm.server.admin_key import http_headers
 from rfm.server.http import NO_ANSWER, Http
@@ -27,12 +28,17 @@ Config = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Told:
-    """One answer. asked_s: when it was asked for, by time.monotonic; configs: of each model, when it was last ready"""
+    """One answer.
+
+    asked_s: when it was asked for, by time.monotonic
+    configs: of each model, when it was last ready; unreadable: models that are ready, and do not tell theirs
+    """
 
     asked_s: float
     versions: Collection[ModelVersion]
     configs: Mapping[str, Config]
     ready: frozenset[str]  # models
+    unreadable: frozenset[str]
 
     def is_unloaded(self, model: str) -> bool:
         """Whether it was unloaded because somebody wanted that."""
@@ -100,13 +106,16 @@ class Inquiry:
         path = "/v2/repository/index"
         versions = versions_of(self._http.get_json(path, _INDEX_TIMEOUT_S, method="POST", headers=self._headers))
         loaded = sorted({entry.name for entry in versions if entry.is_ready})
-        self._configs |= {model: self._http.get_json(f"/v2/models/{model}/config") for model in loaded}
-        ready = frozenset(model for model in loaded if self._is_ready(self._configs[model]))
-        return Told(asked_s, versions, dict(self._configs), ready)
+        for model in loaded:
+            with suppress(*NO_ANSWER):  # the others are looked after
+                self._configs[model] = self._http.get_json(f"/v2/models/{quote(model, safe='')}/config")
+        known = [model for model in loaded if model in self._configs]
+        ready = frozenset(model for model in known if self._is_ready(self._configs[model]))
+        return Told(asked_s, versions, dict(self._configs), ready, frozenset(loaded) - frozenset(known))
 
     def _is_ready(self, config: Config) -> bool:
         """An ensemble, which nobody else asks, is asked; a model that is not made of others has a canary."""
         if "ensemble_scheduling" not in config:
             return True
-        status, _ = self._http.request("GET", f"/v2/models/{config['name']}/ready", _DOOR_TIMEOUT_S)
+        status, _ = self._http.request("GET", f"/v2/models/{quote(config['name'], safe='')}/ready", _DOOR_TIMEOUT_S)
         return status == HTTPStatus.OK

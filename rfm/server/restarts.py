@@ -36,7 +36,7 @@ class Restarts:
         """
         if self._running_since_s is not None and time.monotonic() - self._running_since_s >= STEADY_S:
             self._row = 0
-        self._running_since_s = None  # what is no start that succeeded does not count, however long it took
+        self._running_since_s = None  # a start that failed does not count as running, however long it took
         self._row += 1
         if self._row > MOST:
             got = f"{self._row} ends, each within {STEADY_S:g} s of a start; the last: {reason}"

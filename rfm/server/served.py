@@ -10,12 +10,12 @@ from rfm.server.healing import ModelHealth
 from rfm.server.http import Http
 from rfm.server.inquiry import Config, Inquiry, Told
 from rfm.server.process import TritonServer
-from rfm.server.repository_api import LOADING, UNLOADING
-from rfm.server.repository_api import READY as LOADED
-from rfm.server.status import READY, Status
+from rfm.server.repository_api import LOADING, READY, UNLOADING
+from rfm.server.status import NO_REASON, Status
 from rfm.server.stubs import StubWatch
 
 LOOK_INTERVAL_S = 0.3
+UNREADABLE = "its configuration cannot be read"
 NOT_LOADED = "it is not loaded"
 
 
@@ -55,7 +55,7 @@ class Served:
         self._looked_s = time.monotonic()
         if told is not self._told:
             self._told = told
-            self._watch.tell(told.in_state(LOADED), told.in_state(LOADING, UNLOADING), told.asked_s)
+            self._watch.tell(told.in_state(READY), told.in_state(LOADING, UNLOADING), told.asked_s)
             self._keep_up(told)
         died = {stub.model: self._killed.pop(stub.pid, "its process is dead") for stub in self._watch.dead()}
         for stub, how in self._watch.hung():
@@ -71,7 +71,8 @@ class Served:
             if health.crash_loop is not None:
                 raise health.crash_loop
         self._count_refused()
-        self._status.tell({model: self._reason(model, told) for model in self._models})
+        unreadable = dict.fromkeys(told.unreadable, UNREADABLE)
+        self._status.tell({model: self._reason(model, told) for model in self._models} | unreadable)
         return healed
 
     def close(self) -> None:
@@ -118,10 +119,10 @@ class Served:
         if model not in self._models:
             return NOT_LOADED
         parts = dict.fromkeys(part for part, _ in _parts(self._models[model]))
-        reasons = [f"{part}: {why}" for part in parts if (why := self._reason(part, told)) != READY]
+        reasons = [f"{part}: {why}" for part in parts if (why := self._reason(part, told)) != NO_REASON]
         if reasons:
             return "; ".join(reasons)
-        return READY if model in told.ready else NOT_LOADED
+        return NO_REASON if model in told.ready else NOT_LOADED
 
     def _count_refused(self) -> None:
         for stub in self._watch.all:

@@ -17,7 +17,7 @@ from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, G
 
 from rfm.server.installation import ServerStartError
 
-READY = ""  # the reason why a model is not ready, of one that is
+NO_REASON = ""  # the reason why a model is not ready, of one that is
 REQUEST_S = 5.0  # from its connection to its answer
 MOST_CONNECTIONS = 16  # one more takes the place of the oldest
 
@@ -54,10 +54,10 @@ class Status:
         )
 
     def tell(self, reasons: Mapping[str, str]) -> None:
-        """By model why it is not ready; READY for one that is. There are no other models."""
+        """By model why it is not ready; NO_REASON for one that is. There are no other models."""
         gone, self._reasons = self._reasons.keys() - reasons.keys(), dict(reasons)
         for model, reason in reasons.items():
-            self._ready.labels(model).set(reason == READY)
+            self._ready.labels(model).set(reason == NO_REASON)
         for model in gone:
             self._ready.remove(model)
         for model in gone & self._asked:
@@ -84,8 +84,8 @@ class Status:
     def ready(self) -> tuple[bool, dict[str, Any]]:
         """Whether all models are ready, and what is told of it."""
         reasons = self._reasons
-        is_ready = bool(reasons) and all(reason == READY for reason in reasons.values())
-        models = {model: {"ready": reason == READY, "reason": reason} for model, reason in reasons.items()}
+        is_ready = bool(reasons) and all(reason == NO_REASON for reason in reasons.values())
+        models = {model: {"ready": reason == NO_REASON, "reason": reason} for model, reason in reasons.items()}
         return is_ready, {"ready": is_ready, "models": models}
 
     def metrics(self) -> bytes:
@@ -124,7 +124,7 @@ class _BoundedServer(ThreadingHTTPServer):
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         deadline = threading.Timer(REQUEST_S, _cut, [request])
-        deadline.start()
+        deadline.daemon = True  # nobody waits for it at the end
         with self._lock:
             self._open[request] = None
             if len(self._open) > MOST_CONNECTIONS:
@@ -132,6 +132,7 @@ class _BoundedServer(ThreadingHTTPServer):
                 del self._open[oldest]
                 _cut(oldest)
         try:
+            deadline.start()
             super().process_request_thread(request, client_address)
         finally:
             deadline.cancel()

@@ -116,7 +116,7 @@ class StubWatch:
             if self._has_been(stub, _STOPPED, STOPPED_S):
                 found.append((stub, f"stopped for {STOPPED_S:g} s"))
             elif journal is not None and journal.busy_s > self._hang_s and stub.is_alive:
-                found.append((stub, f"at work on one forward pass for {self._hang_s:g} s"))
+                found.append((stub, f"no forward pass further for {self._hang_s:g} s"))
         return found
 
     def is_getting_on(self, model: str) -> bool:

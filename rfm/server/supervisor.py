@@ -25,7 +25,7 @@ class Supervisor:
     gateway: command line of a gateway that runs beside the server; None: there is none
     status_port: of the status (``status``), on the server's host; None: there is none
     canary_s: how often each model is asked
-    hang_s: how long a model may work on one batch, or answer nobody, before it counts as hung
+    hang_s: how long a model may take to get one forward pass further, or answer nobody, before it counts as hung
     say: is told what happened, a line each
     """
 

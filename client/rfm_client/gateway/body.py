@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import re
 import reprlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache, partial
 from typing import Any
 
+import numpy as np
 from fastapi import HTTPException, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
@@ -20,7 +22,7 @@ from starlette.types import Message
 
 from rfm_client.gateway import schema
 from rfm_client.gateway.memory import Memory, Share
-from rfm_client.gateway.npy import Upload
+from rfm_client.gateway.npy import Upload, read_npy
 from rfm_client.off_loop import off_loop
 
 NPY_ENDPOINT = "/evaluate_batch_npy"
@@ -116,9 +118,10 @@ def _of_json(body: bytes, share: Share) -> Batch:
 
 
 def _of_form(fields: Mapping[str, str], uploads: Mapping[str, Upload], share: Share) -> Batch:
-    share.take(sum(parsed_bytes(field.encode()) for field in fields.values()))
+    share.take(sum(parsed_bytes(field.encode(errors="surrogatepass")) for field in fields.values()))
     samples = [_field(fields, name) for name in _sample_fields(fields)]
-    return Batch(_checked(samples, uploads, share), _flag(fields.get(_STEPS_FIELD, False)))
+    arrays = {name: cache(partial(read_npy, upload)) for name, upload in uploads.items()}  # of each one, however often
+    return Batch(_checked(samples, arrays, share), _flag(fields.get(_STEPS_FIELD, False)))
 
 
 class BodyLimits:
@@ -229,17 +232,19 @@ def _sample_fields(fields: Mapping[str, str]) -> list[str]:
 def _field(fields: Mapping[str, str], name: str) -> Any:
     try:
         return from_json(fields[name])
-    except ValueError as error:
+    except (ValueError, TypeError) as error:  # of TypeError: letters that no UTF-8 has
         raise invalid((name,), f"expected JSON, got: {error}", "json_invalid") from None
 
 
-def _checked(samples: list[Any], uploads: Mapping[str, Upload], share: Share) -> list[schema.Sample]:
+def _checked(
+    samples: list[Any], arrays: Mapping[str, Callable[[], np.ndarray[Any, Any]]], share: Share
+) -> list[schema.Sample]:
     if not samples:
         raise invalid(("samples",), "expected at least one sample, got none", "too_short")
     if len(samples) > MAX_SAMPLES:
         raise invalid(("samples",), f"expected at most {MAX_SAMPLES} samples, got {len(samples)}", "too_long")
     try:
-        return schema.SAMPLES.validate_python(samples, context=uploads)
+        return schema.SAMPLES.validate_python(samples, context=arrays)
     except ValidationError as error:
         share.take(error.error_count() * _ERROR_BYTES)
         raise RequestValidationError(

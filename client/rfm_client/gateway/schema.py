@@ -8,7 +8,7 @@ T frames, H x W pixels, D width of a frame embedding, Dt width of a text embeddi
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
@@ -23,8 +23,6 @@ from pydantic import (
     ValidationInfo,
     WithJsonSchema,
 )
-
-from rfm_client.gateway.npy import Upload, read_npy
 
 UPLOAD_KEY = "__numpy_file__"
 MAX_AXES = 4  # of frames, [T, H, W, 3]
@@ -87,13 +85,13 @@ def _frames(value: Any, info: ValidationInfo) -> Any:
     return _array(value, info)
 
 
-def _uploaded(value: Mapping[str, Any], uploads: Mapping[str, Upload]) -> np.ndarray[Any, Any]:
+def _uploaded(value: Mapping[str, Any], uploads: Mapping[str, Callable[[], Any]]) -> Any:
     name = value.get(UPLOAD_KEY)
     if not isinstance(name, str):
         raise ValueError(f'expected an array or {{"{UPLOAD_KEY}": name}}, got an object without it')
     if name not in uploads:
         raise ValueError(f"expected a .npy part named {name!r}, got none")
-    return read_npy(uploads[name])
+    return uploads[name]()
 
 
 class Trajectory(BaseModel):

@@ -66,11 +66,14 @@ class Scorer:
             raise refused(unfit)
         for error in failed.values():
             raise error
+        scored = [result for result in results if not isinstance(result, RewardError)]  # all of them
         group = 1
-        if served.frames is not None and not steps:  # of the version that has answered, perhaps another than before
-            info = await self._client.model_info(frames=True, timeout_s=deadline.remaining_s())
+        if served.frames is not None and not steps:
+            info = served.frames
+            if any(str(result.model_version) not in info.versions for result in scored):  # perhaps another has answered
+                info = await self._client.model_info(frames=True, timeout_s=deadline.remaining_s())
             group = info.frames_per_value
-        return _answer(batch.samples, results, group)  # type: ignore[arg-type]  # no errors among them
+        return _answer(batch.samples, scored, group)
 
     async def _served(self, samples: Sequence[schema.Sample], deadline: Deadline) -> Served:
         """Asks about the model for frames only if a sample may need it: what is not served is asked for every time."""
