@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, NoReturn
@@ -21,6 +22,7 @@ from rfm.server.supervisor import Supervisor
 from rfm.server.temporary import served, stopped_by_signals
 from rfm_client import RewardError
 from rfm_client.gateway.command import gateway, gateway_command
+from rfm_export.layout import frames_name
 from rfm_export.models_command import AdminKeyFile
 from rfm_export.models_command import app as models_app
 
@@ -216,6 +218,8 @@ def demo(
 
     try:
         from rfm.demo import score_video, show_metrics
+
+        import_module("av")  # which reads the video, once all is served
     except ImportError as error:
         _fail(f'the demo needs {error.name}: pip install "rfm-triton[demo,encoders,triton]"')
     console = Console()
@@ -224,7 +228,12 @@ def demo(
             if checkpoint is not None:
                 repository = Path(folder) / "model_repository"
                 encoders = {"image_encoder": image_encoder, "text_encoder": text_encoder}
-                rfm_export.export(checkpoint, repository, _serve_config(None, **encoders, base_model=base_model))
+                serve = _serve_config(None, **encoders, base_model=base_model)
+                rfm_export.export(checkpoint, repository, serve)
+                if not (repository / frames_name(serve.name)).exists():
+                    _fail(
+                        f"{checkpoint}: expected one that scores frames, got none; name --image-encoder, --text-encoder"
+                    )
             with served(repository, output / "tritonserver.log", tritonserver) as endpoints:
                 score_video(endpoints, video, task, fps, output / "rewards.png", console)
                 show_metrics(endpoints, console)

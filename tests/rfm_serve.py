@@ -93,7 +93,9 @@ class Serving:
 
     @property
     def said(self) -> list[str]:
-        return [line for line in self.log.read_text(errors="replace").splitlines() if line.startswith("rfm: ")]
+        """By ``rfm serve`` itself, but for that it is ready."""
+        lines = self.log.read_text(errors="replace").splitlines()
+        return [line for line in lines if line.startswith("rfm: ") and not line.startswith("rfm: ready: ")]
 
 
 @contextmanager

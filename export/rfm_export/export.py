@@ -223,7 +223,8 @@ def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], serve
         if name not in names and (repository / name).exists():
             raise ExportError(
                 f"{repository / name}: expected a checkpoint that this model can serve too, got one that it cannot; "
-                "name its encoders (--image-encoder, --text-encoder) or choose another --name"
+                "choose another --repository or --name, or, of a ReWiND checkpoint, name its encoders "
+                "(--image-encoder, --text-encoder)"
             )
     for model in models:
         if not (repository / model.name).exists():

@@ -95,6 +95,9 @@ class Supervisor:
         if self._told_to_stop.is_set():  # before there was a process to pass it to
             return
         self._server.wait_ready()
+        ends = self._server.endpoints
+        urls = f"{ends.grpc_url}, {ends.http_url}, metrics at {ends.metrics_url}"
+        self._say(f"ready: {', '.join(self._server.models)} at {urls}")
         self._triton_restarts.started()
         self._served = Served(self._server, self._status, self._canary_s, self._hang_s)
 
