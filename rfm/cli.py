@@ -221,7 +221,7 @@ def demo(
 
         import_module("av")  # which reads the video, once all is served
     except ImportError as error:
-        _fail(f'the demo needs {error.name}: pip install "rfm-triton[demo,encoders,triton]"')
+        _fail(f'the demo needs {error.name}: pip install ".[demo,encoders,triton]"')
     console = Console()
     with stopped_by_signals(), TemporaryDirectory(prefix="rfm-demo-") as folder:
         try:

@@ -619,14 +619,14 @@ def test_what_is_missing_to_run_is_told_with_the_command_that_installs_it() -> N
     program = "import sys; sys.modules['typer'] = None; from rfm_client.cli import main; main()"
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert result.returncode == 1
-    assert result.stderr == 'rfm-client: expected the package typer, got none: pip install "rfm-client[cli]"\n'
+    assert result.stderr == 'rfm-client: expected the package typer, got none: pip install "./client[cli]"\n'
 
 
 def test_a_missing_package_costs_a_line(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "prometheus_client.parser", None)
     result = invoke("status", "--url", served.url("grpc"))
     assert result.exit_code == ExitCode.FAILED
-    assert re.fullmatch(r'rfm-client: .*prometheus_client.*: pip install "rfm-client\[cli\]"\n', result.stderr)
+    assert re.fullmatch(r'rfm-client: .*prometheus_client.*: pip install "./client\[cli\]"\n', result.stderr)
 
 
 # help

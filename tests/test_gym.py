@@ -704,5 +704,5 @@ def test_the_client_does_not_need_gymnasium() -> None:
     done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True)
     assert done.stdout == "False\n"
     assert done.stderr.strip().endswith(
-        'ImportError: rfm_client.gym needs gymnasium >= 1.1: pip install "rfm-client[gym]"'
+        'ImportError: rfm_client.gym needs gymnasium >= 1.1: pip install "./client[gym]"'
     )

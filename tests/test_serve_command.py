@@ -238,7 +238,7 @@ def test_a_program_that_is_not_there_is_named(tmp_path: Path) -> None:
 
 def test_no_triton_at_all_is_told_with_the_command_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
-    with pytest.raises(ServerStartError, match=r'pip install "rfm-triton\[triton\]"'):
+    with pytest.raises(ServerStartError, match=r'pip install ".\[triton\]"'):
         find_installation()
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Gymnasium environments whose reward is a served reward model's. Needs ``pip install "rfm-client[gym]"``.
+"""Gymnasium environments whose reward is a served reward model's. Needs ``pip install "./client[gym]"``.
 
 env = gymnasium.make("CartPole-v1", render_mode="rgb_array")
 env = RewardModelWrapper(env, partial(RewardClient, "grpc://localhost:8001"), "balance the pole")
@@ -38,7 +38,7 @@ try:
     from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
     from gymnasium.vector.utils import iterate
 except ImportError as error:
-    raise ImportError('rfm_client.gym needs gymnasium >= 1.1: pip install "rfm-client[gym]"') from error
+    raise ImportError('rfm_client.gym needs gymnasium >= 1.1: pip install "./client[gym]"') from error
 
 INFO = "reward_model"  # key of info
 

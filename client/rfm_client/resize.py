@@ -69,7 +69,7 @@ def resize_frames(frames: UInt8Array, size: FrameSize) -> UInt8Array:
     try:
         from PIL import Image
     except ImportError as error:
-        raise ImportError('resizing frames needs Pillow: pip install "rfm-client[resize]"') from error
+        raise ImportError('resizing frames needs Pillow: pip install "./client[resize]"') from error
     height, width = size.fitted(frames.shape[1], frames.shape[2])
     if (height, width) == frames.shape[1:3]:
         return frames

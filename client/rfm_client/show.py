@@ -138,7 +138,7 @@ def plot(file: Path, panels: Sequence[Panel], title: str | None = None, *, colum
         import matplotlib
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ImportError('plots need matplotlib: pip install "rfm-client[cli]"') from error
+        raise ImportError('plots need matplotlib: pip install "./client[cli]"') from error
 
     rows = [panels[start : start + columns] for start in range(0, len(panels), columns)]
     heights_in = [PANEL_HEIGHT_IN * (1 if any(panel.strip is not None for panel in row) else 0.7) for row in rows]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Video files and URLs -> frames. Needs PyAV: ``pip install "rfm-client[video]"``."""
+"""Video files and URLs -> frames. Needs PyAV: ``pip install "./client[video]"``."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def read_video(source: str | Path, fps: float | None = None, *, timeout_s: float
     try:
         import av
     except ImportError as error:
-        raise ImportError('video files need PyAV: pip install "rfm-client[video]"') from error
+        raise ImportError('video files need PyAV: pip install "./client[video]"') from error
     if fps is not None and not 0 < fps < math.inf:
         raise InvalidSampleError.at("fps", "a number above 0", repr(fps))
     try:

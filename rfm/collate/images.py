@@ -96,7 +96,7 @@ def resized(frame: UInt8Array, height: int, width: int, resample: int = PIL_BICU
     try:
         from PIL import Image
     except ImportError as error:
-        raise ImportError('vision-language checkpoints need Pillow: pip install "rfm-triton[vlm]"') from error
+        raise ImportError('vision-language checkpoints need Pillow: pip install ".[vlm]"') from error
     return np.asarray(Image.fromarray(frame).resize((width, height), Image.Resampling(resample)))
 
 

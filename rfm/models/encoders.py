@@ -136,7 +136,7 @@ class Encoders:
             from transformers import AutoTokenizer
             from transformers.utils.hub import cached_file
         except ImportError as error:
-            raise ImportError('raw frames need transformers: pip install "rfm-triton[encoders]"') from error
+            raise ImportError('raw frames need transformers: pip install ".[encoders]"') from error
         preprocessor_file = cached_file(str(image_source), PREPROCESSOR_CONFIG)
         preprocessor_config = json.loads(Path(str(preprocessor_file)).read_text())
         return cls(

@@ -169,7 +169,7 @@ def build_backbone(config: VlmConfig, dtype: torch.dtype, attention: str | None 
         import transformers
         from transformers.utils.import_utils import is_flash_attn_2_available
     except ImportError as error:
-        raise ImportError('vision-language checkpoints need transformers: pip install "rfm-triton[vlm]"') from error
+        raise ImportError('vision-language checkpoints need transformers: pip install ".[vlm]"') from error
     names = GENERATORS if config.generates_text else BACKBONES
     network = getattr(transformers, names[config.family])
     settings = network.config_class.from_dict(config.backbone)

@@ -63,7 +63,7 @@ def find_installation(executable: Path | None = None) -> Installation:
 def _wheel_installation() -> Installation:
     package = importlib.util.find_spec("pytriton")
     if package is None or not package.submodule_search_locations:
-        where = f'an explicit path, {EXECUTABLE} in PATH or the wheel (pip install "rfm-triton[triton]")'
+        where = f'an explicit path, {EXECUTABLE} in PATH or the wheel (pip install ".[triton]")'
         raise ServerStartError(f"tritonserver: expected {where}, got none of them")
     wheel = Path(package.submodule_search_locations[0]) / EXECUTABLE
     numpy_version = importlib.metadata.version("numpy")

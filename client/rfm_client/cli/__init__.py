@@ -11,5 +11,5 @@ def main() -> None:
     try:
         from rfm_client.cli.commands import app
     except ModuleNotFoundError as error:
-        sys.exit(f'rfm-client: expected the package {error.name}, got none: pip install "rfm-client[cli]"')
+        sys.exit(f'rfm-client: expected the package {error.name}, got none: pip install "./client[cli]"')
     app()

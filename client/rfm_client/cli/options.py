@@ -199,7 +199,7 @@ def told_on_one_line() -> Iterator[None]:
 
 def missing_package(error: ImportError) -> str:
     """What is missing, with the command that installs it."""
-    return str(error) if "pip install" in str(error) else f'{error}: pip install "rfm-client[cli]"'
+    return str(error) if "pip install" in str(error) else f'{error}: pip install "./client[cli]"'
 
 
 def check_outputs(json: str | None, plot: Path | None) -> None:

@@ -61,7 +61,7 @@ def gateway(
 
         from rfm_client.gateway.app import MIB, GatewaySettings, create_app
     except ModuleNotFoundError as error:
-        raise typer.BadParameter(f'the gateway needs {error.name}: pip install "rfm-client[gateway]"') from None
+        raise typer.BadParameter(f'the gateway needs {error.name}: pip install "./client[gateway]"') from None
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     api_key = _key(api_key_file)
     try:
