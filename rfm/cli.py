@@ -22,11 +22,13 @@ from rfm.server.supervisor import Supervisor
 from rfm.server.temporary import served, stopped_by_signals
 from rfm_client import RewardError
 from rfm_client.gateway.command import gateway, gateway_command
+from rfm_client.gateway.limits import Limits, with_limits
 from rfm_export.layout import frames_name
 from rfm_export.models_command import AdminKeyFile
 from rfm_export.models_command import app as models_app
 
 EXIT_FAILED = 1
+BATCH_SIZE_NOTE = "batch_size has no effect, as in the FastAPI server; max_batch_size bounds a batch"
 ACCEPTED_WARNING = "a Triton with known remote vulnerabilities is accepted: use NVIDIA's container 26.07 or newer"
 
 app = typer.Typer(
@@ -56,6 +58,16 @@ def export(
     image_encoder: Annotated[str | None, typer.Option(help="Folder or id of ReWiND's image encoder.")] = None,
     text_encoder: Annotated[str | None, typer.Option(help="Folder or id of ReWiND's text encoder.")] = None,
     base_model: BaseModel = None,
+    resize_images: Annotated[
+        bool | None,
+        typer.Option(
+            help="Whether a multi-image checkpoint was trained at its run's data.resized_height and _width.",
+            show_default=False,
+        ),
+    ] = None,
+    other_machine: Annotated[
+        bool, typer.Option("--other-machine", help="It is served elsewhere: num_gpus may be more than there are here.")
+    ] = False,
     check: Annotated[bool, typer.Option("--check", help="Write nothing; compare with what would be written.")] = False,
 ) -> None:
     """Write a checkpoint into a model repository as the next version of its models."""
@@ -68,6 +80,7 @@ def export(
         image_encoder=image_encoder,
         text_encoder=text_encoder,
         base_model=base_model,
+        resize_images=resize_images,
     )
     try:
         if check:
@@ -78,13 +91,14 @@ def export(
             return
         if serve.model_path is None:
             _fail("--checkpoint: expected a checkpoint, here or as model_path in --config, got none")
-        version = rfm_export.export(serve.model_path, repository, serve)
+        version = rfm_export.export(serve.model_path, repository, serve, other_machine=other_machine)
     except (CheckpointError, rfm_export.ExportError, OSError) as error:
         _fail(str(error))
     typer.echo(f"{repository}: {serve.name} version {version}, scores equal to the checkpoint's")
 
 
 @app.command()
+@with_limits("gateway_")
 def serve(
     repository: Repository,
     config: Config = None,
@@ -97,6 +111,9 @@ def serve(
     ] = None,
     status_port: Annotated[
         int | None, typer.Option(help="Port that tells of rfm serve itself: /live, /ready and /metrics.")
+    ] = None,
+    triton_silent_s: Annotated[
+        int | None, typer.Option(help="Seconds that Triton may give no answer before it is killed and restarted (10).")
     ] = None,
     admin_key_file: AdminKeyFile = None,
     grpc_certificate: Annotated[
@@ -115,6 +132,8 @@ def serve(
         list[str] | None,
         typer.Argument(metavar="-- --OPTION=VALUE...", help="More of tritonserver's options.", show_default=False),
     ] = None,
+    *,
+    limits: Limits,
 ) -> None:
     """Run tritonserver on a model repository until it is told to stop.
 
@@ -128,6 +147,7 @@ def serve(
         metrics_port=metrics_port,
         gateway_port=gateway_port,
         status_port=status_port,
+        triton_silent_s=triton_silent_s,
         grpc_certificate=grpc_certificate,
         grpc_key=grpc_key,
         grpc_client_ca=grpc_client_ca,
@@ -145,6 +165,7 @@ def serve(
                 settings.name,
                 endpoints.http_host,  # it has no TLS either
                 settings.gateway_port,
+                limits=limits,
             )
         server = TritonServer(
             repository,
@@ -162,6 +183,7 @@ def serve(
             status_port=settings.status_port,
             canary_s=settings.canary_s,
             hang_s=settings.hang_s,
+            triton_silent_s=settings.triton_silent_s,
             say=lambda line: typer.echo(f"rfm: {line}", err=True),
         )
         status = supervisor.run()
@@ -245,6 +267,8 @@ def _serve_config(file: Path | None, **options: Any) -> ServeConfig:
     """The file's configuration with the options that were given on the command line."""
     try:
         config = ServeConfig() if file is None else ServeConfig.from_yaml(file)
+        if config.batch_size is not None:
+            typer.echo(f"rfm: {file}: {BATCH_SIZE_NOTE}", err=True)
         return replace(config, **{key: value for key, value in options.items() if value is not None})
     except ConfigError as error:
         _fail(str(error))

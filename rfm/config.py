@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_TOKEN_BUDGET = 16_384
+DEFAULT_SAMPLE_TOKENS = 131_072
 MAX_PORT = 65_535
 MAX_OF_A_MACHINE = 4096  # GPUs, instances, threads
 MAX_INT32 = 2**31 - 1
@@ -38,7 +39,7 @@ class ServeConfig:
 
     model_path: the checkpoint; ``--checkpoint`` of ``rfm export``
     num_gpus: GPUs to use, one instance of the model on each; null: all there are, the CPU if there are none; 0: the CPU
-    batch_size: the most samples of one batch (``max_batch_size``), whoever sent them
+    batch_size: of no effect, as in the original server, which never reads it; ``max_batch_size`` bounds a batch
     max_workers: threads that read HTTP requests; null: Triton's choice. Batches need no workers here
     server_url: address to listen on, with or without ``http://``
     server_port: HTTP port
@@ -48,9 +49,14 @@ class ServeConfig:
     name: of the model in the repository; raw frames are scored by ``<name>_frames``
     image_encoder, text_encoder: folders or Hugging Face ids of a ReWiND checkpoint's encoders
     base_model: folder or id of a vision-language checkpoint's base model; else the one that the checkpoint names
+    resize_images: of a vision-language checkpoint that reads frames as images and whose run set
+        ``data.resized_height`` and ``data.resized_width``: whether it was trained with that size, as upstream's runs
+        were before 2026-01-21; null: such a checkpoint is refused
+    max_batch_size: the most samples of one batch, whoever sent them
     dtype: float32, bfloat16 or float16 of the network (not of ReWiND's encoders); null: float32, and a vision-language
         checkpoint's own on a GPU
-    token_budget: the most tokens, padding included, of one forward pass
+    token_budget: the most tokens, padding included, of one forward pass of several samples; a larger one runs alone
+    max_sample_tokens: the most tokens of one sample, in dense mode of one frame's; more are refused. It bounds memory
     instances: of each model, on each GPU or on the CPU; ``rfm tune`` measures what serves fastest
     torch_threads: CPU threads of each model instance; 0: on the CPU all instances of a model share its cores
     grpc_port, metrics_port: Triton's other two ports
@@ -63,13 +69,14 @@ class ServeConfig:
         127.0.0.1 alone
     grpc_client_ca: file (PEM) of who may vouch for gRPC's clients, which then need a certificate
     canary_s: how often ``rfm serve`` asks each model whether it answers
-    hang_s: how long a model may take to get one forward pass further (one answer in words is one pass), or answer
-        nobody, before ``rfm serve`` loads it anew
+    hang_s: how long a model may take to get one forward pass further, or answer nobody, before ``rfm serve`` loads it
+        anew
+    triton_silent_s: how long Triton may give no answer, to three looks in a row, before ``rfm serve`` restarts it
     """
 
     model_path: str | None = None
     num_gpus: int | None = None
-    batch_size: int = 64
+    batch_size: int | None = None
     max_workers: int | None = None
     server_url: str = DEFAULT_HOST
     server_port: int = 8000
@@ -77,8 +84,11 @@ class ServeConfig:
     image_encoder: str | None = None
     text_encoder: str | None = None
     base_model: str | None = None
+    resize_images: bool | None = None
+    max_batch_size: int = 64
     dtype: str | None = None
     token_budget: int = DEFAULT_TOKEN_BUDGET
+    max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS
     instances: int = 1
     torch_threads: int = 0
     grpc_port: int = 8001
@@ -92,13 +102,16 @@ class ServeConfig:
     grpc_client_ca: str | None = None
     canary_s: int = 2
     hang_s: int = 30
+    triton_silent_s: int = 10
 
     def __post_init__(self) -> None:
-        _at_least(1, self, "batch_size", "max_workers", "token_budget", "instances", *_PORTS)
-        _at_least(1, self, "max_queue_size", "queue_timeout_ms", "canary_s", "hang_s")
+        _at_least(1, self, "batch_size", "max_batch_size", "max_workers", "instances", *_PORTS)
+        _at_least(1, self, "token_budget", "max_sample_tokens")
+        _at_least(1, self, "max_queue_size", "queue_timeout_ms", "canary_s", "hang_s", "triton_silent_s")
         _at_least(0, self, "num_gpus", "torch_threads")
         _at_most(MAX_OF_A_MACHINE, self, "num_gpus", "instances", "torch_threads", "max_workers")
-        _at_most(MAX_INT32, self, "batch_size", "token_budget", "max_queue_size", "queue_timeout_ms")
+        _at_most(MAX_INT32, self, "max_batch_size", "token_budget", "max_sample_tokens")
+        _at_most(MAX_INT32, self, "max_queue_size", "queue_timeout_ms")
         if self.dtype not in (None, *_DTYPES):
             raise ConfigError(f"dtype: expected one of {', '.join(_DTYPES)} or null, got {self.dtype!r}")
         ports = {name: getattr(self, name) for name in _PORTS if getattr(self, name) is not None}

@@ -15,11 +15,10 @@ import numpy as np
 import torch
 
 from rfm import checkpoint as checkpoints
-from rfm.config import DEFAULT_TOKEN_BUDGET
-from rfm.execution import Execution
+from rfm.config import DEFAULT_SAMPLE_TOKENS, DEFAULT_TOKEN_BUDGET
+from rfm.execution import Execution, memory_errors
 from rfm.families.rewind import RewindFamily
 from rfm.families.vlm import VlmFamily
-from rfm.families.vqa import VqaFamily
 from rfm.family import Family, RowScores
 from rfm.models.encoders import Encoders
 from rfm_client import (
@@ -45,12 +44,20 @@ class Engine:
     """Scores samples with one network on one device.
 
     family: the network and how samples become its batches
-    token_budget: the most tokens, padding included, of one forward pass
+    token_budget: the most tokens, padding included, of one forward pass of several rows; a larger row runs alone
+    max_sample_tokens: the most tokens of one row; a sample that needs more is refused
     """
 
-    def __init__(self, family: Family[Any, Any], *, token_budget: int = DEFAULT_TOKEN_BUDGET) -> None:
+    def __init__(
+        self,
+        family: Family[Any, Any],
+        *,
+        token_budget: int = DEFAULT_TOKEN_BUDGET,
+        max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS,
+    ) -> None:
         self.family = family
         self.token_budget = token_budget
+        self.max_sample_tokens = max_sample_tokens
 
     @classmethod
     def from_checkpoint(
@@ -59,25 +66,28 @@ class Engine:
         *,
         encoders: Encoders | None = None,
         base_model: str | None = None,
+        resize_images: bool | None = None,
         device: str | torch.device = "cpu",
         dtype: torch.dtype | None = None,
         token_budget: int = DEFAULT_TOKEN_BUDGET,
+        max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS,
     ) -> Engine:
         """The engine of a checkpoint folder or Hugging Face id. Raises CheckpointError.
 
         encoders: of a ReWiND checkpoint, for samples of raw frames
-        base_model: of a vision-language checkpoint, as in ``rfm.checkpoint.load``
+        base_model, resize_images: of a vision-language checkpoint, as in ``rfm.checkpoint.load``
         dtype: of the network; None: float32, and a vision-language checkpoint's own on a GPU
         """
         folder = checkpoints.find(source)
         own = folder / PROCESSOR_FOLDER
         return cls.of(
-            checkpoints.load(folder, base_model=base_model),
+            checkpoints.load(folder, base_model=base_model, resize_images=resize_images),
             encoders=encoders,
             processor=base_model or (own if own.is_dir() else None),
             device=device,
             dtype=dtype,
             token_budget=token_budget,
+            max_sample_tokens=max_sample_tokens,
         )
 
     @classmethod
@@ -90,6 +100,7 @@ class Engine:
         device: str | torch.device = "cpu",
         dtype: torch.dtype | None = None,
         token_budget: int = DEFAULT_TOKEN_BUDGET,
+        max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS,
     ) -> Engine:
         """The engine of a checkpoint in memory.
 
@@ -99,12 +110,12 @@ class Engine:
         on = torch.device(device)
         if isinstance(checkpoint, checkpoints.RewindCheckpoint):
             family = RewindFamily(checkpoint.build(), encoders=encoders, device=on, dtype=dtype or torch.float32)
-            return cls(family, token_budget=token_budget)
+            return cls(family, token_budget=token_budget, max_sample_tokens=max_sample_tokens)
         if dtype is None and on.type == "cpu":
             dtype = torch.float32
-        vlm_family = VqaFamily if checkpoint.config.generates_text else VlmFamily
         processor = processor or checkpoint.config.base_model_id
-        return cls(vlm_family.of(checkpoint, processor, on, dtype), token_budget=token_budget)
+        vlm = VlmFamily.of(checkpoint, processor, on, dtype)
+        return cls(vlm, token_budget=token_budget, max_sample_tokens=max_sample_tokens)
 
     def evaluate(self, samples: Sequence[Sample], execution: Execution | None = None) -> list[Outcome]:
         """The result of each sample, or the error of one that has none; neighbours make no difference.
@@ -120,7 +131,7 @@ class Engine:
         rows: list[Any] = []
         rows_of: dict[int, slice] = {}
         for index, sample_rows in enumerate(self.family.rows(samples, execution)):
-            error = sample_rows if isinstance(sample_rows, RewardError) else self._over_budget(sample_rows)
+            error = sample_rows if isinstance(sample_rows, RewardError) else self._too_long(sample_rows)
             if isinstance(sample_rows, RewardError) or error is not None:
                 outcomes[index] = error  # type: ignore[assignment]
                 continue
@@ -135,11 +146,11 @@ class Engine:
             outcomes[index] = _outcome(samples[index], scores[of_sample], timing)
         return [outcomes[index] for index in range(len(samples))]
 
-    def _over_budget(self, rows: Sequence[Any]) -> InvalidSampleError | None:
+    def _too_long(self, rows: Sequence[Any]) -> InvalidSampleError | None:
         longest = max(self.family.num_tokens(self.family.lengths(row)) for row in rows)
-        if longest <= self.token_budget:
+        if longest <= self.max_sample_tokens:
             return None
-        expected = f"at most {self.token_budget} tokens (token_budget of this server)"
+        expected = f"at most {self.max_sample_tokens} tokens (max_sample_tokens of this server)"
         return InvalidSampleError.at("num_frames", expected, f"{longest} tokens")
 
     def _scores(self, rows: Sequence[Any], execution: Execution) -> list[RowScores | RewardError]:
@@ -153,21 +164,29 @@ class Engine:
 
     def _collated(self, rows: Sequence[Any], parts: Sequence[list[int]]) -> Iterator[tuple[list[int], Any]]:
         """Each part with its batch. While one is scored the next is collated, in a thread; the first needs none."""
-        batch = self.family.collate([rows[i] for i in parts[0]]) if parts else None
+        batch = self._collate([rows[i] for i in parts[0]]) if parts else None
         if len(parts) < 2:
             yield from ((part, batch) for part in parts)
             return
         with ThreadPoolExecutor(1) as collating:
             for part, following in zip(parts, [*parts[1:], None], strict=True):
-                coming = collating.submit(self.family.collate, [rows[i] for i in following]) if following else None
+                coming = collating.submit(self._collate, [rows[i] for i in following]) if following else None
                 yield part, batch
                 batch = coming.result() if coming is not None else None
 
+    def _collate(self, rows: Sequence[Any]) -> Any:
+        """The batch of the rows; None if it does not fit in memory now."""
+        try:
+            with memory_errors():
+                return self.family.collate(rows)
+        except torch.OutOfMemoryError:
+            return None
+
     def _score(self, rows: Sequence[Any], batch: Any, execution: Execution) -> Sequence[RowScores | RewardError]:
-        """Of one forward pass. batch: of all rows"""
+        """Of one forward pass. batch: of all rows, if it is made"""
 
         def forward(part: Sequence[Any]) -> Sequence[RowScores | RewardError]:
-            of_part = batch if part is rows else self.family.collate(part)
+            of_part = batch if part is rows and batch is not None else self.family.collate(part)
             scores = self.family.score(part, of_part)
             execution.add_tokens(*self.family.occupancy(of_part))
             return scores

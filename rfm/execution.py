@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -16,9 +18,26 @@ Output = TypeVar("Output")
 
 _log = logging.getLogger(__name__)
 
+_CPU_OUT_OF_MEMORY = re.compile(  # plain RuntimeErrors: of PyTorch's allocator, and of oneDNN, which gives no reason
+    r"DefaultCPUAllocator: can't allocate memory|could not (create|execute) a (primitive|memory object)"
+)
+
 
 def _nothing() -> None:
     pass
+
+
+@contextmanager
+def memory_errors() -> Iterator[None]:
+    """Within it, memory that runs out is a torch.OutOfMemoryError: a GPU's, and on the CPU PyTorch's or Python's."""
+    try:
+        yield
+    except MemoryError as error:
+        raise torch.OutOfMemoryError(str(error)) from error
+    except RuntimeError as error:
+        if not _CPU_OUT_OF_MEMORY.search(str(error)):
+            raise
+        raise torch.OutOfMemoryError(str(error)) from error
 
 
 @dataclass
@@ -45,10 +64,11 @@ class Execution:
         Out of memory, its halves are tried; a row that does not fit alone is an error of its own.
         """
         try:
-            return list(forward(rows))
-        except torch.OutOfMemoryError:
+            with memory_errors():
+                return list(forward(rows))
+        except torch.OutOfMemoryError as error:
             self.out_of_memory_count += 1
-            _log.warning("out of memory with %d rows", len(rows))
+            _log.warning("out of memory with %d rows: %s", len(rows), error)
         finally:
             self.on_forward()
         torch.cuda.empty_cache()  # nothing where there is no GPU

@@ -20,17 +20,14 @@ Batch = TypeVar("Batch")
 
 @dataclass(frozen=True, eq=False)
 class RowScores:
-    """Scores of one row: of the frames of its trajectories, and of its question about two of them.
-
-    Families that do not tell a score, whatever the sample, give NaN for it and have checked the others.
-    """
+    """Scores of one row: of the frames of its trajectories, and of its question about two of them."""
 
     frames: list[FrameScores]
     query: float | None = None
 
 
 def has_numbers(row: RowScores) -> bool:
-    """Whether a network that tells every score gave a number for each."""
+    """Whether the network gave a number for every score."""
     arrays = [array for scores in row.frames for array in (scores.progress, scores.success)]
     return all(np.isfinite(array).all() for array in arrays) and (row.query is None or bool(np.isfinite(row.query)))
 

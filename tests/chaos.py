@@ -46,7 +46,7 @@ def chaos(folder: Path, overload_s: float) -> list[Row]:
     with overload.large_site(folder / "unbounded") as served:
         rows += survive("overload of a gateway", lambda: overload.of_gateway(served, folder, overload_s))
     with overload.large_site(folder / "bounded", **overload.SETTINGS) as served:
-        rows += survive("overload of gRPC", lambda: overload.of_grpc(served, overload_s))
+        rows += survive("overload of gRPC", lambda: overload.of_grpc(served, folder, overload_s))
     for name, inside in mounts.FAULTS.items():
         rows += survive(name, lambda inside=inside: mounts.run(inside, folder))  # type: ignore[misc]
     return rows

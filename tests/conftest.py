@@ -23,8 +23,11 @@ from rfm.server.installation import find_installation
 from rfm.server.process import Endpoints, TritonServer
 from rfm_client import RewardClient, Trajectory
 from rfm_export.export import load_encoders
+from rfm_export.layout import CONFIG_FILE
+from rfm_export.pbtxt import parse, render
 
 torch.set_num_threads(1)
+os.environ["ONEDNN_MAX_CPU_ISA"] = "AVX512_CORE"  # as the references were computed: AMX rounds bfloat16 elsewhere
 
 
 def serve_config(config: goldens.Config, name: str = "rfm") -> ServeConfig:
@@ -101,6 +104,19 @@ def random_trajectory(seed: int, num_frames: int, video_dim: int = 768, text_dim
         video_embeddings=random.standard_normal((num_frames, video_dim), np.float32),
         text_embedding=random.standard_normal(text_dim, np.float32),
     )
+
+
+def forget_input(repository: Path, model: str, name: str) -> None:
+    """The model's configuration becomes one from before it had this input."""
+    file = repository / model / CONFIG_FILE
+    config = parse(file.read_text())
+    inputs = [tensor for tensor in config.input if tensor.name != name]
+    assert len(inputs) < len(config.input)
+    del config.input[:]
+    config.input.extend(inputs)
+    for step in config.ensemble_scheduling.step:
+        step.input_map.pop(name, None)
+    file.write_text(render(config))
 
 
 def kill_model(repository: Path, model: str = "rfm") -> None:

@@ -2,8 +2,8 @@
 """Part of ``make chaos``: raw bytes and mutated requests against HTTP, gRPC and the gateway of a served Triton.
 
 Every request has a deadline. At the end the server lives, scores as before, and is no larger than after the warm-up.
-What is answered is counted by door, kind of request and status. A failure that is not the client's (5xx, INTERNAL and
-so on) must be one of those that Triton gives by itself (TRITONS_OWN), before or behind model.py.
+What is answered is counted by door, kind of request and status. A failure that blames the server (5xx, INTERNAL and
+so on) must be Triton's own: the same request to a control without our code (control.py) fails in the same way.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ import goldens
 import grpc
 import numpy as np
 from conftest import serve_config
+from control import control
 from rich.console import Console
 from rich.table import Table
 from tritonclient.grpc import service_pb2 as pb
@@ -51,12 +52,6 @@ MOST_GROWTH = 0.05
 GATEWAY_START_S = 60
 
 SERVERS_FAULT = re.compile(r"5\d\d|INTERNAL|UNKNOWN|UNAVAILABLE|DATA_LOSS|ABORTED")
-# What Triton 2.51 and its libraries answer by themselves to requests that never reach model.py, or left it.
-TRITONS_OWN = {
-    r"^failed to parse the request JSON buffer": "Triton's HTTP front end: a body that is no JSON",
-    r"^Unable to parse (_|JSON bytes array): ": "Triton's HTTP front end: JSON that is no request",
-    r"^Unable to parse request": "the gRPC library: a message that is no request",
-}
 
 # What Triton 2.51 does not survive, and cannot be kept from it at its own doors: memory for a shape in JSON is taken
 # before the shape is compared with the data (its process ends), and one whose size overflows reaches the stub, whose
@@ -64,6 +59,7 @@ TRITONS_OWN = {
 KILLS_TRITON = re.compile(rb'"shape": *\[[^\]]*\d{6}')
 
 Inputs = Mapping[str, np.ndarray[Any, Any]]
+Fault = tuple[str, str, str]  # kind of request, status, text
 _DATATYPES = {"uint8": "UINT8", "int32": "INT32", "float32": "FP32", "object": "BYTES"}
 _ODD_NUMBERS = (-(2**63), -(2**31), -1, 0, 1, 2, 255, 4096, 2**31 - 1, 2**31, 2**32, 2**63, 1e308, 10**40)
 
@@ -106,12 +102,13 @@ class Outcome:
 
 @dataclass
 class Doors:
-    """Where a served repository is reached, and what processes serve it."""
+    """Where a served repository is reached, and what processes serve it. control: the same without our code"""
 
     endpoints: Endpoints
     gateway_port: int
     pids: tuple[int, ...]
     log: Path
+    control: Doors | None = None
     channel: grpc.Channel = field(init=False)
 
     def __post_init__(self) -> None:
@@ -407,10 +404,15 @@ KINDS: dict[str, Request] = {
 
 @dataclass
 class Report:
-    """statuses: by kind of request; faults: texts of what blames the server; memory: after warm-up, and at the end"""
+    """What came of a run.
+
+    statuses: by kind of request; faults: kind, status and text of what blames the server; ours: those that the control
+    does not have; memory_bytes: after the warm-up, and at the end
+    """
 
     statuses: dict[str, Counter[str]]
-    faults: Counter[tuple[str, str, str]]
+    faults: Counter[Fault]
+    ours: list[Fault]
     memory_bytes: tuple[int, int]
     still_right: bool
     seconds: float
@@ -425,23 +427,15 @@ class Report:
         """Of memory since the warm-up."""
         return self.memory_bytes[1] / self.memory_bytes[0] - 1
 
-    @property
-    def ours(self) -> list[tuple[str, str, str]]:
-        """Faults that are not Triton's own."""
-        return [fault for fault in self.faults if _tritons_own(fault[2]) is None]
-
     def print(self) -> None:
         """A table of the statuses, and what blamed the server."""
         table = Table("request", "statuses")
         for kind, counts in self.statuses.items():
             table.add_row(kind, ", ".join(f"{count} {status}" for status, count in counts.most_common()))
         Console(width=140).print(table)
-        told: Counter[str] = Counter()
-        for (kind, status, text), count in self.faults.items():
-            why = _tritons_own(text) or f"NOT TRITON'S OWN: {text}"
-            told[f"{kind}: {status}: {why}"] += count
-        for line, count in told.most_common():
-            print(f"{count} x {line}")
+        for fault, count in self.faults.most_common():
+            whose = "NOT SO WITHOUT OUR CODE" if fault in self.ours else "so without our code"
+            print(f"{count} x {': '.join(fault)} ({whose})")
         before, after = (memory / 2**20 for memory in self.memory_bytes)
         print(
             f"{sum(map(Counter.total, self.statuses.values()))} requests in {self.seconds:.0f} s; {self.num_late} late"
@@ -461,6 +455,7 @@ def served(folder: Path) -> Iterator[Doors]:
     with (
         log_file.open("wb") as log,
         TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+        control(repository, folder / "control") as bare,
         socket.create_server(("127.0.0.1", 0)) as bound,
     ):
         port = int(bound.getsockname()[1])
@@ -468,10 +463,12 @@ def served(folder: Path) -> Iterator[Doors]:
         command = gateway_command(server.endpoints.grpc_url, server.endpoints.metrics_url, "rfm", "127.0.0.1", port)
         with subprocess.Popen(command, stdout=log, stderr=log) as gateway:
             try:
-                doors = Doors(server.endpoints, port, (server.pid, gateway.pid), log_file)
+                without_us = Doors(bare, 0, (), folder / "control" / "tritonserver.log")
+                doors = Doors(server.endpoints, port, (server.pid, gateway.pid), log_file, without_us)
                 _wait(lambda: gateway.poll() is not None or doors.http(port, post("/", b"")).status == "404")
                 yield doors
                 doors.channel.close()
+                without_us.channel.close()
             finally:
                 gateway.send_signal(signal.SIGTERM)
 
@@ -479,11 +476,19 @@ def served(folder: Path) -> Iterator[Doors]:
 def fuzz(doors: Doors, num_requests: int, seed: int = 0) -> Report:
     """Sends them, mixed, from CALLERS callers."""
     statuses: dict[str, Counter[str]] = {kind: Counter() for kind in KINDS}
-    faults: Counter[tuple[str, str, str]] = Counter()
+    faults: Counter[Fault] = Counter()
+    first: dict[Fault, int] = {}
     kinds = [list(KINDS)[number % len(KINDS)] for number in range(num_requests)]
 
-    def send(number: int) -> Outcome:
-        return KINDS[kinds[number]](doors, random.Random(f"{seed}/{number}"))
+    def send(number: int, to: Doors = doors) -> Outcome:
+        return KINDS[kinds[number]](to, random.Random(f"{seed}/{number}"))
+
+    def is_ours(fault: Fault) -> bool:
+        kind, status, text = fault
+        if kind.startswith("gateway") or doors.control is None:
+            return True
+        bare = send(first[fault], doors.control)
+        return (bare.status, _alike(bare.text)) != (status, text)
 
     started_s = time.perf_counter()
     before = _scores(doors)
@@ -496,10 +501,14 @@ def fuzz(doors: Doors, num_requests: int, seed: int = 0) -> Report:
                 if outcome.status == "dead":
                     raise DiedError(f"request {number} of seed {seed}, or one shortly before it")
                 if outcome.blames_server:
-                    faults[kinds[number], outcome.status, _alike(outcome.text)] += 1
+                    fault = kinds[number], outcome.status, _alike(outcome.text)
+                    faults[fault] += 1
+                    first.setdefault(fault, number)
             memory.append(doors.memory_bytes())
     still_right = np.array_equal(before, _scores(doors))
-    return Report(statuses, faults, (memory[0], memory[1]), still_right, time.perf_counter() - started_s)
+    seconds = time.perf_counter() - started_s
+    ours = [fault for fault in faults if is_ours(fault)]
+    return Report(statuses, faults, ours, (memory[0], memory[1]), still_right, seconds)
 
 
 def _scores(doors: Doors) -> np.ndarray[Any, Any]:
@@ -513,11 +522,6 @@ def _scores(doors: Doors) -> np.ndarray[Any, Any]:
             ]
             parts += [result.progress for result in client.evaluate(asked)]  # type: ignore[union-attr]
     return np.concatenate(parts)
-
-
-def _tritons_own(text: str) -> str | None:
-    """Where in Triton a fault is made; None: it is not known to be Triton's."""
-    return next((why for known, why in TRITONS_OWN.items() if re.search(known, text)), None)
 
 
 def _alike(text: str) -> str:

@@ -82,7 +82,7 @@ class Trial:
         for number in range(count):
             at_step = number // 2 % steps if number % 2 else None
             told = self._kill_at_step(number, at_step) if at_step is not None else self._kill_at_random(number)
-            self.leftovers += len(list(self.folder.glob(".*.export-*")))
+            self.leftovers += len(list(self.repository.rglob(".export-*")))
             which = self.check()
             if number % SERVED_EVERY == SERVED_EVERY - 1:
                 self.check_served()
@@ -130,9 +130,9 @@ class Trial:
     def finish(self) -> int:
         """One whole export at the end: it is served, and nothing of the killed ones lies about."""
         self._export_whole(0)
-        left = list(self.folder.glob(".*.export-*"))
+        left = list(self.repository.rglob(".export-*"))
         if left:
-            raise NotServableError(f"{self.folder}: expected no folders of killed exports, got {left}")
+            raise NotServableError(f"{self.repository}: expected no folders of killed exports, got {left}")
         return self.check_served()
 
     def close(self) -> None:

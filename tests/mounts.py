@@ -124,7 +124,7 @@ def _export_without_room(disk: Path) -> Row:
     config = read_config(repository, "rfm")
     row.expect(list(config.version_policy.specific.versions) == [version], "another version would be served")
     check_digest(repository / "rfm" / str(version), config.parameters[DIGEST_PARAMETER].string_value)
-    left = [str(path) for path in disk.glob(".*.export-*")]
+    left = [str(path) for path in repository.rglob(".export-*")]
     row.expect(not left, f"left behind: {left}")
     return row
 

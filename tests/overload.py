@@ -7,6 +7,7 @@ import asyncio
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
@@ -25,6 +26,7 @@ from callers import (
     trajectory,
 )
 from chaos_site import Row, Site, site, wait_healthy
+from control import SCORE, control
 from prometheus_client.parser import text_string_to_metric_families
 from rfm_serve import MODEL, PATIENCE_S
 
@@ -37,13 +39,14 @@ from rfm_client.gateway.scoring import FRAME_STEPS
 
 ROOM = 8  # calls that may wait at a time: about a second
 # Two instances: with one, a Triton before 26.08 that has a bounded queue serves a batch each half second once it is full.
-SETTINGS = {"max_queue_size": ROOM, "batch_size": 1, "instances": 2}
+SETTINGS = {"max_queue_size": ROOM, "max_batch_size": 1, "instances": 2}
 FACTOR = 4
 CALIBRATION_S = 6.0
 CALLERS = 8
 CROWD_PER_S = 200.0
 CROWD_S = 5.0
 TOLD_S = 0.1
+US_PER_S = 1e6
 P99_FACTOR = 3
 LARGE = RewindConfig(  # much work and few bytes: callers beside the server take little of the machine
     video_feature_dim=VIDEO_DIM,
@@ -75,11 +78,36 @@ def heavy_samples() -> list[Sample]:
     return [ProgressSample(trajectory(random, MOST_FRAMES), frame_steps=FRAME_STEPS) for _ in range(16)]
 
 
-def of_grpc(site: Site, seconds: float) -> list[Row]:
-    """Triton's own queue turns away what it has no room for; and what the gateway says of that."""
-    connect = direct(site.served.endpoints.grpc_url, retry=False, max_in_flight=4096)
-    row, _ = _overload(site, "gRPC", connect, ROOM, lambda: _failures(site), seconds)
-    return [row, _crowd(site)]
+def of_grpc(site: Site, folder: Path, seconds: float) -> list[Row]:
+    """Triton's own queue refuses what it has no room for, beside a control without our code; then the gateway's crowd.
+
+    A bound that the control breaks too is Triton's limit: the row reports it and does not fail for it.
+    """
+    exam = Exam.of(site.checkpoint, heavy_samples())
+    ends = site.served.endpoints
+    ours = _overload(exam, "gRPC", _without_retries(ends), ROOM, lambda: _failures(ends), seconds)
+    with control(site.repository, folder / "control", _service_s(site, exam)) as ends:
+        blank = Exam(exam.samples, [np.full_like(expected, SCORE) for expected in exam.expected])
+        bare = _overload(blank, "a bare Triton", _without_retries(ends), ROOM, lambda: _failures(ends), seconds)
+    for bound, why in ours.broken.items():
+        if bound in bare.broken:
+            ours.row.told += f"; Triton's limit, the control breaks it too: {bare.broken[bound]}"
+        else:
+            ours.row.broken.append(why)
+    return [ours.row, bare.row, _crowd(site)]
+
+
+def _without_retries(endpoints: Endpoints) -> Connect:
+    return direct(endpoints.grpc_url, retry=False, max_in_flight=4096)
+
+
+def _service_s(site: Site, exam: Exam) -> float:
+    """Seconds that a model instance takes for one request of a lone caller, as Triton counts them."""
+    names = ("nv_inference_compute_infer_duration_us", "nv_inference_count")
+    before = [_sum(site.served.endpoints.metrics_url, name, model=MODEL) for name in names]
+    closed_loop(_without_retries(site.served.endpoints), exam, 1, CALIBRATION_S)
+    after = [_sum(site.served.endpoints.metrics_url, name, model=MODEL) for name in names]
+    return (after[0] - before[0]) / (after[1] - before[1]) / US_PER_S
 
 
 def of_gateway(site: Site, folder: Path, seconds: float) -> list[Row]:
@@ -88,22 +116,33 @@ def of_gateway(site: Site, folder: Path, seconds: float) -> list[Row]:
     url = f"http://127.0.0.1:{port}"
     command = gateway_command(endpoints.grpc_url, endpoints.metrics_url, MODEL, "127.0.0.1", port)
     with (folder / "gateway.log").open("wb") as log:
-        gateway = subprocess.Popen([*command, f"--max-in-flight={ROOM}"], stdout=log, stderr=log)
+        gateway = subprocess.Popen([*command, f"--max-in-flight={ROOM}", "--max-waiting=0"], stdout=log, stderr=log)
     try:
         wait_healthy(url)
-        row, counted = _overload(site, "a gateway", through_gateway(url), ROOM, lambda: _rejections(url), seconds)
+        exam = Exam.of(site.checkpoint, heavy_samples())
+        found = _overload(exam, "a gateway", through_gateway(url), ROOM, lambda: _rejections(url), seconds)
     finally:
         gateway.terminate()
         gateway.wait(PATIENCE_S)
-    row.expect(counted == row.refused, f"the gateway counts {counted:.0f} refused calls")
+    row = found.row
+    row.broken += found.broken.values()
+    row.expect(found.counted == row.refused, f"the gateway counts {found.counted:.0f} refused calls")
     return [row]
 
 
+@dataclass
+class Overload:
+    """What became of an overload. counted: refusals that metrics count; broken: by bound, how it was broken"""
+
+    row: Row
+    counted: float
+    broken: dict[str, str]
+
+
 def _overload(
-    site: Site, door: str, connect: Connect, room: int, count: Callable[[], float], seconds: float
-) -> tuple[Row, float]:
-    """FACTOR times what can be served, for so long; with how many more refusals are counted."""
-    exam = Exam.of(site.checkpoint, heavy_samples())
+    exam: Exam, door: str, connect: Connect, room: int, count: Callable[[], float], seconds: float
+) -> Overload:
+    """FACTOR times as many calls as can be served, for so long."""
     unloaded_s = closed_loop(connect, exam, 1, CALIBRATION_S)[0].p99_s
     _, capacity_per_s = closed_loop(connect, exam, CALLERS, CALIBRATION_S)
     before = count()
@@ -119,10 +158,13 @@ def _overload(
         f"(callers were up to {1e3 * latest_s:.0f} ms late themselves); metrics count {counted:.0f}"
     )
     row = Row.of(f"{FACTOR} x overload of {door} for {seconds:g} s", tally, told=told)
-    row.expect(tally.p99_s <= most_s, f"p99 of accepted calls: {tally.p99_s:.2f} s; allowed: {most_s:.2f} s")
     row.expect(tally.refused > 0, "nobody was refused")
-    row.expect(max(tally.refusals_s, default=0) <= TOLD_S, f"a refusal was told after {refusals_ms[1]:.0f} ms")
-    return row, counted
+    broken = {}
+    if tally.p99_s > most_s:
+        broken["p99"] = f"p99 of accepted calls: {tally.p99_s:.2f} s; allowed: {most_s:.2f} s"
+    if max(tally.refusals_s, default=0) > TOLD_S:
+        broken["refusals"] = f"a refusal was told after {refusals_ms[1]:.0f} ms"
+    return Overload(row, counted, broken)
 
 
 def _crowd(site: Site) -> Row:
@@ -140,8 +182,8 @@ def _rejections(gateway_url: str) -> float:
     return _sum(f"{gateway_url}/metrics", "rfm_gateway_rejections_total", reason="unavailable")
 
 
-def _failures(site: Site) -> float:
-    return _sum(site.served.endpoints.metrics_url, "nv_inference_request_failure")
+def _failures(endpoints: Endpoints) -> float:
+    return _sum(endpoints.metrics_url, "nv_inference_request_failure")
 
 
 def _sum(url: str, name: str, **labels: str) -> float:

@@ -35,7 +35,7 @@ def main() -> int:
                     results = client.evaluate(case.samples(), logits=case.config.is_discrete)
                 each = [goldens.differences(r, e) for r, e in zip(results, case.expected(), strict=True)]
                 raw, probability = (max(values) for values in zip(*each, strict=True))
-                allowed = case.tolerances()
+                allowed = case.tolerances
                 failed += raw > allowed[0] or probability > allowed[1]
                 table.add_row(str(case), f"{raw:.1e}", f"{probability:.1e}", f"{allowed[0]:g}, {allowed[1]:g}")
     Console(width=110).print(table)

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: MIT
 """``make rollout``: two versions of a checkpoint take turns on one server while callers ask; what became of each request.
 
-Callers send embeddings and raw frames, in turn, one request at a time and a few a second each, and retry nothing.
+Half of the callers use gRPC, half HTTP. They send embeddings and raw frames, in turn, one request at a time and a few a
+second each, and retry nothing.
 """
 
 from __future__ import annotations
 
 import asyncio
+import functools
 import subprocess
 import sys
 import tempfile
@@ -30,6 +32,7 @@ from rfm.engine import Engine, Outcome
 from rfm.server.process import Endpoints
 from rfm_client import (
     AsyncRewardClient,
+    DeadlineExceededError,
     PreferenceSample,
     ProgressSample,
     RewardClient,
@@ -37,6 +40,7 @@ from rfm_client import (
     Sample,
     Trajectory,
 )
+from rfm_client.async_client import DEFAULT_TIMEOUT_S
 from rfm_export.export import load_encoders
 
 NAME = "rfm"
@@ -48,14 +52,21 @@ TOLERANCE = 1e-5
 CLEARLY = 1e-2  # versions differ by at least so much
 SECONDS = 60.0
 CALLERS = 32
+DEADLINE_S = 10.0  # of a call
 PAUSE_S = 0.2  # a control loop's step; without it they would take the processor from what is being loaded
 
 
 @dataclass
 class Tally:
-    """What became of requests. unlike: answers that are neither version's, or not that of the version they name"""
+    """What became of requests.
+
+    unlike: answers that are neither version's, or not that of the version they name
+    failed: requests without an answer; late: those of them that were past their deadline
+    """
 
     asked: int = 0
+    late: int = 0
+    slowest_s: float = 0.0  # of answers
     by_version: Counter[str] = field(default_factory=Counter)
     unlike: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
@@ -68,7 +79,8 @@ class Tally:
         versions = ", ".join(f"version {version}: {count}" for version, count in sorted(self.by_version.items()))
         return (
             f"asked {self.asked}, answered {self.answered} ({versions}), "
-            f"of neither version {len(self.unlike)}, failed {len(self.failed)}"
+            f"of neither version {len(self.unlike)}, failed {len(self.failed)}, past their deadline {self.late}, "
+            f"slowest answer {self.slowest_s:.1f} s"
         )
 
 
@@ -124,7 +136,13 @@ def difference(left: object, right: object) -> float:
 
 @contextmanager
 def callers(
-    url: str, samples: Sequence[Sample], expected: Mapping[str, Sequence[Outcome]], model: str = NAME
+    url: str,
+    samples: Sequence[Sample],
+    expected: Mapping[str, Sequence[Outcome]],
+    model: str = NAME,
+    *,
+    count: int = CALLERS,
+    timeout_s: float = DEFAULT_TIMEOUT_S,
 ) -> Iterator[Tally]:
     """So many ask on and on within it. expected: answers by version"""
     tally, stop, begun = Tally(), threading.Event(), threading.Event()
@@ -132,13 +150,16 @@ def callers(
     async def call(client: AsyncRewardClient, index: int) -> None:
         while not stop.is_set():
             sample = index % len(samples)
-            index += CALLERS + 1
+            index += count + 1
             tally.asked += 1
+            asked_s = time.monotonic()
             try:
-                result = await client.score(samples[sample])
+                result = await client.score(samples[sample], timeout_s=timeout_s)
             except RewardError as error:
                 tally.failed.append(repr(error))
+                tally.late += isinstance(error, DeadlineExceededError)
                 continue
+            tally.slowest_s = max(tally.slowest_s, time.monotonic() - asked_s)
             version = str(result.model_version)
             tally.by_version[version] += 1
             if version not in expected or difference(result, expected[version][sample]) > TOLERANCE:
@@ -147,8 +168,8 @@ def callers(
             await asyncio.sleep(PAUSE_S)
 
     async def call_all() -> None:
-        async with AsyncRewardClient(url, model=model, retry=False, max_in_flight=CALLERS) as client:
-            await asyncio.gather(*(call(client, index) for index in range(CALLERS)))
+        async with AsyncRewardClient(url, model=model, retry=False, max_in_flight=count) as client:
+            await asyncio.gather(*(call(client, index) for index in range(count)))
 
     thread = threading.Thread(target=asyncio.run, args=(call_all(),))
     thread.start()
@@ -217,17 +238,25 @@ def main() -> int:
         with rfm_serve(repository, key_file, folder / "log") as endpoints:
             export(other, repository)
             begun_s = time.monotonic()
-            with callers(endpoints.grpc_url, samples, expected) as tally:
-                turns = take_turns(repository, endpoints.http_url, key_file, SECONDS)
+            ask = functools.partial(
+                callers, samples=samples, expected=expected, count=CALLERS // 2, timeout_s=DEADLINE_S
+            )
+            with (
+                ask(endpoints.grpc_url) as over_grpc,
+                ask(endpoints.http_url) as over_http,
+            ):
+                turns = take_turns(repository, endpoints.grpc_url, key_file, SECONDS)
             took_s = time.monotonic() - begun_s
         told = [line for line in (folder / "log").read_text().splitlines() if line.startswith("rfm: ")]
     print(
         f"{took_s:.0f} s, {CALLERS} callers, {turns} times another version; the versions differ by {apart:.2g} or more"
     )
-    print(tally)
-    for line in (*told, *tally.failed[:5], *tally.unlike[:5]):
-        print(line)
-    return int(bool(tally.failed or tally.unlike))
+    for protocol, tally in {"gRPC": over_grpc, "HTTP": over_http}.items():
+        print(f"{protocol}: {tally}")
+        for line in (*tally.failed[:5], *tally.unlike[:5]):
+            print(line)
+    print(*told, sep="\n")
+    return int(any(tally.failed or tally.unlike for tally in (over_grpc, over_http)))
 
 
 if __name__ == "__main__":

@@ -2,25 +2,34 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
+from dataclasses import asdict, fields
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import goldens
 import huggingface_hub
+import local_hub
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
 from rfm import checkpoint as checkpoints
 from rfm.checkpoint import CheckpointError, best_tag
+from rfm.models.rewind import RewindConfig
+from rfm.models.vlm import VlmConfig
 
 CONTINUOUS = "legacy_keys_l2"  # lacks causal_mask and use_per_frame_progress_token
 MISMATCHED = "h40_L3_H5_c1_t1_disc5_cfgmismatch"  # its configs say l2 and 32 bins, its weights 5 bins
 IN_RUN_FOLDER = "c1_t1_disc10"  # config.yaml in the parent folder
+WITH_IMAGES = "q3_tok_disc10"  # a vision-language one: each frame an image, with a progress token
+TAG = "best-p-rank-0.8500-step-123"
 
 
 @pytest.fixture
@@ -62,6 +71,12 @@ def test_saving_and_loading_changes_nothing(tmp_path: Path) -> None:
     assert copy.config == original.config
     assert copy.network.keys() == original.network.keys()
     assert all(torch.equal(copy.network[name], original.network[name]) for name in copy.network)
+
+
+@pytest.mark.parametrize("config", [VlmConfig, RewindConfig])
+def test_what_decides_each_setting_is_documented(config: type[VlmConfig | RewindConfig]) -> None:
+    documented = (Path(__file__).parents[1] / "docs" / "checkpoints.md").read_text()
+    assert [field.name for field in fields(config) if f"`{field.name}`" not in documented] == []
 
 
 def test_encoder_weights_are_told_apart() -> None:
@@ -159,6 +174,24 @@ SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
     "a number of heads that is no number": (
         change_json("config.json", lambda c: c.update(num_attention_heads="4")),
         r"num_attention_heads in config.json: expected int, got '4'",
+    ),
+    "no word of a causal mask, from a file that upstream did not write": (
+        lambda folder: (
+            change_json("config.json", lambda c: c.pop("hidden_dim"))(folder),
+            (folder / "config.yaml").unlink(),
+        )[0],
+        r"causal_mask: expected it in config.json or model.rewind of config.yaml, got it in neither",
+    ),
+    "no word of the longest trajectory": (
+        lambda folder: (
+            change_json("config.json", lambda c: c.pop("max_len"))(folder),
+            (folder / "config.yaml").write_text("model: {rewind: {causal_mask: true}}"),
+        )[0],
+        r"max_len: expected it in config.json or model.rewind of config.yaml, got it in neither",
+    ),
+    "no configuration at all": (
+        lambda folder: ((folder / "config.json").unlink(), (folder / "config.yaml").unlink())[0],
+        r"max_len: expected it in config.json or model.rewind of config.yaml, got it in neither",
     ),
     "pickle": (
         as_pickle,
@@ -289,3 +322,54 @@ def test_a_hub_that_cannot_be_reached_is_told(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(huggingface_hub, "snapshot_download", refuse)
     with pytest.raises(CheckpointError, match="org/name@v2: cannot be fetched: no network"):
         checkpoints.load("org/name@v2")
+
+
+LOADS = """
+import json, sys
+from dataclasses import asdict
+from rfm import checkpoint as checkpoints
+try:
+    print(json.dumps(asdict(checkpoints.load(sys.argv[1]).config)))
+except checkpoints.CheckpointError as error:
+    print(error)
+"""
+
+
+def load_from_hub(source: str, revisions: dict[str, Path], cache: Path) -> str:
+    """What a process of its own says of the checkpoint; huggingface_hub reads its environment once."""
+    with local_hub.hub(revisions) as endpoint:
+        environment = {**os.environ, "HF_ENDPOINT": endpoint, "HF_HOME": str(cache), "HF_HUB_OFFLINE": "0"}
+        command = [sys.executable, "-c", LOADS, source]
+        return subprocess.run(
+            command, env=environment, check=True, capture_output=True, text=True, cwd=cache.parent
+        ).stdout.strip()
+
+
+@pytest.fixture
+def tagged(tmp_path: Path) -> tuple[Path, Path]:
+    """A multi-image checkpoint as upstream uploads one: the tag's commit lacks config.yaml, which main has."""
+    tag, main = tmp_path / "tag", tmp_path / "main"
+    shutil.copytree(goldens.config(WITH_IMAGES).checkpoint, tag, copy_function=shutil.copyfile)
+    main.mkdir()
+    (tag / "config.yaml").rename(main / "config.yaml")
+    return tag, main
+
+
+@pytest.mark.parametrize("source", ["org/name", f"org/name@{TAG}"])
+def test_config_yaml_is_found_on_main_of_the_hub_s_repository(
+    tagged: tuple[Path, Path], tmp_path: Path, source: str
+) -> None:
+    tag, main = tagged
+    expected = asdict(checkpoints.load(goldens.config(WITH_IMAGES).checkpoint).config)
+    assert expected["multi_image"] and expected["per_frame_progress_token"]
+    said = load_from_hub(source, {"main": main, TAG: tag}, tmp_path / "cache")
+    assert json.loads(said) == json.loads(json.dumps(expected))
+
+
+def test_a_hub_s_checkpoint_without_any_config_yaml_is_refused(tagged: tuple[Path, Path], tmp_path: Path) -> None:
+    tag, main = tagged
+    (main / "config.yaml").rename(main / "README.md")
+    said = load_from_hub("org/name", {"main": main, TAG: tag}, tmp_path / "cache")
+    assert re.search(
+        r"expected config\.yaml of the training run there, .* or on main of its Hub repository, got none", said
+    )

@@ -10,7 +10,7 @@ import sys
 import sysconfig
 import urllib.request
 import venv
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -332,7 +332,39 @@ def test_frames_are_resized_when_asked(served: Served) -> None:
         from rfm_client.resize import resize_frames
 
         assert_same(resized, client.progress(replace(film, frames=resize_frames(frames, size))))
-        np.testing.assert_allclose(resized.progress, client.progress(film).progress, atol=0.02)
+        np.testing.assert_allclose(resized.progress, client.progress(film).progress, rtol=0, atol=5e-4)
+
+
+def test_each_trajectory_of_a_pair_is_resized_by_its_own_size(served: Served) -> None:
+    random = np.random.default_rng(4)
+    wide, tall = (
+        Trajectory(frames=random.integers(0, 256, (num_frames, *size, 3), np.uint8), task="open the drawer")
+        for num_frames, size in ((4, (120, 160)), (3, (200, 90)))
+    )
+    from rfm_client.resize import resize_frames
+
+    with served.client("grpc", FRAMES_MODEL) as client:
+        size = client.model_info(frames=True).frame_size
+        assert size is not None
+        smaller = [replace(t, frames=resize_frames(t.positions, size)) for t in (wide, tall)]
+        assert smaller[0].positions.shape[1:] != smaller[1].positions.shape[1:]
+        assert_same(client.preference(wide, tall, resize=True), client.preference(*smaller))
+
+
+def test_pairs_of_two_frame_sizes_may_be_awaited(served: Served, protocol: str) -> None:
+    random = np.random.default_rng(5)
+    films = [
+        Trajectory(frames=random.integers(0, 256, (num_frames, *size, 3), np.uint8), task="open the drawer")
+        for num_frames, size in ((4, (48, 60)), (3, (90, 61)), (2, (48, 60)))
+    ]
+    samples = [PreferenceSample(a, b) if a is films[0] else SimilaritySample(a, b) for a in films for b in films]
+
+    async def ask() -> Sequence[Result]:
+        async with AsyncRewardClient(served.url(protocol), model=FRAMES_MODEL) as client:
+            return await client.evaluate(samples)
+
+    for result, expected in zip(asyncio.run(ask()), load_engine(FRAMES_MODEL).evaluate(samples), strict=True):
+        assert_same(result, expected)
 
 
 def test_timing_and_logits_come_when_asked(served: Served, protocol: str) -> None:
@@ -568,9 +600,27 @@ def test_a_wrong_url_is_refused_when_the_client_is_made(urls: str | list[str], m
     assert str(raised.value) == message
 
 
-def test_a_deadline_must_lie_ahead(served: Served) -> None:
-    with served.client("grpc") as client, pytest.raises(ValueError, match="timeout_s: expected more than 0, got 0"):
-        client.progress(random_trajectory(0, 1), timeout_s=0)
+@pytest.mark.parametrize("timeout_s", [float("inf"), float("nan"), 0, -1, 2e9])
+def test_a_deadline_must_lie_ahead_and_within_reach(timeout_s: float) -> None:
+    wanted = f"timeout_s: expected a number of seconds above 0 and at most 1e+09, got {timeout_s}"
+    with RewardClient(NOBODY) as client:
+        calls: list[Callable[[], object]] = [
+            lambda: RewardClient(NOBODY, timeout_s=timeout_s),
+            lambda: client.progress(random_trajectory(0, 1), timeout_s=timeout_s),
+            lambda: client.submit(ProgressSample(random_trajectory(0, 1)), timeout_s=timeout_s).result(),
+            lambda: client.model_info(timeout_s=timeout_s),
+            lambda: client.is_ready(timeout_s=timeout_s),
+            lambda: client.wait_ready(timeout_s),
+        ]
+        for call in calls:
+            with pytest.raises(ValueError, match="timeout_s") as caught:
+                call()
+            assert str(caught.value) == wanted
+
+
+def test_a_call_may_take_very_long(served: Served, protocol: str) -> None:
+    with served.client(protocol) as client:
+        assert client.progress(random_trajectory(0, 1), timeout_s=1e9).progress.shape == (1,)
 
 
 @dataclass(frozen=True)

@@ -23,12 +23,13 @@ import clip
 import numpy as np
 import pytest
 import tritonclient.http
-from conftest import Served, random_trajectory
+from conftest import Served, load_engine, random_trajectory
 from typer.main import get_command
 from typer.testing import CliRunner, Result
 
 from rfm_client import (
     FrameScores,
+    PreferenceResult,
     PreferenceSample,
     ProgressResult,
     ProgressSample,
@@ -280,14 +281,44 @@ def test_compare_writes_what_the_client_gives(served: Served, protocol: str, vid
     assert (tmp_path / "both.pdf").read_bytes().startswith(b"%PDF")
 
 
+def test_compare_takes_videos_of_two_sizes(served: Served, protocol: str, video: Path, tmp_path: Path) -> None:
+    small = tmp_path / "small.npy"
+    np.save(small, np.random.default_rng(0).integers(0, 256, (2, 40, 30, 3), np.uint8))
+    target = tmp_path / "scores.json"
+    result = ask(served, "compare", video, small, "--task", TASK, "--json", target, protocol=protocol)
+    assert (result.exit_code, result.stderr) == (0, "")
+    first, second = load_trajectory(video, task=TASK, fps=3), load_trajectory(small)
+    assert first.positions.shape[1:] != second.positions.shape[1:]
+    (expected,) = load_engine(MODEL).evaluate([PreferenceSample(first, second)])
+    assert isinstance(expected, PreferenceResult)
+    document = json.loads(target.read_text())
+    assert document["preference"] == pytest.approx(expected.preference, abs=TOLERANCE)
+    assert_scores(document["first"], expected.first)
+    assert_scores(document["second"], expected.second)
+
+
 def test_compare_tells_what_cannot_be_compared(served: Served, video: Path, tmp_path: Path) -> None:
-    np.save(tmp_path / "small.npy", np.zeros((2, 8, 8, 3), np.uint8))
-    result = ask(served, "compare", video, tmp_path / "small.npy", "--task", TASK)
+    np.save(tmp_path / "embeddings.npy", np.zeros((2, 8), np.float32))
+    result = ask(served, "compare", video, tmp_path / "embeddings.npy", "--task", TASK)
     assert result.exit_code == ExitCode.FAILED
-    expected = (
-        "second.frames: expected [96, 96, 3] per frame, as the first trajectory (one array holds both), got [8, 8, 3]"
-    )
+    expected = "second: expected frames, as the first trajectory, got video_embeddings"
     assert result.stderr == f"rfm-client: {expected}\n"
+
+
+def test_a_lerobot_file_of_several_episodes_is_neither_scored_nor_compared(
+    served: Served, video: Path, tmp_path: Path
+) -> None:
+    film = tmp_path / "videos" / "observation.images.top" / "chunk-000" / "file-000.mp4"
+    film.parent.mkdir(parents=True)
+    film.write_bytes(video.read_bytes())
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").write_text('{"codebase_version": "v3.0", "total_episodes": 10}')
+    refused = "video: expected a film of one episode, got a LeRobot v3.0 file that holds 10 episodes: cut one episode "
+    for words in (("score", film), ("compare", video, film)):
+        result = ask(served, *words, "--task", TASK)
+        assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
+        assert refused in result.stderr
+        assert str(film) in result.stderr
 
 
 # plots

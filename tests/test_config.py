@@ -14,7 +14,8 @@ def test_the_fastapi_servers_file_is_accepted(tmp_path: Path) -> None:
         "model_path: org/name\nnum_gpus: null\nmax_workers: 4\nbatch_size: 16\nserver_url: http://localhost\nserver_port: 8010\n"
     )
     config = ServeConfig.from_yaml(file)
-    assert (config.model_path, config.num_gpus, config.max_workers, config.batch_size) == ("org/name", None, 4, 16)
+    assert (config.model_path, config.num_gpus, config.max_workers) == ("org/name", None, 4)
+    assert (config.batch_size, config.max_batch_size) == (16, 64)  # the original never reads it
     assert (config.host, config.server_port) == ("127.0.0.1", 8010)
 
 
@@ -35,9 +36,11 @@ BAD = {
         "num_gpu: 1",
         r"serve\.yaml: num_gpu: expected one of model_path, num_gpus, .*, got an unknown key",
     ),
-    "text for a number": ("batch_size: many", r"serve\.yaml: batch_size: expected int, got 'many'"),
+    "text for a number": ("batch_size: many", r"serve\.yaml: batch_size: expected int or null, got 'many'"),
     "true for a number": ("num_gpus: true", r"serve\.yaml: num_gpus: expected int or null, got True"),
     "too small": ("batch_size: 0", r"serve\.yaml: batch_size: expected at least 1, got 0"),
+    "too small a batch": ("max_batch_size: 0", r"serve\.yaml: max_batch_size: expected at least 1, got 0"),
+    "a truth that is a number": ("resize_images: 1", r"serve\.yaml: resize_images: expected bool or null, got 1"),
     "a port that is none": ("grpc_port: 70000", r"serve\.yaml: ports: expected different ones up to 65535, got"),
     "one port twice": ("grpc_port: 8000", r"serve\.yaml: ports: expected different ones up to 65535, got"),
     "a port in the address": ("server_url: http://localhost:8000", r"server_url: expected an address without port"),

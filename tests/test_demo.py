@@ -22,7 +22,7 @@ from rfm.config import ServeConfig
 from rfm_client import InvalidSampleError
 from rfm_client.video import frame_indices, read_video
 
-VIDEOS = Path(__file__).parents[2] / "shared" / "videos"
+VIDEOS = Path(__file__).parent / "videos"
 ROOT = Path(__file__).parents[1]
 REPOSITORY = ROOT / "model_repository"
 PNG = b"\x89PNG"
@@ -122,7 +122,6 @@ def test_the_clip_survives_its_video_file(video: Path) -> None:
         ("jaco_play_pick_up_green_cup", 2, 13),
     ],
 )
-@pytest.mark.skipif(not VIDEOS.is_dir(), reason="robot videos are not at hand")
 def test_robot_videos_are_read_frame_for_frame(name: str, fps: float, count: int) -> None:
     frames = read_video(VIDEOS / f"{name}.mp4", fps)
     assert frames.shape[0] == count

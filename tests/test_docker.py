@@ -373,6 +373,24 @@ def test_what_is_mounted_is_there() -> None:
         assert set(service.get("secrets", [])) <= set(COMPOSE["secrets"])
 
 
+def test_prometheus_has_the_secrets_that_its_configuration_names() -> None:
+    """Also in what is commented out, which its reader is told to use."""
+    text = (DOCKER / "prometheus" / "prometheus.yml").read_text()
+    named = re.findall(r"/run/secrets/(\w+)", text)
+    assert named == ["gateway_api_key"]
+    assert SERVICES["prometheus"]["secrets"] == named
+    with_key = yaml.safe_load(re.sub(r"# (authorization:)", r"\1", text))["scrape_configs"]
+    (gateway,) = (job for job in with_key if job["job_name"] == "gateway")
+    assert gateway["authorization"] == {"credentials_file": "/run/secrets/gateway_api_key"}
+
+
+@pytest.mark.parametrize(("options", "source"), [({}, "/dev/null"), ({"RFM_GATEWAY_KEY_FILE": "./key"}, "docker/key")])
+def test_the_gateway_s_key_is_mounted_where_there_is_one(options: dict[str, str], source: str) -> None:
+    command = [*compose_words("cpu"), "config"]
+    done = subprocess.run(command, env={**os.environ, **options}, check=True, capture_output=True, text=True)
+    assert yaml.safe_load(done.stdout)["secrets"]["gateway_api_key"]["file"].endswith(source)
+
+
 @pytest.mark.parametrize("name", [name for name, service in SERVICES.items() if is_ours(service)])
 def test_the_image_knows_the_options_that_the_compose_file_gives_it(image: Image, name: str) -> None:
     words = [*SERVICES[name].get("entrypoint", entrypoint()), *SERVICES[name]["command"]]

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -11,16 +12,19 @@ from typing import Any
 import goldens
 import pytest
 import torch
-from conftest import serve_config
+from click.testing import Result
+from conftest import forget_input, serve_config
 from google.protobuf import text_format
 from safetensors.torch import load_file, save_file
 from tritonclient.grpc import model_config_pb2 as pb
 from typer.testing import CliRunner
 
 import rfm_export
+from rfm.checkpoint.content import read_run_config
 from rfm.cli import app
 from rfm.config import ServeConfig
 from rfm.models.rewind import RewindTransformer
+from rfm_client import wire
 from rfm_export import ExportDiffersError, ExportError
 from rfm_export.about import Origin
 
@@ -99,12 +103,15 @@ def test_a_checkpoint_without_similarity_is_not_warmed_up_with_it(tmp_path: Path
 def test_frames_go_through_the_encoder_into_the_scorer(exported: Path) -> None:
     encoder, ensemble = read(exported, "film_encoder"), read(exported, "film_frames")
     assert dims(encoder.output) == {"video_embeddings": ("FP32", [-1, 48]), "text_embedding": ("FP32", [32])}
-    assert [tensor.name for tensor in encoder.input if tensor.allow_ragged_batch] == ["frames"]
+    assert [tensor.name for tensor in encoder.input if tensor.allow_ragged_batch] == ["frames", "second_frames"]
+    for config in (encoder, ensemble):
+        assert [tensor.name for tensor in config.input if tensor.optional] == ["second_frames"]
     assert dims(ensemble.input) == {
         "sample_type": ("UINT8", [1]),
         "num_frames": ("INT32", [2]),
         "frame_steps": ("INT32", [1]),
         "frames": ("UINT8", [-1, -1, -1, 3]),
+        "second_frames": ("UINT8", [-1, -1, -1, 3]),
         "task": ("STRING", [1]),
     }
     steps = [(step.model_name, step.model_version) for step in ensemble.ensemble_scheduling.step]
@@ -116,7 +123,8 @@ def test_one_instance_a_gpu_or_one_on_the_cpu(tmp_path: Path) -> None:
     export(EMBEDDINGS, tmp_path / "cpu", num_gpus=0)
     (group,) = read(tmp_path / "cpu", "rfm").instance_group
     assert (group.kind, group.count, list(group.gpus)) == (pb.ModelInstanceGroup.KIND_CPU, 1, [])
-    export(EMBEDDINGS, tmp_path / "gpu", num_gpus=2)
+    serve = replace(serve_config(EMBEDDINGS), num_gpus=2)
+    rfm_export.export(EMBEDDINGS.checkpoint, tmp_path / "gpu", serve, other_machine=True)
     (group,) = read(tmp_path / "gpu", "rfm").instance_group
     assert (group.kind, group.count, list(group.gpus)) == (pb.ModelInstanceGroup.KIND_GPU, 1, [0, 1])
 
@@ -238,6 +246,19 @@ def test_a_model_keeps_its_inputs_and_outputs(tmp_path: Path) -> None:
     assert list(read(tmp_path, "rfm").version_policy.specific.versions) == [1]
 
 
+def test_a_model_may_gain_an_optional_input_and_lose_none(tmp_path: Path) -> None:
+    export(FRAMES, tmp_path)
+    for name in ("rfm_encoder", "rfm_frames"):
+        forget_input(tmp_path, name, wire.SECOND_FRAMES)
+    assert export(FRAMES, tmp_path) == 2
+    assert wire.SECOND_FRAMES in dims(read(tmp_path, "rfm_frames").input)
+    config = read(tmp_path, "rfm_encoder")
+    config.input.add(name="third_frames", data_type=pb.TYPE_UINT8, dims=[1], optional=True)
+    (tmp_path / "rfm_encoder" / "config.pbtxt").write_text(text_format.MessageToString(config))
+    with pytest.raises(ExportError, match="rfm_encoder: expected a checkpoint with the same inputs"):
+        export(FRAMES, tmp_path)
+
+
 def test_an_ensemble_does_not_lose_its_encoder(tmp_path: Path) -> None:
     export(FRAMES, tmp_path)
     with pytest.raises(ExportError, match="expected a checkpoint that this model can serve too"):
@@ -282,7 +303,7 @@ def test_the_commands_errors_are_one_line(tmp_path: Path) -> None:
 
 def test_a_config_file_tells_the_command_what_to_do(tmp_path: Path) -> None:
     (tmp_path / "serve.yaml").write_text(
-        f"model_path: {EMBEDDINGS.checkpoint}\nnum_gpus: 0\nbatch_size: 8\ntoken_budget: 512\nname: reward\n"
+        f"model_path: {EMBEDDINGS.checkpoint}\nnum_gpus: 0\nmax_batch_size: 8\ntoken_budget: 512\nname: reward\n"
     )
     repository = tmp_path / "model_repository"
     result = CliRunner().invoke(
@@ -292,6 +313,44 @@ def test_a_config_file_tells_the_command_what_to_do(tmp_path: Path) -> None:
     config = read(repository, "reward")
     assert config.max_batch_size == 8
     assert config.parameters["token_budget"].string_value == "512"
+
+
+# As upstream publishes it, comments aside.
+EVAL_CONFIG_SERVER = """
+model_path: "robometer/Robometer-4B"
+num_gpus: 1
+max_workers: 8
+batch_size: 4
+server_url: "0.0.0.0"
+server_port: 8000
+"""
+NOTE = "batch_size has no effect, as in the FastAPI server; max_batch_size bounds a batch"
+
+
+def export_as_upstream_serves(folder: Path, *words: str, num_gpus: int) -> Result:
+    file = folder / "eval_config_server.yaml"
+    file.write_text(EVAL_CONFIG_SERVER.replace("num_gpus: 1", f"num_gpus: {num_gpus}"))
+    command = ["export", "--config", str(file), "--checkpoint", str(EMBEDDINGS.checkpoint)]
+    return CliRunner().invoke(app, [*command, "--repository", str(folder / "repository"), *words])
+
+
+def test_upstream_s_batch_size_bounds_nothing_and_says_so(tmp_path: Path) -> None:
+    result = export_as_upstream_serves(tmp_path, num_gpus=0)
+    assert result.exit_code == 0, result.output
+    assert result.stderr == f"rfm: {tmp_path}/eval_config_server.yaml: {NOTE}\n"
+    assert read(tmp_path / "repository", "rfm").max_batch_size == ServeConfig().max_batch_size
+
+
+def test_more_gpus_than_there_are_are_refused_at_export(tmp_path: Path) -> None:
+    there = torch.cuda.device_count()
+    refused = export_as_upstream_serves(tmp_path, num_gpus=there + 1)
+    assert refused.exit_code == 1
+    assert f"rfm: num_gpus: expected at most {there}, got {there + 1}; --other-machine exports" in refused.stderr
+    assert not (tmp_path / "repository").exists()
+    exported = export_as_upstream_serves(tmp_path, "--other-machine", num_gpus=there + 1)
+    assert exported.exit_code == 0, exported.output
+    (group,) = read(tmp_path / "repository", "rfm").instance_group
+    assert list(group.gpus) == list(range(there + 1))
 
 
 def test_the_exported_network_has_every_weight(exported: Path) -> None:
@@ -335,3 +394,16 @@ def test_a_checkpoint_of_the_hub_tells_its_commit(tmp_path: Path) -> None:
     assert Origin.of("org/name@best", snapshot) == Origin("org/name@best", "0123abcd")
     snapshot.mkdir(parents=True)
     assert Origin.of(snapshot, snapshot) == Origin("snapshots/0123abcd", "")
+
+
+def test_the_configuration_of_the_training_run_is_kept_without_its_secrets(tmp_path: Path) -> None:
+    config, checkpoint = goldens.config("legacy_keys_l2"), tmp_path / "checkpoint"
+    shutil.copytree(config.checkpoint, checkpoint)
+    file = checkpoint / "config.yaml"
+    run = json.loads(json.dumps(read_run_config(file)))
+    secrets = "{hub_token: hf_secret, WANDB_API_KEY: secret, max_token: 5, day: 2026-01-02}"
+    file.write_text(f"{file.read_text()}\nreports: {secrets}\n")
+    rfm_export.export(checkpoint, tmp_path / "model_repository", serve_config(config))
+    kept = json.loads(read(tmp_path / "model_repository", "rfm").parameters["run_config"].string_value)
+    assert kept == {**run, "reports": {"max_token": 5, "day": "2026-01-02"}}
+    assert rfm_export.check(tmp_path / "model_repository", serve_config(config)) == []

@@ -22,14 +22,20 @@ import httpx
 import numpy as np
 import pytest
 import trustme
-from conftest import load_engine, random_trajectory, serve_config
+from conftest import kill_model, load_engine, random_trajectory, serve_config
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from test_serve_command import EXIT_S, REPOSITORY, command, regions, wait_for_http
+from typer.testing import CliRunner
 
 import rfm_export
+from rfm.cli import app
 from rfm.config import ConfigError, ServeConfig
 from rfm.server.exposure import MAX_HTTP_BYTES, GrpcTls, check_version, size_limits
 from rfm.server.installation import Installation, ServerStartError, find_installation
 from rfm.server.leftovers import REGION_PREFIX
+from rfm.server.own_tls import OwnTls
 from rfm.server.process import Endpoints, TritonServer
 from rfm_client import AccessDeniedError, ProgressSample, RewardClient, ServerUnavailableError
 from rfm_client.access import Access
@@ -214,11 +220,12 @@ def test_a_client_without_a_certificate_is_refused(mutual: Endpoints, papers: Pa
         assert not asked.is_ready()
 
 
-def test_http_beside_tls_listens_on_loopback_alone(papers: Papers) -> None:
+def test_http_beside_tls_listens_on_loopback_alone(papers: Papers, tmp_path: Path) -> None:
     tls = GrpcTls(papers.certificate, papers.key)
     endpoints = Endpoints("10.0.0.1", 8000, 8001, 8002, tls)
     arguments = TritonServer(REPOSITORY, endpoints, find_installation())._arguments(["rfm"])
-    assert {"--http-address=127.0.0.1", "--grpc-address=10.0.0.1", "--grpc-use-ssl=true"} <= set(arguments)
+    assert {"--http-address=127.0.0.1", "--grpc-address=10.0.0.1"} <= set(arguments)
+    assert "--grpc-use-ssl=true" in OwnTls(tls).arguments(tmp_path)
     assert endpoints.http_url == "http://127.0.0.1:8000"
 
 
@@ -238,6 +245,59 @@ def test_tls_on_one_side_alone_gives_no_connection(mutual: Endpoints, papers: Pa
         url = f"{scheme}://127.0.0.1:{mutual.http_port}"
         with client(url, ca_file=papers.ca, retry=False) as asked, pytest.raises(ServerUnavailableError):
             asked.progress(TRAJECTORY)
+
+
+@pytest.mark.parametrize("with_client_ca", [False, True], ids=["server", "mutual"])
+def test_rfm_serve_itself_loads_over_grpc_with_tls(papers: Papers, tmp_path: Path, with_client_ca: bool) -> None:
+    """It is told of no certificate for itself. `rfm models` is, and shows that there is no other way in."""
+    repository, endpoints = tmp_path / "model_repository", Endpoints.free()
+    rfm_export.export(PLAIN.checkpoint, repository, serve_config(PLAIN))
+    tls = GrpcTls(papers.certificate, papers.key, papers.ca if with_client_ca else None)
+    endpoints = replace(endpoints, grpc_tls=tls)
+    key_file = tmp_path / "key"
+    key_file.touch(0o600)
+    key_file.write_text(KEY)
+    words = ["--grpc-certificate", papers.certificate, "--grpc-key", papers.key, "--admin-key-file", key_file]
+    words += ["--grpc-client-ca", papers.ca] if with_client_ca else []
+    with (tmp_path / "log").open("wb") as output:
+        process = subprocess.Popen([*command(repository, endpoints), *map(str, words)], stdout=output, stderr=output)
+    try:
+        wait_for_http(process, endpoints)
+        kill_model(repository)
+        with client(endpoints.grpc_url, **papers.client) as asked:  # it asks again until the model is back
+            scores_right(asked)
+        assert "rfm: rfm is started again: its process is dead" in (tmp_path / "log").read_text()
+        list_models = ["list", "--url", endpoints.grpc_url, "--admin-key-file", str(key_file)]
+        own = ["--client-certificate", str(papers.client_certificate), "--client-key", str(papers.client_key)]
+        trusted = ["--ca-file", str(papers.ca), *own]
+        assert CliRunner().invoke(app, ["models", *trusted, *list_models]).stdout.split() == ["rfm", "1", "READY"]
+        stranger = ["--ca-file", str(papers.other_ca), *own]
+        for access in [stranger, trusted[:2]] if with_client_ca else [stranger]:
+            refused = CliRunner().invoke(app, ["models", *access, *list_models])
+            assert (refused.exit_code, refused.stdout) == (1, "")
+            assert refused.stderr.startswith(f"rfm: {endpoints.grpc_url}: failed to connect")
+    finally:
+        process.terminate()
+        process.wait(EXIT_S)  # Triton 2.51 gives 1 where a request met the dead process
+
+
+def test_a_certificate_that_names_no_host_is_told_before_anything_starts(papers: Papers, tmp_path: Path) -> None:
+    """gRPC's clients could trust no server that has it."""
+    named = x509.load_pem_x509_certificate(papers.certificate.read_bytes())
+    key = serialization.load_pem_private_key(papers.key.read_bytes(), None)
+    assert isinstance(key, rsa.RSAPrivateKey | ec.EllipticCurvePrivateKey)
+    nobody = x509.CertificateBuilder(
+        named.issuer,
+        x509.Name([]),
+        key.public_key(),
+        1,
+        named.not_valid_before_utc,
+        named.not_valid_after_utc,
+    ).sign(key, hashes.SHA256())
+    file = tmp_path / "nobody.pem"
+    file.write_bytes(nobody.public_bytes(serialization.Encoding.PEM))
+    told = refused_to_serve("--grpc-certificate", file, "--grpc-key", papers.key)
+    assert told == f"rfm: grpc_certificate: expected a certificate that names a host, got none at {file}\n"
 
 
 # HTTP, through a proxy that has TLS and asks for a key

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import http.client
 import io
 import json
@@ -38,13 +39,16 @@ from typer.testing import CliRunner
 
 import rfm_export
 from rfm import checkpoint as checkpoints
+from rfm.checkpoint.content import read_run_config
 from rfm.cli import app
 from rfm.config import ServeConfig
 from rfm.models.rewind import RewindConfig, RewindTransformer
 from rfm.server.installation import find_installation
 from rfm.server.leftovers import REGION_PREFIX
-from rfm.server.process import SHARED_MEMORY, Endpoints, TritonServer
+from rfm.server.process import Endpoints, TritonServer
+from rfm.server.stubs import SHARED_MEMORY
 from rfm_client import (
+    AsyncRewardClient,
     InvalidSampleError,
     ModelNotFoundError,
     PreferenceSample,
@@ -52,9 +56,11 @@ from rfm_client import (
     Result,
     RewardClient,
     Sample,
+    ServerUnavailableError,
     SimilaritySample,
     Trajectory,
 )
+from rfm_client.gateway import state as gateway_state
 from rfm_client.status import read_status
 
 Json: TypeAlias = dict[str, Any]
@@ -202,7 +208,7 @@ def fixture_of(model: str, *options: str) -> Any:
 
 
 tiny, film, video = fixture_of(TINY), fixture_of(FILM), fixture_of(VIDEO)
-strict = fixture_of(TINY, "--timeout", "1", "--max-in-flight", "1", "--max-body-mib", "1")
+strict = fixture_of(TINY, "--timeout", "1", "--max-in-flight", "1", "--max-waiting", "0", "--max-body-mib", "1")
 
 
 # Samples as clients hold them, and three ways to send them
@@ -332,7 +338,7 @@ def expected(gateway: Gateway, samples: Sequence[Json], *, frame_steps: int = 0,
             "task": [reference.get("task") for reference in references],
             "data_source": [reference.get("data_source") for reference in references],
             "data_gen_strategy": [sample.get("data_gen_strategy") for sample, _ in of["similarity"]],
-            "metadata": [reference.get("metadata") for reference in references],
+            "metadata": [reference.get("metadata") or {} for reference in references],
         }
     return told
 
@@ -406,6 +412,17 @@ def test_frames_and_embeddings_may_be_mixed(film: Gateway, ask: Ask) -> None:
     samples = [*mixed(filmed), *mixed(embedded, FILM_DIMS), progress(filmed(3, 2, size_px=40))]
     assert answered(ask(film, samples)) == numbers(expected(film, samples))
     assert answered(ask(film, samples[:1])) == expected(film, samples[:1])
+
+
+def test_pairs_of_two_frame_sizes_are_scored(film: Gateway, video: Gateway, ask: Ask) -> None:
+    samples = [
+        preference(filmed(1, 3), filmed(2, 2, size_px=40)),
+        progress(filmed(3, 2, size_px=40)),
+        preference(filmed(6, 2), filmed(7, 4)),
+    ]
+    assert answered(ask(video, samples)) == numbers(expected(video, samples, group=2))
+    samples.append(similarity(filmed(4, 2, size_px=40), filmed(5, 5)))
+    assert answered(ask(film, samples)) == numbers(expected(film, samples))
 
 
 @pytest.mark.parametrize("num_frames", [1, 2, 9, 40])
@@ -505,6 +522,15 @@ def test_float_frames_are_clipped_and_truncated(film: Gateway, ask: Ask) -> None
     whole = np.clip(frames, 0, 255).astype(np.uint8)
     answer = answered(ask(film, [progress({"frames": frames, "task": "lift"})]))
     assert answer == expected(film, [progress({"frames": whole, "task": "lift"})])
+
+
+def test_one_frame_is_a_film_of_one_and_the_colours_of_rgba_count(film: Gateway, ask: Ask) -> None:
+    whole = filmed(1, 3)
+    answer = answered(ask(film, [progress({**whole, "frames": whole["frames"][0]})]))
+    assert answer == expected(film, [progress({**whole, "frames": whole["frames"][:1]})])
+    opacity = np.random.default_rng(1).integers(0, 256, (3, 32, 32, 1), np.uint8)
+    answer = answered(ask(film, [progress({**whole, "frames": np.concatenate([whole["frames"], opacity], axis=-1)})]))
+    assert answer == expected(film, [progress(whole)])
 
 
 ARRAYS: dict[str, Callable[[Array], bytes]] = {
@@ -663,8 +689,9 @@ BAD_ARRAYS: dict[str, dict[str, tuple[Any, str]]] = {
         "values beyond 255": (BLACK.astype(int) + 256, r"expected values in 0\.\.255, got 256\.\.256"),
         "NaN": (BLACK + np.nan, r"expected finite values in 0\.\.255, got NaN, Inf or nothing"),
         "ragged": ([[[[1, 2, 3]]], [[[1]]]], "expected rows of equal length, got unequal ones"),
-        "four channels": (np.ones((2, 8, 8, 4), int), r"expected uint8 \[T, H, W, 3\], got .* \[2, 8, 8, 4\]"),
-        "one image": (BLACK[0], r"expected uint8 \[T, H, W, 3\], got .* \[8, 8, 3\]"),
+        "values below 0": (BLACK.astype(int) - 1, r"expected values in 0\.\.255, got -1\.\.-1"),
+        "two channels": (np.ones((2, 8, 8, 2), int), r"expected uint8 \[T, H, W, 3\], got .* \[2, 8, 8, 2\]"),
+        "grey levels": (np.ones((8, 8), int), r"expected uint8 \[T, H, W, 3\], got .* \[8, 8\]"),
         "no pixels": (BLACK[:, :0], "expected .*, got .*"),
         "truths": (BLACK > 0, r"expected uint8 \[T, H, W, 3\].*, got bool .*"),
         "words and numbers": (["0.png", 1], "expected numbers, got something else"),
@@ -712,11 +739,6 @@ BAD_SAMPLES: dict[str, tuple[Any, list[Any], str]] = {
         preference(embedded(1, 2, FILM_DIMS), filmed(1, 2)),
         ["chosen_trajectory", "video_embeddings"],
         "expected them in both trajectories or neither, got one of two",
-    ),
-    "frames of two sizes": (
-        similarity(filmed(1, 2), filmed(1, 2, size_px=40)),
-        ["sim_trajectory", "frames"],
-        r"expected \[32, 32, 3\] per frame, .*, got \[40, 40, 3\]",
     ),
     "a bad second": (
         preference(embedded(1, 2, FILM_DIMS), embedded(1, 2, (7, 32))),
@@ -823,6 +845,7 @@ FORMS_REFUSED: dict[str, tuple[dict[str, str], list[Any], str]] = {
     ),
     "no JSON": (FORM | {"sample_1": "{"}, ["sample_1"], "expected JSON, got: .*"),
     "no object": (FORM | {"sample_1": "5"}, ["samples", 1], "expected an object, got int"),
+    "JSON in JSON": (FORM | {"sample_1": json.dumps(FORM["sample_0"])}, ["samples", 1], "expected an object, got str"),
     "a part that was not sent": (
         {"sample_0": dumped(progress({**FIRST, "video_embeddings": {"__numpy_file__": "other"}}))},
         ["samples", 0, *VIDEO_AT],
@@ -875,7 +898,40 @@ def test_steps_are_a_boolean_or_refused(tiny: Gateway, steps: Any) -> None:
     assert answered(response) == answered(ask_json(tiny, [progress(FIRST)], use_frame_steps=meant))
 
 
+@pytest.mark.parametrize(("steps", "meant"), [("true", True), ("True", True), ("1", False), ("0", False), ("", False)])
+def test_steps_in_a_form_are_read_as_the_fastapi_server_reads_them(tiny: Gateway, steps: str, meant: bool) -> None:
+    form = FORM | {"use_frame_steps": steps}
+    response = requests.post(f"{tiny.url}/evaluate_batch_npy", data=form, files={"unused": b"1"})
+    assert answered(response) == expected(tiny, [progress(FIRST)], frame_steps=FRAME_STEPS if meant else 0)
+
+
+def test_a_task_with_a_special_token_is_refused(video: Gateway, ask: Ask) -> None:
+    sample = progress(filmed(1, 2, task="lift <|prog_token|>"))
+    message = r"expected text without the model's special tokens, got '<\|prog_token\|>'"
+    check_refused(ask(video, [sample]), (["samples", 0, "task"], message))
+
+
 MULTIPART = "multipart/form-data; boundary=b"
+CHARSETS = ("undefined", "punycode", "unicode_escape", "rot13", "base64", "idna", "utf-7", "nowhere", "\xfc", "")
+NO_CHARSET = "content-type: expected a charset of utf-8, us-ascii or iso-8859-1, got"
+
+
+@pytest.mark.parametrize("charset", CHARSETS)
+def test_a_charset_that_is_none_of_text_is_a_415(tiny: Gateway, charset: str) -> None:
+    content_type = f'{MULTIPART}; charset="{charset}"'.encode("latin-1")
+    body = NAMED + FORM["sample_0"].encode() + b"\r\n--b--\r\n"
+    response = requests.post(f"{tiny.url}/evaluate_batch_npy", body, headers={"Content-Type": content_type})
+    assert failure(response, 415) == f"{NO_CHARSET} {charset!r}"
+
+
+@pytest.mark.parametrize("charset", ["utf-8", "UTF8", "us-ascii", "ISO_8859-1", "latin1"])
+def test_a_charset_of_text_is_read(tiny: Gateway, charset: str) -> None:
+    body = NAMED + FORM["sample_0"].encode() + b"\r\n--b--\r\n"
+    headers = {"Content-Type": f"{MULTIPART}; charset={charset}"}
+    response = requests.post(f"{tiny.url}/evaluate_batch_npy", body, headers=headers)
+    assert answered(response) == expected(tiny, [progress(FIRST)])
+
+
 NAMED = b'--b\r\nContent-Disposition: form-data; name="sample_0"\r\n\r\n'
 NAMELESS = b"--b\r\nContent-Disposition: form-data\r\n\r\nx\r\n--b--\r\n"
 NO_FORM = "content-type: expected multipart/form-data with a boundary"
@@ -978,6 +1034,153 @@ def paused(triton: Triton) -> Iterator[None]:
         yield
     finally:
         os.killpg(triton.process_id, signal.SIGCONT)
+
+
+def post_body(gateway: Gateway, sample: Json) -> http.client.HTTPConnection:
+    """A connection on which a whole request has been sent."""
+    body = dumped([sample]).encode()
+    connection: http.client.HTTPConnection = begun(gateway, {"Content-Length": str(len(body))}, body)
+    return connection
+
+
+def test_three_hundred_callers_at_once_are_all_answered(triton: Triton, tiny: Gateway) -> None:
+    """Upstream's clients do not ask again: more than are scored at a time wait."""
+    answer = expected(tiny, [progress(FIRST)])
+    with paused(triton):
+        callers = [post_body(tiny, progress(FIRST)) for _ in range(300)]
+        poll(lambda: tiny.metric("requests_in_flight") + tiny.metric("requests_waiting") == 300)
+        assert tiny.metric("requests_waiting") == 300 - 256
+    for caller in callers:
+        response = caller.getresponse()
+        assert (response.status, json.loads(response.read())) == (200, numbers(answer))
+        caller.close()
+
+
+def test_a_caller_who_waits_too_long_is_a_503(triton: Triton, tmp_path: Path) -> None:
+    with running(triton.endpoints, tmp_path, TINY, "--timeout", "1", "--max-in-flight", "1") as gateway:
+        answered(ask_json(gateway, [progress(FIRST)]))
+        with paused(triton):
+            first = post_body(gateway, progress(FIRST))
+            poll(lambda: gateway.metric("requests_in_flight") == 1)
+            second, third = (post_body(gateway, progress(FIRST)) for _ in range(2))
+            codes = []
+            for caller in (first, second, third):
+                codes.append(caller.getresponse().status)
+                caller.close()
+        assert set(codes) == {503, 504}
+
+
+# A model that works for as long as a test wants
+
+CLOSED_GATE = """
+
+_load = TritonPythonModel.load
+
+
+def load(self, version, device, settings):
+    _load(self, version, device, settings)
+    score = self.engine.family.score
+
+    def gated(rows, batch):
+        import time
+
+        while Path({gate!r}).exists():
+            time.sleep(0.01)
+        return score(rows, batch)
+
+    self.engine.family.score = gated
+
+
+TritonPythonModel.load = load
+"""
+
+
+@dataclass(frozen=True)
+class Gated:
+    """A gateway before a Triton whose model works on its batch for as long as the file ``gate`` is there."""
+
+    gateway: Gateway
+    endpoints: Endpoints
+    gate: Path
+
+    @contextmanager
+    def working(self) -> Iterator[http.client.HTTPConnection]:
+        """Within it, the model works on the request of the connection."""
+        self.gate.touch()
+        try:
+            caller = post_body(self.gateway, progress(FIRST))
+            poll(lambda: self.metric("rfm_batch_requests") == 1)
+            yield caller
+        finally:
+            self.gate.unlink()
+
+    def metric(self, name: str, **labels: str) -> float:
+        families = text_string_to_metric_families(requests.get(self.endpoints.metrics_url).text)
+        samples = (sample for family in families for sample in family.samples)
+        return sum(s.value for s in samples if s.name == name and labels.items() <= s.labels.items())
+
+
+@pytest.fixture(scope="module")
+def gated(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransformer) -> Iterator[Gated]:
+    folder = tmp_path_factory.mktemp("gated")
+    repository, checkpoint, gate = folder / "model_repository", folder / "two_wide", folder / "gate"
+    checkpoints.save(checkpoints.RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()), checkpoint)
+    rfm_export.export(checkpoint, repository, ServeConfig(name=TINY, num_gpus=0, torch_threads=1))
+    model = repository / TINY / "1" / "model.py"
+    model.write_text(model.read_text() + CLOSED_GATE.format(gate=str(gate)))
+    with (
+        (folder / "tritonserver.log").open("wb") as log,
+        TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+        running(server.endpoints, folder) as gateway,
+    ):
+        yield Gated(gateway, server.endpoints, gate)
+
+
+def test_callers_who_hang_up_cost_no_forward(gated: Gated) -> None:
+    """Preferences are asked last: once one is counted, a moment later, so is whatever was scored before it."""
+
+    def scored(sample_type: str) -> float:
+        return gated.metric("rfm_samples_total", outcome="scored", sample_type=sample_type)
+
+    samples = [progress(FIRST), preference(FIRST, SECOND)]
+    answers = [expected(gated.gateway, [sample]) for sample in samples]
+    poll(lambda: scored("preference") == 1)
+    progress_before = scored("progress")
+    with gated.working() as first:
+        leaving = [post_body(gated.gateway, progress(FIRST)) for _ in range(12)]
+        poll(lambda: gated.metric("nv_inference_pending_request_count") == len(leaving))
+        for caller in leaving:
+            caller.close()
+        poll(lambda: gated.gateway.metric("requests_total", code="499") == len(leaving))
+        last = post_body(gated.gateway, samples[1])  # behind what has told Triton that they left
+        poll(lambda: gated.metric("nv_inference_pending_request_count") >= 1)
+    for caller, answer in zip((first, last), answers, strict=True):
+        assert json.loads(caller.getresponse().read()) == numbers(answer)
+        caller.close()
+    poll(lambda: scored("preference") == 2)
+    assert scored("progress") == progress_before + 1
+    assert gated.gateway.metric("requests_in_flight") == 0
+
+
+def test_health_is_told_while_a_model_works(gated: Gated, monkeypatch: pytest.MonkeyPatch) -> None:
+    with gated.working() as first:
+        second = post_body(gated.gateway, progress(FIRST))
+        poll(lambda: gated.metric("nv_inference_pending_request_count") == 1)
+        began_s = time.monotonic()
+        response = requests.get(f"{gated.gateway.url}/health")
+        assert time.monotonic() - began_s < TRUTH_S
+        assert answered(response) == {"status": "healthy", "available_gpus": 0, "total_gpus": 1}
+        monkeypatch.setattr(gateway_state, "STALL_S", 0.0)  # nothing is finished for longer than that: it hangs
+
+        async def ask() -> None:
+            async with AsyncRewardClient(gated.endpoints.grpc_url) as client:
+                await gateway_state.State(client, gated.endpoints.grpc_url, gated.endpoints.metrics_url, TINY).health()
+
+        with pytest.raises(ServerUnavailableError, match=r"rfm: no answer within 1\.5 s, and nothing finished for 0 s"):
+            asyncio.run(ask())
+    for caller in (first, second):
+        assert caller.getresponse().status == 200
+        caller.close()
 
 
 def test_no_score_in_time_is_a_504(triton: Triton, strict: Gateway, ask: Ask) -> None:
@@ -1242,6 +1445,11 @@ def test_model_info_tells_the_checkpoint(tiny: Gateway, tiny_network: RewindTran
     assert info == {"model_version": "1", "num_gpus": 1}
 
 
+def test_model_info_has_the_whole_configuration_of_the_training_run(film: Gateway) -> None:
+    run = read_run_config(goldens.config("enc_c1_t1_disc10").checkpoint / "config.yaml")
+    assert requests.get(f"{film.url}/model_info").json()["experiment_config"] == json.loads(json.dumps(run))
+
+
 def test_metrics_count_what_was_asked(tiny: Gateway) -> None:
     def counts() -> list[float]:
         return [
@@ -1316,6 +1524,7 @@ def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed(trito
     shutil.copytree(triton.repository / TINY, repository / TINY)
     ports = {"http": endpoints.http_port, "grpc": endpoints.grpc_port, "metrics": endpoints.metrics_port}
     options = [word for name, number in (ports | {"gateway": port}).items() for word in (f"--{name}-port", str(number))]
+    options += ["--gateway-timeout", "90", "--gateway-max-waiting", "7"]
     rfm = [str(Path(sys.executable).parent / "rfm"), "serve", "--repository", str(repository), *options]
     log_file = tmp_path / "rfm.log"
     with log_file.open("wb") as log:
@@ -1329,6 +1538,8 @@ def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed(trito
         assert requests.get(f"{url}/health").json()["status"] == "healthy"
         started = children(process.pid)
         (gateway_id,) = (child for child, command in started.items() if "rfm_client.gateway" in command)
+        assert "--timeout 90.0 --max-body-mib 512" in started[gateway_id]
+        assert "--max-waiting 7" in started[gateway_id]
         os.kill(gateway_id, signal.SIGKILL)
         poll(lambda: not answers(url))
         poll(lambda: answers(url))
@@ -1353,6 +1564,10 @@ BAD_OPTIONS: dict[str, tuple[list[str], str]] = {
     "no folder": (["--allow-folder", "nowhere"], "No such file or directory"),
     "no key file": (["--api-key-file", "nowhere"], "--api-key-file: expected a text file, got"),
     "an empty key": (["--api-key-file", os.devnull], "key: expected at least one character, got none"),
+    "less memory than a body": (
+        ["--max-memory-mib", "100"],
+        "max_memory_mib: expected at least max_body_mib (512), got less",
+    ),
     "no port": (["--port", "0"], "Input should be greater than or equal to 1"),
 }
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import tracemalloc
 from collections.abc import Iterator
@@ -19,7 +20,8 @@ from PIL import Image
 from starlette.datastructures import UploadFile
 from starlette.requests import Request
 
-from rfm_client.gateway.body import MAX_SAMPLES, BodyLimits, read_json
+from rfm_client.deadline import Deadline
+from rfm_client.gateway.body import MAX_SAMPLES, NPY_ENDPOINT, BodyLimits, read_json, read_multipart
 from rfm_client.gateway.body import _of_form as of_form
 from rfm_client.gateway.body import _of_json as of_json
 from rfm_client.gateway.conversion import Conversion, Served
@@ -30,6 +32,7 @@ from rfm_client.loop_thread import LoopThread
 from rfm_client.model_info import ModelInfo
 
 KIB, MIB = 2**10, 2**20
+WAIT_S = 30
 ROOM_BYTES = 2**40
 NUMBERS = np.random.default_rng(0).standard_normal((64, 768)).tolist()
 
@@ -143,7 +146,7 @@ def refusal(loop: LoopThread, limits: BodyLimits, body: bytes) -> tuple[int, str
 
 
 def test_bodies_count_as_what_they_become(loop: LoopThread) -> None:
-    limits = BodyLimits(MIB)
+    limits = BodyLimits(MIB, 32 * MIB)
     numbers = of("video_embeddings", json.dumps(NUMBERS[:32]))
     count = 0
     with ExitStack() as held, pytest.raises(HTTPException, match="503: body: expected room for it") as refused:
@@ -160,8 +163,60 @@ def test_bodies_count_as_what_they_become(loop: LoopThread) -> None:
 
 
 def test_a_largest_body_of_black_pixels_has_room() -> None:
-    with BodyLimits(MIB).admitted(request_of(b"")) as admitted:
+    with BodyLimits(MIB, 32 * MIB).admitted(request_of(b"")) as admitted:
         of_json(of("frames", f"[[{many('[0,0,0]', MIB - KIB)}]]"), admitted.share)
+
+
+def form_of(parts: int, headers: bytes = b"") -> Request:
+    names = (b'--b\r\nContent-Disposition: form-data; name="p%d"; filename="p"\r\n' % number for number in range(parts))
+    body = b"".join(name + headers + b"\r\n1\r\n" for name in names) + b"--b--\r\n"
+
+    async def receive() -> Any:
+        return {"type": "http.request", "body": body}
+
+    content_type = [(b"content-type", b"multipart/form-data; boundary=b")]
+    return Request({"type": "http", "method": "POST", "path": NPY_ENDPOINT, "headers": content_type}, receive)
+
+
+@pytest.mark.parametrize(("parts", "headers"), [(1_000, b""), (100, b"a: b\r\n" * 6)], ids=["parts", "headers"])
+def test_parts_take_no_more_memory_than_they_are_counted_for(loop: LoopThread, parts: int, headers: bytes) -> None:
+    with BodyLimits(ROOM_BYTES, ROOM_BYTES).admitted(form_of(parts, headers)) as admitted:
+        tracemalloc.start()
+        try:
+            with pytest.raises(RequestValidationError, match="expected at least one sample"):
+                loop.wait(read_multipart(admitted))
+            _, peak_bytes = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+        assert peak_bytes <= admitted.share.held_bytes + MIB
+
+
+def test_parts_that_take_too_much_memory_are_refused(loop: LoopThread) -> None:
+    with BodyLimits(2 * MIB, 2 * MIB).admitted(form_of(2_000)) as admitted, pytest.raises(HTTPException) as refused:
+        loop.wait(read_multipart(admitted))
+    assert refused.value.status_code == 413
+
+
+def test_a_request_waits_for_memory_that_others_hold(loop: LoopThread) -> None:
+    memory = Memory(2 * MIB)
+
+    async def waits() -> None:
+        with memory.share() as late:
+            with memory.share() as early:
+                await early.reserve(MIB, Deadline(WAIT_S))
+                early.take(MIB)
+                assert early.held_bytes == MIB
+                waiting = asyncio.create_task(late.reserve(2 * MIB, Deadline(WAIT_S)))
+                await asyncio.sleep(0)
+                assert not waiting.done()
+            await waiting
+            late.take(2 * MIB)
+            with memory.share() as other, pytest.raises(HTTPException, match="503: body: expected room for it in time"):
+                await other.reserve(1, Deadline(0.01))
+            with pytest.raises(HTTPException, match="413"):
+                late.take(1)
+
+    loop.wait(waits())
 
 
 # Files that a request names

@@ -25,10 +25,12 @@ from rfm_serve import MODEL, PATIENCE_S, RFM, ROOT, TRUTH_S, Serving, children, 
 
 from rfm.server import leftovers, poison, restarts
 from rfm.server.installation import find_installation
-from rfm.server.process import SHARED_MEMORY, Endpoints, TritonServer
+from rfm.server.process import Endpoints, TritonServer
 from rfm.server.restarts import CrashLoopError, Restarts
-from rfm.server.stubs import is_alive
+from rfm.server.self_check import FAILED_BATCHES
+from rfm.server.stubs import SHARED_MEMORY, is_alive
 from rfm_client import (
+    InferenceFailedError,
     InvalidSampleError,
     ProgressSample,
     RewardClient,
@@ -68,6 +70,41 @@ def slow(self, questions, execution):
 
 
 TritonPythonModel.answer = slow
+"""
+BREAKS = """
+
+_answer = TritonPythonModel.answer
+_broken = []
+
+
+def breaking(self, questions, execution):
+    import os
+
+    if os.path.exists({trigger!r}):
+        try:
+            os.unlink({trigger!r})  # one process can
+            _broken.append(True)
+        except FileNotFoundError:
+            pass
+    if _broken:
+        raise RuntimeError("CUDA error: device-side assert triggered")
+    return _answer(self, questions, execution)
+
+
+TritonPythonModel.answer = breaking
+"""
+FAILS = f"""
+
+_answer = TritonPythonModel.answer
+
+
+def failing(self, questions, execution):
+    if any(q.trajectories[0].text_embedding[0] == {MARK} for q in questions):
+        raise RuntimeError("a kernel that does not like this sample")
+    return _answer(self, questions, execution)
+
+
+TritonPythonModel.answer = failing
 """
 
 
@@ -222,6 +259,40 @@ def test_a_server_that_is_killed_leaves_nothing_running_and_the_next_removes_the
     assert not list(Path(tempfile.gettempdir()).glob(f"rfm-backends-{killed.pid}-*"))
 
 
+def test_what_a_killed_container_left_is_removed_and_what_a_living_one_has_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its process ids mean nothing here. Where this user may make no namespace, it is a server like any other."""
+    apart = ["unshare", "--map-root-user", "--pid", "--fork", "--kill-child", "--mount-proc"]
+    if subprocess.run([*apart, "true"], check=False, stderr=subprocess.DEVNULL).returncode != 0:
+        apart = []
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    command = [*apart, RFM, "serve", "--repository", make_repository(tmp_path)]
+    command += [f"--{name}-port={Endpoints.free().http_port}" for name in ("http", "grpc", "metrics", "status")]
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    container = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    def left() -> set[Path]:
+        return {path for name in names for path in SHARED_MEMORY.glob(f"*_rfm_{name}_*")} | set(folders())
+
+    def folders() -> list[Path]:
+        return list(tmp_path.glob("rfm-backends-*"))
+
+    names: list[str] = []
+    try:
+        wait_for(folders)
+        names += [folder.name.removeprefix("rfm-backends-").replace("-", "_") for folder in folders()]
+        wait_for(lambda: any(path.name.endswith(poison.SUFFIX) for path in left()))  # a model process of it runs
+        own = left()
+        assert not own & set(leftovers.clear())
+        assert own <= left()
+    finally:
+        container.kill()
+        container.wait(PATIENCE_S)
+    wait_for(lambda: leftovers.clear() or not own & left())  # its processes have ended
+    assert not own & left()
+
+
 def test_a_request_that_kills_the_model_twice_is_refused_and_its_neighbours_are_served(
     tmp_path: Path, references: list[np.ndarray[Any, Any]]
 ) -> None:
@@ -238,6 +309,42 @@ def test_a_request_that_kills_the_model_twice_is_refused_and_its_neighbours_are_
         assert (callers.lost, callers.wrong) == ([], [])
         assert served.metric("rfm_serve_restarts_total", what=MODEL) == 2
         wait_for(lambda: served.metric("rfm_serve_poison_refused_total") == 2)
+
+
+def test_one_broken_instance_of_several_is_found_and_healed(
+    tmp_path: Path, references: list[np.ndarray[Any, Any]]
+) -> None:
+    trigger = tmp_path / "trigger"
+    repository = make_repository(tmp_path, more_code=BREAKS.format(trigger=str(trigger)), instances=2)
+    with serving(repository) as served, served.client() as client:
+        served.wait_ready()
+        with Callers(client, references) as callers:
+            for count in (1, 2):
+                callers.wait_for_all()
+                trigger.touch()
+                wait_for(lambda count=count: served.metric("rfm_serve_restarts_total", what=MODEL) == count)  # type: ignore[misc]
+                served.wait_ready()
+                failed = list(callers.lost)
+                callers.lost.clear()
+                assert 0 < len(failed) <= FAILED_BATCHES * CALLERS
+                assert {type(error) for error in failed} == {InferenceFailedError}
+                callers.wait_for_all()
+        assert (callers.lost, callers.wrong) == ([], [])
+        assert served.metric("rfm_serve_poison_refused_total") == 0  # nobody is blamed
+    assert served.log.read_text().count("instance_broken") == 2
+
+
+def test_samples_that_fail_do_not_end_the_instance(tmp_path: Path, references: list[np.ndarray[Any, Any]]) -> None:
+    with serving(make_repository(tmp_path, more_code=FAILS)) as served, served.client(retry=False) as client:
+        served.wait_ready()
+        before = served.stubs
+        for _ in range(4 * FAILED_BATCHES):
+            with pytest.raises(InferenceFailedError, match="scoring failed"):
+                client.progress(trajectory(99, mark=MARK))
+        np.testing.assert_allclose(client.progress(trajectory(0)).progress, references[0], rtol=0, atol=TOLERANCE)
+        assert served.stubs == before
+        assert served.metric("rfm_serve_restarts_total") == 0
+    assert served.said == []
 
 
 def test_a_crash_loop_ends_with_its_reason(tmp_path: Path) -> None:

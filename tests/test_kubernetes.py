@@ -11,10 +11,12 @@ import copy
 import functools
 import importlib.metadata
 import json
+import os
 import re
 import shutil
 import subprocess
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -311,7 +313,11 @@ def test_selectors_find_their_pods(folder: str) -> None:
 def test_policies_open_the_ports_that_there_are(folder: str) -> None:
     default = named(folder, "NetworkPolicy", "default")["spec"]
     assert default["podSelector"] == {} and default["policyTypes"] == ["Ingress", "Egress"] and "ingress" not in default
-    assert {port["port"] for rule in default["egress"] for port in rule["ports"]} == {53}
+    (names,) = default["egress"]
+    assert {(port["port"], port["protocol"]) for port in names["ports"]} == {(53, "UDP"), (53, "TCP")}
+    assert {"ipBlock": {"cidr": "169.254.20.10/32"}} in names["to"]  # NodeLocal DNSCache
+    labels = [peer["podSelector"]["matchLabels"]["k8s-app"] for peer in names["to"] if "podSelector" in peer]
+    assert labels == ["kube-dns", "node-local-dns"]
     for deployment in built(folder, "Deployment"):
         policy = named(folder, "NetworkPolicy", deployment["metadata"]["name"])["spec"]
         assert selected(policy["podSelector"]["matchLabels"], folder) == [deployment]
@@ -323,16 +329,55 @@ def test_policies_open_the_ports_that_there_are(folder: str) -> None:
 @pytest.mark.parametrize("folder", OVERLAYS)
 def test_the_gateway_reaches_triton(folder: str) -> None:
     gateway = parameters(get_command(app), container_of(named(folder, "Deployment", "rfm-gateway"))["args"])
-    urls = [urlsplit(gateway["triton"]), urlsplit(gateway["metrics_url"])]
-    service = named(folder, "Service", "rfm-triton")
-    assert {url.hostname for url in urls} == {service["metadata"]["name"]}
-    wanted = {url.port for url in urls}
-    assert wanted <= {port["port"] for port in service["spec"]["ports"]}
+    triton, metrics = urlsplit(gateway["triton"]), urlsplit(gateway["metrics_url"])
+    pods = named(folder, "Service", triton.hostname)["spec"]
+    assert triton.scheme == "grpc"
+    assert pods["clusterIP"] == "None"  # its name has the addresses of all pods, also of those that are added
+    assert triton.port in [port["port"] for port in pods["ports"] if port["name"] == "grpc"]
+    one = named(folder, "Service", metrics.hostname)["spec"]
+    assert metrics.port in [port["port"] for port in one["ports"] if port["name"] == "metrics"]
+    assert pods["selector"] == one["selector"]
+    wanted = {triton.port, metrics.port}
     (way_out,) = named(folder, "NetworkPolicy", "rfm-gateway")["spec"]["egress"]
     labels = named(folder, "Deployment", "rfm-gateway")["spec"]["selector"]["matchLabels"]
     ways_in = named(folder, "NetworkPolicy", "rfm-triton")["spec"]["ingress"]
     (way_in,) = (way for way in ways_in if way["from"] == [{"podSelector": {"matchLabels": labels}}])
     assert wanted == {port["port"] for port in way_out["ports"]} == {port["port"] for port in way_in["ports"]}
+
+
+def test_the_readme_s_patch_lets_pods_ask_another_address_for_names(tmp_path: Path) -> None:
+    (patch,) = re.findall(r"\n    patches:\n(?:      .*\n)+", (KUBERNETES / "README.md").read_text())
+    overlay = KUBERNETES / "overlays" / "cpu"
+    base = os.path.relpath(overlay, tmp_path)
+    (tmp_path / "kustomization.yaml").write_text(f"resources: [{base}]\n{textwrap.dedent(patch)}")
+    command = [BIN / "kubectl", "kustomize", "--load-restrictor=LoadRestrictionsNone", tmp_path]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    policies = (one for one in yaml.safe_load_all(done.stdout) if one["kind"] == "NetworkPolicy")
+    (default,) = (one for one in policies if one["metadata"]["name"] == "default")
+    assert {"ipBlock": {"cidr": "10.96.0.10/32"}} in default["spec"]["egress"][0]["to"]
+    validate(default, RELEASES[-1])
+
+
+@pytest.mark.parametrize("folder", OVERLAYS)
+def test_kube_prometheus_stack_finds_monitors_and_rules(folder: str) -> None:
+    """It selects both by the name of its Helm release, and nothing else is labelled so."""
+    labelled = [one for one in built(folder) if "release" in one["metadata"].get("labels", {})]
+    assert labelled == built(folder, "PodMonitor") != []
+    (release,) = {one["metadata"]["labels"]["release"] for one in labelled}
+    assert f"labels: {{release: {release}}}" in (KUBERNETES / "monitoring" / "kustomization.yaml").read_text()
+    (rules,) = re.findall(r"    for file in .*\n(?:      .*\n)*    done\n", (KUBERNETES / "README.md").read_text())
+    made = subprocess.run(
+        ["bash", "-c", rules.replace("kubectl apply -f -", "cat; echo ---")],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    objects = [one for one in yaml.safe_load_all(made.stdout) if one]
+    assert {one["metadata"]["name"] for one in objects} == {"rfm-alerts", "rfm-recording"}
+    for one in objects:
+        assert (one["kind"], one["metadata"]["labels"]) == ("PrometheusRule", {"release": release})
+        assert one["spec"]["groups"]
 
 
 @pytest.mark.parametrize("folder", OVERLAYS)

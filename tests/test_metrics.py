@@ -397,7 +397,7 @@ def test_a_model_that_is_loaded_again_counts_on(running: Running) -> None:
     def is_served(value: float) -> Callable[[Scraped], bool]:
         return lambda scraped: scraped.value("rfm_checkpoint_info", model=SLOW) == value
 
-    with running.client(SLOW) as client, RepositoryApi(running.endpoints.http_url, KEY) as api:
+    with running.client(SLOW) as client, RepositoryApi(running.endpoints.grpc_url, KEY) as api:
         client.evaluate([sample])
         api.unload(SLOW)
         api.wait_gone(SLOW)

@@ -7,8 +7,11 @@ import os
 import signal
 import stat
 import subprocess
+import time
 import urllib.request
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -42,6 +45,16 @@ from rfm_export.rollout import Rollout, RolloutError
 KEY = "a-key-that-only-tests-know"
 PLAIN = goldens.config("c1_t1_disc10")  # embeddings alone
 TOLERANCE = 1e-5
+CONNECTIONS = 24  # of each protocol; Triton has 8 threads for HTTP
+DEADLINE_S = 20.0
+POLL_S = 0.02
+LARGE_BYTES = 5 * 2**20
+WAITS_AT_IMPORT = """
+import time, pathlib
+pathlib.Path({begun!r}).touch()
+while not pathlib.Path({may_end!r}).exists():
+    time.sleep(0.02)
+"""
 
 
 @dataclass(frozen=True)
@@ -55,13 +68,13 @@ class Running:
 
     def models(self, command: str, *words: str) -> str:
         """Output of ``rfm models COMMAND``, which succeeds."""
-        done = models(command, self.repository, self.endpoints.http_url, self.key_file, *words)
+        done = models(command, self.repository, self.endpoints.grpc_url, self.key_file, *words)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
     def refused(self, command: str, *words: str) -> str:
         """What it says where it fails."""
-        done = models(command, self.repository, self.endpoints.http_url, self.key_file, *words)
+        done = models(command, self.repository, self.endpoints.grpc_url, self.key_file, *words)
         assert done.returncode == 1, done.stdout
         (line,) = done.stderr.splitlines()
         return line
@@ -116,6 +129,76 @@ def test_a_name_is_loaded_listed_and_unloaded_beside_the_others(running: Running
         assert np.isfinite(client.progress(random_trajectory(0, 3)).progress).all()
 
 
+@contextmanager
+def loading(running: Running, name: str, folder: Path) -> Iterator[None]:
+    """Within it Triton is loading a model: its process waits for a file that comes at the end."""
+    export_plain(running.repository, name)
+    begun, may_end = folder / "begun", folder / "may_end"
+    model_file = running.repository / name / "1" / "model.py"
+    future, _, rest = model_file.read_text().partition("from __future__ import annotations\n")
+    wait = WAITS_AT_IMPORT.format(begun=str(begun), may_end=str(may_end))
+    model_file.write_text(f"{future}from __future__ import annotations\n{wait}{rest}")
+    with ThreadPoolExecutor(1) as thread, RepositoryApi(running.endpoints.grpc_url, KEY) as server:
+        load = thread.submit(server.load, name)
+        try:
+            while not begun.exists():
+                assert not load.done(), load.result()
+                time.sleep(POLL_S)
+            yield
+        finally:
+            may_end.touch()
+        load.result()
+        assert server.ready_versions(name) == [1]
+
+
+def test_callers_are_answered_while_another_model_loads(running: Running, tmp_path: Path) -> None:
+    """All of several connections for each thread that Triton has for HTTP. The load ends after they have been answered."""
+    trajectory = random_trajectory(1, 5, *rollout.WIDTHS)
+    urls = (running.endpoints.http_url, running.endpoints.grpc_url) * CONNECTIONS
+    with ExitStack() as stack, ThreadPoolExecutor(len(urls)) as threads:
+        clients = [stack.enter_context(RewardClient(url, model=NAME, retry=False)) for url in urls]
+
+        def ask(client: RewardClient) -> bool:
+            return bool(np.isfinite(client.progress(trajectory, timeout_s=DEADLINE_S).progress).all())
+
+        assert all(threads.map(ask, clients))  # they are connected: new connections would keep away from a busy thread
+        with loading(running, "held", tmp_path):
+            assert all(threads.map(ask, clients))
+            # What is told over gRPC does not wait either.
+            assert ["held", "1", "LOADING"] in [line.split() for line in running.models("list").splitlines()]
+    running.models("unload", "held")
+
+
+def test_a_large_configuration_is_loaded_and_told(running: Running) -> None:
+    """Larger than gRPC's own limit of a message, 4 MiB."""
+    export_plain(running.repository, "large")
+    with RepositoryApi(running.endpoints.grpc_url, KEY) as server:
+        server.load("large")
+        config = server.config("large", 1)
+        config["parameters"]["padding"] = {"string_value": "x" * LARGE_BYTES}
+        server.load("large", config)
+        assert len(server.config("large", 1)["parameters"]["padding"]["string_value"]) == LARGE_BYTES
+        server.unload("large")
+
+
+@pytest.mark.parametrize(
+    ("url", "words", "message"),
+    [
+        ("http://127.0.0.1:8000", (), "url: expected grpc://host:port (its gRPC port, 8001) or with TLS grpcs://"),
+        ("127.0.0.1:8001", (), "url: expected grpc://host:port or http://host:port"),
+        ("grpc://127.0.0.1:1", (), "grpc://127.0.0.1:1: failed to connect to all addresses"),
+        ("grpcs://h:1", ("--ca-file", "/nowhere"), "ca_file: expected certificates (PEM) at /nowhere"),
+        ("grpc://h:1", ("--ca-file", __file__), "ca_file: expected certificates (PEM)"),
+    ],
+)
+def test_a_server_that_cannot_be_reached_is_told(url: str, words: tuple[str, ...], message: str) -> None:
+    line = [str(RFM), "models", *words, "list", "--url", url]
+    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    (told,) = done.stderr.splitlines()
+    assert told.startswith(f"rfm: {message}")
+
+
 def test_two_checkpoints_stand_side_by_side_under_two_names(running: Running, other_plain: Path) -> None:
     for name, checkpoint in {"a": PLAIN.checkpoint, "b": other_plain}.items():
         export_plain(running.repository, name, checkpoint)
@@ -134,8 +217,11 @@ def test_a_rollout_and_a_rollback_lose_no_request_and_mix_no_versions(running: R
     assert min(difference(*pair) for pair in zip(expected["1"], expected["2"], strict=True)) > rollout.CLEARLY
     rollout.export(other, running.repository)
     parts = ("rfm", "rfm_encoder", "rfm_frames")
-    with callers(running.endpoints.grpc_url, samples, expected) as tally:
-        assert tally.by_version.keys() == {"1"}  # an export alone changes nothing
+    with (
+        callers(running.endpoints.http_url, samples, expected, count=rollout.CALLERS // 2) as over_http,
+        callers(running.endpoints.grpc_url, samples, expected, count=rollout.CALLERS // 2) as tally,
+    ):
+        assert tally.by_version.keys() == over_http.by_version.keys() == {"1"}  # an export alone changes nothing
         assert running.models("rollout", NAME, "2").endswith("rfm: version 2 is served\n")
         assert [running.served_by_restart(part) for part in parts] == [[2]] * 3
         by_first = tally.by_version["1"]
@@ -148,8 +234,10 @@ def test_a_rollout_and_a_rollback_lose_no_request_and_mix_no_versions(running: R
         assert tally.by_version["1"] > by_first
         with running.client(NAME) as client:
             assert client.model_info().source == "enc_c1_t1_disc10/checkpoint"
-    assert (tally.failed, tally.unlike) == ([], [])
-    assert tally.asked == tally.answered > rollout.CALLERS
+    for each in (tally, over_http):
+        assert (each.failed, each.unlike) == ([], [])
+        assert each.asked == each.answered > rollout.CALLERS
+        assert each.by_version.keys() == {"1", "2"}
     assert "expected a version before 1, got none" in running.refused("rollback", NAME)
 
 
@@ -214,7 +302,7 @@ def test_a_rollout_that_fails_at_its_end_goes_back_and_loses_no_request(
     parts = ("late_encoder", "late", ensemble)
     with callers(running.endpoints.grpc_url, samples, expected, model=name) as tally:
         with (
-            RepositoryApi(running.endpoints.http_url, KEY) as server,
+            RepositoryApi(running.endpoints.grpc_url, KEY) as server,
             pytest.raises(RolloutError, match=r"made up \(served as before: late_encoder: version 1; late: version 1"),
         ):
             Rollout(running.repository, name, server, lambda line: None).to(2)
@@ -335,9 +423,9 @@ def test_the_server_changes_nothing_without_its_key(running: Running, tmp_path: 
     key_file = tmp_path / "key"
     key_file.touch(0o600)
     key_file.write_text(shown or "")
-    words = ["--url", running.endpoints.http_url, *(["--admin-key-file", str(key_file)] if shown else [])]
+    words = ["--url", running.endpoints.grpc_url, *(["--admin-key-file", str(key_file)] if shown else [])]
     done = subprocess.run([str(RFM), "models", "list", *words], capture_output=True, text=True, check=False)
-    expected = f"admin key: expected that of the server at {running.endpoints.http_url}"
+    expected = f"admin key: expected that of the server at {running.endpoints.grpc_url}"
     hint = f"(--admin-key-file or {VARIABLE}), got {'another' if shown else 'none'}"
     assert (done.returncode, done.stderr) == (1, f"rfm: {expected} {hint}\n")
 
@@ -424,7 +512,7 @@ def test_rfm_serve_takes_the_key_of_the_environment_and_options_of_tritonserver(
             wait_for_http(process, endpoints)
             with RewardClient(endpoints.grpc_url) as client:
                 client.progress(random_trajectory(0, 3))
-            words = ["models", "list", "--url", endpoints.http_url]
+            words = ["models", "list", "--url", endpoints.grpc_url]
             done = subprocess.run([str(RFM), *words], env=environment, capture_output=True, text=True, check=False)
             assert done.stdout.split() == ["rfm", "1", "READY"], done.stderr
             children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()

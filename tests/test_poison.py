@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,6 +26,8 @@ from rfm.server.batch_model import BatchModel
 from rfm.server.canary import blank_question
 from rfm.server.metrics import Counted
 from rfm.server.poison import Journal, Poison, digest, journals
+from rfm.server.self_check import SelfCheck
+from rfm.server.status import NO_REASON
 from rfm_client import InferenceFailedError, ProgressResult, ProgressSample, Result, Sample, wire
 
 PLAIN = goldens.config("c1_t1_disc10")
@@ -83,6 +86,27 @@ def test_a_batch_that_gets_on_is_no_hang_however_long_it_takes(tmp_path: Path) -
         assert result.timing is not None
         assert result.timing.forward_ms > 1.5e3 * HANG_S
         assert served.metric("rfm_serve_restarts_total") == 0
+
+
+def test_a_model_whose_batch_gets_on_is_ready_however_long_its_probe_waits(tmp_path: Path) -> None:
+    repository = tmp_path / "repository"
+    rfm_export.export(PLAIN.checkpoint, repository, replace(serve_config(PLAIN), token_budget=10))
+    model = repository / "rfm" / "1" / "model.py"
+    model.write_text(model.read_text() + SLOW_FORWARD)
+    config = tmp_path / "serve.yaml"
+    config.write_text(json.dumps({"canary_s": 1}))
+    sample = ProgressSample(random_trajectory(0, 3 * DENSE_FRAMES), frame_steps=4)
+    with serving(repository, f"--config={config}") as served, served.client(retry=False) as client:
+        served.wait_ready()
+        with ThreadPoolExecutor(1) as pool:
+            batch = pool.submit(client.evaluate, [sample], timeout_s=PATIENCE_S)
+            was_late, reasons = False, set()
+            while not batch.done():
+                was_late = was_late or served.metric("rfm_serve_canary_ok", model="rfm") == 0
+                reasons |= set(served.reasons().values())
+            assert isinstance(batch.result()[0], ProgressResult)
+        assert was_late  # else this shows nothing
+        assert reasons == {NO_REASON}
 
 
 def test_a_journal_tells_since_when_nothing_has_come_of_a_batch(
@@ -148,6 +172,7 @@ class Model(BatchModel[Sample, Result]):
         self._num_warmups = 0
         self._poison = deadly
         self._blank = digest(blank_question(CONFIG))
+        self._self_check = SelfCheck(lambda: None, lambda error: None)
         self._metrics = SimpleNamespace(at_work_on=lambda count: None, add=self.told.append)  # type: ignore[assignment]
         self._log = SimpleNamespace(tell=lambda asked: None)  # type: ignore[assignment]
 

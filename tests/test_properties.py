@@ -65,6 +65,9 @@ def requests(draw: st.DrawFn, *, frames: bool) -> dict[str, Array]:
     if frames:
         shape = (batch, positions, draw(SMALL), draw(SMALL), 3)
         tensors[wire.FRAMES] = draw(arrays.arrays(np.uint8, shape))
+        if draw(st.booleans()):
+            shape = (batch, draw(SMALL), draw(SMALL), draw(SMALL), 3)
+            tensors[wire.SECOND_FRAMES] = draw(arrays.arrays(np.uint8, shape))
         tasks = draw(st.lists(st.binary(max_size=20), min_size=batch, max_size=batch))
         tensors[wire.TASK] = np.array([[task] for task in tasks], np.object_)
     else:
@@ -90,7 +93,8 @@ def test_any_request_is_samples_or_a_refusal(tensors: dict[str, Array]) -> None:
     except InvalidSampleError as error:
         told(error)
         return
-    again = wire.encode_samples(samples) if len({s.trajectories[0].positions.shape[1:] for s in samples}) == 1 else None
+    shapes = {tuple(trajectory.positions.shape[1:] for trajectory in sample.trajectories) for sample in samples}
+    again = wire.encode_samples(samples) if len(shapes) == 1 else None
     assert len(samples) == len(tensors[wire.NUM_FRAMES])
     if again is not None:  # what was taken was taken whole
         np.testing.assert_array_equal(again[wire.NUM_FRAMES], tensors[wire.NUM_FRAMES])
@@ -101,11 +105,12 @@ def test_any_request_is_samples_or_a_refusal(tensors: dict[str, Array]) -> None:
 @given(requests(frames=True))
 def test_any_request_to_the_encoder_is_trajectories_or_a_refusal(tensors: dict[str, Array]) -> None:
     try:
-        trajectories = wire.decode_trajectories(tensors)
+        samples = wire.decode_trajectories(tensors)
     except InvalidSampleError as error:
         told(error)
         return
-    assert [t.num_frames for t in trajectories] == tensors[wire.NUM_FRAMES].astype(np.int64).sum(axis=1).tolist()
+    num_frames = [sum(trajectory.num_frames for trajectory in sample.trajectories) for sample in samples]
+    assert num_frames == tensors[wire.NUM_FRAMES].astype(np.int64).sum(axis=1).tolist()
 
 
 # The engine: samples do not know of each other, and none of them breaks it

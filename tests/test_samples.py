@@ -22,6 +22,7 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
     float_frames_to_uint8,
+    packing,
     wire,
 )
 
@@ -35,7 +36,7 @@ def embedded(num_frames: int = 3, width: int = 5) -> Trajectory:
 
 
 def filmed(num_frames: int = 3, height: int = 8) -> Trajectory:
-    return Trajectory(frames=np.zeros((num_frames, height, 6, 3), np.uint8), task="lift the cup")
+    return Trajectory(frames=np.full((num_frames, height, 6, 3), num_frames, np.uint8), task="lift the cup")
 
 
 with_nan = VIDEO.copy()
@@ -140,10 +141,6 @@ BAD: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: PreferenceSample(embedded(), filmed()),
         "second: expected video_embeddings, as the first trajectory, got frames",
     ),
-    "unequal image sizes": (
-        lambda: SimilaritySample(filmed(), filmed(height=9)),
-        "other.frames: expected [8, 6, 3] per frame, as the first trajectory (one array holds both), got [9, 6, 3]",
-    ),
     "unequal widths": (
         lambda: PreferenceSample(embedded(), embedded(width=6)),
         "second.video_embeddings: expected [5] per frame, as the first trajectory (one array holds both), got [6]",
@@ -184,6 +181,10 @@ SAMPLES: dict[str, list[Sample]] = {
         SimilaritySample(embedded(3), embedded(1)),
     ],
     "frames": [ProgressSample(filmed(2), frame_steps=2), PreferenceSample(filmed(1), filmed(3))],
+    "pairs of two frame sizes": [
+        PreferenceSample(filmed(4), filmed(1, height=9)),
+        SimilaritySample(filmed(2), filmed(3, height=9)),
+    ],
 }
 
 
@@ -196,6 +197,41 @@ def test_samples_survive_the_wire(samples: list[Sample]) -> None:
         assert copy.trajectories[0].task == sample.trajectories[0].task
         for trajectory, its_copy in zip(sample.trajectories, copy.trajectories, strict=True):
             np.testing.assert_array_equal(its_copy.positions, trajectory.positions)
+
+
+def test_only_pairs_of_two_frame_sizes_take_a_second_array() -> None:
+    assert wire.SECOND_FRAMES not in wire.encode_samples(SAMPLES["frames"])
+    tensors = wire.encode_samples(SAMPLES["pairs of two frame sizes"])
+    assert tensors[wire.FRAMES].shape == (2, 4, 8, 6, 3)
+    assert tensors[wire.SECOND_FRAMES].shape == (2, 3, 9, 6, 3)
+    assert wire.num_positions(tensors) == 4 + 3
+
+
+def test_the_encoder_is_given_each_trajectory_in_its_own_size() -> None:
+    samples = SAMPLES["pairs of two frame sizes"]
+    names = {spec.name for spec in wire.encoder_inputs()}
+    tensors = {name: array for name, array in wire.encode_samples(samples).items() if name in names}
+    for sample, footage in zip(samples, wire.decode_trajectories(tensors), strict=True):
+        for trajectory, its_copy in zip(sample.trajectories, footage.trajectories, strict=True):
+            np.testing.assert_array_equal(its_copy.positions, trajectory.positions)
+
+
+def test_requests_of_two_frame_sizes_are_bounded_by_what_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The longest first trajectory and the longest second one may be of two samples."""
+    counts = [(1, 9), (9, 1), (5, 5), (2, 8), (8, 2), (1, 1)]
+    samples = dict(enumerate(PreferenceSample(filmed(n), filmed(m, height=64)) for n, m in counts))
+    samples |= {index + len(counts): SimilaritySample(sample.first, sample.first) for index, sample in samples.items()}
+    bound = 60_000
+    monkeypatch.setattr(packing, "MAX_REQUEST_BYTES", bound)
+    asked: list[int] = []
+    for _, group in packing.groups(samples, "rfm"):
+        for part in packing.parts(samples, group, max_batch_size=64):
+            tensors = wire.encode_samples([samples[index] for index in part])
+            sent = sum(tensors[name].nbytes for name in (wire.FRAMES, wire.SECOND_FRAMES) if name in tensors)
+            assert sent == packing.padded_bytes([samples[index] for index in part])
+            assert sent <= bound
+            asked += part
+    assert sorted(asked) == sorted(samples)
 
 
 def test_a_sample_of_a_larger_request_is_named_in_its_error() -> None:
@@ -253,7 +289,7 @@ def test_every_error_is_a_reward_error() -> None:
     import rfm_client
 
     errors = [getattr(rfm_client, name) for name in rfm_client.__all__ if name.endswith("Error")]
-    assert len(errors) == 8
+    assert len(errors) == 9
     assert all(issubclass(error, RewardError) for error in errors)
 
 

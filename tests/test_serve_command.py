@@ -20,12 +20,12 @@ from typing import Any
 import clip
 import numpy as np
 import pytest
-from rfm_serve import wait_for
+from rfm_serve import children, serving, wait_for
 
 from rfm.server import installation
 from rfm.server.installation import ServerStartError, find_installation
-from rfm.server.process import SHARED_MEMORY, Endpoints, TritonServer
-from rfm.server.stubs import is_alive
+from rfm.server.process import Endpoints, TritonServer
+from rfm.server.stubs import SHARED_MEMORY, is_alive
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 
 REPOSITORY = Path(__file__).parents[1] / "model_repository"
@@ -131,6 +131,29 @@ def test_a_signal_while_it_still_loads_ends_it() -> None:
         process.terminate()
         _, rest = process.communicate(timeout=EXIT_S)
         assert "rfm: " not in rest
+
+
+def environment(pid: int) -> set[str]:
+    """Names and values of a process."""
+    return set(Path("/proc", str(pid), "environ").read_text().split("\0"))
+
+
+def test_neither_triton_nor_a_model_process_has_a_key_in_its_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keys = {name: f"a-secret-of-{name}" for name in ("RFM_ADMIN_KEY", "RFM_GATEWAY_API_KEY")}
+    for name, key in keys.items():
+        monkeypatch.setenv(name, key)
+    repository = tmp_path / "model_repository"
+    shutil.copytree(REPOSITORY, repository)
+    with serving(repository, f"--gateway-port={Endpoints.free().http_port}") as served:
+        served.wait_ready()
+        (gateway,) = [pid for pid in children(served.process.pid, ".") if pid != served.triton]
+        for pid in (served.triton, *(stub.pid for stub in served.stubs)):
+            assert not [word for word in environment(pid) if "a-secret-of-" in word]
+        assert [word for word in environment(gateway) if "a-secret-of-" in word] == [
+            f"RFM_GATEWAY_API_KEY={keys['RFM_GATEWAY_API_KEY']}"
+        ]
 
 
 def test_a_model_that_cannot_be_loaded_is_named(tmp_path: Path) -> None:

@@ -24,10 +24,11 @@ from rfm.server import healing
 from rfm.server.canary import Canary, Verdict
 from rfm.server.healing import ModelHealth
 from rfm.server.http import Http
+from rfm.server.inquiry import Inquiry
 from rfm.server.installation import find_installation
 from rfm.server.process import Endpoints, TritonServer
 from rfm.server.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
-from rfm.server.served import NOT_LOADED, Served
+from rfm.server.served import NOT_LOADED, SILENT, Served
 from rfm.server.status import NO_REASON, Status
 from rfm_export.rollout import Rollout
 
@@ -36,6 +37,8 @@ __all__ = ["references"]  # a fixture
 KEY = "a-key-that-only-tests-know"
 OTHER = f"{MODEL}_b"
 HANG_S = 3
+SHORT_SILENCE_S = 6.0
+LOOP_S = 180.0  # within which a model that cannot be loaded is in a crash loop
 DIES_AT_ITS_START = "\n\nimport os\n\nos._exit(1)\n"
 WARMS_UP_SLOWLY = f"""
 
@@ -65,7 +68,7 @@ def administered(repository: Path, **settings: int) -> Iterator[tuple[Serving, R
     config.write_text("".join(f"{name}: {value}\n" for name, value in settings.items()))
     with serving(repository, f"--admin-key-file={key_file}", f"--config={config}") as served:
         served.wait_ready()
-        with RepositoryApi(served.endpoints.http_url, KEY) as api:
+        with RepositoryApi(served.endpoints.grpc_url, KEY) as api:
             yield served, api
 
 
@@ -160,6 +163,56 @@ def test_models_come_and_go(tmp_path: Path) -> None:
             assert np.isfinite(client.progress(trajectory(0)).progress).all()
 
 
+def test_a_triton_that_is_started_again_serves_what_it_served_and_not_what_was_exported_since(tmp_path: Path) -> None:
+    repository, samples = tmp_path / "repository", rollout.questions()
+    rollout.export(rollout.WITH_ENCODERS.checkpoint, repository)
+    expected = rollout.answers(rollout.WITH_ENCODERS.checkpoint, samples)
+    parts = (MODEL, "rfm_encoder", "rfm_frames")
+    with administered(repository) as (served, api):
+        rollout.export(rollout.other_checkpoint(tmp_path / "other"), repository)
+        os.kill(served.triton, signal.SIGKILL)
+        served.wait_ready(False)
+        served.wait_ready()
+        assert served.reasons() == dict.fromkeys(parts, NO_REASON)
+        assert [api.ready_versions(part) for part in parts] == [[1]] * 3
+        with served.client() as client:
+            for got, wanted in zip(client.evaluate(samples), expected, strict=True):
+                assert rollout.difference(got, wanted) <= rollout.TOLERANCE
+        assert restarts_of(served, "triton") == 1
+        assert restarts_of(served, MODEL) == 0
+
+
+def test_a_model_that_cannot_be_loaded_again_is_not_ready_and_the_others_serve(tmp_path: Path) -> None:
+    repository = make_repository(tmp_path)
+    shutil.copytree(repository / MODEL, repository / OTHER)
+    change(repository / OTHER / "config.pbtxt", f'name: "{MODEL}"', f'name: "{OTHER}"')
+    code = repository / OTHER / "1" / "model.py"
+    text = code.read_text()
+
+    def is_given_up() -> bool:
+        reason = served.reasons().get(OTHER, "")
+        return reason.startswith("it is loaded anew every 5 minutes, after: ") and "broken" in reason
+
+    with administered(repository) as (served, api), served.client() as client:
+        code.write_text("raise ValueError('broken')\n")
+        served.stubs_of(OTHER)[0].kill()
+        wait_for(is_given_up, LOOP_S)
+        assert served.reasons()[MODEL] == NO_REASON
+        assert served.metric("rfm_serve_not_ready", model=OTHER, reason=served.reasons()[OTHER]) == 1
+        assert np.isfinite(client.progress(trajectory(0)).progress).all()
+        assert [line for line in served.said if line.startswith(f"rfm: model {OTHER}: expected to run, got 6 ends")]
+        # Nor does it keep them from being served when Triton is started again.
+        os.kill(served.triton, signal.SIGKILL)
+        wait_for(lambda: restarts_of(served, "triton") == 1)
+        wait_for(lambda: served.reasons()[MODEL] == NO_REASON and "broken" in served.reasons()[OTHER])
+        assert np.isfinite(client.progress(trajectory(0)).progress).all()
+        wait_for(is_given_up, LOOP_S)
+        code.write_text(text)
+        api.load(OTHER)
+        served.wait_ready()
+        assert restarts_of(served, MODEL) == 0
+
+
 def heal(served: Serving, model: str, meanwhile: Callable[[], Any]) -> None:
     before = restarts_of(served, model)
     (stub,) = served.stubs_of(model)
@@ -172,14 +225,44 @@ def heal(served: Serving, model: str, meanwhile: Callable[[], Any]) -> None:
 
 
 def test_a_triton_that_does_not_answer_is_started_again(tmp_path: Path) -> None:
-    with serving(make_repository(tmp_path)) as served:
+    with serving(make_repository(tmp_path), "--triton-silent-s=3") as served:
         served.wait_ready()
         os.kill(served.triton, signal.SIGSTOP)
-        wait_for(lambda: restarts_of(served, "triton") == 1, 10.0)
+        wait_for(lambda: restarts_of(served, "triton") == 1)
         wait_for(lambda: served.metric("rfm_serve_canary_ok") == served.metric("rfm_serve_ready") == 0, 1.0)
         served.wait_ready()
         assert restarts_of(served, MODEL) == 0
     assert served.said == ["rfm: triton is started again: no answer for 3 s"]
+
+
+def test_a_triton_that_is_silent_for_less_than_its_time_goes_on(tmp_path: Path) -> None:
+    """Readiness tells it meanwhile."""
+    with serving(make_repository(tmp_path), "--triton-silent-s=60") as served:
+        served.wait_ready()
+        triton, stopped_s = served.triton, time.monotonic()
+        os.kill(triton, signal.SIGSTOP)
+        wait_for(lambda: served.reasons() == {MODEL: SILENT})
+        wait_for(lambda: time.monotonic() - stopped_s > SHORT_SILENCE_S)
+        os.kill(triton, signal.SIGCONT)
+        served.wait_ready()
+        assert served.triton == triton
+    assert served.said == []
+
+
+def test_a_triton_has_to_miss_several_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However long one look takes, and however little time is given."""
+    server = SimpleNamespace(endpoints=Endpoints.free(), admin_key=KEY, pid=os.getpid())
+    asked: list[str] = []
+    monkeypatch.setattr(Http, "request", lambda *words, **_: asked.append(words[2]) or refuse())
+    ask = Inquiry(server, 1e-9)  # type: ignore[arg-type]
+    assert not ask.is_silent
+    for looks in range(1, 4):
+        ask.look()
+        assert (len(asked), ask.is_answered, ask.is_silent) == (2 * looks, False, looks == 3)
+
+
+def refuse() -> None:
+    raise ConnectionRefusedError
 
 
 def test_what_is_exported_while_triton_starts_does_not_matter(tmp_path: Path) -> None:
@@ -198,7 +281,7 @@ def test_a_triton_that_is_gone_is_the_supervisor_s_to_see() -> None:
     about = Status()
     about.tell({MODEL: "it is loaded"})
     server = SimpleNamespace(endpoints=Endpoints.free(), admin_key=KEY, pid=os.getpid())
-    served = Served(server, about, 1.0, 1.0)  # type: ignore[arg-type]
+    served = Served(server, about, canary_s=1.0, hang_s=1.0, triton_silent_s=1.0, say=print, restored={})  # type: ignore[arg-type]
     try:
         wait_for(lambda: served.is_silent)
         assert served.look() == []
@@ -217,8 +300,8 @@ def test_what_is_closed_heals_nothing_more(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(healing, "RepositoryApi", refuse)
     endpoints = Endpoints.free()
     canary = Canary(Http(endpoints.http_host, endpoints.http_port), MODEL, 1.0, 1.0, lambda _: None)
-    server = SimpleNamespace(endpoints=endpoints, admin_key=KEY)  # nobody is to end it
-    health = ModelHealth(server, canary, SimpleNamespace(), Status())  # type: ignore[arg-type]
+    server = SimpleNamespace(endpoints=endpoints, admin_key=KEY, grpc_options={})  # nobody is to end it
+    health = ModelHealth(server, canary, SimpleNamespace(), Status(), print)  # type: ignore[arg-type]
     assert health.look("its process is dead", {}) == "its process is dead"
     wait_for(lambda: len(asked) == 4)  # the next is 4 s away
     assert health.reason == "it is loaded anew, after: refused"
@@ -268,12 +351,12 @@ def test_what_others_did_while_a_model_is_healed_stays(
     endpoints = Endpoints.free()
     canary = Canary(Http(endpoints.http_host, endpoints.http_port), MODEL, 1.0, 1.0, lambda _: None)
     watch = SimpleNamespace(of_model=lambda _: [], bury=lambda _: None, is_getting_on=lambda _: False)
-    server = SimpleNamespace(endpoints=endpoints, admin_key=KEY)
-    health = ModelHealth(server, canary, watch, Status())  # type: ignore[arg-type]
+    server = SimpleNamespace(endpoints=endpoints, admin_key=KEY, grpc_options={})
+    health = ModelHealth(server, canary, watch, Status(), print)  # type: ignore[arg-type]
     assert health.look("its process is dead", {}) is not None
     wait_for(lambda: not health.is_healing)
     assert health.look(None, {}) is None  # not once more
-    assert (api.asked, health.crash_loop) == (asked, None)
+    assert api.asked == asked
     health.close()
 
 

@@ -5,15 +5,18 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import goldens
 import numpy as np
 import pytest
 import tritonclient.grpc
-from conftest import Served, load_engine, random_trajectory, rewind_of
+from conftest import Served, forget_input, load_engine, random_trajectory, rewind_of, serve_config
 
+import rfm_export
+from rfm.server.installation import find_installation
+from rfm.server.process import Endpoints, TritonServer
 from rfm_client import (
     InvalidSampleError,
     ModelNotFoundError,
@@ -31,6 +34,7 @@ from rfm_client.transport import connect
 
 MODEL = "c1_t1_disc10"  # tokens, so T <= 16; discrete; all heads
 FRAMES_MODEL = "enc_c1_t1_disc10"
+VLM = "q3_tok_disc10"
 TOLERANCE = 1e-5
 NO_SUCH_MODEL = "not_served"
 
@@ -50,15 +54,17 @@ def mixed_samples(count: int, longest: int = 16) -> list[Sample]:
     return samples
 
 
+@pytest.mark.reference
 @pytest.mark.parametrize("case", goldens.ANSWERED, ids=str)
 def test_every_reference_answer_comes_back_over_the_wire(served: Served, protocol: str, case: goldens.Case) -> None:
     with served.client(protocol, case.config.name) as client:
         results = client.evaluate(case.samples(), logits=case.config.is_discrete)
     for result, expected in zip(results, case.expected(), strict=True):
-        goldens.check(result, expected, case.tolerances())
+        goldens.check(result, expected, case.tolerances)
     case.check_response(results)
 
 
+@pytest.mark.reference
 @pytest.mark.parametrize("case", goldens.REFUSED, ids=str)
 def test_too_long_a_trajectory_is_refused_with_the_limit(served: Served, protocol: str, case: goldens.Case) -> None:
     limit = rewind_of(case.config.name).network.config.max_len
@@ -279,6 +285,23 @@ BAD_FRAMES: dict[str, tuple[wire.Tensors, str]] = {
         {wire.FRAMES: np.ones((1, 5, 2, 200, 3), np.uint8)},
         "^frames: expected frames at most 50 times as long",
     ),
+    "more second frames told than sent": (
+        {wire.FRAMES: FRAMES[:, :3], wire.SECOND_FRAMES: FRAMES[:, :1]},
+        "^num_frames: expected at most the 1 frames in second_frames, got 2$",
+    ),
+    "fewer second frames told than sent": (
+        {wire.FRAMES: FRAMES[:, :3], wire.SECOND_FRAMES: FRAMES},
+        "^second_frames: expected zeros behind the 2",
+    ),
+    "first frames behind those told, beside second ones": (
+        {wire.SECOND_FRAMES: FRAMES[:, :2]},
+        "^frames: expected zeros behind the 3",
+    ),
+    "a second sliver": (
+        {wire.FRAMES: FRAMES[:, :3], wire.SECOND_FRAMES: np.ones((1, 2, 200, 2, 3), np.uint8)},
+        "^frames: expected frames at most 50 times as long as wide, got 200 x 2$",
+    ),
+    "four channels in the second": ({wire.SECOND_FRAMES: np.ones((1, 2, 8, 6, 4), np.uint8)}, "[Ee]xpected.*3.*got.*4"),
     "too many frames": (
         {wire.FRAMES: np.ones((1, 19, 8, 6, 3), np.uint8), wire.NUM_FRAMES: np.array([[2, 17]], int32)},
         "^num_frames: expected at most 16 .*, got 17$",
@@ -352,6 +375,124 @@ def test_frames_of_many_sizes_and_lengths_go_in_one_call(served: Served, protoco
         results = client.evaluate(samples)
     for result, expected in zip(results, load_engine(FRAMES_MODEL).evaluate(samples), strict=True):
         assert_same(result, expected)
+
+
+def sized_film(seed: int, num_frames: int, height: int, width: int) -> Trajectory:
+    frames = np.random.default_rng(seed).integers(0, 256, (num_frames, height, width, 3), np.uint8)
+    return Trajectory(frames=frames, task=f"task {seed}")
+
+
+def pairs(count: int, *, two_sizes: bool) -> list[Sample]:
+    """Of both types, and lengths and sizes that differ from pair to pair."""
+    samples: list[Sample] = []
+    for index in range(count):
+        size = (48, 100) if index % 2 else (90, 61)
+        first = sized_film(2 * index, 1 + index % 5, *size)
+        second = sized_film(2 * index + 1, 1 + index % 3, *(size[::-1] if two_sizes else size))
+        samples.append(SimilaritySample(first, second) if index % 4 > 1 else PreferenceSample(first, second))
+    return samples
+
+
+def test_pairs_of_two_frame_sizes_are_scored_beside_all_others(served: Served, protocol: str) -> None:
+    samples = [
+        sample
+        for group in zip(pairs(12, two_sizes=True), pairs(12, two_sizes=False), strict=True)
+        for sample in (*group, ProgressSample(group[0].trajectories[1]))
+    ]
+    alone = [load_engine(FRAMES_MODEL).evaluate([sample])[0] for sample in samples]
+    with served.client(protocol, FRAMES_MODEL) as client:
+        together = client.evaluate(samples, logits=True)
+        one_by_one = [client.evaluate([sample])[0] for sample in samples[:6]]
+    for result, expected in zip((*together, *one_by_one), (*alone, *alone[:6]), strict=True):
+        assert_same(result, expected)
+
+
+@pytest.mark.parametrize("two_sizes", [False, True], ids=["one size", "two sizes"])
+def test_pairs_of_frames_share_batches(served: Served, protocol: str, two_sizes: bool) -> None:
+    """Of all callers, those without the optional input as before there was one."""
+    samples = pairs(32, two_sizes=two_sizes)
+    alone = [load_engine(FRAMES_MODEL).evaluate([sample])[0] for sample in samples]
+    start = threading.Barrier(len(samples))
+    with served.client(protocol, FRAMES_MODEL) as client, ThreadPoolExecutor(len(samples) + 1) as pool:
+        before = counts(served, f"{FRAMES_MODEL}_encoder")
+
+        def ask(sample: Sample) -> object:
+            start.wait()
+            return client.evaluate([sample])[0]
+
+        busy = pool.submit(client.encode, sized_film(0, 3000, 30, 30))
+        answers = list(pool.map(ask, samples))
+        busy.result()
+        requests, executions = (
+            after - b for after, b in zip(counts(served, f"{FRAMES_MODEL}_encoder"), before, strict=True)
+        )
+    for answer, expected in zip(answers, alone, strict=True):
+        assert_same(answer, expected)
+    assert requests == len(samples) + 1
+    assert executions <= requests // 4
+
+
+def test_a_pair_of_two_frame_sizes_may_be_sent_through_shared_memory(served: Served, protocol: str) -> None:
+    pair = PreferenceSample(sized_film(0, 4, 200, 300), sized_film(1, 3, 120, 90))
+    with RewardClient(served.url(protocol), model=FRAMES_MODEL, shared_memory=True) as client:
+        (result,) = client.evaluate([pair])
+        with tritonclient.grpc.InferenceServerClient(served.url("grpc").removeprefix("grpc://")) as triton:
+            assert triton.get_system_shared_memory_status().regions
+    assert_same(result, load_engine(FRAMES_MODEL).evaluate([pair])[0])
+
+
+@pytest.mark.parametrize("model", [FRAMES_MODEL, VLM])
+def test_a_second_array_may_hold_frames_of_one_size(served: Served, protocol: str, model: str) -> None:
+    """Whoever writes tensors may use the optional input for any pair, and for a sample without a second trajectory."""
+    first, second = (np.random.default_rng(seed).integers(0, 256, (2, 56, 56, 3), np.uint8) for seed in (1, 2))
+    films = [Trajectory(frames=frames, task="lift") for frames in (first, second)]
+    tensors = wire.encode_samples([PreferenceSample(films[0], films[1]), ProgressSample(films[0])])
+    apart = {
+        wire.FRAMES: np.stack([first, first]),
+        wire.SECOND_FRAMES: np.stack([second, np.zeros_like(second)]),
+    }
+    outputs = [wire.PROGRESS, wire.SUCCESS, wire.PREFERENCE]
+    url = served.url(protocol)
+    expected, got = (infer(url, f"{model}_frames", t, outputs) for t in (tensors, tensors | apart))
+    for name in outputs:
+        assert np.isfinite(got[name][0]).all()
+        np.testing.assert_allclose(got[name], expected[name], rtol=0, atol=TOLERANCE)
+
+
+@pytest.fixture(scope="module")
+def served_from_before(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A server of models that were exported before there was an optional input."""
+    folder = tmp_path_factory.mktemp("before")
+    repository = folder / "model_repository"
+    for name in (FRAMES_MODEL, VLM):
+        config = goldens.config(name)
+        rfm_export.export(config.checkpoint, repository, serve_config(config, name))
+    for model in (f"{FRAMES_MODEL}_encoder", f"{FRAMES_MODEL}_frames", f"{VLM}_frames"):
+        forget_input(repository, model, wire.SECOND_FRAMES)
+    with (
+        (folder / "tritonserver.log").open("wb") as log,
+        TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+    ):
+        yield Served(repository, server.endpoints)
+
+
+@pytest.mark.parametrize("model", [FRAMES_MODEL, VLM])
+def test_a_model_from_before_pairs_of_two_frame_sizes_says_so(
+    served_from_before: Served, protocol: str, model: str
+) -> None:
+    wide, tall = sized_film(0, 2, 56, 84), sized_film(1, 2, 84, 56)
+    with served_from_before.client(protocol, model) as client:
+        outcomes = client.evaluate(
+            [PreferenceSample(wide, wide), PreferenceSample(wide, tall), PreferenceSample(tall, tall)],
+            return_errors=True,
+        )
+    assert isinstance(outcomes[1], InvalidSampleError)
+    assert outcomes[1].message == (
+        "second_frames: expected a model that takes pairs of two frame sizes, "
+        "got one that was exported before there was this input: export it again, or resize a trajectory"
+    )
+    assert not isinstance(outcomes[0], RewardError)
+    assert not isinstance(outcomes[2], RewardError)
 
 
 def test_special_tokens_in_a_task_are_text(served: Served, protocol: str) -> None:

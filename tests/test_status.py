@@ -81,4 +81,12 @@ def test_nothing_is_told_of_what_there_was(port: int) -> None:
     assert told(about) == {"rfm_serve_ready a": 1, "rfm_serve_ready a_frames": 1, "rfm_serve_canary_ok a": 1}
     about.tell_down("tritonserver is started again")
     assert told(about) == {"rfm_serve_ready a": 0, "rfm_serve_ready a_frames": 0, "rfm_serve_canary_ok a": 0}
+    text = about.metrics().decode()
+    assert 'rfm_serve_not_ready{model="a",reason="tritonserver is started again"} 1.0' in text
+    about.tell({"a": "it is loaded", "a_frames": NO_REASON})
+    text = about.metrics().decode()
+    assert [line for line in text.splitlines() if line.startswith("rfm_serve_not_ready{")] == [
+        'rfm_serve_not_ready{model="a",reason="it is loaded"} 1.0'
+    ]
+    about.tell_down("tritonserver is started again")
     assert about.ready[1]["models"]["a_frames"] == {"ready": False, "reason": "tritonserver is started again"}

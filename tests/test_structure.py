@@ -41,8 +41,8 @@ EXCEPTIONS = {
     "benchmarks/peers/upstream_forward.py": {"rfm"},
 }
 CLIENT_LAYERS = (  # imports point left
-    "errors", "samples", "results", "wire", "resize", "model_info", "off_loop", "deadline", "access", "shared_memory", "transport",
-    "servers", "in_flight", "packing", "fit", "async_client", "loop_thread", "client",
+    "errors", "samples", "results", "wire", "resize", "model_info", "off_loop", "deadline", "access", "connection", "shared_memory", "transport",
+    "names", "server", "servers", "in_flight", "packing", "fit", "async_client", "loop_thread", "client",
 )  # fmt: skip
 LIGHT = {"numpy", "tritonclient", "aiohttp", "typing_extensions"}  # the last for type checkers only
 # What only an extra brings, and which files need it.

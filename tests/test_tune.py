@@ -100,13 +100,15 @@ def test_the_command_writes_what_export_reads(
     config.write_text("num_gpus: 0\ninstances: 1\n")
     words = ["tune", "--repository", str(repository), "--config", str(config), "--output", str(output)]
     assert CliRunner().invoke(app, words).exit_code == 0
-    expected = ServeConfig(num_gpus=0, instances=2, torch_threads=2, batch_size=64)
+    expected = ServeConfig(num_gpus=0, instances=2, torch_threads=2, max_batch_size=64)
     assert ServeConfig.from_yaml(output) == expected
 
 
 def test_without_a_configuration_only_the_measured_keys_are_written(tmp_path: Path) -> None:
     write_setting(FOUR, tmp_path / "tuned.yaml", None)
-    assert ServeConfig.from_yaml(tmp_path / "tuned.yaml") == ServeConfig(instances=4, torch_threads=1, batch_size=64)
+    assert ServeConfig.from_yaml(tmp_path / "tuned.yaml") == ServeConfig(
+        instances=4, torch_threads=1, max_batch_size=64
+    )
 
 
 def test_what_is_no_repository_is_refused(tmp_path: Path) -> None:

@@ -9,12 +9,13 @@ import secrets
 from collections.abc import Coroutine, Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
+from functools import partial
 from types import TracebackType
 from typing import TYPE_CHECKING, Literal, TypedDict, cast, overload
 
 from rfm_client import wire
 from rfm_client.access import Access, AccessOptions
-from rfm_client.deadline import Deadline
+from rfm_client.deadline import Deadline, check_timeout
 from rfm_client.errors import (
     DeadlineExceededError,
     InferenceFailedError,
@@ -25,11 +26,13 @@ from rfm_client.errors import (
 from rfm_client.fit import FittedSample, fitted, whole, with_frame_indices
 from rfm_client.in_flight import InFlight
 from rfm_client.model_info import ModelInfo
+from rfm_client.names import of_urls
 from rfm_client.off_loop import off_loop
 from rfm_client.packing import groups, model_of, padded_bytes, parts
 from rfm_client.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
-from rfm_client.servers import PROBE_TIMEOUT_S, Servers
+from rfm_client.server import PROBE_TIMEOUT_S
+from rfm_client.servers import Servers
 from rfm_client.transport import Answer, Transport, connect
 
 if TYPE_CHECKING:
@@ -48,7 +51,7 @@ class ClientOptions(AccessOptions, total=False):
     """How a client works.
 
     model: name under which the checkpoint was exported (``rfm``); raw frames go to ``<model>_frames``
-    timeout_s: the longest that a call may take, retries included (60)
+    timeout_s: the longest that a call may take, retries included, at most 1e9; there is no endless wait (60)
     retry: ask again what failed because a server was down, restarting or full, until the time is up (True)
     max_in_flight: requests under way at a time (128); more wait their turn
     shared_memory: large inputs go through memory that client and server map, if both are on one host (False)
@@ -113,10 +116,11 @@ class AsyncRewardClient:
         urls = [urls] if isinstance(urls, str) else urls
         shared_memory = options.get("shared_memory", False)
         access = Access.of(options)
-        transports = transports or [connect(url, shared_memory=shared_memory, access=access) for url in urls]
+        fixed, names = of_urls([] if transports else urls, partial(connect, shared_memory=shared_memory, access=access))
         self._model = options.get("model", DEFAULT_MODEL)
         self._timeout_s = options.get("timeout_s", DEFAULT_TIMEOUT_S)
-        self._servers = Servers(transports, retry=options.get("retry", True))
+        check_timeout(self._timeout_s)
+        self._servers = Servers(transports or fixed, retry=options.get("retry", True), names=names)
         self._in_flight = InFlight(options.get("max_in_flight", DEFAULT_IN_FLIGHT))
         self._model_infos: dict[str, ModelInfo] = {}
         self._is_closed = False
@@ -272,7 +276,10 @@ class AsyncRewardClient:
         return fits, failed
 
     async def _ask(self, model: str, samples: Sequence[Sample], asking: _Asking) -> Sequence[Result | RewardError]:
-        """One request. It fails whole if one sample cannot be scored; then each sample is asked about alone."""
+        """One request. It fails whole if one sample cannot be scored; then each sample is asked about alone.
+
+        A request that is refused because it has ended its process is not taken apart: all its samples fail.
+        """
         request_id = next(asking.request_ids)
         try:
             answer = await self._infer(model, samples, asking, request_id)
@@ -281,6 +288,8 @@ class AsyncRewardClient:
             error.request_id = request_id
             if len(samples) == 1:
                 return [error]
+            if isinstance(error, InvalidSampleError) and error.is_deadly:
+                return _for_each(error, len(samples))  # alone, the one that is would end two more processes
         except RewardError as error:
             return _for_each(error, len(samples))
         alone = await asyncio.gather(*(self._ask(model, [sample], asking) for sample in samples))

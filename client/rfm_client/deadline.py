@@ -13,13 +13,21 @@ else:
 
 from rfm_client.errors import DeadlineExceededError
 
+MAX_TIMEOUT_S = 1e9  # more than thirty years; Triton counts nanoseconds, and could not count many more
+
+
+def check_timeout(timeout_s: float) -> None:
+    """Raises ValueError for what is no time that a call may take. An endless wait is none: servers can hang."""
+    if not 0 < timeout_s <= MAX_TIMEOUT_S:  # nor NaN
+        expected = f"a number of seconds above 0 and at most {MAX_TIMEOUT_S:g}"
+        raise ValueError(f"timeout_s: expected {expected}, got {timeout_s}")
+
 
 class Deadline:
     """A moment ``timeout_s`` seconds from now, shared by everything that one call does."""
 
     def __init__(self, timeout_s: float) -> None:
-        if not timeout_s > 0:
-            raise ValueError(f"timeout_s: expected more than 0, got {timeout_s}")
+        check_timeout(timeout_s)
         self._timeout_s = timeout_s
         self._at_s = time.monotonic() + timeout_s
 

@@ -5,6 +5,7 @@
     +-- InvalidSampleError        the sample is at fault; sending it again gives the same answer
     +-- ServerError               the server is at fault, or cannot be reached
         +-- ServerUnavailableError    no connection, not ready, or its queue is full
+            +-- ProcessEndedError     a process of the model has ended, perhaps because of this request
         +-- DeadlineExceededError     no answer within the time that the caller gave
         +-- ModelNotFoundError        the server does not serve a model of that name
         +-- AccessDeniedError         server and client do not trust each other: certificate, key, or TLS on one side
@@ -14,6 +15,8 @@ No error is ever replaced by a number.
 """
 
 from __future__ import annotations
+
+DEADLY = "request: expected one that the model survives"  # how a server begins to refuse one that it does not
 
 
 class RewardError(Exception):
@@ -36,6 +39,11 @@ class RewardError(Exception):
 class InvalidSampleError(RewardError, ValueError):
     """A sample that cannot be scored, told as ``where: expected X, got Y``."""
 
+    @property
+    def is_deadly(self) -> bool:
+        """Whether the server refuses the request because its process has ended more than once while it had it."""
+        return self.message.startswith(DEADLY)
+
     @classmethod
     def at(cls, where: str, expected: str, got: str) -> InvalidSampleError:
         """The error at the field ``where``."""
@@ -54,6 +62,10 @@ class ServerError(RewardError):
 
 class ServerUnavailableError(ServerError):
     """The server cannot be reached, is not ready, or refuses more work for now."""
+
+
+class ProcessEndedError(ServerUnavailableError):
+    """A process of the model had ended when the request reached it, or while it worked on the request."""
 
 
 class DeadlineExceededError(ServerError, TimeoutError):

@@ -43,7 +43,8 @@ def load_trajectory(source: str | Path, *, task: str = "", fps: float | None = N
     task: instead of the file's own
     fps: frames a second to take of a video; None: all frames
 
-    Raises InvalidSampleError. Arrays of Python objects are refused: to read them is to run code.
+    Raises InvalidSampleError. Arrays of Python objects are refused: to read them is to run code. So are video files in
+    which LeRobot v3.0 keeps several episodes.
     """
     if is_url(source) or Path(source).suffix.lower() not in ARRAY_SUFFIXES:
         return Trajectory(frames=read_video(source, fps), task=task)

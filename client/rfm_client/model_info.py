@@ -18,6 +18,7 @@ SOURCE_PARAMETER = "source"
 REVISION_PARAMETER = "revision"
 DIGEST_PARAMETER = "weights_digest"
 NETWORK_PARAMETER = "network"
+RUN_CONFIG_PARAMETER = "run_config"
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,7 @@ class ModelInfo:
     revision: the commit of the Hub that was exported; None: it was a folder
     weights_digest: 16 hex digits that tell the exported weights from others; None: it does not say
     network: its class, its configuration (config), and how many numbers each part of it has (parameters)
+    run_config: config.yaml of the training run, without secrets; empty: the checkpoint had none
     """
 
     name: str
@@ -50,6 +52,7 @@ class ModelInfo:
     revision: str | None = None
     weights_digest: str | None = None
     network: Mapping[str, Any] = field(default_factory=dict)
+    run_config: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> ModelInfo:
@@ -76,4 +79,5 @@ class ModelInfo:
             revision=parameters.get(REVISION_PARAMETER) or None,
             weights_digest=parameters.get(DIGEST_PARAMETER) or None,
             network=json.loads(parameters.get(NETWORK_PARAMETER) or "{}"),
+            run_config=json.loads(parameters.get(RUN_CONFIG_PARAMETER) or "{}"),
         )

@@ -30,8 +30,6 @@ class FrameScores:
     success: float32 [T], probability that the task is done
     progress_logits: float32 [T, K], raw scores of the progress bins; only of discrete checkpoints, on request
     frame_indices: int64 [T], which frames of the trajectory were scored; None: all of them
-
-    A checkpoint that answers in generated text tells neither success nor the progress of a pair: all NaN.
     """
 
     progress: Float32Array

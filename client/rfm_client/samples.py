@@ -7,7 +7,9 @@ Arrays are checked once, here; everything behind trusts them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -139,6 +141,27 @@ class SimilaritySample:
 Sample: TypeAlias = ProgressSample | PreferenceSample | SimilaritySample
 
 
+@dataclass(frozen=True, eq=False)
+class Footage:
+    """What an encoder is asked about: the trajectories of raw frames of one sample, and the task of the first.
+
+    Those of one size may already be joined.
+    """
+
+    trajectories: tuple[Trajectory, ...]
+
+
+def stackable(trajectories: Sequence[Trajectory]) -> list[list[Trajectory]]:
+    """The trajectories, those together that one array can hold: neighbours whose positions have one shape."""
+    return [list(group) for _, group in groupby(trajectories, lambda trajectory: trajectory.positions.shape[1:])]
+
+
+def joined(trajectories: Sequence[Trajectory]) -> npt.NDArray[Any]:
+    """[P, ...], the positions of trajectories of one shape, one after the other; a view if there is one."""
+    arrays = [trajectory.positions for trajectory in trajectories]
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
+
+
 def float_frames_to_uint8(frames: npt.ArrayLike) -> UInt8Array:
     """uint8 frames from float frames in 0..255, as the original evaluation server made them: clip, then truncate.
 
@@ -212,15 +235,14 @@ def _check_text(trajectory: Trajectory, where: str) -> None:
 
 
 def _check_pair(first: Trajectory, second: Trajectory, where: str) -> None:
-    """Both trajectories of a sample lie in one array."""
+    """Both are of one kind. Embeddings are of one width; frames may be of two sizes."""
     if not isinstance(second, Trajectory):
         raise InvalidSampleError.at(where, "Trajectory", type(second).__name__)
     if (first.frames is None) != (second.frames is None):
         expected, got = ("video_embeddings", "frames") if first.frames is None else ("frames", "video_embeddings")
         raise InvalidSampleError.at(where, f"{expected}, as the first trajectory", got)
-    if first.positions.shape[1:] != second.positions.shape[1:]:
-        name = "video_embeddings" if first.frames is None else "frames"
+    if first.frames is None and first.positions.shape[1:] != second.positions.shape[1:]:
         expected, got = str(list(first.positions.shape[1:])), str(list(second.positions.shape[1:]))
         raise InvalidSampleError.at(
-            f"{where}.{name}", f"{expected} per frame, as the first trajectory (one array holds both)", got
+            f"{where}.video_embeddings", f"{expected} per frame, as the first trajectory (one array holds both)", got
         )

@@ -1,14 +1,26 @@
 # SPDX-License-Identifier: MIT
-"""Several servers of one checkpoint as one: the least busy is asked, and one that fails is left out for a while."""
+"""Several servers of one checkpoint as one: the least busy is asked, and one that fails is left out for a while.
+
+A request may end the process that works on it. Sent from server to server it would end one process after the other.
+So a request that was with server S when a process of S ended waits for S, since S alone can tell whose fault it was:
+its journal lets the others through and refuses a request that has ended its process twice. Once S is loaded anew, the
+request stays with S. If nobody heals S within half of the time that is left, and HEALED_WITHIN_S at most, the request
+goes to a server that is not known to be dead. If a process ends there too, the request fails. Either way it ends two
+processes at most: two of S, or one of S and one of another. Requests that were with S beside it wait as long, and are
+answered. No request is sent to a server that is known to be dead, where others are.
+
+A client of one server sends the request to that server again, after pauses, and its journal bounds it. A URL behind
+which a load balancer picks the server counts as one server: there the bound holds for each server, not for all
+together. Give such servers a URL each, or over gRPC a host name that resolves to all their addresses.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import itertools
 import logging
-import random
-from collections.abc import Awaitable, Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
+import time
+from collections.abc import Awaitable, Callable, Collection, Sequence
 from typing import TypeVar
 
 from rfm_client.deadline import Deadline
@@ -17,19 +29,18 @@ from rfm_client.errors import (
     DeadlineExceededError,
     InferenceFailedError,
     ModelNotFoundError,
+    ProcessEndedError,
     RewardError,
     ServerUnavailableError,
 )
 from rfm_client.model_info import ModelInfo
+from rfm_client.names import REFRESH_S, Name
+from rfm_client.server import HEALED_WITHIN_S, LONGEST_RETRY_PAUSE_S, Server, pause_s
 from rfm_client.transport import Answer, Transport
 from rfm_client.wire import Tensors
 
 Answered = TypeVar("Answered")
-
-FIRST_PAUSE_S = 0.1
-LONGEST_RETRY_PAUSE_S = 2.0
-LONGEST_REST_S = 30.0  # of a server that says that it is ready and fails again and again
-PROBE_TIMEOUT_S = 2.0
+Ask = Callable[[Transport, float], Awaitable[Answered]]
 
 logger = logging.getLogger("rfm_client")
 
@@ -40,13 +51,19 @@ class Servers:
     retry: what fails because a server is down, restarting or full is asked again, elsewhere at once or, when there is
         no other, after pauses that grow, until the deadline; what a server lacks, denies or fails at is asked once of
         each other one. A score depends on the request alone, so asking twice is safe.
+    names: whose addresses are servers, too
     """
 
-    def __init__(self, transports: Sequence[Transport], *, retry: bool) -> None:
-        if not transports:
+    def __init__(self, transports: Sequence[Transport], *, retry: bool, names: Sequence[Name] = ()) -> None:
+        if not transports and not names:
             raise ValueError("url: expected at least one, got none")
-        self._servers = [_Server(transport) for transport in transports]
+        self._transports = transports
+        self._names = names
+        self._servers = [Server(transport) for transport in self._wanted]
+        self._gone: list[Server] = []  # and perhaps not closed yet
         self._retry = retry
+        self._looking_up: asyncio.Task[None] | None = None
+        self._looked_up_s = float("-inf")
 
     def __str__(self) -> str:
         return ", ".join(server.transport.url for server in self._servers)
@@ -71,6 +88,7 @@ class Servers:
 
     async def is_ready(self, models: Sequence[str], timeout_s: float) -> bool:
         """Whether at least one server has one of the models ready. The first that has is enough."""
+        self._keep_up()
         probes = [
             asyncio.ensure_future(server.transport.is_ready(model, timeout_s))
             for server in self._servers
@@ -88,17 +106,35 @@ class Servers:
     async def close(self) -> None:
         """Closes all connections."""
         self._retry = False
-        for server in self._servers:
-            if server.comeback is not None:
-                server.comeback.cancel()
-        await asyncio.gather(*(server.transport.close() for server in self._servers))
+        if self._looking_up is not None:
+            self._looking_up.cancel()
+        await asyncio.gather(*(server.close() for server in (*self._servers, *self._gone)))
 
-    async def _ask(
-        self, model: str, ask: Callable[[Transport, float], Awaitable[Answered]], deadline: Deadline
-    ) -> Answered:
-        refusals: dict[_Server, RewardError] = {}
+    async def _ask(self, model: str, ask: Ask[Answered], deadline: Deadline) -> Answered:
+        """As the module's text has it."""
+        self._keep_up()
+        try:
+            return await self._ask_among(None, model, ask, deadline)
+        except _EndedAtError as ended:
+            first, error = ended.server, ended.error
+        if not self._retry or deadline.ends_within(0):
+            raise error
+        if await first.is_healed(min(HEALED_WITHIN_S, deadline.remaining_s() / 2)):
+            return await self._ask_among(first, model, ask, deadline)
+        try:
+            return await self._ask_among(None, model, ask, deadline)
+        except _EndedAtError as ended:
+            where = f"{first.transport.url} and {ended.server.transport.url}"
+            told = f"{where}: a process of the model ended at each while it had this request, so no other is asked"
+            raise ProcessEndedError(f"{told}: {ended.error.message}") from ended.error
+
+    async def _ask_among(self, only: Server | None, model: str, ask: Ask[Answered], deadline: Deadline) -> Answered:
+        """only: no other is asked; None: any, and of several _EndedAtError is raised where a process has ended."""
+        refusals: dict[Server, RewardError] = {}
         for attempt in itertools.count():
-            server = self._least_busy(refusals)
+            server = only or await self._living(refusals, deadline)
+            if server.is_gone:
+                raise ServerUnavailableError(f"{server.transport.url}: its name does not stand for it any more")
             left_s = deadline.remaining_s()
             try:
                 with server.asked():
@@ -115,70 +151,85 @@ class Servers:
                 if not self._retry:
                     self._leave_out(server, model)
                     raise
-                if len(refusals) == len(self._servers):
+                if only or refusals.keys() >= set(self._servers):
                     break
             except ServerUnavailableError as error:
-                if not server.failures and self._retry:
-                    logger.warning("%s: trying again: %s", server.transport.url, error)
-                self._leave_out(server, model)
-                has_other = any(not other.is_left_out for other in self._servers if other not in {server, *refusals})
-                pause_s = 0.0 if has_other else _pause_s(attempt, LONGEST_RETRY_PAUSE_S)
-                if not self._retry or deadline.ends_within(pause_s):
-                    raise
-                await asyncio.sleep(pause_s)
-                if deadline.ends_within(0):  # the pause took longer than it should have
-                    raise
+                self._note(server, model, error)
+                if isinstance(error, ProcessEndedError) and only is None and len(self._servers) > 1:
+                    raise _EndedAtError(server, error) from error
+                busy = {server, *refusals}
+                has_other = only is None and any(not other.is_left_out for other in self._servers if other not in busy)
+                await self._pause(0.0 if has_other else pause_s(attempt, LONGEST_RETRY_PAUSE_S), deadline, error)
         others = [error for error in refusals.values() if not isinstance(error, ModelNotFoundError)]
         raise (others or list(refusals.values()))[0]
 
-    def _least_busy(self, avoided: Collection[_Server]) -> _Server:
-        def rank(server: _Server) -> tuple[bool, bool, int, int]:
-            return server in avoided, server.is_left_out, server.outstanding, server.last_asked
+    async def _pause(self, duration_s: float, deadline: Deadline, error: ServerUnavailableError) -> None:
+        """Raises the error if it is not worth while."""
+        if not self._retry or deadline.ends_within(duration_s):
+            raise error
+        await asyncio.sleep(duration_s)
+        if deadline.ends_within(0):  # the pause took longer than it should have
+            raise error
+
+    async def _living(self, refusals: Collection[Server], deadline: Deadline) -> Server:
+        """The least busy that is not known to be dead, as soon as there is one. Of the only server nothing is known."""
+        for attempt in itertools.count():
+            server = self._least_busy(refusals)
+            if not server.is_dead:
+                return server
+            error = ProcessEndedError(f"{self}: every process of the model has ended, and none is loaded anew yet")
+            await self._pause(pause_s(attempt, LONGEST_RETRY_PAUSE_S), deadline, error)
+        raise AssertionError("it counts for ever")
+
+    def _least_busy(self, avoided: Collection[Server]) -> Server:
+        def rank(server: Server) -> tuple[bool, bool, bool, int, int]:
+            return server in avoided, server.is_dead, server.is_left_out, server.outstanding, server.last_asked
 
         return min(self._servers, key=rank)
 
-    def _leave_out(self, server: _Server, model: str) -> None:
-        """Until it says that it is ready. The only server there is stays in."""
+    def _note(self, server: Server, model: str, error: ServerUnavailableError) -> None:
+        """That a server is not to be had."""
+        if not server.failures and self._retry:
+            logger.warning("%s: trying again: %s", server.transport.url, error)
+        self._leave_out(server, model, is_dead=isinstance(error, ProcessEndedError))
+
+    def _leave_out(self, server: Server, model: str, *, is_dead: bool = False) -> None:
+        """Until it is ready, or healed. The only server there is stays in."""
         server.failures += 1
-        if len(self._servers) > 1 and not server.is_left_out:
-            server.comeback = asyncio.create_task(server.rest(model))
+        if len(self._servers) > 1:
+            (server.leave_out_dead if is_dead else server.leave_out)(model)
 
-
-class _Server:
-    """What is known of one server. failures: one after the other, up to now."""
-
-    _moments = itertools.count(1)
-
-    def __init__(self, transport: Transport) -> None:
-        self.transport = transport
-        self.outstanding = 0
-        self.last_asked = 0
-        self.failures = 0
-        self.comeback: asyncio.Task[None] | None = None
+    # Names
 
     @property
-    def is_left_out(self) -> bool:
-        return self.comeback is not None and not self.comeback.done()
+    def _wanted(self) -> list[Transport]:
+        return [*self._transports, *(found for name in self._names for found in name.transports.values())]
 
-    @contextmanager
-    def asked(self) -> Iterator[None]:
-        self.outstanding += 1
-        self.last_asked = next(self._moments)
-        try:
-            yield
-        finally:
-            self.outstanding -= 1
+    def _keep_up(self) -> None:
+        """Has the names looked up when that is due. Nobody waits for it."""
+        is_due = time.monotonic() - self._looked_up_s >= REFRESH_S
+        if self._names and is_due and (self._looking_up is None or self._looking_up.done()):
+            self._looking_up = asyncio.create_task(self._look_up())
 
-    async def rest(self, model: str) -> None:
-        """Ends when it says that it is ready; the more often it has failed, the later it is asked."""
-        await asyncio.sleep(_pause_s(self.failures - 1, LONGEST_REST_S))
-        for attempt in itertools.count():
-            if await self.transport.is_ready(model, PROBE_TIMEOUT_S):
-                return
-            await asyncio.sleep(_pause_s(attempt, LONGEST_RETRY_PAUSE_S))
+    async def _look_up(self) -> None:
+        for name in self._names:
+            try:
+                await name.look_up()
+            except (OSError, UnicodeError) as error:
+                logger.info("%s: the name cannot be looked up: %s", name.url, error)
+        self._looked_up_s = time.monotonic()
+        known = {id(server.transport): server for server in self._servers}
+        self._servers = [known.get(id(transport)) or Server(transport) for transport in self._wanted]
+        removed = [server for server in known.values() if server not in self._servers]
+        for server in removed:
+            server.remove()
+        self._gone = [*(server for server in self._gone if not server.is_closed), *removed]
 
 
-def _pause_s(attempt: int, longest_s: float) -> float:
-    """Doubles from try to try; half of it is chance, so that callers do not come back all at once."""
-    pause_s = min(longest_s, FIRST_PAUSE_S * 2.0 ** min(attempt, 16))
-    return random.uniform(pause_s / 2, pause_s)
+class _EndedAtError(Exception):
+    """A process of the model ended at ``server`` when it had the request, or before."""
+
+    def __init__(self, server: Server, error: ProcessEndedError) -> None:
+        super().__init__(server, error)
+        self.server = server
+        self.error = error

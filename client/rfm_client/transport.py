@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import asyncio
 import io
+import logging
 import os
 import re
 import ssl
-from collections.abc import AsyncIterator, Awaitable, Collection, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from typing import Any, Protocol, TypeVar
 
 import numpy.typing as npt
@@ -19,11 +20,12 @@ from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
 from rfm_client import errors
 from rfm_client.access import SECURE_SCHEMES, Access, is_denied
+from rfm_client.connection import GRPC_OPTIONS, Connection
 from rfm_client.deadline import timeout
 from rfm_client.model_info import ModelInfo
 from rfm_client.off_loop import off_loop
 from rfm_client.shared_memory import Region, SharedMemory
-from rfm_client.wire import Tensors
+from rfm_client.wire import SECOND_FRAMES, Tensors
 
 Answered = TypeVar("Answered")
 
@@ -42,23 +44,20 @@ _STATUS_ERRORS: dict[str, type[errors.RewardError]] = {
 }
 _LOST_REGION = "Unable to find shared memory region"
 # Triton answers these with other statuses, but the sample is not at fault and another try may succeed.
-_UNAVAILABLE = re.compile(f"{_LOST_REGION}|has no available versions|Stub process .* is not healthy")
-_URL = re.compile(r"(?P<scheme>grpcs?|https?)://(?P<address>[^/]+:(?P<port>[0-9]{1,5}))/?")
+_UNAVAILABLE = re.compile(f"{_LOST_REGION}|has no available versions")
+_PROCESS_ENDED = re.compile("Stub process .* is not healthy")
+_URL = re.compile(r"((?P<scheme>grpcs?|https?)://|dns:///)(?P<address>[^/]+:(?P<port>[0-9]{1,5}))/?")
 MAX_PORT = 65535
 _REQUEST_ID = re.compile(r"^\[request id: [^\]]*\] ")
 _WRONG_SHAPE = re.compile(  # behind the batch axis, which the caller did not make
     r"unexpected shape for input '(?P<name>\w+)'.*?Expected \[-1,(?P<expected>[^\]]*)\], got \[\d+,(?P<got>[^\]]*)\]"
 )
+_NO_SECOND_FRAMES = re.compile(rf"expected \d+ inputs but got .*'{SECOND_FRAMES}'|unexpected .*input '{SECOND_FRAMES}'")
 _IN_ENSEMBLE = re.compile(r"^in ensemble '[^']*', ")  # what Triton puts before a message; the caller knows the model
 
-_UNBOUNDED = -1
 _US_PER_S = 1_000_000
-_GRPC_OPTIONS = {
-    "grpc.max_send_message_length": _UNBOUNDED,
-    "grpc.max_receive_message_length": _UNBOUNDED,
-    "grpc.initial_reconnect_backoff_ms": 100,
-    "grpc.max_reconnect_backoff_ms": 2000,  # two minutes otherwise, when the server may long be back
-}
+
+logger = logging.getLogger("rfm_client")
 
 
 @dataclass(frozen=True)
@@ -89,24 +88,31 @@ class Transport(Protocol):
         """Closes the connection."""
 
 
-def connect(url: str, *, shared_memory: bool = False, access: Access | None = None) -> Transport:
+def connect(
+    url: str, *, shared_memory: bool = False, access: Access | None = None, named: str | None = None
+) -> Transport:
     """The transport for ``grpc://host:port`` or ``http://host:port``, or with TLS ``grpcs://`` or ``https://``.
 
     It connects when it is first used. Raises ValueError.
 
     shared_memory: large inputs go through memory that the server, on the same host, maps too
     access: certificates, and what is shown with each request
+    named: over gRPC, the ``host:port`` by which the server at this address is known, to its certificate too
     """
-    kind = GrpcTransport if split_url(url)[0].startswith("grpc") else HttpTransport
-    return kind(url, access or Access(), shared_memory=shared_memory)
+    if split_url(url)[0].startswith("grpc"):
+        return GrpcTransport(url, access or Access(), shared_memory=shared_memory, named=named)
+    return HttpTransport(url, access or Access(), shared_memory=shared_memory)
 
 
 def split_url(url: str) -> tuple[str, str]:
-    """``grpc``, ``http``, ``grpcs`` or ``https``, and ``host:port``. Raises ValueError."""
+    """``grpc``, ``http``, ``grpcs`` or ``https``, and ``host:port``. Raises ValueError.
+
+    ``dns:///host:port``, as gRPC writes it, is ``grpc://host:port``.
+    """
     match = _URL.fullmatch(url)
     if match is None or int(match["port"]) > MAX_PORT:
         raise ValueError(f"url: expected grpc://host:port or http://host:port, or grpcs:// or https://, got {url!r}")
-    return match["scheme"], match["address"]
+    return match["scheme"] or "grpc", match["address"]
 
 
 class _TritonTransport:
@@ -120,24 +126,27 @@ class _TritonTransport:
             raise ValueError(f"url: expected grpcs:// or https:// with certificates, got {url}")
         self._shared_memory = SharedMemory(self) if shared_memory else None
         self._requested = cache(lambda name: self._triton.InferRequestedOutput(name))
+        self._connection: Connection | None = None
+        self._left: list[Connection] = []  # and perhaps not closed yet
 
     async def infer(
         self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
     ) -> Answer:
-        return await self._call(self._infer(model, inputs, outputs, request_id, timeout_s), timeout_s)
+        ask = partial(self._infer, model, inputs, outputs, request_id, timeout_s)
+        return await self._call(ask, timeout_s)
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
-        async def ask() -> ModelInfo:
-            return ModelInfo.from_config(await self._model_config(model))
+        async def ask(client: Any) -> ModelInfo:
+            return ModelInfo.from_config(await self._model_config(client, model))
 
-        return await self._call(ask(), timeout_s, bad_request=errors.ModelNotFoundError)
+        return await self._call(ask, timeout_s, bad_request=errors.ModelNotFoundError)
 
     async def is_ready(self, model: str, timeout_s: float) -> bool:
-        async def ask() -> bool:
-            return bool(await self._client.is_server_ready() and await self._client.is_model_ready(model))
+        async def ask(client: Any) -> bool:
+            return bool(await client.is_server_ready() and await client.is_model_ready(model))
 
         try:
-            return await self._call(ask(), timeout_s)
+            return await self._call(ask, timeout_s)
         except errors.ServerError:
             return False
 
@@ -146,17 +155,19 @@ class _TritonTransport:
             if self._shared_memory is not None:
                 await self._shared_memory.close()
         finally:
-            if "_client" in self.__dict__:
-                await self._client.close()
+            for connection in (*self._left, *filter(None, [self._connection])):
+                await connection.close()
 
     async def register_region(self, name: str, byte_size: int) -> None:
-        await self._client.register_system_shared_memory(name, f"/{name}", byte_size)
+        with self._connected().used() as client:
+            await client.register_system_shared_memory(name, f"/{name}", byte_size)
 
     async def unregister_region(self, name: str) -> None:
-        await self._client.unregister_system_shared_memory(name)
+        with self._connected().used() as client:
+            await client.unregister_system_shared_memory(name)
 
     async def _infer(
-        self, model: str, inputs: Tensors, outputs: Collection[str], request_id: str, timeout_s: float
+        self, model: str, inputs: Tensors, outputs: Collection[str], request_id: str, timeout_s: float, client: Any
     ) -> Answer:
         largest = max(inputs, key=lambda name: inputs[name].nbytes)
         async with self._lent(inputs[largest]) as region:
@@ -166,9 +177,7 @@ class _TritonTransport:
             requested = [self._requested(name) for name in outputs]
             # Whoever waits in Triton's queue for longer is dropped there, over HTTP too: nobody waits for the answer.
             waits_us = max(int(timeout_s * _US_PER_S), 1)
-            answer = await self._client.infer(
-                model, tensors, outputs=requested, request_id=request_id, timeout=waits_us
-            )
+            answer = await client.infer(model, tensors, outputs=requested, request_id=request_id, timeout=waits_us)
         return Answer(_outputs(answer, outputs), self._model_version(answer))
 
     @asynccontextmanager
@@ -197,7 +206,7 @@ class _TritonTransport:
 
     async def _call(
         self,
-        call: Awaitable[Answered],
+        ask: Callable[[Any], Awaitable[Answered]],
         timeout_s: float,
         *,
         bad_request: type[errors.RewardError] = errors.InvalidSampleError,
@@ -206,7 +215,7 @@ class _TritonTransport:
         try:
             # Not by a deadline of gRPC: Triton 2.51 overlooks that one has passed, but not that a call is cancelled.
             async with timeout(timeout_s):
-                return await call
+                return await self._heard(ask)
         except InferenceServerException as error:
             if is_denied(error):
                 raise errors.AccessDeniedError(f"{self.url}: access denied: {error.message()}") from error
@@ -225,6 +234,30 @@ class _TritonTransport:
         except (ValueError, LookupError, TypeError) as error:  # while reading what is no answer of a KServe server
             raise errors.InferenceFailedError(f"{self.url}: the answer cannot be read: {error!r}") from error
 
+    async def _heard(self, ask: Callable[[Any], Awaitable[Answered]]) -> Answered:
+        """What the server answers; a connection over which nothing comes is left to those who use it already."""
+        connection = self._connected()
+        try:
+            with connection.used() as client:
+                answer = await ask(client)
+            connection.hear()
+            return answer
+        except InferenceServerException:
+            connection.hear()  # or gRPC knows itself that the connection has ended
+            raise
+        except asyncio.CancelledError:
+            if connection.is_silent and connection is self._connection:
+                logger.info("%s: nothing comes over the connection: the next call gets a new one", self.url)
+                self._connection = None
+                self._left = [*(left for left in self._left if not left.is_closed), connection]
+                connection.leave()
+            raise
+
+    def _connected(self) -> Connection:
+        if self._connection is None:
+            self._connection = Connection(self._open())
+        return self._connection
+
     @property
     def _is_secure(self) -> bool:
         return self._scheme in SECURE_SCHEMES
@@ -235,8 +268,8 @@ class _TritonTransport:
     def _triton(self) -> Any:
         raise NotImplementedError
 
-    @cached_property
-    def _client(self) -> Any:
+    def _open(self) -> Any:
+        """A client of tritonclient's, which connects when it is first used."""
         raise NotImplementedError
 
     @property
@@ -254,7 +287,7 @@ class _TritonTransport:
     async def registered_regions(self) -> list[str]:
         raise NotImplementedError
 
-    async def _model_config(self, model: str) -> Mapping[str, Any]:
+    async def _model_config(self, client: Any, model: str) -> Mapping[str, Any]:
         raise NotImplementedError
 
     def _model_version(self, answer: Any) -> str:
@@ -266,14 +299,17 @@ class GrpcTransport(_TritonTransport):
 
     _first_process: int | None = None  # that used gRPC
 
+    def __init__(self, url: str, access: Access, *, shared_memory: bool, named: str | None = None) -> None:
+        super().__init__(url, access, shared_memory=shared_memory)
+        self._options = {**GRPC_OPTIONS, **_name_options(named)}
+
     @cached_property
     def _triton(self) -> Any:
         import tritonclient.grpc.aio
 
         return tritonclient.grpc.aio
 
-    @cached_property
-    def _client(self) -> Any:
+    def _open(self) -> Any:
         process = GrpcTransport._first_process = GrpcTransport._first_process or os.getpid()
         if process != os.getpid():  # it would crash or hang
             raise RuntimeError(
@@ -281,22 +317,29 @@ class GrpcTransport(_TritonTransport):
                 "have multiprocessing start its processes by spawn or forkserver"
             )
         client = self._triton.InferenceServerClient(
-            self._address, channel_args=list(_GRPC_OPTIONS.items()), **self._access.grpc_options(self._scheme)
+            self._address, channel_args=list(self._options.items()), **self._access.grpc_options(self._scheme)
         )
         self._access.show_with_each_request(client)
         return client
 
     async def registered_regions(self) -> list[str]:
-        answer = await self._client.get_system_shared_memory_status(as_json=True)
+        with self._connected().used() as client:
+            answer = await client.get_system_shared_memory_status(as_json=True)
         return list(answer.get("regions", {}))
 
-    async def _model_config(self, model: str) -> Mapping[str, Any]:
-        answer = await self._client.get_model_config(model, as_json=True)
+    async def _model_config(self, client: Any, model: str) -> Mapping[str, Any]:
+        answer = await client.get_model_config(model, as_json=True)
         config: Mapping[str, Any] = answer["config"]
         return config
 
     def _model_version(self, answer: Any) -> str:
         return str(answer.get_response().model_version)
+
+
+def _name_options(named: str | None) -> dict[str, str]:
+    if named is None:
+        return {}
+    return {"grpc.default_authority": named, "grpc.ssl_target_name_override": named.rpartition(":")[0].strip("[]")}
 
 
 class HttpTransport(_TritonTransport):
@@ -308,8 +351,7 @@ class HttpTransport(_TritonTransport):
 
         return tritonclient.http.aio
 
-    @cached_property
-    def _client(self) -> Any:
+    def _open(self) -> Any:
         secure = {"ssl": True, "ssl_context": self._access.ssl_context} if self._is_secure else {}
         client = self._triton.InferenceServerClient(self._address, conn_limit=0, conn_timeout=None, **secure)
         self._access.show_with_each_request(client)
@@ -342,10 +384,11 @@ class HttpTransport(_TritonTransport):
         return (aiohttp.ClientSSLError, ssl.SSLError)
 
     async def registered_regions(self) -> list[str]:
-        return [region["name"] for region in await self._client.get_system_shared_memory_status()]
+        with self._connected().used() as client:
+            return [region["name"] for region in await client.get_system_shared_memory_status()]
 
-    async def _model_config(self, model: str) -> Mapping[str, Any]:
-        config: Mapping[str, Any] = await self._client.get_model_config(model)
+    async def _model_config(self, client: Any, model: str) -> Mapping[str, Any]:
+        config: Mapping[str, Any] = await client.get_model_config(model)
         return config
 
     def _model_version(self, answer: Any) -> str:
@@ -365,6 +408,12 @@ def _mapped(error: InferenceServerException, bad_request: type[errors.RewardErro
     shape = _WRONG_SHAPE.search(message)
     if shape is not None:
         return bad_request(f"{shape['name']}: expected [{shape['expected']}], got [{shape['got']}]")
+    if _NO_SECOND_FRAMES.search(message):
+        expected = "a model that takes pairs of two frame sizes"
+        got = "one that was exported before there was this input: export it again, or resize a trajectory"
+        return bad_request(f"{SECOND_FRAMES}: expected {expected}, got {got}")
+    if _PROCESS_ENDED.search(message):
+        return errors.ProcessEndedError(message)
     if _UNAVAILABLE.search(message):
         return errors.ServerUnavailableError(message)
     kind = _STATUS_ERRORS.get(str(error.status()), errors.InferenceFailedError)

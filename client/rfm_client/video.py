@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.errors import InvalidSampleError
+from rfm_client.lerobot import check_film_behind, check_local_film
 from rfm_client.samples import UInt8Array
 
 DOWNLOAD_TIMEOUT_S = 60.0
@@ -50,7 +51,8 @@ def read_video(source: str | Path, fps: float | None = None, *, timeout_s: float
 
     timeout_s: the longest that the server of a URL may be silent
 
-    Raises InvalidSampleError for what is no video, or cannot be had.
+    Raises InvalidSampleError for what is no video, or cannot be had, and for a file of several LeRobot episodes
+    (``lerobot``).
     """
     try:
         import av
@@ -59,6 +61,7 @@ def read_video(source: str | Path, fps: float | None = None, *, timeout_s: float
     if fps is not None and not 0 < fps < math.inf:
         raise InvalidSampleError.at("fps", "a number above 0", repr(fps))
     try:
+        check_film_behind(str(source)) if is_url(source) else check_local_film(source)
         with _opened(source, timeout_s) as file:
             return _sampled(av, file, fps)
     except InvalidSampleError as error:

@@ -4,8 +4,11 @@
 Letters: B samples of one request (the batch axis), P frame positions: the first trajectory's frames, then
 the second's, then zero padding; D, Dt, K, H, W as in ``rfm_client.samples``.
 
-Every input is always present, and whatever changes the answer is an input: that is what lets Triton put
-requests of different callers, lengths and sample types into one batch.
+Whatever changes the answer is an input, and every input but one is always present: that is what lets Triton put
+requests of different callers, lengths and sample types into one batch. The one is ``second_frames``, for pairs whose
+trajectories differ in frame size: ``frames`` then holds the first trajectories alone, and it the second ones. It is
+optional, so that requests without it stay what they were before it existed. Triton batches requests that have it among
+themselves. P is then the positions of both arrays.
 """
 
 from __future__ import annotations
@@ -30,11 +33,14 @@ from rfm_client.results import (
 )
 from rfm_client.samples import (
     Float32Array,
+    Footage,
     PreferenceSample,
     ProgressSample,
     Sample,
     SimilaritySample,
     Trajectory,
+    joined,
+    stackable,
 )
 
 Tensors: TypeAlias = dict[str, npt.NDArray[Any]]
@@ -45,6 +51,7 @@ FRAME_STEPS = "frame_steps"
 VIDEO_EMBEDDINGS = "video_embeddings"
 TEXT_EMBEDDING = "text_embedding"
 FRAMES = "frames"
+SECOND_FRAMES = "second_frames"
 TASK = "task"
 
 PROGRESS = "progress"
@@ -81,18 +88,21 @@ class TensorSpec:
     """Name, element type and dimensions (without the batch axis) of one input or output.
 
     ragged: requests in which the variable dimensions differ may still share a batch.
+    optional: a request may leave it out; those with it and those without share no batch.
     """
 
     name: str
     datatype: Literal["UINT8", "INT32", "FP32", "BYTES"]
     dims: tuple[int, ...]
     ragged: bool = False
+    optional: bool = False
 
 
 _NUM_FRAMES_SPEC = TensorSpec(NUM_FRAMES, "INT32", (2,))
 _QUESTION_SPECS = (TensorSpec(SAMPLE_TYPE, "UINT8", (1,)), _NUM_FRAMES_SPEC, TensorSpec(FRAME_STEPS, "INT32", (1,)))
 _FRAMES_SPECS = (
     TensorSpec(FRAMES, "UINT8", (VARIABLE, VARIABLE, VARIABLE, 3), ragged=True),
+    TensorSpec(SECOND_FRAMES, "UINT8", (VARIABLE, VARIABLE, VARIABLE, 3), ragged=True, optional=True),
     TensorSpec(TASK, "BYTES", (1,)),
 )
 
@@ -137,8 +147,8 @@ def score_outputs(progress_bins: int | None) -> tuple[TensorSpec, ...]:
 
 
 def encode_samples(samples: Sequence[Sample]) -> Tensors:
-    """One request for samples whose frame positions have the same shape beyond the time axis."""
-    positions = [_positions(sample) for sample in samples]
+    """One request for samples whose positions have the same shape beyond the time axis, trajectory by trajectory."""
+    arrays = zip(*([joined(part) for part in stackable(sample.trajectories)] for sample in samples), strict=True)
     tensors: Tensors = {
         SAMPLE_TYPE: np.array([[_SAMPLE_TYPES[type(sample)]] for sample in samples], np.uint8),
         NUM_FRAMES: np.array([_num_frames(sample) for sample in samples], np.int32),
@@ -146,9 +156,10 @@ def encode_samples(samples: Sequence[Sample]) -> Tensors:
     }
     texts = [sample.trajectories[0] for sample in samples]
     if texts[0].frames is not None:
-        tensors[FRAMES] = pad_stack(positions)
+        tensors |= {name: pad_stack(array) for name, array in zip((FRAMES, SECOND_FRAMES), arrays, strict=False)}
         tensors[TASK] = np.array([[text.task.encode()] for text in texts], np.object_)
     else:
+        (positions,) = arrays
         tensors[VIDEO_EMBEDDINGS] = pad_stack(positions)
         embeddings = [text.text_embedding for text in texts if text.text_embedding is not None]
         tensors[TEXT_EMBEDDING] = embeddings[0][np.newaxis] if len(embeddings) == 1 else np.stack(embeddings)
@@ -163,7 +174,7 @@ def decode_samples(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Sample]:
 def encode_frames(trajectory: Trajectory) -> Tensors:
     """One request to the encoder, for one trajectory of raw frames."""
     tensors = encode_samples([ProgressSample(trajectory)])
-    return {spec.name: tensors[spec.name] for spec in encoder_inputs()}
+    return {spec.name: tensors[spec.name] for spec in encoder_inputs() if spec.name in tensors}
 
 
 def decode_embeddings(tensors: Mapping[str, npt.NDArray[Any]], trajectory: Trajectory) -> Trajectory:
@@ -177,14 +188,15 @@ def decode_embeddings(tensors: Mapping[str, npt.NDArray[Any]], trajectory: Traje
         raise InferenceFailedError(f"embeddings: {error}") from error
 
 
-def decode_trajectories(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Trajectory]:
+def decode_trajectories(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Footage]:
     """What the encoder is to encode: per sample its frames without padding, and its task."""
 
-    def decode(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> Trajectory:
+    def decode(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> Footage:
         lengths = tensors[NUM_FRAMES][row].tolist()
         if lengths[0] < 1 or lengths[1] < 0:
             raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, at least 0]", str(lengths))
-        return Trajectory(frames=_unpadded(tensors, FRAMES, row, sum(lengths)), task=_task(tensors, row))
+        arrays = _positions(tensors, row, lengths)
+        return Footage(tuple(_trajectory(tensors, row, positions) for positions in arrays if len(positions)))
 
     return [_located(decode, tensors, row) for row in range(len(tensors[NUM_FRAMES]))]
 
@@ -201,7 +213,7 @@ def encode_trajectories(trajectories: Sequence[Trajectory], num_positions: int, 
 
 def num_positions(inputs: Mapping[str, npt.NDArray[Any]]) -> int:
     """P of one request."""
-    return int(inputs[FRAMES if FRAMES in inputs else VIDEO_EMBEDDINGS].shape[1])
+    return sum(int(inputs[name].shape[1]) for name in (FRAMES, SECOND_FRAMES, VIDEO_EMBEDDINGS) if name in inputs)
 
 
 def encode_results(results: Sequence[Result], num_positions: int, outputs: Collection[str]) -> Tensors:
@@ -229,12 +241,6 @@ def pad_stack(arrays: Sequence[npt.NDArray[Any]], length: int | None = None, *, 
     for row, array in zip(padded, arrays, strict=True):
         row[: len(array)] = array
     return padded
-
-
-def _positions(sample: Sample) -> npt.NDArray[Any]:
-    """[P, ...], the trajectories one after the other; a view if there is one."""
-    arrays = [trajectory.positions for trajectory in sample.trajectories]
-    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
 def _num_frames(sample: Sample) -> tuple[int, int]:
@@ -296,21 +302,31 @@ def _decode_sample(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> Sample:
     if sample_type == SampleType.PROGRESS:
         if lengths[0] < 1 or lengths[1] != 0:
             raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, 0] for progress", str(lengths))
-        return ProgressSample(_trajectory(tensors, row, 0, lengths[0], sum(lengths)), frame_steps=frame_steps)
+        positions = _positions(tensors, row, lengths)
+        return ProgressSample(_trajectory(tensors, row, positions[0]), frame_steps=frame_steps)
     if min(lengths) < 1:
         raise InvalidSampleError.at(NUM_FRAMES, "at least one frame of each of the two trajectories", str(lengths))
     if frame_steps != 0:
         raise InvalidSampleError.at(FRAME_STEPS, "0 unless the sample is of type progress", str(frame_steps))
-    first = _trajectory(tensors, row, 0, lengths[0], sum(lengths))
-    second = _trajectory(tensors, row, lengths[0], sum(lengths), sum(lengths))
+    positions = _positions(tensors, row, lengths)
+    if len(positions) == 1:
+        positions = np.split(positions[0], lengths[:1])
+    first, second = (_trajectory(tensors, row, array) for array in positions)
     return (PreferenceSample if sample_type == SampleType.PREFERENCE else SimilaritySample)(first, second)
 
 
-def _trajectory(tensors: Mapping[str, npt.NDArray[Any]], row: int, start: int, stop: int, total: int) -> Trajectory:
+def _trajectory(tensors: Mapping[str, npt.NDArray[Any]], row: int, positions: npt.NDArray[Any]) -> Trajectory:
     if FRAMES in tensors:
-        return Trajectory(frames=_unpadded(tensors, FRAMES, row, total)[start:stop], task=_task(tensors, row))
-    embeddings = _unpadded(tensors, VIDEO_EMBEDDINGS, row, total)[start:stop]
-    return Trajectory(video_embeddings=embeddings, text_embedding=tensors[TEXT_EMBEDDING][row])
+        return Trajectory(frames=positions, task=_task(tensors, row))
+    return Trajectory(video_embeddings=positions, text_embedding=tensors[TEXT_EMBEDDING][row])
+
+
+def _positions(tensors: Mapping[str, npt.NDArray[Any]], row: int, lengths: Sequence[int]) -> list[npt.NDArray[Any]]:
+    """Of one sample what is no padding: those of both trajectories in one array, or each trajectory's in its own."""
+    if SECOND_FRAMES in tensors:
+        arrays = zip((FRAMES, SECOND_FRAMES), lengths, strict=True)
+        return [_unpadded(tensors, name, row, length) for name, length in arrays]
+    return [_unpadded(tensors, FRAMES if FRAMES in tensors else VIDEO_EMBEDDINGS, row, sum(lengths))]
 
 
 def _unpadded(tensors: Mapping[str, npt.NDArray[Any]], name: str, row: int, total: int) -> npt.NDArray[Any]:
@@ -343,13 +359,13 @@ def _decode_result(
     tensors: Mapping[str, npt.NDArray[Any]], row: int, sample: Sample, model_version: str | None
 ) -> Result:
     num_first, num_second = _num_frames(sample)
-    first = _scores_between(tensors, row, slice(0, num_first), isinstance(sample, ProgressSample))
+    first = _scores_between(tensors, row, slice(0, num_first))
     timing = BatchTiming(*tensors[TIMING_MS][row].tolist()) if TIMING_MS in tensors else None
     of_request: dict[str, Any] = {"timing": timing, "model_version": model_version}
     if isinstance(sample, ProgressSample):
         progress, success, logits = first.progress, first.success, first.progress_logits
         return ProgressResult(progress=progress, success=success, progress_logits=logits, **of_request)
-    second = _scores_between(tensors, row, slice(num_first, num_first + num_second), False)
+    second = _scores_between(tensors, row, slice(num_first, num_first + num_second))
     if isinstance(sample, PreferenceSample):
         preference = float(_present(tensors, PREFERENCE, row, slice(0, 1))[0])
         return PreferenceResult(preference=preference, first=first, second=second, **of_request)
@@ -357,26 +373,21 @@ def _decode_result(
     return SimilarityResult(similarity=similarity, reference=first, other=second, **of_request)
 
 
-def _scores_between(
-    tensors: Mapping[str, npt.NDArray[Any]], row: int, positions: slice, progress_asked: bool
-) -> FrameScores:
+def _scores_between(tensors: Mapping[str, npt.NDArray[Any]], row: int, positions: slice) -> FrameScores:
     logits = _present(tensors, PROGRESS_LOGITS, row, positions) if PROGRESS_LOGITS in tensors else None
     return FrameScores(
-        progress=_present(tensors, PROGRESS, row, positions, may_lack=not progress_asked),
-        success=_present(tensors, SUCCESS, row, positions, may_lack=True),
+        progress=_present(tensors, PROGRESS, row, positions),
+        success=_present(tensors, SUCCESS, row, positions),
         progress_logits=logits,
     )
 
 
-def _present(
-    tensors: Mapping[str, npt.NDArray[Any]], name: str, row: int, positions: slice, *, may_lack: bool = False
-) -> Float32Array:
-    """One row's scores at some positions, which must be there and be numbers; ``may_lack``: or all be NaN."""
+def _present(tensors: Mapping[str, npt.NDArray[Any]], name: str, row: int, positions: slice) -> Float32Array:
+    """One row's scores at some positions. Raises InferenceFailedError unless all are there and finite."""
     scores, count = tensors[name], positions.stop - positions.start
     if scores.ndim < 2 or row >= len(scores):
         raise InferenceFailedError(f"{name}: expected scores of sample {row}, got an array {list(scores.shape)}")
     part: Float32Array = scores[row, positions]
-    is_told = len(part) == count and bool(np.isfinite(part).all())
-    if not is_told and not (may_lack and len(part) == count > 0 and np.isnan(part).all()):
+    if len(part) != count or not np.isfinite(part).all():
         raise InferenceFailedError(f"{name}: expected {count} finite scores, got {part.tolist()}")
     return part

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -13,13 +15,22 @@ from typing import Any
 from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.checkpoint import Checkpoint, RewindCheckpoint
+from rfm.checkpoint.content import read_run_config
 from rfm.checkpoint.digest import weights_digest
+from rfm.checkpoint.files import find_run_config
 from rfm.models.encoders import Encoders
 from rfm.models.rewind import RewindTransformer
 from rfm.models.vlm import VlmRewardModel
-from rfm_client.model_info import DIGEST_PARAMETER, NETWORK_PARAMETER, REVISION_PARAMETER, SOURCE_PARAMETER
+from rfm_client.model_info import (
+    DIGEST_PARAMETER,
+    NETWORK_PARAMETER,
+    REVISION_PARAMETER,
+    RUN_CONFIG_PARAMETER,
+    SOURCE_PARAMETER,
+)
 
 _TOLD_PARTS = 2  # of a path; all of it is nobody else's business
+_SECRET = re.compile(r"(^|_)(token|secret|password|key)$", re.IGNORECASE)  # such as hub_token, wandb_api_key
 
 
 @dataclass(frozen=True)
@@ -28,28 +39,34 @@ class Origin:
 
     source: the end of its folder's path, or its Hub id
     revision: the Hub's commit; empty for a folder
+    run_config: config.yaml of its training run as JSON, without secrets; empty if there is none
     """
 
     source: str
     revision: str
+    run_config: str = ""
 
     @classmethod
     def of(cls, source: str | Path, folder: Path) -> Origin:
         """source: as the user named it; folder: where its files lie, of the Hub's a snapshot named by its commit"""
         named = Path(source).expanduser()
+        file = find_run_config(folder)
+        run_config = "" if file is None else json.dumps(_public(read_run_config(file)))
         if str(source) and named.is_dir():
-            return cls("/".join(named.resolve().parts[-_TOLD_PARTS:]), "")
-        return cls(str(source), folder.name)
+            return cls("/".join(named.resolve().parts[-_TOLD_PARTS:]), "", run_config)
+        return cls(str(source), folder.name, run_config)
 
     @classmethod
     def told(cls, config: pb.ModelConfig) -> Origin:
         """As an exported configuration tells it."""
-        return cls(*(str(config.parameters[name].string_value) for name in (SOURCE_PARAMETER, REVISION_PARAMETER)))
+        names = (SOURCE_PARAMETER, REVISION_PARAMETER, RUN_CONFIG_PARAMETER)
+        return cls(*(config.parameters[name].string_value if name in config.parameters else "" for name in names))
 
     @property
     def parameters(self) -> dict[str, str]:
         """By name."""
-        return {SOURCE_PARAMETER: self.source, REVISION_PARAMETER: self.revision}
+        of_run = {RUN_CONFIG_PARAMETER: self.run_config} if self.run_config else {}
+        return {SOURCE_PARAMETER: self.source, REVISION_PARAMETER: self.revision, **of_run}
 
 
 def about(checkpoint: Checkpoint, origin: Origin) -> dict[str, str]:
@@ -70,6 +87,21 @@ def tell_weights(config: pb.ModelConfig, version: int, repository: Path) -> None
     parts = [step.model_name for step in config.ensemble_scheduling.step] or [config.name]
     digest = weights_digest(repository / part / str(version) for part in parts)
     config.parameters[DIGEST_PARAMETER].string_value = digest
+
+
+def _public(value: Any) -> Any:
+    """A value of YAML as JSON can hold it, without the texts whose keys name a secret."""
+    if isinstance(value, dict):
+        kept = {str(key): inner for key, inner in value.items() if not _is_secret(str(key), inner)}
+        return {key: _public(inner) for key, inner in kept.items()}
+    if isinstance(value, (list, tuple, set)):
+        return [_public(inner) for inner in value]
+    is_plain = value is None or isinstance(value, (str, int)) or (isinstance(value, float) and math.isfinite(value))
+    return value if is_plain else str(value)
+
+
+def _is_secret(key: str, value: Any) -> bool:
+    return isinstance(value, (str, bytes)) and _SECRET.search(key) is not None
 
 
 def _network(checkpoint: Checkpoint) -> dict[str, Any]:

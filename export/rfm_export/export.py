@@ -52,18 +52,22 @@ class _Plan:
     frames: bool
 
 
-def export(source: str | Path, repository: Path, serve: ServeConfig) -> int:
+def export(source: str | Path, repository: Path, serve: ServeConfig, *, other_machine: bool = False) -> int:
     """Writes the checkpoint at ``source`` into ``repository`` and gives its version number.
 
     The staged files are loaded and compared with the original before anything in the repository changes.
+    other_machine: it is to be served elsewhere, so that ``num_gpus`` may be more than there are here
     Raises CheckpointError, ExportError.
     """
+    if not other_machine:
+        _check_gpus(serve.num_gpus)
     folder = checkpoints.find(source)
-    checkpoint = checkpoints.load(folder, base_model=serve.base_model)
+    checkpoint = checkpoints.load(folder, base_model=serve.base_model, resize_images=serve.resize_images)
     checkpoints.check(folder, checkpoint)
     origin = Origin.of(source, folder)
-    with alone(repository), staging(repository) as staged:
-        version = next_version(repository, [serve.name, encoder_name(serve.name), frames_name(serve.name)])
+    names = [serve.name, encoder_name(serve.name), frames_name(serve.name)]
+    with alone(repository), staging(repository, names) as staged:
+        version = next_version(repository, names)
         if isinstance(checkpoint, RewindCheckpoint):
             plan = _rewind_plan(checkpoint, serve, version, origin)
         else:
@@ -74,6 +78,15 @@ def export(source: str | Path, repository: Path, serve: ServeConfig) -> int:
         verify(plan.original, lambda: plan.exported(staged), samples)
         publish(repository, staged, plan.models)
     return version
+
+
+def _check_gpus(num_gpus: int | None) -> None:
+    """Raises ExportError for more GPUs than this machine has: Triton would refuse to load the models."""
+    there = torch.cuda.device_count()
+    if num_gpus is not None and num_gpus > there:
+        raise ExportError(
+            f"num_gpus: expected at most {there}, got {num_gpus}; --other-machine exports for a machine with more GPUs"
+        )
 
 
 def _stage(plan: _Plan, staged: Path) -> None:
@@ -217,7 +230,10 @@ def _read_config(repository: Path, name: str) -> Any:
 
 
 def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], serve: ServeConfig) -> None:
-    """A model keeps its inputs and outputs from version to version; its clients rely on them."""
+    """A model keeps its inputs and outputs from version to version; its clients rely on them.
+
+    What those need not know, an optional input, it may gain.
+    """
     names = {model.name for model in models}
     for name in (serve.name, encoder_name(serve.name), frames_name(serve.name)):
         if name not in names and (repository / name).exists():
@@ -230,9 +246,10 @@ def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], serve
         if not (repository / model.name).exists():
             continue
         there = _read_config(repository, model.name)
-        for kind in ("input", "output"):
-            expected, got = ([str(t) for t in getattr(config, kind)] for config in (there, model.config))
-            if expected != got:
+        known = {tensor.name for tensor in there.input}
+        inputs = [tensor for tensor in model.config.input if tensor.name in known or not tensor.optional]
+        for kind, before, after in (("input", there.input, inputs), ("output", there.output, model.config.output)):
+            if list(before) != list(after):
                 raise ExportError(
                     f"{repository / model.name}: expected a checkpoint with the same {kind}s as its other versions, "
                     "got one with different shapes; choose another --name or --repository"

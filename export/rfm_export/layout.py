@@ -119,11 +119,9 @@ def vlm_models(
 ) -> list[GeneratedModel]:
     """The one model of a vision-language checkpoint."""
     outputs = wire.score_outputs(config.progress_bins if config.progress_bins > 1 else None)
-    shares_values = not (config.multi_image or config.generates_text)
-    limits = _limits(config.trained_frames, _frame_size(config), FRAMES_PER_GROUP if shares_values else 1)
+    limits = _limits(config.trained_frames, _frame_size(config), 1 if config.multi_image else FRAMES_PER_GROUP)
     frames = Interface(frames_name(serve.name), wire.frame_inputs(), outputs, {**limits, **about})
-    # What a model that generates text says to blank frames need not be an answer, and a failed warm-up fails the load.
-    warmups = [] if config.generates_text else _warmups(_warmup_frames(), config.has_similarity)
+    warmups = _warmups(_warmup_frames(), config.has_similarity)
     return [_python_model(frames, "rfm", serve, num_gpus, version, warmups)]
 
 
@@ -178,5 +176,4 @@ def _warmup_frames() -> Trajectory:
 
 
 def _encoder_warmup() -> Warmup:
-    tensors = wire.encode_samples([ProgressSample(_warmup_frames())])
-    return Warmup("frames", {spec.name: tensors[spec.name] for spec in wire.encoder_inputs()})
+    return Warmup("frames", wire.encode_frames(_warmup_frames()))

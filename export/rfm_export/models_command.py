@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """``rfm models``: which models, and which versions of them, a running server serves.
 
-NAME is that of ``rfm export --name``: it stands for all models of the checkpoint.
+NAME is that of ``rfm export --name``: it stands for all models of the checkpoint. The server is reached over gRPC: a
+load over HTTP would keep its other callers waiting.
 """
 
 from __future__ import annotations
@@ -16,10 +17,12 @@ import typer
 
 from rfm.server.admin_key import AdminKeyError, take_key
 from rfm.server.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
+from rfm_client.access import Access
 from rfm_export.errors import ExportError
 from rfm_export.rollout import Rollout, models_of, previous_version
 
-DEFAULT_URL = "http://127.0.0.1:8000"
+DEFAULT_URL = "grpc://127.0.0.1:8001"
+SECURE = "grpcs://"
 EXIT_FAILED = 1
 
 app = typer.Typer(no_args_is_help=True)
@@ -30,18 +33,33 @@ AdminKeyFile = Annotated[
 ]
 Name = Annotated[str, typer.Argument(help="As in rfm export --name.")]
 Repository = Annotated[Path, typer.Option(help="The repository that the server reads.")]
-Url = Annotated[str, typer.Option(help="The server, over HTTP.")]
+Url = Annotated[str, typer.Option(help="grpc://host:port of the server, with TLS grpcs://host:port.")]
 
 
 @app.callback()
-def models() -> None:
+def models(
+    context: typer.Context,
+    ca_file: Annotated[
+        Path | None, typer.Option(envvar="RFM_CA_FILE", help="Authorities (PEM) to trust; else gRPC's own.")
+    ] = None,
+    client_certificate: Annotated[
+        Path | None, typer.Option(envvar="RFM_CLIENT_CERTIFICATE", help="By which the server knows you (PEM).")
+    ] = None,
+    client_key: Annotated[
+        Path | None, typer.Option(envvar="RFM_CLIENT_KEY", help="The certificate's key (PEM).")
+    ] = None,
+) -> None:
     """List, load and unload the models of a running server; serve another version of them without losing a request."""
+    try:
+        context.obj = Access(ca_file, client_certificate, client_key)
+    except ValueError as error:
+        raise _failed(error) from None
 
 
 @app.command("list")
-def list_models(url: Url = DEFAULT_URL, admin_key_file: AdminKeyFile = None) -> None:
+def list_models(context: typer.Context, url: Url = DEFAULT_URL, admin_key_file: AdminKeyFile = None) -> None:
     """Each version of each model, its state, and why it is not ready."""
-    with _server(url, admin_key_file) as server:
+    with _server(context, url, admin_key_file) as server:
         rows = [_row(entry) for entry in server.index()]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
@@ -49,18 +67,30 @@ def list_models(url: Url = DEFAULT_URL, admin_key_file: AdminKeyFile = None) -> 
 
 
 @app.command()
-def load(name: Name, repository: Repository, url: Url = DEFAULT_URL, admin_key_file: AdminKeyFile = None) -> None:
+def load(
+    context: typer.Context,
+    name: Name,
+    repository: Repository,
+    url: Url = DEFAULT_URL,
+    admin_key_file: AdminKeyFile = None,
+) -> None:
     """Serve what the configurations of NAME say: a new name, or one that was unloaded."""
-    with _server(url, admin_key_file) as server:
+    with _server(context, url, admin_key_file) as server:
         for model in models_of(repository, name):
             server.load(model)
             typer.echo(f"{model}: {', '.join(map(str, server.ready_versions(model)))} ready")
 
 
 @app.command()
-def unload(name: Name, repository: Repository, url: Url = DEFAULT_URL, admin_key_file: AdminKeyFile = None) -> None:
+def unload(
+    context: typer.Context,
+    name: Name,
+    repository: Repository,
+    url: Url = DEFAULT_URL,
+    admin_key_file: AdminKeyFile = None,
+) -> None:
     """Serve NAME no more, once the requests in flight are answered. Its files stay."""
-    with _server(url, admin_key_file) as server:
+    with _server(context, url, admin_key_file) as server:
         for model in reversed(models_of(repository, name)):
             server.unload(model)
             server.wait_gone(model)
@@ -69,6 +99,7 @@ def unload(name: Name, repository: Repository, url: Url = DEFAULT_URL, admin_key
 
 @app.command()
 def rollout(
+    context: typer.Context,
     name: Name,
     version: Annotated[int, typer.Argument(min=1, help="The version folder to serve.")],
     repository: Repository,
@@ -76,29 +107,44 @@ def rollout(
     admin_key_file: AdminKeyFile = None,
 ) -> None:
     """Serve another version of NAME: loaded beside the old one, probed, then alone. If it fails the old one stays."""
-    with _server(url, admin_key_file) as server:
+    with _server(context, url, admin_key_file) as server:
         Rollout(repository, name, server, typer.echo).to(version)
         typer.echo(f"{name}: version {version} is served")
 
 
 @app.command()
-def rollback(name: Name, repository: Repository, url: Url = DEFAULT_URL, admin_key_file: AdminKeyFile = None) -> None:
+def rollback(
+    context: typer.Context,
+    name: Name,
+    repository: Repository,
+    url: Url = DEFAULT_URL,
+    admin_key_file: AdminKeyFile = None,
+) -> None:
     """Serve the version before the one that is served, as rollout does."""
-    with _server(url, admin_key_file) as server:
+    with _server(context, url, admin_key_file) as server:
         version = previous_version(repository, name, server)
         Rollout(repository, name, server, typer.echo).to(version)
         typer.echo(f"{name}: version {version} is served")
 
 
 @contextmanager
-def _server(url: str, admin_key_file: Path | None) -> Iterator[RepositoryApi]:
+def _server(context: typer.Context, url: str, admin_key_file: Path | None) -> Iterator[RepositoryApi]:
     """The server; what goes wrong with it ends the command with one line."""
+    access: Access = context.obj
     try:
-        with RepositoryApi(url, take_key(admin_key_file, os.environ)) as server:
+        if access.uses_tls and not url.startswith(SECURE):
+            raise RepositoryApiError(f"url: expected {SECURE}host:port with certificates, got {url}")
+        with RepositoryApi(
+            url, take_key(admin_key_file, os.environ), access.grpc_options(url.partition(":")[0])
+        ) as server:
             yield server
     except (AdminKeyError, RepositoryApiError, ExportError, OSError) as error:
-        typer.echo(f"rfm: {error}", err=True)
-        raise typer.Exit(EXIT_FAILED) from None
+        raise _failed(error) from None
+
+
+def _failed(error: Exception) -> typer.Exit:
+    typer.echo(f"rfm: {error}", err=True)
+    return typer.Exit(EXIT_FAILED)
 
 
 def _row(entry: ModelVersion) -> tuple[str, ...]:

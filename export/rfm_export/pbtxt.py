@@ -13,7 +13,7 @@ from google.protobuf import text_format
 from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.config import ServeConfig
-from rfm.server.batch_model import BUDGET_PARAMETER, DTYPE_PARAMETER, THREADS_PARAMETER
+from rfm.server.batch_model import BUDGET_PARAMETER, DTYPE_PARAMETER, SAMPLE_TOKENS_PARAMETER, THREADS_PARAMETER
 from rfm_client import wire
 from rfm_client.wire import TensorSpec
 
@@ -64,11 +64,12 @@ def python_config(
         group.kind = pb.ModelInstanceGroup.KIND_GPU
         group.gpus.extend(range(num_gpus))
     config.parameters[BUDGET_PARAMETER].string_value = str(serve.token_budget)
+    config.parameters[SAMPLE_TOKENS_PARAMETER].string_value = str(serve.max_sample_tokens)
     config.parameters[THREADS_PARAMETER].string_value = str(serve.torch_threads)
     config.parameters[DTYPE_PARAMETER].string_value = serve.dtype or ""
     for warmup in warmups:
         sample = config.model_warmup.add(name=warmup.name, batch_size=1)
-        for spec in interface.inputs:
+        for spec in [spec for spec in interface.inputs if spec.name in warmup.tensors]:
             tensor = sample.inputs[spec.name]
             tensor.data_type = _datatype(spec)
             tensor.dims.extend(warmup.tensors[spec.name].shape[1:])
@@ -116,10 +117,10 @@ def parse(text: str) -> pb.ModelConfig:
 
 
 def _config(interface: Interface, serve: ServeConfig, version: int) -> pb.ModelConfig:
-    config = pb.ModelConfig(name=interface.name, max_batch_size=serve.batch_size)
+    config = pb.ModelConfig(name=interface.name, max_batch_size=serve.max_batch_size)
     config.version_policy.specific.versions.append(version)
     for spec in interface.inputs:
-        config.input.add(name=spec.name, data_type=_datatype(spec), dims=spec.dims)
+        config.input.add(name=spec.name, data_type=_datatype(spec), dims=spec.dims, optional=spec.optional)
     for spec in interface.outputs:
         config.output.add(name=spec.name, data_type=_datatype(spec), dims=spec.dims)
     for name, limit in interface.limits.items():

@@ -4,6 +4,10 @@
 New version folders appear whole (written aside, then renamed) and are not served until the configurations,
 replaced one by one, name them. The order in which that happens keeps every intermediate state consistent.
 
+What is written aside lies in the repository, since nothing else need be writable, or be the same file system. Triton
+takes every folder there for a model, unless it is told which to load, but ignores a model's folders that have no number
+for a name. So the scratch folder is a model's. Only while there is none yet, it is the repository's.
+
 A model has one configuration for all its versions, which tells the checkpoint of the newest. So each version folder
 keeps the one that it was exported with, for the day when it is served again (``rollout``).
 """
@@ -26,6 +30,8 @@ from rfm_export.errors import ExportError
 from rfm_export.layout import CONFIG_FILE, WARMUP_FOLDER, GeneratedModel
 from rfm_export.pbtxt import parse, render, serving_versions
 
+_SCRATCH = ".export-"
+
 _log = logging.getLogger(__name__)
 
 
@@ -47,9 +53,9 @@ def alone(repository: Path) -> Iterator[None]:
             raise
         _log.warning("%s: expected a file system with locks, got: %s: nothing keeps others out", repository, error)
     else:
-        prefix, parent = _scratch_place(repository)
-        for left in [path for path in parent.iterdir() if path.name.startswith(prefix)]:
-            shutil.rmtree(left, ignore_errors=True)
+        for place in (repository, *_models(repository)):
+            for left in list(place.glob(f"{_SCRATCH}*")):
+                shutil.rmtree(left, ignore_errors=True)
     try:
         yield
     finally:
@@ -57,21 +63,22 @@ def alone(repository: Path) -> Iterator[None]:
 
 
 @contextmanager
-def staging(repository: Path) -> Iterator[Path]:
-    """A folder on the repository's file system, gone afterwards."""
-    prefix, parent = _scratch_place(repository)
-    folder = Path(tempfile.mkdtemp(prefix=prefix, dir=parent))
+def staging(repository: Path, names: Sequence[str]) -> Iterator[Path]:
+    """A scratch folder in the repository, gone afterwards. names: of the models that change, if they are there
+
+    It lies in one of those: with another folder in it, a model is loaded anew when Triton is told to load it meanwhile.
+    """
+    changing = [repository / name for name in names if (repository / name / CONFIG_FILE).is_file()]
+    folder = Path(tempfile.mkdtemp(prefix=_SCRATCH, dir=next(iter([*changing, *_models(repository)]), repository)))
     try:
         yield folder
     finally:
         shutil.rmtree(folder)
 
 
-def _scratch_place(repository: Path) -> tuple[str, Path]:
-    """Of staging folders, how their names begin and where they lie: beside the repository, or in a mounted one."""
-    repository = repository.resolve()
-    beside = repository.parent.stat().st_dev == repository.stat().st_dev
-    return f".{repository.name}.export-", repository.parent if beside else repository
+def _models(repository: Path) -> list[Path]:
+    """Their folders."""
+    return sorted(file.parent for file in repository.glob(f"[!.]*/{CONFIG_FILE}"))
 
 
 def next_version(repository: Path, names: Sequence[str]) -> int:

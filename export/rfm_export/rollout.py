@@ -151,7 +151,7 @@ class Rollout:
         self.server.load(config.name)
 
     def _write(self, config: pb.ModelConfig) -> None:
-        with staging(self.repository) as scratch:
+        with staging(self.repository, [config.name]) as scratch:
             replace_config(self.repository, config, scratch)
 
     def _configs(self, models: Sequence[str], versions: Mapping[str, int]) -> dict[str, pb.ModelConfig]:

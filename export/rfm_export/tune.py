@@ -38,7 +38,7 @@ class Setting:
 
     instances: int
     torch_threads: int
-    batch_size: int
+    max_batch_size: int
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Sweep:
         """
         trials = self._trials(self._instances())
         best = quickest(trials)
-        sizes = [replace(best.setting, batch_size=n) for n in BATCH_SIZES if n != best.setting.batch_size]
+        sizes = [replace(best.setting, max_batch_size=n) for n in BATCH_SIZES if n != best.setting.max_batch_size]
         fastest = max(self._trials(sizes), key=lambda trial: trial.samples_per_s)
         return fastest.setting if best.samples_per_s < AS_FAST * fastest.samples_per_s else best.setting
 
@@ -164,7 +164,7 @@ async def _ask(url: str, model: str, samples: Sequence[Sample], callers: int, se
 def _apply(setting: Setting, repository: Path) -> None:
     """Rewrites the configurations, which are links until then."""
     for name, config in _configs(repository).items():
-        config.max_batch_size = setting.batch_size
+        config.max_batch_size = setting.max_batch_size
         for group in config.instance_group:
             group.count = setting.instances
             config.parameters[THREADS_PARAMETER].string_value = str(setting.torch_threads)

@@ -2,8 +2,9 @@
 """Upstream's checkpoint layouts -> configuration and weights.
 
 A checkpoint is a local folder or a Hugging Face id ``org/name[@tag]``. In it: ``model.safetensors`` (or shards
-with an index, or an adapter), ``config.json`` (the network) and, in the folder or its parent, ``config.yaml``
-(the training run). Nothing in a checkpoint is executed: safetensors only, and YAML tags construct nothing.
+with an index, or an adapter), ``config.json`` (the network) and, in the folder, its parent or on main of the Hub's
+repository, ``config.yaml`` (the training run). Nothing in a checkpoint is executed: safetensors only, and YAML tags
+construct nothing.
 """
 
 from __future__ import annotations
@@ -33,14 +34,16 @@ __all__ = [
 ]
 
 
-def load(source: str | Path, *, base_model: str | None = None) -> Checkpoint:
+def load(source: str | Path, *, base_model: str | None = None, resize_images: bool | None = None) -> Checkpoint:
     """The checkpoint at a local folder or Hugging Face id. Raises CheckpointError.
 
     base_model: folder or id of a vision-language checkpoint's backbone; else the one that the checkpoint names
+    resize_images: of a vision-language checkpoint that reads frames as images and whose run set a size for them:
+        whether it was trained with that size; None: such a checkpoint is refused
     """
     folder = find(source)
     if is_there(folder / ADAPTER_CONFIG) or _model_type(folder) in BACKBONES:
-        return load_vlm(folder, base_model)
+        return load_vlm(folder, base_model, resize_images)
     return load_rewind(folder)
 
 

@@ -19,6 +19,7 @@ NETWORK_CONFIG = "config.json"
 RUN_CONFIG = "config.yaml"
 
 _BEST_TAG = re.compile(r"best-.*?-(-?\d+\.\d+)-step-\d+")
+_COMMIT_DIGITS = 40
 MAX_COUNT = 2**20  # of frames: longer than any trajectory
 _PICKLES = ("*.bin", "*.pt", "*.pth", "*.ckpt", "*.pkl")
 _CONVERT = (
@@ -50,9 +51,20 @@ def best_tag(tags: Iterable[str]) -> str | None:
 
 
 def find_run_config(folder: Path) -> Path | None:
-    """config.yaml in the checkpoint's folder or its parent."""
-    candidates = (folder / RUN_CONFIG, folder.resolve().parent / RUN_CONFIG)
+    """config.yaml in the checkpoint's folder, its parent or, of a snapshot in the Hub's cache, main's snapshot."""
+    home = folder.resolve()
+    candidates = (folder / RUN_CONFIG, home.parent / RUN_CONFIG, *_run_config_of_main(home))
     return next((file for file in candidates if is_there(file)), None)
+
+
+def _run_config_of_main(home: Path) -> list[Path]:
+    """Where the Hub's cache has main's config.yaml: in the snapshot of the commit in refs/main, beside ``home``."""
+    main = home.parent.parent / "refs" / "main"
+    if home.parent.name != "snapshots" or not is_there(main):
+        return []
+    with main.open("rb") as file:
+        commit = file.read(_COMMIT_DIGITS + 1)
+    return [home.parent / commit.decode() / RUN_CONFIG] if re.fullmatch(rb"[0-9a-f]+", commit) else []
 
 
 def check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> None:
@@ -111,9 +123,25 @@ def _fetch(repo_id: str, tag: str | None) -> Path:
     try:
         if tag is None:
             tag = best_tag(ref.name for ref in HfApi().list_repo_refs(repo_id).tags)
-        return Path(snapshot_download(repo_id, revision=tag, allow_patterns=patterns))
+        folder = Path(snapshot_download(repo_id, revision=tag, allow_patterns=patterns))
+        if not is_there(folder / RUN_CONFIG):  # upstream's uploader tags a commit of before config.yaml's
+            _fetch_run_config_of_main(repo_id)
+        return folder
     except (HfHubHTTPError, HFValidationError, OSError) as error:
         raise CheckpointError(f"{repo_id}@{tag or 'latest'}: cannot be fetched: {error}") from error
+
+
+def _fetch_run_config_of_main(repo_id: str) -> None:
+    """Puts it into the Hub's cache, where ``find_run_config`` looks; main may have none either."""
+    from huggingface_hub import hf_hub_download
+    from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
+
+    try:
+        hf_hub_download(repo_id, RUN_CONFIG)
+    except LocalEntryNotFoundError:  # the Hub was not asked
+        raise
+    except EntryNotFoundError:
+        return
 
 
 def read_weights(folder: Path) -> dict[str, Tensor]:

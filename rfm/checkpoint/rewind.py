@@ -35,8 +35,8 @@ MODEL_TYPE = "rewind_transformer"
 IMAGE_ENCODER_PREFIX = "image_encoder."
 TEXT_ENCODER_PREFIX = "text_encoder."
 
-# What the weights' shapes cannot tell, and what it is where a checkpoint does not say (older ones).
-_STATED_DEFAULTS: dict[str, Any] = {"causal_mask": False, "max_len": 16}
+# Upstream's configurations of before causal_mask, when no network had one, state all of these.
+_FIRST_FIELDS = {"video_feature_dim", "text_feature_dim", "hidden_dim", "num_layers", "num_attention_heads", "max_len"}
 # What no ReWiND network is beyond, nor below 1: whatever is larger is a lie that would only cost memory and time.
 _LIMITS = {
     "video_feature_dim": MAX_COUNT,
@@ -101,15 +101,16 @@ def _rewind_config(folder: Path, weights: Mapping[str, Tensor]) -> RewindConfig:
     stated = _stated(folder)
     has_progress_tokens = "prog_token_A" in weights
     try:
+        max_len = _shape(weights, "prog_token_A", 3)[1] if has_progress_tokens else _required(stated, "max_len", folder)
         hidden_dim, video_feature_dim = _shape(weights, "video_proj.weight", 2)
         config = RewindConfig(
             video_feature_dim=video_feature_dim,
             text_feature_dim=_shape(weights, "text_proj.weight", 2)[1],
             hidden_dim=hidden_dim,
             num_layers=len({name.split(".")[2] for name in weights if name.startswith(_LAYERS)}),
-            num_attention_heads=stated["num_attention_heads"],
-            max_len=_shape(weights, "prog_token_A", 3)[1] if has_progress_tokens else stated["max_len"],
-            causal_mask=stated["causal_mask"],
+            num_attention_heads=_required(stated, "num_attention_heads", folder),
+            max_len=max_len,
+            causal_mask=_required(stated, "causal_mask", folder),
             use_per_frame_progress_token=has_progress_tokens,
             progress_bins=_shape(weights, "progress_head.4.weight", 2)[0],
             has_similarity="similarity_head.0.weight" in weights,
@@ -124,6 +125,14 @@ def _rewind_config(folder: Path, weights: Mapping[str, Tensor]) -> RewindConfig:
         heads = f"a divisor of the hidden width {config.hidden_dim}"
         raise CheckpointError(f"{folder}: num_attention_heads: expected {heads}, got {config.num_attention_heads}")
     return config
+
+
+def _required(stated: Mapping[str, Any], name: str, folder: Path) -> Any:
+    """Raises CheckpointError for what neither weights nor configurations tell."""
+    if name not in stated:
+        places = f"{NETWORK_CONFIG} or model.rewind of {RUN_CONFIG}"
+        raise CheckpointError(f"{folder}: {name}: expected it in {places}, got it in neither; weights do not tell it")
+    return stated[name]
 
 
 def _shape(weights: Mapping[str, Tensor], name: str, rank: int) -> torch.Size:
@@ -146,7 +155,7 @@ def _trained_frames(folder: Path) -> int | None:
 
 def _stated(folder: Path) -> dict[str, Any]:
     """What config.json and config.yaml say of the network. Both may lack a field; neither may contradict the other."""
-    sources = {}
+    sources: dict[str, dict[str, Any]] = {}
     if is_there(folder / NETWORK_CONFIG):
         sources[NETWORK_CONFIG] = read_json(folder / NETWORK_CONFIG)
     run_config = find_run_config(folder)
@@ -161,7 +170,7 @@ def _stated(folder: Path) -> dict[str, Any]:
         raise CheckpointError(
             f"{folder / NETWORK_CONFIG}: model_type: expected {MODEL_TYPE}, got {cut(str(model_type))}"
         )
-    stated = dict(_STATED_DEFAULTS)
+    stated: dict[str, Any] = {}
     for name, kind in _STATED_TYPES.items():
         values = {source: content[name] for source, content in sources.items() if name in content}
         for source, value in values.items():
@@ -171,4 +180,6 @@ def _stated(folder: Path) -> dict[str, Any]:
             raise CheckpointError(f"{folder}: {name}: expected {' and '.join(values)} to agree, got {values}")
         if values:
             stated[name] = next(iter(values.values()))
+    if any(content.keys() >= _FIRST_FIELDS for content in sources.values()):
+        stated.setdefault("causal_mask", False)
     return stated

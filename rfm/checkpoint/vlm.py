@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 from safetensors.torch import save_file
-from torch import Tensor, nn
+from torch import Tensor
 
 from rfm.checkpoint.content import (
     CheckpointError,
@@ -25,28 +25,23 @@ from rfm.checkpoint.content import (
     is_there,
     listed,
     read_json,
-    read_run_config,
     read_tensors,
     shown,
 )
 from rfm.checkpoint.files import (
     NETWORK_CONFIG,
-    RUN_CONFIG,
     WEIGHTS,
     check_shapes,
-    find_run_config,
     read_weights,
-    trained_frames,
 )
 from rfm.checkpoint.lora import LORA_NAME, merged, scaling
+from rfm.checkpoint.run_config import RunConfig
 from rfm.models.vlm import BACKBONES, SMOL, VlmConfig, VlmRewardModel, build_backbone
 
-VQA = "vqa"  # value of model.model_type of checkpoints that generate text
 ADAPTER_CONFIG = "adapter_config.json"
 ADAPTER_WEIGHTS = "adapter_model.safetensors"
 CUSTOM_HEADS = "custom_heads.safetensors"
 SETTINGS = "rfm"  # key of our own fields in an exported config.json
-LANGUAGE_HEAD = "lm_head.weight"
 EMBEDDING = "model.language_model.embed_tokens.weight"
 
 # Renames of one form, tried in order on each name; the first that matches is applied.
@@ -55,10 +50,6 @@ _FULL: _Renames = ()
 _SMOL: _Renames = ((r"^model\.model\.", "model."),)
 _LORA_INSIDE: _Renames = ((r"^(model\.\w+)\.base_model\.model\.", r"\1."),)
 _ADAPTER: _Renames = ((r"^base_model\.model\.", "model."),)
-_GENERATOR: _Renames = (  # as transformers saves the whole model of Qwen2.5-VL
-    (r"^visual\.", "model.visual."),
-    (r"^model\.(?=embed_tokens|layers|norm)", "model.language_model."),
-)
 _UNUSED = ("lm_head.weight", "model.lm_head.weight")  # makes text, which no reward head reads
 
 _LAYER_COUNTS = ("num_hidden_layers", "num_layers", "depth")
@@ -72,11 +63,8 @@ class VlmCheckpoint:
     config: VlmConfig
     weights: dict[str, Tensor]
 
-    def build(self, dtype: torch.dtype | None = None, attention: str | None = None) -> nn.Module:
-        """The network with these weights, on the CPU, ready to score, in ``dtype`` (None: its own).
-
-        VlmRewardModel, or of a checkpoint that generates text transformers' own network.
-        """
+    def build(self, dtype: torch.dtype | None = None, attention: str | None = None) -> VlmRewardModel:
+        """The network with these weights, on the CPU, ready to score, in ``dtype`` (None: its own)."""
         wanted = dtype or self.config.torch_dtype
         _check_transformers(self.config)
         network = self._network(wanted, attention)
@@ -91,26 +79,27 @@ class VlmCheckpoint:
             network = self._network(self.config.torch_dtype, "sdpa")
         check_shapes(network.state_dict(), self.weights)
 
-    def _network(self, dtype: torch.dtype, attention: str | None) -> nn.Module:
-        backbone = build_backbone(self.config, dtype, attention)
-        return backbone if self.config.generates_text else VlmRewardModel(self.config, backbone)
+    def _network(self, dtype: torch.dtype, attention: str | None) -> VlmRewardModel:
+        return VlmRewardModel(self.config, build_backbone(self.config, dtype, attention))
 
 
-def load_vlm(folder: Path, base_model: str | None = None) -> VlmCheckpoint:
-    """The checkpoint in a local folder; ``base_model`` as in ``rfm.checkpoint.load``. Raises CheckpointError."""
-    run = _run_config(folder)
+def load_vlm(folder: Path, base_model: str | None = None, resize_images: bool | None = None) -> VlmCheckpoint:
+    """The checkpoint in a local folder; other arguments as in ``rfm.checkpoint.load``. Raises CheckpointError."""
     with expecting("a vision-language checkpoint", folder):
-        if is_there(folder / ADAPTER_CONFIG):
-            backbone, weights = _adapted(folder, base_model or _base_model_id(folder, run))
+        is_adapter = is_there(folder / ADAPTER_CONFIG)
+        backbone = {} if is_adapter else read_json(folder / NETWORK_CONFIG)
+        if SETTINGS in backbone:  # written by save_vlm, which says all
+            config = _saved_config(backbone)
+            weights = _renamed(read_weights(folder), _renames(config.family))
         else:
-            backbone, weights = _whole(folder, run)
-        config = _vlm_config(folder, backbone, run, weights)
-        if config.generates_text:
-            weights = _renamed(weights, _GENERATOR)
-            if LANGUAGE_HEAD not in weights and backbone.get("tie_word_embeddings", True):
-                weights[LANGUAGE_HEAD] = weights[EMBEDDING]
-        else:
-            weights = {name: tensor for name, tensor in weights.items() if name not in _UNUSED}
+            run = RunConfig.of(folder)
+            run.check_model_type()
+            if is_adapter:
+                backbone, weights = _adapted(folder, base_model or _base_model_id(run))
+            else:
+                weights = _whole(folder, backbone, run)
+            config = _trained_config(folder, backbone, run, weights, resize_images)
+        weights = {name: tensor for name, tensor in weights.items() if name not in _UNUSED}
     checkpoint = VlmCheckpoint(config, weights)
     checkpoint.check()
     return checkpoint
@@ -123,64 +112,47 @@ def save_vlm(checkpoint: VlmCheckpoint, folder: Path) -> None:
     config = {**checkpoint.config.backbone, SETTINGS: settings}
     (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
     tensors = {name: tensor.contiguous() for name, tensor in checkpoint.weights.items()}
-    if LANGUAGE_HEAD in tensors and tensors[LANGUAGE_HEAD] is tensors.get(EMBEDDING):
-        del tensors[LANGUAGE_HEAD]  # tied: the file holds it once
     save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
 
 
-def _run_config(folder: Path) -> dict[str, Any]:
-    file = find_run_config(folder)
-    run = {} if file is None else read_run_config(file)
-    for section in ("model", "data", "training", "peft"):
-        if not isinstance(run.get(section) or {}, dict):
-            raise CheckpointError(f"{file}: {section}: expected a mapping, got {shown(run[section])}")
-    return run
-
-
-def _base_model_id(folder: Path, run: Mapping[str, Any]) -> str:
-    base = (run.get("model") or {}).get("base_model_id")
+def _base_model_id(run: RunConfig) -> str:
+    base = run.get("model.base_model_id", "")
     if not base:
-        raise CheckpointError(f"{folder}: expected model.base_model_id in {RUN_CONFIG} (or --base-model), got none")
-    return str(base)
+        raise CheckpointError(f"{run.file}: expected model.base_model_id (or --base-model), got none")
+    return base
 
 
-def _vlm_config(
-    folder: Path, backbone: dict[str, Any], run: Mapping[str, Any], weights: Mapping[str, Tensor]
+def _saved_config(content: Mapping[str, Any]) -> VlmConfig:
+    settings = {**content[SETTINGS]}
+    size = settings.pop("size_px")
+    rest = {name: value for name, value in content.items() if name != SETTINGS}
+    return VlmConfig(backbone=rest, size_px=tuple(size) if size else None, **settings)
+
+
+def _trained_config(
+    folder: Path,
+    backbone: dict[str, Any],
+    run: RunConfig,
+    weights: Mapping[str, Tensor],
+    resize_images: bool | None,
 ) -> VlmConfig:
-    if SETTINGS in backbone:  # written by save_vlm
-        settings = {**backbone[SETTINGS]}
-        size = settings.pop("size_px")
-        rest = {name: value for name, value in backbone.items() if name != SETTINGS}
-        return VlmConfig(backbone=rest, size_px=tuple(size) if size else None, **settings)
-    model, data, training = (run.get(section) or {} for section in ("model", "data", "training"))
     family = backbone.get("model_type")
     if family not in BACKBONES:
         raise CheckpointError(f"{folder}: model_type: expected one of {', '.join(BACKBONES)}, got {shown(family)}")
-    generates_text = model.get("model_type", "default") == VQA
-    if model.get("model_type", "default") not in ("default", VQA) or (generates_text and family == SMOL):
-        expected = "default (or vqa of a Qwen backbone)"
-        raise CheckpointError(f"{folder}: model.model_type: expected {expected}, got {shown(model['model_type'])}")
     for name in ("progress_head.4.weight", "frame_pool_attn.weight"):
-        if name not in weights and not generates_text:
+        if name not in weights:
             raise CheckpointError(f"{folder}: expected reward heads, got no {name}")
-    height, width = data.get("resized_height"), data.get("resized_width")
+    network = run.network()
     config = VlmConfig(
         backbone=backbone,
-        dtype=str(model.get("torch_dtype", "bfloat16")).removeprefix("torch."),  # type: ignore[arg-type]
-        multi_image=bool(model.get("use_multi_image", False)),
-        per_frame_progress_token=bool(model.get("use_per_frame_progress_token", False)) and not generates_text,
-        frame_pooling=model.get("frame_pooling", "mean"),
-        pooling_temperature=float(model.get("frame_pooling_attn_temperature", 1.0)),
-        average_temporal_patches=bool(model.get("average_temporal_patches", False)),
-        progress_bins=1 if generates_text else weights["progress_head.4.weight"].shape[0],
+        progress_bins=weights["progress_head.4.weight"].shape[0],
         has_similarity="similarity_head.0.weight" in weights,
-        progress_in_preference=bool(training.get("predict_pref_progress", False)),
-        size_px=(int(height), int(width)) if height and width else None,
-        base_model_id=str(model.get("base_model_id", "")),
-        generates_text=generates_text,
-        trained_frames=trained_frames(run, folder / RUN_CONFIG),
+        size_px=run.size_px(family, network["multi_image"], resize_images),
+        **network,
     )
-    _check_supported(folder, config)
+    if (family == SMOL or config.per_frame_progress_token) and not config.multi_image:
+        why = "SmolVLM" if family == SMOL else "per-frame progress tokens"
+        raise CheckpointError(f"{run.file}: use_multi_image with {why}: expected true, got false")
     return config
 
 
@@ -194,17 +166,8 @@ def _check_transformers(config: VlmConfig) -> None:
         raise CheckpointError(f"transformers: expected {expected}, got {version}")
 
 
-def _check_supported(folder: Path, config: VlmConfig) -> None:
-    expectations: dict[str, tuple[object, tuple[object, ...]]] = {
-        "model.torch_dtype": (config.dtype, ("float32", "bfloat16", "float16")),
-        "model.frame_pooling": (config.frame_pooling, ("mean", "boundary", "attention")),
-    }
-    if config.family == SMOL or config.per_frame_progress_token:
-        why = "SmolVLM" if config.family == SMOL else "per-frame progress tokens"
-        expectations[f"model.use_multi_image with {why}"] = (config.multi_image, (True,))
-    for where, (got, expected) in expectations.items():
-        if got not in expected:
-            raise CheckpointError(f"{folder}: {where}: expected one of {expected}, got {got!r}")
+def _renames(family: Any) -> _Renames:
+    return _SMOL if family == SMOL else _FULL
 
 
 def _renamed(weights: Mapping[str, Tensor], renames: _Renames) -> dict[str, Tensor]:
@@ -218,12 +181,12 @@ def _renamed(weights: Mapping[str, Tensor], renames: _Renames) -> dict[str, Tens
     return {rename(name): tensor for name, tensor in weights.items()}
 
 
-def _whole(folder: Path, run: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Configuration of the backbone, and all weights, LoRA's merged."""
-    backbone, weights = read_json(folder / NETWORK_CONFIG), read_weights(folder)
+def _whole(folder: Path, backbone: Mapping[str, Any], run: RunConfig) -> dict[str, Tensor]:
+    """All weights, LoRA's merged."""
+    weights = read_weights(folder)
     if any(LORA_NAME.fullmatch(name) for name in weights):
-        weights = merged(_renamed(weights, _LORA_INSIDE), scaling(folder / RUN_CONFIG, run.get("peft") or {}))
-    return backbone, _renamed(weights, _SMOL if backbone["model_type"] == SMOL else _FULL)
+        weights = merged(_renamed(weights, _LORA_INSIDE), scaling(run.file, run.sections["peft"]))
+    return _renamed(weights, _renames(backbone["model_type"]))
 
 
 def _check_layers(config: Any) -> None:

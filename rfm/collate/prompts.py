@@ -39,17 +39,6 @@ SIMILARITY_PROMPT = (
 )
 
 
-VQA_PROGRESS_PROMPT = (
-    "For the task '{task}', estimate task progress at each frame in the video trajectory. Give a list of numbers "
-    "between 0 and 1 where 0 means no progress and 1 means successful completion of the task. Format your answer as a "
-    "python list enclosed by <ans> and </ans> tags."
-)
-VQA_PREFERENCE_PROMPT = (
-    "Given these two trajectories for the task '{task}', which one best corresponds to solving the task? "
-    "Trajectory A or B? Format your answer enclosed by <ans> and </ans> tags."
-)
-
-
 @dataclass(frozen=True)
 class TrajectoryPart:
     """Where the frames of trajectory ``index`` (0 or 1) stand in a question."""
@@ -85,18 +74,4 @@ def question(sample: Sample, *, progress_in_preference: bool) -> list[Part]:
         "This is the second trajectory. ",
         TrajectoryPart(1),
         SIMILARITY_TOKEN,
-    ]
-
-
-def text_question(sample: ProgressSample | PreferenceSample) -> list[Part]:
-    """The parts of a question that is to be answered in text."""
-    task = sample.trajectories[0].task
-    if isinstance(sample, ProgressSample):
-        return [VQA_PROGRESS_PROMPT.replace("{task}", task), TrajectoryPart(0)]
-    return [
-        VQA_PREFERENCE_PROMPT.replace("{task}", task),
-        "This is Trajectory A. ",
-        TrajectoryPart(0),
-        "This is Trajectory B. ",
-        TrajectoryPart(1),
     ]

@@ -20,15 +20,7 @@ from torch import Tensor
 
 from rfm.collate.dense import prefix_indices
 from rfm.collate.images import FRAMES_PER_GROUP, Grid, QwenImages, SmolImages
-from rfm.collate.prompts import (
-    PREFERENCE_TOKEN,
-    PROGRESS_TOKEN,
-    SIMILARITY_TOKEN,
-    Part,
-    TrajectoryPart,
-    question,
-    text_question,
-)
+from rfm.collate.prompts import PREFERENCE_TOKEN, PROGRESS_TOKEN, SIMILARITY_TOKEN, TrajectoryPart, question
 from rfm.models.vlm import VlmBatch, VlmConfig
 from rfm_client import InvalidSampleError, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.samples import UInt8Array
@@ -93,8 +85,7 @@ class VlmCollator:
     def rows(self, sample: Sample) -> list[VlmRow]:
         """The conversations about a sample. Raises InvalidSampleError if the checkpoint cannot score it."""
         if isinstance(sample, SimilaritySample) and not self.config.has_similarity:
-            why = "answers in text" if self.config.generates_text else "has no similarity head"
-            supported = f"progress or preference (this checkpoint {why})"
+            supported = "progress or preference (this checkpoint has no similarity head)"
             raise InvalidSampleError.at("sample_type", supported, "similarity")
         frames = tuple(_frames(trajectory) for trajectory in sample.trajectories)
         self._check_task(sample.trajectories[0].task)
@@ -129,26 +120,18 @@ class VlmCollator:
 
     def _row(self, sample: Sample, frames: tuple[UInt8Array, ...]) -> VlmRow:
         parts: list[str | dict[str, str]] = []
-        for part in self._question(sample):
+        for part in question(sample, progress_in_preference=self.config.progress_in_preference):
             parts += self._frame_parts(len(frames[part.index])) if isinstance(part, TrajectoryPart) else [part]
         try:
             text = self._expanded(self._rendered(parts), frames)
         except ValueError as error:  # an image of a shape that cannot be brought to size
             raise InvalidSampleError.at("frames", *str(error).split(", got ")) from error
         ids = np.asarray(self.tokenizer(text, add_special_tokens=False, verbose=False)["input_ids"], np.int64)
-        if self.config.generates_text:
-            return VlmRow(ids, frames, (), None, is_similarity=False)
         pair = len(frames) > 1
         is_similarity = isinstance(sample, SimilaritySample)
         query_token = SIMILARITY_TOKEN if is_similarity else PREFERENCE_TOKEN
         query = int(self._positions(ids, query_token)[-1]) if pair else None
         return VlmRow(ids, frames, self._spans(ids, frames), query, is_similarity)
-
-    def _question(self, sample: Sample) -> list[Part]:
-        if self.config.generates_text:
-            assert not isinstance(sample, SimilaritySample)  # refused before
-            return text_question(sample)
-        return question(sample, progress_in_preference=self.config.progress_in_preference)
 
     def _frame_parts(self, num_frames: int) -> list[str | dict[str, str]]:
         """Placeholders of one trajectory in the conversation."""

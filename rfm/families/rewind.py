@@ -15,6 +15,7 @@ from rfm.family import RowScores, checked, frame_scores, part_of
 from rfm.models.encoders import Encoders
 from rfm.models.rewind import RewindBatch, RewindTransformer
 from rfm_client import InvalidSampleError, ProgressSample, RewardError, Sample, Trajectory
+from rfm_client.samples import Footage
 
 
 class RewindFamily:
@@ -86,7 +87,8 @@ class RewindFamily:
     def _embedded(self, samples: Sequence[Sample], execution: Execution) -> list[Sample | RewardError]:
         """The samples with embeddings in place of raw frames."""
         embedded: list[Sample | RewardError] = list(samples)
-        raw = {i: _joined(sample) for i, sample in enumerate(samples) if sample.trajectories[0].frames is not None}
+        of_frames = {i: s for i, s in enumerate(samples) if s.trajectories[0].frames is not None}
+        raw = {index: Footage(sample.trajectories) for index, sample in of_frames.items()}
         if raw and self.encoders is None:
             missing = InvalidSampleError.at("frames", "video_embeddings (no encoders are loaded)", "frames")
             return [missing if index in raw else sample for index, sample in enumerate(samples)]
@@ -99,16 +101,10 @@ class RewindFamily:
         return embedded
 
 
-def _joined(sample: Sample) -> Trajectory:
-    """All frames of a sample and its task, as one trajectory."""
-    frames = np.concatenate([trajectory.positions for trajectory in sample.trajectories])
-    return Trajectory(frames=frames, task=sample.trajectories[0].task)
-
-
-def _with_embeddings(sample: Sample, joined: Trajectory) -> Sample:
+def _with_embeddings(sample: Sample, encoded: Trajectory) -> Sample:
     bounds = np.cumsum([trajectory.num_frames for trajectory in sample.trajectories])[:-1]
-    videos = np.split(joined.positions, bounds)
-    parts = [Trajectory(video_embeddings=video, text_embedding=joined.text_embedding) for video in videos]
+    videos = np.split(encoded.positions, bounds)
+    parts = [Trajectory(video_embeddings=video, text_embedding=encoded.text_embedding) for video in videos]
     if isinstance(sample, ProgressSample):
         return replace(sample, trajectory=parts[0])
     return type(sample)(parts[0], parts[1])

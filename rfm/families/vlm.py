@@ -21,7 +21,6 @@ from rfm.models.linear import speed_up
 from rfm.models.vlm import SMOL, VlmBatch, VlmConfig
 from rfm_client import FrameScores, InvalidSampleError, RewardError, Sample
 
-CHAT_TEMPLATE = "chat_template.json"
 SMOL_SIZE_PX = 512  # what upstream sets, whatever the base model says; so no image is split
 
 
@@ -34,6 +33,7 @@ class VlmFamily:
         self.collator = collator
         self.device = device
         self._dtype = next(network.parameters()).dtype
+        self._max_tokens = int(network.model.config.get_text_config().max_position_embeddings)
 
     @classmethod
     def of(
@@ -48,10 +48,18 @@ class VlmFamily:
         outcomes: list[list[VlmRow] | RewardError] = []
         for sample in samples:
             try:
-                outcomes.append(self.collator.rows(sample))
+                outcomes.append(self._checked(self.collator.rows(sample)))
             except InvalidSampleError as error:
                 outcomes.append(error)
         return outcomes
+
+    def _checked(self, rows: list[VlmRow]) -> list[VlmRow]:
+        """The backbone has learned no positions beyond its own; its scores of those would mean nothing."""
+        longest = max(row.num_tokens for row in rows)
+        if longest > self._max_tokens:
+            expected = f"at most {self._max_tokens} tokens (max_position_embeddings of this checkpoint)"
+            raise InvalidSampleError.at("num_frames", expected, f"{longest} tokens")
+        return rows
 
     def lengths(self, row: VlmRow) -> tuple[int, ...]:
         """Tokens of the conversation."""
@@ -66,7 +74,7 @@ class VlmFamily:
         return self.collator.collate(rows)
 
     def occupancy(self, batch: VlmBatch) -> tuple[int, int]:
-        """Of conversations, padded to the longest; to be continued, before what is generated."""
+        """Of conversations, padded to the longest."""
         mask = batch.inputs["attention_mask"]
         return int(mask.sum()), mask.numel()
 
@@ -105,19 +113,29 @@ def load_collator(checkpoint: VlmCheckpoint, processor: str | Path) -> VlmCollat
     try:
         tokenizer = AutoTokenizer.from_pretrained(str(processor), use_fast=True, trust_remote_code=False)
         preprocessor = read_json(Path(str(cached_file(str(processor), PREPROCESSOR_CONFIG))))
-        if tokenizer.chat_template is None:
-            tokenizer.chat_template = read_json(Path(str(cached_file(str(processor), CHAT_TEMPLATE))))["chat_template"]
-    except (OSError, ValueError) as error:
+        tokenizer.chat_template = _chat_template(processor, tokenizer)
+    except (LookupError, OSError, ValueError) as error:
         hint = "name its folder with --base-model"
         raise CheckpointError(f"base model {processor}: tokenizer and processor: {error} ({hint})") from error
-    if not checkpoint.config.generates_text:
-        tokenizer.add_tokens(list(SPECIAL_TOKENS), special_tokens=True)
+    tokenizer.add_tokens(list(SPECIAL_TOKENS), special_tokens=True)
     rows = next(t for name, t in checkpoint.weights.items() if name.endswith("embed_tokens.weight")).shape[0]
-    exact = not checkpoint.config.generates_text  # upstream resizes the embedding where it appends tokens
-    if len(tokenizer) != rows if exact else len(tokenizer) > rows:
+    if len(tokenizer) != rows:  # upstream resizes the embedding to it
         expected = f"a tokenizer of {rows} tokens with the special ones, as the checkpoint's embedding"
         raise CheckpointError(f"base model {processor}: expected {expected}, got {len(tokenizer)}")
     return _collator(checkpoint.config, tokenizer, preprocessor, processor)
+
+
+def _chat_template(processor: str | Path, tokenizer: Any) -> str:
+    """The processor's, by which upstream prompts; the tokenizer's where the processor has none. Raises ValueError."""
+    from transformers import ProcessorMixin
+
+    of_processor = ProcessorMixin.get_processor_dict(str(processor))[0].get("chat_template")
+    template = tokenizer.chat_template if of_processor is None else of_processor
+    if isinstance(template, dict):  # several, by name
+        template = template.get("default")
+    if not isinstance(template, str):
+        raise ValueError("expected a chat template, got none")
+    return template
 
 
 def save_processor(collator: VlmCollator, folder: Path) -> None:

@@ -29,7 +29,7 @@ from rfm.execution import Execution
 from rfm.models.linear import speed_up
 from rfm_client import InferenceFailedError, InvalidSampleError, RewardError, Trajectory
 from rfm_client.resize import FrameSize
-from rfm_client.samples import Float32Array, UInt8Array
+from rfm_client.samples import Float32Array, Footage, UInt8Array, joined, stackable
 
 IMAGES_PER_FORWARD = 64
 MAX_ENCODER_ASPECT_RATIO = 50
@@ -182,30 +182,31 @@ class Encoders:
         """Dt."""
         return int(self.text_model.config.hidden_size)
 
-    def encode(
-        self, trajectories: Sequence[Trajectory], execution: Execution | None = None
-    ) -> list[Trajectory | RewardError]:
-        """Trajectories of embeddings for trajectories of frames and task, or the error of one that has none.
+    def encode(self, samples: Sequence[Footage], execution: Execution | None = None) -> list[Trajectory | RewardError]:
+        """The embeddings of each sample's frames, one trajectory after the other, and task, or why there are none.
 
         execution: what it took is added to it; its tokens are those of images, which have no padding, and of tasks
         """
         execution = execution or Execution()
         began_s, collated_s = time.perf_counter(), execution.collate_s
         outcomes: dict[int, Trajectory | RewardError] = {}
-        for index, trajectory in enumerate(trajectories):
+        for index, footage in enumerate(samples):
             try:
-                self._check_task(trajectory.task)
-                _check_shape(trajectory)
+                self._check_task(footage.trajectories[0].task)
+                for trajectory in footage.trajectories:
+                    _check_shape(trajectory)
             except InvalidSampleError as error:
                 outcomes[index] = error
-        good = [index for index in range(len(trajectories)) if index not in outcomes]
+        good = [index for index in range(len(samples)) if index not in outcomes]
         if good:
-            videos = self.encode_frames([trajectories[index].positions for index in good], execution)
-            texts = self.encode_tasks([trajectories[index].task for index in good], execution)
-            for index, video, text in zip(good, videos, texts, strict=True):
-                outcomes[index] = _embedded(video, text)
+            parts = {index: stackable(samples[index].trajectories) for index in good}
+            videos = self.encode_frames([joined(part) for of_sample in parts.values() for part in of_sample], execution)
+            texts = self.encode_tasks([samples[index].trajectories[0].task for index in good], execution)
+            encoded = iter(videos)
+            for (index, of_sample), text in zip(parts.items(), texts, strict=True):
+                outcomes[index] = _embedded(list(islice(encoded, len(of_sample))), text)
         execution.forward_s += time.perf_counter() - began_s - (execution.collate_s - collated_s)
-        return [outcomes[index] for index in range(len(trajectories))]
+        return [outcomes[index] for index in range(len(samples))]
 
     @torch.inference_mode()
     def encode_frames(
@@ -277,15 +278,16 @@ def _of_video(images: Sequence[Tensor | InferenceFailedError]) -> Float32Array |
 
 
 def _embedded(
-    video: Float32Array | InferenceFailedError, text: Float32Array | InferenceFailedError
+    videos: Sequence[Float32Array | InferenceFailedError], text: Float32Array | InferenceFailedError
 ) -> Trajectory | RewardError:
-    if isinstance(video, InferenceFailedError):
-        return video
-    if isinstance(text, InferenceFailedError):
-        return text
-    if not (np.isfinite(video).all() and np.isfinite(text).all()):
-        return InferenceFailedError("an encoder gave an embedding that is not finite")
-    return Trajectory(video_embeddings=video, text_embedding=text)
+    embeddings = []
+    for outcome in (*videos, text):
+        if isinstance(outcome, InferenceFailedError):
+            return outcome
+        if not np.isfinite(outcome).all():
+            return InferenceFailedError("an encoder gave an embedding that is not finite")
+        embeddings.append(outcome)
+    return Trajectory(video_embeddings=np.concatenate(embeddings[:-1]), text_embedding=embeddings[-1])
 
 
 def _check_shape(trajectory: Trajectory) -> None:

@@ -21,11 +21,6 @@ from rfm.models.heads import PredictionHead
 Pooling: TypeAlias = Literal["mean", "boundary", "attention"]
 
 BACKBONES = {"qwen2_5_vl": "Qwen2_5_VLModel", "qwen3_vl": "Qwen3VLModel", "smolvlm": "SmolVLMModel"}
-GENERATORS = {
-    "qwen2_5_vl": "Qwen2_5_VLForConditionalGeneration",
-    "qwen3_vl": "Qwen3VLForConditionalGeneration",
-    "smolvlm": "SmolVLMForConditionalGeneration",
-}
 SMOL = "smolvlm"
 
 
@@ -42,7 +37,6 @@ class VlmConfig:
     average_temporal_patches: in video mode, a group's tokens are averaged; else the token behind them is read
     progress_in_preference: questions of preference ask for progress too
     size_px: height and width that every frame is brought to; None: each its own
-    generates_text: no heads; the backbone with its language head writes the answer
     trained_frames: the most frames of a trajectory in training; None: the checkpoint does not say
     """
 
@@ -58,7 +52,6 @@ class VlmConfig:
     progress_in_preference: bool
     size_px: tuple[int, int] | None
     base_model_id: str
-    generates_text: bool = False
     trained_frames: int | None = None
 
     @property
@@ -68,8 +61,8 @@ class VlmConfig:
 
     @property
     def pads_left(self) -> bool:
-        """On which side the checkpoint was trained to be padded; to be continued, text must end at the end."""
-        return self.family == SMOL or self.generates_text
+        """On which side the checkpoint was trained to be padded."""
+        return self.family == SMOL
 
     @property
     def hidden_dim(self) -> int:
@@ -146,18 +139,32 @@ class VlmRewardModel(nn.Module):
         )
 
     def _frame_states(self, hidden: Tensor, spans: Tensor) -> Tensor:
-        """[F, D]: each span's states, pooled; a span of one token is that token's state."""
+        """[F, D]: each span's states, pooled; a span of one token is that token's state.
+
+        The spans' N tokens lie one span after the other, [N, D], so that a long span costs the others nothing.
+        """
         rows, starts, stops = spans.unbind(dim=1)
         lengths = stops - starts
-        offsets = torch.arange(int(lengths.max()), device=hidden.device)
-        inside = offsets < lengths[:, None]
-        states = hidden[rows[:, None], (starts[:, None] + offsets).clamp(max=hidden.shape[1] - 1)]
+        span = torch.arange(len(spans), device=spans.device).repeat_interleave(lengths)
+        offset = torch.arange(len(span), device=spans.device) - (lengths.cumsum(0) - lengths)[span]
+        states = hidden[rows[span], starts[span] + offset]
         if self.config.frame_pooling == "attention" and not self.config.per_frame_progress_token:
             scores = self.frame_pool_attn(states).squeeze(-1) / self.config.pooling_temperature
-            weights = scores.masked_fill(~inside, float("-inf")).softmax(dim=-1)
-            return (states * weights.unsqueeze(-1)).sum(dim=1)
-        total = states.masked_fill(~inside.unsqueeze(-1), 0).sum(dim=1, dtype=torch.float32)
-        return (total / lengths[:, None]).to(hidden.dtype)
+            states = states * _softmax_of_each(scores, lengths, span).unsqueeze(-1)
+            return _sum_of_each(states.float(), lengths).to(hidden.dtype)
+        return (_sum_of_each(states.float(), lengths) / lengths[:, None]).to(hidden.dtype)
+
+
+def _sum_of_each(values: Tensor, lengths: Tensor) -> Tensor:
+    """[F, ...] of float32 [N, ...]: the sum of each segment."""
+    return torch.segment_reduce(values, "sum", lengths=lengths, axis=0)
+
+
+def _softmax_of_each(scores: Tensor, lengths: Tensor, segment: Tensor) -> Tensor:
+    """[N] of [N]: the softmax within each segment; ``segment``: each value's. In float32, given in the scores' type."""
+    largest = torch.segment_reduce(scores.float(), "max", lengths=lengths, axis=0)
+    weights = (scores.float() - largest[segment]).exp()
+    return (weights / _sum_of_each(weights, lengths)[segment]).to(scores.dtype)
 
 
 def build_backbone(config: VlmConfig, dtype: torch.dtype, attention: str | None = None) -> nn.Module:
@@ -170,8 +177,7 @@ def build_backbone(config: VlmConfig, dtype: torch.dtype, attention: str | None 
         from transformers.utils.import_utils import is_flash_attn_2_available
     except ImportError as error:
         raise ImportError('vision-language checkpoints need transformers: pip install ".[vlm]"') from error
-    names = GENERATORS if config.generates_text else BACKBONES
-    network = getattr(transformers, names[config.family])
+    network = getattr(transformers, BACKBONES[config.family])
     settings = network.config_class.from_dict(config.backbone)
     if attention is None:
         usable = is_flash_attn_2_available() and dtype != torch.float32

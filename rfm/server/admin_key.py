@@ -18,6 +18,7 @@ VARIABLE = "RFM_ADMIN_KEY"
 HEADER = "rfm-admin-key"
 MIN_CHARACTERS = 16
 
+_GRPC_PREFIX = "triton-grpc-protocol-"  # Triton puts it before the name
 _RESTRICTED = "model-repository,logging,trace"
 _RANDOM_BYTES = 32
 _VISIBLE = re.compile("[!-~]*")  # what a header can carry as it is
@@ -53,6 +54,11 @@ def restrictions(key: str) -> list[str]:
 def http_headers(key: str | None) -> Mapping[str, str]:
     """What an HTTP request to a restricted API shows."""
     return {} if key is None else {HEADER: key}
+
+
+def grpc_metadata(key: str | None) -> Mapping[str, str]:
+    """What a gRPC request to a restricted API shows."""
+    return {} if key is None else {f"{_GRPC_PREFIX}{HEADER}": key}
 
 
 def _read(file: Path) -> str:

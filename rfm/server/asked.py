@@ -13,8 +13,8 @@ from rfm_client import (
     ProgressSample,
     RewardError,
     SimilaritySample,
-    Trajectory,
 )
+from rfm_client.samples import Footage
 from rfm_client.wire import Tensors
 
 Question = TypeVar("Question")
@@ -26,7 +26,7 @@ SAMPLE_TYPES = {
     ProgressSample: "progress",
     PreferenceSample: "preference",
     SimilaritySample: "similarity",
-    Trajectory: "encode",
+    Footage: "encode",
 }
 UNKNOWN_TYPE = "unknown"  # of the samples of a request that could not be decoded
 
@@ -82,5 +82,4 @@ class Asked(Generic[Question]):
 
 
 def _num_frames(question: Any) -> int:
-    trajectories = (question,) if isinstance(question, Trajectory) else question.trajectories
-    return sum(trajectory.num_frames for trajectory in trajectories)
+    return sum(trajectory.num_frames for trajectory in question.trajectories)

@@ -19,9 +19,11 @@ from rfm.server.leftovers import end_with_triton
 from rfm.server.metrics import Counted, Metrics
 from rfm.server.poison import NO_DIGEST, Poison, digest
 from rfm.server.request_log import RequestLog
+from rfm.server.self_check import SelfCheck
 from rfm.server.weights import check_digest
-from rfm_client import InferenceFailedError, InvalidSampleError, RewardError, Trajectory, wire
+from rfm_client import InferenceFailedError, InvalidSampleError, RewardError, wire
 from rfm_client.model_info import DIGEST_PARAMETER, NETWORK_PARAMETER, REVISION_PARAMETER, SOURCE_PARAMETER
+from rfm_client.samples import Footage
 from rfm_client.wire import Tensors
 
 Question = TypeVar("Question")
@@ -29,6 +31,7 @@ Answer = TypeVar("Answer")
 
 THREADS_PARAMETER = "torch_threads"  # parameters of config.pbtxt; rfm_export writes them
 BUDGET_PARAMETER = "token_budget"
+SAMPLE_TOKENS_PARAMETER = "max_sample_tokens"
 DTYPE_PARAMETER = "dtype"  # empty: as the checkpoint and the device decide
 
 WORTH_ASKING_S = 10e-3  # for one answer
@@ -63,7 +66,9 @@ class BatchModel(Generic[Question, Answer]):
         self._log = RequestLog(model)
         self._metrics = Metrics(labels, _checkpoint(settings), _sample_types(self.input_names))
         self._poison = Poison.of_this_process(args["model_name"], max(config["max_batch_size"], 1))
-        self._blank = digest(blank_question(config))
+        self._blank_tensors = blank_question(config)
+        self._blank = digest(self._blank_tensors)
+        self._self_check = SelfCheck(self._score_blank, self._log.tell_of_end)
         # Each instance answers them before anybody else is let in.
         self._num_warmups = sum(max(warmup.get("count", 1), 1) for warmup in config.get("model_warmup", []))
 
@@ -90,12 +95,23 @@ class BatchModel(Generic[Question, Answer]):
 
     def execute(self, requests: Sequence[Any]) -> list[Any]:
         """Called by Triton with the requests of one batch; gives one response each."""
+        self._self_check.before_batch()
         batch: list[Asked[Question]] = [Asked(request, self._is_from_a_caller(request)) for request in requests]
         self._metrics.at_work_on(sum(asked.is_counted for asked in batch))
         try:
-            return self._responses(batch)
+            responses = self._responses(batch)
+            self._self_check.after_batch(batch)
+            return responses
         finally:
             self._metrics.at_work_on(0)
+
+    def _score_blank(self) -> None:
+        """Raises the error of an instance that cannot score the blank sample."""
+        questions = self.decode(self._blank_tensors)
+        with self._poison.at_work_on([NO_DIGEST]):  # a hang is noticed, and blames nobody
+            error = _first_error(self.answer(questions, Execution(on_forward=self._poison.renew)))
+        if error is not None and not isinstance(error, InvalidSampleError):
+            raise error
 
     def _is_from_a_caller(self, request: Any) -> bool:
         """Whether it is neither one of the requests with which Triton warms the model up nor says it is a probe."""
@@ -130,9 +146,8 @@ class BatchModel(Generic[Question, Answer]):
         import triton_python_backend_utils as pb_utils
 
         asked.error, asked.num_executed = None, 0
-        asked.tensors = {
-            name: pb_utils.get_input_tensor_by_name(asked.request, name).as_numpy() for name in self.input_names
-        }
+        given = {name: pb_utils.get_input_tensor_by_name(asked.request, name) for name in self.input_names}
+        asked.tensors = {name: tensor.as_numpy() for name, tensor in given.items() if tensor is not None}
         asked.num_samples = len(asked.tensors[wire.NUM_FRAMES])
         if asked.request_id and not asked.is_counted:  # anybody can say to be a probe; a probe asks the blank question
             asked.is_counted = digest(asked.tensors) != self._blank
@@ -224,7 +239,7 @@ def _counted(batch: Sequence[Asked[Any]], execution: Execution) -> Counted:
 def _sample_types(input_names: Sequence[str]) -> list[str]:
     """What a model with these inputs can be asked about."""
     of_samples = wire.SAMPLE_TYPE in input_names
-    return [name for kind, name in SAMPLE_TYPES.items() if issubclass(kind, Trajectory) != of_samples]
+    return [name for kind, name in SAMPLE_TYPES.items() if issubclass(kind, Footage) != of_samples]
 
 
 def _checkpoint(settings: Mapping[str, str]) -> dict[str, str]:

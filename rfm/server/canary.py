@@ -41,6 +41,7 @@ class Verdict(Enum):
     UNKNOWN = "it was not asked yet"
     LIVE = "it answers"
     LATE = "it gives no answer in time"
+    BUSY = "it works on a long batch"
     HUNG = "it gives no answer"
     DEAD = "its process is dead"
     BROKEN = "it fails at what it could answer before"
@@ -185,4 +186,4 @@ def blank_question(config: Mapping[str, Any]) -> wire.Tensors:
         blank = np.zeros((_BLANK_FRAMES, _BLANK_PX, _BLANK_PX, 3), np.uint8)
         trajectory = Trajectory(frames=blank, task="canary")
     tensors = wire.encode_samples([ProgressSample(trajectory)])
-    return {name: tensors[name] for name in dims}
+    return {name: tensor for name, tensor in tensors.items() if name in dims}

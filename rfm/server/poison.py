@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.errors import InvalidSampleError
+from rfm_client.errors import DEADLY, InvalidSampleError
 
 POISON_S = 600.0
 DEATHS = 2  # after which a request is refused
@@ -164,7 +164,7 @@ class Poison:
             self._journal.count_refused()
             got = f"one that has ended its process {self._deaths[told]} times"
             until = f"it is refused for {POISON_S / 60:g} minutes"
-            raise InvalidSampleError(f"request: expected one that the model survives, got {got}: {until}")
+            raise InvalidSampleError(f"{DEADLY}, got {got}: {until}")
 
     @contextmanager
     def at_work_on(self, digests: Sequence[bytes]) -> Iterator[None]:

@@ -4,38 +4,38 @@
 from __future__ import annotations
 
 import os
-import secrets
-import shutil
 import signal
 import socket
 import subprocess
-import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from http.client import HTTPException
 from pathlib import Path
 from types import TracebackType
-from typing import IO
+from typing import IO, Any
 
 import tritonclient.http
 from tritonclient.utils import InferenceServerException
 
 from rfm.config import DEFAULT_HOST, ServeConfig
-from rfm.server import leftovers
-from rfm.server.admin_key import http_headers, new_key, restrictions
+from rfm.server.admin_key import VARIABLE, http_headers, new_key, restrictions
 from rfm.server.arguments import check_arguments
 from rfm.server.exposure import GrpcTls, check_before_start, check_version, size_limits
 from rfm.server.installation import Installation, ServerStartError
+from rfm.server.leftovers import Claim, ending_with_parent
+from rfm.server.own_tls import OwnTls
 from rfm.server.repository_api import one_line
-from rfm.server.stubs import SHARED_MEMORY
+from rfm_client.gateway.command import API_KEY_VARIABLE
 
 POLL_S = 0.1
 EXIT_TIMEOUT_S = 10  # Triton waits this long for requests in flight, and for a stub that is dead
 KILL_AFTER_S = 2 * EXIT_TIMEOUT_S
 NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # a `load` would load all versions anew: their folders have changed
+SECRETS = (VARIABLE, API_KEY_VARIABLE)  # variables that neither Triton nor a model process needs
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_REGIONS = "--backend-config=python,shm-region-prefix-name="
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class TritonServer:
         ends_with_parent: bool = False,
     ) -> None:
         self.endpoints = endpoints
-        self._repository = repository
+        self.repository = repository
         self._installation = installation
         self._http_threads = http_threads
         self._log = log
@@ -132,15 +132,15 @@ class TritonServer:
         self._accepts_known_vulnerabilities = accepts_known_vulnerabilities
         self._more_arguments = tuple(more_arguments)
         self._ends_with_parent = ends_with_parent
-        self._region_prefix = f"{leftovers.owned(leftovers.REGION_PREFIX, '_')}{secrets.token_hex(4)}_"
-        self._backends: Path | None = None
+        self._claim: Claim | None = None
+        self._own_tls: OwnTls | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._loading: frozenset[str] = frozenset()  # what it was told to load at its start
 
     @property
     def models(self) -> list[str]:
         """Of the repository."""
-        return sorted(file.parent.name for file in self._repository.glob("*/config.pbtxt"))
+        return sorted(file.parent.name for file in self.repository.glob("*/config.pbtxt"))
 
     @property
     def pid(self) -> int:
@@ -159,6 +159,11 @@ class TritonServer:
         """What its restricted APIs ask for."""
         return self._admin_key
 
+    @property
+    def grpc_options(self) -> Mapping[str, Any]:
+        """With which a RepositoryApi reaches it, once it is started."""
+        return {} if self._own_tls is None else self._own_tls.options
+
     def signal(self, number: int) -> None:
         """Sends a signal to the process, if it runs."""
         if self._process is not None:
@@ -169,31 +174,37 @@ class TritonServer:
         with suppress(ProcessLookupError):
             os.killpg(self.pid, signal.SIGKILL)
 
-    def start(self) -> None:
-        """Starts the process. Raises ServerStartError for what can be seen to be wrong before."""
+    def start(self, restored: Collection[str] | None = None) -> None:
+        """Starts the process. Raises ServerStartError for what can be seen to be wrong before.
+
+        restored: models that it loads, and ``wait_ready`` does not insist on; None: all, and it does
+        """
         models = self.models
-        self._loading = frozenset(models)
+        self._loading = frozenset(models if restored is None else ())
         if not models:
-            raise ServerStartError(f"repository: expected a folder of models, got {self._repository}")
-        own = self._arguments(models)
-        check_arguments(self._more_arguments, own)
+            raise ServerStartError(f"repository: expected a folder of models, got {self.repository}")
+        own = self._arguments(sorted(models if restored is None else restored))
+        check_arguments(self._more_arguments, [*own, _REGIONS])
         self._check_exposure()
         self.endpoints.check_free()
-        self._backends = Path(tempfile.mkdtemp(prefix=leftovers.owned(leftovers.BACKENDS_PREFIX.rstrip("-"), "-")))
-        arguments = [*own, *self._installation.lay_out_backends(self._backends)]
+        self._claim = Claim()
+        arguments = [*own, f"{_REGIONS}{self._claim.region_prefix}"]
+        arguments += self._installation.lay_out_backends(self._claim.backends)
+        arguments += self._own_tls.arguments(self._claim.backends) if self._own_tls else []
         arguments += [*size_limits(self._installation, self._more_arguments), *self._more_arguments]
         try:
             self._process = subprocess.Popen(
                 [self._installation.executable, *arguments],
-                env={**os.environ, **self._installation.environment, **NO_BYTECODE},
+                env=self._environment(),
                 stdin=subprocess.DEVNULL,
                 stdout=self._log,
                 stderr=self._log,
-                preexec_fn=leftovers.ending_with_parent() if self._ends_with_parent else None,
+                preexec_fn=ending_with_parent() if self._ends_with_parent else None,
+                pass_fds=self._claim.lock_files,
                 start_new_session=True,  # a Ctrl-C in the terminal reaches it once, through us
             )
         except OSError as error:
-            self._clear()
+            self._release()
             program = self._installation.executable
             raise ServerStartError(f"tritonserver: expected a program at {program}, got: {error.strerror}") from error
 
@@ -250,7 +261,7 @@ class TritonServer:
     def _arguments(self, models: Sequence[str]) -> list[str]:
         endpoints = self.endpoints
         return [
-            f"--model-repository={self._repository}",
+            f"--model-repository={self.repository}",
             "--model-control-mode=explicit",
             *(f"--load-model={model}" for model in models),
             "--disable-auto-complete-config",
@@ -263,16 +274,20 @@ class TritonServer:
             f"--grpc-port={endpoints.grpc_port}",
             f"--metrics-address={endpoints.host}",
             f"--metrics-port={endpoints.metrics_port}",
-            f"--backend-config=python,shm-region-prefix-name={self._region_prefix}",
             *([f"--http-thread-count={self._http_threads}"] if self._http_threads else []),
-            *(endpoints.grpc_tls.arguments() if endpoints.grpc_tls else []),
             *restrictions(self._admin_key),
         ]
+
+    def _environment(self) -> dict[str, str]:
+        """That of this process, without its secrets."""
+        own = {name: value for name, value in os.environ.items() if name not in SECRETS}
+        return {**own, **self._installation.environment, **NO_BYTECODE}
 
     def _check_exposure(self) -> None:
         check_before_start(self.endpoints.host, self._installation, accepted=self._accepts_known_vulnerabilities)
         if self.endpoints.grpc_tls is not None:
             self.endpoints.grpc_tls.check()
+            self._own_tls = OwnTls(self.endpoints.grpc_tls)
 
     def _wait(self) -> int:
         """Waits for the server to end and clears away what it leaves; gives its exit status."""
@@ -280,11 +295,10 @@ class TritonServer:
         status = self._process.wait()
         with suppress(ProcessLookupError):  # a stub that has outlived its server, which ran out of time to end it
             os.killpg(self._process.pid, signal.SIGKILL)
-        self._clear()
+        self._release()
         return status
 
-    def _clear(self) -> None:
-        if self._backends is not None:
-            shutil.rmtree(self._backends, ignore_errors=True)
-        for region in SHARED_MEMORY.glob(f"{self._region_prefix}*"):
-            region.unlink(missing_ok=True)
+    def _release(self) -> None:
+        if self._claim is not None:
+            self._claim.release()
+            self._claim = None

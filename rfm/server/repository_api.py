@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""A running server's model-repository API, over HTTP: what is loaded, load, unload; and a question to one version."""
+"""A running server's model-repository API: what is loaded, load, unload; and a probe of one version.
+
+Over gRPC, where Triton works on a load in a thread of its own. Over HTTP a load holds the thread that took the request,
+and with it all connections of that thread, until the model is loaded.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +11,14 @@ import json
 import time
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
-from http.client import HTTPException
 from types import TracebackType
 from typing import Any
 
-import tritonclient.http
+import tritonclient.grpc
+from google.protobuf.json_format import MessageToDict
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
-from rfm.server.admin_key import VARIABLE, http_headers
+from rfm.server.admin_key import VARIABLE, grpc_metadata
 from rfm_client.transport import split_url
 from rfm_client.wire import CANARY_PREFIX, Tensors
 
@@ -24,7 +28,17 @@ CONNECT_S = 10.0
 ANSWER_S = 1800.0  # of one request: a load answers when the model is warmed up
 FINISH_S = 600.0  # requests in flight on a version that is taken out
 
-_FORBIDDEN = "403"
+_GRPC = ("grpc", "grpcs")
+_UNBOUNDED = -1
+_MS_PER_S = 1000
+_CHANNEL = [
+    ("grpc.max_send_message_length", _UNBOUNDED),
+    ("grpc.max_receive_message_length", _UNBOUNDED),
+    ("grpc.min_reconnect_backoff_ms", int(CONNECT_S * _MS_PER_S)),  # how long it may take to connect, too
+    ("grpc.enable_http_proxy", 0),
+]
+_RESTRICTED = "is restricted, expecting header"
+_OF_SERVER = ("StatusCode.UNAVAILABLE", "StatusCode.DEADLINE_EXCEEDED", "StatusCode.CANCELLED")
 _GOING = (READY, UNLOADING)
 _NOT_LOADED = "not loaded"  # Triton tells no state
 _UNAVAILABLE, _UNLOADED = "UNAVAILABLE", "unloaded"
@@ -55,21 +69,28 @@ class ModelVersion:
 
 
 class RepositoryApi:
-    """The server at ``url`` (http://host:port). A context manager. Its methods raise RepositoryApiError."""
+    """The server at ``url`` (grpc://host:port, or grpcs:// with TLS). A context manager.
 
-    def __init__(self, url: str, admin_key: str | None) -> None:
+    options: of tritonclient's gRPC client, as Access and OwnTls have them
+    Its methods raise RepositoryApiError, as it does itself for a url that is none of these.
+    """
+
+    def __init__(self, url: str, admin_key: str | None, options: Mapping[str, Any] | None = None) -> None:
         scheme, address = _split(url)
-        if scheme != "http":
-            raise RepositoryApiError(f"url: expected http://host:port, got {url}")
+        if scheme not in _GRPC:
+            raise RepositoryApiError(
+                f"url: expected grpc://host:port (its gRPC port, 8001) or with TLS grpcs://host:port, got {url}"
+            )
         self._url = url
-        self._headers = http_headers(admin_key)
-        self._client = tritonclient.http.InferenceServerClient(
-            address, connection_timeout=CONNECT_S, network_timeout=ANSWER_S
-        )
+        self._headers = grpc_metadata(admin_key)
+        given = dict(options or {})
+        channel = [*_CHANNEL, *given.pop("channel_args", ())]
+        self._client = tritonclient.grpc.InferenceServerClient(address, channel_args=channel, **given)
 
     def index(self) -> list[ModelVersion]:
         """Everything in the repository, by name and version."""
-        return versions_of(self._ask(self._client.get_model_repository_index, headers=self._headers))
+        answer = self._ask(self._client.get_model_repository_index)
+        return versions_of(MessageToDict(entry) for entry in answer.models)
 
     def ready_versions(self, model: str) -> list[int]:
         """Those that are served now."""
@@ -78,7 +99,8 @@ class RepositoryApi:
 
     def config(self, model: str, version: int) -> dict[str, Any]:
         """With which it was loaded."""
-        config: dict[str, Any] = self._ask(self._client.get_model_config, model, str(version), headers=self._headers)
+        answer = self._ask(self._client.get_model_config, model, str(version))
+        config: dict[str, Any] = MessageToDict(answer.config, preserving_proto_field_name=True)
         return config
 
     def load(self, model: str, config: Mapping[str, Any] | None = None) -> None:
@@ -87,11 +109,11 @@ class RepositoryApi:
         config: instead of the one in the model's file
         """
         instead = None if config is None else json.dumps(config)
-        self._ask(self._client.load_model, model, headers=self._headers, config=instead)
+        self._ask(self._client.load_model, model, config=instead)
 
     def unload(self, model: str) -> None:
         """Has the server forget the model, after the requests that it is working on."""
-        self._ask(self._client.unload_model, model, headers=self._headers)
+        self._ask(self._client.unload_model, model)
 
     def wait_gone(self, model: str, kept: Collection[int] = ()) -> None:
         """Returns when no version of the model but ``kept`` works on a request."""
@@ -107,30 +129,30 @@ class RepositoryApi:
         """What one version answers. By its id it is told from callers' requests in logs."""
         tensors = []
         for name, array in inputs.items():
-            tensors.append(tritonclient.http.InferInput(name, array.shape, np_to_triton_dtype(array.dtype)))
+            tensors.append(tritonclient.grpc.InferInput(name, array.shape, np_to_triton_dtype(array.dtype)))
             tensors[-1].set_data_from_numpy(array)
         answer = self._ask(
             self._client.infer,
             model,
             tensors,
             model_version=str(version),
-            outputs=[tritonclient.http.InferRequestedOutput(name) for name in outputs],
+            outputs=[tritonclient.grpc.InferRequestedOutput(name) for name in outputs],
             request_id=f"{CANARY_PREFIX}-{model}-{version}",
         )
         return {name: answer.as_numpy(name) for name in outputs}
 
     def _ask(self, call: Any, *arguments: Any, **options: Any) -> Any:
         try:
-            return call(*arguments, **options)
+            return call(*arguments, headers=self._headers, client_timeout=ANSWER_S, **options)
         except InferenceServerException as error:
-            if str(error.status()) == _FORBIDDEN:
+            message = one_line(error.message() or "no reason given")
+            if _RESTRICTED in message:
                 got = "another" if self._headers else "none"
                 raise RepositoryApiError(
                     f"admin key: expected that of the server at {self._url} (--admin-key-file or {VARIABLE}), got {got}"
                 ) from None
-            raise RepositoryApiError(one_line(error.message() or "no reason given")) from error
-        except (OSError, EOFError, HTTPException) as error:
-            raise RepositoryApiError(f"{self._url}: no answer: {error or type(error).__name__}") from error
+            is_server_s = str(error.status()) in _OF_SERVER
+            raise RepositoryApiError(f"{self._url}: {message}" if is_server_s else message) from error
 
     def __enter__(self) -> RepositoryApi:
         return self

@@ -36,6 +36,10 @@ class RequestLog:
         said = {"request_ids": [asked.request_id for asked in batch], "error": repr(error)}
         self._write(FAILED, said, error, event="batch_failed")
 
+    def tell_of_end(self, error: Exception) -> None:
+        """Says that the process ends, since it cannot score a blank sample any more."""
+        self._write(FAILED, {"error": repr(error)}, error, event="instance_broken")
+
     def _write(
         self, outcome: str, said: Mapping[str, Any], cause: BaseException | None, event: str | None = None
     ) -> None:

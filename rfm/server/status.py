@@ -33,6 +33,9 @@ class Status:
         self._registry = CollectorRegistry()
         labelled = {"labelnames": ["model"], "registry": self._registry}
         self._ready = Gauge("rfm_serve_ready", "1: the model is ready.", **labelled)  # type: ignore[arg-type]
+        self._reason = Gauge(
+            "rfm_serve_not_ready", "1: the model is not ready, and why.", ["model", "reason"], registry=self._registry
+        )
         self._canary_ok = Gauge("rfm_serve_canary_ok", "1: the last health probe was answered.", **labelled)  # type: ignore[arg-type]
         self.canary_seconds = Histogram(
             "rfm_serve_canary_seconds",
@@ -55,9 +58,14 @@ class Status:
 
     def tell(self, reasons: Mapping[str, str]) -> None:
         """By model why it is not ready; NO_REASON for one that is. There are no other models."""
-        gone, self._reasons = self._reasons.keys() - reasons.keys(), dict(reasons)
+        gone, before, self._reasons = self._reasons.keys() - reasons.keys(), self._reasons, dict(reasons)
+        for model, reason in before.items():
+            if reason not in (NO_REASON, reasons.get(model)):
+                self._reason.remove(model, reason)
         for model, reason in reasons.items():
             self._ready.labels(model).set(reason == NO_REASON)
+            if reason != NO_REASON:
+                self._reason.labels(model, reason).set(1)
         for model in gone:
             self._ready.remove(model)
         for model in gone & self._asked:

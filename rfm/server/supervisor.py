@@ -11,7 +11,7 @@ from types import FrameType
 
 from rfm.server import leftovers
 from rfm.server.gateway_process import GatewayProcess
-from rfm.server.inquiry import SILENT_S
+from rfm.server.inquiry import Config, names_what_was_served
 from rfm.server.installation import ServerStartError
 from rfm.server.process import POLL_S, STOP_SIGNALS, TritonServer
 from rfm.server.restarts import Restarts
@@ -26,6 +26,7 @@ class Supervisor:
     status_port: of the status (``status``), on the server's host; None: there is none
     canary_s: how often each model is asked
     hang_s: how long a model may take to get one forward pass further, or answer nobody, before it counts as hung
+    triton_silent_s: how long Triton may give no answer to several looks in a row before it is killed
     say: is told what happened, a line each
     """
 
@@ -37,6 +38,7 @@ class Supervisor:
         status_port: int | None = None,
         canary_s: float,
         hang_s: float,
+        triton_silent_s: float,
         say: Callable[[str], None],
     ) -> None:
         self._server = server
@@ -44,11 +46,13 @@ class Supervisor:
         self._status_port = status_port
         self._canary_s = canary_s
         self._hang_s = hang_s
+        self._triton_silent_s = triton_silent_s
         self._say = say
         self._status = Status()
         self._told_to_stop = threading.Event()
         self._triton_restarts = Restarts("tritonserver")
         self._served: Served | None = None  # None: it is started, or has ended
+        self._configs: dict[str, Config] | None = None  # of what was served last; None: what the files say
 
     def run(self) -> int:
         """Gives Triton's exit status. Raises ServerStartError for what does not start, or ends again and again."""
@@ -90,22 +94,45 @@ class Supervisor:
         return status
 
     def _start(self) -> None:
-        """Starts Triton, and looks after its models from now on. Raises ServerStartError."""
-        self._server.start()
+        """Starts Triton, and looks after its models from now on. Raises ServerStartError.
+
+        What was served before is served again, whatever was exported since. A model that cannot be loaded then does
+        not keep the others from being served.
+        """
+        self._server.start(self._restored())
         if self._told_to_stop.is_set():  # before there was a process to pass it to
             return
         self._server.wait_ready()
         ends = self._server.endpoints
         urls = f"{ends.grpc_url}, {ends.http_url}, metrics at {ends.metrics_url}"
-        self._say(f"ready: {', '.join(self._server.models)} at {urls}")
+        if self._configs is None:
+            self._say(f"ready: {', '.join(self._server.models)} at {urls}")
         self._triton_restarts.started()
-        self._served = Served(self._server, self._status, self._canary_s, self._hang_s)
+        self._served = Served(
+            self._server,
+            self._status,
+            canary_s=self._canary_s,
+            hang_s=self._hang_s,
+            triton_silent_s=self._triton_silent_s,
+            say=self._say,
+            restored=self._configs or {},
+        )
+
+    def _restored(self) -> list[str] | None:
+        """The models that Triton loads by itself, before it answers anybody; None: all, for it never served any.
+
+        It can do so by their files alone. Where one of those names other versions by now, all are loaded afterwards.
+        """
+        if self._configs is None:
+            return None
+        is_so = all(names_what_was_served(self._server.repository, *served) for served in self._configs.items())
+        return list(self._configs) if is_so else []
 
     def _look(self) -> None:
         """Starts again what has ended. Raises CrashLoopError."""
         if self._served is not None and self._served.is_silent:
             self._server.kill()
-            self._start_again(f"no answer for {SILENT_S:g} s")
+            self._start_again(f"no answer for {self._triton_silent_s:g} s")
         elif self._server.exit_status is not None:
             self._start_again(f"exit status {self._server.exit_status}")
         if self._gateway is not None and (why := self._gateway.look()):
@@ -135,5 +162,7 @@ class Supervisor:
 
     def _close_served(self) -> None:
         if self._served is not None:
+            if self._served.configs is not None:
+                self._configs = self._served.configs
             self._served.close()
             self._served = None

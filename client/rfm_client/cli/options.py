@@ -151,7 +151,7 @@ def read_access(ca_file: Path | None, certificate: Path | None, key: Path | None
 
 def exit_code(error: BaseException) -> ExitCode:
     """How a command ends that fails with this error."""
-    return _ERROR_CODES.get(type(error), ExitCode.FAILED)
+    return next((code for kind, code in _ERROR_CODES.items() if isinstance(error, kind)), ExitCode.FAILED)
 
 
 def exit_code_of(failures: Sequence[Exception], *, some_succeeded: bool) -> ExitCode:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import logging
 import secrets
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,18 +24,16 @@ from starlette.requests import ClientDisconnect
 
 from rfm_client import errors
 from rfm_client.access import Access
-from rfm_client.async_client import DEFAULT_MODEL, DEFAULT_TIMEOUT_S, AsyncRewardClient
+from rfm_client.async_client import DEFAULT_MODEL, AsyncRewardClient
 from rfm_client.gateway import schema
 from rfm_client.gateway.body import Admitted, Batch, BodyLimits, read_json, read_multipart
 from rfm_client.gateway.folder import AllowedFolder
+from rfm_client.gateway.leaving import CallerLeftError, while_connected
+from rfm_client.gateway.limits import MIB, Limits
 from rfm_client.gateway.memory import RETRY_AFTER
-from rfm_client.gateway.observe import REQUEST_ID_HEADER, Metrics, Observed
+from rfm_client.gateway.observe import CALLER_LEFT, REQUEST_ID_HEADER, Metrics, Observed
 from rfm_client.gateway.scoring import Scorer
 from rfm_client.gateway.state import State
-
-MIB = 2**20
-DEFAULT_MAX_BODY_BYTES = 256 * MIB
-DEFAULT_MAX_IN_FLIGHT = 256
 
 _KEY_HEADER = APIKeyHeader(name="X-API-Key", auto_error=False)  # FastAPI looks annotations up in the module
 _KEY_BEARER = HTTPBearer(auto_error=False)
@@ -61,9 +59,7 @@ class GatewaySettings:
     access: certificates, and what Triton is shown
     metrics_url: of Triton's metrics; None: port 8002 of the same host
     model: name under which the checkpoint was exported
-    timeout_s: the longest that a request may take to arrive, and then to be scored
-    max_body_bytes: of one request
-    max_in_flight: evaluations at a time; more are refused with 503
+    limits: what it takes on
     api_key: which requests must show, but for those of health and documentation; None: none
     cors_origins: from which browsers may ask
     folder: whose files requests may name; None: none
@@ -73,9 +69,7 @@ class GatewaySettings:
     access: Access = field(default_factory=Access)
     metrics_url: str | None = None
     model: str = DEFAULT_MODEL
-    timeout_s: float = DEFAULT_TIMEOUT_S
-    max_body_bytes: int = DEFAULT_MAX_BODY_BYTES
-    max_in_flight: int = DEFAULT_MAX_IN_FLIGHT
+    limits: Limits = field(default_factory=Limits)
     api_key: str | None = None
     cors_origins: tuple[str, ...] = ()
     folder: Path | None = None
@@ -83,14 +77,14 @@ class GatewaySettings:
 
 def create_app(settings: GatewaySettings) -> FastAPI:
     """The application. Raises OSError for a folder that is not there, ValueError for a URL that is none."""
-    folder = AllowedFolder(settings.folder, settings.max_body_bytes)
+    folder = AllowedFolder(settings.folder, settings.limits.max_body_mib * MIB)
     metrics = Metrics()
     client = AsyncRewardClient(
         settings.triton_url,
         model=settings.model,
-        timeout_s=settings.timeout_s,
+        timeout_s=settings.limits.timeout,
         retry=False,  # whoever asks is told at once, and decides
-        max_in_flight=settings.max_in_flight,
+        max_in_flight=settings.limits.max_in_flight,
         **settings.access.options,
     )
 
@@ -100,7 +94,7 @@ def create_app(settings: GatewaySettings) -> FastAPI:
             yield
 
     app = FastAPI(title="RFM evaluation gateway", summary="Rewards for robot trajectories.", lifespan=lifespan)
-    app.add_middleware(Observed, metrics=metrics, max_in_flight=settings.max_in_flight)
+    app.add_middleware(Observed, metrics=metrics, limits=settings.limits)
     if settings.cors_origins:
         app.add_middleware(
             CORSMiddleware,
@@ -110,7 +104,7 @@ def create_app(settings: GatewaySettings) -> FastAPI:
             expose_headers=[REQUEST_ID_HEADER],
         )
     state = State(client, settings.triton_url, settings.metrics_url, settings.model, settings.access)
-    for router in (_health(state), _guarded(settings, Scorer(client, folder, settings.timeout_s), state, metrics)):
+    for router in (_health(state), _guarded(settings, Scorer(client, folder, settings.limits.timeout), state, metrics)):
         app.include_router(router)
     _answer_errors(app)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]  # FastAPI's way to extend it
@@ -121,10 +115,15 @@ def _guarded(settings: GatewaySettings, scorer: Scorer, state: State, metrics: M
     """Everything that the key guards."""
     guards = [] if settings.api_key is None else [Depends(_key_check(settings.api_key))]
     router = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
-    limits = BodyLimits(settings.max_body_bytes)
+    limits = BodyLimits(settings.limits.max_body_mib * MIB, settings.limits.max_memory_mib * MIB)
 
-    async def score(admitted: Admitted, batch: Batch) -> Response:
-        answer = await scorer.evaluate(batch, admitted.share, admitted.request.state.request_id)
+    async def evaluated(request: Request, read: Callable[[Admitted], Awaitable[Batch]]) -> Response:
+        with limits.admitted(request) as admitted:
+            await admitted.wait_for_room(request.state.begin_by)
+            with anyio.fail_after(settings.limits.timeout):
+                batch = await read(admitted)
+            scoring = scorer.evaluate(batch, admitted.share, request.state.request_id)
+            answer = await while_connected(request, scoring)
         for sample in batch.samples:
             metrics.samples.labels(sample.sample_type).inc()
         return Response(answer.model_dump_json(), media_type="application/json")
@@ -137,10 +136,7 @@ def _guarded(settings: GatewaySettings, scorer: Scorer, state: State, metrics: M
     )
     async def evaluate_batch(request: Request) -> Response:
         """Score samples that come as JSON."""
-        with limits.admitted(request) as admitted:
-            with anyio.fail_after(settings.timeout_s):
-                batch = await read_json(admitted)
-            return await score(admitted, batch)
+        return await evaluated(request, read_json)
 
     @router.post(
         "/evaluate_batch_npy",
@@ -152,10 +148,7 @@ def _guarded(settings: GatewaySettings, scorer: Scorer, state: State, metrics: M
         """Score samples whose arrays come as .npy files: fields `sample_0`, `sample_1`, ... hold each sample as JSON,
         in which `{"__numpy_file__": name}` stands for the array in the part of that name.
         """
-        with limits.admitted(request) as admitted:
-            with anyio.fail_after(settings.timeout_s):
-                batch = await read_multipart(admitted)
-            return await score(admitted, batch)
+        return await evaluated(request, read_multipart)
 
     @router.get("/gpu_status", responses=_failures(502, 503, 504))
     async def gpu_status() -> schema.GpuStatus:
@@ -239,6 +232,10 @@ def _answer_errors(app: FastAPI) -> None:
     @app.exception_handler(ClientDisconnect)
     async def gone(_request: Request, _error: ClientDisconnect) -> JSONResponse:
         return JSONResponse({"detail": "body: expected all of it, got a part"}, 400)  # which nobody reads
+
+    @app.exception_handler(CallerLeftError)
+    async def left(_request: Request, error: CallerLeftError) -> JSONResponse:
+        return JSONResponse({"detail": str(error)}, CALLER_LEFT)  # which nobody reads
 
     @app.exception_handler(errors.RewardError)
     async def failed(_request: Request, error: errors.RewardError) -> JSONResponse:

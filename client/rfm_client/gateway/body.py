@@ -17,9 +17,11 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails, from_json
 from python_multipart.multipart import parse_options_header
-from starlette.datastructures import UploadFile
+from starlette.datastructures import FormData, UploadFile
+from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.types import Message
 
+from rfm_client.deadline import Deadline
 from rfm_client.gateway import schema
 from rfm_client.gateway.memory import Memory, Share
 from rfm_client.gateway.npy import Upload, read_npy
@@ -30,15 +32,18 @@ MAX_PARTS = 10_000  # files, and fields, of one multipart request
 MAX_SAMPLES = 10_000  # of one request
 MAX_JSON_BYTES = 32 * 2**20  # arrays have a better way
 JSON_GROWTH = 32  # times as large is JSON of numbers, at the most, when it is read: see parsed_bytes
-HELD_BODIES = 4
+READ_JSON_GROWTH = 5  # times as large it is usually: what waits for room before it is read
+CHARSETS = ("utf-8", "utf8", "us-ascii", "ascii", "iso-8859-1", "iso8859-1", "latin-1", "latin1")
 
 _NUMBER_BYTES, _LIST_BYTES, _TEXT_BYTES, _OBJECT_BYTES = 48, 88, 96, 208  # what Python takes for one, at the most
 _ERROR_BYTES = 2048  # of a field, as it is told
+_PART_BYTES, _HEADER_BYTES = 2560, 384  # what a part of a multipart body takes besides its content, and a header of it
 
 _ANY_SAMPLE_FIELD = re.compile(r"sample_[0-9]+")
 _SAMPLE_FIELD = re.compile(r"sample_(0|[1-9][0-9]{0,5})")
 _STEPS_FIELD = "use_frame_steps"
 _FLAGS = {"true": True, "1": True, "false": False, "0": False, "": False}
+_FORM_FLAGS = {**_FLAGS, "1": False}  # as the evaluation server reads forms
 _TAG_ERRORS = ("union_tag_invalid", "union_tag_not_found")
 _EXPECTED = {  # pydantic's kind of error, and what a field of it is
     "string_type": "text",
@@ -68,6 +73,12 @@ class Admitted:
     request: Request
     share: Share
 
+    async def wait_for_room(self, deadline: Deadline) -> None:
+        """Until there is memory for the body that is announced. Raises HTTPException 503."""
+        announced = self.request.headers.get("content-length", "")
+        growth = 1 if self.request.url.path.endswith(NPY_ENDPOINT) else READ_JSON_GROWTH
+        await self.share.reserve(int(announced) * growth if announced.isdecimal() else 0, deadline)
+
 
 async def read_json(admitted: Admitted) -> Batch:
     """The samples of a JSON request. Raises RequestValidationError, HTTPException."""
@@ -80,7 +91,8 @@ async def read_multipart(admitted: Admitted) -> Batch:
 
     Raises RequestValidationError, HTTPException.
     """
-    async with admitted.request.form(max_files=MAX_PARTS, max_fields=MAX_PARTS, max_part_size=MAX_JSON_BYTES) as form:
+    form = await _Form(admitted).parse()
+    try:
         uploads: dict[str, Upload] = {}
         fields: dict[str, str] = {}
         for name, value in form.multi_items():
@@ -97,6 +109,33 @@ async def read_multipart(admitted: Admitted) -> Batch:
             raise HTTPException(413, f"body: expected at most {MAX_JSON_BYTES} bytes of JSON, got more")
         num_bytes = json_bytes + sum(upload.size or 0 for upload in uploads.values())
         return await off_loop(num_bytes, _of_form, fields, uploads, admitted.share)
+    finally:
+        await form.close()
+
+
+class _Form(MultiPartParser):
+    """Starlette's parser, which here counts what parts take besides their content."""
+
+    def __init__(self, admitted: Admitted) -> None:
+        request = admitted.request
+        limits = {"max_files": MAX_PARTS, "max_fields": MAX_PARTS, "max_part_size": MAX_JSON_BYTES}
+        super().__init__(request.headers, request.stream(), **limits)
+        self._share = admitted.share
+
+    def on_part_begin(self) -> None:
+        self._share.take(_PART_BYTES)
+        super().on_part_begin()
+
+    def on_header_end(self) -> None:
+        self._share.take(_HEADER_BYTES)
+        super().on_header_end()
+
+    async def parse(self) -> FormData:
+        """Raises HTTPException."""
+        try:
+            return await super().parse()
+        except MultiPartException as error:
+            raise HTTPException(400, error.message) from None
 
 
 def parsed_bytes(json: bytes) -> int:
@@ -121,17 +160,17 @@ def _of_form(fields: Mapping[str, str], uploads: Mapping[str, Upload], share: Sh
     share.take(sum(parsed_bytes(field.encode(errors="surrogatepass")) for field in fields.values()))
     samples = [_field(fields, name) for name in _sample_fields(fields)]
     arrays = {name: cache(partial(read_npy, upload)) for name, upload in uploads.items()}  # of each one, however often
-    return Batch(_checked(samples, arrays, share), _flag(fields.get(_STEPS_FIELD, False)))
+    return Batch(_checked(samples, arrays, share), _flag(fields.get(_STEPS_FIELD, False), _FORM_FLAGS))
 
 
 class BodyLimits:
-    """How much the requests may bring: ``max_bytes`` each, MAX_JSON_BYTES of JSON, and what is held in memory for all
-    of them together: HELD_BODIES such bodies, where JSON counts as what it becomes, and copies and files are added.
+    """How much the requests may bring: ``max_bytes`` each, MAX_JSON_BYTES of JSON, and ``max_memory_bytes`` that are
+    held for all of them together, where JSON counts as what it becomes, and copies and files are added.
     """
 
-    def __init__(self, max_bytes: int) -> None:
+    def __init__(self, max_bytes: int, max_memory_bytes: int) -> None:
         self._max_bytes = max_bytes
-        self._memory = Memory(max(HELD_BODIES * max_bytes, JSON_GROWTH * min(max_bytes, MAX_JSON_BYTES)))
+        self._memory = Memory(max_memory_bytes)
 
     @contextmanager
     def admitted(self, request: Request) -> Iterator[Admitted]:
@@ -177,15 +216,20 @@ def _ending(request: Request) -> bytes:
         raise HTTPException(
             415, f"content-type: expected multipart/form-data with a boundary, got {kind.decode() or 'none'}"
         )
+    charset = options.get(b"charset", b"utf-8").decode("latin-1")
+    if charset.lower().replace("_", "-") not in CHARSETS:  # Python knows others, some of which are none of text
+        raise HTTPException(
+            415, f"content-type: expected a charset of utf-8, us-ascii or iso-8859-1, got {reprlib.repr(charset)}"
+        )
     return b"--" + options[b"boundary"] + b"--"
 
 
-def _flag(value: Any) -> bool:
-    """A boolean as JSON or a form writes it. Raises RequestValidationError."""
+def _flag(value: Any, flags: Mapping[str, bool] = _FLAGS) -> bool:
+    """A boolean as JSON or, with its own ``flags``, a form writes it. Raises RequestValidationError."""
     if value is None:
         return False
-    if isinstance(value, (bool, int, str)) and str(value).strip().lower() in _FLAGS:
-        return _FLAGS[str(value).strip().lower()]
+    if isinstance(value, (bool, int, str)) and str(value).strip().lower() in flags:
+        return flags[str(value).strip().lower()]
     raise invalid((_STEPS_FIELD,), f"expected true or false, got {reprlib.repr(value)}")
 
 

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from rfm_client.access import Access, check_certificate, is_loopback
+from rfm_client.gateway.limits import Limits, with_limits
 
 API_KEY_VARIABLE = "RFM_GATEWAY_API_KEY"
 KEEP_ALIVE_S = 30
@@ -20,6 +21,7 @@ STOP_WITHIN_S = 30
 logger = logging.getLogger("rfm_client.gateway")
 
 
+@with_limits()
 def gateway(
     triton: Annotated[
         str, typer.Option(help="grpc://host:port or http://host:port of Triton, with TLS grpcs:// or https://.")
@@ -30,11 +32,6 @@ def gateway(
         str | None, typer.Option(help="Triton's metrics; else port 8002 of the same host.", show_default=False)
     ] = None,
     model: Annotated[str, typer.Option(help="Name under which the checkpoint was exported.")] = "rfm",
-    timeout: Annotated[
-        float, typer.Option(min=0.001, help="Seconds that a request may take to arrive, and then to be scored.")
-    ] = 60.0,
-    max_body_mib: Annotated[int, typer.Option(min=1, help="Largest request.")] = 256,
-    max_in_flight: Annotated[int, typer.Option(min=1, help="Evaluations at a time; more are refused with 503.")] = 256,
     api_key_file: Annotated[
         Path | None,
         typer.Option(help=f"File with the key that requests must show; else {API_KEY_VARIABLE}.", show_default=False),
@@ -54,12 +51,14 @@ def gateway(
     allow_folder: Annotated[
         Path | None, typer.Option(help="Folder whose files requests may name.", show_default=False)
     ] = None,
+    *,
+    limits: Limits,
 ) -> None:
     """Serve the FastAPI evaluation server's endpoints before a Triton server."""
     try:
         import uvicorn
 
-        from rfm_client.gateway.app import MIB, GatewaySettings, create_app
+        from rfm_client.gateway.app import GatewaySettings, create_app
     except ModuleNotFoundError as error:
         raise typer.BadParameter(f'the gateway needs {error.name}: pip install "./client[gateway]"') from None
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
@@ -70,9 +69,7 @@ def gateway(
             triton_url=triton,
             metrics_url=metrics_url,
             model=model,
-            timeout_s=timeout,
-            max_body_bytes=max_body_mib * MIB,
-            max_in_flight=max_in_flight,
+            limits=limits,
             api_key=api_key,
             access=Access(triton_ca_file, triton_certificate, triton_key),
             cors_origins=tuple(cors_origin or ()),
@@ -95,9 +92,12 @@ def gateway(
     )
 
 
-def gateway_command(triton: str, metrics_url: str, model: str, host: str, port: int) -> list[str]:
+def gateway_command(
+    triton: str, metrics_url: str, model: str, host: str, port: int, *, limits: Limits | None = None
+) -> list[str]:
     """A command line that serves a gateway as ``gateway`` does, in a process of its own."""
     options = {"triton": triton, "metrics-url": metrics_url, "model": model, "host": host, "port": port}
+    options |= (limits or Limits()).options
     words = (word for name, value in options.items() for word in (f"--{name}", str(value)))
     return [sys.executable, "-m", "rfm_client.gateway", *words]
 

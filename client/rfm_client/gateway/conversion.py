@@ -34,6 +34,7 @@ _SIDES = {  # what the client calls them
     "reference": "ref_trajectory",
     "other": "sim_trajectory",
 }
+RGB_CHANNELS, RGBA_CHANNELS = 3, 4
 Texts: TypeAlias = Mapping[str, Float32Array | InvalidSampleError]  # by task; why one cannot be encoded
 
 
@@ -147,8 +148,14 @@ def converted_bytes(sample: schema.Sample) -> int:
 
 
 def _uint8(frames: Any) -> UInt8Array:
-    """As the evaluation server made images: whole numbers as they are, floats clipped and truncated."""
+    """As the evaluation server made images: whole numbers as they are, floats clipped and truncated; one frame is a
+    film of one, and of RGBA the colours count.
+    """
     array = as_array(frames)
+    if array.ndim == 3:
+        array = array[np.newaxis]
+    if array.ndim == 4 and array.shape[-1] == RGBA_CHANNELS:
+        array = array[..., :RGB_CHANNELS]
     if array.dtype.kind == "f":
         return float_frames_to_uint8(array)
     if array.dtype != np.uint8 and array.dtype.kind in "iu" and array.size:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import secrets
 import time
 
@@ -11,13 +12,26 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from rfm_client.deadline import Deadline, timeout
+from rfm_client.errors import DeadlineExceededError
 from rfm_client.gateway.body import NPY_ENDPOINT
+from rfm_client.gateway.limits import Limits
 from rfm_client.gateway.memory import RETRY_AFTER
 from rfm_client.wire import CANARY_PREFIX, REQUEST_ID
 
 EVALUATIONS = ("/evaluate_batch", NPY_ENDPOINT)
 ENDPOINTS = (*EVALUATIONS, "/gpu_status", "/health", "/model_info", "/metrics")
-REJECTIONS = {401: "key", 408: "slow", 413: "size", 415: "format", 422: "invalid", 503: "unavailable", 504: "deadline"}
+CALLER_LEFT = 499  # as other servers log it; nobody reads the answer
+REJECTIONS = {
+    401: "key",
+    408: "slow",
+    413: "size",
+    415: "format",
+    422: "invalid",
+    CALLER_LEFT: "hung_up",
+    503: "unavailable",
+    504: "deadline",
+}
 
 REQUEST_ID_HEADER = "X-Request-ID"
 _ID_BYTES = 8  # of chance, where a request comes without an id
@@ -47,6 +61,7 @@ class Metrics:
         )
         self.samples = Counter("rfm_gateway_samples", "Samples scored.", ("sample_type",), registry=self._registry)
         self.in_flight = Gauge("rfm_gateway_requests_in_flight", "Evaluations under way.", registry=self._registry)
+        self.waiting = Gauge("rfm_gateway_requests_waiting", "Evaluations not begun.", registry=self._registry)
 
     def text(self) -> bytes:
         """As Prometheus scrapes it."""
@@ -54,13 +69,14 @@ class Metrics:
 
 
 class Observed:
-    """ASGI middleware: names, times and counts every request, and refuses evaluations beyond ``max_in_flight``."""
+    """ASGI middleware: names, times and counts every request, and lets in as many evaluations as ``limits`` say."""
 
-    def __init__(self, app: ASGIApp, metrics: Metrics, max_in_flight: int) -> None:
+    def __init__(self, app: ASGIApp, metrics: Metrics, limits: Limits) -> None:
         self._app = app
         self._metrics = metrics
-        self._max_in_flight = max_in_flight
-        self._in_flight = 0
+        self._limits = limits
+        self._room = asyncio.Semaphore(limits.max_in_flight)
+        self._waiting = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """The request, and its answer."""
@@ -69,7 +85,8 @@ class Observed:
             return
         started_s = time.perf_counter()
         request_id = _request_id(scope)
-        scope.setdefault("state", {})["request_id"] = request_id
+        state = scope.setdefault("state", {})
+        state["request_id"], state["begin_by"] = request_id, Deadline(self._limits.timeout)
         code = 500  # if nothing is answered
 
         async def send_counted(message: Message) -> None:
@@ -81,15 +98,13 @@ class Observed:
 
         is_evaluation = scope["path"] in EVALUATIONS
         try:
-            if is_evaluation and self._in_flight >= self._max_in_flight:
-                refused = {"detail": f"expected at most {self._max_in_flight} evaluations at a time, got more"}
-                await JSONResponse(refused, 503, RETRY_AFTER)(scope, receive, send_counted)
-                return
-            self._count(is_evaluation, 1)
-            try:
+            if not is_evaluation:
                 await self._app(scope, receive, send_counted)
-            finally:
-                self._count(is_evaluation, -1)
+            elif not await self._has_entered(state["begin_by"]):
+                refused = {"detail": f"expected at most {self._limits.max_in_flight} evaluations at a time, got more"}
+                await JSONResponse(refused, 503, RETRY_AFTER)(scope, receive, send_counted)
+            else:
+                await self._evaluated(scope, receive, send_counted)
         finally:
             endpoint = scope["path"] if scope["path"] in ENDPOINTS else "other"  # not whatever somebody asks for
             self._metrics.requests.labels(endpoint, str(code)).inc()
@@ -97,10 +112,28 @@ class Observed:
             if is_evaluation and code >= 400:
                 self._metrics.rejections.labels(REJECTIONS.get(code, "other")).inc()
 
-    def _count(self, is_evaluation: bool, change: int) -> None:
-        if is_evaluation:
-            self._in_flight += change
-            self._metrics.in_flight.set(self._in_flight)
+    async def _has_entered(self, deadline: Deadline) -> bool:
+        """Whether there is room in time, first come, first served."""
+        if self._room.locked() and self._waiting >= self._limits.max_waiting:
+            return False
+        self._waiting += 1
+        self._metrics.waiting.set(self._waiting)
+        try:
+            async with timeout(deadline.remaining_s()):
+                return await self._room.acquire()
+        except (asyncio.TimeoutError, DeadlineExceededError):  # in Python 3.10 not the built-in TimeoutError
+            return False
+        finally:
+            self._waiting -= 1
+            self._metrics.waiting.set(self._waiting)
+
+    async def _evaluated(self, scope: Scope, receive: Receive, send: Send) -> None:
+        self._metrics.in_flight.inc()
+        try:
+            await self._app(scope, receive, send)
+        finally:
+            self._metrics.in_flight.dec()
+            self._room.release()
 
 
 def _request_id(scope: Scope) -> str:

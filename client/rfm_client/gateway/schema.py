@@ -267,7 +267,7 @@ class Health(BaseModel):
     """A server whose every model has answered a request just now."""
 
     status: Literal["healthy"]
-    available_gpus: int | None = Field(description="As total_gpus.")
+    available_gpus: int | None = Field(description="Those at which no request waits.")
     total_gpus: int | None = Field(description="Devices that models run on; null: Triton's metrics cannot be read.")
 
 
@@ -277,5 +277,7 @@ class ModelInformation(BaseModel):
     model_path: str | None = Field(description="Hub id, or name of the folder, that was exported.")
     model_version: str | None = Field(description="Version in the model repository.")
     num_gpus: int | None
-    experiment_config: dict[str, Any] = Field(description="The network's configuration.")
+    experiment_config: dict[str, Any] = Field(
+        description="config.yaml of the training run, without secrets; of a checkpoint without one, the network's."
+    )
     model_architecture: dict[str, Any] = Field(description="Class and numbers of parameters.")

@@ -150,6 +150,6 @@ def _answer(samples: Sequence[schema.Sample], results: Sequence[Result], group: 
             task=[reference.task for reference in references],
             data_source=[reference.data_source for reference in references],
             data_gen_strategy=[getattr(sample, "data_gen_strategy", None) for sample, _ in similar],
-            metadata=[reference.metadata for reference in references],
+            metadata=[{} if reference.metadata is None else reference.metadata for reference in references],
         )
     return answer

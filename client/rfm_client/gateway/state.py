@@ -5,13 +5,21 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from rfm_client.access import Access
 from rfm_client.async_client import AsyncRewardClient
 from rfm_client.deadline import Deadline, timeout
-from rfm_client.errors import ModelNotFoundError, RewardError, ServerError, ServerUnavailableError
+from rfm_client.errors import (
+    DeadlineExceededError,
+    ModelNotFoundError,
+    RewardError,
+    ServerError,
+    ServerUnavailableError,
+)
 from rfm_client.gateway import schema
 from rfm_client.model_info import ModelInfo
 from rfm_client.samples import Trajectory
@@ -19,6 +27,8 @@ from rfm_client.status import Device, ServerStatus, read_status
 from rfm_client.wire import CANARY_PREFIX
 
 HEALTH_TIMEOUT_S = 3.5  # of all that is asked; with HEALTH_KEPT_S less than the 5 s within which it is to be true
+PROBE_TIMEOUT_S = 1.5  # of that: a model that takes longer may be busy
+STALL_S = 30.0  # a busy model that finishes nothing for so long does not work: what rfm serve calls a hang
 HEALTH_KEPT_S = 1.0  # so that probes, which need no key, do not keep the models busy
 STATUS_TIMEOUT_S = 5.0
 MS_PER_S = 1e3
@@ -40,7 +50,8 @@ class State:
         self._asking = asyncio.Lock()
         self._asked_s = -HEALTH_KEPT_S
         self._problem: str | None = None
-        self._num_devices: int | None = None
+        self._devices: schema.GpuStatus | None = None
+        self._stalled: dict[str, _Stalled] = {}
 
     async def gpu_status(self) -> schema.GpuStatus:
         """Raises ServerError."""
@@ -59,12 +70,14 @@ class State:
             if time.monotonic() - self._asked_s >= HEALTH_KEPT_S:
                 deadline = Deadline(HEALTH_TIMEOUT_S)
                 self._problem = await self._ask_all(deadline)
-                self._num_devices = await self._count_devices(deadline) if self._problem is None else None
+                self._devices = await self._read_devices(deadline) if self._problem is None else None
                 self._asked_s = time.monotonic()
-            problem, devices = self._problem, self._num_devices
+            problem, devices = self._problem, self._devices
         if problem is not None:
             raise ServerUnavailableError(problem)
-        return schema.Health(status="healthy", available_gpus=devices, total_gpus=devices)
+        if devices is None:
+            return schema.Health(status="healthy", available_gpus=None, total_gpus=None)
+        return schema.Health(status="healthy", available_gpus=devices.available_gpus, total_gpus=devices.total_gpus)
 
     async def model_info(self) -> schema.ModelInformation:
         """Raises ServerError."""
@@ -76,8 +89,8 @@ class State:
         return schema.ModelInformation(
             model_path=info.source,
             model_version=max(info.versions, key=int, default=None),
-            num_gpus=await self._count_devices(deadline),
-            experiment_config={"model": info.network.get("config", {})},
+            num_gpus=None if (devices := await self._read_devices(deadline)) is None else devices.total_gpus,
+            experiment_config=dict(info.run_config) or {"model": info.network.get("config", {})},
             model_architecture={
                 "model_class": kind,
                 "total_parameters": total,
@@ -88,11 +101,11 @@ class State:
             },
         )
 
-    async def _count_devices(self, deadline: Deadline) -> int | None:
-        """None where the metrics cannot be read: scoring needs them not."""
+    async def _read_devices(self, deadline: Deadline) -> schema.GpuStatus | None:
+        """None where the metrics cannot be read: scoring does not need them."""
         try:
             async with timeout(deadline.remaining_s()):
-                return (await self.gpu_status()).total_gpus
+                return await self.gpu_status()
         except (ServerError, asyncio.TimeoutError):  # in Python 3.10 not the built-in one
             return None
 
@@ -112,15 +125,51 @@ class State:
         return infos
 
     async def _ask_all(self, deadline: Deadline) -> str | None:
-        """Asks every model for a score of next to nothing; the reason of the first that has none to give."""
+        """Asks every model for a score of next to nothing; the reason of the first that neither has one nor works."""
         try:
             infos = await self._infos(deadline)
-            left_s = deadline.remaining_s()
-            canaries = [self._client.progress(_canary(i), timeout_s=left_s, request_id=CANARY_PREFIX) for i in infos]
-            await asyncio.gather(*canaries)
+            late = [name for name in await asyncio.gather(*map(self._late, infos)) if name is not None]
+            if not late:
+                self._stalled.clear()
+                return None
+            return await self._stall(late, deadline)
         except RewardError as error:
             return str(error)
+
+    async def _late(self, info: ModelInfo) -> str | None:
+        """The model's name if it has no score in time. Raises RewardError."""
+        try:
+            await self._client.progress(_canary(info), timeout_s=PROBE_TIMEOUT_S, request_id=CANARY_PREFIX)
+        except DeadlineExceededError:
+            return info.name
         return None
+
+    async def _stall(self, late: Sequence[str], deadline: Deadline) -> str | None:
+        """Why late models do not work; None: they are busy, or may be. Raises RewardError."""
+        left_s = deadline.remaining_s()
+        status = await asyncio.to_thread(
+            read_status, self._url, metrics_url=self._metrics_url, timeout_s=left_s, access=self._access
+        )
+        now_s = time.monotonic()
+        stalled = {}
+        for name in late:
+            finished = sum(e.requests_succeeded + e.requests_failed for e in status.models if e.name == name)
+            known = self._stalled.get(name)
+            is_known = known is not None and known.num_finished == finished
+            stalled[name] = known if known is not None and is_known else _Stalled(finished, now_s)
+        self._stalled = stalled
+        for name, stall in stalled.items():
+            if now_s - stall.since_s >= STALL_S:
+                return f"{name}: no answer within {PROBE_TIMEOUT_S:g} s, and nothing finished for {STALL_S:g} s"
+        return None
+
+
+@dataclass(frozen=True)
+class _Stalled:
+    """A model that is late. num_finished: requests that it has answered; since_s: when it was first seen at that"""
+
+    num_finished: int
+    since_s: float
 
 
 def _canary(info: ModelInfo) -> Trajectory:

@@ -10,7 +10,7 @@ import torch
 
 from rfm.engine import Engine, Outcome
 from rfm.execution import Execution
-from rfm.server.batch_model import BUDGET_PARAMETER, DTYPE_PARAMETER, BatchModel
+from rfm.server.batch_model import BUDGET_PARAMETER, DTYPE_PARAMETER, SAMPLE_TOKENS_PARAMETER, BatchModel
 from rfm_client import Result, Sample, wire
 
 
@@ -23,6 +23,7 @@ class TritonPythonModel(BatchModel[Sample, Result]):
             device=device,
             dtype=getattr(torch, settings[DTYPE_PARAMETER]) if settings[DTYPE_PARAMETER] else None,
             token_budget=int(settings[BUDGET_PARAMETER]),
+            max_sample_tokens=int(settings[SAMPLE_TOKENS_PARAMETER]),
         )
 
     def decode(self, tensors: wire.Tensors) -> list[Sample]:

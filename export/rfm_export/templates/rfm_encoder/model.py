@@ -12,19 +12,20 @@ from rfm.execution import Execution
 from rfm.models.encoders import Encoders
 from rfm.server.batch_model import BatchModel
 from rfm_client import RewardError, Trajectory, wire
+from rfm_client.samples import Footage
 
 
-class TritonPythonModel(BatchModel[Trajectory, Trajectory]):
+class TritonPythonModel(BatchModel[Footage, Trajectory]):
     """One instance: one pair of encoders on one device."""
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
         encoders = Encoders.from_pretrained(version / "image_encoder", version / "text_encoder")
         self.encoders = encoders.to(device)
 
-    def decode(self, tensors: wire.Tensors) -> list[Trajectory]:
+    def decode(self, tensors: wire.Tensors) -> list[Footage]:
         return wire.decode_trajectories(tensors)
 
-    def answer(self, questions: Sequence[Trajectory], execution: Execution) -> list[Trajectory | RewardError]:
+    def answer(self, questions: Sequence[Footage], execution: Execution) -> list[Trajectory | RewardError]:
         return self.encoders.encode(questions, execution)
 
     def encode(self, answers: Sequence[Trajectory], tensors: wire.Tensors, outputs: Collection[str]) -> wire.Tensors:

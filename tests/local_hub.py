@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: MIT
+"""A Hugging Face Hub of one repository on the loopback, for the real ``huggingface_hub`` (``HF_ENDPOINT``)."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+REPOSITORY = "org/name"
+
+
+def commit_of(revision: str) -> str:
+    """Forty digits, as git names commits."""
+    return hashlib.sha1(revision.encode()).hexdigest()
+
+
+@contextmanager
+def hub(revisions: Mapping[str, Path]) -> Iterator[str]:
+    """Serves REPOSITORY with the files of a folder at each revision; all but main are tags. Gives the endpoint."""
+    folders = {**revisions, **{commit_of(name): folder for name, folder in revisions.items()}}
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self._answer(with_body=True)
+
+        def do_HEAD(self) -> None:
+            self._answer(with_body=False)
+
+        def _answer(self, *, with_body: bool) -> None:
+            api, files = f"/api/models/{REPOSITORY}", f"/{REPOSITORY}/resolve/"
+            if self.path == f"{api}/refs":
+                tags = [
+                    {"name": name, "ref": f"refs/tags/{name}", "targetCommit": commit_of(name)}
+                    for name in revisions
+                    if name != "main"
+                ]
+                self._send(200, json.dumps({"branches": [], "converts": [], "tags": tags}).encode(), with_body)
+            elif self.path == api or self.path.startswith(f"{api}/revision/"):
+                revision = self.path.removeprefix(f"{api}/revision/") if self.path != api else "main"
+                siblings = [{"rfilename": file.name} for file in sorted(folders[revision].iterdir())]
+                told = {"id": REPOSITORY, "sha": self._commit(revision), "siblings": siblings}
+                self._send(200, json.dumps(told).encode(), with_body)
+            else:
+                revision, _, name = self.path.removeprefix(files).partition("/")
+                file = folders[revision] / name
+                if not file.is_file():
+                    self._send(404, b"", with_body, {"X-Error-Code": "EntryNotFound"})
+                    return
+                content = file.read_bytes()
+                etag = f'"{hashlib.sha1(content).hexdigest()}"'
+                self._send(200, content, with_body, {"ETag": etag, "X-Repo-Commit": self._commit(revision)})
+
+        def _commit(self, revision: str) -> str:
+            return commit_of(revision) if revision in revisions else revision
+
+        def _send(self, status: int, body: bytes, with_body: bool, headers: Mapping[str, str] | None = None) -> None:
+            self.send_response(status)
+            for name, value in (headers or {}).items():
+                self.send_header(name, value)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            if with_body:
+                self.wfile.write(body)
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Keeps the test's output clean."""
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()

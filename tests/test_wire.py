@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: MIT
+"""The wire contract from both ends: what one side writes the other reads, without a server between them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rfm_client import (
+    BatchTiming,
+    FrameScores,
+    InferenceFailedError,
+    InvalidSampleError,
+    PreferenceResult,
+    PreferenceSample,
+    ProgressResult,
+    ProgressSample,
+    Result,
+    Sample,
+    SimilarityResult,
+    SimilaritySample,
+    Trajectory,
+    wire,
+)
+
+OUTPUTS = [spec.name for spec in wire.score_outputs(4)]
+TIMING = BatchTiming(1.5, 2.5)
+
+
+def embedded(seed: int, num_frames: int) -> Trajectory:
+    random = np.random.default_rng(seed)
+    return Trajectory(
+        video_embeddings=random.standard_normal((num_frames, 5), np.float32),
+        text_embedding=random.standard_normal(3, np.float32),
+    )
+
+
+def filmed(seed: int, num_frames: int) -> Trajectory:
+    frames = np.random.default_rng(seed).integers(1, 256, (num_frames, 6, 4, 3), np.uint8)
+    return Trajectory(frames=frames, task=f"lift cup {seed}")
+
+
+def scores(seed: int, num_frames: int) -> FrameScores:
+    random = np.random.default_rng(seed)
+    progress, success = random.random((2, num_frames), np.float32)
+    return FrameScores(progress=progress, success=success, progress_logits=random.random((num_frames, 4), np.float32))
+
+
+def assert_same_scores(got: FrameScores, wanted: FrameScores) -> None:
+    for name in ("progress", "success", "progress_logits"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(wanted, name))
+
+
+@pytest.mark.parametrize("make", [embedded, filmed])
+def test_samples_of_all_kinds_and_lengths_arrive_as_they_were(make: Any) -> None:
+    samples: list[Sample] = [
+        ProgressSample(make(0, 2), frame_steps=3),
+        PreferenceSample(make(1, 1), make(2, 4)),
+        SimilaritySample(make(3, 3), make(4, 1)),
+        ProgressSample(make(5, 1)),
+    ]
+    tensors = wire.encode_samples(samples)
+    assert tensors[wire.SAMPLE_TYPE].tolist() == [[0], [1], [2], [0]]
+    assert tensors[wire.NUM_FRAMES].tolist() == [[2, 0], [1, 4], [3, 1], [1, 0]]
+    assert tensors[wire.FRAME_STEPS].tolist() == [[3], [0], [0], [0]]
+    assert wire.num_positions(tensors) == 5
+    for got, wanted in zip(wire.decode_samples(tensors), samples, strict=True):
+        assert type(got) is type(wanted)
+        assert getattr(got, "frame_steps", 0) == getattr(wanted, "frame_steps", 0)
+        text = wanted.trajectories[0]  # of a pair there is one
+        for one, other in zip(got.trajectories, wanted.trajectories, strict=True):
+            np.testing.assert_array_equal(one.positions, other.positions)
+            assert one.task == text.task
+            if text.text_embedding is not None:
+                np.testing.assert_array_equal(one.text_embedding, text.text_embedding)
+
+
+def test_a_single_trajectory_is_not_copied() -> None:
+    sample = ProgressSample(embedded(0, 3))
+    tensors = wire.encode_samples([sample])
+    assert np.shares_memory(tensors[wire.VIDEO_EMBEDDINGS], sample.trajectory.positions)
+    assert np.shares_memory(tensors[wire.TEXT_EMBEDDING], sample.trajectory.text_embedding)
+
+
+def results() -> tuple[list[Sample], list[Result]]:
+    samples: list[Sample] = [
+        ProgressSample(embedded(0, 2)),
+        PreferenceSample(embedded(1, 1), embedded(2, 4)),
+        SimilaritySample(embedded(3, 3), embedded(4, 1)),
+    ]
+    first = scores(0, 2)
+    return samples, [
+        ProgressResult(**vars(first), timing=TIMING),
+        PreferenceResult(preference=0.25, first=scores(1, 1), second=scores(2, 4), timing=TIMING),
+        SimilarityResult(similarity=-3.5, reference=scores(3, 3), other=scores(4, 1)),
+    ]
+
+
+def test_results_arrive_as_they_were() -> None:
+    samples, sent = results()
+    tensors = wire.encode_results(sent, 5, OUTPUTS)
+    assert {name: list(array.shape) for name, array in tensors.items()} == {
+        "progress": [3, 5], "success": [3, 5], "preference": [3, 1], "similarity": [3, 1], "timing_ms": [3, 2],
+        "progress_logits": [3, 5, 4],
+    }  # fmt: skip
+    assert all(array.dtype == np.float32 for array in tensors.values())
+    assert np.isnan(tensors["preference"][:, 0]).tolist() == [True, False, True]
+    assert np.isnan(tensors["similarity"][:, 0]).tolist() == [True, True, False]
+    assert np.isnan(tensors["timing_ms"]).tolist() == [[False] * 2, [False] * 2, [True] * 2]
+    assert np.isnan(tensors["progress"]).sum(axis=1).tolist() == [3, 0, 1]
+    progress, preference, similarity = wire.decode_results(tensors, samples, "7")
+    assert isinstance(progress, ProgressResult) and isinstance(sent[0], ProgressResult)
+    assert isinstance(preference, PreferenceResult) and isinstance(sent[1], PreferenceResult)
+    assert isinstance(similarity, SimilarityResult) and isinstance(sent[2], SimilarityResult)
+    assert_same_scores(progress, sent[0])
+    assert_same_scores(preference.first, sent[1].first)
+    assert_same_scores(preference.second, sent[1].second)
+    assert_same_scores(similarity.reference, sent[2].reference)
+    assert_same_scores(similarity.other, sent[2].other)
+    assert (preference.preference, similarity.similarity) == (0.25, -3.5)
+    assert [result.model_version for result in (progress, preference, similarity)] == ["7"] * 3
+    assert (progress.timing, preference.timing) == (TIMING, TIMING)
+
+
+def test_what_was_not_asked_for_is_not_there() -> None:
+    samples, sent = results()
+    (progress, *_) = wire.decode_results(
+        wire.encode_results(sent, 5, ["progress", "success", "preference", "similarity"]), samples
+    )
+    assert isinstance(progress, ProgressResult)
+    assert (progress.progress_logits, progress.timing, progress.model_version) == (None, None, None)
+
+
+def lacking(name: str, row: int, at: slice) -> wire.Tensors:
+    _, sent = results()
+    tensors = wire.encode_results(sent, 5, OUTPUTS)
+    tensors[name] = tensors[name].copy()
+    tensors[name][row, at] = np.nan
+    return tensors
+
+
+@pytest.mark.parametrize(
+    ("name", "row", "at"),
+    [
+        ("progress", 0, slice(0, 2)),  # what was asked
+        ("progress", 1, slice(0, 1)),  # all of a pair's first trajectory
+        ("success", 0, slice(0, 2)),
+        ("success", 0, slice(1, 2)),  # a part
+        ("progress", 1, slice(2, 3)),
+        ("preference", 1, slice(0, 1)),
+        ("similarity", 2, slice(0, 1)),
+        ("progress_logits", 0, slice(0, 1)),
+    ],
+)
+def test_a_score_that_lacks_is_an_error(name: str, row: int, at: slice) -> None:
+    samples, _ = results()
+    tensors = lacking(name, row, at)
+    with pytest.raises(InferenceFailedError, match=f"{name}: expected "):
+        wire.decode_results(tensors, samples)
+
+
+@pytest.mark.parametrize("shape", [(3,), (2, 5)], ids=str)
+def test_an_answer_of_fewer_rows_or_axes_is_an_error(shape: tuple[int, ...]) -> None:
+    samples, sent = results()
+    tensors = wire.encode_results(sent, 5, OUTPUTS) | {"success": np.ones(shape, np.float32)}
+    with pytest.raises(InferenceFailedError, match="success: expected scores of sample"):
+        wire.decode_results(tensors, samples)
+
+
+def test_the_encoder_s_requests_and_answers_arrive_as_they_were() -> None:
+    film = filmed(0, 3)
+    tensors = wire.encode_frames(film)
+    needed = [spec.name for spec in wire.encoder_inputs() if not spec.optional]
+    assert list(tensors) == needed == ["num_frames", "frames", "task"]
+    (footage,) = wire.decode_trajectories(tensors)
+    (got,) = footage.trajectories
+    np.testing.assert_array_equal(got.positions, film.positions)
+    assert got.task == film.task
+    answer = embedded(1, 3)
+    outputs = [spec.name for spec in wire.encoder_outputs(5, 3)]
+    assert outputs == ["video_embeddings", "text_embedding"]
+    told = wire.encode_trajectories([answer], 4, outputs)
+    assert told["video_embeddings"].shape == (1, 4, 5)
+    assert not told["video_embeddings"][0, 3:].any()
+    told["video_embeddings"] = told["video_embeddings"][:, :3]
+    decoded = wire.decode_embeddings(told, film)
+    np.testing.assert_array_equal(decoded.positions, answer.positions)
+    np.testing.assert_array_equal(decoded.text_embedding, answer.text_embedding)
+    assert decoded.task == film.task
+
+
+@pytest.mark.parametrize(
+    ("video", "text"),
+    [((3, 5), (1, 3)), ((1, 3, 5), (3,)), ((1, 2, 5), (1, 3)), ((2, 3, 5), (1, 3)), ((1, 3, 5), (2, 3))],
+)
+def test_embeddings_of_another_shape_are_an_error(video: tuple[int, ...], text: tuple[int, ...]) -> None:
+    tensors = {"video_embeddings": np.ones(video, np.float32), "text_embedding": np.ones(text, np.float32)}
+    with pytest.raises(InferenceFailedError, match=r"embeddings: expected \[1, 3, D\] and \[1, Dt\]"):
+        wire.decode_embeddings(tensors, filmed(0, 3))
+
+
+def request(lengths: tuple[int, int], kind: int, steps: int = 0, positions: int = 4) -> wire.Tensors:
+    return {
+        "sample_type": np.array([[kind]], np.uint8),
+        "num_frames": np.array([lengths], np.int32),
+        "frame_steps": np.array([[steps]], np.int32),
+        "video_embeddings": np.where(np.arange(positions) < sum(lengths), 1, 0).astype(np.float32)[None, :, None],
+        "text_embedding": np.ones((1, 2), np.float32),
+    }
+
+
+@pytest.mark.parametrize(
+    ("tensors", "message"),
+    [
+        (request((0, 0), 0), r"num_frames: expected \[at least 1, 0\] for progress, got \[0, 0\]"),
+        (request((1, 1), 0), r"num_frames: expected \[at least 1, 0\] for progress, got \[1, 1\]"),
+        (request((1, -1), 0), r"num_frames: expected \[at least 1, 0\] for progress, got \[1, -1\]"),
+        (request((2, 0), 1), r"num_frames: expected at least one frame of each of the two trajectories, got \[2, 0\]"),
+        (request((0, 2), 2), r"num_frames: expected at least one frame of each of the two trajectories, got \[0, 2\]"),
+        (request((1, 1), 1, 1), r"frame_steps: expected 0 unless the sample is of type progress, got 1"),
+        (request((1, 1), 2, -1), r"frame_steps: expected 0 unless the sample is of type progress, got -1"),
+        (request((1, 1), 3), r"sample_type: expected one of 0 \(progress\), 1 \(preference\), 2 \(similarity\), got 3"),
+        (request((5, 0), 0), r"num_frames: expected at most the 4 frames in video_embeddings, got 5"),
+        (request((2, 3), 1), r"num_frames: expected at most the 4 frames in video_embeddings, got 5"),
+    ],
+)
+def test_numbers_that_mean_nothing_are_refused(tensors: wire.Tensors, message: str) -> None:
+    with pytest.raises(InvalidSampleError, match=f"^{message}$"):
+        wire.decode_samples(tensors)
+
+
+@pytest.mark.parametrize(("lengths", "is_refused"), [((1, 0), False), ((1, 1), False), ((0, 1), True), ((1, -1), True)])
+def test_the_encoder_reads_what_has_frames(lengths: tuple[int, int], is_refused: bool) -> None:
+    tensors = wire.encode_frames(filmed(0, 2)) | {"num_frames": np.array([lengths], np.int32)}
+    tensors["frames"] = np.where(np.arange(2)[None, :, None, None, None] < sum(lengths), tensors["frames"], 0)
+    if is_refused:
+        with pytest.raises(InvalidSampleError, match="num_frames: expected"):
+            wire.decode_trajectories(tensors)
+    else:
+        (footage,) = wire.decode_trajectories(tensors)
+        assert sum(trajectory.num_frames for trajectory in footage.trajectories) == sum(lengths)
+
+
+def test_rows_are_padded_with_what_is_asked() -> None:
+    one, two = np.array([1.0]), np.array([2.0, 3.0])
+    assert wire.pad_stack([one, two]).tolist() == [[1, 0], [2, 3]]
+    assert wire.pad_stack([two], 3, fill=9).tolist() == [[2, 3, 9]]
+    assert np.shares_memory(wire.pad_stack([two], 2), two)
+
+
+def test_specs_are_those_of_the_contract() -> None:
+    question = [("sample_type", "UINT8", (1,), False), ("num_frames", "INT32", (2,), False), ("frame_steps", "INT32", (1,), False)]  # fmt: skip
+    films = [(name, "UINT8", (-1, -1, -1, 3), True) for name in ("frames", "second_frames")]
+    frames = [*films, ("task", "BYTES", (1,), False)]
+    scored = [("progress", (-1,)), ("success", (-1,)), ("preference", (1,)), ("similarity", (1,)), ("timing_ms", (2,))]
+    embeddings = [("video_embeddings", "FP32", (-1, 5), True), ("text_embedding", "FP32", (3,), False)]
+
+    def told(specs: tuple[wire.TensorSpec, ...]) -> list[tuple[str, str, tuple[int, ...], bool]]:
+        return [(spec.name, spec.datatype, spec.dims, spec.ragged) for spec in specs]
+
+    assert told(wire.embedding_inputs(5, 3)) == [*question, *embeddings]
+    assert told(wire.frame_inputs()) == [*question, *frames]
+    assert told(wire.encoder_inputs()) == [question[1], *frames]
+    assert [spec.name for spec in wire.frame_inputs() if spec.optional] == ["second_frames"]
+    assert told(wire.encoder_outputs(5, 3)) == [(name, kind, dims, False) for name, kind, dims, _ in embeddings]
+    assert told(wire.score_outputs(None)) == [(name, "FP32", dims, False) for name, dims in scored]
+    assert told(wire.score_outputs(4)) == [*told(wire.score_outputs(None)), ("progress_logits", "FP32", (-1, 4), False)]
