@@ -15,7 +15,7 @@ from typing import Any
 from rfm.server.asked import FAILED, SCORED, Asked
 
 FAILED_BATCHES = 3  # in a row, before the blank sample is scored
-ANSWERED_S = 1.0  # for Triton to pass on the errors of the last batch
+ANSWERED_S = 1.0  # for Triton to pass on the errors and the log of the last batch
 
 
 class SelfCheck:
@@ -30,15 +30,15 @@ class SelfCheck:
         self._tell = tell
         self._num_failed = 0
         self._has_scored_blank = False  # else a failure says nothing
-        self._is_broken = False
+        self._ending: threading.Timer | None = None  # of a broken instance
 
     def before_batch(self) -> None:
-        """Ends a broken process. It has begun nothing of the batch, so that no request is a suspect."""
-        if self._is_broken:
-            _end()
+        """Begins nothing of the batch in a broken process, so that no request is a suspect when it ends."""
+        if self._ending is not None:
+            self._ending.join()
 
     def after_batch(self, batch: Sequence[Asked[Any]]) -> None:
-        """Checks the instance if need be. One that is broken ends at the next batch, or when this one is answered."""
+        """Checks the instance if need be. One that is broken ends when Triton has passed on this batch's errors."""
         outcomes = {asked.outcome for asked in batch}
         if any(asked.outcome == SCORED and not asked.is_counted for asked in batch):  # a probe, or a warm-up
             self._has_scored_blank = True
@@ -54,11 +54,10 @@ class SelfCheck:
         try:
             self._score_blank()
         except Exception as error:  # noqa: BLE001  whatever it is: the instance scored this before
-            self._is_broken = True
             self._tell(error)
-            ending = threading.Timer(ANSWERED_S, _end)
-            ending.daemon = True
-            ending.start()
+            self._ending = threading.Timer(ANSWERED_S, _end)
+            self._ending.daemon = True
+            self._ending.start()
 
 
 def _end() -> None:
