@@ -99,9 +99,9 @@ lock:
 	{ echo '# What the image installs beside torch, in the versions of constraints.txt, with the hashes of all files.'; \
 	  echo '# Made by: make lock'; \
 	  echo '# Not here: torch, whose build and so whose hash depends on TORCH_INDEX, and what only torch needs.'; \
-	  printf 'torch\nrfm-client\n' | $(VENV)/lock/bin/uv pip compile --quiet --no-python-downloads --no-header \
+	  printf 'torch\nrfm-client\nrfm-gateway\n' | $(VENV)/lock/bin/uv pip compile --quiet --no-python-downloads --no-header \
 	  --no-annotate --universal --python-version 3.10 --generate-hashes --constraints constraints.txt --excludes - \
-	  --extra gateway --extra encoders --extra vlm client/pyproject.toml pyproject.toml; } > $(VENV)/lock/requirements.txt
+	  --extra encoders --extra vlm client/pyproject.toml gateway/pyproject.toml pyproject.toml; } > $(VENV)/lock/requirements.txt
 	mv $(VENV)/lock/requirements.txt docker/requirements.txt
 
 format: $(INSTALLED)
@@ -117,11 +117,11 @@ model_repository: $(INSTALLED)
 	  --checkpoint build/demo_checkpoint/checkpoint \
 	  --image-encoder build/demo_checkpoint/image_encoder --text-encoder build/demo_checkpoint/text_encoder
 
-$(INSTALLED): pyproject.toml client/pyproject.toml constraints.txt
+$(INSTALLED): pyproject.toml client/pyproject.toml gateway/pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-	  --editable "client[cli,gateway,gym]" --editable ".[encoders,vlm,triton,demo,dev]"
+	  --editable "client[cli,gym]" --editable gateway --editable ".[encoders,vlm,triton,demo,dev]"
 	touch $@
 
 clean:

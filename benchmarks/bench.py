@@ -29,9 +29,10 @@ from load import SHARED_MEMORY, Load
 from rich.console import Console
 
 import rfm_export
-from rfm.checkpoint import RewindCheckpoint, save
 from rfm.config import ServeConfig
-from rfm.models.rewind import RewindConfig, RewindTransformer
+from rfm.families import save
+from rfm.rewind.checkpoint import RewindCheckpoint
+from rfm.rewind.network import RewindConfig, RewindTransformer
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"

@@ -17,10 +17,10 @@ from pathlib import Path
 from load import SHARED_MEMORY, Load, Measured, samples
 
 from rfm.engine import Engine
-from rfm.models.encoders import Encoders
-from rfm.server.process import Endpoints
-from rfm.server.temporary import served
-from rfm_client.gateway.command import gateway_command
+from rfm.rewind.encoders import Encoders
+from rfm.supervise.process import Endpoints
+from rfm.supervise.temporary import served
+from rfm_gateway.command import gateway_command
 
 PEER_SCRIPTS = {"FastAPI": "fastapi_server.py", "LitServe": "litserve_server.py", "mosec": "mosec_server.py"}
 START_S = 120

@@ -29,9 +29,9 @@ from rich.console import Console
 from torch._inductor import config as inductor
 
 from rfm.engine import Engine
-from rfm.families.rewind import RewindFamily
-from rfm.models.heads import progress_from_logits
-from rfm.models.rewind import RewindBatch, RewindConfig, RewindTransformer
+from rfm.layers.heads import progress_from_logits
+from rfm.rewind.family import RewindFamily
+from rfm.rewind.network import RewindBatch, RewindConfig, RewindTransformer
 from rfm_client import ProgressResult, ProgressSample, Trajectory
 
 BATCH_SIZES = (1, 2, 4, 8, 16, 32, 64)

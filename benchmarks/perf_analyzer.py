@@ -27,10 +27,10 @@ from contestants import BareEngine, Callers
 from load import Load, samples
 from rich.console import Console
 
-from rfm.server.installation import find_installation
-from rfm.server.temporary import served
-from rfm_client.perf_input import write_perf_analyzer_input
-from rfm_client.show import table
+from rfm.supervise.installation import find_installation
+from rfm.supervise.temporary import served
+from rfm_client.cli.perf_input import write_perf_analyzer_input
+from rfm_client.cli.show import table
 
 WHEEL = "tritonclient==2.51.0"
 LIBRARIES = ("libcudart.so.12", "libb64.so.0d")  # the wheel of tritonserver has them under other names

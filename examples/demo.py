@@ -13,10 +13,10 @@ from typing import Annotated, NamedTuple
 import typer
 from rich.console import Console
 
-from rfm.demo import show_metrics
-from rfm.server.temporary import served, stopped_by_signals
+from rfm.supervise.temporary import served, stopped_by_signals
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Sample, SimilaritySample, Trajectory
-from rfm_client.show import Panel, plot, scores_table
+from rfm_client.cli.show import Panel, plot, scores_table
+from rfm_commands.demo import show_metrics
 from toy_world import Clip, Task, make_clip
 
 TASK, OTHER_TASK = Task("red", "bowl"), Task("green", "plate")

@@ -19,7 +19,7 @@ from rich.console import Console
 from demo_evaluation.figures import Figure, figures
 from demo_evaluation.questions import HeldOut
 from rfm_client import Result, RewardClient, RewardError, Sample
-from rfm_client.show import table
+from rfm_client.cli.show import table
 
 Evaluate: TypeAlias = Callable[[Sequence[Sample]], Sequence[Result | RewardError]]
 REQUEST_SAMPLES = 64
@@ -74,7 +74,7 @@ def _evaluator(
         with RewardClient(url) as client:
             yield client.evaluate
     else:
-        from rfm.server.temporary import served
+        from rfm.supervise.temporary import served
 
         assert repository is not None  # one of the three is given
         with (
@@ -86,12 +86,12 @@ def _evaluator(
 
 def _in_process(folder: Path) -> Evaluate:
     """The engine of what training wrote."""
-    from rfm import checkpoint as checkpoints
+    from rfm import families
     from rfm.engine import Engine
-    from rfm.models.encoders import Encoders
+    from rfm.rewind.encoders import Encoders
 
-    loaded = checkpoints.load(folder / "checkpoint")
-    assert isinstance(loaded, checkpoints.RewindCheckpoint)
+    loaded = families.load(folder / "checkpoint")
+    assert isinstance(loaded, families.RewindCheckpoint)
     encoders = Encoders.from_pretrained(
         folder / "image_encoder",
         folder / "text_encoder",

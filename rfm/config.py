@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rfm.plain_yaml import read_yaml
-from rfm_client.access import is_loopback
+from rfm_client.contract.addresses import is_loopback
 
 if TYPE_CHECKING:
     import torch

@@ -14,14 +14,14 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch
 
-from rfm import checkpoint as checkpoints
+from rfm import families
 from rfm.config import DEFAULT_SAMPLE_TOKENS, DEFAULT_TOKEN_BUDGET
 from rfm.execution import Execution, memory_errors
-from rfm.families.rewind import RewindFamily
-from rfm.families.vlm import VlmFamily
 from rfm.family import Family, RowScores
-from rfm.models.encoders import Encoders
-from rfm_client import (
+from rfm.rewind.encoders import Encoders
+from rfm.rewind.family import RewindFamily
+from rfm.vlm.family import VlmFamily
+from rfm_client.contract import (
     BatchTiming,
     FrameScores,
     InvalidSampleError,
@@ -78,10 +78,10 @@ class Engine:
         base_model, resize_images: of a vision-language checkpoint, as in ``rfm.checkpoint.load``
         dtype: of the network; None: float32, and a vision-language checkpoint's own on a GPU
         """
-        folder = checkpoints.find(source)
+        folder = families.find(source)
         own = folder / PROCESSOR_FOLDER
         return cls.of(
-            checkpoints.load(folder, base_model=base_model, resize_images=resize_images),
+            families.load(folder, base_model=base_model, resize_images=resize_images),
             encoders=encoders,
             processor=base_model or (own if own.is_dir() else None),
             device=device,
@@ -93,7 +93,7 @@ class Engine:
     @classmethod
     def of(
         cls,
-        checkpoint: checkpoints.Checkpoint,
+        checkpoint: families.Checkpoint,
         *,
         encoders: Encoders | None = None,
         processor: str | Path | None = None,
@@ -108,7 +108,7 @@ class Engine:
         base model that it names
         """
         on = torch.device(device)
-        if isinstance(checkpoint, checkpoints.RewindCheckpoint):
+        if isinstance(checkpoint, families.RewindCheckpoint):
             family = RewindFamily(checkpoint.build(), encoders=encoders, device=on, dtype=dtype or torch.float32)
             return cls(family, token_budget=token_budget, max_sample_tokens=max_sample_tokens)
         if dtype is None and on.type == "cpu":

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from rfm_client import InferenceFailedError
+from rfm_client.contract import InferenceFailedError
 
 Output = TypeVar("Output")
 

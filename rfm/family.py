@@ -11,8 +11,8 @@ import numpy as np
 from torch import Tensor
 
 from rfm.execution import Execution
-from rfm.models.heads import progress_from_logits
-from rfm_client import FrameScores, InferenceFailedError, RewardError, Sample
+from rfm.layers.heads import progress_from_logits
+from rfm_client.contract import FrameScores, InferenceFailedError, RewardError, Sample
 
 Row = TypeVar("Row")
 Batch = TypeVar("Batch")

@@ -22,7 +22,7 @@ from faults import FAULTS
 from rich.console import Console
 from soak import soak
 
-from rfm_client import show
+from rfm_client.cli import show
 
 COLUMNS = ("fault", "asked", "answered", "refused", "broken off", "lost", "wrong", "back s", "told")
 

@@ -15,7 +15,7 @@ from rfm_serve import ROOT, Serving, serving, wait_for
 
 import rfm_export
 from rfm.config import ServeConfig
-from rfm.server.process import Endpoints
+from rfm.supervise.process import Endpoints
 
 CHECKPOINT = ROOT / "model_repository" / "rfm" / "1" / "checkpoint"
 BACK_S = 10.0  # from a fault to readiness, beside what a start takes

@@ -15,12 +15,12 @@ import pytest
 import torch
 
 import rfm_export
-from rfm import checkpoint as checkpoints
+from rfm import families
 from rfm.config import ServeConfig
 from rfm.engine import Engine
-from rfm.families.rewind import RewindFamily
-from rfm.server.installation import find_installation
-from rfm.server.process import Endpoints, TritonServer
+from rfm.rewind.family import RewindFamily
+from rfm.supervise.installation import find_installation
+from rfm.supervise.process import Endpoints, TritonServer
 from rfm_client import RewardClient, Trajectory
 from rfm_export.export import load_encoders
 from rfm_export.layout import CONFIG_FILE
@@ -48,8 +48,8 @@ def load_engine(name: str) -> Engine:
     config = goldens.config(name)
     if config.is_vlm:
         return Engine.from_checkpoint(config.checkpoint, base_model=str(config.base_model))
-    checkpoint = checkpoints.load(config.checkpoint)
-    assert isinstance(checkpoint, checkpoints.RewindCheckpoint)
+    checkpoint = families.load(config.checkpoint)
+    assert isinstance(checkpoint, families.RewindCheckpoint)
     return Engine.of(checkpoint, encoders=load_encoders(checkpoint, serve_config(config)))
 
 

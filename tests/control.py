@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from rfm.server.installation import find_installation
-from rfm.server.process import Endpoints, TritonServer
+from rfm.supervise.installation import find_installation
+from rfm.supervise.process import Endpoints, TritonServer
 
 MODEL = Path(__file__).parent / "control_model.py"
 SERVICE_PARAMETER = "control_service_s"  # control_model.py reads it

@@ -20,9 +20,9 @@ from rfm_serve import MODEL, RFM, TRUTH_S, children, wait_for
 
 import rfm_export
 from rfm.config import ServeConfig
-from rfm.server.stubs import is_alive
+from rfm.supervise.stubs import is_alive
 from rfm_client import RewardClient
-from rfm_client.shared_memory import FOLDER
+from rfm_client.transport.shared_memory import FOLDER
 from rfm_export.publish import read_config
 
 STOPPED_S = 10.0
@@ -129,7 +129,7 @@ def corrupt_weights(site: Site) -> list[Row]:
     content = bytearray(weights.read_bytes())
     content[-1] ^= 0x40
     weights.write_bytes(content)
-    url = site.served.endpoints.http_url
+    url = site.served.endpoints.grpc_url
     words = ["--repository", site.repository, "--url", url, "--admin-key-file", site.key_file]
     with site.callers() as callers:
         done = subprocess.run(

@@ -38,10 +38,11 @@ from rich.table import Table
 from tritonclient.grpc import service_pb2 as pb
 
 import rfm_export
-from rfm.server.installation import find_installation
-from rfm.server.process import Endpoints, TritonServer
-from rfm_client import PreferenceSample, ProgressSample, RewardClient, Sample, Trajectory, wire
-from rfm_client.gateway.command import gateway_command
+from rfm.supervise.installation import find_installation
+from rfm.supervise.process import Endpoints, TritonServer
+from rfm_client import PreferenceSample, ProgressSample, RewardClient, Sample, Trajectory
+from rfm_client.contract import wire
+from rfm_gateway.command import gateway_command
 
 CHECKPOINT = goldens.config("enc_c1_t1_disc10")
 DIMS = (48, 32)  # widths of its embeddings

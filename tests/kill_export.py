@@ -34,14 +34,14 @@ import torch
 from conftest import serve_config
 from safetensors.torch import load_file, save_file
 
-from rfm.cli import app
 from rfm.engine import Engine, Outcome
-from rfm.models.encoders import Encoders
-from rfm.server.installation import find_installation
-from rfm.server.process import Endpoints, TritonServer
-from rfm.server.weights import check_digest
+from rfm.rewind.encoders import Encoders
+from rfm.supervise.installation import find_installation
+from rfm.supervise.process import Endpoints, TritonServer
+from rfm.triton_model.weights import check_digest
 from rfm_client import ProgressResult, ProgressSample, RewardClient, Sample, Trajectory
-from rfm_client.model_info import DIGEST_PARAMETER
+from rfm_client.contract.model_info import DIGEST_PARAMETER
+from rfm_commands.cli import app
 from rfm_export.publish import read_config
 
 CHECKPOINT = goldens.config("enc_c1_t1_disc10")
@@ -240,11 +240,11 @@ def _export_as(how: dict[str, Any]) -> NoReturn:
 
 
 def _load(checkpoint: Path) -> Engine:
-    from rfm import checkpoint as checkpoints
+    from rfm import families
     from rfm_export.export import load_encoders
 
-    loaded = checkpoints.load(checkpoint)
-    assert isinstance(loaded, checkpoints.RewindCheckpoint)
+    loaded = families.load(checkpoint)
+    assert isinstance(loaded, families.RewindCheckpoint)
     return Engine.of(loaded, encoders=load_encoders(loaded, serve_config(CHECKPOINT)))
 
 

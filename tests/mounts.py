@@ -19,9 +19,9 @@ from rfm_serve import RFM
 
 import rfm_export
 from rfm.config import ServeConfig
-from rfm.server.weights import check_digest
-from rfm_client.model_info import DIGEST_PARAMETER
-from rfm_client.shared_memory import FOLDER
+from rfm.triton_model.weights import check_digest
+from rfm_client.contract.model_info import DIGEST_PARAMETER
+from rfm_client.transport.shared_memory import FOLDER
 from rfm_export.publish import read_config
 
 SHM_SIZE = "24m"

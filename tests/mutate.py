@@ -35,23 +35,23 @@ BASELINE_S = 1800.0  # for the tests of the code as it is
 PATIENCE_S = 60.0  # beyond three times what they took
 # Files whose mutants are tried, and the tests of each: the first that fails is enough.
 TESTS: dict[str, tuple[str, ...]] = {
-    "rfm/collate/rewind.py": ("test_rewind", "test_properties"),
-    "rfm/collate/dense.py": ("test_rewind",),
-    "rfm/collate/images.py": ("test_vlm", "test_inputs", "test_encoders"),
-    "rfm/collate/*.py": ("test_vlm",),
-    "rfm/models/linear.py": ("test_linear",),
-    "rfm/models/encoders.py": ("test_encoders",),
-    "rfm/models/vlm.py": ("test_vlm",),
-    "rfm/models/*.py": ("test_rewind",),
-    "rfm/families/rewind.py": ("test_rewind", "test_encoders"),
-    "rfm/families/vlm.py": ("test_vlm",),
-    "rfm/checkpoint/rewind.py": ("test_checkpoint", "test_hostile_files", "test_properties"),
-    "rfm/checkpoint/vlm.py": ("test_vlm", "test_hostile_files", "test_properties"),
-    "rfm/checkpoint/lora.py": ("test_vlm", "test_hostile_files"),
+    "rfm/prefixes.py": ("test_rewind",),
+    "rfm/layers/linear.py": ("test_linear",),
+    "rfm/layers/*.py": ("test_rewind",),
+    "rfm/rewind/collator.py": ("test_rewind", "test_properties"),
+    "rfm/rewind/encoders.py": ("test_encoders",),
+    "rfm/rewind/family.py": ("test_rewind", "test_encoders"),
+    "rfm/rewind/checkpoint.py": ("test_checkpoint", "test_hostile_files", "test_properties"),
+    "rfm/rewind/*.py": ("test_rewind",),
+    "rfm/vlm/images.py": ("test_vlm", "test_inputs", "test_encoders"),
+    "rfm/vlm/checkpoint.py": ("test_vlm", "test_hostile_files", "test_properties"),
+    "rfm/vlm/lora.py": ("test_vlm", "test_hostile_files"),
+    "rfm/vlm/*.py": ("test_vlm",),
+    "rfm/families.py": ("test_checkpoint", "test_vlm"),
     "rfm/checkpoint/*.py": ("test_checkpoint", "test_hostile_files", "test_properties", "test_vlm"),
-    "client/rfm_client/wire.py": ("test_wire", "test_samples", "test_properties"),
-    "rfm/server/batch_model.py": ("test_batch_model", "test_poison", "test_logs"),
-    "rfm/server/healing.py": ("test_healing",),
+    "client/rfm_client/contract/wire.py": ("test_wire", "test_samples", "test_properties"),
+    "rfm/triton_model/batch_model.py": ("test_batch_model", "test_poison", "test_logs"),
+    "rfm/supervise/healing.py": ("test_healing",),
 }
 
 
@@ -173,7 +173,8 @@ class Worker:
         subprocess.run([sys.executable, "-m", "venv", "--without-pip", place], check=True)
         (packages,) = place.glob("lib/python*/site-packages")
         others = next(path for path in sys.path if path.endswith("site-packages"))
-        imported = (self._folder, self._folder / "client", self._folder / "export", others)
+        own = (self._folder, *(self._folder / name for name in ("client", "gateway", "export", "commands")))
+        imported = (*own, others)
         (packages / "mutated.pth").write_text("".join(f"{path}\n" for path in imported))
         for script in ("rfm", "rfm-client"):
             original = Path(sys.executable).with_name(script).read_text().partition("\n")

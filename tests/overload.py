@@ -30,12 +30,13 @@ from control import SCORE, control
 from prometheus_client.parser import text_string_to_metric_families
 from rfm_serve import MODEL, PATIENCE_S
 
-from rfm.checkpoint import RewindCheckpoint, save
-from rfm.models.rewind import RewindConfig, RewindTransformer
-from rfm.server.process import Endpoints
+from rfm.families import save
+from rfm.rewind.checkpoint import RewindCheckpoint
+from rfm.rewind.network import RewindConfig, RewindTransformer
+from rfm.supervise.process import Endpoints
 from rfm_client import ProgressSample, Sample
-from rfm_client.gateway.command import gateway_command
-from rfm_client.gateway.scoring import FRAME_STEPS
+from rfm_gateway.command import gateway_command
+from rfm_gateway.scoring import FRAME_STEPS
 
 ROOM = 8  # calls that may wait at a time: about a second
 # Two instances: with one, a Triton before 26.08 that has a bounded queue serves a batch each half second once it is full.

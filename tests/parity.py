@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.table import Table
 
 import rfm_export
-from rfm.server.installation import find_installation
-from rfm.server.process import Endpoints, TritonServer
+from rfm.supervise.installation import find_installation
+from rfm.supervise.process import Endpoints, TritonServer
 from rfm_client import RewardClient
 
 

@@ -27,9 +27,9 @@ import torch
 from conftest import random_trajectory, serve_config
 
 import rfm_export
-from rfm import checkpoint as checkpoints
+from rfm import families
 from rfm.engine import Engine, Outcome
-from rfm.server.process import Endpoints
+from rfm.supervise.process import Endpoints
 from rfm_client import (
     AsyncRewardClient,
     DeadlineExceededError,
@@ -119,8 +119,8 @@ def questions() -> list[Sample]:
 
 def answers(checkpoint: Path, samples: Sequence[Sample]) -> list[Outcome]:
     """What the checkpoint itself says."""
-    loaded = checkpoints.load(checkpoint)
-    assert isinstance(loaded, checkpoints.RewindCheckpoint)
+    loaded = families.load(checkpoint)
+    assert isinstance(loaded, families.RewindCheckpoint)
     return Engine.of(loaded, encoders=load_encoders(loaded, serve_config(WITH_ENCODERS))).evaluate(samples)
 
 

@@ -12,7 +12,7 @@ from chaos_site import Site
 from fuzz import Doors
 from rich.console import Console
 
-from rfm_client import show
+from rfm_client.cli import show
 
 CALLERS = 6
 OF_GATEWAY = 2

@@ -16,12 +16,12 @@ import pytest
 from conftest import random_trajectory
 
 from rfm.execution import Execution
-from rfm.server import batch_model
-from rfm.server.batch_model import BatchModel
-from rfm.server.canary import blank_question
-from rfm.server.metrics import Counted
-from rfm.server.poison import Poison, digest
-from rfm.server.self_check import SelfCheck
+from rfm.probe import blank_question
+from rfm.triton_model import batch_model
+from rfm.triton_model.batch_model import BatchModel
+from rfm.triton_model.metrics import Counted
+from rfm.triton_model.quarantine import Poison, digest
+from rfm.triton_model.self_check import SelfCheck
 from rfm_client import (
     FrameScores,
     InferenceFailedError,
@@ -32,8 +32,9 @@ from rfm_client import (
     Result,
     RewardError,
     Sample,
-    wire,
 )
+from rfm_client.contract import wire
+from rfm_client.contract.names import PROBE_PREFIX
 
 WIDTHS = (4, 3)
 CONFIG = {
@@ -221,7 +222,7 @@ def test_what_an_answer_takes_is_that_of_a_question(tmp_path: Path, monkeypatch:
 
 def test_warm_ups_and_probes_are_not_counted(tmp_path: Path) -> None:
     model = Model(tmp_path, warmups=2)
-    blank = Request(blank_question(CONFIG), id=f"{wire.CANARY_PREFIX}-rfm")
+    blank = Request(blank_question(CONFIG), id=f"{PROBE_PREFIX}-rfm")
     model.execute([request(1), request(5), blank])
     assert (model.at_work, model.samples) == ([0, 0], {})
     model.execute([request(1), request(1, id="caller")])

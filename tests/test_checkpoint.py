@@ -20,10 +20,11 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from rfm import checkpoint as checkpoints
-from rfm.checkpoint import CheckpointError, best_tag
-from rfm.models.rewind import RewindConfig
-from rfm.models.vlm import VlmConfig
+from rfm import families
+from rfm.checkpoint.content import CheckpointError
+from rfm.checkpoint.files import best_tag
+from rfm.rewind.network import RewindConfig
+from rfm.vlm.network import VlmConfig
 
 CONTINUOUS = "legacy_keys_l2"  # lacks causal_mask and use_per_frame_progress_token
 MISMATCHED = "h40_L3_H5_c1_t1_disc5_cfgmismatch"  # its configs say l2 and 32 bins, its weights 5 bins
@@ -43,14 +44,14 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_weights_decide_where_configurations_disagree() -> None:
-    config = checkpoints.load(goldens.config(MISMATCHED).checkpoint).config
+    config = families.load(goldens.config(MISMATCHED).checkpoint).config
     assert (config.progress_bins, config.max_len, config.num_layers, config.hidden_dim) == (5, 10, 3, 40)
     assert (config.video_feature_dim, config.text_feature_dim) == (256, 96)
     assert config.use_per_frame_progress_token
 
 
 def test_what_an_old_checkpoint_does_not_say_is_off() -> None:
-    config = checkpoints.load(goldens.config(CONTINUOUS).checkpoint).config
+    config = families.load(goldens.config(CONTINUOUS).checkpoint).config
     assert not config.causal_mask
     assert not config.use_per_frame_progress_token
     assert config.progress_bins == 1
@@ -61,13 +62,13 @@ def test_config_yaml_is_found_above_the_checkpoint(tmp_path: Path) -> None:
     (tmp_path / "run" / "ckpt").mkdir(parents=True)
     shutil.copy(source / "model.safetensors", tmp_path / "run" / "ckpt")
     shutil.copy(source.parent / "config.yaml", tmp_path / "run")  # no config.json: all there is
-    assert checkpoints.load(tmp_path / "run" / "ckpt").config == checkpoints.load(source).config
+    assert families.load(tmp_path / "run" / "ckpt").config == families.load(source).config
 
 
 def test_saving_and_loading_changes_nothing(tmp_path: Path) -> None:
-    original = checkpoints.load(goldens.config(IN_RUN_FOLDER).checkpoint)
-    checkpoints.save(original, tmp_path / "saved")
-    copy = checkpoints.load(tmp_path / "saved")
+    original = families.load(goldens.config(IN_RUN_FOLDER).checkpoint)
+    families.save(original, tmp_path / "saved")
+    copy = families.load(tmp_path / "saved")
     assert copy.config == original.config
     assert copy.network.keys() == original.network.keys()
     assert all(torch.equal(copy.network[name], original.network[name]) for name in copy.network)
@@ -80,7 +81,7 @@ def test_what_decides_each_setting_is_documented(config: type[VlmConfig | Rewind
 
 
 def test_encoder_weights_are_told_apart() -> None:
-    checkpoint = checkpoints.load(goldens.config("enc_c1_t1_disc10").checkpoint)
+    checkpoint = families.load(goldens.config("enc_c1_t1_disc10").checkpoint)
     assert "embeddings.cls_token" in checkpoint.image_encoder
     assert "embeddings.word_embeddings.weight" in checkpoint.text_encoder
     checkpoint.build()
@@ -98,9 +99,9 @@ def split_into_shards(folder: Path) -> None:
 
 
 def test_shards_are_put_together(folder: Path) -> None:
-    whole = checkpoints.load(folder)
+    whole = families.load(folder)
     split_into_shards(folder)
-    sharded = checkpoints.load(folder)
+    sharded = families.load(folder)
     assert sharded.config == whole.config
     assert all(torch.equal(sharded.network[name], whole.network[name]) for name in whole.network)
 
@@ -231,17 +232,17 @@ SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
 def test_a_spoiled_checkpoint_is_refused(folder: Path, spoil: Callable[[Path], None], message: str) -> None:
     spoil(folder)
     with pytest.raises(CheckpointError, match=message):
-        checkpoints.load(folder).build()
+        families.load(folder).build()
 
 
 def test_the_conversion_that_the_refusal_of_a_pickle_names_works(folder: Path) -> None:
-    before = checkpoints.load(folder)
+    before = families.load(folder)
     as_pickle(folder)
     with pytest.raises(CheckpointError) as refusal:
-        checkpoints.load(folder)
+        families.load(folder)
     (code,) = re.findall(r'python -c "(.*)"', str(refusal.value))
     exec(code, {})
-    after = checkpoints.load(folder)
+    after = families.load(folder)
     assert all(torch.equal(after.network[name], before.network[name]) for name in before.network)
 
 
@@ -249,7 +250,7 @@ def test_yaml_constructs_nothing(folder: Path, tmp_path: Path) -> None:
     mark = tmp_path / "was_here"
     (folder / "config.yaml").write_text(f'model: {{rewind: !!python/object/apply:os.system ["touch {mark}"]}}\n')
     with pytest.raises(CheckpointError, match=r"config\.yaml: model\.rewind: expected a mapping, got"):
-        checkpoints.load(folder)
+        families.load(folder)
     assert not mark.exists()
 
 
@@ -290,12 +291,12 @@ def hub(monkeypatch: pytest.MonkeyPatch) -> list[str | None]:
 
 
 def test_a_hub_id_is_fetched_at_its_best_tag(hub: list[str | None]) -> None:
-    checkpoints.load("org/name").build()
+    families.load("org/name").build()
     assert hub == ["best-a-0.4-step-3"]
 
 
 def test_a_tag_is_taken_as_it_stands(hub: list[str | None]) -> None:
-    checkpoints.load("org/name@v2").build()
+    families.load("org/name@v2").build()
     assert hub == ["v2"]
 
 
@@ -305,14 +306,14 @@ def test_an_existing_path_wins_over_an_id(
     (tmp_path / "org").mkdir()
     shutil.copytree(goldens.config(CONTINUOUS).checkpoint, tmp_path / "org" / "name@v2")
     monkeypatch.chdir(tmp_path)
-    checkpoints.load("org/name@v2")
+    families.load("org/name@v2")
     assert hub == []
 
 
 @pytest.mark.parametrize("source", ["nowhere", "/no/such/folder", "a/b/c", ""])
 def test_what_is_neither_folder_nor_id_is_refused(source: str) -> None:
     with pytest.raises(CheckpointError, match="expected a folder that exists or a Hugging Face id"):
-        checkpoints.load(source)
+        families.load(source)
 
 
 def test_a_hub_that_cannot_be_reached_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -321,16 +322,16 @@ def test_a_hub_that_cannot_be_reached_is_told(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", refuse)
     with pytest.raises(CheckpointError, match="org/name@v2: cannot be fetched: no network"):
-        checkpoints.load("org/name@v2")
+        families.load("org/name@v2")
 
 
 LOADS = """
 import json, sys
 from dataclasses import asdict
-from rfm import checkpoint as checkpoints
+from rfm import families
 try:
-    print(json.dumps(asdict(checkpoints.load(sys.argv[1]).config)))
-except checkpoints.CheckpointError as error:
+    print(json.dumps(asdict(families.load(sys.argv[1]).config)))
+except families.CheckpointError as error:
     print(error)
 """
 
@@ -360,7 +361,7 @@ def test_config_yaml_is_found_on_main_of_the_hub_s_repository(
     tagged: tuple[Path, Path], tmp_path: Path, source: str
 ) -> None:
     tag, main = tagged
-    expected = asdict(checkpoints.load(goldens.config(WITH_IMAGES).checkpoint).config)
+    expected = asdict(families.load(goldens.config(WITH_IMAGES).checkpoint).config)
     assert expected["multi_image"] and expected["per_frame_progress_token"]
     said = load_from_hub(source, {"main": main, TAG: tag}, tmp_path / "cache")
     assert json.loads(said) == json.loads(json.dumps(expected))

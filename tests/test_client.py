@@ -38,14 +38,14 @@ from rfm_client import (
     ServerUnavailableError,
     SimilaritySample,
     Trajectory,
-    wire,
 )
-from rfm_client.access import Access
-from rfm_client.deadline import Deadline
-from rfm_client.fit import evenly_spaced
-from rfm_client.in_flight import MAX_BYTES, InFlight
-from rfm_client.packing import MAX_REQUEST_BYTES
-from rfm_client.transport import Answer, GrpcTransport
+from rfm_client.batching import MAX_REQUEST_BYTES
+from rfm_client.contract import wire
+from rfm_client.data.fitting import evenly_spaced
+from rfm_client.transport.access import Access
+from rfm_client.transport.calls import Answer, GrpcTransport
+from rfm_client.transport.deadline import Deadline
+from rfm_client.transport.in_flight import MAX_BYTES, InFlight
 
 NOBODY = "grpc://127.0.0.1:1"  # a port where nothing listens
 
@@ -230,7 +230,7 @@ def test_requests_in_flight_are_bounded(served: Served) -> None:
         """A real transport that counts."""
 
         def __init__(self) -> None:
-            from rfm_client.transport import connect
+            from rfm_client.transport.calls import connect
 
             self.inner = connect(served.url("grpc"))
             self.url = self.inner.url
@@ -329,7 +329,7 @@ def test_frames_are_resized_when_asked(served: Served) -> None:
         assert size is not None
         film = Trajectory(frames=frames, task="open the drawer")
         resized = client.progress(film, resize=True)
-        from rfm_client.resize import resize_frames
+        from rfm_client.data.resize import resize_frames
 
         assert_same(resized, client.progress(replace(film, frames=resize_frames(frames, size))))
         np.testing.assert_allclose(resized.progress, client.progress(film).progress, rtol=0, atol=5e-4)
@@ -341,7 +341,7 @@ def test_each_trajectory_of_a_pair_is_resized_by_its_own_size(served: Served) ->
         Trajectory(frames=random.integers(0, 256, (num_frames, *size, 3), np.uint8), task="open the drawer")
         for num_frames, size in ((4, (120, 160)), (3, (200, 90)))
     )
-    from rfm_client.resize import resize_frames
+    from rfm_client.data.resize import resize_frames
 
     with served.client("grpc", FRAMES_MODEL) as client:
         size = client.model_info(frames=True).frame_size

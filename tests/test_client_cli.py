@@ -37,18 +37,18 @@ from rfm_client import (
     Sample,
     SimilaritySample,
     Trajectory,
-    wire,
 )
 from rfm_client.cli.commands import app
 from rfm_client.cli.options import EXIT_CODES, ExitCode
 from rfm_client.cli.outputs import frame_document
+from rfm_client.cli.perf_input import perf_analyzer_input
 from rfm_client.cli.scoring import unique_stems
+from rfm_client.cli.show import Panel, number, plot
 from rfm_client.cli.toy import SampleKind, Toy, parse_lengths
-from rfm_client.inputs import load_trajectory
-from rfm_client.perf_input import perf_analyzer_input
-from rfm_client.show import Panel, number, plot
+from rfm_client.contract import wire
+from rfm_client.contract.wire import encode_samples
+from rfm_client.data.inputs import load_trajectory
 from rfm_client.status import read_status
-from rfm_client.wire import encode_samples
 
 RFM_CLIENT = Path(sys.executable).parent / "rfm-client"
 MODEL = "enc_c1_t1_disc10"

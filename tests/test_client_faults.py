@@ -21,8 +21,8 @@ import pytest
 import tritonclient.grpc
 from test_serving import assert_same
 
-from rfm.server.installation import find_installation
-from rfm.server.process import Endpoints, TritonServer
+from rfm.supervise.installation import find_installation
+from rfm.supervise.process import Endpoints, TritonServer
 from rfm_client import (
     DeadlineExceededError,
     ProgressResult,
@@ -32,7 +32,7 @@ from rfm_client import (
     ServerUnavailableError,
     Trajectory,
 )
-from rfm_client.shared_memory import FOLDER, MIN_SHARED_BYTES
+from rfm_client.transport.shared_memory import FOLDER, MIN_SHARED_BYTES
 
 ROOT = Path(__file__).parents[1]
 PATIENCE_S = 60.0
@@ -339,7 +339,7 @@ def test_a_client_with_another_dev_shm_takes_nothing_back(
     with OneModelServer(repository, endpoints), RewardClient(endpoints.grpc_url, shared_memory=True) as client:
         expected = client.progress(heavy(), frame_steps=2)
         before = regions(endpoints)
-        monkeypatch.setattr("rfm_client.shared_memory.FOLDER", tmp_path)
+        monkeypatch.setattr("rfm_client.transport.shared_memory.FOLDER", tmp_path)
         with RewardClient(endpoints.grpc_url, shared_memory=True) as stranger:
             assert_same(stranger.progress(heavy(), frame_steps=2), expected)
         monkeypatch.undo()

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 from tritonclient.utils import InferenceServerException
 
-from rfm_client.off_loop import MIN_BYTES
-from rfm_client.shared_memory import FOLDER, MIN_REGION_BYTES, MIN_SHARED_BYTES, Region, SharedMemory
+from rfm_client.transport.off_loop import MIN_BYTES
+from rfm_client.transport.shared_memory import FOLDER, MIN_REGION_BYTES, MIN_SHARED_BYTES, Region, SharedMemory
 
 SMALL = np.ones(MIN_SHARED_BYTES, np.uint8)
 LARGE = np.ones(MIN_REGION_BYTES + 1, np.uint8)  # more than the region of a small one holds

@@ -18,16 +18,16 @@ from rfm_client import (
     RewardError,
     ServerUnavailableError,
     Trajectory,
-    wire,
 )
-from rfm_client.gateway.body import Batch
-from rfm_client.gateway.folder import AllowedFolder
-from rfm_client.gateway.memory import Memory
-from rfm_client.gateway.schema import SAMPLES
-from rfm_client.gateway.scoring import Scorer
-from rfm_client.gateway.state import State
-from rfm_client.model_info import ModelInfo
-from rfm_client.transport import Answer
+from rfm_client.contract import wire
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.transport.calls import Answer
+from rfm_gateway.body import Batch
+from rfm_gateway.folder import AllowedFolder
+from rfm_gateway.memory import Memory
+from rfm_gateway.schema import SAMPLES
+from rfm_gateway.scoring import Scorer
+from rfm_gateway.state import State
 
 NUM_FRAMES = 4
 SEEN = random_trajectory(0, NUM_FRAMES)

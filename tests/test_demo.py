@@ -17,10 +17,10 @@ from test_serve_command import nothing_left_behind
 from typer.testing import CliRunner
 
 import rfm_export
-from rfm.cli import app
 from rfm.config import ServeConfig
 from rfm_client import InvalidSampleError
-from rfm_client.video import frame_indices, read_video
+from rfm_client.data.video import frame_indices, read_video
+from rfm_commands.cli import app
 
 VIDEOS = Path(__file__).parent / "videos"
 ROOT = Path(__file__).parents[1]

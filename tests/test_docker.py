@@ -30,8 +30,8 @@ from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 import rfm_export
-from rfm.server.installation import find_installation
-from rfm.server.process import Endpoints
+from rfm.supervise.installation import find_installation
+from rfm.supervise.process import Endpoints
 
 ROOT = Path(__file__).parents[1]
 DOCKER = ROOT / "docker"
@@ -45,7 +45,7 @@ MOUNTED = re.compile(r"--mount=type=bind,source=([^,\s]+),target=(/source[^,\s]+
 HASHES = re.compile(r"( --hash=sha256:[0-9a-f]{64})+")
 STEP = re.compile(r"/source/docker/install\.sh ([a-z]+ /.*)$", re.MULTILINE)
 VARIABLE = re.compile(r"\$\{(\w+):-(.*?)\}")
-OURS = {"rfm-client", "rfm-triton"}
+OURS = {"rfm-client", "rfm-gateway", "rfm-triton"}
 NOT_FOR_SERVING = {"pip", "pytest", "ruff", "mypy", "nvidia-pytriton", "matplotlib", "av", "gymnasium", "hypothesis"}
 UNAVAILABLE = 3
 SYSTEM_PATH = "/usr/local/bin:/usr/bin:/bin"
@@ -229,7 +229,7 @@ def test_the_lock_has_the_versions_of_the_constraints(python: str) -> None:
 
 
 def test_the_lock_names_all_that_the_image_needs_beside_torch() -> None:
-    roots = ("rfm-client[gateway]", "rfm-triton[encoders,vlm]")
+    roots = ("rfm-triton[encoders,vlm]",)
     assert set(pins(LOCK)) == needed(*roots, without="torch") - OURS, "make .venv/installed lock"
 
 
@@ -273,8 +273,8 @@ def test_the_image_holds_what_serving_needs_in_locked_versions_and_nothing_else(
 @pytest.mark.parametrize(
     "words",
     [
-        ["python", "-c", "import rfm_export, rfm.families.vlm, rfm.families.rewind, rfm.models.encoders"],
-        ["python", "-c", "import rfm_client.gateway.app"],
+        ["python", "-c", "import rfm_export, rfm.vlm.family, rfm.rewind.family, rfm.rewind.encoders"],
+        ["python", "-c", "import rfm_gateway.app"],
         ["rfm", "--help"],
         ["rfm-client", "--help"],
     ],

@@ -20,8 +20,8 @@ import numpy as np
 import pytest
 from typer.main import get_command
 
-from rfm.server.installation import find_installation
-from rfm.server.process import Endpoints, TritonServer
+from rfm.supervise.installation import find_installation
+from rfm.supervise.process import Endpoints, TritonServer
 from rfm_client import PreferenceSample, ProgressSample, Trajectory
 from rfm_client.cli.commands import app
 

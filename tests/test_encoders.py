@@ -17,9 +17,9 @@ from conftest import load_engine, rewind_of
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from rfm.collate.images import PREPROCESSOR_CONFIG
+from rfm.checkpoint.preprocessor import PREPROCESSOR_CONFIG
 from rfm.execution import Execution
-from rfm.models.encoders import Encoders, ImagePreprocessor
+from rfm.rewind.encoders import Encoders, ImagePreprocessor
 from rfm_client import (
     BatchTiming,
     InferenceFailedError,
@@ -31,7 +31,7 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.samples import Footage
+from rfm_client.contract.samples import Footage
 
 NAME = "enc_c1_t1_disc10"
 # The original's embeddings, of images and of texts.

@@ -69,8 +69,8 @@ import numpy as np, torch
 from conftest import random_trajectory
 from rfm.engine import Engine
 from rfm.execution import Execution
-from rfm.families.rewind import RewindFamily
-from rfm.models.rewind import RewindConfig, RewindTransformer
+from rfm.rewind.family import RewindFamily
+from rfm.rewind.network import RewindConfig, RewindTransformer
 from rfm_client import InferenceFailedError, ProgressResult, ProgressSample
 
 MIB = 2**20

@@ -21,10 +21,10 @@ from typer.testing import CliRunner
 
 import rfm_export
 from rfm.checkpoint.content import read_run_config
-from rfm.cli import app
 from rfm.config import ServeConfig
-from rfm.models.rewind import RewindTransformer
-from rfm_client import wire
+from rfm.rewind.network import RewindTransformer
+from rfm_client.contract import wire
+from rfm_commands.cli import app
 from rfm_export import ExportDiffersError, ExportError
 from rfm_export.about import Origin
 
@@ -209,14 +209,14 @@ def test_an_export_that_dies_at_any_moment_leaves_a_repository_that_loads(
 def test_an_export_that_differs_from_its_checkpoint_is_not_published(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from rfm import checkpoint as checkpoints
+    from rfm import families
 
-    def save_wrongly(checkpoint: checkpoints.RewindCheckpoint, folder: Path) -> None:
+    def save_wrongly(checkpoint: families.RewindCheckpoint, folder: Path) -> None:
         weights = {name: tensor * 1.001 for name, tensor in checkpoint.network.items()}
         original_save(replace(checkpoint, network=weights), folder)
 
-    original_save = checkpoints.save
-    monkeypatch.setattr(checkpoints, "save", save_wrongly)
+    original_save = families.save
+    monkeypatch.setattr(families, "save", save_wrongly)
     with pytest.raises(ExportDiffersError, match="expected the checkpoint's scores, got a difference of"):
         export(EMBEDDINGS, tmp_path / "repository")
     assert list(tmp_path.rglob("*")) == [tmp_path / "repository"]
@@ -354,9 +354,9 @@ def test_more_gpus_than_there_are_are_refused_at_export(tmp_path: Path) -> None:
 
 
 def test_the_exported_network_has_every_weight(exported: Path) -> None:
-    from rfm import checkpoint as checkpoints
+    from rfm import families
 
-    loaded = checkpoints.load(exported / "rfm" / "1" / "checkpoint")
+    loaded = families.load(exported / "rfm" / "1" / "checkpoint")
     assert loaded.network.keys() == RewindTransformer(loaded.config).state_dict().keys()
 
 

@@ -30,17 +30,17 @@ from test_serve_command import EXIT_S, REPOSITORY, command, regions, wait_for_ht
 from typer.testing import CliRunner
 
 import rfm_export
-from rfm.cli import app
 from rfm.config import ConfigError, ServeConfig
-from rfm.server.exposure import MAX_HTTP_BYTES, GrpcTls, check_version, size_limits
-from rfm.server.installation import Installation, ServerStartError, find_installation
-from rfm.server.leftovers import REGION_PREFIX
-from rfm.server.own_tls import OwnTls
-from rfm.server.process import Endpoints, TritonServer
+from rfm.supervise.exposure import MAX_HTTP_BYTES, GrpcTls, check_version, size_limits
+from rfm.supervise.installation import Installation, ServerStartError, find_installation
+from rfm.supervise.leftovers import REGION_PREFIX
+from rfm.supervise.own_tls import OwnTls
+from rfm.supervise.process import Endpoints, TritonServer
 from rfm_client import AccessDeniedError, ProgressSample, RewardClient, ServerUnavailableError
-from rfm_client.access import Access
-from rfm_client.loop_thread import LoopThread
 from rfm_client.status import read_status
+from rfm_client.transport.access import Access
+from rfm_client.transport.loop_thread import LoopThread
+from rfm_commands.cli import app
 
 PLAIN = goldens.config("c1_t1_disc10")
 TRAJECTORY = random_trajectory(0, 5)
@@ -463,7 +463,7 @@ def gateway(papers: Papers, endpoints: Endpoints, folder: Path, *words: object, 
     options += ["--certificate", str(papers.certificate), "--key", str(papers.key), *map(str, words)]
     with (folder / "gateway.log").open("w") as log:
         process = subprocess.Popen(
-            [sys.executable, "-m", "rfm_client.gateway", *options],
+            [sys.executable, "-m", "rfm_gateway", *options],
             env={**os.environ, **environment},
             stdout=log,
             stderr=log,

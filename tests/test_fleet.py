@@ -18,8 +18,8 @@ from rfm_serve import MODEL, PATIENCE_S, Serving, serving, wait_for
 from test_client_faults import OneModelServer, answered
 from test_healing import DEADLY, MARK, Callers, make_repository, references, trajectory
 
-from rfm.server.process import Endpoints
-from rfm.server.stubs import Stub, StubWatch
+from rfm.supervise.process import Endpoints
+from rfm.supervise.stubs import Stub, StubWatch
 from rfm_client import (
     AsyncRewardClient,
     InvalidSampleError,
@@ -28,8 +28,8 @@ from rfm_client import (
     ProgressSample,
     RewardClient,
     RewardError,
-    names,
 )
+from rfm_client.transport import host_names as names
 
 __all__ = ["references"]  # a fixture
 
@@ -152,7 +152,7 @@ def found(monkeypatch: pytest.MonkeyPatch) -> Names:
     """Looked up as often as a call is made."""
     found = Names()
     monkeypatch.setattr(socket, "getaddrinfo", found)
-    monkeypatch.setattr("rfm_client.servers.REFRESH_S", 0.0)
+    monkeypatch.setattr("rfm_client.transport.servers.REFRESH_S", 0.0)
     return found
 
 

@@ -38,15 +38,14 @@ from prometheus_client.parser import text_string_to_metric_families
 from typer.testing import CliRunner
 
 import rfm_export
-from rfm import checkpoint as checkpoints
+from rfm import families
 from rfm.checkpoint.content import read_run_config
-from rfm.cli import app
 from rfm.config import ServeConfig
-from rfm.models.rewind import RewindConfig, RewindTransformer
-from rfm.server.installation import find_installation
-from rfm.server.leftovers import REGION_PREFIX
-from rfm.server.process import Endpoints, TritonServer
-from rfm.server.stubs import SHARED_MEMORY
+from rfm.rewind.network import RewindConfig, RewindTransformer
+from rfm.supervise.installation import find_installation
+from rfm.supervise.leftovers import REGION_PREFIX
+from rfm.supervise.process import Endpoints, TritonServer
+from rfm.supervise.stubs import SHARED_MEMORY
 from rfm_client import (
     AsyncRewardClient,
     InvalidSampleError,
@@ -60,8 +59,9 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.gateway import state as gateway_state
 from rfm_client.status import read_status
+from rfm_commands.cli import app
+from rfm_gateway import state as gateway_state
 
 Json: TypeAlias = dict[str, Any]
 Array: TypeAlias = npt.NDArray[Any]
@@ -156,7 +156,7 @@ def running(
     endpoints: Endpoints, folder: Path, model: str = TINY, *options: str, **environment: str
 ) -> Iterator[Gateway]:
     port = free_port()
-    command = [sys.executable, "-m", "rfm_client.gateway", "--triton", endpoints.grpc_url, "--port", str(port)]
+    command = [sys.executable, "-m", "rfm_gateway", "--triton", endpoints.grpc_url, "--port", str(port)]
     command += ["--metrics-url", endpoints.metrics_url, "--model", model, *options]
     log_file = folder / f"gateway_{port}.log"
     with log_file.open("wb") as log:
@@ -182,7 +182,7 @@ def tiny_network() -> RewindTransformer:
 def triton(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransformer) -> Iterator[Triton]:
     folder = tmp_path_factory.mktemp("gateway_triton")
     repository, checkpoint = folder / "model_repository", folder / "two_wide"
-    checkpoints.save(checkpoints.RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()), checkpoint)
+    families.save(families.RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()), checkpoint)
     rfm_export.export(checkpoint, repository, ServeConfig(name=TINY, num_gpus=0, torch_threads=1))
     for config, name in ((goldens.config("enc_c1_t1_disc10"), FILM), (goldens.config("q25_video_last_l2"), VIDEO)):
         rfm_export.export(config.checkpoint, repository, serve_config(config, name))
@@ -1124,7 +1124,7 @@ class Gated:
 def gated(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransformer) -> Iterator[Gated]:
     folder = tmp_path_factory.mktemp("gated")
     repository, checkpoint, gate = folder / "model_repository", folder / "two_wide", folder / "gate"
-    checkpoints.save(checkpoints.RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()), checkpoint)
+    families.save(families.RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()), checkpoint)
     rfm_export.export(checkpoint, repository, ServeConfig(name=TINY, num_gpus=0, torch_threads=1))
     model = repository / TINY / "1" / "model.py"
     model.write_text(model.read_text() + CLOSED_GATE.format(gate=str(gate)))
@@ -1275,7 +1275,7 @@ def test_browsers_may_ask_from_the_named_origin_alone(keyed: Gateway, tiny: Gate
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "127.0.0.1"])
 def test_an_open_address_without_a_key_is_warned_of(triton: Triton, tmp_path: Path, host: str) -> None:
-    warning = "WARNING rfm_client.gateway: 0.0.0.0 is no loopback address, and no key is asked for"
+    warning = "WARNING rfm_gateway: 0.0.0.0 is no loopback address, and no key is asked for"
     with running(triton.endpoints, tmp_path, TINY, "--host", host) as gateway:
         assert (warning in gateway.log) is (host == "0.0.0.0")
     with running(triton.endpoints, tmp_path, TINY, "--host", host, RFM_GATEWAY_API_KEY=KEY) as gateway:
@@ -1537,7 +1537,7 @@ def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed(trito
         assert answered(ask_json(gateway, [progress(FIRST)])) == expected(gateway, [progress(FIRST)])
         assert requests.get(f"{url}/health").json()["status"] == "healthy"
         started = children(process.pid)
-        (gateway_id,) = (child for child, command in started.items() if "rfm_client.gateway" in command)
+        (gateway_id,) = (child for child, command in started.items() if "rfm_gateway" in command)
         assert "--timeout 90.0 --max-body-mib 512" in started[gateway_id]
         assert "--max-waiting 7" in started[gateway_id]
         os.kill(gateway_id, signal.SIGKILL)

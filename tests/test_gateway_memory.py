@@ -20,16 +20,16 @@ from PIL import Image
 from starlette.datastructures import UploadFile
 from starlette.requests import Request
 
-from rfm_client.deadline import Deadline
-from rfm_client.gateway.body import MAX_SAMPLES, NPY_ENDPOINT, BodyLimits, read_json, read_multipart
-from rfm_client.gateway.body import _of_form as of_form
-from rfm_client.gateway.body import _of_json as of_json
-from rfm_client.gateway.conversion import Conversion, Served
-from rfm_client.gateway.folder import AllowedFolder, NamedFiles
-from rfm_client.gateway.memory import Memory
-from rfm_client.gateway.schema import SAMPLES
-from rfm_client.loop_thread import LoopThread
-from rfm_client.model_info import ModelInfo
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.transport.deadline import Deadline
+from rfm_client.transport.loop_thread import LoopThread
+from rfm_gateway.body import MAX_SAMPLES, NPY_ENDPOINT, BodyLimits, read_json, read_multipart
+from rfm_gateway.body import _of_form as of_form
+from rfm_gateway.body import _of_json as of_json
+from rfm_gateway.conversion import Conversion, Served
+from rfm_gateway.folder import AllowedFolder, NamedFiles
+from rfm_gateway.memory import Memory
+from rfm_gateway.schema import SAMPLES
 
 KIB, MIB = 2**10, 2**20
 WAIT_S = 30

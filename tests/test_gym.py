@@ -26,12 +26,12 @@ from rfm_client import (
     RewardClient,
     ServerUnavailableError,
     Trajectory,
-    wire,
 )
-from rfm_client.access import Access
+from rfm_client.contract import wire
+from rfm_client.contract.samples import UInt8Array
 from rfm_client.gym import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
-from rfm_client.samples import UInt8Array
-from rfm_client.transport import Answer, GrpcTransport
+from rfm_client.transport.access import Access
+from rfm_client.transport.calls import Answer, GrpcTransport
 
 MODEL = "enc_c1_t1_disc10"
 MAX_FRAMES = 16  # of that checkpoint

@@ -23,12 +23,13 @@ import numpy as np
 import pytest
 from rfm_serve import MODEL, PATIENCE_S, RFM, ROOT, TRUTH_S, Serving, children, serving, wait_for
 
-from rfm.server import leftovers, poison, restarts
-from rfm.server.installation import find_installation
-from rfm.server.process import Endpoints, TritonServer
-from rfm.server.restarts import CrashLoopError, Restarts
-from rfm.server.self_check import FAILED_BATCHES
-from rfm.server.stubs import SHARED_MEMORY, is_alive
+from rfm.supervise import leftovers, restarts
+from rfm.supervise.installation import find_installation
+from rfm.supervise.process import Endpoints, TritonServer
+from rfm.supervise.restarts import CrashLoopError, Restarts
+from rfm.supervise.stubs import SHARED_MEMORY, is_alive
+from rfm.triton_model import quarantine as poison
+from rfm.triton_model.self_check import FAILED_BATCHES
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,
@@ -467,7 +468,7 @@ def test_a_journal_outlives_its_process_and_tells_what_it_was_working_on(tmp_pat
 
     def die(name: str) -> None:
         """A process that dies while it works on two requests."""
-        code = "import os, sys; from pathlib import Path; from rfm.server.poison import Poison; folder = Path(sys.argv[1])\n"
+        code = "import os, sys; from pathlib import Path; from rfm.triton_model.quarantine import Poison; folder = Path(sys.argv[1])\n"
         code += "poison = Poison(folder / sys.argv[2], sorted(folder.glob('*_batch')), 4)\n"
         code += "with poison.at_work_on([bytes.fromhex(word) for word in sys.argv[3:]]): os._exit(1)"
         words = [told.hex() for told in (first, others[0])]

@@ -26,14 +26,13 @@ from safetensors.torch import load_file, save_file
 from typer.testing import CliRunner
 
 import rfm_export
-from rfm import checkpoint as checkpoints
-from rfm.checkpoint import CheckpointError
-from rfm.checkpoint.content import MAX_HEADER_BYTES, MAX_JSON_BYTES
-from rfm.cli import app
+from rfm import families
+from rfm.checkpoint.content import MAX_HEADER_BYTES, MAX_JSON_BYTES, CheckpointError
 from rfm.config import ConfigError, ServeConfig
 from rfm.plain_yaml import MAX_YAML_BYTES
-from rfm.server.installation import ServerStartError, find_installation
-from rfm.server.process import Endpoints, TritonServer
+from rfm.supervise.installation import ServerStartError, find_installation
+from rfm.supervise.process import Endpoints, TritonServer
+from rfm_commands.cli import app
 from rfm_export import ExportError
 
 REWIND = goldens.config("legacy_keys_l2")
@@ -334,7 +333,7 @@ def test_a_base_model_with_code_is_not_asked_about(tmp_path: Path) -> None:
     (base / "evil.py").write_text(f"open({str(mark)!r}, 'w')\n")
     (base / "config.json").write_text(json.dumps({"model_type": "evil", "auto_map": {"AutoConfig": "evil.Config"}}))
     with pytest.raises(CheckpointError, match=r"base model .*: cannot be had: .*trust_remote_code"):
-        checkpoints.load(config.checkpoint, base_model=str(base))
+        families.load(config.checkpoint, base_model=str(base))
     assert not mark.exists()
 
 
@@ -388,7 +387,7 @@ def test_a_file_that_may_not_be_read_is_told(tmp_path: Path) -> None:
             tmp_path.parents[0].chmod(0o755)
             os.seteuid(65534)
         with pytest.raises(CheckpointError, match=r"Permission ?[dD]enied|PermissionError"):
-            checkpoints.load(folder)
+            families.load(folder)
     finally:
         os.seteuid(user)
 
@@ -448,7 +447,7 @@ def test_weights_that_have_changed_since_their_export_are_not_served(tmp_path: P
 
 def test_version_folders_keep_their_digests_side_by_side(tmp_path: Path) -> None:
     """A configuration for all versions tells the newest one's; the older are checked against their own."""
-    from rfm.server.weights import check_digest
+    from rfm.triton_model.weights import check_digest
     from rfm_export.publish import read_config
 
     repository = tmp_path / "model_repository"

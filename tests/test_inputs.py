@@ -26,14 +26,15 @@ import pytest
 import torch
 from PIL import Image
 
-from rfm.collate.images import Normalisation, QwenImages, SmolImages, _scaled_to_longest, fitted_size
 from rfm.engine import Engine
-from rfm.models.encoders import ImagePreprocessor
+from rfm.rewind.encoders import ImagePreprocessor
+from rfm.vlm.images import Normalisation, QwenImages, SmolImages, _scaled_to_longest, fitted_size
 from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, Trajectory
-from rfm_client.inputs import as_trajectory, load_trajectory
-from rfm_client.resize import FrameSize, resize_frames
-from rfm_client.samples import UInt8Array
-from rfm_client.video import read_video
+from rfm_client.contract.frame_size import FrameSize
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.data.inputs import as_trajectory, load_trajectory
+from rfm_client.data.resize import resize_frames
+from rfm_client.data.video import read_video
 
 VIDEOS = Path(__file__).parent / "videos"
 FRAMES = np.random.default_rng(0).integers(0, 256, (4, 6, 8, 3), np.uint8)
@@ -100,8 +101,8 @@ def test_tensors_are_fetched_from_the_gpu() -> None:
 
 def test_inputs_import_nothing_heavy() -> None:
     check = (
-        "import sys, rfm_client, rfm_client.inputs, rfm_client.resize\n"
-        "rfm_client.inputs.as_trajectory({'observation.image': [[[[0.5] * 3]]]})\n"
+        "import sys, rfm_client, rfm_client.data.inputs, rfm_client.data.resize\n"
+        "rfm_client.data.inputs.as_trajectory({'observation.image': [[[[0.5] * 3]]]})\n"
         "print(sorted({'torch', 'PIL', 'av', 'pandas'} & set(sys.modules)))"
     )
     output = subprocess.run([sys.executable, "-c", check], check=True, capture_output=True, text=True).stdout

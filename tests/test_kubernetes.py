@@ -35,10 +35,10 @@ from conftest import kill_model
 from referencing import Registry, Resource
 from typer.main import get_command
 
-from rfm.cli import app
-from rfm.server import admin_key
-from rfm.server.process import KILL_AFTER_S, Endpoints
-from rfm_client.gateway.command import STOP_WITHIN_S
+from rfm.supervise import admin_key
+from rfm.supervise.process import KILL_AFTER_S, Endpoints
+from rfm_commands.cli import app
+from rfm_gateway.command import STOP_WITHIN_S
 
 ROOT = Path(__file__).parents[1]
 KUBERNETES = ROOT / "docker" / "kubernetes"

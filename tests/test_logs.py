@@ -26,8 +26,8 @@ from test_gateway import running as running_gateway
 from tritonclient.utils import np_to_triton_dtype
 
 import rfm_export
-from rfm.server.installation import find_installation
-from rfm.server.process import Endpoints, TritonServer
+from rfm.supervise.installation import find_installation
+from rfm.supervise.process import Endpoints, TritonServer
 from rfm_client import (
     DeadlineExceededError,
     InferenceFailedError,
@@ -37,8 +37,9 @@ from rfm_client import (
     RewardError,
     Sample,
     ServerUnavailableError,
-    wire,
 )
+from rfm_client.contract import wire
+from rfm_client.contract.names import PROBE_PREFIX
 
 CONFIG = goldens.config("c1_t1_disc10")
 DOCUMENT = Path(__file__).parents[1] / "docs" / "logs.md"
@@ -312,7 +313,7 @@ def test_the_gateway_passes_the_caller_s_id_on_and_returns_it(running: Running, 
     assert (scored.status_code, scored.headers["X-Request-ID"]) == (200, "of-the-caller")
 
 
-@pytest.mark.parametrize("given", ["", "two words", "x" * 65, "a\tb", wire.CANARY_PREFIX])
+@pytest.mark.parametrize("given", ["", "two words", "x" * 65, "a\tb", PROBE_PREFIX])
 def test_the_gateway_makes_an_id_where_there_is_none_to_pass_on(gateway: Gateway, given: str) -> None:
     answer = requests.get(f"{gateway.url}/model_info", headers={"X-Request-ID": given}, timeout=PATIENCE_S)
     assert RANDOM_ID.fullmatch(answer.headers["X-Request-ID"])

@@ -21,11 +21,11 @@ from prometheus_client.parser import text_string_to_metric_families
 
 import rfm_export
 from rfm.execution import Execution
-from rfm.server.asked import OUTCOMES, UNKNOWN_TYPE
-from rfm.server.installation import find_installation
-from rfm.server.metrics import BUCKETS_S, PADDING_BUCKETS, SAMPLES_BUCKETS
-from rfm.server.process import Endpoints, TritonServer
-from rfm.server.repository_api import RepositoryApi
+from rfm.supervise.installation import find_installation
+from rfm.supervise.process import Endpoints, TritonServer
+from rfm.supervise.repository_api import RepositoryApi
+from rfm.triton_model.asked import OUTCOMES, UNKNOWN_TYPE
+from rfm.triton_model.metrics import BUCKETS_S, PADDING_BUCKETS, SAMPLES_BUCKETS
 from rfm_client import (
     DeadlineExceededError,
     InferenceFailedError,
@@ -37,8 +37,9 @@ from rfm_client import (
     Sample,
     SimilaritySample,
     Trajectory,
-    wire,
 )
+from rfm_client.contract import wire
+from rfm_client.contract.names import PROBE_PREFIX
 
 PLAIN, FILM = goldens.config("c1_t1_disc10"), goldens.config("enc_c1_t1_disc10")
 MODEL, TWICE, SLOW = "rfm", "twice", "slow"  # MODEL has encoders, TWICE two instances
@@ -331,10 +332,10 @@ def test_health_probes_and_warm_up_are_not_counted(running: Running) -> None:
     blank_film = Trajectory(frames=np.zeros((2, 64, 64, 3), np.uint8), task="canary")
     with running.client() as client:
         for _ in range(3):
-            client.progress(blank, request_id=wire.CANARY_PREFIX)
-            client.encode(blank_film, request_id=f"{wire.CANARY_PREFIX}-probe")
+            client.progress(blank, request_id=PROBE_PREFIX)
+            client.encode(blank_film, request_id=f"{PROBE_PREFIX}-probe")
         with pytest.raises(InvalidSampleError):
-            client.evaluate([too_long()], request_id=wire.CANARY_PREFIX)  # no probe asks that
+            client.evaluate([too_long()], request_id=PROBE_PREFIX)  # no probe asks that
         ask_raw(running, sample_type=0, count=2)  # without an id, as warm-up; but that is over
         client.encode(film())
     running.after(MODEL, {"progress scored": 2, "progress refused": 1}, before)
@@ -419,7 +420,7 @@ def test_a_model_that_is_loaded_again_counts_on(running: Running) -> None:
 # What Triton refuses: another kind of metric has that name.
 BROKEN = """
 
-import rfm.server.metrics as metrics
+import rfm.triton_model.metrics as metrics
 
 metrics._TOTALS["batch_requests"] = "A counter."
 """

@@ -32,15 +32,15 @@ from tritonclient.utils import InferenceServerException
 
 import rfm_export
 from rfm.engine import Engine
-from rfm.server.admin_key import VARIABLE, AdminKeyError, take_key
-from rfm.server.installation import ServerStartError, find_installation
-from rfm.server.process import Endpoints, TritonServer
-from rfm.server.repository_api import RepositoryApi, RepositoryApiError
+from rfm.supervise.admin_key import VARIABLE, AdminKeyError, take_key
+from rfm.supervise.installation import ServerStartError, find_installation
+from rfm.supervise.process import Endpoints, TritonServer
+from rfm.supervise.repository_api import RepositoryApi, RepositoryApiError
 from rfm_client import ModelNotFoundError, ProgressSample, RewardClient, ServerError
 from rfm_client.status import read_status
-from rfm_export import rollout as rfm_rollout
+from rfm_commands import rollout as rfm_rollout
+from rfm_commands.rollout import Rollout, RolloutError
 from rfm_export.publish import read_config
-from rfm_export.rollout import Rollout, RolloutError
 
 KEY = "a-key-that-only-tests-know"
 PLAIN = goldens.config("c1_t1_disc10")  # embeddings alone

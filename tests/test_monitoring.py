@@ -26,7 +26,7 @@ import torch
 import yaml
 from conftest import kill_model, random_trajectory
 
-from rfm.server.process import Endpoints
+from rfm.supervise.process import Endpoints
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, RewardClient, RewardError, Trajectory
 
 ROOT = Path(__file__).parents[1]

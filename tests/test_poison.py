@@ -21,14 +21,17 @@ from rfm_serve import PATIENCE_S, serving
 
 import rfm_export
 from rfm.execution import Execution
-from rfm.server import poison
-from rfm.server.batch_model import BatchModel
-from rfm.server.canary import blank_question
-from rfm.server.metrics import Counted
-from rfm.server.poison import Journal, Poison, digest, journals
-from rfm.server.self_check import SelfCheck
-from rfm.server.status import NO_REASON
-from rfm_client import InferenceFailedError, ProgressResult, ProgressSample, Result, Sample, wire
+from rfm.journal import Journal
+from rfm.probe import blank_question
+from rfm.supervise.status import NO_REASON
+from rfm.triton_model import quarantine as poison
+from rfm.triton_model.batch_model import BatchModel
+from rfm.triton_model.metrics import Counted
+from rfm.triton_model.quarantine import Poison, digest, journals
+from rfm.triton_model.self_check import SelfCheck
+from rfm_client import InferenceFailedError, ProgressResult, ProgressSample, Result, Sample
+from rfm_client.contract import wire
+from rfm_client.contract.names import PROBE_PREFIX
 
 PLAIN = goldens.config("c1_t1_disc10")
 WIDTHS = (4, 3)
@@ -208,7 +211,7 @@ def sample_of(seed: int) -> wire.Tensors:
 
 def deadly(folder: Path, tensors: wire.Tensors) -> Poison:
     """What a process knows when two before it have died of these inputs."""
-    code = "import os, sys; from pathlib import Path; from rfm.server.poison import Journal\n"
+    code = "import os, sys; from pathlib import Path; from rfm.triton_model.quarantine import Journal\n"
     code += "with Journal.create(Path(sys.argv[1]), 1).at_work_on([bytes.fromhex(sys.argv[2])]): os._exit(1)"
     dead = [folder / "1_batch", folder / "2_batch"]
     for file in dead:
@@ -217,7 +220,7 @@ def deadly(folder: Path, tensors: wire.Tensors) -> Poison:
 
 
 @pytest.mark.usefixtures("backend")
-@pytest.mark.parametrize("request_id", ["", wire.CANARY_PREFIX, f"{wire.CANARY_PREFIX}-rfm"])
+@pytest.mark.parametrize("request_id", ["", PROBE_PREFIX, f"{PROBE_PREFIX}-rfm"])
 def test_poison_is_refused_and_counted_whoever_it_says_it_is_from(tmp_path: Path, request_id: str) -> None:
     model = Model(deadly(tmp_path, sample_of(0)))
     model.execute([Request(request_id, sample_of(0)), Request("", sample_of(1))])
@@ -231,5 +234,5 @@ def test_poison_is_refused_and_counted_whoever_it_says_it_is_from(tmp_path: Path
 def test_the_blank_question_of_a_probe_is_answered_and_not_counted(tmp_path: Path) -> None:
     blank = blank_question(CONFIG)
     model = Model(deadly(tmp_path, blank))
-    model.execute([Request(f"{wire.CANARY_PREFIX}-rfm", blank)])
+    model.execute([Request(f"{PROBE_PREFIX}-rfm", blank)])
     assert (model.asked, model.told) == (1, [Counted()])

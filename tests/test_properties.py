@@ -19,10 +19,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from rfm import checkpoint as checkpoints
-from rfm.checkpoint import CheckpointError, RewindCheckpoint
+from rfm import families
+from rfm.checkpoint.content import CheckpointError
 from rfm.engine import Engine
-from rfm.models.rewind import RewindConfig, RewindTransformer
+from rfm.rewind.checkpoint import RewindCheckpoint
+from rfm.rewind.network import RewindConfig, RewindTransformer
 from rfm_client import (
     InvalidSampleError,
     PreferenceSample,
@@ -33,8 +34,8 @@ from rfm_client import (
     SimilarityResult,
     SimilaritySample,
     Trajectory,
-    wire,
 )
+from rfm_client.contract import wire
 
 # The same examples each time: what fails here fails everywhere.
 THOROUGH = settings(max_examples=200, deadline=None, derandomize=True, database=None)
@@ -204,7 +205,7 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
         RewindConfig(VIDEO_DIM, TEXT_DIM, 8, 1, 2, MAX_LEN, True, True, 3, True, trained_frames=4),
         RewindTransformer(RewindConfig(VIDEO_DIM, TEXT_DIM, 8, 1, 2, MAX_LEN, True, True, 3, True)).state_dict(),
     )
-    checkpoints.save(checkpoint, folder)
+    families.save(checkpoint, folder)
     (folder / "config.yaml").write_text(
         "model:\n  rewind: {causal_mask: true, max_len: 7}\ndata: &d {max_frames: 4}\nmore: *d\n"
     )
@@ -250,8 +251,8 @@ def loads_or_refuses(original: Path, file: str, content: bytes) -> None:
         shutil.copytree(original, copy)
         (copy / file).write_bytes(content)
         try:
-            checkpoint = checkpoints.load(copy)
-            checkpoints.check(copy, checkpoint)
+            checkpoint = families.load(copy)
+            families.check(copy, checkpoint)
             checkpoint.build()
         except CheckpointError as error:
             assert 0 < len(str(error)) < 10_000
@@ -291,7 +292,7 @@ def test_any_yaml_is_read_or_refused(original: Path, text: str) -> None:
 @SLOW
 @given(data=st.data(), value=JSON_VALUES)
 def test_any_setting_of_a_vision_language_checkpoint_is_taken_or_refused(data: st.DataObject, value: Any) -> None:
-    from rfm.checkpoint.vlm import load_vlm
+    from rfm.vlm.checkpoint import load_vlm
 
     config = goldens.config("q25_mean_l2")
     content = json.loads((config.checkpoint / "config.json").read_text())

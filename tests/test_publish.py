@@ -17,13 +17,13 @@ import pytest
 from conftest import random_trajectory, serve_config
 
 import rfm_export
-from rfm.server.installation import find_installation
-from rfm.server.process import Endpoints, TritonServer
-from rfm.server.repository_api import RepositoryApi
-from rfm.server.stubs import StubWatch
+from rfm.supervise.installation import find_installation
+from rfm.supervise.process import Endpoints, TritonServer
+from rfm.supervise.repository_api import RepositoryApi
+from rfm.supervise.stubs import StubWatch
 from rfm_client import RewardClient
+from rfm_commands.rollout import Rollout, previous_version
 from rfm_export.publish import staging
-from rfm_export.rollout import Rollout, previous_version
 
 PLAIN = goldens.config("c1_t1_disc10")
 KEY = "a-key-that-only-tests-know"

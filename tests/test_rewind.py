@@ -14,14 +14,14 @@ import torch
 from conftest import random_trajectory
 from torch import Tensor, nn
 
-from rfm.collate.dense import prefix_indices
-from rfm.collate.rewind import MAX_EMBEDDING, RewindCollator
 from rfm.config import DEFAULT_TOKEN_BUDGET
 from rfm.engine import Engine, Outcome
-from rfm.families.rewind import RewindFamily
-from rfm.models.heads import PredictionHead, progress_from_logits
-from rfm.models.packing import Packing, rounded_up
-from rfm.models.rewind import RewindBatch, RewindConfig, RewindTransformer
+from rfm.layers.heads import PredictionHead, progress_from_logits
+from rfm.prefixes import prefix_indices
+from rfm.rewind.collator import MAX_EMBEDDING, RewindCollator
+from rfm.rewind.family import RewindFamily
+from rfm.rewind.network import RewindBatch, RewindConfig, RewindTransformer
+from rfm.rewind.packing import Packing, rounded_up
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,

@@ -22,9 +22,9 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
     float_frames_to_uint8,
-    packing,
-    wire,
 )
+from rfm_client import batching as packing
+from rfm_client.contract import wire
 
 FRAMES = np.zeros((3, 8, 6, 3), np.uint8)
 VIDEO = np.ones((3, 5), np.float32)

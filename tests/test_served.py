@@ -20,17 +20,17 @@ import rollout
 from rfm_serve import MODEL, Serving, serving, wait_for
 from test_healing import Callers, make_repository, references, trajectory
 
-from rfm.server import healing
-from rfm.server.canary import Canary, Verdict
-from rfm.server.healing import ModelHealth
-from rfm.server.http import Http
-from rfm.server.inquiry import Inquiry
-from rfm.server.installation import find_installation
-from rfm.server.process import Endpoints, TritonServer
-from rfm.server.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
-from rfm.server.served import NOT_LOADED, SILENT, Served
-from rfm.server.status import NO_REASON, Status
-from rfm_export.rollout import Rollout
+from rfm.supervise import healing
+from rfm.supervise.canary import Canary, Verdict
+from rfm.supervise.healing import ModelHealth
+from rfm.supervise.http import Http
+from rfm.supervise.inquiry import Inquiry
+from rfm.supervise.installation import find_installation
+from rfm.supervise.process import Endpoints, TritonServer
+from rfm.supervise.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
+from rfm.supervise.served import NOT_LOADED, SILENT, Served
+from rfm.supervise.status import NO_REASON, Status
+from rfm_commands.rollout import Rollout
 
 __all__ = ["references"]  # a fixture
 

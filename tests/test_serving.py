@@ -15,8 +15,8 @@ import tritonclient.grpc
 from conftest import Served, forget_input, load_engine, random_trajectory, rewind_of, serve_config
 
 import rfm_export
-from rfm.server.installation import find_installation
-from rfm.server.process import Endpoints, TritonServer
+from rfm.supervise.installation import find_installation
+from rfm.supervise.process import Endpoints, TritonServer
 from rfm_client import (
     InvalidSampleError,
     ModelNotFoundError,
@@ -28,9 +28,9 @@ from rfm_client import (
     ServerUnavailableError,
     SimilaritySample,
     Trajectory,
-    wire,
 )
-from rfm_client.transport import connect
+from rfm_client.contract import wire
+from rfm_client.transport.calls import connect
 
 MODEL = "c1_t1_disc10"  # tokens, so T <= 16; discrete; all heads
 FRAMES_MODEL = "enc_c1_t1_disc10"

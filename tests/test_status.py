@@ -12,9 +12,9 @@ import httpx
 import pytest
 from rfm_serve import wait_for
 
-from rfm.server import status
-from rfm.server.process import Endpoints
-from rfm.server.status import MOST_CONNECTIONS, NO_REASON, Status, StatusServer
+from rfm.supervise import status
+from rfm.supervise.process import Endpoints
+from rfm.supervise.status import MOST_CONNECTIONS, NO_REASON, Status, StatusServer
 
 HOST = "127.0.0.1"
 

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from rfm.server import poison, stubs
-from rfm.server.poison import Journal
-from rfm.server.stubs import Stub, StubWatch
+from rfm.journal import Journal
+from rfm.supervise import stubs
+from rfm.supervise.stubs import Stub, StubWatch
+from rfm.triton_model import quarantine as poison
 
 TRITON = 10
 MODEL = "rfm"

@@ -14,12 +14,13 @@ from conftest import random_trajectory, serve_config
 from typer.testing import CliRunner
 
 import rfm_export
-from rfm.cli import app
 from rfm.config import ServeConfig
-from rfm.server.temporary import served
+from rfm.supervise.temporary import served
 from rfm_client import ProgressSample, RewardClient, Sample
-from rfm_export import ExportError, tune
-from rfm_export.tune import Setting, Sweep, Trial, quickest, write_setting
+from rfm_commands import tune
+from rfm_commands.cli import app
+from rfm_commands.tune import Setting, Sweep, Trial, quickest, write_setting
+from rfm_export import ExportError
 
 ONE, TWO, FOUR = Setting(1, 4, 64), Setting(2, 2, 64), Setting(4, 1, 64)
 

@@ -25,17 +25,18 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from tritonclient.grpc import model_config_pb2 as pb
 
 import rfm_export
-from rfm import checkpoint as checkpoints
-from rfm.checkpoint import CheckpointError, VlmCheckpoint
-from rfm.collate.images import Normalisation, QwenImages, fitted_size
-from rfm.collate.prompts import SPLIT_TOKEN
-from rfm.collate.vlm import QWEN3, VISION_START, VlmRow
+from rfm import families
+from rfm.checkpoint.content import CheckpointError
 from rfm.config import ServeConfig
 from rfm.engine import Engine
 from rfm.execution import Execution
-from rfm.families.vlm import VlmFamily, load_collator, save_processor
 from rfm.family import RowScores
-from rfm.models.vlm import VlmBatch
+from rfm.vlm.checkpoint import VlmCheckpoint
+from rfm.vlm.collator import QWEN3, VISION_START, VlmRow
+from rfm.vlm.family import VlmFamily, load_collator, save_processor
+from rfm.vlm.images import Normalisation, QwenImages, fitted_size
+from rfm.vlm.network import VlmBatch
+from rfm.vlm.prompts import SPLIT_TOKEN
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,
@@ -47,7 +48,7 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.model_info import FRAME_SIZE_PARAMETER
+from rfm_client.contract.model_info import FRAME_SIZE_PARAMETER
 
 WITH_SIMILARITY = "q25_peft_adapter_disc10"  # in the copied references too
 BFLOAT16 = "q3_tok_disc10_bf16"
@@ -404,7 +405,7 @@ def test_a_sample_that_does_not_fit_in_memory_fails_alone(monkeypatch: pytest.Mo
 
 def load(name: str, folder: Path | None = None, base: str | None = None) -> VlmCheckpoint:
     config = goldens.config(name)
-    checkpoint = checkpoints.load(folder or config.checkpoint, base_model=base or str(config.base_model))
+    checkpoint = families.load(folder or config.checkpoint, base_model=base or str(config.base_model))
     assert isinstance(checkpoint, VlmCheckpoint)
     return checkpoint
 
@@ -423,8 +424,8 @@ def copied(tmp_path: Path) -> Callable[[str], Path]:
 
 def test_saving_and_loading_changes_nothing(tmp_path: Path) -> None:
     original = load(LORA_INSIDE)
-    checkpoints.save(original, tmp_path / "saved")
-    copy = checkpoints.load(tmp_path / "saved")
+    families.save(original, tmp_path / "saved")
+    copy = families.load(tmp_path / "saved")
     assert isinstance(copy, VlmCheckpoint)
     assert copy.config == original.config
     assert all(torch.equal(copy.weights[name], original.weights[name]) for name in original.weights)
@@ -598,9 +599,9 @@ def test_config_yaml_is_found_above_the_checkpoint(copied: Callable[[str], Path]
 
 
 def test_what_was_exported_needs_no_config_yaml(tmp_path: Path) -> None:
-    checkpoints.save(load(PLAIN), tmp_path / "saved")
+    families.save(load(PLAIN), tmp_path / "saved")
     assert not (tmp_path / "saved" / "config.yaml").exists()
-    assert checkpoints.load(tmp_path / "saved").config == load(PLAIN).config
+    assert families.load(tmp_path / "saved").config == load(PLAIN).config
 
 
 TWICE = ("use_multi_image", "use_per_frame_progress_token")
@@ -664,14 +665,14 @@ def test_a_size_for_images_is_kept_or_ignored_as_told(
     text = (tmp_path / "repository" / "rfm_frames" / "config.pbtxt").read_text()
     told = text_format.Parse(text, pb.ModelConfig()).parameters[FRAME_SIZE_PARAMETER].string_value
     assert told == ("" if side_px is None else "exact 128x96")
-    exported = checkpoints.load(tmp_path / "repository" / "rfm_frames" / "1" / "checkpoint")
+    exported = families.load(tmp_path / "repository" / "rfm_frames" / "1" / "checkpoint")
     assert isinstance(exported, VlmCheckpoint)
     assert exported.config.size_px == side_px
 
 
 @pytest.mark.parametrize("resize_images", [True, False, None])
 def test_a_size_for_videos_always_holds(resize_images: bool | None) -> None:
-    checkpoint = checkpoints.load(goldens.config("q25_video_last_l2").checkpoint, resize_images=resize_images)
+    checkpoint = families.load(goldens.config("q25_video_last_l2").checkpoint, resize_images=resize_images)
     assert isinstance(checkpoint, VlmCheckpoint)
     assert checkpoint.config.size_px == (56, 84)
 

@@ -22,8 +22,8 @@ from rfm_client import (
     SimilarityResult,
     SimilaritySample,
     Trajectory,
-    wire,
 )
+from rfm_client.contract import wire
 
 OUTPUTS = [spec.name for spec in wire.score_outputs(4)]
 TIMING = BatchTiming(1.5, 2.5)

@@ -14,9 +14,9 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from rfm.checkpoint import load as load_checkpoint
-from rfm.checkpoint.rewind import RewindCheckpoint
-from rfm.models.rewind import RewindConfig
+from rfm.families import load as load_checkpoint
+from rfm.rewind.checkpoint import RewindCheckpoint
+from rfm.rewind.network import RewindConfig
 
 SampleType = Literal["progress", "preference", "similarity"]
 

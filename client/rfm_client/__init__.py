@@ -10,36 +10,32 @@ with RewardClient("grpc://localhost:8001") as client:
 
 from rfm_client.async_client import AsyncRewardClient
 from rfm_client.client import RewardClient
-from rfm_client.errors import (
+from rfm_client.contract import (
     AccessDeniedError,
+    BatchTiming,
     DeadlineExceededError,
+    FrameScores,
+    FrameSize,
     InferenceFailedError,
     InvalidSampleError,
+    ModelInfo,
     ModelNotFoundError,
+    PreferenceResult,
+    PreferenceSample,
     ProcessEndedError,
+    ProgressResult,
+    ProgressSample,
+    Result,
     RewardError,
+    Sample,
     ServerError,
     ServerUnavailableError,
-)
-from rfm_client.inputs import as_trajectory, load_trajectory
-from rfm_client.model_info import ModelInfo
-from rfm_client.resize import FrameSize
-from rfm_client.results import (
-    BatchTiming,
-    FrameScores,
-    PreferenceResult,
-    ProgressResult,
-    Result,
     SimilarityResult,
-)
-from rfm_client.samples import (
-    PreferenceSample,
-    ProgressSample,
-    Sample,
     SimilaritySample,
     Trajectory,
     float_frames_to_uint8,
 )
+from rfm_client.data.inputs import as_trajectory, load_trajectory
 
 __all__ = [
     "AccessDeniedError",

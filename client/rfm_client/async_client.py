@@ -13,32 +13,32 @@ from functools import partial
 from types import TracebackType
 from typing import TYPE_CHECKING, Literal, TypedDict, cast, overload
 
-from rfm_client import wire
-from rfm_client.access import Access, AccessOptions
-from rfm_client.deadline import Deadline, check_timeout
-from rfm_client.errors import (
+from rfm_client.batching import groups, model_of, padded_bytes, parts
+from rfm_client.contract import wire
+from rfm_client.contract.errors import (
     DeadlineExceededError,
     InferenceFailedError,
     InvalidSampleError,
     ModelNotFoundError,
     RewardError,
 )
-from rfm_client.fit import FittedSample, fitted, whole, with_frame_indices
-from rfm_client.in_flight import InFlight
-from rfm_client.model_info import ModelInfo
-from rfm_client.names import of_urls
-from rfm_client.off_loop import off_loop
-from rfm_client.packing import groups, model_of, padded_bytes, parts
-from rfm_client.results import PreferenceResult, ProgressResult, Result, SimilarityResult
-from rfm_client.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
-from rfm_client.server import PROBE_TIMEOUT_S
-from rfm_client.servers import Servers
-from rfm_client.transport import Answer, Transport, connect
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.names import DEFAULT_MODEL, encoder_name, frames_name
+from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
+from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
+from rfm_client.data.fitting import FittedSample, fitted, whole, with_frame_indices
+from rfm_client.transport.access import Access, AccessOptions
+from rfm_client.transport.calls import Answer, Transport, connect
+from rfm_client.transport.deadline import Deadline, check_timeout
+from rfm_client.transport.host_names import of_urls
+from rfm_client.transport.in_flight import InFlight
+from rfm_client.transport.off_loop import off_loop
+from rfm_client.transport.server import PROBE_TIMEOUT_S
+from rfm_client.transport.servers import Servers
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-DEFAULT_MODEL = "rfm"
 DEFAULT_TIMEOUT_S = 60.0
 DEFAULT_IN_FLIGHT = 128  # twice the usual batch: while one is scored, the next one gathers
 READY_POLL_S = 0.2
@@ -186,20 +186,20 @@ class AsyncRewardClient:
         outputs = (wire.VIDEO_EMBEDDINGS, wire.TEXT_EMBEDDING)
         deadline, name = self._deadline(timeout_s), next(_request_ids(request_id))
         async with self._in_flight.room(trajectory.frames.nbytes, deadline):
-            answer = await self._servers.infer(f"{self._model}_encoder", tensors, outputs, deadline, request_id=name)
+            answer = await self._servers.infer(encoder_name(self._model), tensors, outputs, deadline, request_id=name)
         return wire.decode_embeddings(answer.tensors, trajectory)
 
     async def is_ready(self, *, timeout_s: float | None = None) -> bool:
         """Whether a server answers and has the model ready, for embeddings or for raw frames."""
         left_s = self._deadline(timeout_s).remaining_s()
-        return await self._servers.is_ready((self._model, f"{self._model}_frames"), left_s)
+        return await self._servers.is_ready((self._model, frames_name(self._model)), left_s)
 
     async def wait_ready(self, timeout_s: float) -> None:
         """Returns as soon as ``is_ready``. Raises DeadlineExceededError."""
         deadline = self._deadline(timeout_s)
         while not await self.is_ready(timeout_s=min(PROBE_TIMEOUT_S, deadline.remaining_s())):
             if deadline.ends_within(READY_POLL_S):
-                names = f"{self._model} and {self._model}_frames"
+                names = f"{self._model} and {frames_name(self._model)}"
                 raise DeadlineExceededError(f"{self._servers}: {names}: not ready within {timeout_s:g} s")
             await asyncio.sleep(READY_POLL_S)
 
@@ -212,7 +212,7 @@ class AsyncRewardClient:
 
         Raises ModelNotFoundError if it is not served.
         """
-        name = f"{self._model}_frames" if frames else self._model
+        name = frames_name(self._model) if frames else self._model
         return await self._model_info(name, self._deadline(timeout_s), refresh=refresh)
 
     async def close(self) -> None:

@@ -10,13 +10,13 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 from rfm_client.async_client import AsyncRewardClient, CallOptions, ClientOptions
-from rfm_client.errors import RewardError
-from rfm_client.fit import snapshot
-from rfm_client.loop_thread import LoopThread
-from rfm_client.model_info import ModelInfo
-from rfm_client.results import PreferenceResult, ProgressResult, Result, SimilarityResult
-from rfm_client.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
-from rfm_client.transport import Transport
+from rfm_client.contract.errors import RewardError
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
+from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
+from rfm_client.data.fitting import snapshot
+from rfm_client.transport.calls import Transport
+from rfm_client.transport.loop_thread import LoopThread
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -29,8 +29,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.episode import ClientSource, Episode, Info, RewardOptions, Scorer, SuccessRule
-from rfm_client.errors import InvalidSampleError
+from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.integrations.episode import ClientSource, Episode, Info, RewardOptions, Scorer, SuccessRule
 
 try:
     import gymnasium

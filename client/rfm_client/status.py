@@ -19,9 +19,14 @@ from typing import Any
 
 from tritonclient.utils import InferenceServerException
 
-from rfm_client.access import Access, is_denied
-from rfm_client.errors import AccessDeniedError, DeadlineExceededError, InferenceFailedError, ServerUnavailableError
-from rfm_client.transport import split_url
+from rfm_client.contract.addresses import split_url
+from rfm_client.contract.errors import (
+    AccessDeniedError,
+    DeadlineExceededError,
+    InferenceFailedError,
+    ServerUnavailableError,
+)
+from rfm_client.transport.access import Access, is_denied
 
 METRICS_PORT = 8002
 DEVICE_METRICS = "nv_cpu_utilization, nv_gpu_utilization, nv_*_memory_*_bytes"

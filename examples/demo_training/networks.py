@@ -12,11 +12,11 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from demo_training.groups import HINT_DIM
-from rfm.checkpoint import RewindCheckpoint, save
 from rfm.checkpoint.files import WEIGHTS
-from rfm.checkpoint.rewind import IMAGE_ENCODER_PREFIX, TEXT_ENCODER_PREFIX
-from rfm.models.encoders import Encoders, ImagePreprocessor
-from rfm.models.rewind import RewindConfig, RewindTransformer
+from rfm.families import save
+from rfm.rewind.checkpoint import IMAGE_ENCODER_PREFIX, TEXT_ENCODER_PREFIX, RewindCheckpoint
+from rfm.rewind.encoders import Encoders, ImagePreprocessor
+from rfm.rewind.network import RewindConfig, RewindTransformer
 from toy_world.tasks import COLOURS, TARGETS, TASKS, VERBS
 
 IMAGE_SIZE_PX = 48

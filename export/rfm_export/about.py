@@ -14,14 +14,15 @@ from typing import Any
 
 from tritonclient.grpc import model_config_pb2 as pb
 
-from rfm.checkpoint import Checkpoint, RewindCheckpoint
 from rfm.checkpoint.content import read_run_config
 from rfm.checkpoint.digest import weights_digest
 from rfm.checkpoint.files import find_run_config
-from rfm.models.encoders import Encoders
-from rfm.models.rewind import RewindTransformer
-from rfm.models.vlm import VlmRewardModel
-from rfm_client.model_info import (
+from rfm.families import Checkpoint
+from rfm.rewind.checkpoint import RewindCheckpoint
+from rfm.rewind.encoders import Encoders
+from rfm.rewind.network import RewindTransformer
+from rfm.vlm.network import VlmRewardModel
+from rfm_client.contract.model_info import (
     DIGEST_PARAMETER,
     NETWORK_PARAMETER,
     REVISION_PARAMETER,

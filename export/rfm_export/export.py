@@ -12,18 +12,21 @@ import torch
 from google.protobuf.text_format import ParseError
 from safetensors import SafetensorError
 
-from rfm import checkpoint as checkpoints
-from rfm.checkpoint import Checkpoint, RewindCheckpoint, VlmCheckpoint
+from rfm import families
 from rfm.checkpoint.content import read_json
-from rfm.collate.images import PREPROCESSOR_CONFIG
+from rfm.checkpoint.preprocessor import PREPROCESSOR_CONFIG
 from rfm.config import ServeConfig
 from rfm.engine import PROCESSOR_FOLDER, Engine
-from rfm.families.vlm import load_collator, save_processor
-from rfm.models.encoders import Encoders, ImagePreprocessor
-from rfm_client.resize import FrameSize
+from rfm.families import Checkpoint
+from rfm.rewind.checkpoint import RewindCheckpoint
+from rfm.rewind.encoders import Encoders, ImagePreprocessor
+from rfm.vlm.checkpoint import VlmCheckpoint
+from rfm.vlm.family import load_collator, save_processor
+from rfm_client.contract.frame_size import FrameSize
+from rfm_client.contract.names import encoder_name, frames_name
 from rfm_export.about import Origin, about, tell_weights
 from rfm_export.errors import ExportError
-from rfm_export.layout import GeneratedModel, encoder_name, frames_name, rewind_models, vlm_models
+from rfm_export.layout import GeneratedModel, rewind_models, vlm_models
 from rfm_export.publish import alone, next_version, publish, read_config, staging
 from rfm_export.verify import probes, verify
 
@@ -61,9 +64,9 @@ def export(source: str | Path, repository: Path, serve: ServeConfig, *, other_ma
     """
     if not other_machine:
         _check_gpus(serve.num_gpus)
-    folder = checkpoints.find(source)
-    checkpoint = checkpoints.load(folder, base_model=serve.base_model, resize_images=serve.resize_images)
-    checkpoints.check(folder, checkpoint)
+    folder = families.find(source)
+    checkpoint = families.load(folder, base_model=serve.base_model, resize_images=serve.resize_images)
+    families.check(folder, checkpoint)
     origin = Origin.of(source, folder)
     names = [serve.name, encoder_name(serve.name), frames_name(serve.name)]
     with alone(repository), staging(repository, names) as staged:
@@ -107,7 +110,7 @@ def check(repository: Path, serve: ServeConfig) -> list[str]:
     if not versions:
         raise ExportError(f"{repository / scorer}: expected a configuration that names its versions, got none")
     version = max(versions)
-    checkpoint = checkpoints.load(repository / scorer / str(version) / CHECKPOINT_FOLDER)
+    checkpoint = families.load(repository / scorer / str(version) / CHECKPOINT_FOLDER)
     frame_size = _exported_frame_size(repository / encoder_name(serve.name) / str(version))
     models = _models(checkpoint, serve, version, frame_size, Origin.told(config))
     differences = []
@@ -179,7 +182,7 @@ def _rewind_plan(checkpoint: RewindCheckpoint, serve: ServeConfig, version: int,
         return parts / IMAGE_ENCODER_FOLDER, parts / TEXT_ENCODER_FOLDER
 
     def write(folder: Path) -> None:
-        checkpoints.save(checkpoint, of_scorer(folder))
+        families.save(checkpoint, of_scorer(folder))
         if encoders is not None:
             encoders.save_pretrained(*of_encoders(folder))
 
@@ -208,7 +211,7 @@ def _vlm_plan(checkpoint: VlmCheckpoint, serve: ServeConfig, version: int, origi
         return folder / frames_name(serve.name) / str(version) / CHECKPOINT_FOLDER
 
     def write(folder: Path) -> None:
-        checkpoints.save(checkpoint, of_scorer(folder))
+        families.save(checkpoint, of_scorer(folder))
         save_processor(collator, of_scorer(folder) / PROCESSOR_FOLDER)
 
     device = "cuda" if torch.cuda.is_available() and serve.num_gpus != 0 else "cpu"

@@ -14,18 +14,15 @@ from importlib import resources
 import numpy as np
 from tritonclient.grpc import model_config_pb2 as pb
 
-from rfm.collate.images import FRAMES_PER_GROUP, MERGE, fitted_size
 from rfm.config import ServeConfig
-from rfm.families.vlm import SMOL_SIZE_PX
-from rfm.models.rewind import RewindConfig
-from rfm.models.vlm import SMOL, VlmConfig
-from rfm_client import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory, wire
-from rfm_client.model_info import (
-    FRAME_SIZE_PARAMETER,
-    FRAMES_PER_VALUE_PARAMETER,
-    MAX_FRAMES_PARAMETER,
-)
-from rfm_client.resize import FrameSize
+from rfm.rewind.network import RewindConfig
+from rfm.vlm.family import SMOL_SIZE_PX
+from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, fitted_size
+from rfm.vlm.network import SMOL, VlmConfig
+from rfm_client.contract import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory, wire
+from rfm_client.contract.frame_size import FrameSize
+from rfm_client.contract.model_info import FRAME_SIZE_PARAMETER, FRAMES_PER_VALUE_PARAMETER, MAX_FRAMES_PARAMETER
+from rfm_client.contract.names import encoder_name, frames_name
 from rfm_export.about import about_encoders
 from rfm_export.pbtxt import Interface, Warmup, ensemble_config, python_config, render
 
@@ -67,16 +64,6 @@ class GeneratedModel:
         contents = {CONFIG_FILE: render(self.config).encode(), f"{self.version}/{in_version[0]}": in_version[1]}
         contents |= {f"{WARMUP_FOLDER}/{name}": content for name, content in self.warmup_files.items()}
         return {f"{self.name}/{path}": content for path, content in contents.items()}
-
-
-def encoder_name(name: str) -> str:
-    """Name of the encoder that goes with the model ``name``."""
-    return f"{name}_encoder"
-
-
-def frames_name(name: str) -> str:
-    """Name of the ensemble that scores raw frames."""
-    return f"{name}_frames"
 
 
 def rewind_models(

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm.engine import Engine, Outcome
-from rfm.models.rewind import RewindConfig
-from rfm.models.vlm import VlmConfig
-from rfm_client import (
+from rfm.rewind.network import RewindConfig
+from rfm.vlm.network import VlmConfig
+from rfm_client.contract import (
     FrameScores,
     PreferenceResult,
     PreferenceSample,

@@ -6,19 +6,20 @@ from __future__ import annotations
 import importlib.metadata
 import logging
 import shlex
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from rfm_client.async_client import DEFAULT_MODEL, DEFAULT_TIMEOUT_S
+from rfm_client.async_client import DEFAULT_TIMEOUT_S
 from rfm_client.cli import options, outputs, scoring, toy
 from rfm_client.cli.options import EXIT_CODES, STANDARD_OUTPUT, OneLineCommand, Server
 from rfm_client.cli.scoring import Failed, Question, Scored
-from rfm_client.errors import RewardError
-from rfm_client.gateway.command import gateway
-from rfm_client.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS
-from rfm_client.transport import split_url
+from rfm_client.contract.addresses import split_url
+from rfm_client.contract.errors import RewardError
+from rfm_client.contract.names import DEFAULT_MODEL, frames_name
+from rfm_client.contract.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS
 
 FILE_WIDTH = 200
 
@@ -95,7 +96,7 @@ def score(
     timeout: options.TimeoutS = DEFAULT_TIMEOUT_S,
 ) -> None:
     """Progress and success at each frame of one or many videos. One that fails does not stop the others."""
-    from rfm_client import show
+    from rfm_client.cli import show
 
     options.check_outputs(json, plot)
     _check_arrays(npy, videos)
@@ -141,7 +142,7 @@ def compare(
     timeout: options.TimeoutS = DEFAULT_TIMEOUT_S,
 ) -> None:
     """Which of two videos does the task better, and the progress in both."""
-    from rfm_client import show
+    from rfm_client.cli import show
 
     options.check_outputs(json, plot)
     server = Server(urls, model, timeout, context.obj)
@@ -168,7 +169,7 @@ def status(
     timeout: options.TimeoutS = 10.0,
 ) -> None:
     """The server: its models, their requests, how well they share batches; GPUs and memory."""
-    from rfm_client.show import status_tables
+    from rfm_client.cli.show import status_tables
     from rfm_client.status import read_status
 
     options.check_outputs(json, None)
@@ -212,7 +213,7 @@ def sample(
     timeout: options.TimeoutS = DEFAULT_TIMEOUT_S,
 ) -> None:
     """Ask about made-up samples, to see that the server answers. Their scores mean nothing."""
-    from rfm_client.show import scores_table
+    from rfm_client.cli.show import scores_table
 
     options.check_outputs(json, None)
     server = Server(urls, model, timeout, context.obj)
@@ -246,13 +247,13 @@ def bench_input(
     timeout: options.TimeoutS = DEFAULT_TIMEOUT_S,
 ) -> None:
     """Write made-up samples as input of Triton's perf_analyzer, and print the command that measures with them."""
-    from rfm_client.perf_input import write_perf_analyzer_input
+    from rfm_client.cli.perf_input import write_perf_analyzer_input
 
     made_up = _toy(kind, num_samples, num_frames, use_frames, seed)
     with Server(urls, model, timeout, context.obj).connected() as client:
         write_perf_analyzer_input(output, made_up.samples(client))
     protocol, address = split_url(urls[0])
-    name = f"{model}_frames" if use_frames else model
+    name = frames_name(model) if use_frames else model
     arguments = [
         "perf_analyzer",
         "-m",
@@ -295,4 +296,5 @@ def _print(*tables: object) -> None:
     console.print(*tables, sep="\n")
 
 
-app.command(cls=OneLineCommand)(gateway)
+for _command in entry_points(group="rfm_client.commands"):  # of other distributions: rfm-gateway
+    app.command(_command.name, cls=OneLineCommand)(_command.load())

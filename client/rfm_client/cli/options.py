@@ -13,10 +13,11 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperCommand
 
-from rfm_client import errors
-from rfm_client.access import Access
-from rfm_client.async_client import DEFAULT_MODEL, DEFAULT_TIMEOUT_S
+from rfm_client.async_client import DEFAULT_TIMEOUT_S
 from rfm_client.client import RewardClient
+from rfm_client.contract import errors
+from rfm_client.contract.names import DEFAULT_MODEL
+from rfm_client.transport.access import Access
 
 DEFAULT_URL = "grpc://localhost:8001"
 STANDARD_OUTPUT = "-"

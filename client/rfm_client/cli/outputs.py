@@ -15,8 +15,8 @@ import typer
 
 from rfm_client.cli.options import STANDARD_OUTPUT, Server
 from rfm_client.cli.scoring import Comparison, Outcome, Question, Scored, Times, times_of, unique_stems
-from rfm_client.errors import RewardError
-from rfm_client.results import FrameScores, PreferenceResult, ProgressResult, Result
+from rfm_client.contract.errors import RewardError
+from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
 from rfm_client.status import ServerStatus
 
 

@@ -17,12 +17,12 @@ import numpy.typing as npt
 
 from rfm_client.cli import options
 from rfm_client.cli.options import ExitCode, Server, missing_package
+from rfm_client.cli.show import Panel, number, table
 from rfm_client.client import RewardClient
-from rfm_client.errors import RewardError
-from rfm_client.fit import fitted, with_frame_indices
-from rfm_client.results import FrameScores, PreferenceResult, ProgressResult, Result
-from rfm_client.samples import PreferenceSample, ProgressSample, Sample, Trajectory
-from rfm_client.show import Panel, number, table
+from rfm_client.contract.errors import RewardError
+from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
+from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, Trajectory
+from rfm_client.data.fitting import fitted, with_frame_indices
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -58,8 +58,8 @@ class Source:
     @classmethod
     def read(cls, name: str, question: Question) -> Source:
         """From a file or URL. Raises InvalidSampleError."""
-        from rfm_client.inputs import ARRAY_SUFFIXES, load_trajectory
-        from rfm_client.video import frame_times_s, is_url
+        from rfm_client.data.inputs import ARRAY_SUFFIXES, load_trajectory
+        from rfm_client.data.video import frame_times_s, is_url
 
         if not is_url(name) and PurePath(name).suffix.lower() in ARRAY_SUFFIXES:
             return cls(name, load_trajectory(name, task=question.task), None)

@@ -12,8 +12,8 @@ from enum import Enum
 import numpy as np
 
 from rfm_client.client import RewardClient
-from rfm_client.model_info import ModelInfo
-from rfm_client.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 
 FRAME_SIZE_PX = 64
 TASK = "put the block in the bowl"

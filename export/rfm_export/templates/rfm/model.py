@@ -10,8 +10,9 @@ import torch
 
 from rfm.engine import Engine, Outcome
 from rfm.execution import Execution
-from rfm.server.batch_model import BUDGET_PARAMETER, DTYPE_PARAMETER, SAMPLE_TOKENS_PARAMETER, BatchModel
-from rfm_client import Result, Sample, wire
+from rfm.parameters import BUDGET_PARAMETER, DTYPE_PARAMETER, SAMPLE_TOKENS_PARAMETER
+from rfm.triton_model.batch_model import BatchModel
+from rfm_client.contract import Result, Sample, wire
 
 
 class TritonPythonModel(BatchModel[Sample, Result]):

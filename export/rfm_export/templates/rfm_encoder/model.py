@@ -9,10 +9,10 @@ from pathlib import Path
 import torch
 
 from rfm.execution import Execution
-from rfm.models.encoders import Encoders
-from rfm.server.batch_model import BatchModel
-from rfm_client import RewardError, Trajectory, wire
-from rfm_client.samples import Footage
+from rfm.rewind.encoders import Encoders
+from rfm.triton_model.batch_model import BatchModel
+from rfm_client.contract import RewardError, Trajectory, wire
+from rfm_client.contract.samples import Footage
 
 
 class TritonPythonModel(BatchModel[Footage, Trajectory]):

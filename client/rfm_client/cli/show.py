@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: MIT
+"""Scores and a server's state as a person would look at them: tables and a plot. Needs ``rfm-client[cli]``."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
+from rfm_client.contract.samples import Float32Array, UInt8Array
+from rfm_client.status import DEVICE_METRICS, Device, ModelStatus, ServerStatus
+
+if TYPE_CHECKING:
+    from matplotlib.figure import SubFigure
+    from rich.table import Table
+
+STRIP_FRAMES = 8
+WIDTH_IN = 10.0
+COLUMN_WIDTH_IN = 7.0  # where panels stand side by side
+PANEL_HEIGHT_IN = 4.0
+DOTS_PER_IN = 200
+MAX_PANELS = 50  # one picture of more could not be looked at, nor drawn much further
+
+_GIB = 2**30
+_CURVES = (("progress", "tab:blue", "-", "o"), ("success", "tab:green", "--", "s"))
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """The number, or ``-`` for one that is not told (None, NaN)."""
+    return "-" if value is None or math.isnan(value) else f"{value:.{digits}f}"
+
+
+def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, caption: str | None = None) -> Table:
+    """A table of texts. What is in square brackets is text too, not markup."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    shown = Table(
+        box=box.SIMPLE_HEAD,
+        collapse_padding=True,
+        title=Text(title) if title else None,
+        caption=None if caption is None else Text(caption),
+        title_justify="left",
+        caption_justify="left",
+    )
+    for column in columns:
+        shown.add_column(column, overflow="fold")
+    for row in rows:
+        shown.add_row(*map(Text, row))
+    return shown
+
+
+def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> Table:
+    """One row a result: its question's answer, and the scores of its (first) trajectory's last frame."""
+    shown = []
+    for name, result in rows:
+        frames: FrameScores
+        if isinstance(result, ProgressResult):
+            answer, frames = f"{len(result.progress)} frames", result
+        elif isinstance(result, PreferenceResult):
+            answer, frames = f"P(first) = {result.preference:.4f}", result.first
+        else:
+            answer, frames = f"similarity = {result.similarity:.4f}", result.reference
+        shown.append((name, answer, number(frames.progress[-1]), number(frames.success[-1])))
+    return table(title, ("sample", "answer", "progress at the end", "success at the end"), shown)
+
+
+def status_tables(status: ServerStatus) -> list[Table]:
+    """The server's models, and the machine if its metrics tell of it."""
+    version = f" {status.version}" if status.version else ""
+    title = f"{status.url}: Triton{version}, {'ready' if status.ready else 'not ready'}"
+    columns = (
+        "model", "v", "state", "requests", "failed", "pending", "queue ms", "executions", "samples each", "ms each",
+    )  # fmt: skip
+    caption = (
+        status.metrics_error
+        or "since the model was loaded, warm-up included; queue ms: of a request; each: of an execution"
+    )
+    tables = [table(title, columns, [_model_row(model) for model in status.models], caption=caption)]
+    if status.devices:
+        rows = [_device_row(device) for device in status.devices]
+        tables.append(
+            table(f"machine, from {DEVICE_METRICS}", ("device", "utilization", "memory used", "memory"), rows)
+        )
+    return tables
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """What a plot shows of one trajectory.
+
+    positions: float64 [T], where each scored frame stands on the time axis
+    unit: of the positions, ``s`` or ``frame``
+    strip: uint8 [S, H, W, 3], some of the frames; None: the trajectory is of embeddings
+    strip_positions: float64 [S]
+    """
+
+    title: str
+    scores: FrameScores
+    positions: npt.NDArray[np.float64]
+    unit: str
+    strip: UInt8Array | None
+    strip_positions: npt.NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls,
+        title: str,
+        scores: FrameScores,
+        frames: UInt8Array | None = None,
+        times_s: npt.NDArray[np.float64] | None = None,
+    ) -> Panel:
+        """From the scores of a trajectory, all its frames and their times [T], as far as they are known.
+
+        Of the frames it keeps only copies of those that it shows.
+        """
+        scored = np.arange(len(scores.progress)) if scores.frame_indices is None else scores.frame_indices
+        positions = scored.astype(np.float64) if times_s is None else times_s[scored]
+        shown = np.unique(np.linspace(0, len(scored) - 1, STRIP_FRAMES).round().astype(int))
+        strip = None if frames is None else frames[scored[shown]]
+        return cls(title, scores, positions, "frame" if times_s is None else "s", strip, positions[shown])
+
+
+def plot(file: Path, panels: Sequence[Panel], title: str | None = None, *, columns: int = 1) -> None:
+    """Writes a picture, in the format that the file's name ends in: per panel a film strip, and below it the scores.
+
+    columns: panels that stand side by side
+    """
+    try:
+        import matplotlib
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError('plots need matplotlib: pip install "./client[cli]"') from error
+
+    rows = [panels[start : start + columns] for start in range(0, len(panels), columns)]
+    heights_in = [PANEL_HEIGHT_IN * (1 if any(panel.strip is not None for panel in row) else 0.7) for row in rows]
+    with matplotlib.rc_context({"pdf.fonttype": 42, "text.parse_math": False}):  # fonts that journals take
+        figure = Figure(
+            figsize=(WIDTH_IN if columns == 1 else COLUMN_WIDTH_IN * columns, sum(heights_in)), layout="constrained"
+        )
+        if title is not None:
+            figure.suptitle(title)
+        parts = figure.subfigures(len(rows), columns, squeeze=False, height_ratios=heights_in)
+        for part, panel in zip(parts.flat, panels):  # noqa: B905 - the last row may have room left
+            _draw(part, panel)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Glyph")  # letters that the font lacks are drawn as boxes
+            figure.savefig(file, dpi=DOTS_PER_IN)
+
+
+def _draw(part: SubFigure, panel: Panel) -> None:
+    columns = len(panel.strip_positions)
+    if panel.strip is None:
+        axes = part.add_subplot()
+    else:
+        grid = part.add_gridspec(2, columns, height_ratios=[1, 2])
+        for column, (frame, position) in enumerate(zip(panel.strip, panel.strip_positions, strict=True)):
+            picture = part.add_subplot(grid[0, column])
+            picture.imshow(frame)
+            picture.set_axis_off()
+            picture.set_title(f"{position:.1f} s" if panel.unit == "s" else f"{position:.0f}", fontsize=8)
+        axes = part.add_subplot(grid[1, :])
+    for name, colour, line, marker in _CURVES:
+        scores: Float32Array = getattr(panel.scores, name)
+        if np.isnan(scores).all():
+            axes.plot([], [], color=colour, label=f"{name}: not told")
+        else:
+            axes.plot(panel.positions, scores, color=colour, linestyle=line, marker=marker, markersize=4, label=name)
+    axes.set(xlabel="time (s)" if panel.unit == "s" else "frame", ylabel="score", ylim=(-0.02, 1.02))
+    axes.grid(alpha=0.3)
+    axes.legend(loc="upper left", fontsize=8)
+    part.suptitle(panel.title, fontsize=10)
+
+
+def _model_row(model: ModelStatus) -> tuple[str, ...]:
+    state = f"{model.state}: {model.reason}" if model.reason else model.state
+    counts: tuple[Any, ...] = (model.requests_succeeded, model.requests_failed)
+    return (
+        model.name,
+        model.version,
+        state,
+        *map(str, counts),
+        "-" if model.requests_pending is None else str(model.requests_pending),
+        number(model.queue_ms_per_request, 2),
+        str(model.executions),
+        number(model.samples_per_execution, 1),
+        number(model.compute_ms_per_execution, 2),
+    )
+
+
+def _device_row(device: Device) -> tuple[str, ...]:
+    utilization = "-" if device.utilization is None else f"{device.utilization:.0%}"
+    sizes = (device.memory_used_bytes, device.memory_total_bytes)
+    return (device.name, utilization, *("-" if size is None else f"{size / _GIB:.1f} GiB" for size in sizes))

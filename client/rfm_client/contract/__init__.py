@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: MIT
+"""What client and server share: samples, results, errors, names, and the tensors in which they travel."""
+
+from rfm_client.contract.errors import (
+    AccessDeniedError,
+    DeadlineExceededError,
+    InferenceFailedError,
+    InvalidSampleError,
+    ModelNotFoundError,
+    ProcessEndedError,
+    RewardError,
+    ServerError,
+    ServerUnavailableError,
+)
+from rfm_client.contract.frame_size import FrameSize
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.results import (
+    BatchTiming,
+    FrameScores,
+    PreferenceResult,
+    ProgressResult,
+    Result,
+    SimilarityResult,
+)
+from rfm_client.contract.samples import (
+    PreferenceSample,
+    ProgressSample,
+    Sample,
+    SimilaritySample,
+    Trajectory,
+    float_frames_to_uint8,
+)
+
+__all__ = [
+    "AccessDeniedError",
+    "BatchTiming",
+    "DeadlineExceededError",
+    "FrameScores",
+    "FrameSize",
+    "InferenceFailedError",
+    "InvalidSampleError",
+    "ModelInfo",
+    "ModelNotFoundError",
+    "PreferenceResult",
+    "PreferenceSample",
+    "ProcessEndedError",
+    "ProgressResult",
+    "ProgressSample",
+    "Result",
+    "RewardError",
+    "Sample",
+    "ServerError",
+    "ServerUnavailableError",
+    "SimilarityResult",
+    "SimilaritySample",
+    "Trajectory",
+    "float_frames_to_uint8",
+]

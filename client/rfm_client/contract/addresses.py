@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: MIT
+"""Where a server is, and the certificates of one: URLs, addresses of this machine, PEM files."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+import ssl
+from pathlib import Path
+
+MAX_PORT = 65535
+
+_URL = re.compile(r"((?P<scheme>grpcs?|https?)://|dns:///)(?P<address>[^/]+:(?P<port>[0-9]{1,5}))/?")
+
+
+def split_url(url: str) -> tuple[str, str]:
+    """``grpc``, ``http``, ``grpcs`` or ``https``, and ``host:port``. Raises ValueError.
+
+    ``dns:///host:port``, as gRPC writes it, is ``grpc://host:port``.
+    """
+    match = _URL.fullmatch(url)
+    if match is None or int(match["port"]) > MAX_PORT:
+        raise ValueError(f"url: expected grpc://host:port or http://host:port, or grpcs:// or https://, got {url!r}")
+    return match["scheme"] or "grpc", match["address"]
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address is of this machine alone; of names only ``localhost`` is."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def check_certificate(certificate: str | Path, key: str | Path, where: str) -> None:
+    """Raises ValueError, told as ``where: ...``, unless a server could serve with these files."""
+    load_certificate(ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), certificate, key, where)
+
+
+def check_authorities(file: str | Path, where: str) -> None:
+    """Raises ValueError, told as ``where: ...``, unless certificates can be judged by those in the file."""
+    try:
+        ssl.create_default_context(cafile=file)
+    except OSError as error:
+        raise ValueError(f"{where}: expected certificates (PEM) at {file}, got: {_reason(error)}") from None
+
+
+def load_certificate(context: ssl.SSLContext, certificate: str | Path, key: str | Path, where: str) -> None:
+    """Raises ValueError, told as ``where: ...``, unless the context can use these files."""
+    try:
+        context.load_cert_chain(certificate, key, password="")  # no password: nobody is asked for one
+    except OSError as error:
+        expected = f"a certificate and its key (PEM, unencrypted) at {certificate} and {key}"
+        raise ValueError(f"{where}: expected {expected}, got: {_reason(error)}") from None
+
+
+def _reason(error: OSError) -> str:
+    return getattr(error, "reason", None) or error.strerror or "no PEM file"

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: MIT
+"""Results: what a reward model answers. T frames, K progress bins."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.contract.samples import Float32Array
+
+SUCCESS_THRESHOLD = 0.5
+
+
+@dataclass(frozen=True)
+class BatchTiming:
+    """Milliseconds that the server spent on the batch in which a sample was scored."""
+
+    collate_ms: float
+    forward_ms: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameScores:
+    """Scores of each frame of one trajectory.
+
+    progress: float32 [T], share of the task done, 0..1
+    success: float32 [T], probability that the task is done
+    progress_logits: float32 [T, K], raw scores of the progress bins; only of discrete checkpoints, on request
+    frame_indices: int64 [T], which frames of the trajectory were scored; None: all of them
+    """
+
+    progress: Float32Array
+    success: Float32Array
+    progress_logits: Float32Array | None = None
+    frame_indices: npt.NDArray[np.int64] | None = None
+
+    @property
+    def last_progress(self) -> float:
+        """Progress at the last frame. Raises ValueError if the checkpoint does not tell it."""
+        return float(_told("progress", self.progress)[-1])
+
+    @property
+    def progress_deltas(self) -> Float32Array:
+        """float32 [T], how far each scored frame has come since the one before; 0 for the first.
+
+        Raises ValueError if the checkpoint does not tell progress.
+        """
+        progress = _told("progress", self.progress)
+        return np.diff(progress, prepend=progress[:1])
+
+    def succeeded(self, *, last: int = 1, threshold: float = SUCCESS_THRESHOLD) -> bool:
+        """Whether more than half of the ``last`` frames (all, if there are fewer) reach the probability ``threshold``.
+
+        Raises ValueError if the checkpoint does not tell success.
+        """
+        if last < 1:
+            raise ValueError(f"last: expected at least one frame, got {last}")
+        votes = _told("success", self.success)[-last:] >= threshold
+        return bool(2 * np.count_nonzero(votes) > len(votes))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ProgressResult(FrameScores):
+    """Answer to a ProgressSample: the scores of its trajectory's frames.
+
+    model_version: which version of the checkpoint answered
+    """
+
+    timing: BatchTiming | None = None
+    model_version: str | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PreferenceResult:
+    """Answer to a PreferenceSample: the probability that ``first`` is preferred, and each frame's scores."""
+
+    preference: float
+    first: FrameScores
+    second: FrameScores
+    timing: BatchTiming | None = None
+    model_version: str | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SimilarityResult:
+    """Answer to a SimilaritySample: the model's raw similarity score (unbounded), and each frame's scores."""
+
+    similarity: float
+    reference: FrameScores
+    other: FrameScores
+    timing: BatchTiming | None = None
+    model_version: str | None = None
+
+
+Result: TypeAlias = ProgressResult | PreferenceResult | SimilarityResult
+
+
+def _told(name: str, scores: Float32Array) -> Float32Array:
+    if np.isnan(scores).any():
+        raise ValueError(f"{name}: expected a score of each frame, got NaN: this checkpoint does not tell it")
+    return scores

@@ -1,0 +1,248 @@
+# SPDX-License-Identifier: MIT
+"""Samples: what a reward model is asked.
+
+Shapes: T frames, H x W pixels, D width of a frame embedding, Dt width of a text embedding.
+Arrays are checked once, here; everything behind trusts them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.contract.errors import InvalidSampleError
+
+Float32Array: TypeAlias = npt.NDArray[np.float32]
+UInt8Array: TypeAlias = npt.NDArray[np.uint8]
+
+MIN_FRAME_STEPS = 2  # a prefix of the trajectory sampled to one frame would not be a trajectory
+MAX_FRAME_STEPS = 4096  # more samples of a prefix than any checkpoint takes
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Trajectory:
+    """The frames, or precomputed frame embeddings, of one episode, and its task.
+
+    frames: uint8 [T, H, W, 3], RGB
+    video_embeddings: float32 [T, D]
+    text_embedding: float32 [Dt], embedding of the task; goes with video_embeddings
+    task: the task as a sentence; goes with frames
+
+    Exactly one of ``frames`` and ``video_embeddings`` is given. Raises InvalidSampleError.
+    """
+
+    frames: UInt8Array | None = None
+    video_embeddings: Float32Array | None = None
+    text_embedding: Float32Array | None = None
+    task: str = ""
+
+    def __post_init__(self) -> None:
+        if (self.frames is None) == (self.video_embeddings is None):
+            got = "neither" if self.frames is None else "both"
+            raise InvalidSampleError.at("trajectory", "either frames or video_embeddings", got)
+        if not isinstance(self.task, str):
+            raise InvalidSampleError.at("task", "str", type(self.task).__name__)
+        if any(0xD800 <= ord(character) <= 0xDFFF for character in self.task):
+            raise InvalidSampleError.at("task", "text that UTF-8 can encode", "a lone surrogate")
+        if self.frames is not None and self.text_embedding is not None:
+            raise InvalidSampleError.at("text_embedding", "None with frames, which go with task", "an embedding")
+        if self.frames is not None:
+            object.__setattr__(self, "frames", _checked_frames(self.frames))
+        if self.video_embeddings is not None:
+            embeddings = _checked_floats("video_embeddings", self.video_embeddings, ("T", "D"))
+            object.__setattr__(self, "video_embeddings", embeddings)
+        if self.text_embedding is not None:
+            text = _checked_floats("text_embedding", self.text_embedding, ("Dt",))
+            object.__setattr__(self, "text_embedding", text)
+
+    def __repr__(self) -> str:
+        """With shapes in place of values, which would fill pages."""
+        arrays = {"frames": self.frames, "video_embeddings": self.video_embeddings, "text": self.text_embedding}
+        told = [f"{name}={array.dtype} {list(array.shape)}" for name, array in arrays.items() if array is not None]
+        return f"Trajectory({', '.join([*told, f'task={self.task!r}'])})"
+
+    @property
+    def positions(self) -> npt.NDArray[Any]:
+        """The array whose first axis is time: ``frames`` or ``video_embeddings``."""
+        array = self.video_embeddings if self.frames is None else self.frames
+        assert array is not None  # __post_init__ has seen to it
+        return array
+
+    @property
+    def num_frames(self) -> int:
+        """T."""
+        return int(self.positions.shape[0])
+
+
+@dataclass(frozen=True, eq=False)
+class ProgressSample:
+    """How far has ``trajectory`` come, and has it succeeded, at each of its frames?
+
+    frame_steps: 0 scores the trajectory as a whole. K >= 2 is dense mode: frame t is scored on the
+    prefix 0..t alone, sampled to K frames, as an RL loop would have seen it at that step.
+    """
+
+    trajectory: Trajectory
+    frame_steps: int = 0
+
+    def __post_init__(self) -> None:
+        _check_text(self.trajectory, "trajectory")
+        steps = self.frame_steps
+        is_whole = isinstance(steps, (int, np.integer)) and not isinstance(steps, bool)
+        if not is_whole or not (steps == 0 or MIN_FRAME_STEPS <= steps <= MAX_FRAME_STEPS):
+            expected = f"0 or a whole number from {MIN_FRAME_STEPS} to {MAX_FRAME_STEPS}"
+            raise InvalidSampleError.at("frame_steps", expected, repr(steps))
+
+    @property
+    def trajectories(self) -> tuple[Trajectory, ...]:
+        """The trajectories in the order in which they lie on the time axis."""
+        return (self.trajectory,)
+
+
+@dataclass(frozen=True, eq=False)
+class PreferenceSample:
+    """Which trajectory does the task of ``first`` better?"""
+
+    first: Trajectory
+    second: Trajectory
+
+    def __post_init__(self) -> None:
+        _check_text(self.first, "first")
+        _check_pair(self.first, self.second, "second")
+
+    @property
+    def trajectories(self) -> tuple[Trajectory, ...]:
+        """The trajectories in the order in which they lie on the time axis."""
+        return (self.first, self.second)
+
+
+@dataclass(frozen=True, eq=False)
+class SimilaritySample:
+    """How similar is ``other`` to ``reference``, as ways of doing the task of ``reference``?"""
+
+    reference: Trajectory
+    other: Trajectory
+
+    def __post_init__(self) -> None:
+        _check_text(self.reference, "reference")
+        _check_pair(self.reference, self.other, "other")
+
+    @property
+    def trajectories(self) -> tuple[Trajectory, ...]:
+        """The trajectories in the order in which they lie on the time axis."""
+        return (self.reference, self.other)
+
+
+Sample: TypeAlias = ProgressSample | PreferenceSample | SimilaritySample
+
+
+@dataclass(frozen=True, eq=False)
+class Footage:
+    """What an encoder is asked about: the trajectories of raw frames of one sample, and the task of the first.
+
+    Those of one size may already be joined.
+    """
+
+    trajectories: tuple[Trajectory, ...]
+
+
+def stackable(trajectories: Sequence[Trajectory]) -> list[list[Trajectory]]:
+    """The trajectories, those together that one array can hold: neighbours whose positions have one shape."""
+    return [list(group) for _, group in groupby(trajectories, lambda trajectory: trajectory.positions.shape[1:])]
+
+
+def joined(trajectories: Sequence[Trajectory]) -> npt.NDArray[Any]:
+    """[P, ...], the positions of trajectories of one shape, one after the other; a view if there is one."""
+    arrays = [trajectory.positions for trajectory in trajectories]
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
+
+
+def float_frames_to_uint8(frames: npt.ArrayLike) -> UInt8Array:
+    """uint8 frames from float frames in 0..255, as the original evaluation server made them: clip, then truncate.
+
+    Raises InvalidSampleError for frames in 0..1, which truncation would turn black, and for NaN.
+    """
+    array = as_array(frames)
+    if array.size == 0 or not np.isfinite(array).all():
+        raise InvalidSampleError.at("frames", "finite values in 0..255", "NaN, Inf or nothing")
+    largest = float(array.max())
+    if 0.0 < largest <= 1.0:
+        raise InvalidSampleError.at("frames", "values in 0..255", f"values up to {largest:g}: multiply by 255 first")
+    return np.clip(array, 0, 255).astype(np.uint8)
+
+
+def as_array(values: Any) -> npt.NDArray[Any]:
+    """The values as an array; so are torch tensors, on a GPU or with a gradient too, bfloat16 as float32.
+
+    Raises ValueError for rows of unequal length.
+    """
+    if isinstance(values, (list, tuple)) and values and hasattr(values[0], "detach"):
+        values = [as_array(tensor) for tensor in values]
+    if hasattr(values, "detach"):  # a tensor, told without importing torch
+        tensor = values.detach().cpu()
+        values = (tensor.float() if str(tensor.dtype) == "torch.bfloat16" else tensor).numpy()
+    return np.asarray(values)
+
+
+def _checked_frames(frames: Any) -> UInt8Array:
+    try:
+        array = as_array(frames)
+    except ValueError:  # lists of unequal length
+        raise InvalidSampleError.at("frames", "uint8 [T, H, W, 3]", "frames of unequal size") from None
+    got = f"{array.dtype} {list(array.shape)}"
+    if array.dtype != np.uint8:
+        raise InvalidSampleError.at("frames", "uint8 [T, H, W, 3] (see float_frames_to_uint8)", got)
+    if array.ndim != 4 or array.shape[3] != 3:
+        raise InvalidSampleError.at("frames", "uint8 [T, H, W, 3]", got)
+    if 0 in array.shape:
+        raise InvalidSampleError.at("frames", "at least one frame of at least one pixel", got)
+    return array
+
+
+def _checked_floats(where: str, values: Any, axes: tuple[str, ...]) -> Float32Array:
+    expected = f"float32 [{', '.join(axes)}]"
+    try:
+        array = as_array(values)
+    except ValueError:  # lists of unequal length
+        raise InvalidSampleError.at(where, expected, "rows of unequal length") from None
+    if array.dtype.kind not in "fiu" or array.ndim != len(axes):
+        raise InvalidSampleError.at(where, expected, f"{array.dtype} {list(array.shape)}")
+    if 0 in array.shape:
+        raise InvalidSampleError.at(where, f"{expected} without an empty axis", f"{array.dtype} {list(array.shape)}")
+    if array.dtype != np.float32:
+        with np.errstate(over="ignore"):  # what does not fit becomes Inf and is refused below
+            array = array.astype(np.float32)
+    finite = np.isfinite(array)
+    if not finite.all():
+        position = np.argwhere(~finite)[0].tolist()
+        raise InvalidSampleError.at(where, "finite values", f"{array[tuple(position)]} at {position}")
+    return array
+
+
+def _check_text(trajectory: Trajectory, where: str) -> None:
+    """The first trajectory's text is the one that the model reads."""
+    if not isinstance(trajectory, Trajectory):
+        raise InvalidSampleError.at(where, "Trajectory", type(trajectory).__name__)
+    if trajectory.frames is None and trajectory.text_embedding is None:
+        raise InvalidSampleError.at(f"{where}.text_embedding", "float32 [Dt] with video_embeddings", "None")
+    if trajectory.frames is not None and not trajectory.task.strip():
+        raise InvalidSampleError.at(f"{where}.task", "a task sentence with frames", repr(trajectory.task))
+
+
+def _check_pair(first: Trajectory, second: Trajectory, where: str) -> None:
+    """Both are of one kind. Embeddings are of one width; frames may be of two sizes."""
+    if not isinstance(second, Trajectory):
+        raise InvalidSampleError.at(where, "Trajectory", type(second).__name__)
+    if (first.frames is None) != (second.frames is None):
+        expected, got = ("video_embeddings", "frames") if first.frames is None else ("frames", "video_embeddings")
+        raise InvalidSampleError.at(where, f"{expected}, as the first trajectory", got)
+    if first.frames is None and first.positions.shape[1:] != second.positions.shape[1:]:
+        expected, got = str(list(first.positions.shape[1:])), str(list(second.positions.shape[1:]))
+        raise InvalidSampleError.at(
+            f"{where}.video_embeddings", f"{expected} per frame, as the first trajectory (one array holds both)", got
+        )

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: MIT
+"""A sample made as small as its checkpoint reads it: fewer frames, smaller frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
+from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
+from rfm_client.data.resize import resize_frames
+
+FrameIndices = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class FittedSample:
+    """A sample to be sent, and which frames of each of its trajectories are in it (None: all)."""
+
+    sample: Sample
+    frame_indices: Sequence[FrameIndices | None]
+
+
+def whole(sample: Sample) -> FittedSample:
+    """The sample as it is. Raises InvalidSampleError for what is none."""
+    if not isinstance(sample, Sample):
+        expected = "ProgressSample, PreferenceSample or SimilaritySample"
+        raise InvalidSampleError.at("sample", expected, type(sample).__name__)
+    return FittedSample(sample, (None,) * len(sample.trajectories))
+
+
+def snapshot(sample: Sample) -> Sample:
+    """The sample with arrays of its own, so that what becomes of the caller's does not change what is asked."""
+
+    def copied(trajectory: Trajectory) -> Trajectory:
+        names = ("frames", "video_embeddings", "text_embedding")
+        arrays = {name: getattr(trajectory, name) for name in names}
+        return replace(trajectory, **{name: array.copy() for name, array in arrays.items() if array is not None})
+
+    return (
+        _with_trajectories(sample, [copied(t) for t in sample.trajectories]) if isinstance(sample, Sample) else sample
+    )
+
+
+def fitted(sample: Sample, info: ModelInfo, *, subsample: bool, resize: bool) -> FittedSample:
+    """The sample with at most ``info.max_frames`` frames a trajectory, of at most ``info.frame_size``, as asked.
+
+    In dense mode each prefix is sampled by the server, so no frame is taken away here.
+    """
+    dense = isinstance(sample, ProgressSample) and sample.frame_steps > 0
+    limit = info.max_frames if subsample and not dense else None
+    kept = [evenly_spaced(trajectory.num_frames, limit) for trajectory in sample.trajectories]
+    trajectories = [_taken(t, indices) for t, indices in zip(sample.trajectories, kept, strict=True)]
+    if resize and info.frame_size is not None:
+        size = info.frame_size
+        trajectories = [
+            t if t.frames is None else replace(t, frames=resize_frames(t.frames, size)) for t in trajectories
+        ]
+    return FittedSample(_with_trajectories(sample, trajectories), kept)
+
+
+def evenly_spaced(num_frames: int, limit: int | None) -> FrameIndices | None:
+    """int64 [limit], indices from the first to the last of so many frames, truncated; None: no need to leave any out.
+
+    The original takes its training clips by this rule, but of one frame the first; here that is the last, the newest.
+    """
+    if limit is None or num_frames <= limit:
+        return None
+    if limit == 1:
+        return np.array([num_frames - 1], np.int64)
+    return np.linspace(0, num_frames - 1, limit).astype(np.int64)
+
+
+def with_frame_indices(result: Result, indices: Sequence[FrameIndices | None]) -> Result:
+    """The result, telling which frames of its trajectories were scored."""
+    if all(kept is None for kept in indices):
+        return result
+    if isinstance(result, ProgressResult):
+        return replace(result, frame_indices=indices[0])
+    first, second = indices
+    if isinstance(result, PreferenceResult):
+        return replace(result, first=_of_frames(result.first, first), second=_of_frames(result.second, second))
+    return replace(result, reference=_of_frames(result.reference, first), other=_of_frames(result.other, second))
+
+
+def _taken(trajectory: Trajectory, indices: FrameIndices | None) -> Trajectory:
+    if indices is None:
+        return trajectory
+    if trajectory.frames is not None:
+        return replace(trajectory, frames=trajectory.frames[indices])
+    assert trajectory.video_embeddings is not None  # a Trajectory has one of them
+    return replace(trajectory, video_embeddings=trajectory.video_embeddings[indices])
+
+
+def _with_trajectories(sample: Sample, trajectories: Sequence[Trajectory]) -> Sample:
+    if isinstance(sample, ProgressSample):
+        return replace(sample, trajectory=trajectories[0])
+    first, second = trajectories
+    return PreferenceSample(first, second) if isinstance(sample, PreferenceSample) else SimilaritySample(first, second)
+
+
+def _of_frames(scores: FrameScores, indices: FrameIndices | None) -> FrameScores:
+    return replace(scores, frame_indices=indices)

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: MIT
+"""What people have -> Trajectory: files, URLs, and steps as robot datasets give them.
+
+T steps, H x W pixels. Any array may be a torch tensor, on a GPU or with a gradient too; torch is not imported.
+"""
+
+from __future__ import annotations
+
+import tokenize
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.contract.samples import Trajectory, UInt8Array, as_array
+from rfm_client.data.video import is_url, read_video
+
+MAX_UINT8 = 255
+BROKEN_NPY = (  # what numpy raises of a .npy header that is none
+    *(ValueError, TypeError, LookupError, SyntaxError),
+    *(tokenize.TokenError, MemoryError, RecursionError),
+)
+ARRAY_SUFFIXES = (".npy", ".npz")
+
+_CAMERA_PREFIX = "observation.images."  # LeRobot's keys, followed by the camera's name
+_ONLY_CAMERA = "observation.image"  # of its datasets of one camera without a name
+_IS_PAD = "_is_pad"  # bool [T] beside a camera: steps before the episode's start or after its end
+_FRAMES = "uint8 or float in 0..1 [T, H, W, 3] or [T, 3, H, W]"
+_KEYS = f"{_CAMERA_PREFIX}<camera>, frames or video_embeddings"
+
+
+def load_trajectory(source: str | Path, *, task: str = "", fps: float | None = None) -> Trajectory:
+    """The trajectory in a file or behind an http(s) URL.
+
+    ``.npy``: frames, or embeddings [T, D]. ``.npz``: ``frames``, or ``video_embeddings`` and ``text_embedding``, and
+    ``task``, as in ``as_trajectory``. All else, and every URL, is a video, as in ``read_video``.
+
+    task: instead of the file's own
+    fps: frames a second to take of a video; None: all frames
+
+    Raises InvalidSampleError. Arrays of Python objects are refused: to read them is to run code. So are video files in
+    which LeRobot v3.0 keeps several episodes.
+    """
+    if is_url(source) or Path(source).suffix.lower() not in ARRAY_SUFFIXES:
+        return Trajectory(frames=read_video(source, fps), task=task)
+    if fps is not None:
+        raise InvalidSampleError.at("fps", "None with arrays, which do not tell their own", repr(fps))
+    arrays = _arrays(Path(source))
+    try:
+        return as_trajectory(arrays, task=task)
+    except InvalidSampleError as error:
+        raise InvalidSampleError(f"{error} ({source})") from error
+
+
+def as_trajectory(
+    episode: Mapping[str, Any] | Iterable[Mapping[str, Any]], *, task: str = "", camera: str | None = None
+) -> Trajectory:
+    """The trajectory of an episode of a Hugging Face or LeRobot dataset: a dict over all steps, or one dict a step.
+
+    ``observation.images.<camera>`` or ``frames``: [T, H, W, 3] or [T, 3, H, W], or a sequence of T images (arrays,
+        tensors, PIL); uint8, or float in 0..1, which is multiplied by 255 and rounded. Steps that a LeRobot item
+        marks as padding (``<key>_is_pad``) are left out.
+    ``video_embeddings``, ``text_embedding``: as in Trajectory
+    ``task``: text, the same at all steps
+
+    Other keys are not read, but ``episode_index``, if there is one, must be the same at all steps.
+
+    task: instead of the episode's own
+    camera: which, if there are several; ``image`` for the nameless ``observation.image``
+
+    Raises InvalidSampleError.
+    """
+    columns = episode if isinstance(episode, Mapping) else _columns(episode)
+    _only(columns, "episode_index", None)
+    task = task or _only(columns, "task", "")
+    if camera is None and not {"frames", "video_embeddings"}.isdisjoint(columns):
+        return Trajectory(
+            frames=_frames("frames", columns["frames"]) if "frames" in columns else None,
+            video_embeddings=columns.get("video_embeddings"),
+            text_embedding=columns.get("text_embedding"),
+            task=task,
+        )
+    key = _camera_key(columns, camera)
+    frames = _frames(key, columns[key])
+    if key + _IS_PAD in columns:
+        frames = frames[~_padding(key + _IS_PAD, columns[key + _IS_PAD], len(frames))]
+    return Trajectory(frames=frames, task=task)
+
+
+def _arrays(file: Path) -> Mapping[str, npt.NDArray[Any]]:
+    try:
+        with file.open("rb") as stream:
+            loaded = np.load(stream, allow_pickle=False)
+            if isinstance(loaded, np.ndarray):
+                return {"video_embeddings" if loaded.ndim == 2 else "frames": loaded}
+            return {key: loaded[key] for key in loaded.files}
+    except (OSError, EOFError, BadZipFile, zlib.error, *BROKEN_NPY) as error:
+        raise InvalidSampleError.at("file", "arrays of numbers and text, none pickled", f"{error} ({file})") from error
+
+
+def _columns(steps: Iterable[Mapping[str, Any]]) -> Mapping[str, Any]:
+    """Each key's values at all steps, None where a step lacks it."""
+    items = list(steps) if isinstance(steps, Iterable) else [steps]
+    strangers = [type(item).__name__ for item in items if not isinstance(item, Mapping)]
+    if strangers or not items:
+        raise InvalidSampleError.at("episode", "a dict, or one dict a step", (strangers or ["nothing"])[0])
+    keys = dict.fromkeys(key for item in items for key in item)
+    return {key: [item.get(key) for item in items] for key in keys}
+
+
+def _only(columns: Mapping[str, Any], key: str, default: Any) -> Any:
+    """The value that the key has at every step. Raises InvalidSampleError for several."""
+    values = _values(columns[key]) if key in columns else [default]
+    for value in values:
+        if value != values[0]:
+            raise InvalidSampleError.at(key, "the same at all steps", f"{values[0]!r} and {value!r}")
+    return values[0] if values else default
+
+
+def _values(column: Any) -> list[Any]:
+    """What a column holds, be it one value for all steps or one a step, in whatever container."""
+    if isinstance(column, str):
+        return [column]
+    if isinstance(column, Sequence):
+        return [value for part in column for value in _values(part)]
+    values: list[Any] = as_array(column).reshape(-1).tolist()
+    return values
+
+
+def _camera_key(columns: Mapping[str, Any], camera: str | None) -> str:
+    keys = [key for key in columns if key.startswith(_CAMERA_PREFIX) and not key.endswith(_IS_PAD)]
+    cameras = {key.removeprefix(_CAMERA_PREFIX): key for key in keys}
+    if _ONLY_CAMERA in columns:
+        cameras[_ONLY_CAMERA.rpartition(".")[2]] = _ONLY_CAMERA
+    if not cameras:
+        raise InvalidSampleError.at("episode", _KEYS, f"the keys {', '.join(columns)}")
+    if camera is None and len(cameras) == 1:
+        (camera,) = cameras
+    if camera not in cameras:
+        raise InvalidSampleError.at("camera", f"one of {', '.join(cameras)}", repr(camera))
+    return cameras[camera]
+
+
+def _frames(where: str, values: Any) -> UInt8Array:
+    """uint8 [T, H, W, 3]."""
+    images = [as_array(image) for image in values] if isinstance(values, Sequence) else np.atleast_1d(as_array(values))
+    kinds = {(image.dtype, image.shape) for image in images}
+    if len(kinds) != 1:
+        got = " and ".join(sorted(f"{dtype} {list(shape)}" for dtype, shape in kinds)) or "none"
+        raise InvalidSampleError.at(where, "images of one type and size", got)
+    ((dtype, shape),) = kinds
+    if (dtype != np.uint8 and dtype.kind != "f") or len(shape) != 3 or 3 not in (shape[0], shape[2]) or 0 in shape:
+        raise InvalidSampleError.at(where, _FRAMES, f"{dtype} {[len(images), *shape]}")
+    frames = np.asarray(images if dtype == np.uint8 else [_uint8(where, image) for image in images])
+    return frames if frames.shape[3] == 3 else frames.transpose(0, 2, 3, 1)
+
+
+def _uint8(where: str, image: npt.NDArray[Any]) -> UInt8Array:
+    lowest, highest = float(image.min()), float(image.max())
+    if not (lowest >= 0 and highest <= 1):  # nor NaN
+        got = f"values from {lowest:g} to {highest:g} (of floats in 0..255: float_frames_to_uint8)"
+        raise InvalidSampleError.at(where, _FRAMES, got)
+    scaled = image.astype(np.float32) * np.float32(MAX_UINT8)
+    return scaled.round().astype(np.uint8)
+
+
+def _padding(where: str, marks: Any, num_frames: int) -> npt.NDArray[np.bool_]:
+    padding = as_array(marks)
+    if padding.dtype != bool or padding.shape != (num_frames,):
+        raise InvalidSampleError.at(where, f"bool [{num_frames}]", f"{padding.dtype} {list(padding.shape)}")
+    return padding

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: MIT
+"""Which video files of LeRobot datasets are no film of one episode.
+
+Up to v2.1 a dataset has one film for each episode and camera. Since v3.0 one file holds many episodes, one behind the
+other, and only tables in Parquet tell where each begins. Read as one film, such a file would be scored as one long
+episode. So it is refused unless the dataset has one episode in all. No table is read: that would need pyarrow.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+from rfm_client.contract.errors import InvalidSampleError
+
+_ONE_EPISODE = "a film of one episode"
+_INSTEAD = (
+    "cut one episode out into a file of its own (meta/episodes tells its from_timestamp and to_timestamp), "
+    "or load its steps with LeRobot and pass them to as_trajectory"
+)
+_INFO = Path("meta", "info.json")
+_FILM_AN_EPISODE = re.compile(r"v[12]\.")
+_SHARED_FILE = re.compile(r"/videos/[^/]+/chunk-\d+/file-\d+\.\w+$")  # the layout of v3.0
+
+
+def check_local_film(source: str | Path) -> None:
+    """Raises InvalidSampleError for a file in which a LeRobot dataset keeps several episodes.
+
+    Where no dataset's ``meta/info.json`` lies above the file, the layout of its path decides.
+    """
+    given = Path(source).absolute()
+    for file in dict.fromkeys((given, given.resolve())):  # a download may consist of links into a cache
+        for folder in file.parents:
+            info = _info(folder / _INFO)
+            if info is not None:
+                _check_dataset(info, file, folder)
+                return
+    _check_layout(given.as_posix())
+
+
+def check_film_behind(url: str) -> None:
+    """The same of a URL, by its path alone."""
+    _check_layout(unquote(urlsplit(url).path))
+
+
+def _info(file: Path) -> dict[str, object] | None:
+    """What a LeRobot dataset tells of itself; None: this is none."""
+    try:
+        info = json.loads(file.read_bytes())
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (OSError, ValueError, RecursionError) as error:
+        raise InvalidSampleError.at("meta/info.json", "a readable JSON file", f"{error} ({file})") from error
+    return info if isinstance(info, dict) and "codebase_version" in info else None
+
+
+def _check_dataset(info: dict[str, object], film: Path, root: Path) -> None:
+    version, total = info["codebase_version"], info.get("total_episodes")
+    if (isinstance(version, str) and _FILM_AN_EPISODE.match(version)) or total == 1:
+        return
+    of_camera = root / Path(*film.relative_to(root).parts[:2])  # videos/<camera>
+    files = [file for file in of_camera.rglob(f"*{film.suffix}") if file.is_file()]
+    held = f"{total}" if files == [film] else f"some of the dataset's {total}"
+    raise _refusal(f"a LeRobot {version} file that holds {held} episodes")
+
+
+def _check_layout(path: str) -> None:
+    if _SHARED_FILE.search(path):
+        raise _refusal("a file in the layout of LeRobot v3.0, which holds many episodes")
+
+
+def _refusal(got: str) -> InvalidSampleError:
+    return InvalidSampleError.at("video", _ONE_EPISODE, f"{got}: {_INSTEAD}")

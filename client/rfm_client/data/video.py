@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: MIT
+"""Video files and URLs -> frames. Needs PyAV: ``pip install "./client[video]"``."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from http.client import HTTPException
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any, BinaryIO
+from urllib.error import HTTPError
+from urllib.request import urlopen
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.data.lerobot import check_film_behind, check_local_film
+
+DOWNLOAD_TIMEOUT_S = 60.0
+
+_EXPECTED = "a file with a video stream"
+
+
+def frame_indices(total: int, native_fps: float, fps: float) -> npt.NDArray[np.int64]:
+    """int64 [T], which of ``total`` frames stand for the video at ``fps``.
+
+    As the original example client picks them: round(total * fps / native_fps) frames, at least one and at most
+    all, evenly from the first to the last, truncated to whole frames.
+    """
+    count = min(max(round(total * fps / native_fps), 1), total)
+    return _spread(total, count)
+
+
+def is_url(source: str | Path) -> bool:
+    """Whether ``read_video`` downloads the source."""
+    return isinstance(source, str) and source.lower().startswith(("http://", "https://"))
+
+
+def read_video(source: str | Path, fps: float | None = None, *, timeout_s: float = DOWNLOAD_TIMEOUT_S) -> UInt8Array:
+    """uint8 [T, H, W, 3], the frames at ``fps`` of a video file or http(s) URL; None: all of them.
+
+    Frames are counted, not timed: in a video of variable frame rate, T is that of its average rate, and frames are
+    even in number, not in time. A video that is to be shown turned (as phones film) is turned upright; one that is to
+    be shown mirrored is not. Of all decoded frames only those that are returned are held in memory. A URL is
+    downloaded once, to a temporary file.
+
+    timeout_s: the longest that the server of a URL may be silent
+
+    Raises InvalidSampleError for what is no video, or cannot be had, and for a file of several LeRobot episodes
+    (``lerobot``).
+    """
+    try:
+        import av
+    except ImportError as error:
+        raise ImportError('video files need PyAV: pip install "./client[video]"') from error
+    if fps is not None and not 0 < fps < math.inf:
+        raise InvalidSampleError.at("fps", "a number above 0", repr(fps))
+    try:
+        check_film_behind(str(source)) if is_url(source) else check_local_film(source)
+        with _opened(source, timeout_s) as file:
+            return _sampled(av, file, fps)
+    except InvalidSampleError as error:
+        raise InvalidSampleError(f"{error} ({source})") from error
+    except (av.FFmpegError, OSError) as error:
+        raise InvalidSampleError.at("video", _EXPECTED, f"{error.strerror or error} ({source})") from error
+
+
+def frame_times_s(file: str | Path, num_frames: int) -> npt.NDArray[np.float64] | None:
+    """float64 [T], when each of T frames that ``read_video`` took of a file is shown, the first at 0; None: unknown."""
+    import av
+
+    with av.open(str(file)) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size]
+        times = sorted(float(packet.pts * packet.time_base) for packet in packets if packet.pts is not None)
+    if len(times) < num_frames:
+        return None
+    return np.array(times)[_spread(len(times), num_frames)] - times[0]
+
+
+def _spread(total: int, count: int) -> npt.NDArray[np.int64]:
+    """int64 [count], evenly from the first to the last of ``total``, truncated."""
+    return np.linspace(0, total - 1, count).astype(np.int64)
+
+
+@contextmanager
+def _opened(source: str | Path, timeout_s: float) -> Iterator[BinaryIO]:
+    if not is_url(source):
+        with Path(source).open("rb") as file:
+            yield file
+        return
+    with TemporaryFile() as copy:  # it is read twice, and the index of an MP4 may be at its end
+        _download(str(source), copy, timeout_s)
+        yield copy
+
+
+def _download(url: str, file: BinaryIO, timeout_s: float) -> None:
+    try:
+        with urlopen(url, timeout=timeout_s) as response:
+            shutil.copyfileobj(response, file)
+            length = response.headers.get("Content-Length")
+        if length and file.tell() != int(length):  # urllib takes a connection that broke for the end
+            raise OSError(f"{file.tell()} of {length} bytes came")
+    except (OSError, HTTPException, ValueError) as error:
+        if isinstance(error, HTTPError):
+            error.close()  # it is a response too, and holds the connection
+        raise InvalidSampleError.at("video", _EXPECTED, str(error)) from error
+
+
+def _sampled(av: Any, file: BinaryIO, fps: float | None) -> UInt8Array:
+    """The frames at ``fps``, decoded once if each packet holds one frame, as nearly always, and else once more."""
+    num_packets, native_fps = _length(av, file)
+    if fps is None:
+        fps = native_fps = 1.0
+    if not native_fps:
+        raise InvalidSampleError.at("video", "a frame rate", "none")
+    frames, total = _decoded(av, file, frame_indices(num_packets, native_fps, fps).tolist())
+    if total != num_packets:
+        frames, total = _decoded(av, file, frame_indices(total, native_fps, fps).tolist())
+    if not total:
+        raise InvalidSampleError.at("video", "at least one frame", "none")
+    if len({frame.shape for frame in frames}) > 1:
+        raise InvalidSampleError.at("video", "frames of one size", "several")
+    return np.stack(frames)
+
+
+def _length(av: Any, file: BinaryIO) -> tuple[int, float]:
+    """Packets, which are counted since what the container says may be wrong, and frames a second (0: unknown)."""
+    file.seek(0)
+    with av.open(file) as container:
+        if not container.streams.video:
+            raise InvalidSampleError.at("video", _EXPECTED, "none")
+        stream = container.streams.video[0]
+        return sum(1 for packet in container.demux(stream) if packet.size), float(stream.average_rate or 0)
+
+
+def _decoded(av: Any, file: BinaryIO, indices: Collection[int]) -> tuple[list[UInt8Array], int]:
+    """The frames of these indices, and how many there are in all."""
+    wanted, picked, total = set(indices), [], 0
+    file.seek(0)
+    with av.open(file) as container:
+        for frame in container.decode(video=0):
+            if total in wanted:
+                image = frame.to_ndarray(format="rgb24")
+                picked.append(np.rot90(image, round(frame.rotation / 90)))  # both count counter-clockwise
+            total += 1
+    return picked, total

@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: MIT
+"""An episode as a reward model sees it: its frames, what is known of it, what is asked. ``gym.py`` tells the rules."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, TypeAlias, cast
+
+import numpy as np
+
+from rfm_client.client import RewardClient
+from rfm_client.contract.errors import InvalidSampleError, RewardError
+from rfm_client.contract.results import SUCCESS_THRESHOLD, ProgressResult, Result
+from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array
+from rfm_client.data.fitting import evenly_spaced
+
+Info: TypeAlias = dict[str, Any]
+ClientSource: TypeAlias = RewardClient | Callable[[], RewardClient]
+
+
+def _check_at_least_one(name: str, value: int) -> None:
+    if value < 1:
+        raise ValueError(f"{name}: expected at least 1, got {value}")
+
+
+@dataclass(frozen=True)
+class SuccessRule:
+    """A scored step succeeds when most of the ``last`` frames sent for it have a success of ``threshold`` or more."""
+
+    threshold: float = SUCCESS_THRESHOLD
+    last: int = 1
+
+    def __post_init__(self) -> None:
+        _check_at_least_one("last", self.last)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardOptions:
+    """How an episode is scored, and how progress becomes reward. Raises ValueError for what cannot be.
+
+    mode: a step is paid the newest known progress (absolute), or how far that has come since the step before (delta):
+        then an episode's rewards add up to its last known progress less its first, however late answers come
+    scale: factor of what is paid
+    add_to_env_reward: the environment's own reward is added; otherwise it is replaced
+    every: steps from one scoring to the next; in between, absolute holds its value and delta is 0
+    terminate_on_success: terminates the episode when an answer says success, except one about the frame of the reset
+    frames_from: where frames, uint8 [H, W, 3], come from. None: ``render()``; or a key of the observation; or what
+        takes one environment's observation and gives its frame
+    max_frames: most frames that are sent; None: as many as the checkpoint was trained on, all if it does not say
+    blocking: a step waits for its score
+    max_pending: most open questions of one environment when not blocking
+    await_last: the last step of an episode is waited for even when not blocking; otherwise what is open is dropped
+    """
+
+    mode: Literal["absolute", "delta"] = "absolute"
+    scale: float = 1.0
+    add_to_env_reward: bool = False
+    every: int = 1
+    terminate_on_success: SuccessRule | None = None
+    frames_from: str | Callable[[Any], UInt8Array] | None = None
+    max_frames: int | None = None
+    blocking: bool = True
+    max_pending: int = 4
+    await_last: bool = True
+
+    def __post_init__(self) -> None:
+        if self.mode not in ("absolute", "delta"):
+            raise ValueError(f"mode: expected 'absolute' or 'delta', got {self.mode!r}")
+        _check_at_least_one("every", self.every)
+        _check_at_least_one("max_pending", self.max_pending)
+        if self.max_frames is not None:
+            _check_at_least_one("max_frames", self.max_frames)
+
+
+class Scorer:
+    """Asks the reward model about episodes. Connects when it is first asked to."""
+
+    def __init__(self, client: ClientSource, options: RewardOptions) -> None:
+        if not (isinstance(client, RewardClient) or callable(client)):
+            raise TypeError(f"client: expected a RewardClient or what makes one, got {type(client).__name__}")
+        self._source = client
+        self._options = options
+        self._made: RewardClient | None = None
+
+    def score(self, episodes: Mapping[Episode, bool]) -> None:
+        """Has episodes learn what has come, and asks about their newest frames where that is due.
+
+        episodes: with whether their newest frame is their last
+        """
+        awaited = []
+        for episode, ends in episodes.items():
+            episode.collect()
+            ends = ends or episode.succeeded
+            due = ends or not episode.is_known or episode.step % self._options.every == 0
+            waits = self._options.blocking or not episode.is_known or (ends and self._options.await_last)
+            if ends:
+                episode.cancel()
+            if due and waits:
+                awaited.append(episode)
+            elif due and not ends:
+                self._submit(episode)
+        if awaited:
+            self._await(awaited)
+
+    def close(self) -> None:
+        """Closes the client if it was made here."""
+        if self._made is not None:
+            self._made.close()
+
+    def _submit(self, episode: Episode) -> None:
+        if episode.num_pending >= self._options.max_pending:
+            episode.num_skipped += 1
+        else:
+            episode.expect(self._client.submit(episode.sample(self._max_frames)))
+
+    def _await(self, episodes: Sequence[Episode]) -> None:
+        samples = [episode.sample(self._max_frames) for episode in episodes]
+        outcomes = self._client.evaluate(samples, return_errors=True)
+        results = [episode.checked(outcome) for episode, outcome in zip(episodes, outcomes, strict=True)]
+        for episode, result in zip(episodes, results, strict=True):
+            episode.learn(episode.step, result)
+
+    @property
+    def _client(self) -> RewardClient:
+        if isinstance(self._source, RewardClient):
+            return self._source
+        if self._made is None:
+            self._made = self._source()
+        return self._made
+
+    @cached_property
+    def _max_frames(self) -> int | None:
+        return self._options.max_frames or self._client.model_info(frames=True).max_frames
+
+
+class Episode:
+    """The frames of one episode, what is known of it, and what is still asked about it.
+
+    where: names its environment in messages; empty if there is only one
+    """
+
+    def __init__(self, options: RewardOptions, task: str, where: str = "") -> None:
+        self._options = options
+        self._task = task
+        self._where = where
+        self._frames: list[UInt8Array] = []
+        self._pending: dict[int, Future[ProgressResult]] = {}  # by step
+        self._known_step = -1
+        self._progress = self._success = self._paid_progress = np.nan
+        self.num_skipped = 0
+        self.succeeded = False
+
+    @property
+    def step(self) -> int:
+        """Steps since the reset."""
+        return len(self._frames) - 1
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there is an answer."""
+        return self._known_step >= 0
+
+    @property
+    def num_pending(self) -> int:
+        """Questions without an answer."""
+        return len(self._pending)
+
+    def add(self, frame: Any) -> None:
+        """Keeps a copy: an environment may draw into the same array again."""
+        kept = np.array(frame)
+        got = f"{kept.dtype} {list(kept.shape)}"
+        if kept.dtype != np.uint8 or kept.ndim != 3 or kept.shape[2] != 3:
+            raise self._located(InvalidSampleError.at("frame", "uint8 [H, W, 3]", got))
+        if self._frames and kept.shape != self._frames[0].shape:
+            first = f"uint8 {list(self._frames[0].shape)}, as the episode's first"
+            raise self._located(InvalidSampleError.at("frame", first, got))
+        self._frames.append(kept)
+
+    def sample(self, max_frames: int | None) -> ProgressSample:
+        """The question about the newest frame."""
+        indices = evenly_spaced(len(self._frames), max_frames)
+        frames = self._frames if indices is None else [self._frames[index] for index in indices]
+        return ProgressSample(Trajectory(frames=np.stack(frames), task=self._task))
+
+    def expect(self, answer: Future[ProgressResult]) -> None:
+        """An answer about the newest frame will come."""
+        self._pending[self.step] = answer
+
+    def collect(self) -> None:
+        """Learns the answers that have come. Raises the RewardError of one that failed."""
+        for step in [step for step, answer in self._pending.items() if answer.done()]:
+            answer = self._pending.pop(step)
+            error = answer.exception()
+            if isinstance(error, RewardError):
+                raise self._located(error)
+            self.learn(step, answer.result())
+
+    def cancel(self) -> None:
+        """Takes back the questions that are open."""
+        for answer in self._pending.values():
+            answer.cancel()
+        self._pending.clear()
+
+    def checked(self, outcome: Result | RewardError) -> ProgressResult:
+        """The answer; raises what came in its place."""
+        if isinstance(outcome, RewardError):
+            raise self._located(outcome)
+        return cast(ProgressResult, outcome)
+
+    def learn(self, step: int, result: ProgressResult) -> None:
+        """Takes over an answer unless a newer one is known."""
+        if step <= self._known_step:
+            return
+        if not self.is_known:
+            self._paid_progress = result.last_progress
+        self._known_step = step
+        self._progress, self._success = result.last_progress, float(result.success[-1])
+        rule = self._options.terminate_on_success
+        if rule is not None and step > 0:
+            self.succeeded |= result.succeeded(last=rule.last, threshold=rule.threshold)
+
+    def reward(self, env_reward: float) -> float:
+        """What the step is paid."""
+        change, self._paid_progress = self._progress - self._paid_progress, self._progress
+        reward = self._options.scale * (self._progress if self._options.mode == "absolute" else change)
+        return reward + env_reward if self._options.add_to_env_reward else reward
+
+    def info(self) -> Info:
+        """What is known, and how late."""
+        told = {"progress": self._progress, "success": self._success, "step": self._known_step}
+        told |= {"lag": self.step - self._known_step, "skipped": self.num_skipped}
+        return told if self._options.terminate_on_success is None else told | {"succeeded": self.succeeded}
+
+    def _located(self, error: RewardError) -> RewardError:
+        return error.inside(self._where) if self._where and isinstance(error, InvalidSampleError) else error

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: MIT
+"""How a server is reached that is not open to all: whom to trust, with what to answer for oneself, what to show."""
+
+from __future__ import annotations
+
+import re
+import ssl
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypedDict, cast
+
+from tritonclient.utils import InferenceServerException
+
+from rfm_client.contract.addresses import check_authorities, load_certificate
+
+SECURE_SCHEMES = ("grpcs", "https")
+AUTHORIZATION = "authorization"
+
+_REFUSALS = ("401", "403", "StatusCode.UNAUTHENTICATED", "StatusCode.PERMISSION_DENIED")
+_NO_CONNECTION = "StatusCode.UNAVAILABLE"
+_NO_TRUST = re.compile(  # how gRPC tells why TLS did not come about, and Triton that it wants a key
+    "CERTIFICATE|certificate|[Vv]erification [Cc]heck failed|WRONG_VERSION_NUMBER|is restricted, expecting header"
+)
+_NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*")
+_VALUE = re.compile("[!-~]([ -~]*[!-~])?")  # visible ASCII; blanks inside
+
+
+class AccessOptions(TypedDict, total=False):
+    """As Access has them."""
+
+    ca_file: str | Path | None
+    client_certificate: str | Path | None
+    client_key: str | Path | None
+    headers: Mapping[str, str]
+    api_key: str | None
+
+
+@dataclass(frozen=True)
+class Access:
+    """What a connection takes beyond a URL. Raises ValueError for what cannot be used, without telling a key.
+
+    ca_file: certificates (PEM) of the authorities that may vouch for the server; None: those of the system
+    client_certificate, client_key: files (PEM) by which a server knows this client (mutual TLS); both or none
+    headers: shown with each request, in HTTP and as gRPC's metadata
+    api_key: shown with each request as ``Authorization: Bearer KEY``
+    """
+
+    ca_file: str | Path | None = None
+    client_certificate: str | Path | None = None
+    client_key: str | Path | None = None
+    headers: Mapping[str, str] = field(default_factory=dict, repr=False)
+    api_key: str | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        if (self.client_certificate is None) != (self.client_key is None):
+            raise ValueError("client_certificate, client_key: expected both or none, got one")
+        for name, value in self.shown.items():
+            if not _NAME.fullmatch(name) or name.endswith("-bin"):  # binary metadata in gRPC
+                raise ValueError(f"headers: expected letters, digits and any of ._- as a name, got {name!r:.100}")
+            if not _VALUE.fullmatch(value):
+                raise ValueError(f"{name}: expected visible ASCII characters, got others or none")
+        if self.uses_tls:
+            self.ssl_context  # noqa: B018  # what cannot be read is told now, not when it is first needed
+
+    @property
+    def uses_tls(self) -> bool:
+        """Whether it has something that means nothing without TLS."""
+        return self.ca_file is not None or self.client_certificate is not None
+
+    @classmethod
+    def of(cls, options: AccessOptions) -> Access:
+        """From what is of it among a client's options."""
+        given = cast("dict[str, Any]", options)
+        return cls(**{name: given[name] for name in AccessOptions.__annotations__ if name in given})
+
+    @property
+    def options(self) -> AccessOptions:
+        """The same as options of a RewardClient."""
+        return {
+            "ca_file": self.ca_file,
+            "client_certificate": self.client_certificate,
+            "client_key": self.client_key,
+            "headers": self.headers,
+            "api_key": self.api_key,
+        }
+
+    @property
+    def shown(self) -> dict[str, str]:
+        """All headers, by name in lower case, as gRPC wants it."""
+        given = {name.lower(): value for name, value in self.headers.items()}
+        return given if self.api_key is None else {**given, AUTHORIZATION: f"Bearer {self.api_key}"}
+
+    @cached_property
+    def ssl_context(self) -> ssl.SSLContext:
+        """For HTTP."""
+        if self.ca_file is not None:
+            check_authorities(self.ca_file, "ca_file")
+        context = ssl.create_default_context(cafile=self.ca_file)
+        if self.client_certificate is not None:
+            assert self.client_key is not None  # checked
+            load_certificate(context, self.client_certificate, self.client_key, "client_certificate, client_key")
+        return context
+
+    def http_options(self, scheme: str) -> dict[str, Any]:
+        """Arguments of tritonclient's HTTP clients that do not wait by asyncio."""
+        if scheme not in SECURE_SCHEMES:
+            return {}
+        files = {"ca_certs": self.ca_file}  # None: the system's, not the library's own
+        if self.client_certificate is not None:
+            files |= {"certfile": self.client_certificate, "keyfile": self.client_key}
+        return {"ssl": True, "ssl_options": files}
+
+    def grpc_options(self, scheme: str) -> dict[str, Any]:
+        """Arguments of tritonclient's gRPC clients."""
+        if scheme not in SECURE_SCHEMES:
+            return {}
+        files = {
+            "root_certificates": self.ca_file,
+            "private_key": self.client_key,
+            "certificate_chain": self.client_certificate,
+        }
+        return {"ssl": True, **files}
+
+    def show_with_each_request(self, client: Any) -> None:
+        """Has one of tritonclient's clients show the headers."""
+        shown = self.shown
+        if not shown:
+            return
+
+        def show(request: Any) -> None:
+            request.headers = {**request.headers, **shown}
+
+        client.register_plugin(show)
+
+
+def is_denied(error: InferenceServerException) -> bool:
+    """Whether one side refused the other."""
+    status = str(error.status())
+    return status in _REFUSALS or (status == _NO_CONNECTION and _NO_TRUST.search(error.message() or "") is not None)

@@ -1,0 +1,408 @@
+# SPDX-License-Identifier: MIT
+"""Named tensors to one Triton server and back, over gRPC or HTTP; the errors of both in our own tree."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import logging
+import os
+import re
+import ssl
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from functools import cache, cached_property, partial
+from typing import Any, Protocol, TypeVar
+
+import numpy.typing as npt
+from tritonclient.utils import InferenceServerException, np_to_triton_dtype
+
+from rfm_client.contract import errors
+from rfm_client.contract.addresses import split_url
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.wire import SECOND_FRAMES, Tensors
+from rfm_client.transport.access import SECURE_SCHEMES, Access, is_denied
+from rfm_client.transport.connection import GRPC_OPTIONS, Connection
+from rfm_client.transport.deadline import timeout
+from rfm_client.transport.off_loop import off_loop
+from rfm_client.transport.shared_memory import Region, SharedMemory
+
+Answered = TypeVar("Answered")
+
+# What a status means to the caller: as gRPC names it, or as HTTP numbers it.
+_STATUS_ERRORS: dict[str, type[errors.RewardError]] = {
+    "StatusCode.INVALID_ARGUMENT": errors.InvalidSampleError,
+    "400": errors.InvalidSampleError,
+    "StatusCode.NOT_FOUND": errors.ModelNotFoundError,
+    "404": errors.ModelNotFoundError,
+    "StatusCode.UNAVAILABLE": errors.ServerUnavailableError,
+    "503": errors.ServerUnavailableError,
+    "StatusCode.CANCELLED": errors.ServerUnavailableError,  # not by us: the server is stopping
+    "499": errors.ServerUnavailableError,
+    "StatusCode.DEADLINE_EXCEEDED": errors.DeadlineExceededError,
+    "504": errors.DeadlineExceededError,
+}
+_LOST_REGION = "Unable to find shared memory region"
+# Triton answers these with other statuses, but the sample is not at fault and another try may succeed.
+_UNAVAILABLE = re.compile(f"{_LOST_REGION}|has no available versions")
+_PROCESS_ENDED = re.compile("Stub process .* is not healthy")
+_REQUEST_ID = re.compile(r"^\[request id: [^\]]*\] ")
+_WRONG_SHAPE = re.compile(  # behind the batch axis, which the caller did not make
+    r"unexpected shape for input '(?P<name>\w+)'.*?Expected \[-1,(?P<expected>[^\]]*)\], got \[\d+,(?P<got>[^\]]*)\]"
+)
+_NO_SECOND_FRAMES = re.compile(rf"expected \d+ inputs but got .*'{SECOND_FRAMES}'|unexpected .*input '{SECOND_FRAMES}'")
+_IN_ENSEMBLE = re.compile(r"^in ensemble '[^']*', ")  # what Triton puts before a message; the caller knows the model
+
+_US_PER_S = 1_000_000
+
+logger = logging.getLogger("rfm_client")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The outputs of one request, and the version of the model that gave them."""
+
+    tensors: Tensors
+    model_version: str
+
+
+class Transport(Protocol):
+    """A connection to one server, for one event loop. Its methods raise a RewardError."""
+
+    url: str
+
+    async def infer(
+        self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
+    ) -> Answer:
+        """The named ``outputs`` of ``model`` for ``inputs``. request_id: what the server calls the request"""
+
+    async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
+        """What the server tells of ``model``. ModelNotFoundError when it is not served."""
+
+    async def is_ready(self, model: str, timeout_s: float) -> bool:
+        """Whether the server answers and ``model`` is ready."""
+
+    async def close(self) -> None:
+        """Closes the connection."""
+
+
+def connect(
+    url: str, *, shared_memory: bool = False, access: Access | None = None, named: str | None = None
+) -> Transport:
+    """The transport for ``grpc://host:port`` or ``http://host:port``, or with TLS ``grpcs://`` or ``https://``.
+
+    It connects when it is first used. Raises ValueError.
+
+    shared_memory: large inputs go through memory that the server, on the same host, maps too
+    access: certificates, and what is shown with each request
+    named: over gRPC, the ``host:port`` by which the server at this address is known, to its certificate too
+    """
+    if split_url(url)[0].startswith("grpc"):
+        return GrpcTransport(url, access or Access(), shared_memory=shared_memory, named=named)
+    return HttpTransport(url, access or Access(), shared_memory=shared_memory)
+
+
+class _TritonTransport:
+    """What gRPC and HTTP have in common: tritonclient's asyncio clients are the same but for a few options."""
+
+    def __init__(self, url: str, access: Access, *, shared_memory: bool) -> None:
+        self.url = url
+        self._scheme, self._address = split_url(url)
+        self._access = access
+        if access.uses_tls and not self._is_secure:
+            raise ValueError(f"url: expected grpcs:// or https:// with certificates, got {url}")
+        self._shared_memory = SharedMemory(self) if shared_memory else None
+        self._requested = cache(lambda name: self._triton.InferRequestedOutput(name))
+        self._connection: Connection | None = None
+        self._left: list[Connection] = []  # and perhaps not closed yet
+
+    async def infer(
+        self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
+    ) -> Answer:
+        ask = partial(self._infer, model, inputs, outputs, request_id, timeout_s)
+        return await self._call(ask, timeout_s)
+
+    async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
+        async def ask(client: Any) -> ModelInfo:
+            return ModelInfo.from_config(await self._model_config(client, model))
+
+        return await self._call(ask, timeout_s, bad_request=errors.ModelNotFoundError)
+
+    async def is_ready(self, model: str, timeout_s: float) -> bool:
+        async def ask(client: Any) -> bool:
+            return bool(await client.is_server_ready() and await client.is_model_ready(model))
+
+        try:
+            return await self._call(ask, timeout_s)
+        except errors.ServerError:
+            return False
+
+    async def close(self) -> None:
+        try:
+            if self._shared_memory is not None:
+                await self._shared_memory.close()
+        finally:
+            for connection in (*self._left, *filter(None, [self._connection])):
+                await connection.close()
+
+    async def register_region(self, name: str, byte_size: int) -> None:
+        with self._connected().used() as client:
+            await client.register_system_shared_memory(name, f"/{name}", byte_size)
+
+    async def unregister_region(self, name: str) -> None:
+        with self._connected().used() as client:
+            await client.unregister_system_shared_memory(name)
+
+    async def _infer(
+        self, model: str, inputs: Tensors, outputs: Collection[str], request_id: str, timeout_s: float, client: Any
+    ) -> Answer:
+        largest = max(inputs, key=lambda name: inputs[name].nbytes)
+        async with self._lent(inputs[largest]) as region:
+            regions = {largest: region} if region is not None else {}
+            through_socket = 0 if regions else inputs[largest].nbytes
+            tensors = await off_loop(through_socket, self._inputs, inputs, regions)
+            requested = [self._requested(name) for name in outputs]
+            # Whoever waits in Triton's queue for longer is dropped there, over HTTP too: nobody waits for the answer.
+            waits_us = max(int(timeout_s * _US_PER_S), 1)
+            answer = await client.infer(model, tensors, outputs=requested, request_id=request_id, timeout=waits_us)
+        return Answer(_outputs(answer, outputs), self._model_version(answer))
+
+    @asynccontextmanager
+    async def _lent(self, array: npt.NDArray[Any]) -> AsyncIterator[Region | None]:
+        if self._shared_memory is None:
+            yield None
+            return
+        async with self._shared_memory.lend(array) as region:
+            try:
+                yield region
+            except InferenceServerException as error:
+                if region is not None and _LOST_REGION in (error.message() or ""):
+                    self._shared_memory.forget(region)
+                raise
+
+    def _inputs(self, inputs: Tensors, regions: Mapping[str, Region]) -> list[Any]:
+        tensors = []
+        for name, array in inputs.items():
+            tensor = self._triton.InferInput(name, array.shape, np_to_triton_dtype(array.dtype))
+            if name in regions:
+                tensor.set_shared_memory(regions[name].name, array.nbytes)
+            else:
+                tensor.set_data_from_numpy(array)
+            tensors.append(tensor)
+        return tensors
+
+    async def _call(
+        self,
+        ask: Callable[[Any], Awaitable[Answered]],
+        timeout_s: float,
+        *,
+        bad_request: type[errors.RewardError] = errors.InvalidSampleError,
+    ) -> Answered:
+        """``bad_request``: what a 400 means; Triton answers it for an unknown model too."""
+        try:
+            # Not by a deadline of gRPC: Triton 2.51 overlooks that one has passed, but not that a call is cancelled.
+            async with timeout(timeout_s):
+                return await self._heard(ask)
+        except InferenceServerException as error:
+            if is_denied(error):
+                raise errors.AccessDeniedError(f"{self.url}: access denied: {error.message()}") from error
+            raise _mapped(error, bad_request) from error
+        except (asyncio.TimeoutError, TimeoutError) as error:  # in Python 3.10 two
+            raise errors.DeadlineExceededError(f"{self.url}: no answer in time") from error
+        except self.protocol_errors as error:
+            hint = "no answer of an HTTP server (is it the gRPC port? then grpc://)"
+            raise errors.InferenceFailedError(f"{self.url}: {hint}: {type(error).__name__}") from error
+        except self.access_errors as error:
+            raise errors.AccessDeniedError(f"{self.url}: access denied: {error}") from error
+        except self.connection_errors as error:
+            raise errors.ServerUnavailableError(
+                f"{self.url}: no connection: {error or type(error).__name__}"
+            ) from error
+        except (ValueError, LookupError, TypeError) as error:  # while reading what is no answer of a KServe server
+            raise errors.InferenceFailedError(f"{self.url}: the answer cannot be read: {error!r}") from error
+
+    async def _heard(self, ask: Callable[[Any], Awaitable[Answered]]) -> Answered:
+        """What the server answers; a connection over which nothing comes is left to those who use it already."""
+        connection = self._connected()
+        try:
+            with connection.used() as client:
+                answer = await ask(client)
+            connection.hear()
+            return answer
+        except InferenceServerException:
+            connection.hear()  # or gRPC knows itself that the connection has ended
+            raise
+        except asyncio.CancelledError:
+            if connection.is_silent and connection is self._connection:
+                logger.info("%s: nothing comes over the connection: the next call gets a new one", self.url)
+                self._connection = None
+                self._left = [*(left for left in self._left if not left.is_closed), connection]
+                connection.leave()
+            raise
+
+    def _connected(self) -> Connection:
+        if self._connection is None:
+            self._connection = Connection(self._open())
+        return self._connection
+
+    @property
+    def _is_secure(self) -> bool:
+        return self._scheme in SECURE_SCHEMES
+
+    # What differs. A module is imported when it is first needed; a client belongs to the event loop that runs then.
+
+    @cached_property
+    def _triton(self) -> Any:
+        raise NotImplementedError
+
+    def _open(self) -> Any:
+        """A client of tritonclient's, which connects when it is first used."""
+        raise NotImplementedError
+
+    @property
+    def connection_errors(self) -> tuple[type[Exception], ...]:
+        return (OSError, EOFError)
+
+    @property
+    def protocol_errors(self) -> tuple[type[Exception], ...]:
+        return ()
+
+    @property
+    def access_errors(self) -> tuple[type[Exception], ...]:
+        return ()
+
+    async def registered_regions(self) -> list[str]:
+        raise NotImplementedError
+
+    async def _model_config(self, client: Any, model: str) -> Mapping[str, Any]:
+        raise NotImplementedError
+
+    def _model_version(self, answer: Any) -> str:
+        raise NotImplementedError
+
+
+class GrpcTransport(_TritonTransport):
+    """gRPC: a call that runs out of time, or is cancelled, is cancelled on the server too (if it has not begun)."""
+
+    _first_process: int | None = None  # that used gRPC
+
+    def __init__(self, url: str, access: Access, *, shared_memory: bool, named: str | None = None) -> None:
+        super().__init__(url, access, shared_memory=shared_memory)
+        self._options = {**GRPC_OPTIONS, **_name_options(named)}
+
+    @cached_property
+    def _triton(self) -> Any:
+        import tritonclient.grpc.aio
+
+        return tritonclient.grpc.aio
+
+    def _open(self) -> Any:
+        process = GrpcTransport._first_process = GrpcTransport._first_process or os.getpid()
+        if process != os.getpid():  # it would crash or hang
+            raise RuntimeError(
+                f"gRPC was used in process {process}, which forked this one: "
+                "have multiprocessing start its processes by spawn or forkserver"
+            )
+        client = self._triton.InferenceServerClient(
+            self._address, channel_args=list(self._options.items()), **self._access.grpc_options(self._scheme)
+        )
+        self._access.show_with_each_request(client)
+        return client
+
+    async def registered_regions(self) -> list[str]:
+        with self._connected().used() as client:
+            answer = await client.get_system_shared_memory_status(as_json=True)
+        return list(answer.get("regions", {}))
+
+    async def _model_config(self, client: Any, model: str) -> Mapping[str, Any]:
+        answer = await client.get_model_config(model, as_json=True)
+        config: Mapping[str, Any] = answer["config"]
+        return config
+
+    def _model_version(self, answer: Any) -> str:
+        return str(answer.get_response().model_version)
+
+
+def _name_options(named: str | None) -> dict[str, str]:
+    if named is None:
+        return {}
+    return {"grpc.default_authority": named, "grpc.ssl_target_name_override": named.rpartition(":")[0].strip("[]")}
+
+
+class HttpTransport(_TritonTransport):
+    """HTTP: as many connections as there are calls at a time. Triton finishes a request that nobody waits for."""
+
+    @cached_property
+    def _triton(self) -> Any:
+        import tritonclient.http.aio
+
+        return tritonclient.http.aio
+
+    def _open(self) -> Any:
+        secure = {"ssl": True, "ssl_context": self._access.ssl_context} if self._is_secure else {}
+        client = self._triton.InferenceServerClient(self._address, conn_limit=0, conn_timeout=None, **secure)
+        self._access.show_with_each_request(client)
+        post = client._post
+
+        async def post_stream(request_uri: str, request_body: str | bytes, headers: Any, query_params: Any) -> Any:
+            # As a stream aiohttp sends it piece by piece; in one piece it would hold the event loop, and warns.
+            body = io.BytesIO(request_body) if isinstance(request_body, bytes) else request_body
+            return await post(request_uri, body, headers, query_params)
+
+        client._post = post_stream
+        return client
+
+    @property
+    def connection_errors(self) -> tuple[type[Exception], ...]:
+        import aiohttp
+
+        return (aiohttp.ClientError, OSError, EOFError)
+
+    @property
+    def protocol_errors(self) -> tuple[type[Exception], ...]:
+        import aiohttp
+
+        return (aiohttp.ClientResponseError,)
+
+    @property
+    def access_errors(self) -> tuple[type[Exception], ...]:
+        import aiohttp
+
+        return (aiohttp.ClientSSLError, ssl.SSLError)
+
+    async def registered_regions(self) -> list[str]:
+        with self._connected().used() as client:
+            return [region["name"] for region in await client.get_system_shared_memory_status()]
+
+    async def _model_config(self, client: Any, model: str) -> Mapping[str, Any]:
+        config: Mapping[str, Any] = await client.get_model_config(model)
+        return config
+
+    def _model_version(self, answer: Any) -> str:
+        return str(answer.get_response()["model_version"])
+
+
+def _outputs(answer: Any, names: Collection[str]) -> Tensors:
+    arrays = {name: answer.as_numpy(name) for name in names}
+    absent = [name for name, array in arrays.items() if array is None]
+    if absent:
+        raise errors.InferenceFailedError(f"outputs: expected {', '.join(names)}, got no {', '.join(absent)}")
+    return arrays
+
+
+def _mapped(error: InferenceServerException, bad_request: type[errors.RewardError]) -> errors.RewardError:
+    message = _IN_ENSEMBLE.sub("", _REQUEST_ID.sub("", error.message() or "no reason given"))
+    shape = _WRONG_SHAPE.search(message)
+    if shape is not None:
+        return bad_request(f"{shape['name']}: expected [{shape['expected']}], got [{shape['got']}]")
+    if _NO_SECOND_FRAMES.search(message):
+        expected = "a model that takes pairs of two frame sizes"
+        got = "one that was exported before there was this input: export it again, or resize a trajectory"
+        return bad_request(f"{SECOND_FRAMES}: expected {expected}, got {got}")
+    if _PROCESS_ENDED.search(message):
+        return errors.ProcessEndedError(message)
+    if _UNAVAILABLE.search(message):
+        return errors.ServerUnavailableError(message)
+    kind = _STATUS_ERRORS.get(str(error.status()), errors.InferenceFailedError)
+    return (bad_request if kind is errors.InvalidSampleError else kind)(message)

@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: MIT
+"""The time that a call has left."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+if sys.version_info >= (3, 11):
+    from asyncio import timeout as timeout
+else:
+    from async_timeout import timeout as timeout
+
+from rfm_client.contract.errors import DeadlineExceededError
+
+MAX_TIMEOUT_S = 1e9  # more than thirty years; Triton counts nanoseconds, and could not count many more
+
+
+def check_timeout(timeout_s: float) -> None:
+    """Raises ValueError for what is no time that a call may take. An endless wait is none: servers can hang."""
+    if not 0 < timeout_s <= MAX_TIMEOUT_S:  # nor NaN
+        expected = f"a number of seconds above 0 and at most {MAX_TIMEOUT_S:g}"
+        raise ValueError(f"timeout_s: expected {expected}, got {timeout_s}")
+
+
+class Deadline:
+    """A moment ``timeout_s`` seconds from now, shared by everything that one call does."""
+
+    def __init__(self, timeout_s: float) -> None:
+        check_timeout(timeout_s)
+        self._timeout_s = timeout_s
+        self._at_s = time.monotonic() + timeout_s
+
+    def ends_within(self, seconds: float) -> bool:
+        """Whether less than that is left."""
+        return time.monotonic() + seconds >= self._at_s
+
+    def remaining_s(self) -> float:
+        """Seconds left, more than 0. Raises DeadlineExceededError when there are none."""
+        remaining_s = self._at_s - time.monotonic()
+        if remaining_s <= 0:
+            raise self.exceeded()
+        return remaining_s
+
+    def exceeded(self, where: str = "") -> DeadlineExceededError:
+        """The error of a call that came to its end, while it waited for the server ``where``."""
+        return DeadlineExceededError(f"{where}{': ' if where else ''}no answer within {self._timeout_s:g} s")

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: MIT
+"""What a client knows of one server: how busy it is, and whether it is left out."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import random
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rfm_client.transport.calls import Transport
+
+FIRST_PAUSE_S = 0.1
+LONGEST_RETRY_PAUSE_S = 2.0
+LONGEST_REST_S = 30.0  # of a server that says that it is ready and fails again and again
+PROBE_TIMEOUT_S = 2.0
+HEALED_WITHIN_S = 60.0  # the longest that a call waits for the server that it was with when a process ended
+_HEAL_POLL_S = 0.2  # while it loads its model anew, which takes seconds, it is not ready
+
+
+class Server:
+    """failures: one after the other, up to now; is_gone: it is asked no more, and closed as soon as nobody uses it"""
+
+    _moments = itertools.count(1)
+
+    def __init__(self, transport: Transport) -> None:
+        self.transport = transport
+        self.outstanding = 0
+        self.last_asked = 0
+        self.failures = 0
+        self.comeback: asyncio.Task[bool] | None = None  # whether it was seen to be healed
+        self._has_ended_process = False
+        self.is_gone = False
+        self._closing: asyncio.Task[None] | None = None
+
+    @property
+    def is_left_out(self) -> bool:
+        """Until it says that it is ready."""
+        return self.comeback is not None and not self.comeback.done()
+
+    @property
+    def is_dead(self) -> bool:
+        """Whether it is left out since a process of the model has ended."""
+        return self._has_ended_process and self.is_left_out
+
+    @contextmanager
+    def asked(self) -> Iterator[None]:
+        """Within it, a request is under way."""
+        self.outstanding += 1
+        self.last_asked = next(self._moments)
+        try:
+            yield
+        finally:
+            self.outstanding -= 1
+            self._close_if_unused()
+
+    def leave_out(self, model: str) -> None:
+        """Until it says that it is ready; the more often it has failed, the later it is asked."""
+        if not self.is_left_out and not self.is_gone:
+            self._has_ended_process = False
+            self.comeback = asyncio.create_task(self._rest(model))
+
+    def leave_out_dead(self, model: str) -> None:
+        """Until it is healed. Triton 2.51 says that a dead model is ready, so it must have said the opposite before."""
+        if not self.is_dead and not self.is_gone:
+            if self.comeback is not None:
+                self.comeback.cancel()
+            self._has_ended_process = True
+            self.comeback = asyncio.create_task(self._heal(model))
+
+    async def is_healed(self, within_s: float) -> bool:
+        """Whether it has been loaded anew, as soon as it has."""
+        if self.comeback is None:
+            return False
+        comeback = self.comeback
+        await asyncio.wait({comeback}, timeout=within_s)
+        return not self.is_gone and comeback.done() and not comeback.cancelled() and comeback.result()
+
+    def remove(self) -> None:
+        """No request that begins now will be sent to it."""
+        self.is_gone = True
+        if self.comeback is not None:
+            self.comeback.cancel()
+        self._close_if_unused()
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether nothing of it is left."""
+        return self._closing is not None and self._closing.done()
+
+    async def close(self) -> None:
+        """Closes the connection, whoever still uses it."""
+        self.is_gone = True
+        if self.comeback is not None:
+            self.comeback.cancel()
+        if self._closing is None:
+            self._closing = asyncio.create_task(self.transport.close())
+        await self._closing
+
+    def _close_if_unused(self) -> None:
+        if self.is_gone and not self.outstanding and self._closing is None:
+            self._closing = asyncio.create_task(self.transport.close())
+
+    async def _rest(self, model: str) -> bool:
+        await asyncio.sleep(pause_s(self.failures - 1, LONGEST_REST_S))
+        for attempt in itertools.count():
+            if await self.transport.is_ready(model, PROBE_TIMEOUT_S):
+                break
+            await asyncio.sleep(pause_s(attempt, LONGEST_RETRY_PAUSE_S))
+        return False
+
+    async def _heal(self, model: str) -> bool:
+        """It may be that nobody heals it, or that its load was too short to be seen: then it is tried again."""
+        was_unready = False
+        tried_at_s = time.monotonic() + LONGEST_REST_S
+        while True:
+            is_ready = await self.transport.is_ready(model, PROBE_TIMEOUT_S)
+            if is_ready and (was_unready or time.monotonic() >= tried_at_s):
+                return was_unready
+            was_unready = was_unready or not is_ready
+            await asyncio.sleep(_HEAL_POLL_S)
+
+
+def pause_s(attempt: int, longest_s: float) -> float:
+    """Doubles from try to try; half of it is chance, so that callers do not come back all at once."""
+    pause_s = min(longest_s, FIRST_PAUSE_S * 2.0 ** min(attempt, 16))
+    return random.uniform(pause_s / 2, pause_s)

@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: MIT
+"""Several servers of one checkpoint as one: the least busy is asked, and one that fails is left out for a while.
+
+A request may end the process that works on it. Sent from server to server it would end one process after the other.
+So a request that was with server S when a process of S ended waits for S, since S alone can tell whose fault it was:
+its journal lets the others through and refuses a request that has ended its process twice. Once S is loaded anew, the
+request stays with S. If nobody heals S within half of the time that is left, and HEALED_WITHIN_S at most, the request
+goes to a server that is not known to be dead. If a process ends there too, the request fails. Either way it ends two
+processes at most: two of S, or one of S and one of another. Requests that were with S beside it wait as long, and are
+answered. No request is sent to a server that is known to be dead, where others are.
+
+A client of one server sends the request to that server again, after pauses, and its journal bounds it. A URL behind
+which a load balancer picks the server counts as one server: there the bound holds for each server, not for all
+together. Give such servers a URL each, or over gRPC a host name that resolves to all their addresses.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+import time
+from collections.abc import Awaitable, Callable, Collection, Sequence
+from typing import TypeVar
+
+from rfm_client.contract.errors import (
+    AccessDeniedError,
+    DeadlineExceededError,
+    InferenceFailedError,
+    ModelNotFoundError,
+    ProcessEndedError,
+    RewardError,
+    ServerUnavailableError,
+)
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.wire import Tensors
+from rfm_client.transport.calls import Answer, Transport
+from rfm_client.transport.deadline import Deadline
+from rfm_client.transport.host_names import REFRESH_S, Name
+from rfm_client.transport.server import HEALED_WITHIN_S, LONGEST_RETRY_PAUSE_S, Server, pause_s
+
+Answered = TypeVar("Answered")
+Ask = Callable[[Transport, float], Awaitable[Answered]]
+
+logger = logging.getLogger("rfm_client")
+
+
+class Servers:
+    """Asks one of several servers, for one event loop.
+
+    retry: what fails because a server is down, restarting or full is asked again, elsewhere at once or, when there is
+        no other, after pauses that grow, until the deadline; what a server lacks, denies or fails at is asked once of
+        each other one. A score depends on the request alone, so asking twice is safe.
+    names: whose addresses are servers, too
+    """
+
+    def __init__(self, transports: Sequence[Transport], *, retry: bool, names: Sequence[Name] = ()) -> None:
+        if not transports and not names:
+            raise ValueError("url: expected at least one, got none")
+        self._transports = transports
+        self._names = names
+        self._servers = [Server(transport) for transport in self._wanted]
+        self._gone: list[Server] = []  # and perhaps not closed yet
+        self._retry = retry
+        self._looking_up: asyncio.Task[None] | None = None
+        self._looked_up_s = float("-inf")
+
+    def __str__(self) -> str:
+        return ", ".join(server.transport.url for server in self._servers)
+
+    async def infer(
+        self, model: str, inputs: Tensors, outputs: Collection[str], deadline: Deadline, *, request_id: str
+    ) -> Answer:
+        """The named ``outputs`` of ``model`` for ``inputs``. Raises RewardError, which names the request."""
+
+        def ask(server: Transport, left_s: float) -> Awaitable[Answer]:
+            return server.infer(model, inputs, outputs, left_s, request_id=request_id)
+
+        try:
+            return await self._ask(model, ask, deadline)
+        except RewardError as error:
+            error.request_id = request_id
+            raise
+
+    async def model_info(self, model: str, deadline: Deadline) -> ModelInfo:
+        """What a server tells of ``model``. Raises RewardError."""
+        return await self._ask(model, lambda server, left_s: server.model_info(model, left_s), deadline)
+
+    async def is_ready(self, models: Sequence[str], timeout_s: float) -> bool:
+        """Whether at least one server has one of the models ready. The first that has is enough."""
+        self._keep_up()
+        probes = [
+            asyncio.ensure_future(server.transport.is_ready(model, timeout_s))
+            for server in self._servers
+            for model in models
+        ]
+        try:
+            for answered in asyncio.as_completed(probes):
+                if await answered:
+                    return True
+            return False
+        finally:
+            for probe in probes:
+                probe.cancel()
+
+    async def close(self) -> None:
+        """Closes all connections."""
+        self._retry = False
+        if self._looking_up is not None:
+            self._looking_up.cancel()
+        await asyncio.gather(*(server.close() for server in (*self._servers, *self._gone)))
+
+    async def _ask(self, model: str, ask: Ask[Answered], deadline: Deadline) -> Answered:
+        """As the module's text has it."""
+        self._keep_up()
+        try:
+            return await self._ask_among(None, model, ask, deadline)
+        except _EndedAtError as ended:
+            first, error = ended.server, ended.error
+        if not self._retry or deadline.ends_within(0):
+            raise error
+        if await first.is_healed(min(HEALED_WITHIN_S, deadline.remaining_s() / 2)):
+            return await self._ask_among(first, model, ask, deadline)
+        try:
+            return await self._ask_among(None, model, ask, deadline)
+        except _EndedAtError as ended:
+            where = f"{first.transport.url} and {ended.server.transport.url}"
+            told = f"{where}: a process of the model ended at each while it had this request, so no other is asked"
+            raise ProcessEndedError(f"{told}: {ended.error.message}") from ended.error
+
+    async def _ask_among(self, only: Server | None, model: str, ask: Ask[Answered], deadline: Deadline) -> Answered:
+        """only: no other is asked; None: any, and of several _EndedAtError is raised where a process has ended."""
+        refusals: dict[Server, RewardError] = {}
+        for attempt in itertools.count():
+            server = only or await self._living(refusals, deadline)
+            if server.is_gone:
+                raise ServerUnavailableError(f"{server.transport.url}: its name does not stand for it any more")
+            left_s = deadline.remaining_s()
+            try:
+                with server.asked():
+                    answer = await ask(server.transport, left_s)
+                server.failures = 0
+                for other in refusals:  # not before: what all refuse is no fault of one
+                    self._leave_out(other, model)
+                return answer
+            except DeadlineExceededError as error:  # perhaps it hangs
+                self._leave_out(server, model)
+                raise deadline.exceeded(server.transport.url) from error
+            except (AccessDeniedError, InferenceFailedError, ModelNotFoundError) as error:
+                refusals[server] = error
+                if not self._retry:
+                    self._leave_out(server, model)
+                    raise
+                if only or refusals.keys() >= set(self._servers):
+                    break
+            except ServerUnavailableError as error:
+                self._note(server, model, error)
+                if isinstance(error, ProcessEndedError) and only is None and len(self._servers) > 1:
+                    raise _EndedAtError(server, error) from error
+                busy = {server, *refusals}
+                has_other = only is None and any(not other.is_left_out for other in self._servers if other not in busy)
+                await self._pause(0.0 if has_other else pause_s(attempt, LONGEST_RETRY_PAUSE_S), deadline, error)
+        others = [error for error in refusals.values() if not isinstance(error, ModelNotFoundError)]
+        raise (others or list(refusals.values()))[0]
+
+    async def _pause(self, duration_s: float, deadline: Deadline, error: ServerUnavailableError) -> None:
+        """Raises the error if it is not worth while."""
+        if not self._retry or deadline.ends_within(duration_s):
+            raise error
+        await asyncio.sleep(duration_s)
+        if deadline.ends_within(0):  # the pause took longer than it should have
+            raise error
+
+    async def _living(self, refusals: Collection[Server], deadline: Deadline) -> Server:
+        """The least busy that is not known to be dead, as soon as there is one. Of the only server nothing is known."""
+        for attempt in itertools.count():
+            server = self._least_busy(refusals)
+            if not server.is_dead:
+                return server
+            error = ProcessEndedError(f"{self}: every process of the model has ended, and none is loaded anew yet")
+            await self._pause(pause_s(attempt, LONGEST_RETRY_PAUSE_S), deadline, error)
+        raise AssertionError("it counts for ever")
+
+    def _least_busy(self, avoided: Collection[Server]) -> Server:
+        def rank(server: Server) -> tuple[bool, bool, bool, int, int]:
+            return server in avoided, server.is_dead, server.is_left_out, server.outstanding, server.last_asked
+
+        return min(self._servers, key=rank)
+
+    def _note(self, server: Server, model: str, error: ServerUnavailableError) -> None:
+        """That a server is not to be had."""
+        if not server.failures and self._retry:
+            logger.warning("%s: trying again: %s", server.transport.url, error)
+        self._leave_out(server, model, is_dead=isinstance(error, ProcessEndedError))
+
+    def _leave_out(self, server: Server, model: str, *, is_dead: bool = False) -> None:
+        """Until it is ready, or healed. The only server there is stays in."""
+        server.failures += 1
+        if len(self._servers) > 1:
+            (server.leave_out_dead if is_dead else server.leave_out)(model)
+
+    # Names
+
+    @property
+    def _wanted(self) -> list[Transport]:
+        return [*self._transports, *(found for name in self._names for found in name.transports.values())]
+
+    def _keep_up(self) -> None:
+        """Has the names looked up when that is due. Nobody waits for it."""
+        is_due = time.monotonic() - self._looked_up_s >= REFRESH_S
+        if self._names and is_due and (self._looking_up is None or self._looking_up.done()):
+            self._looking_up = asyncio.create_task(self._look_up())
+
+    async def _look_up(self) -> None:
+        for name in self._names:
+            try:
+                await name.look_up()
+            except (OSError, UnicodeError) as error:
+                logger.info("%s: the name cannot be looked up: %s", name.url, error)
+        self._looked_up_s = time.monotonic()
+        known = {id(server.transport): server for server in self._servers}
+        self._servers = [known.get(id(transport)) or Server(transport) for transport in self._wanted]
+        removed = [server for server in known.values() if server not in self._servers]
+        for server in removed:
+            server.remove()
+        self._gone = [*(server for server in self._gone if not server.is_closed), *removed]
+
+
+class _EndedAtError(Exception):
+    """A process of the model ended at ``server`` when it had the request, or before."""
+
+    def __init__(self, server: Server, error: ProcessEndedError) -> None:
+        super().__init__(server, error)
+        self.server = server
+        self.error = error

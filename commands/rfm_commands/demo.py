@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: MIT
+"""A video's scores from a server, as a table and a picture. What ``rfm demo`` shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+
+from rfm.supervise.process import Endpoints
+from rfm_client import RewardClient, Trajectory
+from rfm_client.cli.show import Panel, plot, scores_table, status_tables
+from rfm_client.data.video import frame_times_s, read_video
+from rfm_client.status import read_status
+
+
+def score_video(endpoints: Endpoints, video: Path, task: str, fps: float, picture: Path, console: Console) -> None:
+    """Scores the video's frames at ``fps``, or as many, evenly, as the checkpoint takes, and draws a picture."""
+    frames = read_video(video, fps)
+    with RewardClient(endpoints.grpc_url) as client:
+        result = client.progress(Trajectory(frames=frames, task=task), subsample=True)
+    if len(result.progress) < len(frames):
+        console.print(f"{video.name}: {len(result.progress)} of {len(frames)} frames, evenly, are scored")
+    console.print(scores_table(f'"{task}"', [(video.name, result)]))
+    plot(picture, [Panel.of(f'"{task}"', result, frames, frame_times_s(video, len(frames)))])
+    console.print(f"plot: {picture}")
+
+
+def show_metrics(endpoints: Endpoints, console: Console) -> None:
+    """What Triton counted meanwhile."""
+    console.print(*status_tables(read_status(endpoints.http_url, metrics_url=endpoints.metrics_url)), sep="\n")

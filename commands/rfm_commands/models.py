@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: MIT
+"""``rfm models``: which models, and which versions of them, a running server serves.
+
+NAME is that of ``rfm export --name``: it stands for all models of the checkpoint. The server is reached over gRPC: a
+load over HTTP would keep its other callers waiting.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rfm.supervise.admin_key import AdminKeyError, take_key
+from rfm.supervise.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
+from rfm_client.transport.access import Access
+from rfm_commands.rollout import Rollout, models_of, previous_version
+from rfm_export.errors import ExportError
+
+DEFAULT_URL = "grpc://127.0.0.1:8001"
+SECURE = "grpcs://"
+EXIT_FAILED = 1
+
+app = typer.Typer(no_args_is_help=True)
+
+AdminKeyFile = Annotated[
+    Path | None,
+    typer.Option(help="File with the server's admin key; else RFM_ADMIN_KEY.", show_default=False),
+]
+Name = Annotated[str, typer.Argument(help="As in rfm export --name.")]
+Repository = Annotated[Path, typer.Option(help="The repository that the server reads.")]
+Url = Annotated[str, typer.Option(help="grpc://host:port of the server, with TLS grpcs://host:port.")]
+
+
+@app.callback()
+def models(
+    context: typer.Context,
+    ca_file: Annotated[
+        Path | None, typer.Option(envvar="RFM_CA_FILE", help="Authorities (PEM) to trust; else gRPC's own.")
+    ] = None,
+    client_certificate: Annotated[
+        Path | None, typer.Option(envvar="RFM_CLIENT_CERTIFICATE", help="By which the server knows you (PEM).")
+    ] = None,
+    client_key: Annotated[
+        Path | None, typer.Option(envvar="RFM_CLIENT_KEY", help="The certificate's key (PEM).")
+    ] = None,
+) -> None:
+    """List, load and unload the models of a running server; serve another version of them without losing a request."""
+    try:
+        context.obj = Access(ca_file, client_certificate, client_key)
+    except ValueError as error:
+        raise _failed(error) from None
+
+
+@app.command("list")
+def list_models(context: typer.Context, url: Url = DEFAULT_URL, admin_key_file: AdminKeyFile = None) -> None:
+    """Each version of each model, its state, and why it is not ready."""
+    with _server(context, url, admin_key_file) as server:
+        rows = [_row(entry) for entry in server.index()]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        typer.echo("  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip())
+
+
+@app.command()
+def load(
+    context: typer.Context,
+    name: Name,
+    repository: Repository,
+    url: Url = DEFAULT_URL,
+    admin_key_file: AdminKeyFile = None,
+) -> None:
+    """Serve what the configurations of NAME say: a new name, or one that was unloaded."""
+    with _server(context, url, admin_key_file) as server:
+        for model in models_of(repository, name):
+            server.load(model)
+            typer.echo(f"{model}: {', '.join(map(str, server.ready_versions(model)))} ready")
+
+
+@app.command()
+def unload(
+    context: typer.Context,
+    name: Name,
+    repository: Repository,
+    url: Url = DEFAULT_URL,
+    admin_key_file: AdminKeyFile = None,
+) -> None:
+    """Serve NAME no more, once the requests in flight are answered. Its files stay."""
+    with _server(context, url, admin_key_file) as server:
+        for model in reversed(models_of(repository, name)):
+            server.unload(model)
+            server.wait_gone(model)
+            typer.echo(f"{model}: unloaded")
+
+
+@app.command()
+def rollout(
+    context: typer.Context,
+    name: Name,
+    version: Annotated[int, typer.Argument(min=1, help="The version folder to serve.")],
+    repository: Repository,
+    url: Url = DEFAULT_URL,
+    admin_key_file: AdminKeyFile = None,
+) -> None:
+    """Serve another version of NAME: loaded beside the old one, probed, then alone. If it fails the old one stays."""
+    with _server(context, url, admin_key_file) as server:
+        Rollout(repository, name, server, typer.echo).to(version)
+        typer.echo(f"{name}: version {version} is served")
+
+
+@app.command()
+def rollback(
+    context: typer.Context,
+    name: Name,
+    repository: Repository,
+    url: Url = DEFAULT_URL,
+    admin_key_file: AdminKeyFile = None,
+) -> None:
+    """Serve the version before the one that is served, as rollout does."""
+    with _server(context, url, admin_key_file) as server:
+        version = previous_version(repository, name, server)
+        Rollout(repository, name, server, typer.echo).to(version)
+        typer.echo(f"{name}: version {version} is served")
+
+
+@contextmanager
+def _server(context: typer.Context, url: str, admin_key_file: Path | None) -> Iterator[RepositoryApi]:
+    """The server; what goes wrong with it ends the command with one line."""
+    access: Access = context.obj
+    try:
+        if access.uses_tls and not url.startswith(SECURE):
+            raise RepositoryApiError(f"url: expected {SECURE}host:port with certificates, got {url}")
+        with RepositoryApi(
+            url, take_key(admin_key_file, os.environ), access.grpc_options(url.partition(":")[0])
+        ) as server:
+            yield server
+    except (AdminKeyError, RepositoryApiError, ExportError, OSError) as error:
+        raise _failed(error) from None
+
+
+def _failed(error: Exception) -> typer.Exit:
+    typer.echo(f"rfm: {error}", err=True)
+    return typer.Exit(EXIT_FAILED)
+
+
+def _row(entry: ModelVersion) -> tuple[str, ...]:
+    return entry.name, "" if entry.version is None else str(entry.version), entry.state, entry.reason

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: MIT
+"""Another version of a checkpoint's models on a running server, with no request lost.
+
+Files and server go in step, so that a restart serves what ran. A checkpoint with encoders is three models: its encoder
+and its scorer (parts), and an ensemble, whose configuration names the versions of both. In this order:
+
+1. Parts serve the new version beside the old. It is warmed up first, and one that cannot be loaded is never asked.
+2. The new version of each part answers a probe that names it.
+3. The ensemble goes over to the new version, and Triton finishes what the old one has begun.
+4. Parts serve the new version alone; Triton finishes again.
+
+Whatever fails on the way, the versions that were served before are loaded again with their own configurations. Those
+are put back even if the server is gone, so that a restart serves what was served before; a server that comes back
+within RETURN_S is told to load them.
+
+Requests that name no version are answered by the highest one that is ready: by the new one from step 1 on, in a
+rollback from step 4 on. Since one configuration holds for all versions of a model, step 1 has Triton load the old
+version a second time, with the new one's: for a moment there must be room for three copies.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from google.protobuf.text_format import ParseError
+from tritonclient.grpc import model_config_pb2 as pb
+
+from rfm.supervise.repository_api import RepositoryApi, RepositoryApiError
+from rfm_client import PreferenceSample, ProgressSample, RewardError, Trajectory
+from rfm_client.contract import wire
+from rfm_client.contract.names import encoder_name, frames_name
+from rfm_export.errors import ExportError
+from rfm_export.layout import CONFIG_FILE
+from rfm_export.pbtxt import serving_versions
+from rfm_export.publish import alone, config_of, read_config, replace_config, staging
+
+RETURN_S = 120.0
+POLL_S = 1.0
+PROBE_FRAMES = 2
+PROBE_SIZE_PX = 64
+PROBE_SEED = 0
+SCORES = (wire.PROGRESS, wire.SUCCESS, wire.PREFERENCE)
+EMBEDDINGS = (wire.VIDEO_EMBEDDINGS, wire.TEXT_EMBEDDING)
+
+Configs = Mapping[str, pb.ModelConfig]
+
+
+class RolloutError(ExportError):
+    """A version that is not served now, and why."""
+
+
+def models_of(repository: Path, name: str) -> list[str]:
+    """The models that `rfm export --name NAME` made, an ensemble behind what it is made of. Raises RolloutError."""
+    names = (encoder_name(name), name, frames_name(name))
+    models = [model for model in names if (repository / model / CONFIG_FILE).is_file()]
+    if not models:
+        raise RolloutError(f"{repository}: expected a model {name} (rfm export --name), got none")
+    return models
+
+
+def previous_version(repository: Path, name: str, server: RepositoryApi) -> int:
+    """The version folder before the one that is served. Raises RolloutError, RepositoryApiError."""
+    models = models_of(repository, name)
+    served = [version for model in models for version in server.ready_versions(model)]
+    if not served:
+        raise RolloutError(f"{name}: expected to be served, got no version that is")
+    each = [{int(path.name) for path in (repository / model).glob("*") if path.name.isdecimal()} for model in models]
+    older = [version for version in set.intersection(*each) if version < max(served)]
+    if not older:
+        raise RolloutError(f"{repository / models[0]}: expected a version before {max(served)}, got none")
+    return max(older)
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What is changed, on which server. tell: is told each step"""
+
+    repository: Path
+    name: str
+    server: RepositoryApi
+    tell: Callable[[str], None]
+
+    def to(self, version: int) -> None:
+        """Has ``version`` served, alone. Raises RolloutError, RepositoryApiError when nothing has been changed."""
+        with alone(self.repository):
+            self._to(version)
+
+    def _to(self, version: int) -> None:
+        models = models_of(self.repository, self.name)
+        served = {model: self.server.ready_versions(model) for model in models}
+        try:
+            new = self._configs(models, dict.fromkeys(models, version))
+            # Of what is not served the configuration that stands there.
+            old = {model: read_config(self.repository, model) for model in models if not served[model]}
+            old |= self._configs(models, {model: max(served[model]) for model in models if served[model]})
+        except (OSError, ParseError) as error:
+            raise RolloutError(f"{self.name} version {version}: expected an exported version, got {error}") from error
+        try:
+            self._switch(new, served, version)
+        except (RepositoryApiError, RewardError, OSError) as error:
+            became = self._go_back(old, served)
+            raise RolloutError(f"{self.name} version {version}: {error} ({became})") from error
+        except BaseException:  # told to stop
+            self.tell(self._go_back(old, served))
+            raise
+
+    def _switch(self, new: Configs, served: Mapping[str, Sequence[int]], version: int) -> None:
+        parts = [model for model, config in new.items() if not _is_ensemble(config)]
+        for model in parts:
+            self._serve(new[model], sorted({version, *served[model]}))
+            probe(self.server, new[model], version)
+        for model in (*(model for model in new if model not in parts), *parts):
+            self._serve(new[model], [version])
+            self.server.wait_gone(model, kept=[version])
+            if model not in parts:
+                probe(self.server, new[model], version)
+
+    def _go_back(self, old: Configs, served: Mapping[str, Sequence[int]]) -> str:
+        """What became of it, in words."""
+        self.tell("going back")
+        ends_s = time.monotonic() + RETURN_S
+        failed: dict[str, str | None] = dict.fromkeys(reversed(list(served)))  # the ensemble before what it names
+        while True:
+            failed = {model: why for model in failed if (why := self._put_back(old[model], served[model]))}
+            if not failed or time.monotonic() >= ends_s:
+                break
+            time.sleep(POLL_S)
+        if failed:
+            why = "; ".join(f"{model}: {error}" for model, error in failed.items())
+            return f"expected to serve again what it served, got: {why}"
+        return f"served as before: {'; '.join(f'{model}: {_words(versions)}' for model, versions in served.items())}"
+
+    def _put_back(self, config: pb.ModelConfig, versions: Sequence[int]) -> str | None:
+        """A model's file and what is served of it. Why that failed: the server is gone, or other models come first."""
+        try:
+            self._write(serving_versions(config, versions) if versions else config)
+            if versions:
+                self.server.load(config.name)
+            else:
+                self.server.unload(config.name)
+        except (RepositoryApiError, OSError) as error:
+            return str(error)
+        return None
+
+    def _serve(self, config: pb.ModelConfig, versions: Sequence[int]) -> None:
+        self._write(serving_versions(config, versions))
+        self.tell(f"{config.name}: loading {_words(versions)}")
+        self.server.load(config.name)
+
+    def _write(self, config: pb.ModelConfig) -> None:
+        with staging(self.repository, [config.name]) as scratch:
+            replace_config(self.repository, config, scratch)
+
+    def _configs(self, models: Sequence[str], versions: Mapping[str, int]) -> dict[str, pb.ModelConfig]:
+        return {model: config_of(self.repository, model, versions[model]) for model in models if model in versions}
+
+
+def probe(server: RepositoryApi, config: pb.ModelConfig, version: int) -> None:
+    """Raises RepositoryApiError or RewardError unless the version answers with numbers.
+
+    A model without warm-up generates text: what it says to noise need not be an answer, and it is not asked.
+    """
+    if not (config.model_warmup or _is_ensemble(config)):
+        return
+    trajectory = _noise(config)
+    if wire.VIDEO_EMBEDDINGS in _widths(config.output):
+        embeddings = server.infer(config.name, version, wire.encode_frames(trajectory), EMBEDDINGS)
+        wire.decode_embeddings(embeddings, trajectory)
+        return
+    for sample in (ProgressSample(trajectory), PreferenceSample(trajectory, trajectory)):
+        scores = server.infer(config.name, version, wire.encode_samples([sample]), SCORES)
+        wire.decode_results(scores, [sample])
+
+
+def _noise(config: pb.ModelConfig) -> Trajectory:
+    """What the model takes: embeddings, or frames."""
+    random = np.random.default_rng(PROBE_SEED)
+    widths = _widths(config.input)
+    if wire.FRAMES in widths:
+        frames = random.integers(0, 256, (PROBE_FRAMES, PROBE_SIZE_PX, PROBE_SIZE_PX, 3), np.uint8)
+        return Trajectory(frames=frames, task="pick up the red cup")
+    return Trajectory(
+        video_embeddings=random.standard_normal((PROBE_FRAMES, widths[wire.VIDEO_EMBEDDINGS]), np.float32),
+        text_embedding=random.standard_normal(widths[wire.TEXT_EMBEDDING], np.float32),
+    )
+
+
+def _widths(tensors: Iterable[Any]) -> dict[str, int]:
+    """The last dimension of each, by name."""
+    return {tensor.name: tensor.dims[-1] for tensor in tensors}
+
+
+def _is_ensemble(config: pb.ModelConfig) -> bool:
+    return bool(config.platform == "ensemble")
+
+
+def _words(versions: Sequence[int]) -> str:
+    return f"version {' and '.join(map(str, versions))}" if versions else "none"

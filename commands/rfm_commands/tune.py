@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: MIT
+"""How many instances, of how many threads and for what batches, serve a repository best here: each setting is tried."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import shutil
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import yaml
+from tritonclient.grpc import model_config_pb2 as pb
+
+from rfm.parameters import THREADS_PARAMETER
+from rfm.supervise.temporary import served
+from rfm_client import AsyncRewardClient, RewardClient, Sample
+from rfm_client.cli.toy import SampleKind, Toy
+from rfm_export.errors import ExportError
+from rfm_export.layout import CONFIG_FILE
+from rfm_export.pbtxt import parse, render
+
+AS_FAST = 0.95  # of the highest rate: closer than that, rates do not tell settings apart
+INSTANCES_PER_GPU = (1, 2, 3)
+BATCH_SIZES = (8, 32, 128)
+NUM_SAMPLES = 64
+NUM_FRAMES = 16  # of a sample, where the checkpoint does not say on how many it was trained
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Values of the ServeConfig keys of these names."""
+
+    instances: int
+    torch_threads: int
+    max_batch_size: int
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a setting gave, as medians of the rounds. samples_per_s: of all callers; p50_ms: of one caller alone."""
+
+    setting: Setting
+    samples_per_s: float
+    p50_ms: float
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Trials on a copy of a repository, whose own files stay as they are.
+
+    name: of its models; callers: at a time, with one sample each; seconds: of each measurement
+    tell: is told each measurement as it is made
+    """
+
+    repository: Path
+    name: str
+    callers: int = 32
+    seconds: float = 3.0
+    rounds: int = 3
+    use_frames: bool = False
+    tritonserver: Path | None = None
+    tell: Callable[[str], None] = print
+
+    def best(self) -> Setting:
+        """Instances and threads first, then the size of batches for the best of those.
+
+        Raises ServerStartError, RewardError if it cannot score made-up samples, ExportError if it is no repository or
+        ``seconds`` are too few for an answer.
+        """
+        trials = self._trials(self._instances())
+        best = quickest(trials)
+        sizes = [replace(best.setting, max_batch_size=n) for n in BATCH_SIZES if n != best.setting.max_batch_size]
+        fastest = max(self._trials(sizes), key=lambda trial: trial.samples_per_s)
+        return fastest.setting if best.samples_per_s < AS_FAST * fastest.samples_per_s else best.setting
+
+    def _instances(self) -> list[Setting]:
+        """On a GPU a few instances; on the CPU as many as share its cores evenly."""
+        batched = [config for config in _configs(self.repository).values() if config.instance_group]
+        if not batched:
+            raise ExportError(f"{self.repository}: expected an exported repository, got no model of one")
+        (group,), batch_size = batched[0].instance_group, batched[0].max_batch_size
+        if group.kind == pb.ModelInstanceGroup.KIND_GPU:
+            threads = int(batched[0].parameters[THREADS_PARAMETER].string_value)
+            return [Setting(count, threads, batch_size) for count in INSTANCES_PER_GPU]
+        cores = len(os.sched_getaffinity(0))
+        return [Setting(count, cores // count, batch_size) for count in (1 << n for n in range(cores.bit_length()))]
+
+    def _trials(self, settings: Sequence[Setting]) -> list[Trial]:
+        """In rounds, so that a machine that drifts hits all settings alike."""
+        measured: dict[Setting, list[tuple[float, float]]] = {setting: [] for setting in settings}
+        for number in range(self.rounds):
+            for setting, of_setting in measured.items():
+                of_setting.append(self._measured(setting))
+                rate, p50_ms = of_setting[-1]
+                self.tell(f"round {number + 1}: {setting}: {rate:.0f} samples/s, one caller waits {p50_ms:.1f} ms")
+        return [
+            Trial(setting, *map(statistics.median, zip(*values, strict=True))) for setting, values in measured.items()
+        ]
+
+    def _measured(self, setting: Setting) -> tuple[float, float]:
+        """Samples a second of all callers, and the median wait of a single one, in milliseconds."""
+        with TemporaryDirectory(prefix="rfm-tune-") as folder:
+            repository = Path(folder) / "repository"
+            shutil.copytree(self.repository.resolve(), repository, copy_function=os.symlink)
+            _apply(setting, repository)
+            with served(repository, Path(folder) / "triton.log", self.tritonserver) as endpoints:
+                url = endpoints.grpc_url
+                with RewardClient(url, model=self.name) as client:
+                    frames = client.model_info(frames=self.use_frames).max_frames or NUM_FRAMES
+                    toy = Toy(SampleKind.progress, NUM_SAMPLES, [min(frames, NUM_FRAMES)], self.use_frames, seed=0)
+                    samples = toy.samples(client)
+                    client.evaluate(samples)  # whatever is made at first use
+                alone = asyncio.run(_ask(url, self.name, samples, 1, self.seconds))
+                together = asyncio.run(_ask(url, self.name, samples, self.callers, self.seconds))
+        return len(together) / self.seconds, statistics.median(alone) * 1e3 if alone else math.inf
+
+
+def quickest(trials: Sequence[Trial]) -> Trial:
+    """Of those that are about as fast as the fastest, the one with the shortest wait for a single caller.
+
+    Raises ExportError if none has answered.
+    """
+    fastest = max(trial.samples_per_s for trial in trials)
+    if not fastest:
+        raise ExportError("--seconds: expected time for an answer, got none in time with any setting")
+    return min((t for t in trials if t.samples_per_s >= AS_FAST * fastest), key=lambda trial: trial.p50_ms)
+
+
+def write_setting(setting: Setting, file: Path, config: Path | None) -> None:
+    """Writes the keys of ``config`` (none: no others) with those of the setting. Raises OSError."""
+    keys = {} if config is None else yaml.safe_load(config.read_text()) or {}
+    file.write_text("# Measured by `rfm tune`.\n" + yaml.safe_dump(keys | asdict(setting), sort_keys=False))
+
+
+async def _ask(url: str, model: str, samples: Sequence[Sample], callers: int, seconds: float) -> list[float]:
+    """Latencies in seconds of what is answered within ``seconds``, once the client is connected.
+
+    ``callers`` each ask about one sample after the other.
+    """
+    latencies_s: list[float] = []
+
+    async def call(first: int, end_s: float) -> None:
+        index = first
+        while (asked_s := time.perf_counter()) < end_s:
+            await client.score(samples[index % len(samples)])
+            answered_s = time.perf_counter()
+            if answered_s <= end_s:
+                latencies_s.append(answered_s - asked_s)
+            index += callers
+
+    async with AsyncRewardClient(url, model=model, max_in_flight=2 * callers) as client:
+        await client.score(samples[0])
+        end_s = time.perf_counter() + seconds
+        await asyncio.gather(*(call(first, end_s) for first in range(callers)))
+    return latencies_s
+
+
+def _apply(setting: Setting, repository: Path) -> None:
+    """Rewrites the configurations, which are links until then."""
+    for name, config in _configs(repository).items():
+        config.max_batch_size = setting.max_batch_size
+        for group in config.instance_group:
+            group.count = setting.instances
+            config.parameters[THREADS_PARAMETER].string_value = str(setting.torch_threads)
+        file = repository / name / CONFIG_FILE
+        file.unlink()
+        file.write_text(render(config))
+
+
+def _configs(repository: Path) -> dict[str, pb.ModelConfig]:
+    return {file.parent.name: parse(file.read_text()) for file in sorted(repository.glob(f"*/{CONFIG_FILE}"))}

@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: MIT
+"""The gateway as a FastAPI application."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import anyio
+from fastapi import APIRouter, Depends, FastAPI, HTTPException, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.middleware.cors import CORSMiddleware
+from fastapi.openapi.utils import get_openapi
+from fastapi.responses import JSONResponse
+from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
+from pydantic.json_schema import models_json_schema
+from starlette.exceptions import HTTPException as StarletteHTTPException
+from starlette.requests import ClientDisconnect
+
+from rfm_client.async_client import AsyncRewardClient
+from rfm_client.contract import errors
+from rfm_client.contract.names import DEFAULT_MODEL
+from rfm_client.transport.access import Access
+from rfm_gateway import schema
+from rfm_gateway.body import Admitted, Batch, BodyLimits, read_json, read_multipart
+from rfm_gateway.folder import AllowedFolder
+from rfm_gateway.leaving import CallerLeftError, while_connected
+from rfm_gateway.limits import MIB, Limits
+from rfm_gateway.memory import RETRY_AFTER
+from rfm_gateway.observe import CALLER_LEFT, REQUEST_ID_HEADER, Metrics, Observed
+from rfm_gateway.scoring import Scorer
+from rfm_gateway.state import State
+
+_KEY_HEADER = APIKeyHeader(name="X-API-Key", auto_error=False)  # FastAPI looks annotations up in the module
+_KEY_BEARER = HTTPBearer(auto_error=False)
+
+_REFERENCE = "#/components/schemas/{model}"
+_MODELS = (schema.EvaluateBatchRequest, schema.InvalidRequest, schema.Failure)
+_STATUS_OF = {  # of an answer, by what went wrong behind it
+    errors.ServerUnavailableError: 503,
+    errors.ModelNotFoundError: 503,
+    errors.DeadlineExceededError: 504,
+    errors.InferenceFailedError: 502,
+    errors.AccessDeniedError: 502,  # the gateway's own credentials, not the caller's
+}
+
+logger = logging.getLogger("rfm_gateway")
+
+
+@dataclass(frozen=True)
+class GatewaySettings:
+    """How a gateway works.
+
+    triton_url: ``grpc://host:port`` or ``http://host:port``, or with TLS ``grpcs://`` or ``https://``
+    access: certificates, and what Triton is shown
+    metrics_url: of Triton's metrics; None: port 8002 of the same host
+    model: name under which the checkpoint was exported
+    limits: what it takes on
+    api_key: which requests must show, but for those of health and documentation; None: none
+    cors_origins: from which browsers may ask
+    folder: whose files requests may name; None: none
+    """
+
+    triton_url: str
+    access: Access = field(default_factory=Access)
+    metrics_url: str | None = None
+    model: str = DEFAULT_MODEL
+    limits: Limits = field(default_factory=Limits)
+    api_key: str | None = None
+    cors_origins: tuple[str, ...] = ()
+    folder: Path | None = None
+
+
+def create_app(settings: GatewaySettings) -> FastAPI:
+    """The application. Raises OSError for a folder that is not there, ValueError for a URL that is none."""
+    folder = AllowedFolder(settings.folder, settings.limits.max_body_mib * MIB)
+    metrics = Metrics()
+    client = AsyncRewardClient(
+        settings.triton_url,
+        model=settings.model,
+        timeout_s=settings.limits.timeout,
+        retry=False,  # whoever asks is told at once, and decides
+        max_in_flight=settings.limits.max_in_flight,
+        **settings.access.options,
+    )
+
+    @asynccontextmanager
+    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        async with client:
+            yield
+
+    app = FastAPI(title="RFM evaluation gateway", summary="Rewards for robot trajectories.", lifespan=lifespan)
+    app.add_middleware(Observed, metrics=metrics, limits=settings.limits)
+    if settings.cors_origins:
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings.cors_origins,
+            allow_methods=["GET", "POST"],
+            allow_headers=["*"],
+            expose_headers=[REQUEST_ID_HEADER],
+        )
+    state = State(client, settings.triton_url, settings.metrics_url, settings.model, settings.access)
+    for router in (_health(state), _guarded(settings, Scorer(client, folder, settings.limits.timeout), state, metrics)):
+        app.include_router(router)
+    _answer_errors(app)
+    app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]  # FastAPI's way to extend it
+    return app
+
+
+def _guarded(settings: GatewaySettings, scorer: Scorer, state: State, metrics: Metrics) -> APIRouter:
+    """Everything that the key guards."""
+    guards = [] if settings.api_key is None else [Depends(_key_check(settings.api_key))]
+    router = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
+    limits = BodyLimits(settings.limits.max_body_mib * MIB, settings.limits.max_memory_mib * MIB)
+
+    async def evaluated(request: Request, read: Callable[[Admitted], Awaitable[Batch]]) -> Response:
+        with limits.admitted(request) as admitted:
+            await admitted.wait_for_room(request.state.begin_by)
+            with anyio.fail_after(settings.limits.timeout):
+                batch = await read(admitted)
+            scoring = scorer.evaluate(batch, admitted.share, request.state.request_id)
+            answer = await while_connected(request, scoring)
+        for sample in batch.samples:
+            metrics.samples.labels(sample.sample_type).inc()
+        return Response(answer.model_dump_json(), media_type="application/json")
+
+    @router.post(
+        "/evaluate_batch",
+        response_model=schema.EvaluateBatchAnswer,
+        responses={422: {"model": schema.InvalidRequest}, **_failures(408, 413, 502, 503, 504)},
+        openapi_extra=_body("application/json", {"$ref": _REFERENCE.format(model="EvaluateBatchRequest")}),
+    )
+    async def evaluate_batch(request: Request) -> Response:
+        """Score samples that come as JSON."""
+        return await evaluated(request, read_json)
+
+    @router.post(
+        "/evaluate_batch_npy",
+        response_model=schema.EvaluateBatchAnswer,
+        responses={422: {"model": schema.InvalidRequest}, **_failures(400, 408, 413, 415, 502, 503, 504)},
+        openapi_extra=_body("multipart/form-data", _MULTIPART),
+    )
+    async def evaluate_batch_npy(request: Request) -> Response:
+        """Score samples whose arrays come as .npy files: fields `sample_0`, `sample_1`, ... hold each sample as JSON,
+        in which `{"__numpy_file__": name}` stands for the array in the part of that name.
+        """
+        return await evaluated(request, read_multipart)
+
+    @router.get("/gpu_status", responses=_failures(502, 503, 504))
+    async def gpu_status() -> schema.GpuStatus:
+        """What the devices do that models run on."""
+        return await state.gpu_status()
+
+    @router.get("/model_info", responses=_failures(502, 503, 504))
+    async def model_info() -> schema.ModelInformation:
+        """Which checkpoint is served."""
+        return await state.model_info()
+
+    @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
+    async def metrics_text() -> Response:
+        """The gateway's own metrics, for Prometheus."""
+        return Response(metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+    return router
+
+
+def _health(state: State) -> APIRouter:
+    router = APIRouter()
+
+    @router.get("/health", responses=_failures(502, 503, 504))
+    async def health() -> schema.Health:
+        """Healthy if every model has just scored something."""
+        return await state.health()
+
+    return router
+
+
+_MULTIPART = {
+    "type": "object",
+    "required": ["sample_0"],
+    "properties": {
+        "sample_0": {"type": "string", "description": "A sample as JSON; sample_1 and so on hold the others."},
+        "use_frame_steps": {"type": "string", "enum": ["true", "false"]},
+    },
+    "additionalProperties": {"type": "string", "format": "binary", "description": "An array as a .npy file."},
+}
+
+
+def _body(media_type: str, content: dict[str, Any]) -> dict[str, Any]:
+    return {"requestBody": {"required": True, "content": {media_type: {"schema": content}}}}
+
+
+def _failures(*codes: int) -> dict[int | str, dict[str, Any]]:
+    return {code: {"model": schema.Failure} for code in codes}
+
+
+def _key_check(key: str) -> Callable[..., None]:
+    """A dependency that refuses requests without the key."""
+    expected = key.encode()
+
+    def check(
+        in_header: Annotated[str | None, Depends(_KEY_HEADER)],
+        in_bearer: Annotated[HTTPAuthorizationCredentials | None, Depends(_KEY_BEARER)],
+    ) -> None:
+        given = (in_header or "", in_bearer.credentials if in_bearer is not None else "")
+        matches = [secrets.compare_digest(each.encode(), expected) for each in given]  # both, in the same time
+        if not any(matches):
+            raise HTTPException(
+                401,
+                "key: expected X-API-Key or Authorization: Bearer, got another or none",
+                {"WWW-Authenticate": "Bearer"},
+            )
+
+    return check
+
+
+def _answer_errors(app: FastAPI) -> None:
+    """Every error is told as JSON, and none of bad input is a 500."""
+
+    @app.exception_handler(RequestValidationError)
+    async def invalid(_request: Request, error: RequestValidationError) -> JSONResponse:
+        return JSONResponse({"detail": [dict(each) for each in error.errors()]}, 422)
+
+    @app.exception_handler(TimeoutError)
+    async def slow(_request: Request, _error: TimeoutError) -> JSONResponse:
+        return JSONResponse({"detail": "body: expected all of it in time, got a part"}, 408, {"Connection": "close"})
+
+    @app.exception_handler(ClientDisconnect)
+    async def gone(_request: Request, _error: ClientDisconnect) -> JSONResponse:
+        return JSONResponse({"detail": "body: expected all of it, got a part"}, 400)  # which nobody reads
+
+    @app.exception_handler(CallerLeftError)
+    async def left(_request: Request, error: CallerLeftError) -> JSONResponse:
+        return JSONResponse({"detail": str(error)}, CALLER_LEFT)  # which nobody reads
+
+    @app.exception_handler(errors.RewardError)
+    async def failed(_request: Request, error: errors.RewardError) -> JSONResponse:
+        code = next((code for kind, code in _STATUS_OF.items() if isinstance(error, kind)), 500)
+        return JSONResponse({"detail": str(error)}, code, RETRY_AFTER if code == 503 else None)
+
+    @app.exception_handler(StarletteHTTPException)
+    async def refused(_request: Request, error: StarletteHTTPException) -> JSONResponse:
+        return JSONResponse({"detail": error.detail}, error.status_code, error.headers)
+
+    @app.exception_handler(Exception)
+    async def unexpected(request: Request, error: Exception) -> JSONResponse:
+        logger.error("request %s: unexpected", request.state.request_id, exc_info=error)
+        return JSONResponse({"detail": "the gateway failed; its log has the reason"}, 500)
+
+
+def _openapi(app: FastAPI) -> dict[str, Any]:
+    """With the schemas of bodies, which are read from the stream and not declared as parameters."""
+    if app.openapi_schema is None:
+        document = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
+        _, models = models_json_schema([(model, "validation") for model in _MODELS], ref_template=_REFERENCE)
+        document["components"]["schemas"].update(models["$defs"])
+        app.openapi_schema = document
+    return app.openapi_schema

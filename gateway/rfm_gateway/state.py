@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: MIT
+"""What ``/gpu_status``, ``/health`` and ``/model_info`` tell, from Triton's metrics, statistics and configuration."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rfm_client.async_client import AsyncRewardClient
+from rfm_client.contract.errors import (
+    DeadlineExceededError,
+    ModelNotFoundError,
+    RewardError,
+    ServerError,
+    ServerUnavailableError,
+)
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.names import PROBE_PREFIX
+from rfm_client.contract.samples import Trajectory
+from rfm_client.status import Device, ServerStatus, read_status
+from rfm_client.transport.access import Access
+from rfm_client.transport.deadline import Deadline, timeout
+from rfm_gateway import schema
+
+HEALTH_TIMEOUT_S = 3.5  # of all that is asked; with HEALTH_KEPT_S less than the 5 s within which it is to be true
+PROBE_TIMEOUT_S = 1.5  # of that: a model that takes longer may be busy
+STALL_S = 30.0  # a busy model that finishes nothing for so long does not work: what rfm serve calls a hang
+HEALTH_KEPT_S = 1.0  # so that probes, which need no key, do not keep the models busy
+STATUS_TIMEOUT_S = 5.0
+MS_PER_S = 1e3
+_CANARY_FRAMES = 2
+_CANARY_PX = 64
+
+
+class State:
+    """Asks the server at ``url``, whose metrics are at ``metrics_url``, about ``model``."""
+
+    def __init__(
+        self, client: AsyncRewardClient, url: str, metrics_url: str | None, model: str, access: Access | None = None
+    ) -> None:
+        self._client = client
+        self._url = url
+        self._metrics_url = metrics_url
+        self._model = model
+        self._access = access
+        self._asking = asyncio.Lock()
+        self._asked_s = -HEALTH_KEPT_S
+        self._problem: str | None = None
+        self._devices: schema.GpuStatus | None = None
+        self._stalled: dict[str, _Stalled] = {}
+
+    async def gpu_status(self) -> schema.GpuStatus:
+        """Raises ServerError."""
+        status = await asyncio.to_thread(
+            read_status,
+            self._url,
+            metrics_url=self._metrics_url,
+            timeout_s=STATUS_TIMEOUT_S,
+            access=self._access,
+        )
+        return _gpu_status(status, self._model)
+
+    async def health(self) -> schema.Health:
+        """Within HEALTH_TIMEOUT_S. Raises ServerUnavailableError with the reason when a model does not answer."""
+        async with self._asking:
+            if time.monotonic() - self._asked_s >= HEALTH_KEPT_S:
+                deadline = Deadline(HEALTH_TIMEOUT_S)
+                self._problem = await self._ask_all(deadline)
+                self._devices = await self._read_devices(deadline) if self._problem is None else None
+                self._asked_s = time.monotonic()
+            problem, devices = self._problem, self._devices
+        if problem is not None:
+            raise ServerUnavailableError(problem)
+        if devices is None:
+            return schema.Health(status="healthy", available_gpus=None, total_gpus=None)
+        return schema.Health(status="healthy", available_gpus=devices.available_gpus, total_gpus=devices.total_gpus)
+
+    async def model_info(self) -> schema.ModelInformation:
+        """Raises ServerError."""
+        deadline = Deadline(STATUS_TIMEOUT_S)
+        info = (await self._infos(deadline))[0]
+        parts = info.network.get("parameters", {})
+        total = sum(parts.values())
+        kind = info.network.get("class")
+        return schema.ModelInformation(
+            model_path=info.source,
+            model_version=max(info.versions, key=int, default=None),
+            num_gpus=None if (devices := await self._read_devices(deadline)) is None else devices.total_gpus,
+            experiment_config=dict(info.run_config) or {"model": info.network.get("config", {})},
+            model_architecture={
+                "model_class": kind,
+                "total_parameters": total,
+                "trainable_parameters": 0,  # served weights are frozen
+                "frozen_parameters": total,
+                "trainable_percentage": 0.0,
+                "architecture_summary": [{"name": name, "parameters": count} for name, count in parts.items()],
+            },
+        )
+
+    async def _read_devices(self, deadline: Deadline) -> schema.GpuStatus | None:
+        """None where the metrics cannot be read: scoring does not need them."""
+        try:
+            async with timeout(deadline.remaining_s()):
+                return await self.gpu_status()
+        except (ServerError, asyncio.TimeoutError):  # in Python 3.10 not the built-in one
+            return None
+
+    async def _infos(self, deadline: Deadline) -> list[ModelInfo]:
+        """Of the models for embeddings and for raw frames, as far as they are served now: another version may be."""
+        infos = []
+        missing = None
+        for frames in (False, True):
+            try:
+                left_s = deadline.remaining_s()
+                infos.append(await self._client.model_info(frames=frames, refresh=True, timeout_s=left_s))
+            except ModelNotFoundError as error:
+                missing = error
+        if not infos:
+            assert missing is not None
+            raise missing
+        return infos
+
+    async def _ask_all(self, deadline: Deadline) -> str | None:
+        """Asks every model for a score of next to nothing; the reason of the first that neither has one nor works."""
+        try:
+            infos = await self._infos(deadline)
+            late = [name for name in await asyncio.gather(*map(self._late, infos)) if name is not None]
+            if not late:
+                self._stalled.clear()
+                return None
+            return await self._stall(late, deadline)
+        except RewardError as error:
+            return str(error)
+
+    async def _late(self, info: ModelInfo) -> str | None:
+        """The model's name if it has no score in time. Raises RewardError."""
+        try:
+            await self._client.progress(_canary(info), timeout_s=PROBE_TIMEOUT_S, request_id=PROBE_PREFIX)
+        except DeadlineExceededError:
+            return info.name
+        return None
+
+    async def _stall(self, late: Sequence[str], deadline: Deadline) -> str | None:
+        """Why late models do not work; None: they are busy, or may be. Raises RewardError."""
+        left_s = deadline.remaining_s()
+        status = await asyncio.to_thread(
+            read_status, self._url, metrics_url=self._metrics_url, timeout_s=left_s, access=self._access
+        )
+        now_s = time.monotonic()
+        stalled = {}
+        for name in late:
+            finished = sum(e.requests_succeeded + e.requests_failed for e in status.models if e.name == name)
+            known = self._stalled.get(name)
+            is_known = known is not None and known.num_finished == finished
+            stalled[name] = known if known is not None and is_known else _Stalled(finished, now_s)
+        self._stalled = stalled
+        for name, stall in stalled.items():
+            if now_s - stall.since_s >= STALL_S:
+                return f"{name}: no answer within {PROBE_TIMEOUT_S:g} s, and nothing finished for {STALL_S:g} s"
+        return None
+
+
+@dataclass(frozen=True)
+class _Stalled:
+    """A model that is late. num_finished: requests that it has answered; since_s: when it was first seen at that"""
+
+    num_finished: int
+    since_s: float
+
+
+def _canary(info: ModelInfo) -> Trajectory:
+    if info.video_dim is None or info.text_dim is None:
+        blank = np.zeros((_CANARY_FRAMES, _CANARY_PX, _CANARY_PX, 3), np.uint8)
+        return Trajectory(frames=blank, task="canary")
+    return Trajectory(
+        video_embeddings=np.zeros((_CANARY_FRAMES, info.video_dim), np.float32),
+        text_embedding=np.zeros(info.text_dim, np.float32),
+    )
+
+
+def _gpu_status(status: ServerStatus, model: str) -> schema.GpuStatus:
+    served = {name for device in status.devices for name in device.work}
+    # An ensemble's work is that of its parts: it is left out, and a request counted where it is scored.
+    scorer = model if model in served else f"{model}_frames"
+    parts = {scorer, f"{model}_encoder"}
+    devices = [device for device in status.devices if parts & device.work.keys()] or list(status.devices)
+    if not devices:
+        raise ServerUnavailableError(status.metrics_error or f"{status.metrics_url}: no device is told of")
+    is_waiting = any(entry.requests_pending for entry in status.models)
+    last_used = max((entry.last_used_s for entry in status.models if entry.last_used_s), default=None)
+    stats = {
+        str(number): schema.GpuStats(
+            device=device.name,
+            status="processing" if is_waiting else "ready",
+            total_requests=device.work[scorer].requests if scorer in device.work else 0,
+            total_processing_time=sum(_busy_s(status, device, name) for name in parts),
+            last_used=last_used,
+            utilization=device.utilization,
+            memory_used_bytes=device.memory_used_bytes,
+            memory_total_bytes=device.memory_total_bytes,
+        )
+        for number, device in enumerate(devices)
+    }
+    count = len(devices)
+    return schema.GpuStatus(
+        total_gpus=count,
+        available_gpus=0 if is_waiting else count,
+        max_workers=count,
+        pool_size=count,
+        gpu_stats=stats,
+    )
+
+
+def _busy_s(status: ServerStatus, device: Device, model: str) -> float:
+    """Seconds of a model's batches on one device: of all that Triton tells, the share that its requests had there."""
+    on_all = sum(each.work[model].compute_s for each in status.devices if model in each.work)
+    if model not in device.work or not on_all:
+        return 0.0
+    batches_s = sum(entry.compute_ms for entry in status.models if entry.name == model) / MS_PER_S
+    return batches_s * device.work[model].compute_s / on_all

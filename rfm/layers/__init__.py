@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Parts of networks that more than one family has."""

@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""The networks: one file per model family."""

@@ -1,0 +1,7 @@
+# SPDX-License-Identifier: MIT
+"""Names of the parameters in config.pbtxt that a model process reads."""
+
+THREADS_PARAMETER = "torch_threads"  # parameters of config.pbtxt; rfm_export writes them
+BUDGET_PARAMETER = "token_budget"
+SAMPLE_TOKENS_PARAMETER = "max_sample_tokens"
+DTYPE_PARAMETER = "dtype"  # empty: as the checkpoint and the device decide

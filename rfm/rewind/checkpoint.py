@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: MIT
+"""ReWiND checkpoints: one flat file of weights, the encoders' under a prefix.
+
+Where configuration and weights disagree, the weights decide.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from rfm.checkpoint.content import CheckpointError, cut, is_there, read_json, read_run_config, shown
+from rfm.checkpoint.files import (
+    MAX_COUNT,
+    NETWORK_CONFIG,
+    RUN_CONFIG,
+    WEIGHTS,
+    check_shapes,
+    find_run_config,
+    frame_count,
+    read_weights,
+    take_prefix,
+    trained_frames,
+)
+from rfm.rewind.network import RewindConfig, RewindTransformer
+
+MODEL_TYPE = "rewind_transformer"
+IMAGE_ENCODER_PREFIX = "image_encoder."
+TEXT_ENCODER_PREFIX = "text_encoder."
+
+# Upstream's configurations of before causal_mask, when no network had one, state all of these.
+_FIRST_FIELDS = {"video_feature_dim", "text_feature_dim", "hidden_dim", "num_layers", "num_attention_heads", "max_len"}
+# What no ReWiND network is beyond, nor below 1: whatever is larger is a lie that would only cost memory and time.
+_LIMITS = {
+    "video_feature_dim": MAX_COUNT,
+    "text_feature_dim": MAX_COUNT,
+    "hidden_dim": MAX_COUNT,
+    "num_layers": 1024,
+    "num_attention_heads": MAX_COUNT,
+    "max_len": MAX_COUNT,
+    "progress_bins": MAX_COUNT,
+}
+_LAYERS = "transformer.layers."
+_STATED_TYPES: dict[str, type] = {"num_attention_heads": int, "max_len": int, "causal_mask": bool}
+
+
+@dataclass(frozen=True)
+class RewindCheckpoint:
+    """A ReWiND checkpoint in memory.
+
+    network: weights of RewindTransformer
+    image_encoder, text_encoder: encoder weights without their prefix; empty if the checkpoint has none
+    """
+
+    config: RewindConfig
+    network: dict[str, Tensor]
+    image_encoder: dict[str, Tensor] = field(default_factory=dict)
+    text_encoder: dict[str, Tensor] = field(default_factory=dict)
+
+    def build(self) -> RewindTransformer:
+        """The network with these weights, on the CPU, ready to score. Raises CheckpointError."""
+        self.check()
+        network = RewindTransformer(self.config)
+        network.load_state_dict(self.network, strict=True)
+        return network.eval().requires_grad_(False)
+
+    def check(self) -> None:
+        """Raises CheckpointError unless the weights are those of the network; no memory is taken for it before."""
+        with torch.device("meta"):
+            network = RewindTransformer(self.config)
+        check_shapes(network.state_dict(), self.network)
+
+
+def load_rewind(folder: Path) -> RewindCheckpoint:
+    """The checkpoint in a local folder. Raises CheckpointError."""
+    weights = read_weights(folder)
+    image_encoder = take_prefix(weights, IMAGE_ENCODER_PREFIX)
+    text_encoder = take_prefix(weights, TEXT_ENCODER_PREFIX)
+    checkpoint = RewindCheckpoint(_rewind_config(folder, weights), weights, image_encoder, text_encoder)
+    checkpoint.check()
+    return checkpoint
+
+
+def save_rewind(checkpoint: RewindCheckpoint, folder: Path) -> None:
+    """Writes network and configuration in the layout that ``load_rewind`` reads, without encoders."""
+    folder.mkdir(parents=True)
+    config = {"model_type": MODEL_TYPE, **asdict(checkpoint.config)}
+    (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
+    tensors = {name: tensor.contiguous() for name, tensor in checkpoint.network.items()}
+    save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
+
+
+def _rewind_config(folder: Path, weights: Mapping[str, Tensor]) -> RewindConfig:
+    stated = _stated(folder)
+    has_progress_tokens = "prog_token_A" in weights
+    try:
+        max_len = _shape(weights, "prog_token_A", 3)[1] if has_progress_tokens else _required(stated, "max_len", folder)
+        hidden_dim, video_feature_dim = _shape(weights, "video_proj.weight", 2)
+        config = RewindConfig(
+            video_feature_dim=video_feature_dim,
+            text_feature_dim=_shape(weights, "text_proj.weight", 2)[1],
+            hidden_dim=hidden_dim,
+            num_layers=len({name.split(".")[2] for name in weights if name.startswith(_LAYERS)}),
+            num_attention_heads=_required(stated, "num_attention_heads", folder),
+            max_len=max_len,
+            causal_mask=_required(stated, "causal_mask", folder),
+            use_per_frame_progress_token=has_progress_tokens,
+            progress_bins=_shape(weights, "progress_head.4.weight", 2)[0],
+            has_similarity="similarity_head.0.weight" in weights,
+            trained_frames=_trained_frames(folder),
+        )
+    except KeyError as error:
+        raise CheckpointError(f"{folder}: expected a ReWiND checkpoint, which has {error}") from error
+    for name, most in _LIMITS.items():
+        if not 1 <= getattr(config, name) <= most:
+            raise CheckpointError(f"{folder}: {name}: expected 1 to {most}, got {shown(getattr(config, name))}")
+    if config.hidden_dim % config.num_attention_heads:
+        heads = f"a divisor of the hidden width {config.hidden_dim}"
+        raise CheckpointError(f"{folder}: num_attention_heads: expected {heads}, got {config.num_attention_heads}")
+    return config
+
+
+def _required(stated: Mapping[str, Any], name: str, folder: Path) -> Any:
+    """Raises CheckpointError for what neither weights nor configurations tell."""
+    if name not in stated:
+        places = f"{NETWORK_CONFIG} or model.rewind of {RUN_CONFIG}"
+        raise CheckpointError(f"{folder}: {name}: expected it in {places}, got it in neither; weights do not tell it")
+    return stated[name]
+
+
+def _shape(weights: Mapping[str, Tensor], name: str, rank: int) -> torch.Size:
+    """Raises KeyError if there is no such weight, CheckpointError if it has another number of axes."""
+    shape = weights[name].shape
+    if len(shape) != rank:
+        raise CheckpointError(f"{name}: expected {rank} axes, got {list(shape)}")
+    return shape
+
+
+def _trained_frames(folder: Path) -> int | None:
+    """As ``save_rewind`` wrote it to config.json, else as config.yaml tells it."""
+    if is_there(folder / NETWORK_CONFIG):
+        saved = read_json(folder / NETWORK_CONFIG).get("trained_frames")
+        if saved is not None:
+            return frame_count(saved, f"{folder / NETWORK_CONFIG}: trained_frames")
+    run_config = find_run_config(folder)
+    return None if run_config is None else trained_frames(read_run_config(run_config), run_config)
+
+
+def _stated(folder: Path) -> dict[str, Any]:
+    """What config.json and config.yaml say of the network. Both may lack a field; neither may contradict the other."""
+    sources: dict[str, dict[str, Any]] = {}
+    if is_there(folder / NETWORK_CONFIG):
+        sources[NETWORK_CONFIG] = read_json(folder / NETWORK_CONFIG)
+    run_config = find_run_config(folder)
+    if run_config is not None:
+        model = read_run_config(run_config).get("model") or {}
+        network = model.get("rewind") or {} if isinstance(model, dict) else model
+        if not isinstance(network, dict):
+            raise CheckpointError(f"{run_config}: model.rewind: expected a mapping, got {shown(network)}")
+        sources[RUN_CONFIG] = network
+    model_type = sources.get(NETWORK_CONFIG, {}).get("model_type", MODEL_TYPE)
+    if model_type != MODEL_TYPE:
+        raise CheckpointError(
+            f"{folder / NETWORK_CONFIG}: model_type: expected {MODEL_TYPE}, got {cut(str(model_type))}"
+        )
+    stated: dict[str, Any] = {}
+    for name, kind in _STATED_TYPES.items():
+        values = {source: content[name] for source, content in sources.items() if name in content}
+        for source, value in values.items():
+            if type(value) is not kind:
+                raise CheckpointError(f"{folder}: {name} in {source}: expected {kind.__name__}, got {shown(value)}")
+        if name != "max_len" and len(set(values.values())) > 1:  # weights tell max_len where it matters
+            raise CheckpointError(f"{folder}: {name}: expected {' and '.join(values)} to agree, got {values}")
+        if values:
+            stated[name] = next(iter(values.values()))
+    if any(content.keys() >= _FIRST_FIELDS for content in sources.values()):
+        stated.setdefault("causal_mask", False)
+    return stated

@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: MIT
+"""The ReWiND transformer: frame and text embeddings in; progress, success, preference, similarity out.
+
+B rows, T frames of a trajectory, L tokens, D width, K progress bins (1: continuous progress).
+
+A row is the token sequence ``[text] [first trajectory] ([second trajectory] [query])``. The order of frames
+is known through the causal mask, the embedding added to each trajectory's first frame and, where the
+checkpoint has them, a progress token behind each frame; there is no other positional encoding.
+Architecture: ReWiND (https://arxiv.org/abs/2505.10911) as in the public implementation ``reward_fm``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from rfm.layers.heads import PredictionHead
+from rfm.layers.linear import Linear, linear
+from rfm.rewind.packing import Packing, rounded_up, starts
+
+FEED_FORWARD_RATIO = 4
+
+
+@dataclass(frozen=True)
+class RewindConfig:
+    """What a checkpoint's network looks like; field names as in upstream's config.json where it has them.
+
+    trained_frames: the most frames of a trajectory in training; None: the checkpoint does not say
+    """
+
+    video_feature_dim: int
+    text_feature_dim: int
+    hidden_dim: int
+    num_layers: int
+    num_attention_heads: int
+    max_len: int
+    causal_mask: bool
+    use_per_frame_progress_token: bool
+    progress_bins: int
+    has_similarity: bool
+    trained_frames: int | None = None
+
+    @property
+    def max_frames(self) -> int | None:
+        """The longest trajectory the network can take; None: any length."""
+        return self.max_len if self.use_per_frame_progress_token else None
+
+    @property
+    def tokens_per_frame(self) -> int:
+        """Tokens that one frame adds to a row."""
+        return 2 if self.use_per_frame_progress_token else 1
+
+    def num_tokens(self, num_first: int, num_second: int) -> int:
+        """L of a row of two trajectories of so many frames; num_second = 0: of one trajectory."""
+        query = 1 if num_second else 0
+        return 1 + self.tokens_per_frame * (num_first + num_second) + query
+
+
+@dataclass(frozen=True)
+class RewindBatch:
+    """Rows of any lengths and kinds, packed. F frames of all rows' trajectories, Q rows of two trajectories.
+
+    text: float32 [B, Dt]
+    video: float32 [V, Dv], embeddings of frames; as many as F, or more that mean nothing, unless ``shown`` tells
+    shown: int64 [F], which of ``video`` each frame of a row is (dense mode shows one in many rows); None: in order
+    is_similarity: bool [Q], asks for similarity rather than preference; None: all ask for preference
+    packing: where tokens lie; ``*_at`` are positions in its packed tokens
+    text_at, frame_at, query_at: int64 [B], [F], [Q]
+    place: int64 [F], each frame's number in its trajectory, and max_len more in a second one
+    first_starts, second_starts: int64, those of the F frames that begin a first or second trajectory
+    read_at: int64 [F + Q + room], the tokens whose outputs are read: each frame's last, then the queries
+    """
+
+    text: Tensor
+    video: Tensor
+    shown: Tensor | None
+    is_similarity: Tensor | None
+    packing: Packing
+    text_at: Tensor
+    frame_at: Tensor
+    query_at: Tensor
+    place: Tensor
+    first_starts: Tensor
+    second_starts: Tensor
+    read_at: Tensor
+
+    @classmethod
+    def of(
+        cls,
+        config: RewindConfig,
+        text: Tensor,
+        video: Tensor,
+        num_frames: npt.NDArray[np.int64],
+        *,
+        shown: Tensor | None = None,
+        is_similarity: Tensor | None = None,
+    ) -> RewindBatch:
+        """Rows whose trajectories have int64 [B, 2] frames; the second has 0 in rows of one.
+
+        Raises ValueError for a trajectory of more frames than there are progress tokens.
+        """
+        if config.max_frames is not None and num_frames.max() > config.max_frames:
+            raise ValueError(f"num_frames: expected at most {config.max_frames}, got {num_frames.max()}")
+        first, both = num_frames[:, 0], num_frames.sum(axis=1)
+        has_query = num_frames[:, 1] > 0
+        step = config.tokens_per_frame
+        num_tokens = 1 + step * both + has_query
+        text_at = starts(num_tokens)
+        query_at = (text_at + num_tokens - 1)[has_query]
+        in_row: npt.NDArray[np.int64] = np.arange(both.sum()) - np.repeat(starts(both), both)
+        frame_at = np.repeat(text_at, both) + 1 + step * in_row
+        lengths_of_first = np.repeat(first, both)
+        is_second = in_row >= lengths_of_first
+        place = np.where(is_second, in_row - lengths_of_first + config.max_len, in_row)
+        second_starts = (starts(both) + first)[has_query]
+        read_at = np.zeros(rounded_up(len(frame_at) + len(query_at)), np.int64)
+        read_at[: len(frame_at)] = frame_at + step - 1
+        read_at[len(frame_at) : len(frame_at) + len(query_at)] = query_at
+        positions = (text_at, frame_at, query_at, place, starts(both), second_starts, read_at)
+        packing = Packing.of(num_tokens)
+        return cls(text, video, shown, is_similarity, packing, *map(torch.from_numpy, positions))
+
+    def to(self, device: torch.device, dtype: torch.dtype) -> RewindBatch:
+        """The batch on ``device``, with embeddings of ``dtype``."""
+        parts: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
+        moved: dict[str, Any] = {name: None if part is None else part.to(device) for name, part in parts.items()}
+        moved |= {name: moved[name].to(dtype) for name in ("text", "video")}
+        return RewindBatch(**moved)
+
+
+@dataclass(frozen=True)
+class RewindOutput:
+    """Raw scores of a RewindBatch: progress logits [F, K], success logits [F], query logits [Q]."""
+
+    progress: Tensor
+    success: Tensor
+    query: Tensor
+
+
+class SelfAttention(nn.Module):
+    """Multi-head attention of packed tokens [N, D] to those of their row; parameters named as nn.MultiheadAttention's.
+
+    ``out_proj`` is left to the layer, which needs it of some tokens alone.
+    """
+
+    def __init__(self, config: RewindConfig) -> None:
+        super().__init__()
+        width = config.hidden_dim
+        self.num_heads = config.num_attention_heads
+        self.is_causal = config.causal_mask
+        self.in_proj_weight = nn.Parameter(torch.empty(3 * width, width))
+        self.in_proj_bias = nn.Parameter(torch.zeros(3 * width))
+        self.out_proj = Linear(width, width)
+        nn.init.xavier_uniform_(self.in_proj_weight)
+
+    def forward(self, x: Tensor, packing: Packing) -> Tensor:
+        """[N, D] -> [N, D]. What lies behind the end of a row is never looked at."""
+        padded = packing.padded(linear(x, self.in_proj_weight, self.in_proj_bias))
+        parts = padded.chunk(3, dim=-1)
+        queries, keys, values = (part.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for part in parts)
+        mask = None if self.is_causal else packing.mask
+        attended = F.scaled_dot_product_attention(queries, keys, values, attn_mask=mask, is_causal=self.is_causal)
+        return packing.packed(attended.transpose(1, 2).flatten(2))
+
+
+class EncoderLayer(nn.Module):
+    """Post-norm transformer layer with a ReLU feed-forward; parameters named as nn.TransformerEncoderLayer's."""
+
+    def __init__(self, config: RewindConfig) -> None:
+        super().__init__()
+        width = config.hidden_dim
+        self.self_attn = SelfAttention(config)
+        self.norm1 = nn.LayerNorm(width)
+        self.linear1 = Linear(width, FEED_FORWARD_RATIO * width)
+        self.linear2 = Linear(FEED_FORWARD_RATIO * width, width)
+        self.norm2 = nn.LayerNorm(width)
+
+    def forward(self, x: Tensor, packing: Packing, read_at: Tensor | None = None) -> Tensor:
+        """[N, D] -> [N, D], or [R, D]: of the tokens ``read_at``, int64 [R], alone."""
+        attended = self.self_attn(x, packing)
+        if read_at is not None:
+            attended, x = attended[read_at], x[read_at]
+        x = self.norm1(self.self_attn.out_proj(attended, plus=x))
+        return self.norm2(self.linear2(self.linear1(x, relu=True), plus=x))
+
+
+class Encoder(nn.Module):
+    """A stack of EncoderLayer, the last of which is computed of those tokens alone that are read."""
+
+    def __init__(self, config: RewindConfig) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(EncoderLayer(config) for _ in range(config.num_layers))
+
+    def forward(self, x: Tensor, packing: Packing, read_at: Tensor) -> Tensor:
+        """[N, D] -> [R, D], the tokens at int64 [R]."""
+        for layer in self.layers[:-1]:
+            x = layer(x, packing)
+        return self.layers[-1](x, packing, read_at)
+
+
+class RewindTransformer(nn.Module):
+    """The network; its state dict has upstream's names."""
+
+    def __init__(self, config: RewindConfig) -> None:
+        super().__init__()
+        self.config = config
+        width = config.hidden_dim
+        self.video_proj = Linear(config.video_feature_dim, width)
+        self.text_proj = Linear(config.text_feature_dim, width)
+        self.first_embedding_A = nn.Parameter(torch.randn(1, 1, width))
+        self.first_embedding_B = nn.Parameter(torch.randn(1, 1, width))
+        if config.use_per_frame_progress_token:
+            self.text_position_embedding = nn.Parameter(torch.randn(1, 1, width))
+            self.prog_token_A = nn.Parameter(torch.randn(1, config.max_len, width))
+            self.prog_token_B = nn.Parameter(torch.randn(1, config.max_len, width))
+        self.transformer = Encoder(config)
+        self.progress_head = PredictionHead(width, config.progress_bins)
+        self.success_head = PredictionHead(width, 1)
+        self.preference_token = nn.Parameter(torch.randn(1, 1, width))
+        self.preference_head = PredictionHead(width, 1)
+        if config.has_similarity:
+            self.similarity_token = nn.Parameter(torch.randn(1, 1, width))
+            self.similarity_head = PredictionHead(width, 1)
+
+    def forward(self, batch: RewindBatch) -> RewindOutput:
+        """Raw scores."""
+        hidden = self.transformer(self._tokens(batch), batch.packing, batch.read_at)
+        num_frames, num_queries = len(batch.frame_at), len(batch.query_at)
+        query = self._query_scores(hidden[num_frames : num_frames + num_queries], batch)
+        progress, success = self.progress_head(hidden), self.success_head(hidden).squeeze(-1)
+        return RewindOutput(progress[:num_frames], success[:num_frames], query)
+
+    def _tokens(self, batch: RewindBatch) -> Tensor:
+        """[N + room, D], what the transformer reads."""
+        text = self.text_proj(batch.text)
+        frames = self.video_proj(batch.video)
+        frames = frames[: len(batch.frame_at)] if batch.shown is None else frames[batch.shown]
+        frames[batch.first_starts] += self.first_embedding_A[0]
+        tokens = batch.packing.empty(self.config.hidden_dim, text)
+        if self.config.use_per_frame_progress_token:
+            text = text + self.text_position_embedding[0]
+            of_places = torch.cat([self.prog_token_A[0], self.prog_token_B[0]])
+            tokens[batch.frame_at + 1] = of_places[batch.place]
+        if len(batch.query_at):
+            frames[batch.second_starts] += self.first_embedding_B[0]
+            tokens[batch.query_at] = self._query_tokens(batch)
+        tokens[batch.text_at] = text
+        tokens[batch.frame_at] = frames
+        return tokens
+
+    def _query_tokens(self, batch: RewindBatch) -> Tensor:
+        """[Q or 1, D]: the tokens whose outputs answer the rows' questions."""
+        if batch.is_similarity is None:
+            return self.preference_token[0]
+        return torch.where(batch.is_similarity[:, None], self.similarity_token[0], self.preference_token[0])
+
+    def _query_scores(self, hidden: Tensor, batch: RewindBatch) -> Tensor:
+        """[Q] logits of the query tokens' [Q, D]."""
+        preference = self.preference_head(hidden).squeeze(-1)
+        if batch.is_similarity is None:
+            return preference
+        return torch.where(batch.is_similarity, self.similarity_head(hidden).squeeze(-1), preference)

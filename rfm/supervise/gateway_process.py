@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: MIT
+"""The gateway that ``rfm serve`` runs beside Triton."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Sequence
+
+from rfm.supervise.leftovers import ending_with_parent
+from rfm.supervise.process import KILL_AFTER_S
+from rfm.supervise.restarts import Restarts
+
+
+class GatewayProcess:
+    """Runs the command line from ``start`` to ``stop``; ``look``, called often, starts it again when it has ended."""
+
+    def __init__(self, command: Sequence[str]) -> None:
+        self._command = command
+        self._restarts = Restarts("gateway")
+        self._process: subprocess.Popen[bytes] | None = None
+        self._due_s: float | None = None
+
+    def start(self) -> None:
+        """Starts it."""
+        self._process = subprocess.Popen(
+            self._command, stdin=subprocess.DEVNULL, preexec_fn=ending_with_parent(), start_new_session=True
+        )
+        self._restarts.started()
+
+    def look(self) -> str | None:
+        """Why it was started again; None: it was not. Raises CrashLoopError."""
+        if self._process is None or self._process.poll() is None:
+            return None
+        why = f"exit status {self._process.returncode}"
+        if self._due_s is None:
+            self._due_s = time.monotonic() + self._restarts.pause_s(why)
+        if time.monotonic() < self._due_s:
+            return None
+        self._due_s = None
+        self.start()
+        return why
+
+    def stop(self) -> None:
+        """Has it answer what it has begun, and end; by force after KILL_AFTER_S."""
+        if self._process is None:
+            return
+        if self._process.poll() is None:
+            self._process.terminate()
+        try:
+            self._process.wait(KILL_AFTER_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()

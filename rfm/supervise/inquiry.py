@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: MIT
+"""What a Triton says of itself, asked again and again: does it answer at all, and what does it serve?"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from google.protobuf import text_format
+from tritonclient.grpc.model_config_pb2 import ModelConfig
+
+from rfm.supervise.admin_key import http_headers
+from rfm.supervise.http import NO_ANSWER, Http
+from rfm.supervise.process import TritonServer
+from rfm.supervise.repository_api import READY, ModelVersion, versions_of
+
+INTERVAL_S = 1.0
+LOOKS = 3  # without any answer, at least, before it has to be started again
+
+_DOOR_TIMEOUT_S = 1.5  # at most; a look tries both doors
+_INDEX_TIMEOUT_S = 5.0
+
+Config = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Told:
+    """One answer.
+
+    asked_s: when it was asked for, by time.monotonic
+    configs: of each model, when it was last ready; unreadable: models that are ready, and do not tell theirs
+    """
+
+    asked_s: float
+    versions: Collection[ModelVersion]
+    configs: Mapping[str, Config]
+    ready: frozenset[str]  # models
+    unreadable: frozenset[str]
+
+    def is_unloaded(self, model: str) -> bool:
+        """Whether it was unloaded because somebody wanted that."""
+        return all(entry.is_unloaded for entry in self.versions if entry.name == model)
+
+    def has(self, model: str, version: int) -> bool:
+        """Whether this version of it is ready; -1: any."""
+        ready = {number for name, number in self.in_state(READY) if name == model}
+        return bool(ready) if version == -1 else version in ready
+
+    def in_state(self, *states: str) -> set[tuple[str, int]]:
+        """Models and versions."""
+        return {(entry.name, entry.version or 0) for entry in self.versions if entry.state in states}
+
+
+def serving_just(config: Config, versions: Sequence[int]) -> Config:
+    """A model's configuration, for these versions alone: a file may name others by now."""
+    return {**config, "version_policy": {"specific": {"versions": list(versions)}}}
+
+
+def names_what_was_served(repository: Path, model: str, served: Config) -> bool:
+    """Whether the model's file names the versions of ``served``, which is as ``serving_just`` gives it."""
+    try:
+        config = text_format.Parse((repository / model / "config.pbtxt").read_text(), ModelConfig())
+    except (OSError, UnicodeDecodeError, text_format.ParseError):
+        return False
+    return bool(list(config.version_policy.specific.versions) == served["version_policy"]["specific"]["versions"])
+
+
+class Inquiry:
+    """Asks a server that is ready, in a thread.
+
+    silent_s: how long it may give no answer, to LOOKS looks in a row, before it has to be started again
+    """
+
+    def __init__(self, server: TritonServer, silent_s: float) -> None:
+        endpoints = server.endpoints
+        self._http = Http(endpoints.http_host, endpoints.http_port)
+        # While the threads of HTTP wait for models that are loaded, this one answers still.
+        self._metrics = Http(endpoints.host, endpoints.metrics_port)
+        self._headers = http_headers(server.admin_key)
+        self._configs: dict[str, Config] = {}
+        self._silent_s = silent_s
+        self._door_timeout_s = min(silent_s / LOOKS / 2, _DOOR_TIMEOUT_S)
+        self._silent_since_s: float | None = None
+        self._failed_looks = 0
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._ask_for_ever, name="rfm-inquiry", daemon=True)
+        self.told: Told | None = None  # the latest
+
+    def start(self) -> None:
+        """Asks from now on."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Asks no more."""
+        self._closed.set()
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether it has not answered for ``silent_s``, and has to be started again."""
+        silent_since_s = self._silent_since_s
+        if silent_since_s is None or self._failed_looks < LOOKS:
+            return False
+        return time.monotonic() - silent_since_s >= self._silent_s
+
+    @property
+    def is_answered(self) -> bool:
+        """Whether it has answered the last look."""
+        return self._silent_since_s is None
+
+    def _ask_for_ever(self) -> None:
+        while not self._closed.is_set():
+            asked_s = time.monotonic()
+            self.look()
+            self._closed.wait(max(INTERVAL_S - (time.monotonic() - asked_s), 0.0))
+
+    def look(self) -> None:
+        """Asks once."""
+        asked_s = time.monotonic()
+        if self._answers(self._http, "/v2") or self._answers(self._metrics, "/metrics"):
+            self._silent_since_s, self._failed_looks = None, 0
+            with suppress(*NO_ANSWER):  # it is asked again
+                self.told = self._ask()
+        else:
+            self._failed_looks += 1
+            self._silent_since_s = self._silent_since_s or asked_s
+
+    def _answers(self, door: Http, path: str) -> bool:
+        try:
+            door.request("GET", path, self._door_timeout_s)
+        except NO_ANSWER:
+            return False
+        return True
+
+    def _ask(self) -> Told:
+        asked_s = time.monotonic()
+        path = "/v2/repository/index"
+        versions = versions_of(self._http.get_json(path, _INDEX_TIMEOUT_S, method="POST", headers=self._headers))
+        loaded = sorted({entry.name for entry in versions if entry.is_ready})
+        for model in loaded:
+            numbers = [entry.version for entry in versions if entry.name == model and entry.is_ready and entry.version]
+            path = f"/v2/models/{quote(model, safe='')}/versions/{max(numbers, default=1)}/config"
+            with suppress(*NO_ANSWER):  # the others are looked after
+                self._configs[model] = serving_just(self._http.get_json(path), numbers)
+        known = [model for model in loaded if model in self._configs]
+        ready = frozenset(model for model in known if self._is_ready(self._configs[model]))
+        return Told(asked_s, versions, dict(self._configs), ready, frozenset(loaded) - frozenset(known))
+
+    def _is_ready(self, config: Config) -> bool:
+        """An ensemble, which nobody else asks, is asked; a model that is not made of others has a canary."""
+        if "ensemble_scheduling" not in config:
+            return True
+        path = f"/v2/models/{quote(config['name'], safe='')}/ready"
+        status, _ = self._http.request("GET", path, self._door_timeout_s)
+        return status == HTTPStatus.OK

@@ -1,0 +1,304 @@
+# SPDX-License-Identifier: MIT
+"""One tritonserver process: started, ready, stopped, and nothing of it left behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from http.client import HTTPException
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+import tritonclient.http
+from tritonclient.utils import InferenceServerException
+
+from rfm.config import DEFAULT_HOST, ServeConfig
+from rfm.supervise.admin_key import VARIABLE, http_headers, new_key, restrictions
+from rfm.supervise.arguments import check_arguments
+from rfm.supervise.exposure import GrpcTls, check_before_start, check_version, size_limits
+from rfm.supervise.installation import Installation, ServerStartError
+from rfm.supervise.leftovers import Claim, ending_with_parent
+from rfm.supervise.own_tls import OwnTls
+from rfm.supervise.repository_api import one_line
+from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
+
+POLL_S = 0.1
+EXIT_TIMEOUT_S = 10  # Triton waits this long for requests in flight, and for a stub that is dead
+KILL_AFTER_S = 2 * EXIT_TIMEOUT_S
+NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # a `load` would load all versions anew: their folders have changed
+SECRETS = (VARIABLE, GATEWAY_KEY_VARIABLE)  # variables that neither Triton nor a model process needs
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_REGIONS = "--backend-config=python,shm-region-prefix-name="
+
+
+@dataclass(frozen=True)
+class Endpoints:
+    """Addresses of one server. grpc_tls: gRPC is encrypted; HTTP cannot be, and then listens on 127.0.0.1 alone"""
+
+    host: str = DEFAULT_HOST
+    http_port: int = 8000
+    grpc_port: int = 8001
+    metrics_port: int = 8002
+    grpc_tls: GrpcTls | None = None
+
+    @classmethod
+    def of(cls, config: ServeConfig) -> Endpoints:
+        """The endpoints that a configuration names."""
+        return cls(config.host, config.server_port, config.grpc_port, config.metrics_port, GrpcTls.of(config))
+
+    @classmethod
+    def free(cls) -> Endpoints:
+        """Loopback endpoints on ports that are free now."""
+        sockets = [socket.create_server((DEFAULT_HOST, 0)) for _ in range(3)]
+        ports = [bound.getsockname()[1] for bound in sockets]
+        for bound in sockets:
+            bound.close()
+        return cls(DEFAULT_HOST, *ports)
+
+    @property
+    def http_url(self) -> str:
+        """For RewardClient, over HTTP."""
+        return f"http://{self.http_host}:{self.http_port}"
+
+    @property
+    def http_host(self) -> str:
+        """Where HTTP listens."""
+        return self.host if self.grpc_tls is None else DEFAULT_HOST
+
+    @property
+    def grpc_url(self) -> str:
+        """For RewardClient, over gRPC."""
+        return f"{'grpc' if self.grpc_tls is None else 'grpcs'}://{self.host}:{self.grpc_port}"
+
+    @property
+    def metrics_url(self) -> str:
+        """What Prometheus scrapes."""
+        return f"http://{self.host}:{self.metrics_port}/metrics"
+
+    def check_free(self) -> None:
+        """Raises ServerStartError for a port that is taken or an address that is not this machine's."""
+        listening = (
+            ("HTTP", self.http_host, self.http_port),
+            ("gRPC", self.host, self.grpc_port),
+            ("metrics", self.host, self.metrics_port),
+        )
+        for name, host, port in listening:
+            try:
+                socket.create_server((host, port)).close()
+            except (OSError, OverflowError) as error:
+                expected = f"a free port of this machine at {host}:{port}"
+                number = getattr(error, "errno", None)
+                reason = os.strerror(number) if number and number > 0 else str(error)
+                raise ServerStartError(f"{name}: expected {expected}, got: {reason}") from error
+
+
+class TritonServer:
+    """A tritonserver on ``repository`` with every model of it loaded. A context manager that stops it.
+
+    http_threads: threads that read HTTP requests; None: Triton's choice
+    log: where Triton's log goes; None: this process's standard output and error
+    admin_key: what requests to the restricted APIs must show (``admin_key``); None: a new one, known to this alone
+    ends_with_parent: it is killed when the thread that starts it ends, be it by kill -9
+    accepts_known_vulnerabilities: it may be reached from elsewhere although its Triton has some
+    more_arguments: of tritonserver, such as ``--trace-config=...``; none that are set here
+    """
+
+    def __init__(
+        self,
+        repository: Path,
+        endpoints: Endpoints,
+        installation: Installation,
+        *,
+        http_threads: int | None = None,
+        log: IO[bytes] | None = None,
+        admin_key: str | None = None,
+        accepts_known_vulnerabilities: bool = False,
+        more_arguments: Sequence[str] = (),
+        ends_with_parent: bool = False,
+    ) -> None:
+        self.endpoints = endpoints
+        self.repository = repository
+        self._installation = installation
+        self._http_threads = http_threads
+        self._log = log
+        self._admin_key = admin_key or new_key()
+        self._accepts_known_vulnerabilities = accepts_known_vulnerabilities
+        self._more_arguments = tuple(more_arguments)
+        self._ends_with_parent = ends_with_parent
+        self._claim: Claim | None = None
+        self._own_tls: OwnTls | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._loading: frozenset[str] = frozenset()  # what it was told to load at its start
+
+    @property
+    def models(self) -> list[str]:
+        """Of the repository."""
+        return sorted(file.parent.name for file in self.repository.glob("*/config.pbtxt"))
+
+    @property
+    def pid(self) -> int:
+        """Of the process that was started last."""
+        assert self._process is not None  # started
+        return self._process.pid
+
+    @property
+    def exit_status(self) -> int | None:
+        """None: it runs."""
+        assert self._process is not None  # started
+        return self._process.poll()
+
+    @property
+    def admin_key(self) -> str:
+        """What its restricted APIs ask for."""
+        return self._admin_key
+
+    @property
+    def grpc_options(self) -> Mapping[str, Any]:
+        """With which a RepositoryApi reaches it, once it is started."""
+        return {} if self._own_tls is None else self._own_tls.options
+
+    def signal(self, number: int) -> None:
+        """Sends a signal to the process, if it runs."""
+        if self._process is not None:
+            self._process.send_signal(number)
+
+    def kill(self) -> None:
+        """Ends the process and its children at once."""
+        with suppress(ProcessLookupError):
+            os.killpg(self.pid, signal.SIGKILL)
+
+    def start(self, restored: Collection[str] | None = None) -> None:
+        """Starts the process. Raises ServerStartError for what can be seen to be wrong before.
+
+        restored: models that it loads, and ``wait_ready`` does not insist on; None: all, and it does
+        """
+        models = self.models
+        self._loading = frozenset(models if restored is None else ())
+        if not models:
+            raise ServerStartError(f"repository: expected a folder of models, got {self.repository}")
+        own = self._arguments(sorted(models if restored is None else restored))
+        check_arguments(self._more_arguments, [*own, _REGIONS])
+        self._check_exposure()
+        self.endpoints.check_free()
+        self._claim = Claim()
+        arguments = [*own, f"{_REGIONS}{self._claim.region_prefix}"]
+        arguments += self._installation.lay_out_backends(self._claim.backends)
+        arguments += self._own_tls.arguments(self._claim.backends) if self._own_tls else []
+        arguments += [*size_limits(self._installation, self._more_arguments), *self._more_arguments]
+        try:
+            self._process = subprocess.Popen(
+                [self._installation.executable, *arguments],
+                env=self._environment(),
+                stdin=subprocess.DEVNULL,
+                stdout=self._log,
+                stderr=self._log,
+                preexec_fn=ending_with_parent() if self._ends_with_parent else None,
+                pass_fds=self._claim.lock_files,
+                start_new_session=True,  # a Ctrl-C in the terminal reaches it once, through us
+            )
+        except OSError as error:
+            self._release()
+            program = self._installation.executable
+            raise ServerStartError(f"tritonserver: expected a program at {program}, got: {error.strerror}") from error
+
+    def wait_ready(self) -> None:
+        """Returns when every model is ready. Raises ServerStartError with the reason of one that is not."""
+        assert self._process is not None  # started
+        client = tritonclient.http.InferenceServerClient(f"{self.endpoints.http_host}:{self.endpoints.http_port}")
+        try:
+            while self._process.poll() is None:
+                try:
+                    index = client.get_model_repository_index(headers=http_headers(self._admin_key))
+                except (OSError, EOFError, HTTPException, InferenceServerException):
+                    time.sleep(POLL_S)  # Triton answers nothing while it loads
+                    continue
+                failed = [model for model in index if model.get("state") != "READY" and model["name"] in self._loading]
+                if not failed:
+                    version = client.get_server_metadata().get("version", "")
+                    check_version(self.endpoints.host, version, accepted=self._accepts_known_vulnerabilities)
+                    return
+                reasons = "; ".join(
+                    f"{m['name']}: {one_line(m.get('reason', 'not loaded')) or 'unknown'}" for m in failed
+                )
+                raise ServerStartError(f"models: expected all to be ready, got {reasons}")
+            raise ServerStartError(f"tritonserver: expected to run, got exit status {self._process.returncode}")
+        finally:
+            client.close()
+
+    def stop(self) -> int:
+        """Ends the server gracefully, by force after KILL_AFTER_S, and gives its exit status (0 if it never ran)."""
+        if self._process is None:
+            return 0
+        if self._process.poll() is None:
+            self._process.terminate()
+        try:
+            self._process.wait(KILL_AFTER_S)
+        except subprocess.TimeoutExpired:
+            os.killpg(self._process.pid, signal.SIGKILL)
+        return self._wait()
+
+    def __enter__(self) -> TritonServer:
+        try:
+            self.start()
+            self.wait_ready()
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _arguments(self, models: Sequence[str]) -> list[str]:
+        endpoints = self.endpoints
+        return [
+            f"--model-repository={self.repository}",
+            "--model-control-mode=explicit",
+            *(f"--load-model={model}" for model in models),
+            "--disable-auto-complete-config",
+            "--strict-readiness=false",  # else one version that cannot be loaded makes all not ready
+            "--exit-on-error=false",  # so that the reason of each model that fails can be asked for
+            f"--exit-timeout-secs={EXIT_TIMEOUT_S}",
+            f"--http-address={endpoints.http_host}",
+            f"--http-port={endpoints.http_port}",
+            f"--grpc-address={endpoints.host}",
+            f"--grpc-port={endpoints.grpc_port}",
+            f"--metrics-address={endpoints.host}",
+            f"--metrics-port={endpoints.metrics_port}",
+            *([f"--http-thread-count={self._http_threads}"] if self._http_threads else []),
+            *restrictions(self._admin_key),
+        ]
+
+    def _environment(self) -> dict[str, str]:
+        """That of this process, without its secrets."""
+        own = {name: value for name, value in os.environ.items() if name not in SECRETS}
+        return {**own, **self._installation.environment, **NO_BYTECODE}
+
+    def _check_exposure(self) -> None:
+        check_before_start(self.endpoints.host, self._installation, accepted=self._accepts_known_vulnerabilities)
+        if self.endpoints.grpc_tls is not None:
+            self.endpoints.grpc_tls.check()
+            self._own_tls = OwnTls(self.endpoints.grpc_tls)
+
+    def _wait(self) -> int:
+        """Waits for the server to end and clears away what it leaves; gives its exit status."""
+        assert self._process is not None  # started
+        status = self._process.wait()
+        with suppress(ProcessLookupError):  # a stub that has outlived its server, which ran out of time to end it
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._release()
+        return status
+
+    def _release(self) -> None:
+        if self._claim is not None:
+            self._claim.release()
+            self._claim = None

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: MIT
+"""How soon something that has ended is started again, and when that is given up."""
+
+from __future__ import annotations
+
+import time
+
+from rfm.supervise.installation import ServerStartError
+
+STEADY_S = 60.0  # whatever has run for so long is no part of a crash loop
+MOST = 5  # restarts in a row
+LONGEST_PAUSE_S = 10.0
+_FIRST_PAUSE_S = 0.5
+
+
+class CrashLoopError(ServerStartError):
+    """Something ends again and again."""
+
+
+class Restarts:
+    """Of one process. The first comes at once; those that follow close behind one another come after longer pauses."""
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._row = 0
+        self._running_since_s: float | None = None  # None: it has ended
+
+    def started(self) -> None:
+        """It runs now."""
+        self._running_since_s = time.monotonic()
+
+    def pause_s(self, reason: str) -> float:
+        """How long to wait before the next start, now that it has ended, or could not be started.
+
+        Raises CrashLoopError when it is one.
+        """
+        if self._running_since_s is not None and time.monotonic() - self._running_since_s >= STEADY_S:
+            self._row = 0
+        self._running_since_s = None  # a start that failed does not count as running, however long it took
+        self._row += 1
+        if self._row > MOST:
+            got = f"{self._row} ends, each within {STEADY_S:g} s of a start; the last: {reason}"
+            raise CrashLoopError(f"{self._what}: expected to run, got {got}")
+        return 0.0 if self._row == 1 else min(_FIRST_PAUSE_S * 2.0 ** (self._row - 2), LONGEST_PAUSE_S)

@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: MIT
+"""The status port of ``rfm serve``: is it live, is it ready, and what has it had to do."""
+
+from __future__ import annotations
+
+import json
+import socket
+import sys
+import threading
+from collections.abc import Mapping
+from contextlib import suppress
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+
+from rfm.supervise.installation import ServerStartError
+
+NO_REASON = ""  # the reason why a model is not ready, of one that is
+REQUEST_S = 5.0  # from its connection to its answer
+MOST_CONNECTIONS = 16  # one more takes the place of the oldest
+
+_BUCKETS_S = tuple(digit * 10.0**power for power in range(-3, 2) for digit in (1, 2, 5))
+
+
+class Status:
+    """What is told. ``tell`` is for who knows, the rest for who asks."""
+
+    def __init__(self) -> None:
+        self._reasons: Mapping[str, str] = {}
+        self._asked: set[str] = set()  # models that have a canary
+        self._registry = CollectorRegistry()
+        labelled = {"labelnames": ["model"], "registry": self._registry}
+        self._ready = Gauge("rfm_serve_ready", "1: the model is ready.", **labelled)  # type: ignore[arg-type]
+        self._reason = Gauge(
+            "rfm_serve_not_ready", "1: the model is not ready, and why.", ["model", "reason"], registry=self._registry
+        )
+        self._canary_ok = Gauge("rfm_serve_canary_ok", "1: the last health probe was answered.", **labelled)  # type: ignore[arg-type]
+        self.canary_seconds = Histogram(
+            "rfm_serve_canary_seconds",
+            "From a health probe to its answer.",
+            ["model"],
+            buckets=_BUCKETS_S,
+            registry=self._registry,
+        )
+        self.restarts = Counter(
+            "rfm_serve_restarts",
+            "What was started again because it was dead or hung: triton, gateway, or a model.",
+            ["what"],
+            registry=self._registry,
+        )
+        self.poison_refused = Counter(
+            "rfm_serve_poison_refused",
+            "Requests that were refused because they had ended the model's process.",
+            registry=self._registry,
+        )
+
+    def tell(self, reasons: Mapping[str, str]) -> None:
+        """By model why it is not ready; NO_REASON for one that is. There are no other models."""
+        gone, before, self._reasons = self._reasons.keys() - reasons.keys(), self._reasons, dict(reasons)
+        for model, reason in before.items():
+            if reason not in (NO_REASON, reasons.get(model)):
+                self._reason.remove(model, reason)
+        for model, reason in reasons.items():
+            self._ready.labels(model).set(reason == NO_REASON)
+            if reason != NO_REASON:
+                self._reason.labels(model, reason).set(1)
+        for model in gone:
+            self._ready.remove(model)
+        for model in gone & self._asked:
+            self._asked.remove(model)
+            self._canary_ok.remove(model)
+
+    def tell_down(self, reason: str) -> None:
+        """Why none is ready."""
+        self.tell(dict.fromkeys(self._reasons, reason))
+        for model in self._asked:
+            self.tell_canary(model, is_ok=False)
+
+    def tell_canary(self, model: str, *, is_ok: bool) -> None:
+        """Whether a model's last probe was answered."""
+        self._asked.add(model)
+        self._canary_ok.labels(model).set(is_ok)
+
+    @property
+    def models(self) -> list[str]:
+        """Of which it was told."""
+        return list(self._reasons)
+
+    @property
+    def ready(self) -> tuple[bool, dict[str, Any]]:
+        """Whether all models are ready, and what is told of it."""
+        reasons = self._reasons
+        is_ready = bool(reasons) and all(reason == NO_REASON for reason in reasons.values())
+        models = {model: {"ready": reason == NO_REASON, "reason": reason} for model, reason in reasons.items()}
+        return is_ready, {"ready": is_ready, "models": models}
+
+    def metrics(self) -> bytes:
+        """For Prometheus."""
+        return generate_latest(self._registry)
+
+
+class StatusServer:
+    """Tells a Status over HTTP, at ``/live``, ``/ready`` and ``/metrics``. Raises ServerStartError for a taken port."""
+
+    def __init__(self, host: str, port: int, status: Status) -> None:
+        try:
+            self._server = _BoundedServer((host, port), _handler(status))
+        except OSError as error:
+            raise ServerStartError(f"status: expected a free port at {host}:{port}, got: {error.strerror}") from error
+        self._thread = threading.Thread(target=self._server.serve_forever, name="rfm-status", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Tells no more."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+
+class _BoundedServer(ThreadingHTTPServer):
+    """Whoever is slow loses the connection, and the thread that it holds: after REQUEST_S, or to somebody else."""
+
+    daemon_threads = True
+    request_queue_size = 8 * MOST_CONNECTIONS  # what is beyond it has to try again after a second
+
+    def __init__(self, *arguments: Any) -> None:
+        self._open: dict[socket.socket, None] = {}  # the oldest first
+        self._lock = threading.Lock()
+        super().__init__(*arguments)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        deadline = threading.Timer(REQUEST_S, _cut, [request])
+        deadline.daemon = True  # nobody waits for it at the end
+        with self._lock:
+            self._open[request] = None
+            if len(self._open) > MOST_CONNECTIONS:
+                oldest = next(iter(self._open))
+                del self._open[oldest]
+                _cut(oldest)
+        try:
+            deadline.start()
+            super().process_request_thread(request, client_address)
+        finally:
+            deadline.cancel()
+            with self._lock:
+                self._open.pop(request, None)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Who leaves without an answer is no news."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(request, client_address)
+
+
+def _cut(connection: socket.socket) -> None:
+    with suppress(OSError):  # it is closed
+        connection.shutdown(socket.SHUT_RDWR)
+
+
+def _handler(status: Status) -> type[BaseHTTPRequestHandler]:
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            if self.path == "/live":
+                self._answer(HTTPStatus.OK, b"{}", "application/json")
+            elif self.path == "/ready":
+                is_ready, told = status.ready
+                code = HTTPStatus.OK if is_ready else HTTPStatus.SERVICE_UNAVAILABLE
+                self._answer(code, json.dumps(told).encode(), "application/json")
+            elif self.path == "/metrics":
+                self._answer(HTTPStatus.OK, status.metrics(), CONTENT_TYPE_LATEST)
+            else:
+                self._answer(HTTPStatus.NOT_FOUND, b"{}", "application/json")
+
+        def _answer(self, code: HTTPStatus, body: bytes, content_type: str) -> None:
+            self.send_response(code)
+            self.send_header("Content-Type", content_type)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *_: Any) -> None:
+            """Probes are no news."""
+
+    return Handler

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: MIT
+"""The model processes of a tritonserver ("stubs", one for each instance of a model), as /proc shows them.
+
+Triton does not notice that a stub is dead until it has a request for it, and keeps it as a zombie until the model is
+unloaded. So a stub that is a zombie is one that was killed, or has crashed.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Collection, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from rfm.journal import SUFFIX, Journal
+
+CONFIRM_S = 0.3  # one that was unloaded is a zombie for a moment, too
+STOPPED_S = 3.0  # by SIGSTOP, say, before it counts as hung
+
+SHARED_MEMORY = Path("/dev/shm")
+_PROC = Path("/proc")
+_PROGRAM = b"triton_python_backend_stub"
+_ZOMBIE, _STOPPED = "Z", "T"
+_PARENT, _STARTED = 1, 19  # places in what _stat gives
+_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+
+
+@dataclass(frozen=True)
+class Stub:
+    """One model process. started_ticks: by the kernel's clock; no other process of this id has it"""
+
+    pid: int
+    started_ticks: int
+    model: str
+    version: int
+    region: str  # name of its shared memory
+
+    @property
+    def serves(self) -> tuple[str, int]:
+        """Model and version."""
+        return self.model, self.version
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether it has not ended."""
+        return self.state not in (None, _ZOMBIE)
+
+    @property
+    def state(self) -> str | None:
+        """As the kernel has it; None: there is no such process."""
+        fields = _stat(self.pid)
+        return fields[0] if fields and int(fields[_STARTED]) == self.started_ticks else None
+
+    @property
+    def started_s(self) -> float:
+        """When, by time.monotonic."""
+        age_s = time.clock_gettime(time.CLOCK_BOOTTIME) - self.started_ticks / _TICKS_PER_S
+        return time.monotonic() - age_s
+
+    @property
+    def journal(self) -> Journal | None:
+        """What it is working on; None: it does not tell."""
+        return Journal.open(SHARED_MEMORY / f"{self.region}_{self.model}{SUFFIX}")
+
+    def kill(self) -> None:
+        """Ends it at once, whatever it does."""
+        if self.is_alive:
+            with suppress(ProcessLookupError):
+                os.kill(self.pid, signal.SIGKILL)
+
+
+class StubWatch:
+    """Sees which stubs of the tritonserver ``triton_pid`` have died, or hang. Those that still load are Triton's.
+
+    hang_s: what one forward pass may take before its stub counts as hung
+    """
+
+    def __init__(self, triton_pid: int, hang_s: float) -> None:
+        self._triton_pid = triton_pid
+        self._hang_s = hang_s
+        self._stubs: set[Stub] = set()
+        self._loaded: set[Stub] = set()
+        self._watched: set[Stub] = set()
+        self._buried: set[Stub] = set()
+        self._since: dict[tuple[Stub, str], float] = {}  # stub and state: when it was first seen so
+        self._lock = threading.Lock()
+
+    def tell(self, ready: Collection[tuple[str, int]], going: Collection[tuple[str, int]], asked_s: float) -> None:
+        """Which versions of which models were ready at ``asked_s``, and which were on their way to or from that.
+
+        The stubs of a version that is ready have loaded. A version that is loaded once more stays ready meanwhile, so
+        its new stubs have loaded when the old ones are gone.
+        """
+        self._scan()
+        with self._lock:
+            self._loaded &= self._stubs
+            old = {stub.serves for stub in self._loaded}
+            new = {stub for stub in self._stubs if stub.serves in ready and stub.serves not in old}
+            self._loaded |= {stub for stub in new if stub.started_s < asked_s}
+            self._watched = {stub for stub in self._loaded if stub.serves not in going}
+
+    def dead(self) -> list[Stub]:
+        """Those that have died and were not buried."""
+        self._look()
+        return [stub for stub in self._now_watched if self._has_been(stub, _ZOMBIE, CONFIRM_S)]
+
+    def hung(self) -> list[tuple[Stub, str]]:
+        """Those that are alive and get nowhere, and why."""
+        found = []
+        for stub in self._now_watched:
+            journal = stub.journal
+            if self._has_been(stub, _STOPPED, STOPPED_S):
+                found.append((stub, f"stopped for {STOPPED_S:g} s"))
+            elif journal is not None and journal.busy_s > self._hang_s and stub.is_alive:
+                found.append((stub, f"no forward pass further for {self._hang_s:g} s"))
+        return found
+
+    def is_getting_on(self, model: str) -> bool:
+        """Whether one of the model's stubs is at work, and none of its forward passes takes too long."""
+        journals = [stub.journal for stub in self._now_watched if stub.model == model and stub.is_alive]
+        return any(journal is not None and 0 < journal.busy_s <= self._hang_s for journal in journals)
+
+    def of_model(self, model: str) -> list[Stub]:
+        """The model's stubs, dead or alive."""
+        self._scan()
+        return [stub for stub in self.all if stub.model == model]
+
+    @property
+    def all(self) -> list[Stub]:
+        """Those that are known."""
+        with self._lock:
+            return list(self._stubs)
+
+    def bury(self, stubs: Iterable[Stub]) -> None:
+        """Stubs that are of no more interest."""
+        with self._lock:
+            self._buried.update(stubs)
+            self._stubs -= self._buried
+            self._loaded -= self._buried
+            self._watched -= self._buried
+
+    @property
+    def _now_watched(self) -> list[Stub]:
+        with self._lock:
+            return list(self._watched)
+
+    def _look(self) -> None:
+        now_s = time.monotonic()
+        states = {stub: stub.state for stub in self._now_watched}
+        seen = {(stub, state) for stub, state in states.items() if state in (_ZOMBIE, _STOPPED)}
+        self._since = {key: self._since.get(key, now_s) for key in seen}
+
+    def _has_been(self, stub: Stub, state: str, duration_s: float) -> bool:
+        since_s = self._since.get((stub, state))
+        return since_s is not None and time.monotonic() - since_s >= duration_s
+
+    def _scan(self) -> None:
+        with self._lock:
+            known = {stub for stub in self._stubs if stub.state is not None}  # a zombie tells nothing of itself
+            found = (_stub(folder, self._triton_pid) for folder in _PROC.glob("[0-9]*"))
+            self._buried = {stub for stub in self._buried if stub.state is not None}
+            self._stubs = known | {stub for stub in found if stub is not None} - self._buried
+
+
+def is_alive(pid: int) -> bool:
+    """Whether there is a process that has not ended."""
+    fields = _stat(pid)
+    return bool(fields) and fields[0] != _ZOMBIE
+
+
+def _stat(pid: int) -> list[str]:
+    """State, parent and so on: what stands behind the name, which may hold anything."""
+    try:
+        return (_PROC / str(pid) / "stat").read_text().rpartition(")")[2].split()
+    except (FileNotFoundError, ProcessLookupError):
+        return []
+
+
+def _stub(folder: Path, parent: int) -> Stub | None:
+    """Its arguments are .../<model>/<version>/model.py, the name of its shared memory, and others."""
+    pid = int(folder.name)
+    fields = _stat(pid)
+    if not fields or int(fields[_PARENT]) != parent:
+        return None
+    try:
+        words = (folder / "cmdline").read_bytes().split(b"\0")
+    except (FileNotFoundError, ProcessLookupError):
+        return None
+    if len(words) < 3 or not words[0].endswith(_PROGRAM):
+        return None
+    version = Path(os.fsdecode(words[1])).parent
+    if not version.name.isdecimal():
+        return None
+    return Stub(pid, int(fields[_STARTED]), version.parent.name, int(version.name), os.fsdecode(words[2]))

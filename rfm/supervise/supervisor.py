@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: MIT
+"""What ``rfm serve`` runs: Triton, and perhaps a gateway, kept answering until it is told to stop."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import closing, nullcontext
+from types import FrameType
+
+from rfm.supervise import leftovers
+from rfm.supervise.gateway_process import GatewayProcess
+from rfm.supervise.inquiry import Config, names_what_was_served
+from rfm.supervise.installation import ServerStartError
+from rfm.supervise.process import POLL_S, STOP_SIGNALS, TritonServer
+from rfm.supervise.restarts import Restarts
+from rfm.supervise.served import Served
+from rfm.supervise.status import Status, StatusServer
+
+
+class Supervisor:
+    """Serves until told to stop (STOP_SIGNALS). To be run by the main thread.
+
+    gateway: command line of a gateway that runs beside the server; None: there is none
+    status_port: of the status (``status``), on the server's host; None: there is none
+    canary_s: how often each model is asked
+    hang_s: how long a model may take to get one forward pass further, or answer nobody, before it counts as hung
+    triton_silent_s: how long Triton may give no answer to several looks in a row before it is killed
+    say: is told what happened, a line each
+    """
+
+    def __init__(
+        self,
+        server: TritonServer,
+        *,
+        gateway: Sequence[str] | None = None,
+        status_port: int | None = None,
+        canary_s: float,
+        hang_s: float,
+        triton_silent_s: float,
+        say: Callable[[str], None],
+    ) -> None:
+        self._server = server
+        self._gateway = None if gateway is None else GatewayProcess(gateway)
+        self._status_port = status_port
+        self._canary_s = canary_s
+        self._hang_s = hang_s
+        self._triton_silent_s = triton_silent_s
+        self._say = say
+        self._status = Status()
+        self._told_to_stop = threading.Event()
+        self._triton_restarts = Restarts("tritonserver")
+        self._served: Served | None = None  # None: it is started, or has ended
+        self._configs: dict[str, Config] | None = None  # of what was served last; None: what the files say
+
+    def run(self) -> int:
+        """Gives Triton's exit status. Raises ServerStartError for what does not start, or ends again and again."""
+        for path in leftovers.clear():
+            self._say(f"removed {path}, which a server left that was killed")
+        self._status.tell(dict.fromkeys(self._server.models, "it is loaded"))
+        for what in ("triton", *self._server.models, *(() if self._gateway is None else ("gateway",))):
+            self._status.restarts.labels(what)  # 0, so that already the first is an increase
+        previous = {number: signal.signal(number, self._stop) for number in STOP_SIGNALS}
+        port, host = self._status_port, self._server.endpoints.host
+        try:
+            with nullcontext() if port is None else closing(StatusServer(host, port, self._status)):
+                return self._serve()
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+
+    def _stop(self, number: int, _frame: FrameType | None) -> None:
+        self._told_to_stop.set()
+        if self._served is None:  # it loads, and would not look
+            self._server.signal(signal.SIGTERM if number == signal.SIGHUP else number)
+
+    def _serve(self) -> int:
+        try:
+            self._start()
+            if self._gateway is not None and self._served is not None:
+                self._gateway.start()
+            while not self._told_to_stop.wait(POLL_S):
+                self._look()
+        except ServerStartError:
+            if not self._told_to_stop.is_set():  # else it ended since it was told to
+                raise
+        finally:
+            self._status.tell_down("it is told to stop")
+            if self._gateway is not None:  # it answers what it has begun, and then the server is stopped
+                self._gateway.stop()
+            self._close_served()
+            status = self._server.stop()
+        return status
+
+    def _start(self) -> None:
+        """Starts Triton, and looks after its models from now on. Raises ServerStartError.
+
+        What was served before is served again, whatever was exported since. A model that cannot be loaded then does
+        not keep the others from being served.
+        """
+        self._server.start(self._restored())
+        if self._told_to_stop.is_set():  # before there was a process to pass it to
+            return
+        self._server.wait_ready()
+        ends = self._server.endpoints
+        urls = f"{ends.grpc_url}, {ends.http_url}, metrics at {ends.metrics_url}"
+        if self._configs is None:
+            self._say(f"ready: {', '.join(self._server.models)} at {urls}")
+        self._triton_restarts.started()
+        self._served = Served(
+            self._server,
+            self._status,
+            canary_s=self._canary_s,
+            hang_s=self._hang_s,
+            triton_silent_s=self._triton_silent_s,
+            say=self._say,
+            restored=self._configs or {},
+        )
+
+    def _restored(self) -> list[str] | None:
+        """The models that Triton loads by itself, before it answers anybody; None: all, for it never served any.
+
+        It can do so by their files alone. Where one of those names other versions by now, all are loaded afterwards.
+        """
+        if self._configs is None:
+            return None
+        is_so = all(names_what_was_served(self._server.repository, *served) for served in self._configs.items())
+        return list(self._configs) if is_so else []
+
+    def _look(self) -> None:
+        """Starts again what has ended. Raises CrashLoopError."""
+        if self._served is not None and self._served.is_silent:
+            self._server.kill()
+            self._start_again(f"no answer for {self._triton_silent_s:g} s")
+        elif self._server.exit_status is not None:
+            self._start_again(f"exit status {self._server.exit_status}")
+        if self._gateway is not None and (why := self._gateway.look()):
+            self._count("gateway", why)
+        if self._served is not None:
+            for model, why in self._served.look():
+                self._count(model, why)
+
+    def _start_again(self, why: str) -> None:
+        """Returns when Triton is ready, or this is told to stop. Raises CrashLoopError."""
+        while not self._told_to_stop.is_set():
+            self._count("triton", why)
+            self._close_served()
+            self._status.tell_down(f"tritonserver is started again, after {why}")
+            self._server.stop()  # what is left of it
+            if self._told_to_stop.wait(self._triton_restarts.pause_s(why)):
+                return
+            try:
+                self._start()
+                return
+            except ServerStartError as error:
+                why = str(error)
+
+    def _count(self, what: str, why: str) -> None:
+        self._status.restarts.labels(what).inc()
+        self._say(f"{what} is started again: {why}")
+
+    def _close_served(self) -> None:
+        if self._served is not None:
+            if self._served.configs is not None:
+                self._configs = self._served.configs
+            self._served.close()
+            self._served = None

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: MIT
+"""The ``rfm_*`` metrics of a model instance, on Triton's metrics endpoint.
+
+To change one is a call to Triton's process, of some 20 us. So a thread makes these calls, with sums where sums do,
+at most every FLUSH_INTERVAL_S; what answers requests only puts what it did into a queue.
+"""
+
+from __future__ import annotations
+
+import threading
+import traceback
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from rfm.execution import Execution
+from rfm.triton_model.asked import OUTCOMES, UNKNOWN_TYPE
+
+FLUSH_INTERVAL_S = 0.25
+IDLE_INTERVAL_S = 5.0  # while nothing is asked
+
+COUNTER, GAUGE, HISTOGRAM = "COUNTER", "GAUGE", "HISTOGRAM"  # as Triton names them
+FRAMES, RETRIES = "frames_total", "out_of_memory_retries_total"
+BATCH_SAMPLES, BATCH_PADDING = "batch_samples", "batch_padding_ratio"
+COLLATE_SECONDS, FORWARD_SECONDS = "collate_seconds", "forward_seconds"
+
+SAMPLES_BUCKETS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
+PADDING_BUCKETS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+BUCKETS_S = tuple(digit * 10.0**power for power in range(-4, 2) for digit in (1, 2, 5))  # 0.1 ms to 50 s
+
+_TOTALS = {
+    FRAMES: "Frames scored.",
+    RETRIES: "Forward passes that ran out of memory and were tried again in halves.",
+}
+_HISTOGRAMS = {
+    BATCH_SAMPLES: ("Samples of one execution.", SAMPLES_BUCKETS),
+    BATCH_PADDING: ("Share of the token slots of an execution's forward passes that were padding.", PADDING_BUCKETS),
+    COLLATE_SECONDS: ("Of one execution, in which batches were made and no forward pass ran.", BUCKETS_S),
+    FORWARD_SECONDS: ("Of one execution's forward passes.", BUCKETS_S),
+}
+
+
+@dataclass
+class Counted:
+    """What came of one batch.
+
+    samples: how many, by (sample type, outcome)
+    num_frames: of the samples that were scored
+    num_executed: samples that ``execution`` was about
+    """
+
+    samples: Counter[tuple[str, str]] = field(default_factory=Counter)
+    num_frames: int = 0
+    num_executed: int = 0
+    execution: Execution = field(default_factory=Execution)
+
+    def totals(self) -> dict[str, int]:
+        """By name of a counter."""
+        return {FRAMES: self.num_frames, RETRIES: self.execution.out_of_memory_count}
+
+    def observed(self) -> dict[str, float]:
+        """By name of a histogram; nothing if no forward pass was spent on anybody."""
+        if not (self.num_executed and self.execution.num_slots):
+            return {}
+        return {
+            BATCH_SAMPLES: self.num_executed,
+            BATCH_PADDING: self.execution.padding_ratio,
+            COLLATE_SECONDS: self.execution.collate_s,
+            FORWARD_SECONDS: self.execution.forward_s,
+        }
+
+
+class Metrics:
+    """Those of one instance; to be closed. Whatever goes wrong with them is logged once, and fails no request.
+
+    labels: that tell the instance
+    checkpoint: labels of rfm_checkpoint_info
+    sample_types: that the model can be asked about
+    """
+
+    def __init__(self, labels: Mapping[str, str], checkpoint: Mapping[str, str], sample_types: Collection[str]) -> None:
+        self._at_work = 0
+        self._queue: SimpleQueue[Counted | None] = SimpleQueue()  # None only wakes the thread
+        self._closing = threading.Event()
+        self._has_failed = False
+        self._thread: threading.Thread | None = None
+        try:
+            self._series = _Series(labels, checkpoint, sample_types)
+        except Exception:  # noqa: BLE001  a Triton without metrics serves all the same
+            self._log_once()
+            return
+        self._thread = threading.Thread(target=self._flush_for_ever, name="rfm-metrics", daemon=True)
+        self._thread.start()
+
+    def at_work_on(self, num_requests: int) -> None:
+        """Tells the size of the batch that is worked on from now on; 0: there is none."""
+        if self._thread is not None and num_requests != self._at_work:
+            self._at_work = num_requests
+            self._queue.put(None)
+
+    def add(self, counted: Counted) -> None:
+        """Counts what came of a batch."""
+        if self._thread is not None:
+            self._queue.put(counted)
+
+    def close(self) -> None:
+        """Returns when all that was added is told, and that the checkpoint is served no more."""
+        if self._thread is None:
+            return
+        self._closing.set()
+        self._queue.put(None)
+        self._thread.join()
+        self._tell(is_served=False)
+
+    def _flush_for_ever(self) -> None:
+        while not self._closing.is_set():
+            first = None
+            with suppress(Empty):
+                first = self._queue.get(timeout=IDLE_INTERVAL_S)
+            self._closing.wait(FLUSH_INTERVAL_S)
+            self._tell(first, is_served=True)
+
+    def _tell(self, first: Counted | None = None, *, is_served: bool) -> None:
+        try:
+            batches = [batch for batch in (first, *_drained(self._queue)) if batch is not None]
+            self._series.tell(batches, at_work=self._at_work, is_served=is_served)
+        except Exception:  # noqa: BLE001  requests are answered all the same
+            self._log_once()
+
+    def _log_once(self) -> None:
+        import triton_python_backend_utils as pb_utils
+
+        if not self._has_failed:
+            self._has_failed = True
+            pb_utils.Logger.log_error(f"metrics cannot be told: {traceback.format_exc()}")
+
+
+class _Series:
+    """The metrics in Triton's process. They outlive this one, and go on where a model is loaded again."""
+
+    def __init__(self, labels: Mapping[str, str], checkpoint: Mapping[str, str], sample_types: Collection[str]) -> None:
+        self._families: list[Any] = []  # a metric dies with its family
+        samples = self._family("samples_total", COUNTER, "Samples, by what became of the request that they were in.")
+        self._samples = {  # all at once, so that already the first failure is an increase
+            (sample_type, outcome): samples.Metric(labels={**labels, "sample_type": sample_type, "outcome": outcome})
+            for sample_type in (*sample_types, UNKNOWN_TYPE)
+            for outcome in OUTCOMES
+        }
+        self._totals = {
+            name: self._family(name, COUNTER, description).Metric(labels=dict(labels))
+            for name, description in _TOTALS.items()
+        }
+        self._histograms = {
+            name: self._family(name, HISTOGRAM, description).Metric(labels=dict(labels), buckets=list(buckets))
+            for name, (description, buckets) in _HISTOGRAMS.items()
+        }
+        at_work = self._family("batch_requests", GAUGE, "Requests of the batch that is worked on now; 0: idle.")
+        self._at_work = at_work.Metric(labels=dict(labels))
+        self._told_at_work: int | None = None
+        info = self._family("checkpoint_info", GAUGE, "1: the checkpoint is served.")
+        model = {name: labels[name] for name in ("model", "version")}
+        self._checkpoint = info.Metric(labels={**model, **checkpoint})
+        self.tell([], at_work=0, is_served=True)
+
+    def _family(self, name: str, kind: str, description: str) -> Any:
+        import triton_python_backend_utils as pb_utils
+
+        kind = getattr(pb_utils.MetricFamily, kind)
+        self._families.append(pb_utils.MetricFamily(name=f"rfm_{name}", description=description, kind=kind))
+        return self._families[-1]
+
+    def tell(self, batches: Iterable[Counted], *, at_work: int, is_served: bool) -> None:
+        """Adds what came of ``batches``."""
+        samples: Counter[tuple[str, str]] = Counter()
+        totals: Counter[str] = Counter()
+        for batch in batches:
+            samples.update(batch.samples)
+            totals.update(+Counter(batch.totals()))
+            for name, value in batch.observed().items():
+                self._histograms[name].observe(value)
+        for key, count in samples.items():
+            self._samples[key].increment(count)
+        for name, total in totals.items():
+            self._totals[name].increment(total)
+        if at_work != self._told_at_work:
+            self._at_work.set(at_work)
+            self._told_at_work = at_work
+        # Every time: where a model is reloaded, the instance that goes says 0 when the one that comes has said 1.
+        self._checkpoint.set(float(is_served))
+
+
+def _drained(queue: SimpleQueue[Counted | None]) -> list[Counted | None]:
+    drained: list[Counted | None] = []
+    with suppress(Empty):
+        while True:
+            drained.append(queue.get_nowait())
+    return drained

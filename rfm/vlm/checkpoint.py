@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: MIT
+"""Vision-language checkpoints: full weights, or LoRA weights that are merged into their base here.
+
+Names of weights become those of VlmRewardModel, by one rename table per form.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from rfm.checkpoint.content import (
+    CheckpointError,
+    cut,
+    expecting,
+    is_there,
+    listed,
+    read_json,
+    read_tensors,
+    shown,
+)
+from rfm.checkpoint.files import (
+    NETWORK_CONFIG,
+    WEIGHTS,
+    check_shapes,
+    read_weights,
+)
+from rfm.vlm.lora import LORA_NAME, merged, scaling
+from rfm.vlm.network import BACKBONES, SMOL, VlmConfig, VlmRewardModel, build_backbone
+from rfm.vlm.run_config import RunConfig
+
+ADAPTER_CONFIG = "adapter_config.json"
+ADAPTER_WEIGHTS = "adapter_model.safetensors"
+CUSTOM_HEADS = "custom_heads.safetensors"
+SETTINGS = "rfm"  # key of our own fields in an exported config.json
+EMBEDDING = "model.language_model.embed_tokens.weight"
+
+# Renames of one form, tried in order on each name; the first that matches is applied.
+_Renames = Sequence[tuple[str, str]]
+_FULL: _Renames = ()
+_SMOL: _Renames = ((r"^model\.model\.", "model."),)
+_LORA_INSIDE: _Renames = ((r"^(model\.\w+)\.base_model\.model\.", r"\1."),)
+_ADAPTER: _Renames = ((r"^base_model\.model\.", "model."),)
+_UNUSED = ("lm_head.weight", "model.lm_head.weight")  # makes text, which no reward head reads
+
+_LAYER_COUNTS = ("num_hidden_layers", "num_layers", "depth")
+MAX_LAYERS = 1024
+
+
+@dataclass(frozen=True)
+class VlmCheckpoint:
+    """A vision-language checkpoint in memory: weights of VlmRewardModel."""
+
+    config: VlmConfig
+    weights: dict[str, Tensor]
+
+    def build(self, dtype: torch.dtype | None = None, attention: str | None = None) -> VlmRewardModel:
+        """The network with these weights, on the CPU, ready to score, in ``dtype`` (None: its own)."""
+        wanted = dtype or self.config.torch_dtype
+        _check_transformers(self.config)
+        network = self._network(wanted, attention)
+        # Parameters only: rotary frequencies stay float32, as in the original.
+        network.load_state_dict({k: v.to(wanted) for k, v in self.weights.items()}, strict=True, assign=True)
+        return network.eval().requires_grad_(False)
+
+    def check(self) -> None:
+        """Raises CheckpointError unless the weights are those of the network; no memory is taken for it before."""
+        _check_layers(self.config.backbone)
+        with expecting("a backbone that transformers can make", NETWORK_CONFIG), torch.device("meta"):
+            network = self._network(self.config.torch_dtype, "sdpa")
+        check_shapes(network.state_dict(), self.weights)
+
+    def _network(self, dtype: torch.dtype, attention: str | None) -> VlmRewardModel:
+        return VlmRewardModel(self.config, build_backbone(self.config, dtype, attention))
+
+
+def load_vlm(folder: Path, base_model: str | None = None, resize_images: bool | None = None) -> VlmCheckpoint:
+    """The checkpoint in a local folder; other arguments as in ``rfm.checkpoint.load``. Raises CheckpointError."""
+    with expecting("a vision-language checkpoint", folder):
+        is_adapter = is_there(folder / ADAPTER_CONFIG)
+        backbone = {} if is_adapter else read_json(folder / NETWORK_CONFIG)
+        if SETTINGS in backbone:  # written by save_vlm, which says all
+            config = _saved_config(backbone)
+            weights = _renamed(read_weights(folder), _renames(config.family))
+        else:
+            run = RunConfig.of(folder)
+            run.check_model_type()
+            if is_adapter:
+                backbone, weights = _adapted(folder, base_model or _base_model_id(run))
+            else:
+                weights = _whole(folder, backbone, run)
+            config = _trained_config(folder, backbone, run, weights, resize_images)
+        weights = {name: tensor for name, tensor in weights.items() if name not in _UNUSED}
+    checkpoint = VlmCheckpoint(config, weights)
+    checkpoint.check()
+    return checkpoint
+
+
+def save_vlm(checkpoint: VlmCheckpoint, folder: Path) -> None:
+    """Writes merged weights and one config.json that says all."""
+    folder.mkdir(parents=True)
+    settings = {name: value for name, value in asdict(checkpoint.config).items() if name != "backbone"}
+    config = {**checkpoint.config.backbone, SETTINGS: settings}
+    (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
+    tensors = {name: tensor.contiguous() for name, tensor in checkpoint.weights.items()}
+    save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
+
+
+def _base_model_id(run: RunConfig) -> str:
+    base = run.get("model.base_model_id", "")
+    if not base:
+        raise CheckpointError(f"{run.file}: expected model.base_model_id (or --base-model), got none")
+    return base
+
+
+def _saved_config(content: Mapping[str, Any]) -> VlmConfig:
+    settings = {**content[SETTINGS]}
+    size = settings.pop("size_px")
+    rest = {name: value for name, value in content.items() if name != SETTINGS}
+    return VlmConfig(backbone=rest, size_px=tuple(size) if size else None, **settings)
+
+
+def _trained_config(
+    folder: Path,
+    backbone: dict[str, Any],
+    run: RunConfig,
+    weights: Mapping[str, Tensor],
+    resize_images: bool | None,
+) -> VlmConfig:
+    family = backbone.get("model_type")
+    if family not in BACKBONES:
+        raise CheckpointError(f"{folder}: model_type: expected one of {', '.join(BACKBONES)}, got {shown(family)}")
+    for name in ("progress_head.4.weight", "frame_pool_attn.weight"):
+        if name not in weights:
+            raise CheckpointError(f"{folder}: expected reward heads, got no {name}")
+    network = run.network()
+    config = VlmConfig(
+        backbone=backbone,
+        progress_bins=weights["progress_head.4.weight"].shape[0],
+        has_similarity="similarity_head.0.weight" in weights,
+        size_px=run.size_px(family, network["multi_image"], resize_images),
+        **network,
+    )
+    if (family == SMOL or config.per_frame_progress_token) and not config.multi_image:
+        why = "SmolVLM" if family == SMOL else "per-frame progress tokens"
+        raise CheckpointError(f"{run.file}: use_multi_image with {why}: expected true, got false")
+    return config
+
+
+def _check_transformers(config: VlmConfig) -> None:
+    """transformers 5 computes other image features for SmolVLM than those that checkpoints were trained on."""
+    if config.family != SMOL:
+        return
+    version = importlib.metadata.version("transformers")
+    if int(version.partition(".")[0]) >= 5:
+        expected = "transformers < 5 for a SmolVLM checkpoint, whose scores would differ"
+        raise CheckpointError(f"transformers: expected {expected}, got {version}")
+
+
+def _renames(family: Any) -> _Renames:
+    return _SMOL if family == SMOL else _FULL
+
+
+def _renamed(weights: Mapping[str, Tensor], renames: _Renames) -> dict[str, Tensor]:
+    def rename(name: str) -> str:
+        for pattern, replacement in renames:
+            changed, count = re.subn(pattern, replacement, name)
+            if count:
+                return changed
+        return name
+
+    return {rename(name): tensor for name, tensor in weights.items()}
+
+
+def _whole(folder: Path, backbone: Mapping[str, Any], run: RunConfig) -> dict[str, Tensor]:
+    """All weights, LoRA's merged."""
+    weights = read_weights(folder)
+    if any(LORA_NAME.fullmatch(name) for name in weights):
+        weights = merged(_renamed(weights, _LORA_INSIDE), scaling(run.file, run.sections["peft"]))
+    return _renamed(weights, _renames(backbone["model_type"]))
+
+
+def _check_layers(config: Any) -> None:
+    """Raises CheckpointError for so many layers that making them would not end."""
+    inner = config.values() if isinstance(config, dict) else config if isinstance(config, list) else ()
+    for part in inner:
+        _check_layers(part)
+    for name in _LAYER_COUNTS if isinstance(config, dict) else ():
+        count = config.get(name)
+        if isinstance(count, (int, float)) and count > MAX_LAYERS:
+            raise CheckpointError(f"{NETWORK_CONFIG}: {name}: expected at most {MAX_LAYERS}, got {shown(count)}")
+
+
+def _adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Configuration of the base model's backbone, and its weights with the adapter merged into them."""
+    adapter_config = read_json(folder / ADAPTER_CONFIG)
+    adapter = _renamed(read_tensors(folder / ADAPTER_WEIGHTS), _ADAPTER)
+    config, base = _read_base(base_model)
+    if EMBEDDING not in adapter:
+        raise CheckpointError(f"{folder / ADAPTER_WEIGHTS}: expected the embedding of the special tokens, got none")
+    factors = {name: tensor for name, tensor in adapter.items() if LORA_NAME.fullmatch(name)}
+    replaced = {name: tensor for name, tensor in adapter.items() if name not in factors}
+    unknown = sorted(replaced.keys() - base.keys())
+    if unknown:
+        raise CheckpointError(
+            f"{folder / ADAPTER_WEIGHTS}: expected weights of {base_model}, got also {listed(unknown)}"
+        )
+    config["text_config"]["vocab_size"] = len(replaced[EMBEDDING])
+    whole = merged(base | replaced | factors, scaling(folder / ADAPTER_CONFIG, adapter_config))
+    return config, whole | read_tensors(folder / CUSTOM_HEADS)
+
+
+def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The backbone of a base model: its configuration and its weights, named as in VlmRewardModel."""
+    import transformers
+
+    try:
+        config = transformers.AutoConfig.from_pretrained(base_model, trust_remote_code=False)  # else it asks the user
+        if config.model_type not in BACKBONES:
+            known = ", ".join(BACKBONES)
+            raise CheckpointError(f"base model {base_model}: expected one of {known}, got {config.model_type}")
+        network, loaded = getattr(transformers, BACKBONES[config.model_type]).from_pretrained(
+            base_model, use_safetensors=True, dtype="auto", output_loading_info=True
+        )
+    except (OSError, RecursionError, ValueError) as error:
+        hint = "name its folder with --base-model"
+        raise CheckpointError(f"base model {base_model}: cannot be had: {cut(str(error))} ({hint})") from error
+    if loaded["missing_keys"]:
+        raise CheckpointError(f"base model {base_model}: missing keys: {sorted(loaded['missing_keys'])}")
+    return config.to_dict(), {f"model.{name}": tensor for name, tensor in network.state_dict().items()}

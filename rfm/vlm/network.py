@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: MIT
+"""Reward heads on a vision-language backbone: RFM and Robometer checkpoints.
+
+B rows, L tokens, D width, F frames (in video mode: temporal groups) of all rows together, K progress bins.
+``transformers`` carries the backbone. Ours is how its last hidden states (behind the final norm) are read: a
+frame's state is pooled over a span of tokens, a question's is that of its token.
+"""
+
+from __future__ import annotations
+
+import inspect
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias
+
+import torch
+from torch import Tensor, nn
+
+from rfm.layers.heads import PredictionHead
+
+Pooling: TypeAlias = Literal["mean", "boundary", "attention"]
+
+BACKBONES = {"qwen2_5_vl": "Qwen2_5_VLModel", "qwen3_vl": "Qwen3VLModel", "smolvlm": "SmolVLMModel"}
+SMOL = "smolvlm"
+
+
+@dataclass(frozen=True)
+class VlmConfig:
+    """What a checkpoint's network looks like and how it was trained to be asked.
+
+    backbone: transformers' configuration of it (config.json)
+    dtype: of all parameters, heads included
+    multi_image: each frame is an image of its own; else a trajectory is one video
+    per_frame_progress_token: a progress token behind each image carries its state
+    frame_pooling: else, how an image's tokens make up its state; boundary: the last one
+    pooling_temperature: of attention pooling
+    average_temporal_patches: in video mode, a group's tokens are averaged; else the token behind them is read
+    progress_in_preference: questions of preference ask for progress too
+    size_px: height and width that every frame is brought to; None: each its own
+    trained_frames: the most frames of a trajectory in training; None: the checkpoint does not say
+    """
+
+    backbone: dict[str, Any] = field(hash=False)
+    dtype: Literal["float32", "bfloat16", "float16"]
+    multi_image: bool
+    per_frame_progress_token: bool
+    frame_pooling: Pooling
+    pooling_temperature: float
+    average_temporal_patches: bool
+    progress_bins: int
+    has_similarity: bool
+    progress_in_preference: bool
+    size_px: tuple[int, int] | None
+    base_model_id: str
+    trained_frames: int | None = None
+
+    @property
+    def family(self) -> str:
+        """Name of the backbone's kind: a key of BACKBONES."""
+        return str(self.backbone["model_type"])
+
+    @property
+    def pads_left(self) -> bool:
+        """On which side the checkpoint was trained to be padded."""
+        return self.family == SMOL
+
+    @property
+    def hidden_dim(self) -> int:
+        """D."""
+        return int(self.backbone["text_config"]["hidden_size"])
+
+    @property
+    def torch_dtype(self) -> torch.dtype:
+        """``dtype`` as torch has it."""
+        return {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}[self.dtype]
+
+
+@dataclass(frozen=True)
+class VlmBatch:
+    """Conversations, padded to the longest.
+
+    inputs: the backbone's arguments
+    spans: int64 [F, 3], row and first and behind-the-last token of each frame's state
+    query_rows, query_tokens: int64 [Q], where the questions' tokens stand
+    """
+
+    inputs: dict[str, Tensor]
+    spans: Tensor
+    query_rows: Tensor
+    query_tokens: Tensor
+
+    def to(self, device: torch.device, dtype: torch.dtype) -> VlmBatch:
+        """The batch on ``device``, pixels in ``dtype``."""
+        inputs = {
+            name: tensor.to(device, dtype if tensor.is_floating_point() else None, non_blocking=True)
+            for name, tensor in self.inputs.items()
+        }
+        rest = (tensor.to(device) for tensor in (self.spans, self.query_rows, self.query_tokens))
+        return VlmBatch(inputs, *rest)
+
+
+@dataclass(frozen=True)
+class VlmOutput:
+    """Raw scores: progress logits [F, K], success logits [F], preference and similarity logits [Q]."""
+
+    progress: Tensor
+    success: Tensor
+    preference: Tensor
+    similarity: Tensor | None
+
+
+class VlmRewardModel(nn.Module):
+    """Backbone and heads; the heads' names are upstream's."""
+
+    def __init__(self, config: VlmConfig, backbone: nn.Module) -> None:
+        super().__init__()
+        self.config = config
+        self.model = backbone
+        width = config.hidden_dim
+        self.progress_head = PredictionHead(width, config.progress_bins)
+        self.success_head = PredictionHead(width, 1)
+        self.preference_head = PredictionHead(width, 1)
+        if config.has_similarity:
+            self.similarity_head = PredictionHead(width, 1)
+        self.frame_pool_attn = nn.Linear(width, 1, bias=False)
+        self._accepted = set(inspect.signature(backbone.forward).parameters)
+
+    def forward(self, batch: VlmBatch) -> VlmOutput:
+        """Raw scores of every frame and question of the batch."""
+        inputs = {name: tensor for name, tensor in batch.inputs.items() if name in self._accepted}
+        hidden = self.model(**inputs, use_cache=False).last_hidden_state
+        frames = self._frame_states(hidden, batch.spans)
+        queries = hidden[batch.query_rows, batch.query_tokens]
+        return VlmOutput(
+            self.progress_head(frames),
+            self.success_head(frames).squeeze(-1),
+            self.preference_head(queries).squeeze(-1),
+            self.similarity_head(queries).squeeze(-1) if self.config.has_similarity else None,
+        )
+
+    def _frame_states(self, hidden: Tensor, spans: Tensor) -> Tensor:
+        """[F, D]: each span's states, pooled; a span of one token is that token's state.
+
+        The spans' N tokens lie one span after the other, [N, D], so that a long span costs the others nothing.
+        """
+        rows, starts, stops = spans.unbind(dim=1)
+        lengths = stops - starts
+        span = torch.arange(len(spans), device=spans.device).repeat_interleave(lengths)
+        offset = torch.arange(len(span), device=spans.device) - (lengths.cumsum(0) - lengths)[span]
+        states = hidden[rows[span], starts[span] + offset]
+        if self.config.frame_pooling == "attention" and not self.config.per_frame_progress_token:
+            scores = self.frame_pool_attn(states).squeeze(-1) / self.config.pooling_temperature
+            states = states * _softmax_of_each(scores, lengths, span).unsqueeze(-1)
+            return _sum_of_each(states.float(), lengths).to(hidden.dtype)
+        return (_sum_of_each(states.float(), lengths) / lengths[:, None]).to(hidden.dtype)
+
+
+def _sum_of_each(values: Tensor, lengths: Tensor) -> Tensor:
+    """[F, ...] of float32 [N, ...]: the sum of each segment."""
+    return torch.segment_reduce(values, "sum", lengths=lengths, axis=0)
+
+
+def _softmax_of_each(scores: Tensor, lengths: Tensor, segment: Tensor) -> Tensor:
+    """[N] of [N]: the softmax within each segment; ``segment``: each value's. In float32, given in the scores' type."""
+    largest = torch.segment_reduce(scores.float(), "max", lengths=lengths, axis=0)
+    weights = (scores.float() - largest[segment]).exp()
+    return (weights / _sum_of_each(weights, lengths)[segment]).to(scores.dtype)
+
+
+def build_backbone(config: VlmConfig, dtype: torch.dtype, attention: str | None = None) -> nn.Module:
+    """The backbone with memory for its weights but no values in it; buffers keep the type that they need.
+
+    attention: implementation; None: flash attention where it is installed and can be used, else SDPA
+    """
+    try:
+        import transformers
+        from transformers.utils.import_utils import is_flash_attn_2_available
+    except ImportError as error:
+        raise ImportError('vision-language checkpoints need transformers: pip install ".[vlm]"') from error
+    network = getattr(transformers, BACKBONES[config.family])
+    settings = network.config_class.from_dict(config.backbone)
+    if attention is None:
+        usable = is_flash_attn_2_available() and dtype != torch.float32
+        attention = "flash_attention_2" if usable else "sdpa"
+    with _no_init_weights():
+        backbone: nn.Module = network._from_config(settings, dtype=dtype, attn_implementation=attention)
+    return backbone
+
+
+def _no_init_weights() -> AbstractContextManager[None]:
+    """transformers' own switch, which moved between its major versions."""
+    try:
+        from transformers.initialization import no_init_weights
+    except ImportError:
+        from transformers.modeling_utils import no_init_weights
+    return no_init_weights()

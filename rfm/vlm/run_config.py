@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: MIT
+"""config.yaml of a vision-language training run: the settings that weights do not tell.
+
+docs/checkpoints.md lists every setting, and what decides it where the file lacks its key.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from rfm.checkpoint.content import CheckpointError, read_run_config, shown
+from rfm.checkpoint.files import RUN_CONFIG, find_run_config, frame_count, trained_frames
+from rfm.vlm.network import SMOL
+
+HEADS, VQA = "default", "vqa"  # values of model.model_type: reward heads, and answers in generated text
+DTYPES = ("float32", "bfloat16", "float16")
+POOLINGS = ("mean", "boundary", "attention")
+_SECTIONS = ("model", "data", "training", "peft")
+_DROPPED = ("pairwise_progress", "use_progress_token")  # other ways to prompt that upstream once had
+
+Value = TypeVar("Value", bool, str, float)
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """The sections of a run's config.yaml. A null is a key that is not there, as it is upstream.
+
+    file: where it lies
+    """
+
+    file: Path
+    sections: dict[str, dict[str, Any]]
+
+    @classmethod
+    def of(cls, folder: Path) -> RunConfig:
+        """That of the checkpoint in ``folder``. Raises CheckpointError if there is none, or none of upstream's."""
+        file = find_run_config(folder)
+        if file is None:
+            raise CheckpointError(
+                f"{folder}: expected {RUN_CONFIG} of the training run there, in the folder above, or on main of its "
+                "Hub repository, got none: weights do not tell how the model was shown frames; "
+                f"copy the run's {RUN_CONFIG} into the folder"
+            )
+        content = read_run_config(file)
+        sections = {name: content.get(name) or {} for name in _SECTIONS}
+        for name, section in sections.items():
+            if not isinstance(section, dict):
+                raise CheckpointError(f"{file}: {name}: expected a mapping, got {shown(section)}")
+        if not sections["model"]:
+            raise CheckpointError(f"{file}: model: expected the settings of the training run, got none")
+        return cls(file, sections)
+
+    def check_model_type(self) -> None:
+        """Raises CheckpointError for a checkpoint that upstream does not score by reward heads as they are today."""
+        told, why = self.get("model.model_type", HEADS), ""
+        if told == VQA:
+            why = (
+                ": such a checkpoint answers in generated text, upstream's server and its training collator prompt it "
+                "in different ways, and upstream's successor dropped the type"
+            )
+        if told != HEADS:
+            raise CheckpointError(f"{self.file}: model.model_type: expected {HEADS}, got {shown(told)}{why}")
+        for section in ("model", "data"):
+            for key in _DROPPED:
+                if self.get(f"{section}.{key}", False):
+                    expected = "false (upstream dropped this way to prompt a model)"
+                    raise CheckpointError(f"{self.file}: {section}.{key}: expected {expected}, got true")
+
+    def network(self) -> dict[str, Any]:
+        """Fields of VlmConfig about the network and its prompts, but for the frames' size."""
+        temperature = self.get("model.frame_pooling_attn_temperature", 1.0)
+        if not 0 < temperature < math.inf:
+            where = f"{self.file}: model.frame_pooling_attn_temperature"
+            raise CheckpointError(f"{where}: expected a number above 0, got {shown(temperature)}")
+        return {
+            "dtype": self._one_of("model.torch_dtype", "bfloat16", DTYPES),
+            "multi_image": self._of_either("use_multi_image"),
+            "per_frame_progress_token": self._of_either("use_per_frame_progress_token"),
+            "frame_pooling": self._one_of("model.frame_pooling", "mean", POOLINGS),
+            "pooling_temperature": temperature,
+            "average_temporal_patches": self.get("model.average_temporal_patches", False),
+            "progress_in_preference": self.get("training.predict_pref_progress", False),
+            "base_model_id": self.get("model.base_model_id", ""),
+            "trained_frames": trained_frames(self.sections, self.file),
+        }
+
+    def size_px(self, family: str, multi_image: bool, resize_images: bool | None) -> tuple[int, int] | None:
+        """Height and width to which every frame is brought; None: each frame's own size is where resizing begins.
+
+        resize_images: whether that size holds for images, too; None: refuse a checkpoint for which it matters
+        """
+        if family == SMOL:  # whose images have a size of their own
+            return None
+        keys = ("resized_height", "resized_width")
+        if not multi_image:
+            for key in keys:
+                if key not in self.sections["data"]:  # upstream's default was 224 first and null later
+                    raise CheckpointError(f"{self.file}: data.{key}: expected a number or null, got no such key")
+        height, width = (frame_count(self.sections["data"].get(key), f"{self.file}: data.{key}") for key in keys)
+        if height is None or width is None:
+            return None
+        if multi_image and resize_images is None:
+            raise CheckpointError(
+                f"{self.file}: data.resized_height, data.resized_width: expected null for a multi-image checkpoint, or "
+                f"resize_images to say whether it was trained with them, got {height} and {width}: upstream brought "
+                "images to that size before 2026-01-21 and has ignored it since; export with --resize-images a run "
+                "of before that day, and with --no-resize-images a later one"
+            )
+        return (height, width) if resize_images or not multi_image else None
+
+    def get(self, place: str, default: Value) -> Value:
+        """The value at ``section.key``, of the default's type; the default where there is none."""
+        section, _, key = place.partition(".")
+        value = self.sections[section].get(key)
+        if value is None:
+            return default
+        if type(value) is int and type(default) is float:
+            value = float(value)
+        if type(value) is not type(default):
+            raise CheckpointError(f"{self.file}: {place}: expected {type(default).__name__}, got {shown(value)}")
+        return value
+
+    def _one_of(self, place: str, default: str, known: tuple[str, ...]) -> str:
+        value = self.get(place, default).removeprefix("torch.")
+        if value not in known:
+            raise CheckpointError(f"{self.file}: {place}: expected one of {known}, got {shown(value)}")
+        return value
+
+    def _of_either(self, key: str) -> bool:
+        """Upstream has it twice: its network reads that of ``model``, its collator that of ``data``."""
+        places = [f"{name}.{key}" for name in ("model", "data") if self.sections[name].get(key) is not None]
+        told = {place: self.get(place, False) for place in places}
+        if len(set(told.values())) > 1:
+            got = " and ".join(f"{place} {str(value).lower()}" for place, value in told.items())
+            mend = "set both to how the run showed frames"
+            raise CheckpointError(f"{self.file}: expected {' and '.join(places)} to agree, got {got}; {mend}")
+        return any(told.values())
