@@ -5,6 +5,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed
+TOOL := PYTHONPATH=tests/support:tools/faults $(BIN)/python
 
 .PHONY: demo test check parity rollout bench bench-full perf chaos chaos-full soak format model_repository clean \
   ops-check ops-tools audit lock mutate
@@ -23,11 +24,11 @@ check: $(INSTALLED)
 
 # Every reference case through Triton: how far are the scores from the original's?
 parity: $(INSTALLED)
-	$(BIN)/python tests/parity.py
+	$(TOOL) tools/parity.py
 
 # Two versions take turns while 32 callers ask, half over gRPC and half over HTTP: is a request lost?
 rollout: $(INSTALLED)
-	$(BIN)/python tests/rollout.py
+	$(TOOL) tools/faults/rollout.py
 
 # This server beside the bare engine, the FastAPI server's design, LitServe and mosec, in one run.
 bench: $(INSTALLED)
@@ -47,29 +48,29 @@ perf: $(INSTALLED)
 
 # Faults while callers ask: processes killed and stopped, full memory and disks, overload, broken requests, killed exports.
 chaos: $(INSTALLED)
-	$(BIN)/python tests/chaos.py
-	$(BIN)/python tests/fuzz.py
-	$(BIN)/python tests/kill_export.py --kills 10
+	$(TOOL) tools/faults/chaos.py
+	$(TOOL) tools/faults/fuzz.py
+	$(TOOL) tools/faults/kill_export.py --kills 10
 
 # The same with 100 killed exports. A quarter of an hour.
 chaos-full: $(INSTALLED)
-	$(BIN)/python tests/chaos.py
-	$(BIN)/python tests/fuzz.py
-	$(BIN)/python tests/kill_export.py --kills 100
+	$(TOOL) tools/faults/chaos.py
+	$(TOOL) tools/faults/fuzz.py
+	$(TOOL) tools/faults/kill_export.py --kills 100
 
 # Half an hour at half of what can be served: do memory and latency stay?
 soak: $(INSTALLED)
-	$(BIN)/python tests/chaos.py --soak
+	$(TOOL) tools/faults/chaos.py --soak
 
 # Do the tests see small faults? 220 changes of one operator, constant, index or branch, each tried by the tests of its
 # file. Three quarters of an hour on two cores.
 mutate: $(INSTALLED)
-	$(BIN)/python tests/mutate.py
+	$(TOOL) tools/mutation/mutate.py
 
 # What docker/ holds, as far as it can be checked without a container engine or a cluster: alerts and recording rules on
 # made-up series, they and the dashboard on a live Prometheus and Triton; Dockerfile and compose file; Kubernetes.
 ops-check: ops-tools
-	$(BIN)/pytest tests/test_monitoring.py tests/test_docker.py tests/test_kubernetes.py
+	$(BIN)/pytest tests/ops
 
 # Programs of Debian and Ubuntu that tests run. Prometheus is unpacked into $(VENV): installed, it starts a service.
 AS_ROOT = $(shell if [ "$$(id -u)" = 0 ]; then :; elif sudo -n true 2>/dev/null; then echo sudo -n; else echo false; fi)

@@ -1,82 +1,27 @@
 # SPDX-License-Identifier: MIT
 from __future__ import annotations
 
-import functools
 import os
-import signal
 from collections.abc import Callable, Iterator
-from contextlib import suppress
-from dataclasses import dataclass
-from pathlib import Path
 
-import goldens
-import numpy as np
 import pytest
 import torch
 
+import goldens
 import rfm_export
-from rfm import families
-from rfm.config import ServeConfig
+from engines import load_engine, serve_config
+from reference_server import Served
 from rfm.engine import Engine
-from rfm.rewind.family import RewindFamily
 from rfm.supervise.installation import find_installation
 from rfm.supervise.process import Endpoints, TritonServer
-from rfm_client import RewardClient, Trajectory
-from rfm_export.export import load_encoders
-from rfm_export.layout import CONFIG_FILE
-from rfm_export.pbtxt import parse, render
 
 torch.set_num_threads(1)
 os.environ["ONEDNN_MAX_CPU_ISA"] = "AVX512_CORE"  # as the references were computed: AMX rounds bfloat16 elsewhere
 
 
-def serve_config(config: goldens.Config, name: str = "rfm") -> ServeConfig:
-    """How the tests export a reference checkpoint."""
-    return ServeConfig(
-        name=name,
-        num_gpus=0,
-        torch_threads=1,
-        image_encoder=str(config.image_encoder) if config.image_encoder else None,
-        text_encoder=str(config.text_encoder) if config.text_encoder else None,
-        base_model=str(config.base_model) if config.base_model else None,
-    )
-
-
-@functools.cache
-def load_engine(name: str) -> Engine:
-    """The engine of a reference checkpoint, with its encoders if it has some."""
-    config = goldens.config(name)
-    if config.is_vlm:
-        return Engine.from_checkpoint(config.checkpoint, base_model=str(config.base_model))
-    checkpoint = families.load(config.checkpoint)
-    assert isinstance(checkpoint, families.RewindCheckpoint)
-    return Engine.of(checkpoint, encoders=load_encoders(checkpoint, serve_config(config)))
-
-
-def rewind_of(name: str) -> RewindFamily:
-    """What of a reference checkpoint's engine is ReWiND's own."""
-    family = load_engine(name).family
-    assert isinstance(family, RewindFamily)
-    return family
-
-
 @pytest.fixture
 def engine() -> Callable[[str], Engine]:
     return load_engine
-
-
-@dataclass(frozen=True)
-class Served:
-    """A running server with every reference checkpoint under its own name."""
-
-    repository: Path
-    endpoints: Endpoints
-
-    def url(self, protocol: str) -> str:
-        return self.endpoints.grpc_url if protocol == "grpc" else self.endpoints.http_url
-
-    def client(self, protocol: str, model: str = "c1_t1_disc10") -> RewardClient:
-        return RewardClient(self.url(protocol), model=model)
 
 
 @pytest.fixture(scope="session")
@@ -95,37 +40,3 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 @pytest.fixture(params=["grpc", "http"])
 def protocol(request: pytest.FixtureRequest) -> str:
     return str(request.param)
-
-
-def random_trajectory(seed: int, num_frames: int, video_dim: int = 768, text_dim: int = 384) -> Trajectory:
-    """Embeddings in the widths of the upstream checkpoints."""
-    random = np.random.default_rng(seed)
-    return Trajectory(
-        video_embeddings=random.standard_normal((num_frames, video_dim), np.float32),
-        text_embedding=random.standard_normal(text_dim, np.float32),
-    )
-
-
-def forget_input(repository: Path, model: str, name: str) -> None:
-    """The model's configuration becomes one from before it had this input."""
-    file = repository / model / CONFIG_FILE
-    config = parse(file.read_text())
-    inputs = [tensor for tensor in config.input if tensor.name != name]
-    assert len(inputs) < len(config.input)
-    del config.input[:]
-    config.input.extend(inputs)
-    for step in config.ensemble_scheduling.step:
-        step.input_map.pop(name, None)
-    file.write_text(render(config))
-
-
-def kill_model(repository: Path, model: str = "rfm") -> None:
-    """Kills each process of a model that a server of ``repository`` runs."""
-    model_file = f"{repository}/{model}/1/model.py"
-    killed = []
-    for command in Path("/proc").glob("[0-9]*/cmdline"):
-        with suppress(OSError):  # it has ended meanwhile
-            if model_file in command.read_text():
-                killed.append(command)
-                os.kill(int(command.parent.name), signal.SIGKILL)
-    assert killed

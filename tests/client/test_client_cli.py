@@ -1,0 +1,715 @@
+# SPDX-License-Identifier: MIT
+"""``rfm-client``: what it writes is what RewardClient gives, and how it ends tells a script what happened."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tritonclient.http
+from typer.main import get_command
+from typer.testing import CliRunner, Result
+
+import clip
+from engines import load_engine
+from reference_server import Served
+from rfm_client import (
+    FrameScores,
+    PreferenceResult,
+    PreferenceSample,
+    ProgressResult,
+    ProgressSample,
+    RewardClient,
+    Sample,
+    SimilaritySample,
+    Trajectory,
+)
+from rfm_client.cli.commands import app
+from rfm_client.cli.options import EXIT_CODES, ExitCode
+from rfm_client.cli.outputs import frame_document
+from rfm_client.cli.perf_input import perf_analyzer_input
+from rfm_client.cli.scoring import unique_stems
+from rfm_client.cli.show import Panel, number, plot
+from rfm_client.cli.toy import SampleKind, Toy, parse_lengths
+from rfm_client.contract import wire
+from rfm_client.contract.wire import encode_samples
+from rfm_client.data.inputs import load_trajectory
+from rfm_client.status import read_status
+from trajectories import random_trajectory
+
+RFM_CLIENT = Path(sys.executable).parent / "rfm-client"
+MODEL = "enc_c1_t1_disc10"
+MAX_FRAMES = 16  # of that checkpoint
+WIDTHS = (48, 32)  # of its video and text embeddings
+TASK = clip.TASK
+TOLERANCE = 1e-5
+COMMANDS = get_command(app).commands  # type: ignore[attr-defined]
+EVENLY = np.linspace(0, clip.NUM_FRAMES - 1, MAX_FRAMES).astype(int)
+
+
+@pytest.fixture(scope="session")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("videos") / "clip.mp4"
+    clip.write(file)
+    return file
+
+
+@pytest.fixture(autouse=True)
+def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("TERMINAL_WIDTH", "200")
+    monkeypatch.delenv("RFM_URL", raising=False)
+
+
+def invoke(*words: object) -> Result:
+    """The command in this process."""
+    return CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
+
+
+def ask(served: Served, *words: object, protocol: str = "grpc", model: str = MODEL) -> Result:
+    """A command about the served model, in this process."""
+    return invoke(*words, "--url", served.url(protocol), "--model", model)
+
+
+def run(*words: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    """The command as a user calls it."""
+    return subprocess.run(
+        [str(RFM_CLIENT), *map(str, words)],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+def columns(output: str, row: str) -> list[str]:
+    """The cells of the table row that begins so."""
+    (line,) = (line for line in output.splitlines() if line.strip().startswith(row))
+    return re.split(r"\s{2,}", line.strip())
+
+
+def assert_scores(document: dict[str, Any], scores: FrameScores) -> None:
+    np.testing.assert_allclose(document["progress"], scores.progress, rtol=0, atol=TOLERANCE)
+    np.testing.assert_allclose(document["success"], scores.success, rtol=0, atol=TOLERANCE)
+
+
+@contextmanager
+def web_server(folder: Path) -> Iterator[str]:
+    class Silent(SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Silent, directory=str(folder))) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+@contextmanager
+def silent_server() -> Iterator[tuple[str, socket.socket]]:
+    """A server that takes connections and never answers."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        yield f"http://127.0.0.1:{listening.getsockname()[1]}", listening
+
+
+# score
+
+
+def test_score_writes_what_the_client_gives_and_one_bad_video_does_not_stop_the_others(
+    served: Served, protocol: str, video: Path, tmp_path: Path
+) -> None:
+    embeddings = tmp_path / "embeddings.npz"
+    seen = random_trajectory(3, 5, *WIDTHS)
+    np.savez(embeddings, video_embeddings=seen.video_embeddings, text_embedding=seen.text_embedding)
+    missing = tmp_path / "missing.mp4"
+    target = tmp_path / "scores.json"
+    plotted = tmp_path / "plot.png"
+    result = run(
+        *("score", video, missing, embeddings, "--task", TASK, "--fps", 10, "--model", MODEL),
+        *("--json", target, "--npy", tmp_path / "arrays", "--plot", plotted),
+        RFM_URL=served.url(protocol),
+    )
+    assert result.returncode == ExitCode.FAILED
+    assert result.stderr.splitlines() == [
+        f"rfm-client: note: {video}: 16 of 32 frames were scored, evenly spaced",
+        f"rfm-client: {missing}: video: expected a file with a video stream, got No such file or directory",
+    ]
+    with served.client(protocol, MODEL) as client:
+        filmed = client.progress(load_trajectory(video, task=TASK, fps=10), subsample=True)
+        embedded = client.progress(seen)
+
+    document = json.loads(target.read_text())
+    assert document["servers"] == [served.url(protocol)]
+    assert (document["model"], document["task"], document["fps"]) == (MODEL, TASK, 10)
+    first, failed, second = document["videos"]
+    assert_scores(first, filmed)
+    assert_scores(second, embedded)
+    assert (first["source"], first["num_frames"], first["model_version"]) == (str(video), 32, "1")
+    assert first["frame_indices"] == EVENLY.tolist()
+    np.testing.assert_allclose(first["frame_times_s"], EVENLY / clip.FPS)
+    assert second["frame_indices"] == list(range(5))
+    assert second["frame_times_s"] is None
+    assert failed["source"] == str(missing)
+    assert failed["error_type"] == "InvalidSampleError"
+
+    assert columns(result.stdout, str(video))[1:5] == [
+        *(f"{first[name][-1]:.4f}" for name in ("progress", "success")),
+        "16 of 32",
+        "3.1",
+    ]
+    assert columns(result.stdout, str(embeddings))[3:5] == ["5", "-"]
+
+    assert sorted(file.name for file in (tmp_path / "arrays").iterdir()) == ["clip.npy", "embeddings.npy"]
+    array = np.load(tmp_path / "arrays" / "clip.npy")
+    assert array.dtype == np.float32
+    np.testing.assert_array_equal(array, np.float32([first["progress"], first["success"]]).T)
+    assert plotted.read_bytes().startswith(b"\x89PNG")
+
+
+OPTIONS: dict[str, tuple[list[object], dict[str, Any]]] = {
+    "as it is": ([], {"subsample": True}),
+    "dense": (["--frame-steps", 4], {"frame_steps": 4}),
+    "resized": (["--resize"], {"subsample": True, "resize": True}),
+}
+
+
+@pytest.mark.parametrize(("words", "options"), OPTIONS.values(), ids=OPTIONS)
+def test_score_passes_its_options_on(served: Served, video: Path, words: list[object], options: dict[str, Any]) -> None:
+    result = ask(served, "score", video, "--task", TASK, *words, "--json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    (scored,) = json.loads(result.stdout)["videos"]  # and nothing but JSON
+    with served.client("grpc", MODEL) as client:
+        expected = client.progress(load_trajectory(video, task=TASK, fps=3.0), **options)
+    assert_scores(scored, expected)
+    np.testing.assert_allclose(scored["frame_times_s"], np.linspace(0, 31, 10).astype(int) / clip.FPS)
+
+
+@pytest.mark.parametrize("limit", [4, 24])
+def test_score_takes_at_most_as_many_frames_as_it_is_told_and_the_checkpoint_reads(
+    served: Served, video: Path, limit: int
+) -> None:
+    result = ask(served, "score", video, "--task", TASK, "--fps", 10, "--max-frames", limit, "--json", "-")
+    (scored,) = json.loads(result.stdout)["videos"]
+    indices = np.linspace(0, clip.NUM_FRAMES - 1, min(limit, MAX_FRAMES)).astype(int)
+    assert scored["frame_indices"] == indices.tolist()
+    frames = load_trajectory(video, fps=10).frames
+    assert frames is not None
+    with served.client("grpc", MODEL) as client:
+        assert_scores(scored, client.progress(Trajectory(frames=frames[indices], task=TASK)))
+
+
+def test_score_leaves_no_frame_out_if_told_so(served: Served, video: Path) -> None:
+    result = ask(served, "score", video, "--task", TASK, "--fps", 10, "--no-subsample")
+    assert result.exit_code == ExitCode.FAILED
+    assert result.stderr.startswith(f"rfm-client: {video}: num_frames: expected at most 16")
+    assert result.stderr.count("\n") == 1
+    assert result.stdout == ""
+
+
+def test_score_reads_videos_behind_urls(served: Served, video: Path) -> None:
+    with web_server(video.parent) as url:
+        result = ask(served, "score", f"{url}/clip.mp4", video, "--task", TASK, "--json", "-")
+    remote, local = json.loads(result.stdout)["videos"]
+    np.testing.assert_allclose(remote["progress"], local["progress"], rtol=0, atol=TOLERANCE)
+    assert remote["frame_times_s"] is None
+
+
+def test_score_writes_one_video_to_a_file(served: Served, video: Path, tmp_path: Path) -> None:
+    result = ask(served, "score", video, "--task", TASK, "--npy", tmp_path / "rewards.npy")
+    assert result.exit_code == 0, result.stderr
+    assert np.load(tmp_path / "rewards.npy").shape == (10, 2)
+
+
+def test_score_asks_several_servers(served: Served, video: Path) -> None:
+    urls = f"{served.url('http')} {served.url('grpc')}"
+    result = CliRunner().invoke(
+        app, ["score", str(video), "--task", TASK, "--model", MODEL, "--json", "-"], env={"RFM_URL": urls}
+    )
+    assert json.loads(result.stdout)["servers"] == urls.split()
+
+
+def test_a_task_that_is_missing_is_told(served: Served, video: Path) -> None:
+    result = ask(served, "score", video)
+    assert result.exit_code == ExitCode.FAILED
+    assert result.stderr == f"rfm-client: {video}: trajectory.task: expected a task sentence with frames, got ''\n"
+
+
+# compare
+
+
+def test_compare_writes_what_the_client_gives(served: Served, protocol: str, video: Path, tmp_path: Path) -> None:
+    still = tmp_path / "still.npy"
+    np.save(still, np.repeat(load_trajectory(video, fps=1).frames, 8, axis=0)[:20])  # type: ignore[arg-type]
+    target = tmp_path / "scores.json"
+    result = ask(
+        *(served, "compare", video, still, "--task", TASK, "--json", target, "--plot", tmp_path / "both.pdf"),
+        protocol=protocol,
+    )
+    assert (result.exit_code, result.stderr) == (
+        0,
+        f"rfm-client: note: {still}: 16 of 20 frames were scored, evenly spaced\n",
+    )
+    first, second = load_trajectory(video, task=TASK, fps=3), load_trajectory(still)
+    with served.client(protocol, MODEL) as client:
+        expected = client.preference(first, second, subsample=True)
+    document = json.loads(target.read_text())
+    assert document["preference"] == pytest.approx(expected.preference, abs=TOLERANCE)
+    assert_scores(document["first"], expected.first)
+    assert_scores(document["second"], expected.second)
+    assert document["second"]["frame_indices"] == np.linspace(0, 19, 16).astype(int).tolist()
+    assert [document[name]["source"] for name in ("first", "second")] == [str(video), str(still)]
+    shares = [columns(result.stdout, str(name))[1] for name in (video, still)]
+    assert shares == [f"{document['preference']:.4f}", f"{1 - document['preference']:.4f}"]
+    assert (tmp_path / "both.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_compare_takes_videos_of_two_sizes(served: Served, protocol: str, video: Path, tmp_path: Path) -> None:
+    small = tmp_path / "small.npy"
+    np.save(small, np.random.default_rng(0).integers(0, 256, (2, 40, 30, 3), np.uint8))
+    target = tmp_path / "scores.json"
+    result = ask(served, "compare", video, small, "--task", TASK, "--json", target, protocol=protocol)
+    assert (result.exit_code, result.stderr) == (0, "")
+    first, second = load_trajectory(video, task=TASK, fps=3), load_trajectory(small)
+    assert first.positions.shape[1:] != second.positions.shape[1:]
+    (expected,) = load_engine(MODEL).evaluate([PreferenceSample(first, second)])
+    assert isinstance(expected, PreferenceResult)
+    document = json.loads(target.read_text())
+    assert document["preference"] == pytest.approx(expected.preference, abs=TOLERANCE)
+    assert_scores(document["first"], expected.first)
+    assert_scores(document["second"], expected.second)
+
+
+def test_compare_tells_what_cannot_be_compared(served: Served, video: Path, tmp_path: Path) -> None:
+    np.save(tmp_path / "embeddings.npy", np.zeros((2, 8), np.float32))
+    result = ask(served, "compare", video, tmp_path / "embeddings.npy", "--task", TASK)
+    assert result.exit_code == ExitCode.FAILED
+    expected = "second: expected frames, as the first trajectory, got video_embeddings"
+    assert result.stderr == f"rfm-client: {expected}\n"
+
+
+def test_a_lerobot_file_of_several_episodes_is_neither_scored_nor_compared(
+    served: Served, video: Path, tmp_path: Path
+) -> None:
+    film = tmp_path / "videos" / "observation.images.top" / "chunk-000" / "file-000.mp4"
+    film.parent.mkdir(parents=True)
+    film.write_bytes(video.read_bytes())
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").write_text('{"codebase_version": "v3.0", "total_episodes": 10}')
+    refused = "video: expected a film of one episode, got a LeRobot v3.0 file that holds 10 episodes: cut one episode "
+    for words in (("score", film), ("compare", video, film)):
+        result = ask(served, *words, "--task", TASK)
+        assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
+        assert refused in result.stderr
+        assert str(film) in result.stderr
+
+
+# plots
+
+
+def test_a_panel_shows_the_frames_that_were_scored() -> None:
+    frames = np.arange(30, dtype=np.uint8).reshape(10, 1, 1, 3)
+    indices = np.array([0, 4, 9])
+    scores = FrameScores(progress=np.zeros(3, np.float32), success=np.ones(3, np.float32), frame_indices=indices)
+    panel = Panel.of("title", scores, frames, np.arange(10) / 10)
+    assert panel.unit == "s"
+    assert panel.positions.tolist() == panel.strip_positions.tolist() == [0, 0.4, 0.9]
+    assert panel.strip is not None
+    np.testing.assert_array_equal(panel.strip, frames[indices])
+    untimed = Panel.of("title", scores)
+    assert (untimed.unit, untimed.positions.tolist(), untimed.strip) == ("frame", [0, 4, 9], None)
+
+
+def test_a_plot_has_a_strip_for_each_video_and_is_drawn_without_scores_too(tmp_path: Path) -> None:
+    told = FrameScores(progress=np.linspace(0, 1, 12, dtype=np.float32), success=np.full(12, np.nan, np.float32))
+    frames = np.random.default_rng(0).integers(0, 256, (12, 8, 8, 3), np.uint8)
+    panels = [Panel.of("costs $5_$ 漢字", told, frames), Panel.of("[embeddings]", told)]
+    plot(tmp_path / "plot.svg", panels, title="both")
+    drawn = (tmp_path / "plot.svg").read_text()
+    assert drawn.count("<image") == 8
+
+
+# status
+
+
+@pytest.fixture
+def triton(served: Served) -> Iterator[Any]:
+    client = tritonclient.http.InferenceServerClient(served.url("http").removeprefix("http://"))
+    yield client
+    client.close()
+
+
+def test_status_tells_what_triton_counts(served: Served, protocol: str, triton: Any) -> None:
+    with served.client(protocol, MODEL) as client:
+        client.progress(random_trajectory(0, 3, *WIDTHS))
+    metrics = served.endpoints.metrics_url
+    result = run("status", "--url", served.url(protocol), "--metrics-url", metrics, "--json")
+    assert (result.returncode, result.stderr) == (0, "")
+    (server,) = json.loads(result.stdout)["servers"]
+    assert (server["ready"], server["version"], server["metrics_error"]) == (True, "2.51.0", None)
+    models = {model["name"]: model for model in server["models"]}
+    assert models.keys() == {file.parent.name for file in served.repository.glob("*/config.pbtxt")}
+    (counted,) = triton.get_inference_statistics(MODEL)["model_stats"]
+    model = models[MODEL]
+    assert (model["state"], model["version"], model["reason"]) == ("READY", "1", "")
+    assert model["requests_succeeded"] == counted["inference_stats"]["success"]["count"] > 0
+    assert model["requests_failed"] == counted["inference_stats"]["fail"]["count"]
+    assert model["samples"] == counted["inference_count"]
+    assert model["executions"] == counted["execution_count"]
+    assert model["samples_per_execution"] == counted["inference_count"] / counted["execution_count"]
+    assert model["queue_ms"] == pytest.approx(counted["inference_stats"]["queue"]["ns"] / 1e6)
+    assert model["compute_ms_per_execution"] > 0
+    assert model["requests_pending"] == 0
+    (cpu,) = (device for device in server["devices"] if device["name"] == "CPU")
+    assert 0 < cpu["memory_used_bytes"] < cpu["memory_total_bytes"]
+
+
+def test_status_shows_the_gpus_and_what_waits(served: Served, tmp_path: Path) -> None:
+    gib = 2**30
+    (tmp_path / "metrics").write_text(
+        "# TYPE nv_gpu_utilization gauge\n"
+        'nv_gpu_utilization{gpu_uuid="GPU-a"} 0.75\n'
+        f'nv_gpu_memory_used_bytes{{gpu_uuid="GPU-a"}} {3 * gib}\n'
+        f'nv_gpu_memory_total_bytes{{gpu_uuid="GPU-a"}} {80 * gib}\n'
+        'nv_gpu_utilization{gpu_uuid="GPU-b"} 0\n'
+        f'nv_inference_pending_request_count{{model="{MODEL}",version="1"}} 12\n'
+    )
+    with web_server(tmp_path) as url:
+        result = invoke("status", "--url", served.url("grpc"), "--metrics-url", f"{url}/metrics")
+    assert result.exit_code == 0
+    assert columns(result.stdout, f"{MODEL} ")[5] == "12"
+    assert columns(result.stdout, "GPU-a") == ["GPU-a", "75%", "3.0 GiB", "80.0 GiB"]
+    assert columns(result.stdout, "GPU-b") == ["GPU-b", "0%", "-", "-"]
+
+
+def test_status_without_metrics_shows_the_rest_and_says_so(served: Served) -> None:
+    with silent_server() as (url, _):
+        address = url  # nobody listens there any more
+    result = invoke("status", "--url", served.url("http"), "--metrics-url", f"{address}/metrics")
+    assert result.exit_code == 0
+    assert f"no metrics of the machine: {address}/metrics: " in result.stdout
+    assert columns(result.stdout, f"{MODEL} ")[1:3] == ["1", "READY"]
+
+
+def test_status_looks_for_metrics_at_the_server_s_host(served: Served) -> None:
+    assert read_status(served.url("grpc")).metrics_url == "http://127.0.0.1:8002/metrics"
+
+
+# wait
+
+
+def test_wait_returns_when_the_model_is_ready(served: Served, protocol: str) -> None:
+    result = ask(served, "wait", protocol=protocol)
+    assert (result.exit_code, result.output) == (0, "")
+
+
+# sample, bench-input
+
+
+def toy_samples(client: RewardClient, kind: str, lengths: str = "8", *, use_frames: bool = False) -> list[Sample]:
+    return Toy(SampleKind(kind), 3, parse_lengths(lengths), use_frames, seed=5).samples(client)
+
+
+@pytest.mark.parametrize("use_frames", [False, True], ids=["embeddings", "frames"])
+@pytest.mark.parametrize("kind", ["progress", "preference", "similarity"])
+def test_sample_shows_what_the_client_gives(served: Served, kind: str, use_frames: bool) -> None:
+    words = ["--sample-type", kind, "--num-samples", 3, "--num-frames", "2,5", "--seed", 5]
+    result = ask(served, "sample", *words, *(["--use-frames"] if use_frames else []), "--json", "-")
+    assert (result.exit_code, result.stderr) == (0, "")
+    with served.client("grpc", MODEL) as client:
+        samples = toy_samples(client, kind, "2,5", use_frames=use_frames)
+        expected = client.evaluate(samples)
+    answers = json.loads(result.stdout)["samples"]
+    assert len(answers) == len(expected)
+    for answer, scores in zip(answers, expected, strict=True):
+        if isinstance(scores, ProgressResult):
+            assert_scores(answer, scores)
+        else:
+            assert answer[kind] == pytest.approx(getattr(scores, kind), abs=1e-4)
+            for name in ("first", "second") if kind == "preference" else ("reference", "other"):
+                assert_scores(answer[name], getattr(scores, name))
+
+
+def test_sample_shows_a_table_and_tells_of_each_that_fails(served: Served) -> None:
+    result = ask(served, "sample", "--sample-type", "preference", "--num-samples", 2, "--num-frames", "3,17")
+    assert result.exit_code == ExitCode.FAILED
+    assert [line.partition(": num_frames: expected at most 16")[0] for line in result.stderr.splitlines()] == [
+        "rfm-client: samples[0]",
+        "rfm-client: samples[1]",
+    ]
+    assert result.stdout == ""
+    good = ask(served, "sample", "--sample-type", "preference", "--num-samples", 1)
+    with served.client("grpc", MODEL) as client:
+        (expected,) = client.evaluate(Toy(SampleKind.preference, 1, [8], False, 0).samples(client))
+    assert f"P(first) = {expected.preference:.4f}" in good.stdout  # type: ignore[union-attr]
+
+
+LENGTHS = {"8": [8], "4,8,16": [4, 8, 16], "4-6": [4, 5, 6], "1, 3-4": [1, 3, 4]}
+
+
+@pytest.mark.parametrize(("text", "lengths"), LENGTHS.items(), ids=LENGTHS)
+def test_lengths_are_one_several_or_a_range(text: str, lengths: list[int]) -> None:
+    assert parse_lengths(text) == lengths
+
+
+@pytest.mark.parametrize("kind", ["progress", "preference", "similarity"])
+def test_toy_samples_have_the_lengths_in_turn(served: Served, kind: str) -> None:
+    with served.client("grpc", MODEL) as client:
+        samples = toy_samples(client, kind, "4,8,16")
+    lengths = [trajectory.num_frames for sample in samples for trajectory in sample.trajectories]
+    assert sorted(lengths[:3]) == [4, 8, 16]
+    assert lengths[3:] == lengths[: len(lengths) - 3]
+
+
+def decoded(tensor: dict[str, Any], like: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """A tensor of the file, as perf_analyzer reads it, with the batch axis that it adds."""
+    content = tensor["content"]
+    if isinstance(content, list):
+        flat = np.array([text.encode() for text in content], np.object_)
+    else:
+        flat = np.frombuffer(base64.b64decode(content["b64"], validate=True), like.dtype.newbyteorder("<"))
+    return flat.reshape(1, *tensor["shape"])
+
+
+@pytest.mark.parametrize("use_frames", [False, True], ids=["embeddings", "frames"])
+@pytest.mark.parametrize("kind", ["progress", "preference", "similarity"])
+def test_bench_input_holds_the_tensors_of_the_contract(
+    served: Served, tmp_path: Path, kind: str, use_frames: bool
+) -> None:
+    target = tmp_path / "input.json"
+    words = ["--sample-type", kind, "--num-samples", 3, "--num-frames", "4-6", "--seed", 5, "--output", target]
+    result = ask(served, "bench-input", *words, *(["--use-frames"] if use_frames else []))
+    name = f"{MODEL}_frames" if use_frames else MODEL
+    address = served.url("grpc").removeprefix("grpc://")
+    expected = f"perf_analyzer -m {name} -i grpc -u {address} --input-data {target}"
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert result.stdout == f"{expected} --async --concurrency-range 1:16:5\n"
+    with served.client("grpc", MODEL) as client:
+        samples = toy_samples(client, kind, "4-6", use_frames=use_frames)
+    requests = json.loads(target.read_text())["data"]
+    assert len(requests) == 3
+    for request, sample in zip(requests, samples, strict=True):
+        tensors = encode_samples([sample])
+        assert request.keys() == tensors.keys()
+        for tensor, array in tensors.items():
+            assert decoded(request[tensor], array).dtype == array.dtype
+            np.testing.assert_array_equal(decoded(request[tensor], array), array)
+
+
+def test_the_input_file_s_requests_are_answered(served: Served, triton: Any) -> None:
+    """Sent as perf_analyzer sends them: each entry as a request of one sample."""
+    first, second = (random_trajectory(seed, length, *WIDTHS) for seed, length in ((1, 3), (2, 7)))
+    samples: list[Sample] = [ProgressSample(first), PreferenceSample(first, second), SimilaritySample(first, second)]
+    for sample, request in zip(samples, perf_analyzer_input(samples)["data"], strict=True):
+        tensors = []
+        for name, like in encode_samples([sample]).items():
+            tensors.append(
+                tritonclient.http.InferInput(
+                    name, [1, *request[name]["shape"]], tritonclient.utils.np_to_triton_dtype(like.dtype)
+                )
+            )
+            tensors[-1].set_data_from_numpy(decoded(request[name], like))
+        answer = triton.infer(MODEL, tensors)
+        with served.client("http", MODEL) as client:
+            (expected,) = client.evaluate([sample])
+        scores = expected if isinstance(expected, ProgressResult) else getattr(expected, "first", None)
+        if scores is not None:
+            progress = answer.as_numpy(wire.PROGRESS)[0, :3]
+            np.testing.assert_allclose(progress, scores.progress, rtol=0, atol=TOLERANCE)
+
+
+# how it ends
+
+
+def free_url() -> str:
+    with silent_server() as (url, _):
+        return url
+
+
+ASKING = {
+    "score": ["score", "film.mp4"],
+    "compare": ["compare", "a.mp4", "b.mp4"],
+    "sample": ["sample"],
+    "bench-input": ["bench-input", "--output", "input.json"],
+    "status": ["status"],
+}
+
+
+@pytest.mark.parametrize("scheme", ["grpc", "http"])
+@pytest.mark.parametrize("words", ASKING.values(), ids=ASKING)
+def test_no_server_is_told_at_once(words: list[str], scheme: str) -> None:
+    result = invoke(*words, "--url", free_url().replace("http", scheme))
+    assert result.exit_code == ExitCode.UNAVAILABLE
+    assert re.fullmatch(r"rfm-client: .*\n", result.stderr), result.stderr
+    assert result.stdout == ""
+
+
+@pytest.mark.parametrize("words", ASKING.values(), ids=ASKING)
+def test_a_server_that_does_not_answer_is_out_of_time(words: list[str]) -> None:
+    with silent_server() as (url, _):
+        result = invoke(*words, "--url", url, "--timeout", 0.2)
+    assert result.exit_code == ExitCode.DEADLINE
+    assert re.fullmatch(r"rfm-client: .*no answer within 0\.2 s\n", result.stderr), result.stderr
+
+
+@pytest.mark.parametrize("name", ["score", "compare", "sample", "bench-input"])
+def test_a_model_that_is_not_served_is_told(served: Served, protocol: str, name: str) -> None:
+    result = ask(served, *ASKING[name], model="unknown", protocol=protocol)
+    assert result.exit_code == ExitCode.NO_MODEL
+    assert re.fullmatch(r"rfm-client: .*unknown_frames.*\n", result.stderr), result.stderr
+
+
+def test_embeddings_alone_are_no_model_for_videos(served: Served, video: Path) -> None:
+    result = ask(served, "score", video, "--task", TASK, model="c1_t1_disc10")
+    assert result.exit_code == ExitCode.NO_MODEL
+    assert "c1_t1_disc10_frames" in result.stderr
+
+
+def test_one_server_that_is_down_does_not_matter(served: Served) -> None:
+    result = ask(served, "sample", "--url", free_url())
+    assert result.exit_code == 0, result.stderr
+    reordered = invoke("sample", "--url", free_url(), "--url", served.url("grpc"), "--model", MODEL)
+    assert reordered.exit_code == 0, reordered.stderr
+
+
+def test_waiting_ends_in_time() -> None:
+    url = free_url()
+    result = invoke("wait", "--url", url, "--timeout", 0.2)
+    assert result.exit_code == ExitCode.DEADLINE
+    assert result.stderr == f"rfm-client: {url}: rfm and rfm_frames: not ready within 0.2 s\n"
+
+
+@pytest.mark.parametrize("words", [["wait"], ["score", "film.mp4"]], ids=lambda words: str(words[0]))
+def test_an_interrupt_ends_it_without_a_traceback(words: list[str]) -> None:
+    with silent_server() as (url, listening):
+        process = subprocess.Popen([str(RFM_CLIENT), *words, "--url", url], stderr=subprocess.PIPE, text=True)
+        connection, _ = listening.accept()  # by now it is asking
+        with connection:
+            process.send_signal(signal.SIGINT)
+            _, told = process.communicate(timeout=30)
+    assert (process.returncode, told) == (ExitCode.INTERRUPTED, "rfm-client: interrupted\n")
+
+
+USAGE: dict[str, tuple[list[str], str]] = {
+    "no videos": (["score"], "Missing argument"),
+    "unknown option": (["score", "a.mp4", "--what"], "No such option"),
+    "url": (
+        ["sample", "--url", "localhost:8001"],
+        "expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
+    ),
+    "status url": (
+        ["status", "--url", "localhost:8001"],
+        "expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
+    ),
+    "json over a video": (["score", "--json", "a.mp4", "b.mp4"], "expected a .json file or -, got a.mp4"),
+    "json nowhere": (["status", "--json", "/nowhere/a.json"], "expected a folder at /nowhere, got none"),
+    "picture": (["score", "a.mp4", "--plot", "a.gif"], "expected a file that ends in .png, .pdf, .svg, got a.gif"),
+    "many pictures": (["score", *["a.mp4"] * 51, "--plot", "a.png"], "expected at most 50 videos, got 51"),
+    "array": (["score", "a.mp4", "--npy", "a.npz"], "expected a .npy file or a folder, got a.npz"),
+    "one array": (["score", "a.mp4", "b.mp4", "--npy", "a.npy"], "expected a folder for 2 videos, got a.npy"),
+    "lengths": (["sample", "--num-frames", "8-4"], "expected a length (8), several (4,8,16) or a range (4-16)"),
+    "dense": (["score", "a.mp4", "--frame-steps", "1"], "expected 0 or at least 2, got 1"),
+    "port": (
+        ["status", "--url", "http://localhost:99999"],
+        "expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
+    ),
+    "long": (["sample", "--num-frames", "10000"], "expected a length (8), several (4,8,16) or a range (4-16)"),
+    "no length": (["sample", "--num-frames", "0"], "expected a length (8), several (4,8,16) or a range (4-16)"),
+    "metrics": (
+        ["status", "--url", "http://a:1", "--url", "http://b:1", "--metrics-url", "http://a:2"],
+        "expected one --url with it, got several",
+    ),
+}
+
+
+@pytest.mark.parametrize(("words", "message"), USAGE.values(), ids=USAGE)
+def test_wrong_usage_is_told_before_anything_is_asked(words: list[str], message: str) -> None:
+    result = invoke(*words)
+    assert result.exit_code == ExitCode.USAGE
+    assert message in " ".join(result.stderr.split())
+
+
+def test_what_is_missing_to_run_is_told_with_the_command_that_installs_it() -> None:
+    program = "import sys; sys.modules['typer'] = None; from rfm_client.cli import main; main()"
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert result.returncode == 1
+    assert result.stderr == 'rfm-client: expected the package typer, got none: pip install "./client[cli]"\n'
+
+
+def test_a_missing_package_costs_a_line(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "prometheus_client.parser", None)
+    result = invoke("status", "--url", served.url("grpc"))
+    assert result.exit_code == ExitCode.FAILED
+    assert re.fullmatch(r'rfm-client: .*prometheus_client.*: pip install "./client\[cli\]"\n', result.stderr)
+
+
+# help
+
+
+def test_every_command_and_option_has_help() -> None:
+    assert COMMANDS.keys() == {"score", "compare", "status", "wait", "sample", "bench-input", "gateway"}
+    for name, command in COMMANDS.items():
+        assert command.help, name
+        result = invoke(name, "--help")
+        shown = " ".join(result.stdout.split())
+        assert (EXIT_CODES in shown) == (name != "gateway")  # which runs until it is stopped
+        for parameter in command.params:
+            assert parameter.help, (name, parameter.name)
+            for option in parameter.opts:
+                assert not option.startswith("--") or option in shown
+
+
+def test_exit_codes_are_documented() -> None:
+    result = run("--help")
+    assert (result.returncode, result.stderr) == (0, "")
+    shown = " ".join(result.stdout.split())
+    assert EXIT_CODES in shown
+    for code in ExitCode:
+        assert re.search(rf"\b{code.value} ", EXIT_CODES), code
+    for name in COMMANDS:
+        assert name in shown
+
+
+def test_the_shell_can_complete_commands_and_options() -> None:
+    script = run(_RFM_CLIENT_COMPLETE="source_bash").stdout
+    assert "_RFM_CLIENT_COMPLETE=complete_bash" in script
+    assert "rfm-client" in script
+    asked = {"COMP_WORDS": "rfm-client st", "COMP_CWORD": "1", "_RFM_CLIENT_COMPLETE": "complete_bash"}
+    assert run(**asked).stdout.split() == ["status"]
+    shown = run("--show-completion", "bash", _TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION="1")
+    assert (shown.returncode, shown.stdout.strip()) == (0, script.strip())
+
+
+# small parts
+
+
+def test_a_score_that_is_not_told_is_null_and_shown_as_a_dash() -> None:
+    scores = FrameScores(progress=np.float32([0.25, 0.5]), success=np.full(2, np.nan, np.float32))
+    document = frame_document(scores, None)
+    assert (document["progress"], document["success"]) == ([0.25, 0.5], None)
+    assert [number(value) for value in (None, float("nan"), 0.5)] == ["-", "-", "0.5000"]
+
+
+def test_files_about_videos_of_one_name_do_not_overwrite_each_other() -> None:
+    names = ["a/clip.mp4", "b/clip.mp4", "http://host/clip.mp4?size=2", "other.tar.mp4"]
+    assert unique_stems(names) == ["clip", "clip_2", "clip_3", "other.tar"]
+    assert unique_stems(["x/a.mp4", "a_2.mp4", "y/a.mp4"]) == ["a", "a_2", "a_3"]

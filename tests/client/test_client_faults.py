@@ -1,0 +1,487 @@
+# SPDX-License-Identifier: MIT
+"""Servers that restart, die or are full, and shared memory that outlives nobody. All with real servers."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tritonclient.grpc
+
+from mixtures import assert_same
+from one_model import OneModelServer, answered
+from paths import ROOT
+from rfm.supervise.process import Endpoints
+from rfm_client import (
+    DeadlineExceededError,
+    ProgressResult,
+    ProgressSample,
+    Result,
+    RewardClient,
+    ServerUnavailableError,
+    Trajectory,
+)
+from rfm_client.transport.shared_memory import FOLDER, MIN_SHARED_BYTES
+
+PATIENCE_S = 60.0
+
+
+@pytest.fixture
+def repository(tmp_path: Path) -> Path:
+    """The demo's checkpoint on one thread."""
+    folder = tmp_path / "model_repository"
+    shutil.copytree(ROOT / "model_repository" / "rfm", folder / "rfm")
+    config = folder / "rfm" / "config.pbtxt"
+    text = config.read_text()
+    threads = 'key: "torch_threads"\n  value {\n    string_value: "%s"'
+    assert threads % 0 in text
+    config.write_text(text.replace(threads % 0, threads % 1))
+    return folder
+
+
+@pytest.fixture(params=["grpc", "http"])
+def protocol(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def url_of(endpoints: Endpoints, protocol: str) -> str:
+    return endpoints.grpc_url if protocol == "grpc" else endpoints.http_url
+
+
+def trajectory(seed: int, num_frames: int = 8) -> Trajectory:
+    random = np.random.default_rng(seed)
+    return Trajectory(
+        video_embeddings=random.standard_normal((num_frames, 64), np.float32),
+        text_embedding=random.standard_normal(32, np.float32),
+    )
+
+
+def heavy() -> Trajectory:
+    """Large enough for shared memory."""
+    heavy = trajectory(0, 2000)
+    assert heavy.video_embeddings is not None
+    assert heavy.video_embeddings.nbytes > MIN_SHARED_BYTES
+    return heavy
+
+
+class Outcomes:
+    """What came of the calls of several threads."""
+
+    def __init__(self) -> None:
+        self._all: list[Result | Exception] = []
+        self._changed = threading.Condition()
+
+    def append(self, outcome: Result | Exception) -> None:
+        with self._changed:
+            self._all.append(outcome)
+            self._changed.notify_all()
+
+    def wait_for(self, kind: type, count: int = 20) -> None:
+        """Returns when ``count`` more of that kind have come."""
+        with self._changed:
+            start = len(self._all)
+            enough = lambda: sum(isinstance(outcome, kind) for outcome in self._all[start:]) >= count  # noqa: E731
+            assert self._changed.wait_for(enough, PATIENCE_S)
+
+    @property
+    def errors(self) -> list[Exception]:
+        return [outcome for outcome in self._all if isinstance(outcome, Exception)]
+
+
+@contextmanager
+def calling(client: RewardClient, threads: int = 4) -> Iterator[Outcomes]:
+    """Within it, threads ask without pause."""
+    outcomes = Outcomes()
+    stop = threading.Event()
+
+    def ask(seed: int) -> None:
+        while not stop.is_set():
+            try:
+                outcomes.append(client.progress(trajectory(seed)))
+            except Exception as error:  # noqa: BLE001  whatever it is, the test looks at it
+                outcomes.append(error)
+
+    with ThreadPoolExecutor(threads) as pool:
+        running = [pool.submit(ask, seed) for seed in range(threads)]
+        try:
+            yield outcomes
+        finally:
+            stop.set()
+            for thread in running:
+                thread.result()
+
+
+def test_calls_survive_a_restart_of_the_server(repository: Path, protocol: str) -> None:
+    endpoints = Endpoints.free()
+    with ExitStack() as servers, RewardClient(url_of(endpoints, protocol), timeout_s=PATIENCE_S) as client:
+        server = servers.enter_context(OneModelServer(repository, endpoints))
+        expected = client.progress(trajectory(0))
+        with calling(client) as outcomes:
+            outcomes.wait_for(ProgressResult)
+            server.stop()
+            servers.enter_context(OneModelServer(repository, endpoints))
+            outcomes.wait_for(ProgressResult)
+        assert outcomes.errors == []
+        assert_same(expected, client.progress(trajectory(0)))
+
+
+def test_without_retries_a_restart_is_an_error(repository: Path, protocol: str) -> None:
+    endpoints = Endpoints.free()
+    with ExitStack() as servers, RewardClient(url_of(endpoints, protocol), retry=False) as client:
+        server = servers.enter_context(OneModelServer(repository, endpoints))
+        with calling(client, threads=2) as outcomes:
+            outcomes.wait_for(ProgressResult)
+            server.stop()
+            outcomes.wait_for(ServerUnavailableError)
+            servers.enter_context(OneModelServer(repository, endpoints))
+            outcomes.wait_for(ProgressResult)
+    assert {type(error) for error in outcomes.errors} == {ServerUnavailableError}
+
+
+def test_of_two_servers_one_may_be_killed_and_come_back(tmp_path: Path, repository: Path, protocol: str) -> None:
+    both = [Endpoints.free(), Endpoints.free()]
+    other_repository = shutil.copytree(repository, tmp_path / "other" / "model_repository")
+    urls = [url_of(endpoints, protocol) for endpoints in both]
+    with ExitStack() as servers, RewardClient(urls, timeout_s=PATIENCE_S) as client:
+        first = servers.enter_context(OneModelServer(repository, both[0]))
+        servers.enter_context(OneModelServer(other_repository, both[1]))
+        with calling(client) as outcomes:
+            until(lambda: all(answered(endpoints) for endpoints in both))  # the load is shared
+            first.kill()
+            outcomes.wait_for(ProgressResult, 100)
+            servers.enter_context(OneModelServer(repository, both[0]))
+            until(lambda: answered(both[0]) > 0)  # it is asked again
+        assert outcomes.errors == []
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Asks the servers again and again."""
+    end_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end_s
+
+
+def test_a_server_that_hangs_costs_one_call_and_is_left_out(repository: Path, protocol: str) -> None:
+    endpoints = Endpoints.free()
+    with OneModelServer(repository, endpoints), socket.create_server(("127.0.0.1", 0)) as hung:
+        urls = [f"{protocol}://127.0.0.1:{hung.getsockname()[1]}", url_of(endpoints, protocol)]
+        with RewardClient(urls, timeout_s=2) as client:
+            client.wait_ready(30)  # the one that is ready is enough
+            outcomes: list[Result | Exception] = []
+            for _ in range(6):
+                outcomes += client.evaluate([ProgressSample(trajectory(0))], return_errors=True)
+    assert [type(outcome) for outcome in outcomes if isinstance(outcome, Exception)] == [DeadlineExceededError]
+
+
+class Proxy:
+    """Forwards TCP connections to a port, until it goes silent: connections stay open, and nothing comes over them.
+
+    It stands in for a network that drops packets, which needs a privilege to be had. ``reads``: what a client sends
+    over a silent connection is still acknowledged, and dropped; otherwise nothing more is taken from it.
+    """
+
+    def __init__(self, port: int, *, reads: bool = True) -> None:
+        self._port = port
+        self._reads = reads
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listener.getsockname()[1]
+        self._is_closed = threading.Event()
+        self._pairs: list[tuple[socket.socket, socket.socket, threading.Event]] = []
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    @property
+    def num_connections(self) -> int:
+        return len(self._pairs)
+
+    def go_silent(self) -> None:
+        """All connections that there are; a new one is forwarded."""
+        for *_, is_silent in self._pairs:
+            is_silent.set()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                near, _ = self._listener.accept()
+            except OSError:  # closed: the test is over
+                return
+            if not self._reads and not self._pairs:
+                near.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            far = socket.create_connection(("127.0.0.1", self._port))
+            is_silent = threading.Event()
+            self._pairs.append((near, far, is_silent))
+            for source, target in ((near, far), (far, near)):
+                threading.Thread(target=self._forward, args=(source, target, is_silent), daemon=True).start()
+
+    def _forward(self, source: socket.socket, target: socket.socket, is_silent: threading.Event) -> None:
+        while True:
+            if is_silent.is_set() and not self._reads:
+                self._is_closed.wait()
+            try:
+                content = source.recv(65536)
+                if not is_silent.is_set():
+                    target.sendall(content)
+            except OSError:  # one side has ended it
+                return
+            if not content:
+                with suppress(OSError):
+                    target.shutdown(socket.SHUT_WR)
+                return
+
+    def __enter__(self) -> Proxy:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._is_closed.set()
+        self._listener.close()
+        for near, far, _ in self._pairs:
+            near.close()
+            far.close()
+
+
+def test_a_connection_that_dies_in_silence_costs_one_deadline(repository: Path, protocol: str) -> None:
+    endpoints = Endpoints.free()
+    port = endpoints.grpc_port if protocol == "grpc" else endpoints.http_port
+    with (
+        OneModelServer(repository, endpoints),
+        Proxy(port) as proxy,
+        RewardClient(f"{protocol}://127.0.0.1:{proxy.port}", timeout_s=3) as client,
+    ):
+        expected = client.progress(trajectory(0), timeout_s=PATIENCE_S)
+        proxy.go_silent()
+        outcomes = [client.evaluate([ProgressSample(trajectory(0))], return_errors=True)[0] for _ in range(5)]
+        assert [type(outcome) for outcome in outcomes] == [DeadlineExceededError, *[ProgressResult] * 4]
+        assert_same(expected, outcomes[-1])
+        assert proxy.num_connections == 2
+
+
+def test_a_request_that_nobody_takes_goes_over_a_new_connection_within_its_time(repository: Path) -> None:
+    endpoints = Endpoints.free()
+    large = trajectory(0, 40_000)  # 10 MB: more than the sockets' buffers take
+    with (
+        OneModelServer(repository, endpoints),
+        Proxy(endpoints.grpc_port, reads=False) as proxy,
+        RewardClient(f"grpc://127.0.0.1:{proxy.port}", timeout_s=PATIENCE_S) as client,
+    ):
+        expected = client.progress(trajectory(0))
+        proxy.go_silent()
+        assert client.progress(large, frame_steps=2).progress.shape == (40_000,)
+        assert_same(expected, client.progress(trajectory(0)))
+        assert proxy.num_connections == 2
+
+
+def test_calls_that_share_a_connection_with_one_that_hits_its_deadline_go_on(repository: Path) -> None:
+    """Over a connection that is alive and slow: a call that has more time keeps it."""
+    endpoints = Endpoints.free()
+    with OneModelServer(repository, endpoints) as server, RewardClient(endpoints.grpc_url) as client:
+        expected = client.progress(trajectory(0))
+        server.signal(signal.SIGSTOP)
+        try:
+            patient = client.submit(ProgressSample(trajectory(0)), timeout_s=PATIENCE_S)
+            with pytest.raises(DeadlineExceededError):
+                client.progress(trajectory(0), timeout_s=2)
+        finally:
+            server.signal(signal.SIGCONT)
+        assert_same(expected, patient.result())
+
+
+def test_a_server_that_hangs_does_not_hold_what_shares_memory_with_it(repository: Path) -> None:
+    endpoints = Endpoints.free()
+    before = ours_in_dev_shm()
+    with OneModelServer(repository, endpoints) as server:
+        client = RewardClient(endpoints.grpc_url, shared_memory=True)
+        client.progress(heavy(), frame_steps=2)
+        server.signal(signal.SIGSTOP)
+        try:
+            client.close()
+        finally:
+            server.signal(signal.SIGCONT)
+        assert ours_in_dev_shm() == before
+
+
+def test_a_client_with_another_dev_shm_takes_nothing_back(
+    repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    endpoints = Endpoints.free()
+    with OneModelServer(repository, endpoints), RewardClient(endpoints.grpc_url, shared_memory=True) as client:
+        expected = client.progress(heavy(), frame_steps=2)
+        before = regions(endpoints)
+        monkeypatch.setattr("rfm_client.transport.shared_memory.FOLDER", tmp_path)
+        with RewardClient(endpoints.grpc_url, shared_memory=True) as stranger:
+            assert_same(stranger.progress(heavy(), frame_steps=2), expected)
+        monkeypatch.undo()
+        assert "no shared memory" in caplog.text
+        assert regions(endpoints) == before != set()
+
+
+@pytest.fixture
+def short_queue(repository: Path) -> Path:
+    config = repository / "rfm" / "config.pbtxt"
+    policy = "dynamic_batching {\n  default_queue_policy {\n    max_queue_size: 1\n  }\n}"
+    config.write_text(
+        config.read_text().replace("dynamic_batching {\n}", policy).replace("batch_size: 64", "batch_size: 1")
+    )
+    assert policy in config.read_text()
+    return repository
+
+
+def test_a_full_queue_is_waited_for(short_queue: Path, protocol: str) -> None:
+    samples = [ProgressSample(trajectory(seed, 32), frame_steps=16) for seed in range(40)]
+    endpoints = Endpoints.free()
+    with OneModelServer(short_queue, endpoints):
+        with RewardClient(url_of(endpoints, protocol), retry=False) as client:
+            outcomes = client.evaluate(samples, return_errors=True)
+        with RewardClient(url_of(endpoints, protocol), timeout_s=PATIENCE_S) as client:
+            answers = client.evaluate(samples)
+    refused = [outcome for outcome in outcomes if isinstance(outcome, Exception)]
+    assert {type(error) for error in refused} == {ServerUnavailableError}
+    assert "maximum queue size" in str(refused[0])
+    assert len(answers) == len(samples)
+    for outcome, answer in zip(outcomes, answers, strict=True):
+        if not isinstance(outcome, Exception):
+            assert_same(outcome, answer)
+
+
+def regions(endpoints: Endpoints) -> set[str]:
+    """Names of the regions that the server maps."""
+    with tritonclient.grpc.InferenceServerClient(endpoints.grpc_url.removeprefix("grpc://")) as client:
+        return set(client.get_system_shared_memory_status().regions)
+
+
+def ours_in_dev_shm() -> set[str]:
+    return {file.name for file in FOLDER.iterdir() if "rfm-client-" in file.name}
+
+
+def test_shared_memory_changes_no_answer_and_leaves_nothing(repository: Path, protocol: str) -> None:
+    endpoints = Endpoints.free()
+    samples = [ProgressSample(heavy(), frame_steps=2), ProgressSample(trajectory(1))]
+    before = ours_in_dev_shm()
+    with OneModelServer(repository, endpoints):
+        with RewardClient(url_of(endpoints, protocol)) as client:
+            expected = client.evaluate(samples)
+        with RewardClient(url_of(endpoints, protocol), shared_memory=True) as client:
+            assert regions(endpoints) == set()
+            for _ in range(3):
+                for answer, plain in zip(client.evaluate(samples), expected, strict=True):
+                    assert_same(answer, plain)
+            assert len(regions(endpoints)) == 1  # one, used again and again
+            left = ours_in_dev_shm() - before
+            assert [name.endswith(".lock") for name in left] == [True]  # its name is gone while it is in use
+        assert regions(endpoints) == set()
+    assert ours_in_dev_shm() == before
+
+
+def test_memory_of_cancelled_calls_never_mixes_with_that_of_others(repository: Path) -> None:
+    endpoints = Endpoints.free()
+    samples = [ProgressSample(trajectory(seed, 6000), frame_steps=2) for seed in range(6)]  # 1.5 MB: copied in a thread
+    with OneModelServer(repository, endpoints):
+        with RewardClient(endpoints.grpc_url) as client:
+            expected = [client.evaluate([sample])[0] for sample in samples]
+        with RewardClient(endpoints.grpc_url, shared_memory=True) as client:
+            for round_number in range(10):
+                late = [client.submit(sample, timeout_s=0.001 * (1 + round_number)) for sample in samples]
+                futures = [client.submit(sample) for sample in samples]
+                for future, plain in zip(futures, expected, strict=True):
+                    assert_same(future.result(), plain)
+                assert {type(future.exception()) for future in late} <= {DeadlineExceededError, type(None)}
+
+
+def test_shared_memory_serves_many_callers(repository: Path) -> None:
+    endpoints = Endpoints.free()
+    heavies = [ProgressSample(trajectory(seed, 300 + seed), frame_steps=2) for seed in range(24)]
+    with OneModelServer(repository, endpoints):
+        with RewardClient(endpoints.grpc_url) as client:
+            expected = [client.evaluate([sample])[0] for sample in heavies]
+        with RewardClient(endpoints.grpc_url, shared_memory=True) as client:
+            futures = [client.submit(sample) for sample in heavies]
+            for future, plain in zip(futures, expected, strict=True):
+                assert_same(future.result(), plain)
+        assert regions(endpoints) == set()
+
+
+def test_shared_memory_survives_a_restart_of_the_server(repository: Path) -> None:
+    endpoints = Endpoints.free()
+    with RewardClient(endpoints.grpc_url, shared_memory=True) as client:
+        with OneModelServer(repository, endpoints):
+            expected = client.progress(heavy(), frame_steps=2)
+        with OneModelServer(repository, endpoints):
+            assert_same(client.progress(heavy(), frame_steps=2), expected)
+            assert len(regions(endpoints)) == 1
+
+
+KILLED_CLIENT = """
+import os, signal, sys
+import numpy as np
+from rfm_client import RewardClient, Trajectory
+client = RewardClient(sys.argv[1], shared_memory=True)
+client.progress(Trajectory(video_embeddings=np.ones((2000, 64)), text_embedding=np.ones(32)), frame_steps=2)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_a_killed_client_shared_is_taken_back_by_the_next(repository: Path, protocol: str) -> None:
+    endpoints = Endpoints.free()
+    url = url_of(endpoints, protocol)
+    before = ours_in_dev_shm()
+    with OneModelServer(repository, endpoints):
+        killed = subprocess.run([sys.executable, "-c", KILLED_CLIENT, url], timeout=60)
+        assert killed.returncode == -signal.SIGKILL
+        assert all(name.endswith(".lock") for name in ours_in_dev_shm() - before)  # no data
+        orphans = regions(endpoints)
+        assert len(orphans) == 1
+        with RewardClient(url, shared_memory=True) as neighbour, RewardClient(url, shared_memory=True) as client:
+            neighbour.progress(heavy(), frame_steps=2)
+            assert not orphans & regions(endpoints)
+            client.progress(heavy(), frame_steps=2)
+            assert len(regions(endpoints)) == 2  # a living client keeps its own
+        assert regions(endpoints) == set()
+    assert ours_in_dev_shm() == before
+
+
+def test_a_server_without_the_extension_is_asked_through_the_socket(
+    repository: Path, protocol: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    endpoints = Endpoints.free()
+    option = "--grpc-restricted-protocol" if protocol == "grpc" else "--http-restricted-api"
+    before = ours_in_dev_shm()
+    with OneModelServer(repository, endpoints, f"{option}=shared-memory:key=value"):
+        with RewardClient(url_of(endpoints, protocol)) as client:
+            expected = client.progress(heavy(), frame_steps=2)
+        with RewardClient(url_of(endpoints, protocol), shared_memory=True) as client:
+            for _ in range(3):
+                assert_same(client.progress(heavy(), frame_steps=2), expected)
+    assert len(caplog.messages) == 1
+    assert "no shared memory, inputs go through the socket: " in caplog.messages[0]
+    assert ours_in_dev_shm() == before
+
+
+OUT_OF_MEMORY = """
+import resource, signal, sys
+import numpy as np
+from rfm_client import RewardClient, Trajectory
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16))  # as a full /dev/shm, for this process alone
+with RewardClient(sys.argv[1], shared_memory=True) as client:
+    trajectory = Trajectory(video_embeddings=np.ones((2000, 64)), text_embedding=np.ones(32))
+    print(client.progress(trajectory, frame_steps=2).last_progress)
+"""
+
+
+def test_a_full_dev_shm_kills_nobody(repository: Path) -> None:
+    endpoints = Endpoints.free()
+    with OneModelServer(repository, endpoints):
+        command = [sys.executable, "-c", OUT_OF_MEMORY, endpoints.grpc_url]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) > 0
+    assert "no shared memory, inputs go through the socket: [Errno 27] File too large" in done.stderr

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: MIT
+"""Servers that go over to another version, and several of which one lacks the model. Stand-ins tell what they like."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import Collection
+
+import numpy as np
+import pytest
+
+from rfm_client import (
+    AsyncRewardClient,
+    InferenceFailedError,
+    ModelNotFoundError,
+    RewardError,
+    ServerUnavailableError,
+    Trajectory,
+)
+from rfm_client.contract import wire
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.transport.calls import Answer
+from rfm_gateway.body import Batch
+from rfm_gateway.folder import AllowedFolder
+from rfm_gateway.memory import Memory
+from rfm_gateway.schema import SAMPLES
+from rfm_gateway.scoring import Scorer
+from rfm_gateway.state import State
+from trajectories import random_trajectory
+
+NUM_FRAMES = 4
+SEEN = random_trajectory(0, NUM_FRAMES)
+FILMED = Trajectory(frames=np.zeros((NUM_FRAMES, 8, 8, 3), np.uint8), task="lift")
+WITHIN_S = 5.0
+
+
+class Stand:
+    """Serves ``version``, in which ``frames_per_value`` frames share a value; or fails with ``error``."""
+
+    def __init__(self, url: str = "grpc://stand:1", error: RewardError | None = None) -> None:
+        self.url = url
+        self.error = error
+        self.version, self.frames_per_value = 1, 1
+        self.asked: Counter[str] = Counter()
+
+    async def infer(
+        self, model: str, inputs: wire.Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
+    ) -> Answer:
+        self.asked["infer"] += 1
+        await asyncio.sleep(0)
+        if self.error is not None:
+            raise self.error
+        shape = inputs[wire.NUM_FRAMES].shape[0], wire.num_positions(inputs)
+        tensors = {name: np.full(shape, 0.5, np.float32) for name in outputs}
+        return Answer(tensors, str(self.version))
+
+    async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
+        self.asked["model_info"] += 1
+        if self.error is not None:
+            raise self.error
+        limits = {"max_batch_size": 64, "max_frames": None, "frame_size": None}
+        widths = {"video_dim": None, "text_dim": None, "progress_bins": None}
+        return ModelInfo(model, (str(self.version),), **limits, **widths, frames_per_value=self.frames_per_value)  # type: ignore[arg-type]
+
+    async def is_ready(self, model: str, timeout_s: float) -> bool:
+        return self.error is None
+
+    async def close(self) -> None:
+        pass
+
+
+def test_what_is_known_of_a_model_is_forgotten_when_another_version_answers() -> None:
+    async def ask() -> None:
+        stand = Stand()
+        async with AsyncRewardClient("", transports=[stand]) as client:
+            for _ in range(3):
+                assert (await client.model_info()).versions == ("1",)
+                await client.progress(SEEN)
+            assert stand.asked["model_info"] == 1
+            stand.version = 2
+            assert (await client.model_info()).versions == ("1",)
+            assert (await client.model_info(refresh=True)).versions == ("2",)
+            stand.version = 1
+            await client.progress(SEEN)
+            assert (await client.model_info()).versions == ("1",)
+            assert stand.asked["model_info"] == 3
+            stand.error = ModelNotFoundError("rfm is not served")
+            for refresh in (True, False):
+                with pytest.raises(ModelNotFoundError):
+                    await client.model_info(refresh=refresh)
+
+    asyncio.run(ask())
+
+
+def test_the_gateway_tells_of_the_version_that_answers_now() -> None:
+    async def ask() -> None:
+        stand = Stand()
+        async with AsyncRewardClient("", transports=[stand], retry=False) as client:
+            state = State(client, "grpc://127.0.0.1:1", "http://127.0.0.1:1/metrics", "rfm")
+            scorer = Scorer(client, AllowedFolder(None, 0), WITHIN_S)
+            sample = {"sample_type": "progress", "trajectory": {"task": "lift", "frames": FILMED.frames}}
+            batch = Batch(SAMPLES.validate_python([sample], context={}), False)
+            for version, frames_per_value in ((1, 1), (2, 2)):
+                stand.version, stand.frames_per_value = version, frames_per_value
+                with Memory(2**20).share() as share:
+                    answer = await scorer.evaluate(batch, share, "request")
+                assert answer.outputs_progress is not None
+                assert len(answer.outputs_progress.progress_pred[0]) == NUM_FRAMES // frames_per_value
+            stand.version = 3
+            assert (await state.model_info()).model_version == "3"
+
+    asyncio.run(ask())
+
+
+LACKING = ModelNotFoundError("lacking")
+
+
+def test_a_server_that_lacks_the_model_is_left_out() -> None:
+    async def ask() -> None:
+        lacking, good = Stand("grpc://lacking:1", LACKING), Stand("grpc://good:1")
+        async with AsyncRewardClient("", transports=[lacking, good]) as client:
+            for _ in range(20):
+                await asyncio.gather(*(client.progress(SEEN) for _ in range(4)))
+        assert good.asked["infer"] == 80
+        assert lacking.asked["infer"] <= 4  # of the first round
+
+    asyncio.run(asyncio.wait_for(ask(), WITHIN_S))
+
+
+@pytest.mark.parametrize(
+    ("others", "kind"),
+    [
+        ([LACKING, LACKING], ModelNotFoundError),
+        ([InferenceFailedError("it failed"), LACKING], InferenceFailedError),
+        ([LACKING, InferenceFailedError("it failed")], InferenceFailedError),
+        ([LACKING, ServerUnavailableError("it is down")], ServerUnavailableError),
+    ],
+)
+def test_a_model_is_not_served_only_if_every_server_says_so(others: list[RewardError], kind: type[RewardError]) -> None:
+    async def ask() -> None:
+        stands = [Stand(f"grpc://{number}:1", error) for number, error in enumerate(others)]
+        async with AsyncRewardClient("", transports=stands, timeout_s=0.5) as client:
+            with pytest.raises(kind):
+                await client.progress(SEEN)
+            if kind is ModelNotFoundError:  # and which of them is asked next is as it was
+                assert not any(server.is_left_out for server in client._servers._servers)
+
+    asyncio.run(asyncio.wait_for(ask(), WITHIN_S))

@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: MIT
+"""Several real servers of one checkpoint: a request that ends its process, and a name of several addresses."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from one_model import OneModelServer, answered
+from patients import DEADLY, MARK, Callers, make_repository, references, trajectory
+from rfm.supervise.process import Endpoints
+from rfm.supervise.stubs import Stub, StubWatch
+from rfm_client import (
+    AsyncRewardClient,
+    InvalidSampleError,
+    ProcessEndedError,
+    ProgressResult,
+    ProgressSample,
+    RewardClient,
+    RewardError,
+)
+from rfm_client.transport import host_names as names
+from rfm_serve import MODEL, PATIENCE_S, Serving, serving, wait_for
+
+__all__ = ["references"]  # a fixture
+
+POISON = trajectory(99, mark=MARK)
+NUM_SERVERS = 3
+LONG_S = 4 * PATIENCE_S  # so that a machine that is slow to heal a model decides nothing
+NAME = "rfm-servers.test"
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Iterator[list[Serving]]:
+    """Servers that heal themselves, each with a model that ends its process on a marked sample."""
+    with ExitStack() as stack:
+        folders = [tmp_path / f"server-{number}" for number in range(NUM_SERVERS)]
+        served = [stack.enter_context(serving(make_repository(folder, more_code=DEADLY))) for folder in folders]
+        for server in served:
+            server.wait_ready(True, LONG_S)
+        yield served
+
+
+def num_ended(fleet: list[Serving]) -> int:
+    """Model processes that have ended and were replaced."""
+    return int(sum(server.metric("rfm_serve_restarts_total", what=MODEL) for server in fleet))
+
+
+def test_a_request_that_ends_its_process_ends_two_of_a_fleet_and_those_beside_it_are_answered(
+    fleet: list[Serving], references: list[np.ndarray[Any, Any]]
+) -> None:
+    urls = [server.endpoints.grpc_url for server in fleet]
+    with (
+        RewardClient(urls, timeout_s=LONG_S) as client,
+        RewardClient(urls, timeout_s=LONG_S) as other,
+        Callers(client, references) as callers,
+    ):
+        callers.wait_for_all()
+        # In one request with two others, which is as bad, and by another client beside those that are answered.
+        batch = [ProgressSample(sample) for sample in (trajectory(0), POISON, trajectory(1))]
+        outcomes = other.evaluate(batch, return_errors=True)
+        assert [type(outcome) for outcome in outcomes] == [InvalidSampleError] * 3
+        assert "got one that has ended its process 2 times" in str(outcomes[1])
+        for server in fleet:
+            server.wait_ready(True, LONG_S)
+        callers.wait_for_all()
+        assert num_ended(fleet) == 2
+    assert (callers.lost, callers.wrong) == ([], [])
+
+
+def test_requests_that_end_their_process_at_one_time_end_two_each_at_most(
+    fleet: list[Serving], references: list[np.ndarray[Any, Any]]
+) -> None:
+    urls = [server.endpoints.grpc_url for server in fleet]
+    with RewardClient(urls, timeout_s=LONG_S) as client, Callers(client, references) as callers:
+        callers.wait_for_all()
+        futures = [client.submit(ProgressSample(trajectory(seed, mark=MARK))) for seed in range(90, 93)]
+        for future in futures:
+            assert isinstance(future.exception(LONG_S), (InvalidSampleError, ProcessEndedError))
+        for server in fleet:
+            server.wait_ready(True, LONG_S)
+        callers.wait_for_all()
+        assert num_ended(fleet) <= 2 * len(futures)
+    assert callers.wrong == []
+    assert callers.lost == []
+
+
+@dataclass
+class Unhealed:
+    """A Triton without ``rfm serve``: nobody loads its model anew."""
+
+    server: OneModelServer
+    stubs: list[Stub]
+
+    @property
+    def is_dead(self) -> bool:
+        return not any(stub.is_alive for stub in self.stubs)
+
+
+@contextmanager
+def unhealed(folder: Path) -> Iterator[Unhealed]:
+    with OneModelServer(make_repository(folder, more_code=DEADLY), Endpoints.free()) as server:
+        stubs = StubWatch(server.pid, PATIENCE_S).of_model(MODEL)
+        assert stubs
+        yield Unhealed(server, stubs)
+
+
+def test_where_nobody_heals_a_request_ends_two_processes_and_says_so(tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        servers = [stack.enter_context(unhealed(tmp_path / f"server-{number}")) for number in range(NUM_SERVERS)]
+        client = stack.enter_context(RewardClient([one.server.endpoints.grpc_url for one in servers]))
+        told = r"grpc://.* and grpc://.*: a process of the model ended at each while it had this request, so no other"
+        with pytest.raises(ProcessEndedError, match=told):
+            client.progress(POISON, timeout_s=8)
+        assert [one.is_dead for one in servers].count(True) == 2
+        assert isinstance(client.progress(trajectory(0)), ProgressResult)
+        assert [one.is_dead for one in servers].count(True) == 2
+
+
+# A name of several addresses
+
+
+class Names:
+    """Answers for ``NAME``. The look-up alone is faked: no name of several addresses can be had without a DNS server."""
+
+    def __init__(self, *hosts: str) -> None:
+        self.hosts = hosts
+        self.error: OSError | None = None
+        self.num_asked = 0
+        self._real = socket.getaddrinfo
+
+    def __call__(self, host: Any, port: Any, *rest: Any, **options: Any) -> Any:
+        if host != NAME:
+            return self._real(host, port, *rest, **options)
+        self.num_asked += 1
+        if self.error is not None:
+            raise self.error
+        return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (address, port)) for address in self.hosts]
+
+
+@pytest.fixture
+def found(monkeypatch: pytest.MonkeyPatch) -> Names:
+    """Looked up as often as a call is made."""
+    found = Names()
+    monkeypatch.setattr(socket, "getaddrinfo", found)
+    monkeypatch.setattr("rfm_client.transport.servers.REFRESH_S", 0.0)
+    return found
+
+
+@pytest.mark.parametrize("url", [f"grpc://{NAME}:%d", f"dns:///{NAME}:%d"])
+def test_servers_behind_one_name_share_the_calls_and_those_that_are_added_join(
+    tmp_path: Path, found: Names, url: str
+) -> None:
+    first = Endpoints.free()
+    places = [first, *(replace(first, host=f"127.0.0.{number}") for number in (2, 3))]
+
+    def each_answers(client: RewardClient, places: list[Endpoints]) -> bool:
+        before = [answered(place) for place in places]
+        for _ in places:
+            client.progress(trajectory(0))
+        return np.subtract([answered(place) for place in places], before).tolist() == [1] * len(places)
+
+    with ExitStack() as stack:
+        client = stack.enter_context(RewardClient(url % first.grpc_port, shared_memory=True))
+        for number, place in enumerate(places):
+            stack.enter_context(OneModelServer(make_repository(tmp_path / place.host), place))
+            found.hosts = tuple(one.host for one in places[: number + 1])
+            if number:  # of one address gRPC looks the name up itself, which is not faked
+                wait_for(partial(each_answers, client, places[: number + 1]))
+        # One that is taken away is asked no more, and an error of the look-up changes nothing.
+        found.hosts = found.hosts[:2]
+        asked = found.num_asked
+        wait_for(lambda: client.progress(trajectory(0)) and found.num_asked > asked + 1)
+        found.error = socket.gaierror("no answer")
+        before = [answered(place) for place in places]
+        for _ in range(6):
+            client.progress(trajectory(0))
+        assert np.subtract([answered(place) for place in places], before).tolist() == [3, 3, 0]
+
+
+def test_a_server_that_is_looked_up_is_known_by_its_name() -> None:
+    made: list[tuple[str, str | None]] = []
+
+    def connect(url: str, *, named: str | None = None) -> Any:
+        made.append((url, named))
+        return object()
+
+    async def look_up() -> None:
+        name = names.Name("grpcs://localhost:8001", connect)
+        await name.look_up()
+        assert list(name.transports) == [""]
+
+    asyncio.run(look_up())
+    assert made == [("grpcs://localhost:8001", None)]
+
+
+@pytest.mark.parametrize(
+    ("url", "is_name"),
+    [
+        ("grpc://rfm-triton-pods:8001", True),
+        ("grpcs://rfm-triton-pods:8001", True),
+        ("dns:///rfm-triton-pods:8001", True),
+        ("http://rfm-triton-pods:8000", False),
+        ("grpc://localhost:8001", False),
+        ("grpc://127.0.0.1:8001", False),
+        ("grpc://[::1]:8001", False),
+    ],
+)
+def test_which_url_may_stand_for_several_servers(url: str, is_name: bool) -> None:
+    assert names.is_name(url) is is_name
+
+
+def test_a_client_of_a_name_that_nobody_knows_says_so(found: Names) -> None:
+    found.error = socket.gaierror("no such name")
+
+    async def ask() -> None:
+        async with AsyncRewardClient("grpc://rfm-servers.invalid:8001", retry=False) as client:
+            await client.progress(trajectory(0))
+
+    with pytest.raises(RewardError, match=r"resol|DNS"):
+        asyncio.run(ask())

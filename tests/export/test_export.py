@@ -1,0 +1,411 @@
+# SPDX-License-Identifier: MIT
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from click.testing import Result
+from google.protobuf import text_format
+from safetensors.torch import load_file, save_file
+from tritonclient.grpc import model_config_pb2 as pb
+from typer.testing import CliRunner
+
+import goldens
+import rfm_export
+from engines import serve_config
+from paths import ROOT
+from repositories import forget_input
+from rfm.checkpoint.content import read_run_config
+from rfm.config import ServeConfig
+from rfm.rewind.network import RewindTransformer
+from rfm_client.contract import wire
+from rfm_commands.cli import app
+from rfm_export import ExportDiffersError, ExportError
+from rfm_export.about import Origin
+
+EMBEDDINGS = goldens.config("c1_t1_disc10")
+FRAMES = goldens.config("enc_c1_t1_disc10")
+REPOSITORY = ROOT / "model_repository"
+
+
+def export(config: goldens.Config, repository: Path, **changes: Any) -> int:
+    return rfm_export.export(config.checkpoint, repository, replace(serve_config(config), **changes))
+
+
+def read(repository: Path, name: str) -> pb.ModelConfig:
+    """As Triton reads it."""
+    return text_format.Parse((repository / name / "config.pbtxt").read_text(), pb.ModelConfig())
+
+
+def dims(tensors: Any) -> dict[str, tuple[str, list[int]]]:
+    return {t.name: (pb.DataType.Name(t.data_type).removeprefix("TYPE_"), list(t.dims)) for t in tensors}
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    repository = tmp_path_factory.mktemp("exported") / "model_repository"
+    export(EMBEDDINGS, repository)
+    export(FRAMES, repository, name="film")
+    return repository
+
+
+def test_the_scorers_configuration_is_the_wire_contract(exported: Path) -> None:
+    config = read(exported, "rfm")
+    assert config.backend == "python"
+    assert config.max_batch_size == 64
+    assert dims(config.input) == {
+        "sample_type": ("UINT8", [1]),
+        "num_frames": ("INT32", [2]),
+        "frame_steps": ("INT32", [1]),
+        "video_embeddings": ("FP32", [-1, 768]),
+        "text_embedding": ("FP32", [384]),
+    }
+    assert dims(config.output) == {
+        "progress": ("FP32", [-1]),
+        "success": ("FP32", [-1]),
+        "preference": ("FP32", [1]),
+        "similarity": ("FP32", [1]),
+        "progress_logits": ("FP32", [-1, 10]),
+        "timing_ms": ("FP32", [2]),
+    }
+    assert [tensor.name for tensor in config.input if tensor.allow_ragged_batch] == ["video_embeddings"]
+    batching = config.dynamic_batching
+    assert not batching.max_queue_delay_microseconds  # a delay would cost every lone request
+    assert not batching.HasField("default_queue_policy")  # with one, Triton 2.51 at times misses requests for 0.5 s
+    assert not config.HasField("sequence_batching")
+    assert [warmup.name for warmup in config.model_warmup] == ["progress", "preference", "similarity"]
+
+
+def test_a_queue_is_bounded_where_the_configuration_says_so(tmp_path: Path) -> None:
+    config = goldens.config("c1_t1_disc10")
+    serve = replace(serve_config(config), max_queue_size=7, queue_timeout_ms=250)
+    rfm_export.export(config.checkpoint, tmp_path, serve)
+    policy = read(tmp_path, "rfm").dynamic_batching.default_queue_policy
+    assert (policy.max_queue_size, policy.default_timeout_microseconds) == (7, 250_000)
+    assert policy.timeout_action == pb.ModelQueuePolicy.REJECT and policy.allow_timeout_override
+
+
+def test_a_continuous_checkpoint_has_no_progress_logits(tmp_path: Path) -> None:
+    export(goldens.config("legacy_keys_l2"), tmp_path)
+    assert "progress_logits" not in dims(read(tmp_path, "rfm").output)
+
+
+def test_a_checkpoint_without_similarity_is_not_warmed_up_with_it(tmp_path: Path) -> None:
+    export(goldens.config("robometer_c1_t1_disc10"), tmp_path)
+    assert [warmup.name for warmup in read(tmp_path, "rfm").model_warmup] == ["progress", "preference"]
+
+
+def test_frames_go_through_the_encoder_into_the_scorer(exported: Path) -> None:
+    encoder, ensemble = read(exported, "film_encoder"), read(exported, "film_frames")
+    assert dims(encoder.output) == {"video_embeddings": ("FP32", [-1, 48]), "text_embedding": ("FP32", [32])}
+    assert [tensor.name for tensor in encoder.input if tensor.allow_ragged_batch] == ["frames", "second_frames"]
+    for config in (encoder, ensemble):
+        assert [tensor.name for tensor in config.input if tensor.optional] == ["second_frames"]
+    assert dims(ensemble.input) == {
+        "sample_type": ("UINT8", [1]),
+        "num_frames": ("INT32", [2]),
+        "frame_steps": ("INT32", [1]),
+        "frames": ("UINT8", [-1, -1, -1, 3]),
+        "second_frames": ("UINT8", [-1, -1, -1, 3]),
+        "task": ("STRING", [1]),
+    }
+    steps = [(step.model_name, step.model_version) for step in ensemble.ensemble_scheduling.step]
+    assert steps == [("film_encoder", 1), ("film", 1)]
+    assert dims(ensemble.output) == dims(read(exported, "film").output)
+
+
+def test_one_instance_a_gpu_or_one_on_the_cpu(tmp_path: Path) -> None:
+    export(EMBEDDINGS, tmp_path / "cpu", num_gpus=0)
+    (group,) = read(tmp_path / "cpu", "rfm").instance_group
+    assert (group.kind, group.count, list(group.gpus)) == (pb.ModelInstanceGroup.KIND_CPU, 1, [])
+    serve = replace(serve_config(EMBEDDINGS), num_gpus=2)
+    rfm_export.export(EMBEDDINGS.checkpoint, tmp_path / "gpu", serve, other_machine=True)
+    (group,) = read(tmp_path / "gpu", "rfm").instance_group
+    assert (group.kind, group.count, list(group.gpus)) == (pb.ModelInstanceGroup.KIND_GPU, 1, [0, 1])
+
+
+def test_an_export_holds_what_serving_needs_and_nothing_of_the_training_run(exported: Path) -> None:
+    files = {str(file.relative_to(exported)) for file in exported.rglob("*") if file.is_file()}
+    assert {"rfm/1/model.py", "rfm/1/checkpoint/model.safetensors", "rfm/1/checkpoint/config.json"} <= files
+    assert {"film_encoder/1/image_encoder/model.safetensors", "film_encoder/1/text_encoder/tokenizer.json"} <= files
+    assert not [file for file in files if file.endswith((".yaml", ".bin"))]
+
+
+@pytest.mark.parametrize("folder", ["rfm", "rfm_encoder"])
+def test_model_py_stays_thin(folder: str) -> None:
+    lines = (REPOSITORY / folder / "1" / "model.py").read_text().splitlines()
+    assert len(lines) <= 120
+
+
+def test_the_next_export_is_the_next_version(tmp_path: Path) -> None:
+    assert [export(FRAMES, tmp_path) for _ in range(3)] == [1, 2, 3]
+    for name in ("rfm", "rfm_encoder", "rfm_frames"):
+        assert list(read(tmp_path, name).version_policy.specific.versions) == [3]
+        assert {path.name for path in (tmp_path / name).iterdir() if path.name.isdecimal()} == {"1", "2", "3"}
+    assert {step.model_version for step in read(tmp_path, "rfm_frames").ensemble_scheduling.step} == {3}
+
+
+def check_loadable(repository: Path) -> None:
+    """Whatever Triton would load now is whole and fits together."""
+    served = {}
+    for folder in sorted(path for path in repository.iterdir() if path.is_dir()):
+        config = read(repository, folder.name)
+        served[folder.name] = list(config.version_policy.specific.versions)
+        assert served[folder.name]
+        for version in served[folder.name]:
+            assert any((folder / str(version)).iterdir())
+        for warmup in config.model_warmup:
+            for tensor in warmup.inputs.values():
+                assert tensor.zero_data or (folder / "warmup" / tensor.input_data_file).is_file()
+    for name in served:
+        for step in read(repository, name).ensemble_scheduling.step:
+            assert step.model_version in served[step.model_name]
+
+
+class Killed(BaseException):
+    """In place of kill -9 between two operations on the file system."""
+
+
+@pytest.mark.parametrize("before", [0, 1], ids=["first export", "second export"])
+def test_an_export_that_dies_at_any_moment_leaves_a_repository_that_loads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: int
+) -> None:
+    died = True
+    survived = 0
+    while died:
+        repository = tmp_path / str(survived) / "model_repository"
+        for _ in range(before):
+            export(FRAMES, repository)
+        remaining = survived
+
+        def counted(original: Any, repository: Path = repository) -> Any:
+            def move(self: Path, target: Path) -> Path:
+                nonlocal remaining
+                if repository in Path(target).parents:
+                    if remaining == 0:
+                        raise Killed
+                    remaining -= 1
+                return Path(original(self, target))
+
+            return move
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "rename", counted(Path.rename))
+            patch.setattr(Path, "replace", counted(Path.replace))
+            try:
+                export(FRAMES, repository)
+                died = False
+            except Killed:
+                survived += 1
+        check_loadable(repository)
+    assert survived >= (3, 8)[before]  # three folders; and three versions, warm-up files, five configurations
+
+
+def test_an_export_that_differs_from_its_checkpoint_is_not_published(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from rfm import families
+
+    def save_wrongly(checkpoint: families.RewindCheckpoint, folder: Path) -> None:
+        weights = {name: tensor * 1.001 for name, tensor in checkpoint.network.items()}
+        original_save(replace(checkpoint, network=weights), folder)
+
+    original_save = families.save
+    monkeypatch.setattr(families, "save", save_wrongly)
+    with pytest.raises(ExportDiffersError, match="expected the checkpoint's scores, got a difference of"):
+        export(EMBEDDINGS, tmp_path / "repository")
+    assert list(tmp_path.rglob("*")) == [tmp_path / "repository"]
+
+
+def test_a_checkpoint_that_gives_no_numbers_is_not_published(tmp_path: Path) -> None:
+    """All of its weights are numbers; what the network makes of them is not."""
+    checkpoint = tmp_path / "checkpoint"
+    shutil.copytree(EMBEDDINGS.checkpoint, checkpoint)
+    file = checkpoint / "model.safetensors"
+    weights = load_file(file)
+    weights["progress_head.4.weight"] = torch.full_like(weights["progress_head.4.weight"], torch.finfo().max)
+    file.chmod(0o644)
+    save_file(weights, file, {"format": "pt"})
+    expected = "probe 0: expected scores of the checkpoint, got: the network gave a score that is not finite"
+    with pytest.raises(ExportDiffersError, match=expected):
+        rfm_export.export(checkpoint, tmp_path / "repository", serve_config(EMBEDDINGS))
+    assert list((tmp_path / "repository").iterdir()) == []
+
+
+def test_a_model_keeps_its_inputs_and_outputs(tmp_path: Path) -> None:
+    export(EMBEDDINGS, tmp_path)
+    with pytest.raises(ExportError, match=r"expected a checkpoint with the same inputs .*; choose another --name"):
+        export(goldens.config("h40_L3_H5_c1_t1_disc5_cfgmismatch"), tmp_path)
+    with pytest.raises(ExportError, match=r"expected a checkpoint with the same outputs .*; choose another --name"):
+        export(goldens.config("legacy_keys_l2"), tmp_path)
+    assert list(read(tmp_path, "rfm").version_policy.specific.versions) == [1]
+
+
+def test_a_model_may_gain_an_optional_input_and_lose_none(tmp_path: Path) -> None:
+    export(FRAMES, tmp_path)
+    for name in ("rfm_encoder", "rfm_frames"):
+        forget_input(tmp_path, name, wire.SECOND_FRAMES)
+    assert export(FRAMES, tmp_path) == 2
+    assert wire.SECOND_FRAMES in dims(read(tmp_path, "rfm_frames").input)
+    config = read(tmp_path, "rfm_encoder")
+    config.input.add(name="third_frames", data_type=pb.TYPE_UINT8, dims=[1], optional=True)
+    (tmp_path / "rfm_encoder" / "config.pbtxt").write_text(text_format.MessageToString(config))
+    with pytest.raises(ExportError, match="rfm_encoder: expected a checkpoint with the same inputs"):
+        export(FRAMES, tmp_path)
+
+
+def test_an_ensemble_does_not_lose_its_encoder(tmp_path: Path) -> None:
+    export(FRAMES, tmp_path)
+    with pytest.raises(ExportError, match="expected a checkpoint that this model can serve too"):
+        export(EMBEDDINGS, tmp_path)
+
+
+def test_encoders_of_another_width_are_refused(tmp_path: Path) -> None:
+    encoders = {"image_encoder": str(FRAMES.image_encoder), "text_encoder": str(FRAMES.text_encoder)}
+    with pytest.raises(ExportError, match=r"expected widths \(768, 384\), got \(48, 32\)"):
+        export(EMBEDDINGS, tmp_path, **encoders)
+
+
+def test_encoders_that_cannot_be_had_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match=r"encoders /no/such/folder and .*--image-encoder and --text-encoder"):
+        export(FRAMES, tmp_path, image_encoder="/no/such/folder")
+
+
+def test_the_committed_repository_is_what_an_export_generates() -> None:
+    result = CliRunner().invoke(
+        app, ["export", "--check", "--repository", str(REPOSITORY), "--config", str(REPOSITORY / "serve.yaml")]
+    )
+    assert result.exit_code == 0, result.output
+
+
+def test_check_names_what_differs(tmp_path: Path) -> None:
+    repository = tmp_path / "model_repository"
+    shutil.copytree(REPOSITORY, repository)
+    (repository / "rfm" / "1" / "model.py").write_text("# changed\n")
+    (repository / "rfm_frames" / "config.pbtxt").unlink()
+    differences = rfm_export.check(repository, ServeConfig.from_yaml(REPOSITORY / "serve.yaml"))
+    assert differences == [
+        f"{repository}/rfm/1/model.py: differs from what `rfm export` generates",
+        f"{repository}/rfm_frames/config.pbtxt: is missing",
+    ]
+
+
+def test_the_commands_errors_are_one_line(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["export", "--checkpoint", "nowhere", "--repository", str(tmp_path)])
+    assert result.exit_code == 1
+    assert re.fullmatch(r"rfm: checkpoint: expected .*, got 'nowhere'\n", result.stderr)
+
+
+def test_a_config_file_tells_the_command_what_to_do(tmp_path: Path) -> None:
+    (tmp_path / "serve.yaml").write_text(
+        f"model_path: {EMBEDDINGS.checkpoint}\nnum_gpus: 0\nmax_batch_size: 8\ntoken_budget: 512\nname: reward\n"
+    )
+    repository = tmp_path / "model_repository"
+    result = CliRunner().invoke(
+        app, ["export", "--config", str(tmp_path / "serve.yaml"), "--repository", str(repository)]
+    )
+    assert result.exit_code == 0, result.output
+    config = read(repository, "reward")
+    assert config.max_batch_size == 8
+    assert config.parameters["token_budget"].string_value == "512"
+
+
+# As upstream publishes it, comments aside.
+EVAL_CONFIG_SERVER = """
+model_path: "robometer/Robometer-4B"
+num_gpus: 1
+max_workers: 8
+batch_size: 4
+server_url: "0.0.0.0"
+server_port: 8000
+"""
+NOTE = "batch_size has no effect, as in the FastAPI server; max_batch_size bounds a batch"
+
+
+def export_as_upstream_serves(folder: Path, *words: str, num_gpus: int) -> Result:
+    file = folder / "eval_config_server.yaml"
+    file.write_text(EVAL_CONFIG_SERVER.replace("num_gpus: 1", f"num_gpus: {num_gpus}"))
+    command = ["export", "--config", str(file), "--checkpoint", str(EMBEDDINGS.checkpoint)]
+    return CliRunner().invoke(app, [*command, "--repository", str(folder / "repository"), *words])
+
+
+def test_upstream_s_batch_size_bounds_nothing_and_says_so(tmp_path: Path) -> None:
+    result = export_as_upstream_serves(tmp_path, num_gpus=0)
+    assert result.exit_code == 0, result.output
+    assert result.stderr == f"rfm: {tmp_path}/eval_config_server.yaml: {NOTE}\n"
+    assert read(tmp_path / "repository", "rfm").max_batch_size == ServeConfig().max_batch_size
+
+
+def test_more_gpus_than_there_are_are_refused_at_export(tmp_path: Path) -> None:
+    there = torch.cuda.device_count()
+    refused = export_as_upstream_serves(tmp_path, num_gpus=there + 1)
+    assert refused.exit_code == 1
+    assert f"rfm: num_gpus: expected at most {there}, got {there + 1}; --other-machine exports" in refused.stderr
+    assert not (tmp_path / "repository").exists()
+    exported = export_as_upstream_serves(tmp_path, "--other-machine", num_gpus=there + 1)
+    assert exported.exit_code == 0, exported.output
+    (group,) = read(tmp_path / "repository", "rfm").instance_group
+    assert list(group.gpus) == list(range(there + 1))
+
+
+def test_the_exported_network_has_every_weight(exported: Path) -> None:
+    from rfm import families
+
+    loaded = families.load(exported / "rfm" / "1" / "checkpoint")
+    assert loaded.network.keys() == RewindTransformer(loaded.config).state_dict().keys()
+
+
+def parameter(repository: Path, model: str, name: str) -> str:
+    return str(read(repository, model).parameters[name].string_value)
+
+
+def test_models_tell_their_weights_by_the_files_digest(exported: Path) -> None:
+    """That of an ensemble is of its parts' files, one after the other."""
+
+    def digest(*folders: str) -> str:
+        files = (file for folder in folders for file in sorted((exported / folder).rglob("*.safetensors")))
+        return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
+
+    expected = {"rfm": digest("rfm"), "film": digest("film"), "film_encoder": digest("film_encoder")}
+    expected["film_frames"] = digest("film_encoder", "film")
+    assert len(set(expected.values())) == len(expected)
+    assert {name: parameter(exported, name, "weights_digest") for name in expected} == expected
+
+
+def test_check_notices_other_weights(exported: Path, tmp_path: Path) -> None:
+    repository = shutil.copytree(exported, tmp_path / "repository")
+    weights = repository / "film_encoder" / "1" / "text_encoder" / "model.safetensors"
+    content = bytearray(weights.read_bytes())
+    content[-1] ^= 1
+    weights.write_bytes(content)
+    assert rfm_export.check(repository, serve_config(FRAMES, "film")) == [
+        f"{repository}/film_encoder/config.pbtxt: differs from what `rfm export` generates",
+        f"{repository}/film_frames/config.pbtxt: differs from what `rfm export` generates",
+    ]
+
+
+def test_a_checkpoint_of_the_hub_tells_its_commit(tmp_path: Path) -> None:
+    snapshot = tmp_path / "models--org--name" / "snapshots" / "0123abcd"
+    assert Origin.of("org/name@best", snapshot) == Origin("org/name@best", "0123abcd")
+    snapshot.mkdir(parents=True)
+    assert Origin.of(snapshot, snapshot) == Origin("snapshots/0123abcd", "")
+
+
+def test_the_configuration_of_the_training_run_is_kept_without_its_secrets(tmp_path: Path) -> None:
+    config, checkpoint = goldens.config("legacy_keys_l2"), tmp_path / "checkpoint"
+    shutil.copytree(config.checkpoint, checkpoint)
+    file = checkpoint / "config.yaml"
+    run = json.loads(json.dumps(read_run_config(file)))
+    secrets = "{hub_token: hf_secret, WANDB_API_KEY: secret, max_token: 5, day: 2026-01-02}"
+    file.write_text(f"{file.read_text()}\nreports: {secrets}\n")
+    rfm_export.export(checkpoint, tmp_path / "model_repository", serve_config(config))
+    kept = json.loads(read(tmp_path / "model_repository", "rfm").parameters["run_config"].string_value)
+    assert kept == {**run, "reports": {"max_token": 5, "day": "2026-01-02"}}
+    assert rfm_export.check(tmp_path / "model_repository", serve_config(config)) == []

@@ -1,0 +1,377 @@
+# SPDX-License-Identifier: MIT
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, fields
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import huggingface_hub
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+import goldens
+import local_hub
+from paths import ROOT
+from rfm import families
+from rfm.checkpoint.content import CheckpointError
+from rfm.checkpoint.files import best_tag
+from rfm.rewind.network import RewindConfig
+from rfm.vlm.network import VlmConfig
+
+CONTINUOUS = "legacy_keys_l2"  # lacks causal_mask and use_per_frame_progress_token
+MISMATCHED = "h40_L3_H5_c1_t1_disc5_cfgmismatch"  # its configs say l2 and 32 bins, its weights 5 bins
+IN_RUN_FOLDER = "c1_t1_disc10"  # config.yaml in the parent folder
+WITH_IMAGES = "q3_tok_disc10"  # a vision-language one: each frame an image, with a progress token
+TAG = "best-p-rank-0.8500-step-123"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A copy of a reference checkpoint that a test may spoil."""
+    copy = tmp_path / "checkpoint"
+    shutil.copytree(goldens.config(CONTINUOUS).checkpoint, copy)
+    for file in copy.iterdir():
+        file.chmod(0o644)
+    return copy
+
+
+def test_weights_decide_where_configurations_disagree() -> None:
+    config = families.load(goldens.config(MISMATCHED).checkpoint).config
+    assert (config.progress_bins, config.max_len, config.num_layers, config.hidden_dim) == (5, 10, 3, 40)
+    assert (config.video_feature_dim, config.text_feature_dim) == (256, 96)
+    assert config.use_per_frame_progress_token
+
+
+def test_what_an_old_checkpoint_does_not_say_is_off() -> None:
+    config = families.load(goldens.config(CONTINUOUS).checkpoint).config
+    assert not config.causal_mask
+    assert not config.use_per_frame_progress_token
+    assert config.progress_bins == 1
+
+
+def test_config_yaml_is_found_above_the_checkpoint(tmp_path: Path) -> None:
+    source = goldens.config(IN_RUN_FOLDER).checkpoint
+    (tmp_path / "run" / "ckpt").mkdir(parents=True)
+    shutil.copy(source / "model.safetensors", tmp_path / "run" / "ckpt")
+    shutil.copy(source.parent / "config.yaml", tmp_path / "run")  # no config.json: all there is
+    assert families.load(tmp_path / "run" / "ckpt").config == families.load(source).config
+
+
+def test_saving_and_loading_changes_nothing(tmp_path: Path) -> None:
+    original = families.load(goldens.config(IN_RUN_FOLDER).checkpoint)
+    families.save(original, tmp_path / "saved")
+    copy = families.load(tmp_path / "saved")
+    assert copy.config == original.config
+    assert copy.network.keys() == original.network.keys()
+    assert all(torch.equal(copy.network[name], original.network[name]) for name in copy.network)
+
+
+@pytest.mark.parametrize("config", [VlmConfig, RewindConfig])
+def test_what_decides_each_setting_is_documented(config: type[VlmConfig | RewindConfig]) -> None:
+    documented = (ROOT / "docs" / "checkpoints.md").read_text()
+    assert [field.name for field in fields(config) if f"`{field.name}`" not in documented] == []
+
+
+def test_encoder_weights_are_told_apart() -> None:
+    checkpoint = families.load(goldens.config("enc_c1_t1_disc10").checkpoint)
+    assert "embeddings.cls_token" in checkpoint.image_encoder
+    assert "embeddings.word_embeddings.weight" in checkpoint.text_encoder
+    checkpoint.build()
+
+
+def split_into_shards(folder: Path) -> None:
+    weights = load_file(folder / "model.safetensors")
+    names = sorted(weights)
+    weight_map = {}
+    for shard, part in {"a.safetensors": names[:20], "b.safetensors": names[20:]}.items():
+        save_file({name: weights[name] for name in part}, folder / shard)
+        weight_map |= dict.fromkeys(part, shard)
+    (folder / "model.safetensors").unlink()
+    (folder / "model.safetensors.index.json").write_text(json.dumps({"weight_map": weight_map}))
+
+
+def test_shards_are_put_together(folder: Path) -> None:
+    whole = families.load(folder)
+    split_into_shards(folder)
+    sharded = families.load(folder)
+    assert sharded.config == whole.config
+    assert all(torch.equal(sharded.network[name], whole.network[name]) for name in whole.network)
+
+
+def change_weights(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
+    def spoil(folder: Path) -> None:
+        weights = load_file(folder / "model.safetensors")
+        change(weights)
+        save_file(weights, folder / "model.safetensors")
+
+    return spoil
+
+
+def change_json(file: str, change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
+    def spoil(folder: Path) -> None:
+        content = json.loads((folder / file).read_text())
+        change(content)
+        (folder / file).write_text(json.dumps(content))
+
+    return spoil
+
+
+def as_pickle(folder: Path) -> None:
+    torch.save(load_file(folder / "model.safetensors"), folder / "pytorch_model.bin")
+    (folder / "model.safetensors").unlink()
+
+
+def shard_outside(folder: Path) -> None:
+    split_into_shards(folder)
+    change_json("model.safetensors.index.json", lambda c: c["weight_map"].update(x="../../etc/passwd"))(folder)
+
+
+def lost_shard(folder: Path) -> None:
+    split_into_shards(folder)
+    (folder / "b.safetensors").unlink()
+
+
+def truncate(folder: Path) -> None:
+    content = (folder / "model.safetensors").read_bytes()
+    (folder / "model.safetensors").write_bytes(content[: len(content) // 2])
+
+
+SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
+    "missing and unexpected keys": (
+        change_weights(lambda w: w.update(surplus=w.pop("success_head.4.bias"))),
+        r"missing keys: \['success_head.4.bias'\]; unexpected keys: \['surplus'\]",
+    ),
+    "a tensor of another shape": (
+        change_weights(lambda w: w.update({"success_head.4.bias": torch.zeros(2)})),
+        r"success_head\.4\.bias: expected \[1\], got \[2\]",
+    ),
+    "another kind of checkpoint": (
+        change_weights(lambda w: w.pop("video_proj.weight")),
+        r"expected a ReWiND checkpoint, which has 'video_proj.weight'",
+    ),
+    "another model type": (
+        change_json("config.json", lambda c: c.update(model_type="llama")),
+        r"model_type: expected rewind_transformer, got llama",
+    ),
+    "configurations that contradict each other": (
+        change_json("config.json", lambda c: c.update(num_attention_heads=8)),
+        r"num_attention_heads: expected config.json and config.yaml to agree, got",
+    ),
+    "heads that do not divide the width": (
+        lambda folder: (
+            change_json("config.json", lambda c: c.update(num_attention_heads=5))(folder),
+            (folder / "config.yaml").unlink(),
+        )[0],
+        r"num_attention_heads: expected a divisor of the hidden width 32, got 5",
+    ),
+    "a number of heads that is no number": (
+        change_json("config.json", lambda c: c.update(num_attention_heads="4")),
+        r"num_attention_heads in config.json: expected int, got '4'",
+    ),
+    "no word of a causal mask, from a file that upstream did not write": (
+        lambda folder: (
+            change_json("config.json", lambda c: c.pop("hidden_dim"))(folder),
+            (folder / "config.yaml").unlink(),
+        )[0],
+        r"causal_mask: expected it in config.json or model.rewind of config.yaml, got it in neither",
+    ),
+    "no word of the longest trajectory": (
+        lambda folder: (
+            change_json("config.json", lambda c: c.pop("max_len"))(folder),
+            (folder / "config.yaml").write_text("model: {rewind: {causal_mask: true}}"),
+        )[0],
+        r"max_len: expected it in config.json or model.rewind of config.yaml, got it in neither",
+    ),
+    "no configuration at all": (
+        lambda folder: ((folder / "config.json").unlink(), (folder / "config.yaml").unlink())[0],
+        r"max_len: expected it in config.json or model.rewind of config.yaml, got it in neither",
+    ),
+    "pickle": (
+        as_pickle,
+        r"expected model.safetensors, got pytorch_model.bin: .*refused; .*python -c \"import torch, safetensors",
+    ),
+    "no weights": (
+        lambda folder: (folder / "model.safetensors").unlink(),
+        r"expected model.safetensors or .*, got config",
+    ),
+    "half a file": (truncate, r"model.safetensors: expected a safetensors file, got"),
+    "a shard outside the folder": (shard_outside, r"expected names of files beside it, got '../../etc/passwd'"),
+    "a lost shard": (lost_shard, r"names the shard b.safetensors, which is not there"),
+    "JSON that is none": (
+        lambda folder: (folder / "config.json").write_text("{") and None,
+        r"config.json: expected JSON",
+    ),
+    "YAML that is none": (
+        lambda folder: (folder / "config.yaml").write_text("a: [") and None,
+        r"config.yaml: expected YAML",
+    ),
+    "YAML that is no mapping": (
+        lambda folder: (folder / "config.yaml").write_text("- 1") and None,
+        r"config.yaml: expected a mapping, got list",
+    ),
+    "data that is no mapping": (
+        lambda folder: (folder / "config.yaml").write_text("data: [1]") and None,
+        r"config.yaml: data: expected a mapping, got \[1\]",
+    ),
+    "a half frame": (
+        change_json("config.json", lambda c: c.update(trained_frames=7.5)),
+        r"config.json: trained_frames: expected a whole number of at least 1, got 7.5",
+    ),
+}
+
+
+@pytest.mark.parametrize(("spoil", "message"), SPOILED.values(), ids=SPOILED)
+def test_a_spoiled_checkpoint_is_refused(folder: Path, spoil: Callable[[Path], None], message: str) -> None:
+    spoil(folder)
+    with pytest.raises(CheckpointError, match=message):
+        families.load(folder).build()
+
+
+def test_the_conversion_that_the_refusal_of_a_pickle_names_works(folder: Path) -> None:
+    before = families.load(folder)
+    as_pickle(folder)
+    with pytest.raises(CheckpointError) as refusal:
+        families.load(folder)
+    (code,) = re.findall(r'python -c "(.*)"', str(refusal.value))
+    exec(code, {})
+    after = families.load(folder)
+    assert all(torch.equal(after.network[name], before.network[name]) for name in before.network)
+
+
+def test_yaml_constructs_nothing(folder: Path, tmp_path: Path) -> None:
+    mark = tmp_path / "was_here"
+    (folder / "config.yaml").write_text(f'model: {{rewind: !!python/object/apply:os.system ["touch {mark}"]}}\n')
+    with pytest.raises(CheckpointError, match=r"config\.yaml: model\.rewind: expected a mapping, got"):
+        families.load(folder)
+    assert not mark.exists()
+
+
+TAGS = {
+    "the highest score": (["best-x-0.5-step-10", "best-x-0.75-step-5", "main"], "best-x-0.75-step-5"),
+    "negative scores": (["best-loss--0.9-step-1", "best-loss--0.2-step-2"], "best-loss--0.2-step-2"),
+    "the first of equals": (["best-a-0.5-step-1", "best-b-0.5-step-2"], "best-a-0.5-step-1"),
+    "none": (["v1", "best-0.5", "best-a-1-step-2"], None),
+    "no tags": ([], None),
+}
+
+
+@pytest.mark.parametrize(("tags", "expected"), TAGS.values(), ids=TAGS)
+def test_the_best_tag(tags: list[str], expected: str | None) -> None:
+    assert best_tag(tags) == expected
+
+
+@pytest.fixture
+def hub(monkeypatch: pytest.MonkeyPatch) -> list[str | None]:
+    """A Hub of one repository, since tests reach no network; gives the revisions that were asked for."""
+    asked: list[str | None] = []
+
+    def snapshot_download(repo_id: str, *, revision: str | None, allow_patterns: list[str]) -> str:
+        assert repo_id == "org/name"
+        assert not any(re.search(r"\.(bin|pt|py)$", pattern) for pattern in allow_patterns)
+        asked.append(revision)
+        return str(goldens.config(CONTINUOUS).checkpoint)
+
+    class FakeApi:
+        def list_repo_refs(self, _repo_id: str) -> SimpleNamespace:
+            return SimpleNamespace(
+                tags=[SimpleNamespace(name=tag) for tag in ("best-a-0.2-step-1", "best-a-0.4-step-3")]
+            )
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    monkeypatch.setattr(huggingface_hub, "HfApi", FakeApi)
+    return asked
+
+
+def test_a_hub_id_is_fetched_at_its_best_tag(hub: list[str | None]) -> None:
+    families.load("org/name").build()
+    assert hub == ["best-a-0.4-step-3"]
+
+
+def test_a_tag_is_taken_as_it_stands(hub: list[str | None]) -> None:
+    families.load("org/name@v2").build()
+    assert hub == ["v2"]
+
+
+def test_an_existing_path_wins_over_an_id(
+    hub: list[str | None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "org").mkdir()
+    shutil.copytree(goldens.config(CONTINUOUS).checkpoint, tmp_path / "org" / "name@v2")
+    monkeypatch.chdir(tmp_path)
+    families.load("org/name@v2")
+    assert hub == []
+
+
+@pytest.mark.parametrize("source", ["nowhere", "/no/such/folder", "a/b/c", ""])
+def test_what_is_neither_folder_nor_id_is_refused(source: str) -> None:
+    with pytest.raises(CheckpointError, match="expected a folder that exists or a Hugging Face id"):
+        families.load(source)
+
+
+def test_a_hub_that_cannot_be_reached_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise ConnectionRefusedError("no network")
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", refuse)
+    with pytest.raises(CheckpointError, match="org/name@v2: cannot be fetched: no network"):
+        families.load("org/name@v2")
+
+
+LOADS = """
+import json, sys
+from dataclasses import asdict
+from rfm import families
+try:
+    print(json.dumps(asdict(families.load(sys.argv[1]).config)))
+except families.CheckpointError as error:
+    print(error)
+"""
+
+
+def load_from_hub(source: str, revisions: dict[str, Path], cache: Path) -> str:
+    """What a process of its own says of the checkpoint; huggingface_hub reads its environment once."""
+    with local_hub.hub(revisions) as endpoint:
+        environment = {**os.environ, "HF_ENDPOINT": endpoint, "HF_HOME": str(cache), "HF_HUB_OFFLINE": "0"}
+        command = [sys.executable, "-c", LOADS, source]
+        return subprocess.run(
+            command, env=environment, check=True, capture_output=True, text=True, cwd=cache.parent
+        ).stdout.strip()
+
+
+@pytest.fixture
+def tagged(tmp_path: Path) -> tuple[Path, Path]:
+    """A multi-image checkpoint as upstream uploads one: the tag's commit lacks config.yaml, which main has."""
+    tag, main = tmp_path / "tag", tmp_path / "main"
+    shutil.copytree(goldens.config(WITH_IMAGES).checkpoint, tag, copy_function=shutil.copyfile)
+    main.mkdir()
+    (tag / "config.yaml").rename(main / "config.yaml")
+    return tag, main
+
+
+@pytest.mark.parametrize("source", ["org/name", f"org/name@{TAG}"])
+def test_config_yaml_is_found_on_main_of_the_hub_s_repository(
+    tagged: tuple[Path, Path], tmp_path: Path, source: str
+) -> None:
+    tag, main = tagged
+    expected = asdict(families.load(goldens.config(WITH_IMAGES).checkpoint).config)
+    assert expected["multi_image"] and expected["per_frame_progress_token"]
+    said = load_from_hub(source, {"main": main, TAG: tag}, tmp_path / "cache")
+    assert json.loads(said) == json.loads(json.dumps(expected))
+
+
+def test_a_hub_s_checkpoint_without_any_config_yaml_is_refused(tagged: tuple[Path, Path], tmp_path: Path) -> None:
+    tag, main = tagged
+    (main / "config.yaml").rename(main / "README.md")
+    said = load_from_hub("org/name", {"main": main, TAG: tag}, tmp_path / "cache")
+    assert re.search(
+        r"expected config\.yaml of the training run there, .* or on main of its Hub repository, got none", said
+    )

@@ -1,0 +1,463 @@
+# SPDX-License-Identifier: MIT
+"""Checkpoints, settings and disks that are broken or lie: `rfm export` refuses them, soon, and changes nothing."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import re
+import resource
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from typer.testing import CliRunner
+
+import goldens
+import rfm_export
+from engines import serve_config
+from rfm import families
+from rfm.checkpoint.content import MAX_HEADER_BYTES, MAX_JSON_BYTES, CheckpointError
+from rfm.config import ConfigError, ServeConfig
+from rfm.plain_yaml import MAX_YAML_BYTES
+from rfm.supervise.installation import ServerStartError, find_installation
+from rfm.supervise.process import Endpoints, TritonServer
+from rfm_commands.cli import app
+from rfm_export import ExportError
+
+REWIND = goldens.config("legacy_keys_l2")
+VLM = goldens.config("q25_mean_l2")
+RFM = Path(sys.executable).parent / "rfm"
+WEIGHTS, INDEX = "model.safetensors", "model.safetensors.index.json"
+LONGEST_S = 30
+MOST_MEMORY_BYTES = 512 * 2**20  # beyond what the process had at its largest
+
+Spoil = Callable[[Path], object]
+
+
+@pytest.fixture(autouse=True)
+def _soon() -> Iterator[None]:
+    """Whatever waits for a pipe, or works for ever, is interrupted."""
+
+    def late(*_: object) -> None:
+        raise TimeoutError(f"no end within {LONGEST_S} s")
+
+    previous = signal.signal(signal.SIGALRM, late)
+    signal.alarm(LONGEST_S)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, previous)
+
+
+def copied(config: goldens.Config, folder: Path) -> Path:
+    shutil.copytree(config.checkpoint, folder)
+    for file in folder.rglob("*"):
+        file.chmod(0o644 if file.is_file() else 0o755)
+    return folder
+
+
+def files_in(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def text(name: str, content: str) -> Spoil:
+    return lambda folder: (folder / name).write_text(content)
+
+
+def settings(file: str, **changes: Any) -> Spoil:
+    def spoil(folder: Path) -> None:
+        content = json.loads((folder / file).read_text())
+        (folder / file).write_text(json.dumps(content | changes))
+
+    return spoil
+
+
+def text_settings(**changes: Any) -> Spoil:
+    """Of the language model in a vision-language one."""
+
+    def spoil(folder: Path) -> None:
+        content = json.loads((folder / "config.json").read_text())
+        content["text_config"].update(changes)
+        (folder / "config.json").write_text(json.dumps(content))
+
+    return spoil
+
+
+def header(change: Callable[[dict[str, Any]], object]) -> Spoil:
+    """Another header before the same numbers."""
+
+    def spoil(folder: Path) -> None:
+        content = (folder / WEIGHTS).read_bytes()
+        (length,) = struct.unpack_from("<Q", content)
+        told = json.loads(content[8 : 8 + length])
+        changed = change(told) or told
+        raw = changed if isinstance(changed, bytes) else json.dumps(changed).encode()
+        (folder / WEIGHTS).write_bytes(struct.pack("<Q", len(raw)) + raw + content[8 + length :])
+
+    return spoil
+
+
+def weights(change: Callable[[dict[str, torch.Tensor]], object]) -> Spoil:
+    def spoil(folder: Path) -> None:
+        tensors = load_file(folder / WEIGHTS)
+        change(tensors)
+        save_file(tensors, folder / WEIGHTS)
+
+    return spoil
+
+
+def instead(name: str, make: Callable[[Path], object]) -> Spoil:
+    """Something else under the name of a file."""
+
+    def spoil(folder: Path) -> None:
+        (folder / name).unlink()
+        make(folder / name)
+
+    return spoil
+
+
+def shards(**weight_map: Any) -> Spoil:
+    def spoil(folder: Path) -> None:
+        (folder / WEIGHTS).unlink()
+        (folder / INDEX).write_text(json.dumps({"weight_map": weight_map}))
+
+    return spoil
+
+
+def one_value(name: str, value: float) -> Spoil:
+    def change(tensors: dict[str, torch.Tensor]) -> None:
+        tensors[name].view(-1)[-1] = value
+
+    return weights(change)
+
+
+def other_endian(folder: Path) -> None:
+    content = (folder / WEIGHTS).read_bytes()
+    (length,) = struct.unpack_from("<Q", content)
+    numbers = np.frombuffer(content[8 + length :], "<f4").byteswap()
+    (folder / WEIGHTS).write_bytes(content[: 8 + length] + numbers.tobytes())
+
+
+def no_numbers_but_shapes(folder: Path) -> None:
+    """Shapes of which one axis is 0 need no bytes, whatever the others are."""
+    names = list(load_file(folder / WEIGHTS))
+    told = {name: {"dtype": "F32", "shape": [2**19, 0], "data_offsets": [0, 0]} for name in names}
+    raw = json.dumps(told).encode()
+    (folder / WEIGHTS).write_bytes(struct.pack("<Q", len(raw)) + raw)
+
+
+def sparse(folder: Path) -> None:
+    """A petabyte, of which nothing lies on the disk."""
+    raw = json.dumps({"a": {"dtype": "F32", "shape": [2**44], "data_offsets": [0, 2**46]}}).encode()
+    with (folder / WEIGHTS).open("wb") as file:
+        file.write(struct.pack("<Q", len(raw)) + raw)
+        file.truncate(2**43)
+
+
+FIRST = "first_embedding_A"
+LAUGHS = "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}' if n else 'x'] * 10)}]\n" for n in range(12))
+MERGES = "a0: &a0 {x: 1}\n" + "".join(f"a{n}: &a{n} {{<<: [{', '.join([f'*a{n - 1}'] * 10)}]}}\n" for n in range(1, 12))
+
+SAFETENSORS = rf"{WEIGHTS}: expected a safetensors file, got "
+HOSTILE: dict[str, tuple[Spoil, str]] = {
+    # safetensors
+    "an empty file": (lambda f: (f / WEIGHTS).write_bytes(b""), SAFETENSORS + "only 0 bytes"),
+    "a header of 2^63 bytes": (
+        lambda f: (f / WEIGHTS).write_bytes(struct.pack("<Q", 2**63) + b"{}"),
+        SAFETENSORS + f"one whose header would be {2**63} bytes long",
+    ),
+    "a header that fits but is huge": (
+        header(lambda _: b"{" + b" " * MAX_HEADER_BYTES + b"}"),
+        SAFETENSORS + "one whose header would be",
+    ),
+    "a header of the other endianness": (
+        lambda f: (f / WEIGHTS).write_bytes(struct.pack(">Q", 2) + b"{}"),
+        SAFETENSORS + "one whose header would be 144115188075855872 bytes long",
+    ),
+    "a deep header": (header(lambda _: b"[" * 2**20), SAFETENSORS),
+    "a header that is a list": (header(lambda _: b"[1, 2]"), SAFETENSORS),
+    "a header in no encoding": (header(lambda _: b'{"\xff\xfe": 1}'), SAFETENSORS),
+    "a tensor twice": (
+        header(lambda h: json.dumps(h).replace("{", f'{{"{FIRST}": {json.dumps(h[FIRST])}, ', 1).encode()),
+        SAFETENSORS + f"the key '{FIRST}' twice",
+    ),
+    "offsets beyond the end": (header(lambda h: h[FIRST].update(data_offsets=[0, 2**60])), SAFETENSORS),
+    "offsets that overlap": (
+        header(lambda h: h[FIRST].update(data_offsets=h["first_embedding_B"]["data_offsets"])),
+        SAFETENSORS,
+    ),
+    "offsets backwards": (header(lambda h: h[FIRST].update(data_offsets=h[FIRST]["data_offsets"][::-1])), SAFETENSORS),
+    "offsets that are negative": (header(lambda h: h[FIRST].update(data_offsets=[-128, 0])), SAFETENSORS),
+    "a shape that lies": (header(lambda h: h[FIRST].update(shape=[1, 1, 10**6])), SAFETENSORS),
+    "a shape whose size overflows": (header(lambda h: h[FIRST].update(shape=[2**33, 2**33, 2**33])), SAFETENSORS),
+    "a type that lies": (header(lambda h: h[FIRST].update(dtype="F16")), SAFETENSORS),
+    "a type that is none": (header(lambda h: h[FIRST].update(dtype="PY")), SAFETENSORS + f"'{FIRST}' of type 'PY'"),
+    "a type of eight bits": (header(lambda h: h[FIRST].update(dtype="F8_E4M3")), SAFETENSORS + f"'{FIRST}' of type"),
+    "whole numbers as weights": (header(lambda h: h[FIRST].update(dtype="I32")), rf"{FIRST}: expected numbers like"),
+    "huge shapes of no numbers": (no_numbers_but_shapes, r"expected|axes"),
+    "a petabyte that is not there": (sparse, SAFETENSORS),
+    "a tail": (lambda f: (f / WEIGHTS).write_bytes((f / WEIGHTS).read_bytes() + b"tail"), SAFETENSORS),
+    "Git LFS": (
+        text(WEIGHTS, "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n"),
+        SAFETENSORS + "Git LFS's note of where it is; `git lfs pull` fetches it",
+    ),
+    "a web page": (text(WEIGHTS, "<!doctype html><html>404</html>"), SAFETENSORS),
+    "a zip": (lambda f: torch.save({}, f / WEIGHTS), SAFETENSORS),
+    "NaN": (one_value("video_proj.bias", float("nan")), r"video_proj\.bias: expected finite weights, got nan at \[31\]"),
+    "infinity": (one_value("success_head.4.bias", float("inf")), r"success_head\.4\.bias: expected finite weights, got inf"),
+    "numbers of the other endianness": (other_endian, r"expected finite weights, got|expected the checkpoint's scores"),
+    # settings
+    "a deep config.json": (text("config.json", "[" * 10**6), r"config\.json: expected JSON, got"),
+    "a huge config.json": (text("config.json", " " * (MAX_JSON_BYTES + 1)), r"config\.json: expected at most \d+ bytes"),
+    "a number of many digits": (text("config.json", "9" * 10**5), r"config\.json: expected JSON, got"),
+    "a key twice": (text("config.json", '{"max_len": 3, "max_len": 4}'), r"config\.json: expected JSON, got the key 'max_len' twice"),
+    "max_len that nothing can hold": (settings("config.json", max_len=10**15), r"max_len: expected 1 to \d+, got 10{15}"),
+    "max_len below 1": (settings("config.json", max_len=-1), r"max_len: expected 1 to \d+, got -1"),
+    "frames without end": (settings("config.json", trained_frames=10**30), r"trained_frames: expected at most \d+"),
+    "a model type that is a list": (settings("config.json", model_type=[]), r"model_type: expected rewind_transformer"),
+    "a billion laughs": (text("config.yaml", LAUGHS), r"config\.yaml: expected YAML, got aliases that stand for more"),
+    "a billion merges": (text("config.yaml", MERGES), r"config\.yaml: expected YAML, got aliases that stand for more"),
+    "a value inside itself": (text("config.yaml", "model: &m {rewind: *m}"), r"got a value that is inside itself"),
+    "a deep config.yaml": (text("config.yaml", "[" * 10**5), r"config\.yaml: expected YAML, got"),
+    "a huge config.yaml": (text("config.yaml", "#" * (MAX_YAML_BYTES + 1)), r"config\.yaml: expected YAML, got more than"),
+    "a day that is none": (text("config.yaml", "day: 2001-99-99"), r"config\.yaml: expected YAML, got"),
+    "a truth that is none": (text("config.yaml", "a: !!bool maybe"), r"config\.yaml: expected YAML, got"),
+    "a whole number of nothing": (text("config.yaml", 'a: !!int ""'), r"config\.yaml: expected YAML, got"),
+    "a number of a thousand digits": (text("config.yaml", f"a: 0x{'f' * 1000}"), r"got a number of 1002 digits"),
+    "two documents": (text("config.yaml", "a: 1\n---\nb: 2\n"), r"config\.yaml: expected YAML, got"),
+    "a key twice in YAML": (text("config.yaml", "data: {}\ndata: {}"), r"config\.yaml: expected YAML, got the key 'data' twice"),
+    # names
+    "a shard elsewhere": (shards(a="../secret.safetensors"), r"expected names of files beside it, got '\.\./secret"),
+    "a shard at the root": (shards(a="/etc/passwd"), r"expected names of files beside it, got '/etc/passwd'"),
+    "a shard that is the folder": (shards(a=".."), r"expected names of files beside it, got '\.\.'"),
+    "a shard with a NUL": (shards(a="a\0.safetensors"), r"expected a file|not there"),
+    "a shard that is no name": (shards(a=[1], b={}), r"expected names of files beside it, got"),
+    # what is no file
+    "a folder as weights": (instead(WEIGHTS, Path.mkdir), rf"{WEIGHTS}: expected a file, got a folder"),
+    "a pipe as weights": (instead(WEIGHTS, os.mkfifo), rf"{WEIGHTS}: expected a file, got a pipe"),
+    "a pipe as config.json": (instead("config.json", os.mkfifo), r"config\.json: expected a file, got a pipe"),
+    "a pipe as config.yaml": (instead("config.yaml", os.mkfifo), r"config\.yaml: expected a file, got a pipe"),
+    "a device": (instead(WEIGHTS, lambda f: f.symlink_to("/dev/zero")), rf"{WEIGHTS}: expected a file, got a device"),
+    "a link to nowhere": (instead("config.json", lambda f: f.symlink_to("gone")), r"got a link that leads nowhere"),
+    "a link to itself": (instead("config.json", lambda f: f.symlink_to("config.json")), r"config\.json: expected a file, got"),
+    "a link out of the checkpoint": (
+        instead(WEIGHTS, lambda f: f.symlink_to(REWIND.checkpoint / WEIGHTS)),
+        rf"{WEIGHTS}: expected a file of the checkpoint, got a link to /",
+    ),
+}  # fmt: skip
+
+
+def refused(checkpoint: Path, repository: Path, message: str, *options: str) -> None:
+    """`rfm export` says one line, with exit status 1, soon, in little memory, and the repository stays as it is."""
+    before, largest_kib = files_in(repository), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    arguments = ["export", "--checkpoint", str(checkpoint), "--repository", str(repository), *options]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 1, result.output
+    assert isinstance(result.exception, SystemExit)
+    assert re.search(message, result.stderr), result.stderr
+    assert result.stderr.startswith("rfm: ")
+    assert len(result.stderr) < 10_000
+    assert files_in(repository) == before
+    assert not list(repository.parent.glob(".*export*"))
+    assert (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - largest_kib) * 1024 < MOST_MEMORY_BYTES
+
+
+@pytest.fixture(scope="module")
+def repository(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    repository = tmp_path_factory.mktemp("hostile") / "model_repository"
+    rfm_export.export(REWIND.checkpoint, repository, serve_config(REWIND))
+    return repository
+
+
+@pytest.mark.parametrize(("spoil", "message"), HOSTILE.values(), ids=HOSTILE)
+def test_a_hostile_checkpoint_is_refused(tmp_path: Path, repository: Path, spoil: Spoil, message: str) -> None:
+    folder = copied(REWIND, tmp_path / "checkpoint")
+    spoil(folder)
+    refused(folder, repository, message)
+
+
+HOSTILE_VLM: dict[str, tuple[Spoil, str]] = {
+    "layers without end": (
+        settings("config.json", text_config={"num_hidden_layers": 10**9}),
+        r"num_hidden_layers: expected at most 1024, got 1000000000",
+    ),
+    "a vocabulary that nothing can hold": (
+        text_settings(vocab_size=10**12),
+        r"embed_tokens\.weight: expected \[1000000000000, \d+\], got",
+    ),
+    "a configuration that is a list": (settings("config.json", text_config=[1]), r"expected a backbone that transformers can"),
+    "another type of value": (settings("config.json", vision_config={"patch_size": "x"}), r"expected a backbone that"),
+    "a run that is a list": (text("config.yaml", "model: [1]"), r"config\.yaml: model: expected a mapping, got \[1\]"),
+    "a temperature that is none": (text("config.yaml", "model: {frame_pooling_attn_temperature: hot}"), r"expected"),
+    "a pipe as adapter": (lambda f: os.mkfifo(f / "adapter_config.json"), r"adapter_config\.json: expected a file, got a pipe"),
+    "code of its own": (settings("config.json", auto_map={"AutoConfig": "evil.Config"}, model_type="evil"), r"expected"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("spoil", "message"), HOSTILE_VLM.values(), ids=HOSTILE_VLM)
+def test_a_hostile_vision_language_checkpoint_is_refused(tmp_path: Path, spoil: Spoil, message: str) -> None:
+    folder = copied(VLM, tmp_path / "checkpoint")
+    spoil(folder)
+    (tmp_path / "model_repository").mkdir()
+    refused(folder, tmp_path / "model_repository", message, "--base-model", str(VLM.base_model))
+
+
+def test_lora_factors_whose_product_would_be_huge_are_refused(tmp_path: Path) -> None:
+    config = goldens.config("q25_peft_adapter_disc10")
+    folder = copied(config, tmp_path / "checkpoint")
+    adapter = load_file(folder / "adapter_model.safetensors")
+    name = next(name for name in adapter if ".lora_A." in name)
+    adapter[name] = torch.zeros(1, 2**20)
+    adapter[name.replace("lora_A", "lora_B")] = torch.zeros(2**20, 1)
+    save_file(adapter, folder / "adapter_model.safetensors")
+    (tmp_path / "model_repository").mkdir()
+    message = r"expected LoRA factors of \[\d+, \d+\], got \[1048576, 1\] and \[1, 1048576\]"
+    refused(folder, tmp_path / "model_repository", message, "--base-model", str(config.base_model))
+
+
+def test_a_base_model_with_code_is_not_asked_about(tmp_path: Path) -> None:
+    config = goldens.config("q25_peft_adapter_disc10")
+    base = tmp_path / "base"
+    base.mkdir()
+    mark = tmp_path / "was_here"
+    (base / "evil.py").write_text(f"open({str(mark)!r}, 'w')\n")
+    (base / "config.json").write_text(json.dumps({"model_type": "evil", "auto_map": {"AutoConfig": "evil.Config"}}))
+    with pytest.raises(CheckpointError, match=r"base model .*: cannot be had: .*trust_remote_code"):
+        families.load(config.checkpoint, base_model=str(base))
+    assert not mark.exists()
+
+
+def test_the_links_of_the_hubs_cache_are_followed(tmp_path: Path) -> None:
+    blobs, snapshot = (
+        tmp_path / "models--org--name" / "blobs",
+        tmp_path / "models--org--name" / "snapshots" / ("0" * 40),
+    )
+    blobs.mkdir(parents=True)
+    snapshot.mkdir(parents=True)
+    for number, file in enumerate(sorted(REWIND.checkpoint.iterdir())):
+        shutil.copy(file, blobs / str(number))
+        (snapshot / file.name).symlink_to(Path("..", "..", "blobs", str(number)))
+    repository = tmp_path / "model_repository"
+    rfm_export.export(snapshot, repository, serve_config(REWIND))
+    assert not [path for path in repository.rglob("*") if path.is_symlink()]
+
+
+BAD_SETTINGS = {
+    "a billion laughs": (LAUGHS, r"serve\.yaml: expected a YAML file, got aliases that stand for more"),
+    "a path as name": ("name: ../../etc", r"serve\.yaml: name: expected letters, digits, _ and -, got"),
+    "an endless name": (f"name: {'a' * 300}", r"serve\.yaml: name: expected at most 100 characters, got 300"),
+    "a batch beyond int32": ("max_batch_size: 9999999999", r"serve\.yaml: max_batch_size: expected at most 2147483647"),
+    "GPUs without end": ("num_gpus: 1000000000", r"serve\.yaml: num_gpus: expected at most 4096"),
+    "a key twice": (
+        "batch_size: 1\nbatch_size: 2",
+        r"serve\.yaml: expected a YAML file, got the key 'batch_size' twice",
+    ),
+    "a port of many digits": (f"server_port: 0x{'f' * 5000}", r"serve\.yaml: expected a YAML file, got a number of"),
+}
+
+
+@pytest.mark.parametrize(("content", "message"), BAD_SETTINGS.values(), ids=BAD_SETTINGS)
+def test_hostile_settings_are_refused(tmp_path: Path, content: str, message: str) -> None:
+    (tmp_path / "serve.yaml").write_text(content)
+    with pytest.raises(ConfigError, match=message):
+        ServeConfig.from_yaml(tmp_path / "serve.yaml")
+
+
+@pytest.mark.parametrize("source", ["../nowhere", "org/..", "..@tag", "a" * 5000, "~nobody-here/x/y", "a\0b"])
+def test_what_is_no_id_is_not_asked_for(tmp_path: Path, source: str) -> None:
+    refused(Path(source), tmp_path, "checkpoint: expected a folder that exists or a Hugging Face id")
+
+
+def test_a_file_that_may_not_be_read_is_told(tmp_path: Path) -> None:
+    folder = copied(REWIND, tmp_path / "checkpoint")
+    (folder / "config.json").chmod(0)
+    user = os.geteuid()
+    try:
+        if user == 0:  # who may read everything
+            tmp_path.parents[0].chmod(0o755)
+            os.seteuid(65534)
+        with pytest.raises(CheckpointError, match=r"Permission ?[dD]enied|PermissionError"):
+            families.load(folder)
+    finally:
+        os.seteuid(user)
+
+
+@pytest.mark.parametrize("room", [0, 100, (REWIND.checkpoint / WEIGHTS).stat().st_size // 2], ids=["0", "100", "half"])
+def test_a_full_disk_is_told_and_changes_nothing(tmp_path: Path, room: int) -> None:
+    """Under a limit of file sizes, of the child alone."""
+    repository = tmp_path / "model_repository"
+    rfm_export.export(REWIND.checkpoint, repository, serve_config(REWIND))
+    before = files_in(repository)
+    failed = subprocess.run(
+        [str(RFM), "export", "--checkpoint", str(REWIND.checkpoint), "--repository", str(repository)],
+        capture_output=True,
+        text=True,
+        timeout=LONGEST_S,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (room, room)),
+    )
+    assert failed.returncode == 1, failed
+    assert files_in(repository) == before
+    assert not list(tmp_path.rglob(".*"))
+    told = (
+        r"rfm: .*/model_repository/rfm/\.export-\w+: expected room for the exported files, got: .*[Ff]ile too large.*\n"
+    )
+    assert re.fullmatch(told, failed.stderr), failed.stderr
+
+
+def test_two_exports_at_a_time_are_one_too_many(tmp_path: Path) -> None:
+    repository = tmp_path / "model_repository"
+    left = repository / ".export-killed"
+    left.mkdir(parents=True)
+    descriptor = os.open(repository, os.O_RDONLY)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
+    try:
+        with pytest.raises(ExportError, match="model_repository: expected no other export or rollout at work, got one"):
+            rfm_export.export(REWIND.checkpoint, repository, serve_config(REWIND))
+        assert left.exists()  # it may be the other's
+    finally:
+        os.close(descriptor)
+    assert rfm_export.export(REWIND.checkpoint, repository, serve_config(REWIND)) == 1
+    assert not left.exists()
+
+
+def test_weights_that_have_changed_since_their_export_are_not_served(tmp_path: Path) -> None:
+    repository = tmp_path / "model_repository"
+    rfm_export.export(REWIND.checkpoint, repository, serve_config(REWIND))
+    file = repository / "rfm" / "1" / "checkpoint" / WEIGHTS
+    content = bytearray(file.read_bytes())
+    content[-2] ^= 1  # of one number, a little
+    file.write_bytes(content)
+    log_file = tmp_path / "triton.log"
+    with log_file.open("wb") as log:
+        server = TritonServer(repository, Endpoints.free(), find_installation(), log=log)
+        with pytest.raises(ServerStartError), server:
+            pass
+    assert re.search(r"rfm/1: expected the weights that were exported \(\w{16}\), got others", log_file.read_text())
+
+
+def test_version_folders_keep_their_digests_side_by_side(tmp_path: Path) -> None:
+    """A configuration for all versions tells the newest one's; the older are checked against their own."""
+    from rfm.triton_model.weights import check_digest
+    from rfm_export.publish import read_config
+
+    repository = tmp_path / "model_repository"
+    other = copied(REWIND, tmp_path / "other")
+    weights(lambda tensors: tensors["video_proj.bias"].add_(1))(other)
+    for source in (REWIND.checkpoint, other):
+        rfm_export.export(source, repository, serve_config(REWIND))
+    told = read_config(repository, "rfm").parameters["weights_digest"].string_value
+    for version in ("1", "2"):
+        check_digest(repository / "rfm" / version, told)
+    shutil.copy(other / WEIGHTS, repository / "rfm" / "1" / "checkpoint" / WEIGHTS)
+    with pytest.raises(CheckpointError, match="rfm/1: expected the weights that were exported"):
+        check_digest(repository / "rfm" / "1", told)

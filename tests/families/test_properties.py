@@ -1,0 +1,310 @@
+# SPDX-License-Identifier: MIT
+"""What holds of any input: made up by hypothesis, and made smaller where it does not hold."""
+
+from __future__ import annotations
+
+import functools
+import json
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+import goldens
+from rfm import families
+from rfm.checkpoint.content import CheckpointError
+from rfm.engine import Engine
+from rfm.rewind.checkpoint import RewindCheckpoint
+from rfm.rewind.network import RewindConfig, RewindTransformer
+from rfm_client import (
+    InvalidSampleError,
+    PreferenceSample,
+    ProgressResult,
+    ProgressSample,
+    Result,
+    Sample,
+    SimilarityResult,
+    SimilaritySample,
+    Trajectory,
+)
+from rfm_client.contract import wire
+
+# The same examples each time: what fails here fails everywhere.
+THOROUGH = settings(max_examples=200, deadline=None, derandomize=True, database=None)
+SLOW = settings(
+    max_examples=60, deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow]
+)
+TOLERANCE = 1e-5
+VIDEO_DIM, TEXT_DIM, MAX_LEN = 6, 5, 7
+Array = npt.NDArray[Any]
+
+
+# The wire: whatever Triton lets through, of the declared types and ranks
+
+SMALL = st.integers(0, 4)
+COUNTS = st.sampled_from([-(2**31), -1, 0, 1, 2, 3, 4, 5, 4096, 4097, 2**31 - 1])
+FLOATS = st.floats(width=32, allow_nan=True, allow_infinity=True)
+
+
+@st.composite
+def requests(draw: st.DrawFn, *, frames: bool) -> dict[str, Array]:
+    batch = draw(st.integers(1, 3))
+    tensors: dict[str, Array] = {
+        wire.SAMPLE_TYPE: draw(arrays.arrays(np.uint8, (batch, 1), elements=st.sampled_from([0, 1, 2, 3, 255]))),
+        wire.NUM_FRAMES: draw(arrays.arrays(np.int32, (batch, 2), elements=COUNTS)),
+        wire.FRAME_STEPS: draw(arrays.arrays(np.int32, (batch, 1), elements=COUNTS)),
+    }
+    positions = draw(SMALL)
+    if frames:
+        shape = (batch, positions, draw(SMALL), draw(SMALL), 3)
+        tensors[wire.FRAMES] = draw(arrays.arrays(np.uint8, shape))
+        if draw(st.booleans()):
+            shape = (batch, draw(SMALL), draw(SMALL), draw(SMALL), 3)
+            tensors[wire.SECOND_FRAMES] = draw(arrays.arrays(np.uint8, shape))
+        tasks = draw(st.lists(st.binary(max_size=20), min_size=batch, max_size=batch))
+        tensors[wire.TASK] = np.array([[task] for task in tasks], np.object_)
+    else:
+        tensors[wire.VIDEO_EMBEDDINGS] = draw(
+            arrays.arrays(np.float32, (batch, positions, draw(SMALL)), elements=FLOATS)
+        )
+        tensors[wire.TEXT_EMBEDDING] = draw(arrays.arrays(np.float32, (batch, draw(SMALL)), elements=FLOATS))
+    return tensors
+
+
+def told(error: InvalidSampleError) -> None:
+    """As all errors of input are told."""
+    assert ": expected " in str(error)
+    assert ", got " in str(error)
+    assert len(str(error)) < 1000
+
+
+@THOROUGH
+@given(st.booleans().flatmap(lambda frames: requests(frames=frames)))
+def test_any_request_is_samples_or_a_refusal(tensors: dict[str, Array]) -> None:
+    try:
+        samples = wire.decode_samples(tensors)
+    except InvalidSampleError as error:
+        told(error)
+        return
+    shapes = {tuple(trajectory.positions.shape[1:] for trajectory in sample.trajectories) for sample in samples}
+    again = wire.encode_samples(samples) if len(shapes) == 1 else None
+    assert len(samples) == len(tensors[wire.NUM_FRAMES])
+    if again is not None:  # what was taken was taken whole
+        np.testing.assert_array_equal(again[wire.NUM_FRAMES], tensors[wire.NUM_FRAMES])
+        np.testing.assert_array_equal(again[wire.FRAME_STEPS], tensors[wire.FRAME_STEPS])
+
+
+@THOROUGH
+@given(requests(frames=True))
+def test_any_request_to_the_encoder_is_trajectories_or_a_refusal(tensors: dict[str, Array]) -> None:
+    try:
+        samples = wire.decode_trajectories(tensors)
+    except InvalidSampleError as error:
+        told(error)
+        return
+    num_frames = [sum(trajectory.num_frames for trajectory in sample.trajectories) for sample in samples]
+    assert num_frames == tensors[wire.NUM_FRAMES].astype(np.int64).sum(axis=1).tolist()
+
+
+# The engine: samples do not know of each other, and none of them breaks it
+
+
+@functools.cache
+def engine(*, causal: bool, tokens: bool, bins: int, similarity: bool) -> Engine:
+    torch.manual_seed(0)
+    config = RewindConfig(
+        video_feature_dim=VIDEO_DIM,
+        text_feature_dim=TEXT_DIM,
+        hidden_dim=16,
+        num_layers=2,
+        num_attention_heads=4,
+        max_len=MAX_LEN,
+        causal_mask=causal,
+        use_per_frame_progress_token=tokens,
+        progress_bins=bins,
+        has_similarity=similarity,
+    )
+    return Engine.of(RewindCheckpoint(config, RewindTransformer(config).state_dict()), token_budget=48)
+
+
+ENGINES = st.builds(
+    engine, causal=st.booleans(), tokens=st.booleans(), bins=st.sampled_from([1, 5]), similarity=st.booleans()
+)
+
+
+@st.composite
+def trajectories(draw: st.DrawFn) -> Trajectory:
+    numbers = np.random.default_rng(draw(st.integers(0, 99)))
+    scale = draw(st.sampled_from([0.0, 1.0, 1.0, 1.0, 1e5, 1e30]))
+    width = draw(st.sampled_from([VIDEO_DIM] * 9 + [VIDEO_DIM + 1]))
+    return Trajectory(
+        video_embeddings=(scale * numbers.standard_normal((draw(st.integers(1, MAX_LEN + 2)), width))).astype(
+            np.float32
+        ),
+        text_embedding=numbers.standard_normal(TEXT_DIM, np.float32),
+    )
+
+
+@st.composite
+def mixes(draw: st.DrawFn) -> list[Sample]:
+    def pair(kind: Any) -> Sample | None:
+        try:
+            return kind(draw(trajectories()), draw(trajectories()))  # type: ignore[no-any-return]
+        except InvalidSampleError:  # of two widths
+            return None
+
+    steps = st.sampled_from([0, 0, 2, 3, MAX_LEN + 1])
+    makers = {
+        "progress": lambda: ProgressSample(draw(trajectories()), frame_steps=draw(steps)),
+        "preference": lambda: pair(PreferenceSample),
+        "similarity": lambda: pair(SimilaritySample),
+    }
+    kinds = draw(st.lists(st.sampled_from(sorted(makers)), min_size=1, max_size=6))
+    return [sample for kind in kinds if (sample := makers[kind]()) is not None]
+
+
+def numbers_of(result: Result) -> Array:
+    if isinstance(result, ProgressResult):
+        return np.concatenate([result.progress, result.success])
+    if isinstance(result, SimilarityResult):
+        return np.concatenate([[result.similarity], result.reference.progress, result.other.progress])
+    return np.concatenate([[result.preference], result.first.progress, result.second.progress])
+
+
+@SLOW
+@given(ENGINES, mixes())
+def test_a_sample_is_scored_or_refused_alike_in_any_company(scorer: Engine, samples: list[Sample]) -> None:
+    together = scorer.evaluate(samples)
+    assert len(together) == len(samples)
+    for sample, outcome in zip(samples, together, strict=True):
+        (alone,) = scorer.evaluate([sample])
+        assert type(outcome) is type(alone)
+        if isinstance(outcome, InvalidSampleError):
+            told(outcome)
+            assert str(outcome) == str(alone)
+        else:
+            np.testing.assert_allclose(numbers_of(outcome), numbers_of(alone), rtol=0, atol=TOLERANCE)  # type: ignore[arg-type]
+
+
+# The checkpoint loader: any change to a file is harmless or refused
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("original") / "checkpoint"
+    torch.manual_seed(0)
+    checkpoint = RewindCheckpoint(
+        RewindConfig(VIDEO_DIM, TEXT_DIM, 8, 1, 2, MAX_LEN, True, True, 3, True, trained_frames=4),
+        RewindTransformer(RewindConfig(VIDEO_DIM, TEXT_DIM, 8, 1, 2, MAX_LEN, True, True, 3, True)).state_dict(),
+    )
+    families.save(checkpoint, folder)
+    (folder / "config.yaml").write_text(
+        "model:\n  rewind: {causal_mask: true, max_len: 7}\ndata: &d {max_frames: 4}\nmore: *d\n"
+    )
+    return folder
+
+
+CHANGES = st.lists(
+    st.tuples(
+        st.floats(0, 1),
+        st.sampled_from(["flip", "insert", "delete", "cut", "repeat"]),
+        st.binary(min_size=1, max_size=8),
+    ),
+    min_size=1,
+    max_size=4,
+)
+JSON_VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**70), 2**70) | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=5,
+)
+
+
+def changed(content: bytes, changes: list[tuple[float, str, bytes]]) -> bytes:
+    new = bytearray(content)
+    for place, kind, given_bytes in changes:
+        at = int(place * len(new))
+        if kind == "flip" and at < len(new):
+            new[at] ^= given_bytes[0] or 1
+        elif kind == "insert":
+            new[at:at] = given_bytes
+        elif kind == "delete":
+            del new[at : at + len(given_bytes)]
+        elif kind == "cut":
+            del new[at:]
+        elif kind == "repeat":
+            new[at:at] = new[at : at + 8 * len(given_bytes)]
+    return bytes(new)
+
+
+def loads_or_refuses(original: Path, file: str, content: bytes) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "checkpoint"
+        shutil.copytree(original, copy)
+        (copy / file).write_bytes(content)
+        try:
+            checkpoint = families.load(copy)
+            families.check(copy, checkpoint)
+            checkpoint.build()
+        except CheckpointError as error:
+            assert 0 < len(str(error)) < 10_000
+
+
+@SLOW
+@given(file=st.sampled_from(["model.safetensors", "config.json", "config.yaml"]), changes=CHANGES)
+def test_any_bytes_are_a_checkpoint_or_refused(
+    original: Path, file: str, changes: list[tuple[float, str, bytes]]
+) -> None:
+    loads_or_refuses(original, file, changed((original / file).read_bytes(), changes))
+
+
+@SLOW
+@given(changes=CHANGES)
+def test_any_header_is_a_checkpoint_or_refused(original: Path, changes: list[tuple[float, str, bytes]]) -> None:
+    content = (original / "model.safetensors").read_bytes()
+    length = int.from_bytes(content[:8], "little")
+    header = changed(content[8 : 8 + length], changes)
+    loads_or_refuses(original, "model.safetensors", len(header).to_bytes(8, "little") + header + content[8 + length :])
+
+
+@SLOW
+@given(data=st.data(), value=JSON_VALUES)
+def test_any_setting_is_taken_or_refused(original: Path, data: st.DataObject, value: Any) -> None:
+    content = json.loads((original / "config.json").read_text())
+    content[data.draw(st.sampled_from(sorted(content)))] = value
+    loads_or_refuses(original, "config.json", json.dumps(content).encode())
+
+
+@THOROUGH
+@given(text=st.text(alphabet="ab:-&*!<>{}[],'\"|?#% \n0123456789.x", max_size=60))
+def test_any_yaml_is_read_or_refused(original: Path, text: str) -> None:
+    loads_or_refuses(original, "config.yaml", text.encode())
+
+
+@SLOW
+@given(data=st.data(), value=JSON_VALUES)
+def test_any_setting_of_a_vision_language_checkpoint_is_taken_or_refused(data: st.DataObject, value: Any) -> None:
+    from rfm.vlm.checkpoint import load_vlm
+
+    config = goldens.config("q25_mean_l2")
+    content = json.loads((config.checkpoint / "config.json").read_text())
+    place = (
+        content[data.draw(st.sampled_from(["text_config", "vision_config"]))] if data.draw(st.booleans()) else content
+    )
+    place[data.draw(st.sampled_from(sorted(place)))] = value
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "checkpoint"
+        shutil.copytree(config.checkpoint, copy, copy_function=shutil.copyfile)
+        (copy / "config.json").write_text(json.dumps(content))
+        try:
+            load_vlm(copy)
+        except CheckpointError as error:
+            assert 0 < len(str(error)) < 10_000

@@ -1,0 +1,388 @@
+# SPDX-License-Identifier: MIT
+"""The network against torch's own transformer, in every variant; the collator; the engine's batches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+import goldens
+from rfm.config import DEFAULT_TOKEN_BUDGET
+from rfm.engine import Engine, Outcome
+from rfm.layers.heads import PredictionHead, progress_from_logits
+from rfm.prefixes import prefix_indices
+from rfm.rewind.collator import MAX_EMBEDDING, RewindCollator
+from rfm.rewind.family import RewindFamily
+from rfm.rewind.network import RewindBatch, RewindConfig, RewindTransformer
+from rfm.rewind.packing import Packing, rounded_up
+from rfm_client import (
+    InferenceFailedError,
+    InvalidSampleError,
+    PreferenceSample,
+    ProgressResult,
+    ProgressSample,
+    RewardError,
+    Sample,
+    SimilaritySample,
+    Trajectory,
+)
+from trajectories import random_trajectory
+
+TOLERANCE = 1e-6  # seen: 2.1e-7
+BASE = RewindConfig(
+    video_feature_dim=12,
+    text_feature_dim=6,
+    hidden_dim=24,
+    num_layers=2,
+    num_attention_heads=3,
+    max_len=8,
+    causal_mask=True,
+    use_per_frame_progress_token=True,
+    progress_bins=5,
+    has_similarity=True,
+)
+VARIANTS = {
+    f"causal={causal} tokens={tokens} bins={bins}": replace(
+        BASE, causal_mask=causal, use_per_frame_progress_token=tokens, progress_bins=bins
+    )
+    for causal, tokens, bins in product((True, False), (True, False), (1, 5))
+} | {
+    "one wide layer": replace(BASE, num_layers=1, hidden_dim=64, num_attention_heads=8),
+    "many narrow layers": replace(BASE, num_layers=5, hidden_dim=4, num_attention_heads=1),
+    "no similarity": replace(BASE, has_similarity=False),
+}
+
+
+def build(config: RewindConfig, seed: int = 0) -> RewindTransformer:
+    torch.manual_seed(seed)
+    network = RewindTransformer(config).eval()
+    for parameter in network.parameters():  # no layer is left at zeros or ones
+        nn.init.normal_(parameter, std=0.3)
+    return network.requires_grad_(False)
+
+
+def engine_of(network: RewindTransformer, *, device: str = "cpu", token_budget: int = DEFAULT_TOKEN_BUDGET) -> Engine:
+    return Engine(RewindFamily(network, encoders=None, device=torch.device(device)), token_budget=token_budget)
+
+
+def trajectory(seed: int, num_frames: int) -> Trajectory:
+    return random_trajectory(seed, num_frames, BASE.video_feature_dim, BASE.text_feature_dim)
+
+
+def sequence_of(network: RewindTransformer, sample: Sample) -> tuple[Tensor, list[list[int]]]:
+    """Written from the format's description, one token at a time: the row's tokens, and where scores are read."""
+    weights, config = network.state_dict(), network.config
+    text = torch.as_tensor(sample.trajectories[0].text_embedding)
+    token = weights["text_proj.weight"] @ text + weights["text_proj.bias"]
+    if config.use_per_frame_progress_token:
+        token = token + weights["text_position_embedding"][0, 0]
+    tokens, read = [token], []
+    for side, part in zip("AB", sample.trajectories, strict=False):
+        positions = []
+        for index, frame in enumerate(torch.as_tensor(part.video_embeddings)):
+            token = weights["video_proj.weight"] @ frame + weights["video_proj.bias"]
+            tokens.append(token + weights[f"first_embedding_{side}"][0, 0] if index == 0 else token)
+            if config.use_per_frame_progress_token:
+                tokens.append(weights[f"prog_token_{side}"][0, index])
+            positions.append(len(tokens) - 1)
+        read.append(positions)
+    if len(sample.trajectories) == 2:
+        name = "similarity_token" if isinstance(sample, SimilaritySample) else "preference_token"
+        tokens.append(weights[name][0, 0])
+    return torch.stack(tokens), read
+
+
+def reference_scores(network: RewindTransformer, sample: Sample) -> list[Tensor]:
+    """The sample's scores by torch's own transformer: per trajectory progress and success, then the query."""
+    config = network.config
+    layer = nn.TransformerEncoderLayer(
+        config.hidden_dim, config.num_attention_heads, 4 * config.hidden_dim, batch_first=True, dropout=0.0
+    )
+    transformer = nn.TransformerEncoder(layer, config.num_layers, enable_nested_tensor=False)
+    transformer.load_state_dict(network.transformer.state_dict())
+    tokens, read = sequence_of(network, sample)
+    length = len(tokens)
+    mask = torch.ones(length, length, dtype=torch.bool).triu(1) if config.causal_mask else None
+    hidden = transformer(tokens[None], mask=mask)[0]  # in training mode, without dropout: the plain path
+    scores = []
+    for positions in read:
+        logits = network.progress_head(hidden[positions])
+        if config.progress_bins == 1:
+            scores.append(logits.squeeze(-1).sigmoid())
+        else:
+            scores.append(logits.softmax(-1) @ torch.linspace(0, 1, config.progress_bins))
+        scores.append(network.success_head(hidden[positions]).squeeze(-1).sigmoid())
+    if isinstance(sample, PreferenceSample):
+        scores.append(network.preference_head(hidden[-1]).sigmoid())
+    elif isinstance(sample, SimilaritySample):
+        scores.append(network.similarity_head(hidden[-1]))
+    return scores
+
+
+def numbers(outcome: Outcome) -> np.ndarray:
+    assert not isinstance(outcome, RewardError), outcome
+    parts = [part for scores in goldens.frame_scores(outcome) for part in (scores.progress, scores.success)]
+    query = [[getattr(outcome, name)] for name in ("preference", "similarity") if hasattr(outcome, name)]
+    return np.concatenate([*parts, *query])
+
+
+def samples_for(config: RewindConfig) -> list[Sample]:
+    samples: list[Sample] = [ProgressSample(trajectory(t, t)) for t in (1, 2, 5, 8)]
+    samples += [PreferenceSample(trajectory(a, a), trajectory(b + 50, b)) for a, b in ((1, 1), (3, 6), (8, 2))]
+    if config.has_similarity:
+        samples += [SimilaritySample(trajectory(a, a), trajectory(b + 70, b)) for a, b in ((1, 4), (6, 6))]
+    return samples
+
+
+@pytest.mark.parametrize("config", VARIANTS.values(), ids=VARIANTS)
+def test_every_variant_scores_as_torchs_own_transformer(config: RewindConfig) -> None:
+    network = build(config)
+    samples = samples_for(config)
+    for sample, outcome in zip(samples, engine_of(network).evaluate(samples), strict=True):
+        expected = torch.cat([score.detach().flatten() for score in reference_scores(network, sample)])
+        np.testing.assert_allclose(numbers(outcome), expected.numpy(), rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("config", VARIANTS.values(), ids=VARIANTS)
+@pytest.mark.parametrize("token_budget", [64, 16_384])
+def test_a_result_does_not_depend_on_its_neighbours(config: RewindConfig, token_budget: int) -> None:
+    samples = samples_for(config) * 3
+    order = np.random.default_rng(0).permutation(len(samples))
+    network = build(config)
+    alone = [numbers(engine_of(network).evaluate([sample])[0]) for sample in samples]
+    together = engine_of(network, token_budget=token_budget).evaluate([samples[index] for index in order])
+    for index, outcome in zip(order, together, strict=True):
+        np.testing.assert_allclose(numbers(outcome), alone[index], rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_mix_of_lengths_and_types_changes_a_result(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    samples = samples_for(BASE)
+    samples += [ProgressSample(trajectory(t, t), frame_steps=3) for t in (2, 5)]
+    engine = engine_of(build(BASE))
+    alone = [numbers(engine.evaluate([sample])[0]) for sample in samples]
+    for size in range(1, 60):
+        chosen = random.integers(0, len(samples), size)
+        for index, outcome in zip(chosen, engine.evaluate([samples[i] for i in chosen]), strict=True):
+            np.testing.assert_allclose(numbers(outcome), alone[index], rtol=0, atol=TOLERANCE)
+
+
+def test_frames_beyond_max_len_are_taken_without_progress_tokens() -> None:
+    config = replace(BASE, use_per_frame_progress_token=False)
+    (outcome,) = engine_of(build(config)).evaluate([ProgressSample(trajectory(0, 3 * config.max_len))])
+    assert isinstance(outcome, ProgressResult)
+    assert len(outcome.progress) == 3 * config.max_len
+
+
+def test_the_token_budget_bounds_every_forward() -> None:
+    network = build(BASE)
+    sizes: list[int] = []
+    network.transformer.register_forward_hook(
+        lambda _m, inputs, _o: sizes.append(inputs[1].num_rows * inputs[1].longest)
+    )
+    engine_of(network, token_budget=100).evaluate(samples_for(BASE) * 5)
+    assert max(sizes) <= 100
+    assert len(sizes) < 30
+
+
+def test_dense_mode_takes_as_few_forwards_as_the_budget_allows() -> None:
+    network = build(BASE)
+    calls: list[int] = []
+    network.transformer.register_forward_hook(lambda *_: calls.append(1))
+    samples = [ProgressSample(trajectory(t, t), frame_steps=4) for t in (3, 9, 20)]
+    engine_of(network).evaluate(samples)
+    assert len(calls) == 1
+
+
+def test_a_row_over_the_token_budget_runs_alone() -> None:
+    network = build(BASE)
+    samples = [ProgressSample(trajectory(seed, 8)) for seed in range(3)] + [ProgressSample(trajectory(3, 2))] * 2
+    expected = [numbers(outcome) for outcome in engine_of(network).evaluate(samples)]
+    rows: list[int] = []
+    network.transformer.register_forward_hook(lambda _m, inputs, _o: rows.append(inputs[1].num_rows))
+    outcomes = engine_of(network, token_budget=10).evaluate(samples)  # a row of eight frames has 17 tokens
+    for outcome, other in zip(outcomes, expected, strict=True):
+        np.testing.assert_allclose(numbers(outcome), other, rtol=0, atol=TOLERANCE)
+    assert rows == [2, 1, 1, 1]
+
+
+def test_a_sample_over_the_servers_limit_is_refused_alone() -> None:
+    engine = Engine(RewindFamily(build(BASE), encoders=None, device=torch.device("cpu")), max_sample_tokens=16)
+    refused, scored = engine.evaluate([ProgressSample(trajectory(0, 8)), ProgressSample(trajectory(0, 7))])
+    assert isinstance(refused, InvalidSampleError)
+    assert str(refused) == "num_frames: expected at most 16 tokens (max_sample_tokens of this server), got 17 tokens"
+    assert isinstance(scored, ProgressResult)
+
+
+BAD_FOR_CHECKPOINT: dict[str, tuple[Sample, str]] = {
+    "T over max_len": (
+        ProgressSample(trajectory(0, 9)),
+        "num_frames: expected at most 8 (max_len of this checkpoint, which has per-frame progress tokens), got 9",
+    ),
+    "second T over max_len": (
+        PreferenceSample(trajectory(0, 1), trajectory(0, 9)),
+        "num_frames: expected at most 8 (max_len of this checkpoint, which has per-frame progress tokens), got 9",
+    ),
+    "wrong D": (
+        ProgressSample(random_trajectory(0, 2, 13, 6)),
+        "video_embeddings: expected float32 [T, 12], got [2, 13]",
+    ),
+    "wrong Dt": (ProgressSample(random_trajectory(0, 2, 12, 7)), "text_embedding: expected float32 [6], got [7]"),
+    "frames without encoders": (
+        ProgressSample(Trajectory(frames=np.zeros((1, 4, 4, 3), np.uint8), task="lift")),
+        "frames: expected video_embeddings (no encoders are loaded), got frames",
+    ),
+}
+
+
+@pytest.mark.parametrize(("sample", "message"), BAD_FOR_CHECKPOINT.values(), ids=BAD_FOR_CHECKPOINT)
+def test_what_the_checkpoint_cannot_take_fails_alone(sample: Sample, message: str) -> None:
+    good = ProgressSample(trajectory(1, 3))
+    engine = engine_of(build(BASE))
+    first, failed, last = engine.evaluate([good, sample, good])
+    assert isinstance(failed, InvalidSampleError)
+    assert str(failed) == message
+    np.testing.assert_allclose(numbers(first), numbers(engine.evaluate([good])[0]), atol=TOLERANCE)
+    np.testing.assert_allclose(numbers(first), numbers(last), atol=TOLERANCE)
+
+
+def test_a_score_that_is_no_number_is_an_error() -> None:
+    huge = Trajectory(
+        video_embeddings=np.full((2, 12), MAX_EMBEDDING, np.float32), text_embedding=np.ones(6, np.float32)
+    )
+    network = build(BASE)
+    network.video_proj.weight.data *= 1e14  # so that the largest embedding overflows
+    failed, good = engine_of(network).evaluate([ProgressSample(huge), ProgressSample(trajectory(0, 2))])
+    assert isinstance(failed, InferenceFailedError)
+    assert isinstance(good, ProgressResult)
+
+
+def test_no_samples_no_results() -> None:
+    assert engine_of(build(BASE)).evaluate([]) == []
+
+
+def test_prefixes_are_sampled_as_the_original_samples_them() -> None:
+    assert prefix_indices(1, 4).tolist() == [[0, 0, 0, 0]]
+    assert prefix_indices(6, 4).tolist() == [
+        [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 2], [0, 1, 2, 3], [0, 1, 2, 4], [0, 1, 3, 5]
+    ]  # fmt: skip
+
+
+def test_rows_of_all_kinds_are_packed_into_one_batch() -> None:
+    collator = RewindCollator(BASE)
+    samples: Sequence[Sample] = [
+        PreferenceSample(trajectory(0, 1), trajectory(1, 3)),
+        ProgressSample(trajectory(4, 2)),
+        SimilaritySample(trajectory(2, 2), trajectory(3, 1)),
+    ]
+    batch = collator.collate([row for sample in samples for row in collator.rows(sample)])
+    # [text] [A a] [B b B b B b] [query] | [text] [A a A a] | [text] [A a A a] [B b] [query]
+    assert batch.text_at.tolist() == [0, 10, 15]
+    assert batch.frame_at.tolist() == [1, 3, 5, 7, 11, 13, 16, 18, 20]
+    assert batch.query_at.tolist() == [9, 22]
+    assert batch.read_at[:11].tolist() == [2, 4, 6, 8, 12, 14, 17, 19, 21, 9, 22]
+    assert batch.place.tolist() == [0, 8, 9, 10, 0, 1, 0, 1, 8]
+    assert batch.first_starts.tolist() == [0, 4, 6]
+    assert batch.second_starts.tolist() == [1, 8]
+    assert batch.shown is None
+    assert batch.is_similarity is not None
+    assert batch.is_similarity.tolist() == [False, True]
+    expected = np.concatenate([t.positions for sample in samples for t in sample.trajectories])
+    np.testing.assert_array_equal(batch.video[:9].numpy(), expected)
+
+
+@pytest.mark.parametrize("num_frames", [[9, 0], [1, 9]], ids=str)
+def test_more_frames_than_progress_tokens_are_refused(num_frames: list[int]) -> None:
+    frames = torch.zeros(sum(num_frames), 12)
+    with pytest.raises(ValueError, match="num_frames: expected at most 8, got 9"):
+        RewindBatch.of(BASE, torch.zeros(1, 6), frames, np.array([num_frames]))
+
+
+def test_frames_that_many_rows_show_are_in_a_batch_once() -> None:
+    collator = RewindCollator(BASE)
+    same = trajectory(1, 3)
+    samples: Sequence[Sample] = [ProgressSample(trajectory(0, 5), frame_steps=4), PreferenceSample(same, same)]
+    batch = collator.collate([row for sample in samples for row in collator.rows(sample)])
+    assert len(batch.video) == rounded_up(5 + 3)
+    assert batch.shown is not None
+    assert batch.shown.tolist() == [*prefix_indices(5, 4).flatten(), 5, 6, 7, 5, 6, 7]
+
+
+@pytest.mark.parametrize("lengths", [(5,), (33, 33), (7, 7, 7), (2, 9, 1), (33, 34), (34, 33)], ids=str)
+def test_what_is_padded_and_packed_again_is_the_same(lengths: tuple[int, ...]) -> None:
+    """Also where the room behind the tokens makes them as many as the padded rows' (33 and 34: 67 in 68)."""
+    packing = Packing.of(np.array(lengths))
+    packed = torch.randn(len(packing.at), 3)
+    padded = packing.padded(packed)
+    assert padded.shape == (len(lengths), max(lengths), 3)
+    rows = packed[: sum(lengths)].split(lengths)
+    assert all(torch.equal(row, of_batch[: len(row)]) for row, of_batch in zip(rows, padded, strict=True))
+    assert torch.equal(packing.packed(padded)[: sum(lengths)], packed[: sum(lengths)])
+
+
+def test_packed_tokens_are_padded_for_attention_alone() -> None:
+    packing = Packing.of(np.array([2, 3, 1]))
+    packed = torch.arange(1.0, 7.0)[:, None]
+    padded = packing.padded(packed)
+    assert padded.squeeze(-1).tolist() == [[1, 2, 0], [3, 4, 5], [6, 0, 0]]
+    assert torch.equal(packing.packed(padded)[:6], packed)
+    assert packing.mask is not None
+    assert packing.mask[:, 0, 0].int().tolist() == [[1, 1, 0], [1, 1, 1], [1, 0, 0]]
+    assert Packing.of(np.array([4, 4])).mask is None
+
+
+def test_counts_are_rounded_up_to_one_of_few() -> None:
+    counts = range(1, 5000)
+    assert all(count <= rounded_up(count) <= count * 17 / 16 for count in counts)
+    assert [rounded_up(count) for count in (1, 31, 32, 33, 65, 1056, 1089)] == [1, 31, 32, 34, 68, 1088, 1152]
+    assert len({rounded_up(count) for count in counts}) < 160
+
+
+def test_discrete_progress_is_read_in_float32() -> None:
+    logits = torch.randn(3, 4, 10, generator=torch.manual_seed(0)).bfloat16()
+    expected = logits.double().softmax(-1) @ torch.linspace(0, 1, 10, dtype=torch.float64)
+    torch.testing.assert_close(progress_from_logits(logits).double(), expected, rtol=0, atol=1e-6)
+
+
+def test_head_parameters_have_the_names_of_checkpoints() -> None:
+    assert set(PredictionHead(8, 3).state_dict()) == {f"{i}.{kind}" for i in (0, 1, 4) for kind in ("weight", "bias")}
+
+
+@pytest.mark.reference
+@pytest.mark.parametrize("case", goldens.CASES, ids=str)
+def test_the_engine_gives_every_reference_answer(case: goldens.Case, engine: Callable[[str], Engine]) -> None:
+    outcomes = engine(case.config.name).evaluate(case.samples())
+    if case.is_refused:
+        assert all(isinstance(outcome, InvalidSampleError) and "max_len" in str(outcome) for outcome in outcomes)
+        return
+    results = [outcome for outcome in outcomes if not isinstance(outcome, RewardError)]
+    for result, expected in zip(results, case.expected(), strict=True):
+        goldens.check(result, expected, case.tolerances)
+    case.check_response(results)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("config", VARIANTS.values(), ids=VARIANTS)
+def test_the_gpu_gives_the_numbers_of_the_cpu(config: RewindConfig) -> None:
+    samples = samples_for(config)
+    on_cpu, on_gpu = (engine_of(build(config), device=device).evaluate(samples) for device in ("cpu", "cuda"))
+    for left, right in zip(on_cpu, on_gpu, strict=True):
+        np.testing.assert_allclose(numbers(left), numbers(right), rtol=0, atol=1e-4)
+
+
+def test_half_precision_scores_are_near_those_of_float32() -> None:
+    """ReWiND in bfloat16, where somebody asks for it."""
+    checkpoint = goldens.config("c1_t1_disc10").checkpoint
+    in_float32, in_bfloat16 = (Engine.from_checkpoint(checkpoint, dtype=dtype) for dtype in (None, torch.bfloat16))
+    samples = [ProgressSample(random_trajectory(seed, 1 + seed)) for seed in range(8)]
+    for exact, near in zip(in_float32.evaluate(samples), in_bfloat16.evaluate(samples), strict=True):
+        assert isinstance(exact, ProgressResult) and isinstance(near, ProgressResult)
+        assert near.progress.dtype == np.float32
+        assert 0 < np.abs(near.progress - exact.progress).max() < 0.02

@@ -1,0 +1,492 @@
+# SPDX-License-Identifier: MIT
+"""The Kubernetes manifests: built by kubectl's kustomize, checked against schemas and policies, and against the programs.
+
+Kubernetes' own schemas come with kubernetes-validate; those of PodMonitor and of KServe's objects are excerpts
+(``custom_resource_schemas.json`` says of what). What only a cluster can tell is not tested here.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+import importlib.metadata
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from http import HTTPStatus
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import httpx
+import jsonschema
+import kubernetes_validate
+import pytest
+import yaml
+from referencing import Registry, Resource
+from typer.main import get_command
+
+from paths import ROOT
+from repositories import kill_model
+from rfm.supervise import admin_key
+from rfm.supervise.process import KILL_AFTER_S, Endpoints
+from rfm_commands.cli import app
+from rfm_gateway.command import STOP_WITHIN_S
+
+KUBERNETES = ROOT / "docker" / "kubernetes"
+BIN = Path(sys.executable).parent
+PROMETHEUS = yaml.safe_load((ROOT / "docker" / "prometheus" / "prometheus.yml").read_text())
+OVERLAYS = ("overlays/cpu", "overlays/gpu")
+SETS = (*OVERLAYS, "kserve")
+RELEASES = ("1.31", "1.37")  # the oldest that the manifests are for, and the newest known
+CUSTOM = ("monitoring.coreos.com/", "serving.kserve.io/")
+VOLUMES = {"configMap", "csi", "downwardAPI", "emptyDir", "ephemeral", "persistentVolumeClaim", "projected", "secret"}
+PORT_OPTIONS = {
+    "http": "http_port",
+    "http1": "http_port",
+    "grpc": "grpc_port",
+    "metrics": "metrics_port",
+    "status": "status_port",
+    "gateway": "port",
+}
+PATIENCE_S = 120.0
+POLL_S = 0.02
+
+Object = dict[str, Any]
+
+
+@functools.cache
+def _built(folder: str) -> str:
+    command = [BIN / "kubectl", "kustomize", KUBERNETES / folder]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
+def built(folder: str, *kinds: str) -> list[Object]:
+    """What ``kubectl apply -k`` would send; of the kinds alone, if any are named."""
+    return [found for found in yaml.safe_load_all(_built(folder)) if not kinds or found["kind"] in kinds]
+
+
+def named(folder: str, kind: str, name: str) -> Object:
+    (found,) = (found for found in built(folder, kind) if found["metadata"]["name"] == name)
+    return found
+
+
+def pod_of(workload: Object) -> Object:
+    """The pod's specification."""
+    return workload["spec"] if workload["kind"] == "ServingRuntime" else workload["spec"]["template"]["spec"]
+
+
+def container_of(workload: Object) -> Object:
+    (container,) = pod_of(workload)["containers"]
+    return container
+
+
+def workloads(*folders: str) -> list[Any]:
+    """Everything that makes pods, as parameters."""
+    return [
+        pytest.param(workload, id=f"{folder}-{workload['metadata']['name']}")
+        for folder in folders
+        for workload in built(folder, "Deployment", "ServingRuntime")
+    ]
+
+
+def parameters(command: Any, words: list[str]) -> dict[str, Any]:
+    """What the real command line reads ``words`` as; it runs nothing."""
+    name, *arguments = words
+    return command.commands[name].make_context(name, arguments).params
+
+
+def selected(selector: dict[str, str], folder: str) -> list[Object]:
+    """Deployments whose pods have these labels."""
+    deployments = built(folder, "Deployment")
+    return [one for one in deployments if selector.items() <= one["spec"]["template"]["metadata"]["labels"].items()]
+
+
+def validate(manifest: Object, release: str) -> None:
+    if not manifest["apiVersion"].startswith(CUSTOM):
+        kubernetes_validate.validate(manifest, release, strict=True)
+        return
+    folder = f"v{kubernetes_validate.latest_version()}-local-strict"
+    core = json.loads(
+        (files("kubernetes_validate") / "kubernetes-json-schema" / folder / "_definitions.json").read_text()
+    )
+    excerpt = json.loads(Path(__file__).with_name("custom_resource_schemas.json").read_text())
+    schema = {"$ref": f"#/$defs/{manifest['kind']}", **excerpt}
+    registry = Registry().with_resource(core["$id"], Resource.from_contents(core))
+    jsonschema.Draft202012Validator(schema, registry=registry).validate(manifest)
+
+
+@pytest.mark.parametrize("release", RELEASES)
+@pytest.mark.parametrize("folder", SETS)
+def test_every_manifest_fits_its_schema(folder: str, release: str) -> None:
+    for manifest in built(folder):
+        validate(manifest, release)
+
+
+@pytest.mark.parametrize("folder", SETS)
+def test_a_misspelt_field_is_found(folder: str) -> None:
+    for manifest in built(folder):
+        if "spec" in manifest:
+            manifest["spec"]["replica"] = 1
+            with pytest.raises(jsonschema.ValidationError, match="'replica' was unexpected"):
+                validate(manifest, RELEASES[-1])
+    for workload in built(folder, "Deployment", "ServingRuntime"):
+        container_of(workload)["livenessProbe"]["periodSecond"] = 1
+        with pytest.raises(jsonschema.ValidationError, match="'periodSecond' was unexpected"):
+            validate(workload, RELEASES[-1])
+
+
+def violations(pod: Object) -> Iterator[str]:
+    """What the pod security standard "restricted" forbids, and a root file system that can be written."""
+    around = pod.get("securityContext", {})
+    yield from (key for key in ("hostNetwork", "hostPID", "hostIPC") if pod.get(key))
+    yield from (f"sysctls {one}" for one in around.get("sysctls", []))
+    yield from (kind for volume in pod.get("volumes", []) for kind in set(volume) - {"name"} - VOLUMES)
+    for container in [*pod["containers"], *pod.get("initContainers", [])]:
+        inside = container.get("securityContext", {})
+        context = {**around, **inside}
+        yield from (key for key in ("privileged", "procMount", "seLinuxOptions", "appArmorProfile") if context.get(key))
+        yield from ("hostPort" for port in container.get("ports", []) if port.get("hostPort"))
+        capabilities = inside.get("capabilities", {})
+        if capabilities.get("drop") != ["ALL"] or set(capabilities.get("add", [])) - {"NET_BIND_SERVICE"}:
+            yield "capabilities"
+        if inside.get("allowPrivilegeEscalation") is not False:
+            yield "allowPrivilegeEscalation"
+        if context.get("runAsNonRoot") is not True or context.get("runAsUser") == 0:
+            yield "root"
+        if context.get("seccompProfile", {}).get("type") not in ("RuntimeDefault", "Localhost"):
+            yield "seccompProfile"
+        if inside.get("readOnlyRootFilesystem") is not True:
+            yield "readOnlyRootFilesystem"
+
+
+@pytest.mark.parametrize("workload", workloads(*SETS))
+def test_pods_are_restricted(workload: Object) -> None:
+    assert list(violations(pod_of(workload))) == []
+
+
+@pytest.mark.parametrize(
+    ("loosen", "found"),
+    [
+        (lambda pod: pod.update(hostNetwork=True), "hostNetwork"),
+        (lambda pod: pod["volumes"].append({"name": "node", "hostPath": {"path": "/"}}), "hostPath"),
+        (lambda pod: pod["securityContext"].pop("runAsNonRoot"), "root"),
+        (lambda pod: pod["securityContext"].pop("seccompProfile"), "seccompProfile"),
+        (lambda pod: pod["containers"][0]["securityContext"].pop("capabilities"), "capabilities"),
+        (lambda pod: pod["containers"][0]["securityContext"].update(privileged=True), "privileged"),
+        (
+            lambda pod: pod["containers"][0]["securityContext"].pop("allowPrivilegeEscalation"),
+            "allowPrivilegeEscalation",
+        ),
+        (lambda pod: pod["containers"][0]["securityContext"].update(runAsUser=0), "root"),
+    ],
+)
+def test_a_loosened_pod_is_not(loosen: Callable[[Object], object], found: str) -> None:
+    pod = copy.deepcopy(pod_of(named("overlays/cpu", "Deployment", "rfm-triton")))
+    loosen(pod)
+    assert list(violations(pod)) == [found]
+
+
+def test_namespaces_say_that_pods_are_restricted() -> None:
+    for folder in SETS:
+        (namespace,) = built(folder, "Namespace")
+        modes = ("warn", "audit") if folder == "kserve" else ("enforce", "warn", "audit")
+        labels = namespace["metadata"]["labels"]
+        assert {labels[f"pod-security.kubernetes.io/{mode}"] for mode in modes} == {"restricted"}
+        assert {one["metadata"].get("namespace") for one in built(folder)} == {None, namespace["metadata"]["name"]}
+
+
+@pytest.mark.parametrize("workload", workloads(*SETS))
+def test_containers_have_limits_probes_and_the_release_s_image(workload: Object) -> None:
+    container = container_of(workload)
+    on_gpu = "nvidia.com/gpu" in container["resources"]["limits"]
+    variants = ("", "-cpu") if container["args"][0] == "gateway" else ("",) if on_gpu else ("-cpu",)
+    release = f"registry.example.com/rfm-triton:{importlib.metadata.version('rfm-triton')}"
+    assert container["image"] in [release + variant for variant in variants]
+    resources = container["resources"]
+    assert resources["requests"]["memory"] and resources["limits"]["memory"] and resources["requests"]["cpu"]
+    for kind in ("startupProbe", "readinessProbe", "livenessProbe"):
+        assert container[kind]["periodSeconds"] and container[kind]["timeoutSeconds"]
+    mounts = {mount["name"] for mount in container["volumeMounts"]}
+    assert mounts == {volume["name"] for volume in pod_of(workload)["volumes"]}
+
+
+def test_a_gpu_is_asked_for_where_there_is_one() -> None:
+    cpu, gpu = (pod_of(named(folder, "Deployment", "rfm-triton")) for folder in OVERLAYS)
+    assert gpu["containers"][0]["resources"]["limits"]["nvidia.com/gpu"] == "1"
+    assert gpu["tolerations"] == [{"key": "nvidia.com/gpu", "operator": "Exists", "effect": "NoSchedule"}]
+    assert "nvidia.com/gpu" not in cpu["containers"][0]["resources"]["limits"] and "tolerations" not in cpu
+    threads = {"name": "OMP_NUM_THREADS", "value": cpu["containers"][0]["resources"]["limits"]["cpu"]}
+    assert threads in cpu["containers"][0]["env"]
+
+
+@pytest.mark.parametrize("workload", workloads(*SETS))
+def test_arguments_are_those_of_the_program(workload: Object) -> None:
+    container = container_of(workload)
+    assert container["command"] == ["rfm"]
+    given = parameters(get_command(app), container["args"])
+    assert given["host"] == "0.0.0.0"
+    ports = {port["name"]: port["containerPort"] for port in container["ports"]}
+    assert ports == {name: given[PORT_OPTIONS[name]] for name in ports}
+    is_gateway = container["args"][0] == "gateway"
+    for kind in ("startupProbe", "readinessProbe", "livenessProbe"):
+        if "httpGet" in container[kind]:
+            port = container[kind]["httpGet"]["port"]
+            assert ports.get(port, port) == given["port" if is_gateway else "status_port"]
+    if is_gateway:
+        return
+    is_kserve = workload["kind"] == "ServingRuntime"
+    mounts = {mount["name"]: mount["mountPath"] for mount in container["volumeMounts"]}
+    assert str(given["repository"]) == ("/mnt/models" if is_kserve else f"{mounts['repository']}/model_repository")
+
+
+@pytest.mark.parametrize("workload", workloads(*OVERLAYS))
+def test_keys_are_files_that_others_cannot_read(workload: Object) -> None:
+    container, pod = container_of(workload), pod_of(workload)
+    (secret,) = (volume for volume in pod["volumes"] if "secret" in volume)
+    (mount,) = (mount for mount in container["volumeMounts"] if mount["name"] == secret["name"])
+    given = parameters(get_command(app), container["args"])
+    file = given["api_key_file"] if container["args"][0] == "gateway" else given["admin_key_file"]
+    assert file.parent == Path(mount["mountPath"])
+    assert secret["secret"]["defaultMode"] == 0o400
+    assert pod["securityContext"]["fsGroup"] == pod["securityContext"]["runAsGroup"]
+    assert_readme_creates(secret["secret"]["secretName"], file.name)
+
+
+def test_kserve_s_key_is_a_variable() -> None:
+    container = container_of(named("kserve", "ServingRuntime", "rfm-triton"))
+    assert parameters(get_command(app), container["args"])["admin_key_file"] is None
+    (key,) = (one["valueFrom"]["secretKeyRef"] for one in container["env"] if one["name"] == admin_key.VARIABLE)
+    assert_readme_creates(key["name"], key["key"])
+
+
+def assert_readme_creates(secret: str, key: str) -> None:
+    command = f"create secret generic {secret} --from-literal={key}="
+    assert command in (KUBERNETES / "README.md").read_text()
+
+
+@pytest.mark.parametrize("workload", workloads(*OVERLAYS))
+def test_requests_in_flight_have_time_to_end(workload: Object) -> None:
+    sleep_s = container_of(workload)["lifecycle"]["preStop"]["sleep"]["seconds"]
+    stops_within_s = STOP_WITHIN_S if container_of(workload)["args"][0] == "gateway" else KILL_AFTER_S
+    assert pod_of(workload)["terminationGracePeriodSeconds"] > sleep_s + stops_within_s
+    assert workload["spec"]["strategy"]["rollingUpdate"] == {"maxSurge": 1, "maxUnavailable": 0}
+    startup = container_of(workload)["startupProbe"]
+    deadline_s = workload["spec"].get("progressDeadlineSeconds", 600)
+    assert startup["periodSeconds"] * startup["failureThreshold"] < deadline_s
+
+
+@pytest.mark.parametrize("folder", OVERLAYS)
+def test_selectors_find_their_pods(folder: str) -> None:
+    for deployment in built(folder, "Deployment"):
+        labels = deployment["spec"]["selector"]["matchLabels"]
+        assert [one["metadata"]["name"] for one in selected(labels, folder)] == [deployment["metadata"]["name"]]
+        for spread in pod_of(deployment)["topologySpreadConstraints"]:
+            assert spread["labelSelector"]["matchLabels"] == labels
+        for kind in ("PodDisruptionBudget", "PodMonitor"):
+            assert named(folder, kind, deployment["metadata"]["name"])["spec"]["selector"]["matchLabels"] == labels
+    for service in built(folder, "Service"):
+        (deployment,) = selected(service["spec"]["selector"], folder)
+        names = {port["name"] for port in container_of(deployment)["ports"]}
+        assert {port["targetPort"] for port in service["spec"]["ports"]} <= names
+    jobs, scraped = [job["job_name"] for job in PROMETHEUS["scrape_configs"]], []
+    for monitor in built(folder, "PodMonitor"):
+        (deployment,) = selected(monitor["spec"]["selector"]["matchLabels"], folder)
+        names = {port["name"] for port in container_of(deployment)["ports"]}
+        for endpoint in monitor["spec"]["podMetricsEndpoints"]:
+            assert endpoint["port"] in names
+            (relabeling,) = endpoint["relabelings"]
+            assert relabeling["targetLabel"] == "job"
+            scraped.append(relabeling["replacement"])
+    assert sorted(scraped) == sorted(jobs)  # which the alerts name
+
+
+@pytest.mark.parametrize("folder", OVERLAYS)
+def test_policies_open_the_ports_that_there_are(folder: str) -> None:
+    default = named(folder, "NetworkPolicy", "default")["spec"]
+    assert default["podSelector"] == {} and default["policyTypes"] == ["Ingress", "Egress"] and "ingress" not in default
+    (names,) = default["egress"]
+    assert {(port["port"], port["protocol"]) for port in names["ports"]} == {(53, "UDP"), (53, "TCP")}
+    assert {"ipBlock": {"cidr": "169.254.20.10/32"}} in names["to"]  # NodeLocal DNSCache
+    labels = [peer["podSelector"]["matchLabels"]["k8s-app"] for peer in names["to"] if "podSelector" in peer]
+    assert labels == ["kube-dns", "node-local-dns"]
+    for deployment in built(folder, "Deployment"):
+        policy = named(folder, "NetworkPolicy", deployment["metadata"]["name"])["spec"]
+        assert selected(policy["podSelector"]["matchLabels"], folder) == [deployment]
+        opened = {port["port"] for rule in policy["ingress"] for port in rule["ports"]}
+        assert opened == {port["containerPort"] for port in container_of(deployment)["ports"]}
+        assert all(rule["from"] for rule in policy["ingress"])
+
+
+@pytest.mark.parametrize("folder", OVERLAYS)
+def test_the_gateway_reaches_triton(folder: str) -> None:
+    gateway = parameters(get_command(app), container_of(named(folder, "Deployment", "rfm-gateway"))["args"])
+    triton, metrics = urlsplit(gateway["triton"]), urlsplit(gateway["metrics_url"])
+    pods = named(folder, "Service", triton.hostname)["spec"]
+    assert triton.scheme == "grpc"
+    assert pods["clusterIP"] == "None"  # its name has the addresses of all pods, also of those that are added
+    assert triton.port in [port["port"] for port in pods["ports"] if port["name"] == "grpc"]
+    one = named(folder, "Service", metrics.hostname)["spec"]
+    assert metrics.port in [port["port"] for port in one["ports"] if port["name"] == "metrics"]
+    assert pods["selector"] == one["selector"]
+    wanted = {triton.port, metrics.port}
+    (way_out,) = named(folder, "NetworkPolicy", "rfm-gateway")["spec"]["egress"]
+    labels = named(folder, "Deployment", "rfm-gateway")["spec"]["selector"]["matchLabels"]
+    ways_in = named(folder, "NetworkPolicy", "rfm-triton")["spec"]["ingress"]
+    (way_in,) = (way for way in ways_in if way["from"] == [{"podSelector": {"matchLabels": labels}}])
+    assert wanted == {port["port"] for port in way_out["ports"]} == {port["port"] for port in way_in["ports"]}
+
+
+def test_the_readme_s_patch_lets_pods_ask_another_address_for_names(tmp_path: Path) -> None:
+    (patch,) = re.findall(r"\n    patches:\n(?:      .*\n)+", (KUBERNETES / "README.md").read_text())
+    overlay = KUBERNETES / "overlays" / "cpu"
+    base = os.path.relpath(overlay, tmp_path)
+    (tmp_path / "kustomization.yaml").write_text(f"resources: [{base}]\n{textwrap.dedent(patch)}")
+    command = [BIN / "kubectl", "kustomize", "--load-restrictor=LoadRestrictionsNone", tmp_path]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    policies = (one for one in yaml.safe_load_all(done.stdout) if one["kind"] == "NetworkPolicy")
+    (default,) = (one for one in policies if one["metadata"]["name"] == "default")
+    assert {"ipBlock": {"cidr": "10.96.0.10/32"}} in default["spec"]["egress"][0]["to"]
+    validate(default, RELEASES[-1])
+
+
+@pytest.mark.parametrize("folder", OVERLAYS)
+def test_kube_prometheus_stack_finds_monitors_and_rules(folder: str) -> None:
+    """It selects both by the name of its Helm release, and nothing else is labelled so."""
+    labelled = [one for one in built(folder) if "release" in one["metadata"].get("labels", {})]
+    assert labelled == built(folder, "PodMonitor") != []
+    (release,) = {one["metadata"]["labels"]["release"] for one in labelled}
+    assert f"labels: {{release: {release}}}" in (KUBERNETES / "monitoring" / "kustomization.yaml").read_text()
+    (rules,) = re.findall(r"    for file in .*\n(?:      .*\n)*    done\n", (KUBERNETES / "README.md").read_text())
+    made = subprocess.run(
+        ["bash", "-c", rules.replace("kubectl apply -f -", "cat; echo ---")],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    objects = [one for one in yaml.safe_load_all(made.stdout) if one]
+    assert {one["metadata"]["name"] for one in objects} == {"rfm-alerts", "rfm-recording"}
+    for one in objects:
+        assert (one["kind"], one["metadata"]["labels"]) == ("PrometheusRule", {"release": release})
+        assert one["spec"]["groups"]
+
+
+@pytest.mark.parametrize("folder", OVERLAYS)
+def test_the_autoscaler_s_metric_is_recorded_and_handed_on(folder: str) -> None:
+    scaler = named(folder, "HorizontalPodAutoscaler", "rfm-triton")["spec"]
+    target = scaler["scaleTargetRef"]
+    assert "replicas" not in named(folder, target["kind"], target["name"])["spec"]
+    (metric,) = scaler["metrics"]
+    (rule,) = yaml.safe_load((KUBERNETES / "monitoring" / "prometheus-adapter.yaml").read_text())["rules"]["custom"]
+    assert rule["name"]["as"] == metric["pods"]["metric"]["name"]
+    series = rule["seriesQuery"].partition("{")[0]
+    assert re.search(rule["name"]["matches"], series)
+    groups = (yaml.safe_load(file.read_text())["groups"] for file in (ROOT / "docker/prometheus/rules").glob("*.yml"))
+    recorded = {
+        one["record"]: one["expr"] for group in groups for part in group for one in part["rules"] if "record" in one
+    }
+    assert " by " not in recorded[series]  # that would drop the labels namespace and pod
+
+
+def test_kserve_s_objects_know_each_other() -> None:
+    (runtime,), (service,) = built("kserve", "ServingRuntime"), built("kserve", "InferenceService")
+    (claim,) = built("kserve", "PersistentVolumeClaim")
+    model = service["spec"]["predictor"]["model"]
+    assert model["runtime"] == runtime["metadata"]["name"]
+    assert model["modelFormat"]["name"] in [known["name"] for known in runtime["spec"]["supportedModelFormats"]]
+    assert model["protocolVersion"] in runtime["spec"]["protocolVersions"]
+    assert urlsplit(model["storageUri"]).netloc == claim["metadata"]["name"]
+
+
+def test_what_the_readme_applies_is_there() -> None:
+    applied = re.findall(r"-k docker/kubernetes/([\w/]+)", (KUBERNETES / "README.md").read_text())
+    assert set(applied) == set(SETS)
+
+
+def with_values(arguments: list[str], values: dict[str, Any]) -> list[str]:
+    """The same options, with other values."""
+    options = (word.partition("=") for word in arguments)
+    return [f"{name}={values[name]}" if has_value else name for name, has_value, _ in options]
+
+
+def eventually(is_so: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not is_so():
+        assert time.monotonic() < deadline_s
+        time.sleep(POLL_S)
+
+
+@dataclass(frozen=True)
+class Probed:
+    """What a pod's container runs, on ports of this machine."""
+
+    container: Object
+    process: subprocess.Popen[bytes]
+    status_port: int
+    log: Path
+
+    def passes(self, kind: str) -> bool:
+        """As the kubelet asks."""
+        assert self.process.poll() is None, self.log.read_text()
+        get = self.container[kind]["httpGet"]
+        assert get["port"] == "status"
+        try:
+            return httpx.get(f"http://127.0.0.1:{self.status_port}{get['path']}").status_code == HTTPStatus.OK
+        except httpx.TransportError:
+            return False
+
+    def run_kserve_s_liveness_probe(self) -> None:
+        """Raises CalledProcessError if it does not pass. Knative sends an httpGet to no port but that of requests."""
+        container = container_of(named("kserve", "ServingRuntime", "rfm-triton"))
+        program, *words, script = container["livenessProbe"]["exec"]["command"]
+        assert program == "python"
+        port = parameters(get_command(app), container["args"])["status_port"]
+        subprocess.run([sys.executable, *words, script.replace(f":{port}/", f":{self.status_port}/")], check=True)
+
+
+@pytest.fixture
+def probed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Probed]:
+    """The demo's ``rfm`` alone."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    shutil.copytree(ROOT / "model_repository" / "rfm", tmp_path / "model_repository" / "rfm")
+    key, log = tmp_path / "admin-key", tmp_path / "log"
+    key.write_text("0123456789abcdef" * 4)
+    key.chmod(0o400)
+    container = container_of(named("overlays/cpu", "Deployment", "rfm-triton"))
+    endpoints, status_port = Endpoints.free(), Endpoints.free().http_port
+    values = {
+        "--repository": tmp_path / "model_repository",
+        "--host": endpoints.host,
+        "--http-port": endpoints.http_port,
+        "--grpc-port": endpoints.grpc_port,
+        "--metrics-port": endpoints.metrics_port,
+        "--status-port": status_port,
+        "--admin-key-file": key,
+    }
+    command = [BIN / container["command"][0], *with_values(container["args"], values)]
+    with log.open("wb") as lines, subprocess.Popen(command, stdout=lines, stderr=lines) as process:
+        try:
+            yield Probed(container, process, status_port, log)
+        finally:
+            process.terminate()
+    assert process.returncode == 0, log.read_text()
+
+
+def test_the_probes_tell_a_living_model_from_a_dead_one(probed: Probed, tmp_path: Path) -> None:
+    eventually(lambda: probed.passes("livenessProbe"))
+    assert not probed.passes("startupProbe")  # it loads
+    eventually(lambda: probed.passes("startupProbe") and probed.passes("readinessProbe"))
+    kill_model(tmp_path / "model_repository")
+    eventually(lambda: not probed.passes("readinessProbe"))
+    assert probed.passes("livenessProbe")
+    probed.run_kserve_s_liveness_probe()
+    eventually(lambda: probed.passes("readinessProbe"))  # rfm serve has healed it

@@ -1,0 +1,352 @@
+# SPDX-License-Identifier: MIT
+"""docker/prometheus and docker/grafana before the real thing: Prometheus scrapes `rfm serve`, Triton and gateway."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import httpx
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from paths import ROOT
+from repositories import kill_model
+from rfm.supervise.process import Endpoints
+from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, RewardClient, RewardError, Trajectory
+from trajectories import random_trajectory
+
+PROMETHEUS = ROOT / "docker" / "prometheus"
+GRAFANA = ROOT / "docker" / "grafana"
+RUNBOOKS = ROOT / "docs" / "operations.md"
+
+WITHIN_S = 60
+POLL_S = 0.2
+INTERVALS = {"15s": "1s", "1m": "10s"}  # of the files, and what they are here
+EMBEDDING_DIMS = (64, 32)  # D and Dt of the demo's checkpoint
+TOO_MANY_FRAMES = 100  # for it
+GATEWAY_CALLERS = 4
+METRIC = re.compile(r"\b(?:up|ALERTS|(?:nv|rfm)[_:][a-z0-9_:]+)\b")
+NEEDS_GPU = "nv_gpu_"
+MODEL = "rfm"  # whose process dies
+PROGRAMS = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+
+Json: TypeAlias = dict[str, Any]
+
+
+def load_rules(name: str) -> list[Json]:
+    groups = yaml.safe_load((PROMETHEUS / "rules" / f"{name}.yml").read_text())["groups"]
+    return [rule for group in groups for rule in group["rules"]]
+
+
+RECORDED = [rule["record"] for rule in load_rules("recording")]
+ALERTS = load_rules("alerts")
+DASHBOARD: Json = json.loads((GRAFANA / "dashboards" / "rfm.json").read_text())
+ROWS = [panel for panel in DASHBOARD["panels"] if panel["type"] == "row"]
+PANELS = [panel for panel in DASHBOARD["panels"] if panel["type"] != "row"]
+QUERIES = [
+    pytest.param(target["expr"], id=f"{panel['title']} {target['refId']}")
+    for panel in PANELS
+    for target in panel["targets"]
+]
+
+
+def program(name: str) -> str:
+    found = shutil.which(name, path=PROGRAMS)
+    assert found, f"{name}: expected in PATH, got nothing (make ops-tools)"
+    return found
+
+
+def promtool(*words: str | Path) -> str:
+    """What it says, which is that all is well."""
+    done = subprocess.run([program("promtool"), *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    assert done.returncode == 0, done.stdout
+    return done.stdout
+
+
+@dataclass(frozen=True)
+class Monitored:
+    """A Prometheus, and what it scrapes."""
+
+    url: str
+
+    def get(self, path: str, **parameters: str) -> Any:
+        answer = httpx.get(f"{self.url}/api/v1/{path}", params=parameters).json()
+        assert answer["status"] == "success", answer
+        return answer["data"]
+
+    def query(self, expression: str) -> list[Json]:
+        """Each series that has a number."""
+        result = self.get("query", query=expression)["result"]
+        return [entry for entry in result if math.isfinite(float(entry["value"][1]))]
+
+
+def eventually(ask: Callable[[], Any]) -> Any:
+    """The first answer that is true."""
+    deadline_s = time.monotonic() + WITHIN_S
+    while time.monotonic() < deadline_s:
+        if answer := ask():
+            return answer
+        time.sleep(POLL_S)
+    return ask()
+
+
+@contextmanager
+def running(command: list[str], log: Path, *ready_urls: str) -> Iterator[None]:
+    """A process that answers at ``ready_urls``, and is ended."""
+    with log.open("wb") as lines:
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=lines, stderr=lines)
+
+    def is_ready() -> bool:
+        assert process.poll() is None, log.read_text()
+        try:
+            return all(httpx.get(url).is_success for url in ready_urls)
+        except httpx.TransportError:  # it does not listen yet
+            return False
+
+    try:
+        assert eventually(is_ready), log.read_text()
+        yield
+    finally:
+        process.terminate()
+        process.wait(WITHIN_S)
+
+
+def write_configuration(folder: Path, targets: dict[str, str]) -> Path:
+    """The project's, with other targets and intervals."""
+    copy = shutil.copytree(PROMETHEUS, folder / "prometheus")
+    file = copy / "prometheus.yml"
+    config = yaml.safe_load(file.read_text())
+    for name in ("scrape_interval", "evaluation_interval"):
+        config["global"][name] = INTERVALS[config["global"][name]]
+    for job in config["scrape_configs"]:
+        job["static_configs"] = [{"targets": [targets[job["job_name"]]]}]
+    file.write_text(yaml.safe_dump(config))
+    for rules in (copy / "rules").iterdir():
+        rules.write_text(rules.read_text().replace("[1m]", f"[{INTERVALS['1m']}]"))
+    return file
+
+
+def embedded(seed: int, num_frames: int) -> Trajectory:
+    return random_trajectory(seed, num_frames, *EMBEDDING_DIMS)
+
+
+def load_triton(url: str, is_over: threading.Event) -> None:
+    """Samples of all kinds and both models, among them bad ones."""
+    frames = np.random.default_rng(0).integers(0, 256, (4, 64, 64, 3), np.uint8)
+    seed = 0
+    with RewardClient(url, retry=False) as client:
+        while not is_over.wait(0.02):  # the scrapes want some of the cores
+            seed += 1
+            try:
+                pair = PreferenceSample(embedded(seed, 9), embedded(seed + 1, 5))
+                client.evaluate([ProgressSample(embedded(seed, 12)), pair])
+                client.progress(Trajectory(frames=frames, task="stack the cups"))
+                client.progress(embedded(seed, TOO_MANY_FRAMES))
+            except InvalidSampleError:
+                pass
+            except RewardError:  # of a model whose process was killed
+                is_over.wait(0.1)
+
+
+def load_gateway(url: str, is_over: threading.Event) -> None:
+    """Several requests at a time, and something that is no request."""
+    video, text = embedded(0, 8).video_embeddings, embedded(0, 8).text_embedding
+    assert video is not None and text is not None
+    trajectory = {"video_embeddings": video.tolist(), "text_embedding": text.tolist()}
+    good = {"samples": [{"sample_type": "progress", "trajectory": trajectory}] * 20}
+    with httpx.Client(base_url=url, timeout=WITHIN_S) as client, ThreadPoolExecutor(GATEWAY_CALLERS) as callers:
+        while not is_over.wait(0.1):
+            for body in (good, {"samples": "none"}):
+                list(callers.map(lambda body: client.post("/evaluate_batch", json=body), [body] * GATEWAY_CALLERS))
+
+
+@contextmanager
+def loaded(endpoints: Endpoints, gateway_url: str) -> Iterator[None]:
+    is_over = threading.Event()
+    with ThreadPoolExecutor() as threads:
+        loads = [
+            threads.submit(load_triton, endpoints.grpc_url, is_over),
+            threads.submit(load_gateway, gateway_url, is_over),
+        ]
+        try:
+            yield
+        finally:
+            is_over.set()
+        for load in loads:
+            load.result()
+
+
+@pytest.fixture(scope="module")
+def monitored(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Monitored]:
+    """Once all is scraped, a model's process dies: what was never started again is in no metric."""
+    folder = tmp_path_factory.mktemp("monitored")
+    repository = shutil.copytree(ROOT / "model_repository", folder / "model_repository")
+    triton, others = Endpoints.free(), Endpoints.free()
+    host, gateway_port, status_port, port = others.host, others.http_port, others.grpc_port, others.metrics_port
+    ports = {"http": triton.http_port, "grpc": triton.grpc_port, "metrics": triton.metrics_port}
+    ports |= {"gateway": gateway_port, "status": status_port}
+    options = [f"--{name}-port={number}" for name, number in ports.items()]
+    serve = [program("rfm"), "serve", f"--repository={repository}", *options]
+    targets = {
+        "triton": f"{host}:{triton.metrics_port}",
+        "gateway": f"{host}:{gateway_port}",
+        "rfm-serve": f"{host}:{status_port}",
+    }
+    prometheus = [
+        program("prometheus"),
+        f"--config.file={write_configuration(folder, targets)}",
+        f"--storage.tsdb.path={folder / 'data'}",
+        f"--web.listen-address={host}:{port}",
+    ]
+    served_urls = [f"http://{host}:{status_port}/ready", f"http://{host}:{gateway_port}/metrics"]
+    monitored = Monitored(f"http://{host}:{port}")
+    with (
+        running(serve, folder / "rfm.log", *served_urls),
+        running(prometheus, folder / "prometheus.log", f"{monitored.url}/-/ready"),
+        loaded(triton, f"http://{host}:{gateway_port}"),
+    ):
+        assert eventually(lambda: monitored.query(f'rfm_serve_canary_ok{{model="{MODEL}"}} == 1'))
+        kill_model(repository)
+        yield monitored
+
+
+def test_prometheus_takes_the_configuration_and_the_rules() -> None:
+    assert f"{len(RECORDED)} rules found" in promtool("check", "config", PROMETHEUS / "prometheus.yml")
+
+
+@pytest.mark.parametrize("name", ["recording", "alerts"])
+def test_rules_do_on_made_up_series_what_they_should(name: str) -> None:
+    promtool("test", "rules", PROMETHEUS / "tests" / f"{name}.yml")
+
+
+def test_every_rule_has_a_test_on_made_up_series() -> None:
+    recorded, alerts = (
+        yaml.safe_load((PROMETHEUS / "tests" / f"{n}.yml").read_text()) for n in ("recording", "alerts")
+    )
+    tried = {case["expr"] for test in recorded["tests"] for case in test["promql_expr_test"]}
+    cases = [case for test in alerts["tests"] for case in test["alert_rule_test"]]
+    names = {rule["alert"] for rule in ALERTS}
+    assert tried >= set(RECORDED)
+    assert {case["alertname"] for case in cases if case.get("exp_alerts")} == names
+    assert {case["alertname"] for case in cases if not case.get("exp_alerts")} == names
+
+
+@pytest.mark.parametrize("rule", ALERTS, ids=[rule["alert"] for rule in ALERTS])
+def test_every_alert_says_what_to_do(rule: Json) -> None:
+    assert rule["labels"]["severity"] in ("critical", "warning")
+    assert rule["for"]
+    assert {"summary", "description", "runbook"} == rule["annotations"].keys()
+    file, _, anchor = rule["annotations"]["runbook"].partition("#")
+    assert ROOT / file == RUNBOOKS
+    assert anchor == rule["alert"].lower()
+    assert f"\n### {rule['alert']}\n" in RUNBOOKS.read_text()
+
+
+def test_the_dashboard_is_one_that_can_be_read() -> None:
+    assert [row["title"] for row in ROWS] == ["Traffic", "Latency", "Batching", "GPU", "Errors"]
+    assert [variable["name"] for variable in DASHBOARD["templating"]["list"]] == ["model", "version"]
+    ids = [panel["id"] for panel in DASHBOARD["panels"]]
+    assert len(set(ids)) == len(ids)
+    for panel in PANELS:
+        assert panel["description"].endswith("."), panel["title"]
+        assert panel["fieldConfig"]["defaults"]["unit"], panel["title"]
+        assert panel["targets"], panel["title"]
+
+
+def test_no_panel_lies_on_another() -> None:
+    taken: set[tuple[int, int]] = set()
+    for panel in DASHBOARD["panels"]:
+        at = panel["gridPos"]
+        cells = {(x, y) for x in range(at["x"], at["x"] + at["w"]) for y in range(at["y"], at["y"] + at["h"])}
+        assert at["x"] + at["w"] <= 24 and not cells & taken, panel["title"]
+        taken |= cells
+
+
+def test_grafana_finds_its_data_source_where_the_dashboard_looks_for_it() -> None:
+    (source,) = yaml.safe_load((GRAFANA / "provisioning/datasources/prometheus.yml").read_text())["datasources"]
+    assert source["jsonData"]["timeInterval"] == "15s"  # as Prometheus scrapes
+    for part in (*PANELS, *DASHBOARD["templating"]["list"]):
+        assert part["datasource"] == {"type": "prometheus", "uid": source["uid"]}
+
+
+def test_triton_the_gateway_and_rfm_serve_are_scraped(monitored: Monitored) -> None:
+    def up() -> bool:
+        told = {entry["metric"]["job"]: entry["value"][1] for entry in monitored.query("up")}
+        return told == {"triton": "1", "gateway": "1", "rfm-serve": "1"}
+
+    assert eventually(up), monitored.get("targets")
+
+
+@pytest.mark.parametrize("name", RECORDED)
+def test_every_recording_rule_gives_data(monitored: Monitored, name: str) -> None:
+    entries = eventually(lambda: monitored.query(name))
+    assert entries
+    for entry in entries:
+        assert {"job", "instance"} <= entry["metric"].keys() <= {"__name__", "job", "instance", "model", "version"}
+        assert float(entry["value"][1]) >= 0
+
+
+def test_every_rule_is_evaluated(monitored: Monitored) -> None:
+    def healths() -> list[tuple[str, str]]:
+        groups = monitored.get("rules")["groups"]
+        rules = [(rule["name"], rule["health"], rule.get("lastError")) for group in groups for rule in group["rules"]]
+        return [] if any(health == "unknown" for _, health, _ in rules) else rules
+
+    told = eventually(healths)
+    assert {name for name, *_ in told} == {*RECORDED, *(rule["alert"] for rule in ALERTS)}
+    assert [rule for rule in told if rule[1] != "ok"] == []
+
+
+@pytest.mark.parametrize("expression", QUERIES)
+def test_every_query_of_the_dashboard_gives_data(monitored: Monitored, expression: str) -> None:
+    for name, value in {"$model": ".*", "$version": ".*", "$__rate_interval": INTERVALS["1m"]}.items():
+        expression = expression.replace(name, value)
+    assert "$" not in expression
+    if NEEDS_GPU in expression and not torch.cuda.is_available():
+        assert monitored.query(expression) == []
+    else:
+        assert eventually(lambda: monitored.query(expression))
+
+
+@pytest.mark.parametrize("variable", DASHBOARD["templating"]["list"], ids=lambda variable: variable["name"])
+def test_every_variable_of_the_dashboard_has_values(monitored: Monitored, variable: Json) -> None:
+    series, label = re.fullmatch(r"label_values\((.*), (\w+)\)", variable["query"]["query"]).groups()  # type: ignore[union-attr]
+    expected = {"model": {"rfm", "rfm_encoder", "rfm_frames"}, "version": {"1"}}[label]
+    series = series.replace("$model", ".*")
+    assert eventually(lambda: set(monitored.get(f"label/{label}/values", **{"match[]": series})) == expected)
+
+
+@pytest.mark.parametrize("rule", ALERTS, ids=[rule["alert"] for rule in ALERTS])
+def test_every_metric_of_an_alert_is_there(monitored: Monitored, rule: Json) -> None:
+    """A name that is misspelt would never fire."""
+    wanted = set(METRIC.findall(rule["expr"]))
+    assert wanted
+    if not torch.cuda.is_available():
+        wanted = {name for name in wanted if NEEDS_GPU not in name}
+    assert eventually(lambda: wanted <= set(monitored.get("label/__name__/values")))
+
+
+def test_a_dead_model_process_is_noticed_and_healed(monitored: Monitored) -> None:
+    """The fixture has killed it."""
+    name = f'{{alertname="RfmCanaryFailing", alertstate="pending", model="{MODEL}"}}'
+    assert eventually(lambda: monitored.query(f"last_over_time(ALERTS{name}[10m])"))
+    assert eventually(lambda: monitored.query(f'rfm_serve_restarts_total{{what="{MODEL}"}} >= 1'))
+    assert eventually(lambda: monitored.query(f'rfm_serve_ready{{model="{MODEL}"}} == 1'))
+    assert eventually(lambda: not monitored.query(f"ALERTS{name}"))
+    assert not monitored.query('{alertname="RfmModelProcessDead", alertstate="firing"}')

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: MIT
+"""The demo, the checkpoint that it shows, and how that is made."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+from typer.testing import CliRunner
+
+import clip
+import rfm_export
+from commands import nothing_left_behind
+from paths import ROOT, VIDEOS
+from rfm.config import ServeConfig
+from rfm_client import InvalidSampleError
+from rfm_client.data.video import frame_indices, read_video
+from rfm_commands.cli import app
+
+REPOSITORY = ROOT / "model_repository"
+PNG = b"\x89PNG"
+
+
+def example(name: str, *arguments: object) -> str:
+    """What a script of examples/ prints."""
+    command = [sys.executable, str(ROOT / "examples" / name), *map(str, arguments)]
+    environment = {**os.environ, "COLUMNS": "160"}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, env=environment)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    clip.write(tmp_path / "clip.mp4")
+    return tmp_path / "clip.mp4"
+
+
+def test_the_demo_shows_what_it_promises(tmp_path: Path) -> None:
+    with nothing_left_behind():
+        shown = example("demo.py", "--output", tmp_path)
+    for text in ("put the red block in the bowl", "a success", "rewound", "P(first) = ", "similarity = ", "executions"):
+        assert text in shown
+    assert (tmp_path / "rewards.png").read_bytes().startswith(PNG)
+
+
+def test_the_served_checkpoint_keeps_its_bounds_on_clips_it_never_saw(tmp_path: Path) -> None:
+    """A part of what the model card tells, which is of 240 tasks."""
+    output = tmp_path / "evaluation.json"
+    with nothing_left_behind():
+        shown = example("evaluate_demo_checkpoint.py", "--repository", REPOSITORY, "--clips", 48, "--output", output)
+    assert shown.count("holds") == 6
+    figures = json.loads(output.read_text())["figures"]
+    assert figures["last progress: successes, mean"] > 0.9
+    assert figures["last progress: wrong sentence, mean"] < 0.2
+
+
+@pytest.mark.parametrize("own_checkpoint", [False, True], ids=["a repository", "a checkpoint"])
+def test_a_video_is_scored(tmp_path: Path, video: Path, own_checkpoint: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "160")
+    encoder = REPOSITORY / "rfm_encoder" / "1"
+    source = {"--repository": REPOSITORY}
+    if own_checkpoint:
+        source = {
+            "--checkpoint": REPOSITORY / "rfm" / "1" / "checkpoint",
+            "--image-encoder": encoder / "image_encoder",
+            "--text-encoder": encoder / "text_encoder",
+        }
+    options = {"--video": video, "--task": clip.TASK, "--fps": 10, "--output": tmp_path, **source}
+    with nothing_left_behind():
+        result = CliRunner().invoke(app, ["demo", *(str(word) for pair in options.items() for word in pair)])
+    assert result.exit_code == 0, result.output
+    for shown in (clip.TASK, "clip.mp4", "32 frames", "executions"):
+        assert shown in result.output
+    assert (tmp_path / "rewards.png").read_bytes().startswith(PNG)
+
+
+def test_a_repository_that_is_none_is_told(tmp_path: Path, video: Path) -> None:
+    arguments = ["demo", "--video", str(video), "--task", "x", "--repository", str(tmp_path / "none")]
+    result = CliRunner().invoke(app, [*arguments, "--output", str(tmp_path)])
+    assert result.exit_code == 1
+    assert result.stderr.startswith("rfm: ")
+
+
+def test_training_is_reproducible_and_its_result_is_served_as_any_checkpoint(tmp_path: Path) -> None:
+    steps = ("--encoder-steps", 2, "--frozen-steps", 1, "--joint-steps", 1, "--groups", 1)
+    for name in ("first", "second"):
+        example("train_demo_checkpoint.py", tmp_path / name, *steps)
+    weights = [load_file(tmp_path / name / "checkpoint" / "model.safetensors") for name in ("first", "second")]
+    assert weights[0].keys() == weights[1].keys()
+    for name, array in weights[0].items():
+        np.testing.assert_array_equal(array, weights[1][name], err_msg=name)
+    written = tmp_path / "first"
+    config = ServeConfig(image_encoder=str(written / "image_encoder"), text_encoder=str(written / "text_encoder"))
+    assert rfm_export.export(str(written / "checkpoint"), tmp_path / "model_repository", config) == 1  # verified there
+    assert json.loads((written / "training.json").read_text())["steps"] == {"encoder": 2, "frozen": 1, "joint": 1}
+
+
+def test_the_committed_repository_is_small() -> None:
+    files = [file for file in REPOSITORY.rglob("*") if file.is_file() and "__pycache__" not in file.parts]
+    assert sum(file.stat().st_size for file in files) <= 3e6
+
+
+def test_the_clip_survives_its_video_file(video: Path) -> None:
+    frames = read_video(video, clip.FPS)
+    assert frames.shape == clip.render().shape
+    assert np.abs(frames.astype(int) - clip.render()).mean() < 8  # lossy, but the same picture
+
+
+@pytest.mark.parametrize(
+    ("name", "fps", "count"),
+    [
+        ("soar_put_green_stick_in_brown_bowl", 3, 10),
+        ("berkeley_rpt_stack_cup", 3, 10),
+        ("jaco_play_pick_up_green_cup", 2, 13),
+    ],
+)
+def test_robot_videos_are_read_frame_for_frame(name: str, fps: float, count: int) -> None:
+    frames = read_video(VIDEOS / f"{name}.mp4", fps)
+    assert frames.shape[0] == count
+    assert frames.shape[3] == 3
+    assert frames.std() > 10
+
+
+FRAMES = {
+    "3 of 10 fps": ((32, 10.0, 3.0), 10),
+    "2 of 10 fps": ((64, 10.0, 2.0), 13),
+    "all": ((7, 10.0, 30.0), 7),
+    "at least one": ((5, 30.0, 0.1), 1),
+}
+
+
+@pytest.mark.parametrize(("arguments", "count"), FRAMES.values(), ids=FRAMES)
+def test_frames_are_picked_as_the_original_client_picks_them(arguments: tuple[int, float, float], count: int) -> None:
+    indices = frame_indices(*arguments)
+    assert indices.tolist() == np.linspace(0, arguments[0] - 1, count).astype(int).tolist()
+
+
+def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "text.mp4").write_text("no video")
+    with pytest.raises(InvalidSampleError, match=r"video: expected a file with a video stream, got .*text\.mp4"):
+        read_video(tmp_path / "text.mp4", 3)
+    with pytest.raises(InvalidSampleError, match=r"video: expected a file with a video stream, got .*nothing\.mp4"):
+        read_video(tmp_path / "nothing.mp4", 3)

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: MIT
+"""What may import what, and what is said where."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+
+from paths import ROOT
+from rfm_commands.cli import app
+
+SHARED = {  # what a family may import beside itself
+    "rfm.checkpoint",
+    "rfm.execution",
+    "rfm.family",
+    "rfm.layers",
+    "rfm.prefixes",
+    "rfm_client.contract",
+}
+FOLDERS = {
+    "rfm": ".",
+    "rfm_client": "client",
+    "rfm_commands": "commands",
+    "rfm_export": "export",
+    "rfm_gateway": "gateway",
+}
+# Package, or folder of programs -> what of ours it may import besides itself.
+MAY_IMPORT = {
+    "rfm_client.contract": set(),
+    "rfm_client.transport": {"rfm_client.contract"},
+    "rfm_client.data": {"rfm_client.contract"},
+    "rfm_client": set(),
+    "rfm_gateway": {"rfm_client"},
+    "rfm.layers": set(),
+    "rfm.checkpoint": {"rfm.plain_yaml"},
+    "rfm.rewind": SHARED,
+    "rfm.vlm": SHARED,
+    "rfm.triton_model": {*SHARED, "rfm.journal", "rfm.parameters", "rfm.probe"},
+    "rfm.supervise": {"rfm.config", "rfm.journal", "rfm.probe", "rfm_client.contract"},
+    "rfm": {"rfm_client.contract"},
+    "rfm_export": {"rfm", "rfm_client.contract"},
+    "rfm_commands": {"rfm", "rfm_client", "rfm_export", "rfm_gateway"},
+    "model_repository": {"rfm", "rfm_client.contract"},
+    "examples": {"rfm_client"},
+    "benchmarks": {"rfm_client", "rfm_gateway"},
+}
+EXCEPTIONS = {
+    "commands/rfm_commands/cli.py": {"rfm_export"},  # the command, where all packages meet
+    "examples/demo_training/losses.py": {"rfm"},  # what is trained is the network that is served
+    "examples/demo_training/networks.py": {"rfm"},
+    "examples/demo.py": {"rfm", "rfm_commands"},  # starts the server
+    "examples/evaluate_demo_checkpoint.py": {"rfm"},
+    "benchmarks/bench.py": {"rfm", "rfm_export"},  # the engine without a server, and what is served
+    "benchmarks/contestants.py": {"rfm"},
+    "benchmarks/forward.py": {"rfm"},
+    "benchmarks/perf_analyzer.py": {"rfm"},
+    "benchmarks/peers/litserve_server.py": {"rfm"},  # the peers score with our engine, or weights
+    "benchmarks/peers/mosec_server.py": {"rfm"},
+    "benchmarks/peers/message.py": {"rfm"},
+    "benchmarks/peers/upstream_forward.py": {"rfm"},
+}
+LIGHT = {"numpy", "tritonclient", "aiohttp", "typing_extensions"}  # the last for type checkers only
+# What only an extra brings, and which files need it.
+EXTRAS = {
+    "av": {"video.py"},
+    "async_timeout": {"deadline.py"},  # Python 3.10 only
+    "PIL": {"resize.py"},
+    "gymnasium": {"gym.py"},
+    "typer": {"cli"},
+    "rich": {"cli"},
+    "matplotlib": {"cli"},
+    "prometheus_client": {"status.py"},
+}
+
+
+def imports(file: Path) -> set[str]:
+    """Dotted names of everything that a file imports, wherever in it."""
+    found = set()
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {name.name for name in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file}: relative import"
+            found |= {node.module or "", *(f"{node.module}.{name.name}" for name in node.names)}
+    return found
+
+
+def is_part(name: str, packages: set[str]) -> bool:
+    """Whether the module is one of these packages or in one."""
+    return any(name == package or name.startswith(f"{package}.") for package in packages)
+
+
+@pytest.mark.parametrize("package", MAY_IMPORT)
+def test_imports_point_the_right_way(package: str) -> None:
+    files = list((ROOT / FOLDERS.get(package.partition(".")[0], ".") / package.replace(".", "/")).rglob("*.py"))
+    assert files
+    for file in files:
+        allowed = {package, *MAY_IMPORT[package], *EXCEPTIONS.get(str(file.relative_to(ROOT)), set())}
+        ours = {name for name in imports(file) if name.partition(".")[0] in FOLDERS}
+        assert not {name for name in ours if not is_part(name, allowed)}, file
+
+
+def test_the_client_needs_only_light_packages() -> None:
+    for file in (ROOT / "client" / "rfm_client").rglob("*.py"):
+        part = file.relative_to(ROOT / "client" / "rfm_client").parts
+        extras = {module for module, files in EXTRAS.items() if files & set(part)}
+        tops = {name.partition(".")[0] for name in imports(file)}
+        assert tops - sys.stdlib_module_names <= LIGHT | extras | {"rfm_client"}, file
+
+
+def test_scoring_embeddings_needs_no_extra() -> None:
+    check = "import sys, rfm.engine; print(sorted({'transformers', 'PIL', 'av', 'matplotlib'} & set(sys.modules)))"
+    output = subprocess.run([sys.executable, "-c", check], check=True, capture_output=True, text=True).stdout
+    assert output.strip() == "[]"
+
+
+def test_the_domain_knows_nothing_of_triton() -> None:
+    for file in (ROOT / "rfm").rglob("*.py"):
+        if not {"supervise", "triton_model"} & set(file.parts):
+            assert not [name for name in imports(file) if "triton" in name.replace("rfm_triton", "")], file
+
+
+def test_every_command_and_option_is_documented() -> None:
+    readme = (ROOT / "README.md").read_text()
+    for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]
+        assert command.help, name
+        assert f"rfm {name}" in readme
+        for parameter in command.params:
+            if parameter.name != "help":
+                assert parameter.help, (name, parameter.name)
+
+
+def test_every_tensor_of_the_contract_is_documented() -> None:
+    from rfm_client.contract import wire
+
+    readme = (ROOT / "README.md").read_text()
+    specs = (*wire.embedding_inputs(1, 1), *wire.frame_inputs(), *wire.score_outputs(10))
+    for spec in specs:
+        assert f"`{spec.name}`" in readme
+
+
+def test_every_key_of_the_configuration_is_documented() -> None:
+    from dataclasses import fields
+
+    from rfm.config import ServeConfig
+
+    readme = (ROOT / "README.md").read_text()
+    for field in fields(ServeConfig):
+        assert f"`{field.name}`" in readme, field.name
+
+
+def test_files_say_their_licence() -> None:
+    files = [
+        file
+        for part in ("client", "gateway", "rfm", "export", "commands", "examples", "tests")
+        for file in (ROOT / part).rglob("*.py")
+    ]
+    assert files
+    for file in files:
+        assert re.match(r"# SPDX-License-Identifier: MIT\n", file.read_text()), file

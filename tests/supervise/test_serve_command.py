@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: MIT
+"""``rfm serve``: the process, its signals, and what it leaves behind."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sysconfig
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import clip
+from commands import EXIT_S, REPOSITORY, RFM, command, nothing_left_behind, wait_for_http
+from rfm.supervise import installation
+from rfm.supervise.installation import ServerStartError, find_installation
+from rfm.supervise.process import Endpoints, TritonServer
+from rfm.supervise.stubs import is_alive
+from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
+from rfm_serve import children, serving, wait_for
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
+def test_the_committed_repository_is_served_until_a_signal(number: signal.Signals) -> None:
+    endpoints = Endpoints.free()
+    with nothing_left_behind():
+        process = subprocess.Popen(command(REPOSITORY, endpoints), stderr=subprocess.PIPE, text=True)
+        try:
+            wait_for_http(process, endpoints)
+            film = Trajectory(frames=clip.render()[::4], task=clip.TASK)
+            with RewardClient(endpoints.grpc_url) as client:
+                first, second = client.evaluate([ProgressSample(film), PreferenceSample(film, film)])
+            assert np.isfinite(first.progress).all()  # type: ignore[union-attr]
+            assert 0 < second.preference < 1  # type: ignore[union-attr]
+        finally:
+            process.send_signal(number)
+            _, log = process.communicate(timeout=EXIT_S)
+        assert process.returncode == 0
+        assert "successfully unloaded" in log  # Triton's log is forwarded
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["serve", "--repository", str(REPOSITORY)],
+        ["demo", "--repository", str(REPOSITORY), "--video", "clip.mp4", "--task", clip.TASK],
+        ["tune", "--repository", str(REPOSITORY), "--output", "tuned.yaml"],
+    ],
+    ids=lambda words: words[0],
+)
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGKILL], ids=lambda number: number.name)
+def test_a_signal_leaves_nothing_running(tmp_path: Path, arguments: list[str], number: signal.Signals) -> None:
+    program = tmp_path / "tritonserver"  # a stand-in that never gets ready, so that the moment of the signal is known
+    program.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/pid\nmv {tmp_path}/pid {tmp_path}/started\nexec sleep 600\n")
+    program.chmod(0o755)
+    temporary = tmp_path / "tmp"
+    temporary.mkdir()
+    process = subprocess.Popen(
+        [str(RFM), *arguments, "--tritonserver", str(program)],
+        cwd=tmp_path,
+        env={**os.environ, "TMPDIR": str(temporary)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    while not (tmp_path / "started").exists():
+        assert process.poll() is None
+    process.send_signal(number)
+    process.wait(EXIT_S)
+    wait_for(lambda: not is_alive(int((tmp_path / "started").read_text())))
+    if number != signal.SIGKILL:  # which leaves folders to the next start
+        assert list(temporary.glob("rfm-*")) == []
+
+
+def test_a_signal_while_it_still_loads_ends_it() -> None:
+    with nothing_left_behind():
+        process = subprocess.Popen(command(REPOSITORY, Endpoints.free()), stderr=subprocess.PIPE, text=True)
+        assert process.stderr is not None
+        next(line for line in process.stderr if "server.cc" in line or "model_lifecycle" in line)
+        process.terminate()
+        _, rest = process.communicate(timeout=EXIT_S)
+        assert "rfm: " not in rest
+
+
+def environment(pid: int) -> set[str]:
+    """Names and values of a process."""
+    return set(Path("/proc", str(pid), "environ").read_text().split("\0"))
+
+
+def test_neither_triton_nor_a_model_process_has_a_key_in_its_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keys = {name: f"a-secret-of-{name}" for name in ("RFM_ADMIN_KEY", "RFM_GATEWAY_API_KEY")}
+    for name, key in keys.items():
+        monkeypatch.setenv(name, key)
+    repository = tmp_path / "model_repository"
+    shutil.copytree(REPOSITORY, repository)
+    with serving(repository, f"--gateway-port={Endpoints.free().http_port}") as served:
+        served.wait_ready()
+        (gateway,) = [pid for pid in children(served.process.pid, ".") if pid != served.triton]
+        for pid in (served.triton, *(stub.pid for stub in served.stubs)):
+            assert not [word for word in environment(pid) if "a-secret-of-" in word]
+        assert [word for word in environment(gateway) if "a-secret-of-" in word] == [
+            f"RFM_GATEWAY_API_KEY={keys['RFM_GATEWAY_API_KEY']}"
+        ]
+
+
+def test_a_model_that_cannot_be_loaded_is_named(tmp_path: Path) -> None:
+    repository = tmp_path / "model_repository"
+    shutil.copytree(REPOSITORY, repository)
+    (repository / "rfm" / "1" / "checkpoint" / "config.json").write_text("{")
+    with nothing_left_behind():
+        result = subprocess.run(
+            command(repository, Endpoints.free()), capture_output=True, text=True, timeout=EXIT_S, check=False
+        )
+    assert result.returncode == 1
+    (line,) = (line for line in result.stderr.splitlines() if line.startswith("rfm: "))
+    assert line.startswith("rfm: models: expected all to be ready, got rfm: ")
+    assert "config.json: expected JSON" in line
+
+
+def test_a_port_that_is_taken_is_named() -> None:
+    endpoints = Endpoints.free()
+    with nothing_left_behind(), socket.create_server((endpoints.host, endpoints.grpc_port)):
+        result = subprocess.run(
+            command(REPOSITORY, endpoints), capture_output=True, text=True, timeout=EXIT_S, check=False
+        )
+    assert result.returncode == 1
+    where = f"gRPC: expected a free port of this machine at 127.0.0.1:{endpoints.grpc_port}"
+    assert result.stderr == f"rfm: {where}, got: Address already in use\n"
+
+
+def test_a_folder_without_models_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ServerStartError, match="repository: expected a folder of models, got"):
+        TritonServer(tmp_path, Endpoints.free(), find_installation()).start()
+
+
+def test_a_program_that_cannot_run_is_named(tmp_path: Path) -> None:
+    program = tmp_path / "tritonserver"
+    program.write_bytes(b"\x7fELF no program")
+    program.chmod(0o755)
+    server = TritonServer(REPOSITORY, Endpoints.free(), find_installation(program))
+    with pytest.raises(ServerStartError, match=r"tritonserver: expected a program at .*tritonserver, got: Exec format"):
+        server.start()
+
+
+def test_a_known_vulnerable_triton_on_an_open_address_is_warned_of() -> None:
+    result = subprocess.run(
+        [str(RFM), "serve", "--repository", "/nowhere", "--host", "0.0.0.0", "--accept-known-vulnerabilities"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.stderr.startswith("rfm: warning: 0.0.0.0 is no loopback address, and a Triton with known")
+
+
+def test_a_plain_tritonserver_serves_the_repository_too(tmp_path: Path) -> None:
+    """Without ``rfm serve``: no explicit model control, configurations completed automatically."""
+    triton, endpoints = find_installation(), Endpoints.free()
+    arguments = [f"--model-repository={REPOSITORY}", *triton.lay_out_backends(tmp_path / "backends")]
+    for protocol, port in {
+        "http": endpoints.http_port,
+        "grpc": endpoints.grpc_port,
+        "metrics": endpoints.metrics_port,
+    }.items():
+        arguments += [f"--{protocol}-address={endpoints.host}", f"--{protocol}-port={port}"]
+    arguments.append(f"--backend-config=python,shm-region-prefix-name=plain_{os.getpid()}_")
+    with (tmp_path / "log").open("wb") as log, nothing_left_behind():
+        process = subprocess.Popen(
+            [triton.executable, *arguments], env={**os.environ, **triton.environment}, stdout=log, stderr=log
+        )
+        try:
+            wait_for_http(process, endpoints)
+            with RewardClient(endpoints.http_url) as client:
+                result = client.progress(Trajectory(frames=clip.render()[::8], task=clip.TASK))
+            assert np.isfinite(result.progress).all()
+        finally:
+            process.terminate()
+            process.wait(EXIT_S)
+
+
+def test_a_server_that_ends_at_once_is_told(tmp_path: Path) -> None:
+    program = tmp_path / "tritonserver"
+    program.write_text("#!/bin/sh\nexit 3\n")
+    program.chmod(0o755)
+    with (
+        pytest.raises(ServerStartError, match="tritonserver: expected to run, got exit status 3"),
+        TritonServer(REPOSITORY, Endpoints.free(), find_installation(program)),
+    ):
+        pass
+
+
+def test_an_explicit_program_wins_over_path_and_path_over_the_wheel(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert find_installation().wheel is not None
+    for folder in ("in_path", "explicit"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "tritonserver").touch(mode=0o755)
+    monkeypatch.setenv("PATH", str(tmp_path / "in_path"), prepend=os.pathsep)
+    assert find_installation().executable == tmp_path / "in_path" / "tritonserver"
+    explicit = tmp_path / "explicit" / "tritonserver"
+    assert find_installation(explicit).executable == explicit
+
+
+def test_a_program_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ServerStartError, match=r"tritonserver: expected a program at .*/nothing, got none"):
+        find_installation(tmp_path / "nothing")
+
+
+def test_no_triton_at_all_is_told_with_the_command_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
+    with pytest.raises(ServerStartError, match=r'pip install ".\[triton\]"'):
+        find_installation()
+
+
+def test_numpy_2_is_refused_with_the_wheel(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.metadata, "version", lambda _name: "2.1.0")
+    with pytest.raises(ServerStartError, match=r"numpy: expected < 2 with the Triton of nvidia-pytriton, got 2\.1\.0"):
+        find_installation()
+
+
+def test_a_missing_libpython_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(sysconfig, "get_config_var", lambda _name: str(tmp_path))
+    monkeypatch.setattr(installation.sys, "base_prefix", str(tmp_path))
+    with pytest.raises(ServerStartError, match=r"libpython3\.\d+\.so\.1\.0: expected in .*apt-get install libpython3"):
+        find_installation()

@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: MIT
+"""Engines of the reference checkpoints, and how they are exported."""
+
+from __future__ import annotations
+
+import functools
+
+import goldens
+from rfm import families
+from rfm.config import ServeConfig
+from rfm.engine import Engine
+from rfm.rewind.family import RewindFamily
+from rfm_export.export import load_encoders
+
+
+def serve_config(config: goldens.Config, name: str = "rfm") -> ServeConfig:
+    """How the tests export a reference checkpoint."""
+    return ServeConfig(
+        name=name,
+        num_gpus=0,
+        torch_threads=1,
+        image_encoder=str(config.image_encoder) if config.image_encoder else None,
+        text_encoder=str(config.text_encoder) if config.text_encoder else None,
+        base_model=str(config.base_model) if config.base_model else None,
+    )
+
+
+@functools.cache
+def load_engine(name: str) -> Engine:
+    """The engine of a reference checkpoint, with its encoders if it has some."""
+    config = goldens.config(name)
+    if config.is_vlm:
+        return Engine.from_checkpoint(config.checkpoint, base_model=str(config.base_model))
+    checkpoint = families.load(config.checkpoint)
+    assert isinstance(checkpoint, families.RewindCheckpoint)
+    return Engine.of(checkpoint, encoders=load_encoders(checkpoint, serve_config(config)))
+
+
+def rewind_of(name: str) -> RewindFamily:
+    """What of a reference checkpoint's engine is ReWiND's own."""
+    family = load_engine(name).family
+    assert isinstance(family, RewindFamily)
+    return family

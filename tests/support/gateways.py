@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: MIT
+"""Gateways as processes."""
+
+from __future__ import annotations
+
+import http.client
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import requests
+from prometheus_client.parser import text_string_to_metric_families
+
+from rfm.supervise.process import Endpoints
+from rfm_client import (
+    RewardClient,
+)
+
+WITHIN_S = 60
+
+
+@dataclass(frozen=True)
+class Gateway:
+    """A running gateway, and the Triton behind it."""
+
+    url: str
+    model: str
+    triton_url: str
+    process: subprocess.Popen[bytes]
+    log_file: Path
+
+    @property
+    def log(self) -> str:
+        return self.log_file.read_text()
+
+    def client(self) -> RewardClient:
+        """Asks the same model without the gateway."""
+        return RewardClient(self.triton_url, model=self.model)
+
+    def connect(self) -> http.client.HTTPConnection:
+        return http.client.HTTPConnection(self.url.removeprefix("http://"), timeout=WITHIN_S)
+
+    def metric(self, name: str, **labels: str) -> float:
+        """Of the gateway's own; 0 before it is first counted."""
+        families = text_string_to_metric_families(requests.get(f"{self.url}/metrics").text)
+        samples = (sample for family in families for sample in family.samples)
+        return sum(s.value for s in samples if s.name == f"rfm_gateway_{name}" and labels.items() <= s.labels.items())
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as bound:
+        return int(bound.getsockname()[1])
+
+
+def poll(is_so: Callable[[], bool]) -> None:
+    ends_s = time.monotonic() + WITHIN_S
+    while not is_so():
+        assert time.monotonic() < ends_s
+        time.sleep(0.02)
+
+
+def answers(url: str) -> bool:
+    try:
+        return requests.get(f"{url}/openapi.json").ok
+    except requests.ConnectionError:
+        return False
+
+
+@contextmanager
+def running(
+    endpoints: Endpoints, folder: Path, model: str = "rfm", *options: str, **environment: str
+) -> Iterator[Gateway]:
+    port = free_port()
+    command = [sys.executable, "-m", "rfm_gateway", "--triton", endpoints.grpc_url, "--port", str(port)]
+    command += ["--metrics-url", endpoints.metrics_url, "--model", model, *options]
+    log_file = folder / f"gateway_{port}.log"
+    with log_file.open("wb") as log:
+        process = subprocess.Popen(command, env={**os.environ, **environment}, stdout=log, stderr=log)
+    gateway = Gateway(f"http://127.0.0.1:{port}", model, endpoints.grpc_url, process, log_file)
+    try:
+        poll(lambda: process.poll() is not None or answers(gateway.url))
+        assert process.poll() is None, gateway.log
+        yield gateway
+        assert "Traceback" not in gateway.log
+    finally:
+        process.terminate()
+        process.wait(WITHIN_S)

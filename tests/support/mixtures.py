@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: MIT
+"""Samples of all types for the reference server, and what it is to have done with them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import tritonclient.grpc
+
+import goldens
+from reference_server import Served
+from rfm_client import (
+    PreferenceSample,
+    ProgressSample,
+    RewardError,
+    Sample,
+    SimilaritySample,
+)
+from trajectories import random_trajectory
+
+TOLERANCE = 1e-5
+MODEL = "c1_t1_disc10"  # tokens, so T <= 16; discrete; all heads
+
+
+FRAMES_MODEL = "enc_c1_t1_disc10"
+
+
+def mixed_samples(count: int, longest: int = 16) -> list[Sample]:
+    """All types, all lengths from 1 to ``longest``, in turn."""
+    samples: list[Sample] = []
+    for index in range(count):
+        first = random_trajectory(2 * index, 1 + index % longest)
+        second = random_trajectory(2 * index + 1, 1 + (7 * index) % longest)
+        kinds: tuple[Callable[[], Sample], ...] = (
+            lambda first=first: ProgressSample(first),
+            lambda first=first, second=second: PreferenceSample(first, second),
+            lambda first=first, second=second: SimilaritySample(first, second),
+        )
+        samples.append(kinds[index % 3]())
+    return samples
+
+
+def plug() -> list[Sample]:
+    """Keeps the model busy while other requests queue up."""
+    return [ProgressSample(random_trajectory(0, 256), frame_steps=16) for _ in range(32)]
+
+
+def counts(served: Served, model: str) -> tuple[int, int]:
+    """Requests and executions so far."""
+    with tritonclient.grpc.InferenceServerClient(served.url("grpc").removeprefix("grpc://")) as client:
+        stats = client.get_inference_statistics(model).model_stats[0]
+    return stats.inference_stats.success.count, stats.execution_count
+
+
+def assert_same(left: object, right: object) -> None:
+    assert not isinstance(left, RewardError), left
+    assert not isinstance(right, RewardError), right
+    for a, b in zip(goldens.frame_scores(left), goldens.frame_scores(right), strict=True):  # type: ignore[arg-type]
+        np.testing.assert_allclose(a.progress, b.progress, rtol=0, atol=TOLERANCE)
+        np.testing.assert_allclose(a.success, b.success, rtol=0, atol=TOLERANCE)
+    for name in ("preference", "similarity"):
+        if hasattr(left, name):
+            assert abs(getattr(left, name) - getattr(right, name)) <= TOLERANCE

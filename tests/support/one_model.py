@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: MIT
+"""A server of one small model."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import tritonclient.grpc
+
+from rfm.supervise.installation import find_installation
+from rfm.supervise.process import Endpoints, TritonServer
+
+
+class OneModelServer(TritonServer):
+    """A server of the demo's ``rfm`` alone, which loads in a second; with more arguments, and killed if asked."""
+
+    def __init__(self, repository: Path, endpoints: Endpoints, *arguments: str) -> None:
+        log = (repository.parent / "tritonserver.log").open("ab")
+        super().__init__(repository, endpoints, find_installation(), log=log, more_arguments=arguments)
+        self._own_log = log
+
+    def signal(self, number: signal.Signals) -> None:
+        assert self._process is not None
+        os.killpg(self._process.pid, number)
+
+    def kill(self) -> None:
+        self.signal(signal.SIGKILL)
+        self.stop()
+
+    def stop(self) -> int:
+        status = super().stop()
+        self._own_log.close()
+        return status
+
+
+def answered(endpoints: Endpoints) -> int:
+    with tritonclient.grpc.InferenceServerClient(endpoints.grpc_url.removeprefix("grpc://")) as client:
+        stats = client.get_inference_statistics("rfm").model_stats[0]
+    return int(stats.inference_stats.success.count)

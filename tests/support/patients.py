@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: MIT
+"""A small repository whose model breaks when it is told to, and callers that notice."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from paths import ROOT
+from rfm_client import (
+    ProgressSample,
+    RewardClient,
+    Trajectory,
+)
+from rfm_serve import MODEL, wait_for
+
+CALLERS = 16
+
+
+TOLERANCE = 1e-5
+
+
+MARK = 7.0  # in the text embedding of a sample that a model of this test dies of
+
+
+DEADLY = f"""
+
+_answer = TritonPythonModel.answer
+
+
+def deadly(self, questions, execution):
+    import os
+
+    marked = [q for q in questions if q.trajectories[0].text_embedding[0] == {MARK}]
+    if marked:
+        os._exit(1)
+    return _answer(self, questions, execution)
+
+
+TritonPythonModel.answer = deadly
+"""
+
+
+def make_repository(
+    folder: Path, *, more_code: str = "", instances: int = 1, batch_size: int = 64, queue: str = ""
+) -> Path:
+    """The demo's ``rfm`` on one thread, changed as a test needs it."""
+    repository = folder / "model_repository"
+    shutil.copytree(ROOT / "model_repository" / MODEL, repository / MODEL, ignore=shutil.ignore_patterns("__pycache__"))
+    model = repository / MODEL / "1" / "model.py"
+    model.write_text(model.read_text() + more_code)
+    config = repository / MODEL / "config.pbtxt"
+    text = config.read_text()
+    changes = {r"count: \d+": f"count: {instances}", r'("torch_threads"\s+value {\s+string_value: )"\d+"': r'\1"1"'}
+    changes |= {r"max_batch_size: \d+": f"max_batch_size: {batch_size}"}
+    changes |= {r"dynamic_batching {\n}": f"dynamic_batching {{ default_queue_policy {{ {queue} }} }}"} if queue else {}
+    for pattern, wanted in changes.items():
+        text, count = re.subn(pattern, wanted, text)
+        assert count == 1, pattern
+    config.write_text(text)
+    return repository
+
+
+def trajectory(seed: int, num_frames: int = 8, mark: float = 0.0) -> Trajectory:
+    random = np.random.default_rng(seed)
+    text = random.standard_normal(32, np.float32)
+    text[0] = mark
+    return Trajectory(video_embeddings=random.standard_normal((num_frames, 64), np.float32), text_embedding=text)
+
+
+@pytest.fixture(scope="module")
+def references() -> list[np.ndarray[Any, Any]]:
+    """What the engine answers, without Triton."""
+    from rfm.engine import Engine
+
+    engine = Engine.from_checkpoint(ROOT / "model_repository" / MODEL / "1" / "checkpoint")
+    return [result.progress for result in engine.evaluate([ProgressSample(trajectory(n)) for n in range(CALLERS)])]  # type: ignore[union-attr]
+
+
+class Callers:
+    """16 threads that ask without pause, with the client's default retries, and compare what they get."""
+
+    def __init__(self, client: RewardClient, references: list[np.ndarray[Any, Any]]) -> None:
+        self._client = client
+        self._references = references
+        self._stop = threading.Event()
+        self.answered = [0] * CALLERS
+        self.wrong: list[int] = []
+        self.lost: list[Exception] = []
+        self._threads = [threading.Thread(target=self._ask, args=(number,)) for number in range(CALLERS)]
+
+    def _ask(self, number: int) -> None:
+        while not self._stop.is_set():
+            try:
+                progress = self._client.progress(trajectory(number)).progress
+                if np.abs(progress - self._references[number]).max() > TOLERANCE:
+                    self.wrong.append(number)
+                self.answered[number] += 1
+            except Exception as error:  # noqa: BLE001  whatever it is, it is lost
+                self.lost.append(error)
+
+    def wait_for_all(self) -> None:
+        """Each is answered twice more: the second answer is to a question that was asked from now on."""
+        before = list(self.answered)
+        wait_for(lambda: self.lost or all(now > then + 1 for now, then in zip(self.answered, before, strict=True)))
+
+    def __enter__(self) -> Callers:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        for thread in self._threads:
+            thread.join()

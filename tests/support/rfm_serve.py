@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: MIT
+"""An ``rfm serve`` of a test's own: starts it, watches it, and sees that nothing of it is left."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+from prometheus_client.parser import text_string_to_metric_families
+
+from rfm.supervise.process import Endpoints
+from rfm.supervise.stubs import SHARED_MEMORY, Stub, StubWatch
+from rfm_client import RewardClient
+
+RFM = Path(sys.executable).parent / "rfm"
+MODEL = "rfm"
+PATIENCE_S = 60.0
+TRUTH_S = 5.0  # within which readiness tells what is so
+
+
+def wait_for(is_so: Callable[[], Any], within_s: float = PATIENCE_S) -> float:
+    """Seconds until it was so."""
+    started_s = time.monotonic()
+    while not is_so():
+        assert time.monotonic() - started_s < within_s
+        time.sleep(0.02)
+    return time.monotonic() - started_s
+
+
+def children(pid: int, program: str) -> list[int]:
+    return [
+        int(word) for word in subprocess.run(["pgrep", "-P", str(pid), program], stdout=subprocess.PIPE).stdout.split()
+    ]
+
+
+@dataclass
+class Serving:
+    """An ``rfm serve`` that runs."""
+
+    process: subprocess.Popen[bytes]
+    endpoints: Endpoints
+    status_url: str
+    log: Path
+
+    def ready(self) -> httpx.Response | None:
+        try:
+            return httpx.get(f"{self.status_url}/ready")
+        except httpx.TransportError:
+            return None
+
+    def is_ready(self) -> bool:
+        answer = self.ready()
+        return answer is not None and answer.status_code == 200
+
+    def wait_ready(self, is_so: bool = True, within_s: float = PATIENCE_S) -> float:
+        return wait_for(lambda: self.is_ready() is is_so or self.process.poll() is not None, within_s)
+
+    @property
+    def triton(self) -> int:
+        (pid,) = children(self.process.pid, "tritonserver")
+        return pid
+
+    @property
+    def stubs(self) -> list[Stub]:
+        return self.stubs_of(MODEL)
+
+    def stubs_of(self, model: str) -> list[Stub]:
+        return [stub for stub in StubWatch(self.triton, PATIENCE_S).of_model(model) if stub.is_alive]
+
+    def reasons(self) -> dict[str, str]:
+        """Why models are not ready, of all that it knows; empty: they are."""
+        answer = self.ready()
+        return {} if answer is None else {name: told["reason"] for name, told in answer.json()["models"].items()}
+
+    def client(self, **options: Any) -> RewardClient:
+        return RewardClient(self.endpoints.grpc_url, **options)
+
+    def metric(self, name: str, **labels: str) -> float:
+        text = httpx.get(f"{self.status_url}/metrics").text
+        samples = [sample for family in text_string_to_metric_families(text) for sample in family.samples]
+        return sum(
+            sample.value for sample in samples if sample.name == name and labels.items() <= sample.labels.items()
+        )
+
+    @property
+    def said(self) -> list[str]:
+        """By ``rfm serve`` itself, but for that it is ready."""
+        lines = self.log.read_text(errors="replace").splitlines()
+        return [line for line in lines if line.startswith("rfm: ") and not line.startswith("rfm: ready: ")]
+
+
+@contextmanager
+def serving(repository: Path, *more: str) -> Iterator[Serving]:
+    """Within it, the repository is served. Nothing of it may be left behind."""
+    endpoints, status_port = Endpoints.free(), Endpoints.free().http_port
+    ports = {"http": endpoints.http_port, "grpc": endpoints.grpc_port, "metrics": endpoints.metrics_port}
+    options = [f"--{name}-port={port}" for name, port in (ports | {"status": status_port}).items()]
+    log = repository.parent / "rfm.log"
+    with log.open("wb") as lines:
+        process = subprocess.Popen(
+            [RFM, "serve", "--repository", repository, *options, *more], stdout=lines, stderr=lines
+        )
+    served = Serving(process, endpoints, f"http://127.0.0.1:{status_port}", log)
+    try:
+        yield served
+    finally:
+        if process.poll() is None:
+            process.terminate()
+        process.wait(PATIENCE_S)
+    assert not list(SHARED_MEMORY.glob(f"*_rfm_{process.pid}_*"))
+    assert not list(Path(tempfile.gettempdir()).glob(f"rfm-backends-{process.pid}-*"))

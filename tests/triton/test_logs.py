@@ -1,0 +1,326 @@
+# SPDX-License-Identifier: MIT
+"""A request's id: in what the client raises, in Triton's log, in traces, and through the gateway."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy
+from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+import requests
+import tritonclient.http
+from tritonclient.utils import np_to_triton_dtype
+
+import goldens
+import rfm_export
+from engines import serve_config
+from gateways import Gateway
+from gateways import running as running_gateway
+from paths import ROOT
+from rfm.supervise.installation import find_installation
+from rfm.supervise.process import Endpoints, TritonServer
+from rfm_client import (
+    DeadlineExceededError,
+    InferenceFailedError,
+    InvalidSampleError,
+    ProgressSample,
+    RewardClient,
+    RewardError,
+    Sample,
+    ServerUnavailableError,
+)
+from rfm_client.contract import wire
+from rfm_client.contract.names import PROBE_PREFIX
+from trajectories import random_trajectory
+
+CONFIG = goldens.config("c1_t1_disc10")
+DOCUMENT = ROOT / "docs" / "logs.md"
+NOBODY = "grpc://127.0.0.1:9"
+PATIENCE_S = 30.0
+RANDOM_ID = re.compile(r"[0-9a-f]{16}")
+FAILING_STEPS = 7
+
+# A model with a fault in it, as nobody wants it to be.
+FAULTY = f"""
+
+class TritonPythonModel(TritonPythonModel):
+    def answer(self, questions, execution):
+        if any(getattr(question, "frame_steps", 0) == {FAILING_STEPS} for question in questions):
+            raise ZeroDivisionError("a fault of the model's")
+        return super().answer(questions, execution)
+"""
+
+
+@dataclass(frozen=True)
+class Running:
+    endpoints: Endpoints
+    log: Path
+    traces: list[bytes]
+
+    def url(self, protocol: str) -> str:
+        return self.endpoints.grpc_url if protocol == "grpc" else self.endpoints.http_url
+
+    def client(self, protocol: str = "grpc") -> RewardClient:
+        return RewardClient(self.url(protocol), retry=False)
+
+    def lines(self) -> list[tuple[str, dict[str, Any]]]:
+        """The model's own: severity and content."""
+        found = []
+        for line in self.log.read_text().splitlines():
+            match = re.fullmatch(r'([IWE])\d{4} \S+ \d+ request_log\.py:\d+\] ("\{.*\}")', line)
+            if match is not None:
+                found.append((match[1], json.loads(json.loads(match[2]))))
+        return found
+
+    def said_of(self, request_id: str) -> tuple[str, dict[str, Any]]:
+        """The one line about a request."""
+        (line,) = (line for line in self.lines() if line[1].get("request_id") == request_id)
+        return line
+
+
+class Collector(ThreadingHTTPServer):
+    """What an OpenTelemetry collector is to Triton: it takes what comes."""
+
+    def __init__(self) -> None:
+        self.traces: list[bytes] = []
+        super().__init__(("127.0.0.1", 0), Taker)
+
+
+class Taker(BaseHTTPRequestHandler):
+    server: Collector
+
+    def do_POST(self) -> None:
+        self.server.traces.append(self.rfile.read(int(self.headers["Content-Length"])))
+        self.send_response(200)
+        self.end_headers()
+
+    def log_message(self, *_arguments: object) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def collector() -> Iterator[Collector]:
+    with Collector() as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join()
+
+
+def documented_options(traces_url: str) -> list[str]:
+    """What docs/logs.md tells to give tritonserver, but with this collector, and for every request."""
+    options = re.findall(r"--(?:trace-config|log-verbose)=[^\s`]+", DOCUMENT.read_text())
+    assert {option.partition("=")[0] for option in options} == {"--trace-config", "--log-verbose"}
+    replaced = {"opentelemetry,url": traces_url, "rate": "1"}
+    for name, value in replaced.items():
+        options = [
+            re.sub(rf"^--trace-config={name}=.*", f"--trace-config={name}={value}", option) for option in options
+        ]
+    return options
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory, collector: Collector) -> Iterator[Running]:
+    folder = tmp_path_factory.mktemp("logs")
+    repository, log = folder / "repository", folder / "tritonserver.log"
+    rfm_export.export(CONFIG.checkpoint, repository, serve_config(CONFIG))
+    model = repository / "rfm" / "1" / "model.py"
+    model.write_text(model.read_text() + FAULTY)
+    options = documented_options(f"http://127.0.0.1:{collector.server_address[1]}/v1/traces")
+    with (
+        log.open("wb") as lines,
+        TritonServer(repository, Endpoints.free(), find_installation(), log=lines, more_arguments=options) as server,
+    ):
+        yield Running(server.endpoints, log, collector.traces)
+
+
+def too_long() -> Sample:
+    return ProgressSample(random_trajectory(0, 17))
+
+
+def failing() -> Sample:
+    return ProgressSample(random_trajectory(0, 3), frame_steps=FAILING_STEPS)
+
+
+def good() -> Sample:
+    return ProgressSample(random_trajectory(0, 3))
+
+
+def poll(is_so: Callable[[], bool]) -> None:
+    ends_s = time.monotonic() + PATIENCE_S
+    while not is_so():
+        assert time.monotonic() < ends_s
+        time.sleep(0.05)
+
+
+# The client
+
+
+def test_what_is_refused_is_told_with_its_request_and_logged_as_verbose(running: Running, protocol: str) -> None:
+    with running.client(protocol) as client, pytest.raises(InvalidSampleError, match="at most 16") as raised:
+        client.evaluate([too_long()])
+    request_id = raised.value.request_id
+    assert request_id is not None
+    assert re.fullmatch(f"{RANDOM_ID.pattern}-1", request_id)
+    assert str(raised.value) == f"{raised.value.message} (request {request_id})"
+    severity, said = running.said_of(request_id)
+    assert severity == "I"
+    assert said == {
+        "event": "request_refused",
+        "model": "rfm",
+        "version": "1",
+        "request_id": request_id,
+        "sample_type": "progress",
+        "error": raised.value.message,
+    }
+
+
+def test_what_failed_is_logged_as_an_error_with_its_traceback(running: Running, protocol: str) -> None:
+    name = f"a.fault/of-{protocol}"
+    with running.client(protocol) as client, pytest.raises(InferenceFailedError) as raised:
+        client.evaluate([failing()], request_id=name)
+    assert str(raised.value) == f"scoring failed; the server's log has the reason (request {name}-1)"
+    severity, said = running.said_of(f"{name}-1")
+    assert severity == "E"
+    assert (said["event"], said["sample_type"]) == ("request_failed", "progress")
+    assert said["traceback"].startswith("Traceback (most recent call last):\n")
+    assert said["traceback"].endswith("ZeroDivisionError: a fault of the model's\n")
+
+
+def test_the_requests_of_a_call_begin_alike(running: Running, protocol: str) -> None:
+    """One of three samples, which is refused, then each sample alone."""
+    with running.client(protocol) as client:
+        outcomes = client.evaluate([good(), too_long(), good()], return_errors=True, request_id="call")
+        assert isinstance(outcomes[1], InvalidSampleError)
+        assert outcomes[1].request_id in [f"call-{number}" for number in (2, 3, 4)]
+        with pytest.raises(InvalidSampleError, match=r"^samples\[1\]\.num_frames: .* \(request call-[234]\)$"):
+            client.evaluate([good(), too_long(), good()], request_id="call")
+
+
+def test_requests_that_fail_together_are_named_together(running: Running) -> None:
+    """Whoever shared the batch of a faulty request is scored alone."""
+
+    def ask(number: int) -> bool:
+        sample = failing() if number == 0 else good()
+        try:
+            client.evaluate([sample], request_id=f"together-{number}")
+        except InferenceFailedError:
+            return False
+        return True
+
+    def batches() -> list[dict[str, Any]]:
+        return [said for _, said in running.lines() if said["event"] == "batch_failed"]
+
+    with running.client() as client, ThreadPoolExecutor(16) as pool:
+        rounds = 0
+        while not batches():
+            rounds += 1
+            assert rounds < 50
+            assert list(pool.map(ask, range(16))) == [False, *[True] * 15]
+    for said in batches():
+        assert "together-0-1" in said["request_ids"]
+        assert len(said["request_ids"]) > 1
+        assert "a fault of the model's" in said["traceback"]
+        assert said["error"] == 'ZeroDivisionError("a fault of the model\'s")'
+
+
+@pytest.mark.parametrize("name", ["", "two words", "new\nline", "] forged", "x" * 65, "\u00e4"])
+def test_a_name_that_a_log_could_not_hold_is_refused(name: str) -> None:
+    with RewardClient(NOBODY) as client, pytest.raises(ValueError, match="request_id: expected 1 to 64 letters"):
+        client.progress(random_trajectory(0, 2), request_id=name)
+
+
+def test_a_request_without_an_answer_is_named_too(running: Running) -> None:
+    lost = pytest.raises(ServerUnavailableError, match=r"\(request lost-1\)$")
+    with RewardClient(NOBODY, retry=False) as client, lost:
+        client.progress(random_trajectory(0, 2), request_id="lost")
+    with running.client() as client, pytest.raises(DeadlineExceededError) as raised:
+        client.evaluate([ProgressSample(random_trajectory(0, 500), frame_steps=16)], timeout_s=0.05, request_id="late")
+    assert raised.value.request_id in ("late-1", None)  # None: the time was up before it was sent
+
+
+def test_an_error_keeps_its_request_where_it_goes() -> None:
+    error = InvalidSampleError.at("num_frames", "1", "2")
+    error.request_id = "x-1"
+    for other in (copy(error), pickle.loads(pickle.dumps(error))):
+        assert (str(other), other.request_id) == ("num_frames: expected 1, got 2 (request x-1)", "x-1")
+    located = error.inside("samples[3]")
+    assert str(located) == "samples[3].num_frames: expected 1, got 2 (request x-1)"
+    assert str(RewardError("no request")) == "no request"
+
+
+# Traces, with the options of docs/logs.md
+
+
+def test_traces_name_the_request(running: Running) -> None:
+    with running.client() as client:
+        client.progress(random_trajectory(0, 3), request_id="traced")
+    poll(lambda: any(b'"triton.request_id","value":{"stringValue":"traced-1"}' in trace for trace in running.traces))
+
+
+def test_a_caller_s_trace_is_continued(running: Running) -> None:
+    trace_id = "4bf92f3577b34da6a3ce929d0e0e4736"
+    inputs = []
+    for name, array in wire.encode_samples([good()]).items():
+        inputs.append(tritonclient.http.InferInput(name, array.shape, np_to_triton_dtype(array.dtype)))
+        inputs[-1].set_data_from_numpy(array)
+    headers = {"traceparent": f"00-{trace_id}-00f067aa0ba902b7-01"}
+    with tritonclient.http.InferenceServerClient(running.endpoints.http_url.removeprefix("http://")) as client:
+        client.infer("rfm", inputs, headers=headers)
+    poll(lambda: any(trace_id.encode() in trace for trace in running.traces))
+
+
+# The gateway
+
+
+@pytest.fixture(scope="module")
+def gateway(running: Running, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
+    with running_gateway(running.endpoints, tmp_path_factory.mktemp("gateway"), "rfm") as started:
+        yield started
+
+
+def asked(gateway: Gateway, request_id: str, **content: Any) -> requests.Response:
+    headers = {"X-Request-ID": request_id}
+    return requests.post(f"{gateway.url}/evaluate_batch", headers=headers, timeout=PATIENCE_S, **content)
+
+
+def body(num_frames: int) -> dict[str, Any]:
+    trajectory = random_trajectory(0, num_frames)
+    assert trajectory.video_embeddings is not None
+    assert trajectory.text_embedding is not None
+    embeddings = {
+        "video_embeddings": trajectory.video_embeddings.tolist(),
+        "text_embedding": trajectory.text_embedding.tolist(),
+    }
+    return {"samples": [{"sample_type": "progress", "trajectory": embeddings}]}
+
+
+def test_the_gateway_passes_the_caller_s_id_on_and_returns_it(running: Running, gateway: Gateway) -> None:
+    refused = asked(gateway, "of-the-caller", json=body(17))
+    assert (refused.status_code, refused.headers["X-Request-ID"]) == (422, "of-the-caller")
+    assert "(request" not in refused.text
+    assert running.said_of("of-the-caller-1")[1]["error"].startswith("num_frames: expected at most 16")
+    scored = asked(gateway, "of-the-caller", json=body(3))
+    assert (scored.status_code, scored.headers["X-Request-ID"]) == (200, "of-the-caller")
+
+
+@pytest.mark.parametrize("given", ["", "two words", "x" * 65, "a\tb", PROBE_PREFIX])
+def test_the_gateway_makes_an_id_where_there_is_none_to_pass_on(gateway: Gateway, given: str) -> None:
+    answer = requests.get(f"{gateway.url}/model_info", headers={"X-Request-ID": given}, timeout=PATIENCE_S)
+    assert RANDOM_ID.fullmatch(answer.headers["X-Request-ID"])
+
+
+def test_what_the_gateway_refuses_by_itself_has_an_id_too(gateway: Gateway) -> None:
+    answer = asked(gateway, "odd", data=b"no JSON")
+    assert (answer.status_code, answer.headers["X-Request-ID"]) == (422, "odd")

@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: MIT
+"""``make rollout``: two versions of a checkpoint take turns on one server while callers ask; what became of each request.
+
+Half of the callers use gRPC, half HTTP. They send embeddings and raw frames, in turn, one request at a time and a few a
+second each, and retry nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import safetensors.torch
+import torch
+
+import goldens
+import rfm_export
+from engines import serve_config
+from rfm import families
+from rfm.engine import Engine, Outcome
+from rfm.supervise.process import Endpoints
+from rfm_client import (
+    AsyncRewardClient,
+    DeadlineExceededError,
+    PreferenceSample,
+    ProgressSample,
+    RewardClient,
+    RewardError,
+    Sample,
+    Trajectory,
+)
+from rfm_client.async_client import DEFAULT_TIMEOUT_S
+from rfm_export.export import load_encoders
+from trajectories import random_trajectory
+
+NAME = "rfm"
+WITH_ENCODERS = goldens.config("enc_c1_t1_disc10")
+WIDTHS = (48, 32)
+FRAME_PX = 48
+RFM = Path(sys.executable).parent / "rfm"
+TOLERANCE = 1e-5
+CLEARLY = 1e-2  # versions differ by at least so much
+SECONDS = 60.0
+CALLERS = 32
+DEADLINE_S = 10.0  # of a call
+PAUSE_S = 0.2  # a control loop's step; without it they would take the processor from what is being loaded
+
+
+@dataclass
+class Tally:
+    """What became of requests.
+
+    unlike: answers that are neither version's, or not that of the version they name
+    failed: requests without an answer; late: those of them that were past their deadline
+    """
+
+    asked: int = 0
+    late: int = 0
+    slowest_s: float = 0.0  # of answers
+    by_version: Counter[str] = field(default_factory=Counter)
+    unlike: list[str] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
+
+    @property
+    def answered(self) -> int:
+        return self.by_version.total()
+
+    def __str__(self) -> str:
+        versions = ", ".join(f"version {version}: {count}" for version, count in sorted(self.by_version.items()))
+        return (
+            f"asked {self.asked}, answered {self.answered} ({versions}), "
+            f"of neither version {len(self.unlike)}, failed {len(self.failed)}, past their deadline {self.late}, "
+            f"slowest answer {self.slowest_s:.1f} s"
+        )
+
+
+def other_checkpoint(folder: Path, source: Path = WITH_ENCODERS.checkpoint) -> Path:
+    """A copy of the checkpoint with other weights, in its encoders too."""
+    folder.mkdir(parents=True)
+    for file in source.iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    weights = safetensors.torch.load_file(folder / "model.safetensors")
+    random = torch.Generator().manual_seed(0)
+    changed = {
+        name: weight + 0.5 * weight.std() * torch.randn(weight.shape, generator=random) if weight.ndim == 2 else weight
+        for name, weight in weights.items()
+    }
+    safetensors.torch.save_file(changed, folder / "model.safetensors", {"format": "pt"})
+    return folder
+
+
+def export(checkpoint: Path, repository: Path, name: str = NAME) -> int:
+    return rfm_export.export(checkpoint, repository, serve_config(WITH_ENCODERS, name))
+
+
+def questions() -> list[Sample]:
+    """Embeddings and frames, several lengths, two types."""
+    random = np.random.default_rng(0)
+    samples: list[Sample] = []
+    for index in range(16):
+        count = 1 + index % 6
+        embedded = random_trajectory(index, count, *WIDTHS)
+        frames = random.integers(0, 256, (count, FRAME_PX, FRAME_PX, 3), np.uint8)
+        filmed = Trajectory(frames=frames, task=f"stack {index} cups")
+        for trajectory in (embedded, filmed):
+            samples.append(PreferenceSample(trajectory, trajectory) if index % 4 == 3 else ProgressSample(trajectory))
+    return samples
+
+
+def answers(checkpoint: Path, samples: Sequence[Sample]) -> list[Outcome]:
+    """What the checkpoint itself says."""
+    loaded = families.load(checkpoint)
+    assert isinstance(loaded, families.RewindCheckpoint)
+    return Engine.of(loaded, encoders=load_encoders(loaded, serve_config(WITH_ENCODERS))).evaluate(samples)
+
+
+def numbers(outcome: object) -> np.ndarray:
+    """Progress of the (first) trajectory, where there is one also its success."""
+    scores = getattr(outcome, "first", outcome)
+    return np.concatenate([scores.progress, scores.success])  # type: ignore[attr-defined]
+
+
+def difference(left: object, right: object) -> float:
+    return float(np.abs(numbers(left) - numbers(right)).max())
+
+
+@contextmanager
+def callers(
+    url: str,
+    samples: Sequence[Sample],
+    expected: Mapping[str, Sequence[Outcome]],
+    model: str = NAME,
+    *,
+    count: int = CALLERS,
+    timeout_s: float = DEFAULT_TIMEOUT_S,
+) -> Iterator[Tally]:
+    """So many ask on and on within it. expected: answers by version"""
+    tally, stop, begun = Tally(), threading.Event(), threading.Event()
+
+    async def call(client: AsyncRewardClient, index: int) -> None:
+        while not stop.is_set():
+            sample = index % len(samples)
+            index += count + 1
+            tally.asked += 1
+            asked_s = time.monotonic()
+            try:
+                result = await client.score(samples[sample], timeout_s=timeout_s)
+            except RewardError as error:
+                tally.failed.append(repr(error))
+                tally.late += isinstance(error, DeadlineExceededError)
+                continue
+            tally.slowest_s = max(tally.slowest_s, time.monotonic() - asked_s)
+            version = str(result.model_version)
+            tally.by_version[version] += 1
+            if version not in expected or difference(result, expected[version][sample]) > TOLERANCE:
+                tally.unlike.append(f"{samples[sample]!r:.80} by version {version}: {numbers(result)}")
+            begun.set()
+            await asyncio.sleep(PAUSE_S)
+
+    async def call_all() -> None:
+        async with AsyncRewardClient(url, model=model, retry=False, max_in_flight=count) as client:
+            await asyncio.gather(*(call(client, index) for index in range(count)))
+
+    thread = threading.Thread(target=asyncio.run, args=(call_all(),))
+    thread.start()
+    try:
+        assert begun.wait(60)
+        yield tally
+    finally:
+        stop.set()
+        thread.join()
+
+
+def models(command: str, repository: Path, url: str, key_file: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """``rfm models COMMAND``."""
+    options = ["--url", url, "--admin-key-file", str(key_file)]
+    if command != "list":
+        options += ["--repository", str(repository)]
+    line = [str(RFM), "models", command, *words, *options]
+    return subprocess.run(line, capture_output=True, text=True, timeout=180, check=False)
+
+
+@contextmanager
+def rfm_serve(repository: Path, key_file: Path, log: Path) -> Iterator[Endpoints]:
+    """What users run, until it is left."""
+    endpoints = Endpoints.free()
+    ports = {"http": endpoints.http_port, "grpc": endpoints.grpc_port, "metrics": endpoints.metrics_port}
+    options = [f"--{name}-port={port}" for name, port in ports.items()]
+    line = [str(RFM), "serve", "--repository", str(repository), "--admin-key-file", str(key_file), *options]
+    with log.open("wb") as lines:
+        process = subprocess.Popen(line, stdout=lines, stderr=lines)
+    try:
+        with RewardClient(endpoints.grpc_url, model=NAME) as client:
+            client.wait_ready(120)
+        yield endpoints
+    finally:
+        process.terminate()
+        process.wait(60)
+
+
+def take_turns(repository: Path, url: str, key_file: Path, seconds: float) -> int:
+    """Rollout of version 2 and rollback in turn, for so long; how many there were."""
+    end_s, turn = time.monotonic() + seconds, 0
+    while time.monotonic() < end_s:
+        begun_s = time.monotonic()
+        words = ("rollback", NAME) if turn % 2 else ("rollout", NAME, "2")
+        done = models(words[0], repository, url, key_file, *words[1:])
+        if done.returncode != 0:
+            raise RuntimeError(done.stderr)
+        print(f"{' '.join(words)}: {time.monotonic() - begun_s:.1f} s", flush=True)
+        turn += 1
+    return turn
+
+
+def main() -> int:
+    """Prints the figures; 1 if a request was lost or answered by neither version."""
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory(prefix="rfm-rollout-") as name:
+        folder = Path(name)
+        repository, key_file, samples = folder / "repository", folder / "key", questions()
+        key_file.touch(0o600)
+        key_file.write_text("the-key-of-this-run")
+        other = other_checkpoint(folder / "other")
+        expected = {"1": answers(WITH_ENCODERS.checkpoint, samples), "2": answers(other, samples)}
+        apart = min(difference(*pair) for pair in zip(expected["1"], expected["2"], strict=True))
+        assert apart > CLEARLY, apart
+        export(WITH_ENCODERS.checkpoint, repository)
+        with rfm_serve(repository, key_file, folder / "log") as endpoints:
+            export(other, repository)
+            begun_s = time.monotonic()
+            ask = functools.partial(
+                callers, samples=samples, expected=expected, count=CALLERS // 2, timeout_s=DEADLINE_S
+            )
+            with (
+                ask(endpoints.grpc_url) as over_grpc,
+                ask(endpoints.http_url) as over_http,
+            ):
+                turns = take_turns(repository, endpoints.grpc_url, key_file, SECONDS)
+            took_s = time.monotonic() - begun_s
+        told = [line for line in (folder / "log").read_text().splitlines() if line.startswith("rfm: ")]
+    print(
+        f"{took_s:.0f} s, {CALLERS} callers, {turns} times another version; the versions differ by {apart:.2g} or more"
+    )
+    for protocol, tally in {"gRPC": over_grpc, "HTTP": over_http}.items():
+        print(f"{protocol}: {tally}")
+        for line in (*tally.failed[:5], *tally.unlike[:5]):
+            print(line)
+    print(*told, sep="\n")
+    return int(any(tally.failed or tally.unlike for tally in (over_grpc, over_http)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
