@@ -1,5 +1,6 @@
 # make demo    a first look: serves a small trained checkpoint, scores clips, draws their curves
-# make test    everything that CI runs: lint, types, generated files, tests
+# make test    lint, types, generated files, and the tests that take minutes
+# make test-all    all that CI runs: also what kills, waits, restarts, or needs programs of Debian
 # make ops-check    what runs around the server: alerts, dashboards, containers, Kubernetes
 PYTHON ?= python3
 VENV := .venv
@@ -7,13 +8,17 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed
 TOOL := PYTHONPATH=tests/support:tools/faults $(BIN)/python
 
-.PHONY: demo test check parity rollout bench bench-full perf chaos chaos-full soak format model_repository clean \
+.PHONY: demo test test-all check parity rollout bench bench-full perf chaos chaos-full soak format model_repository clean \
   ops-check ops-tools audit lock mutate
 
 demo: $(INSTALLED)
 	$(BIN)/python examples/demo.py
 
-test: check ops-tools
+test: check
+	$(BIN)/pytest -m "not gpu and not slow"
+
+# The tests that kill, wait and restart, and those that need programs of Debian, too.
+test-all: check ops-tools
 	$(BIN)/pytest
 
 check: $(INSTALLED)

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import os
+import uuid
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -9,6 +10,7 @@ import torch
 
 import goldens
 import rfm_export
+from commands import RUN
 from engines import load_engine, serve_config
 from reference_server import Served
 from rfm.engine import Engine
@@ -16,6 +18,7 @@ from rfm.supervise.installation import find_installation
 from rfm.supervise.process import Endpoints, TritonServer
 
 torch.set_num_threads(1)
+os.environ[RUN] = uuid.uuid4().hex  # by which tests know what this run has started
 os.environ["ONEDNN_MAX_CPU_ISA"] = "AVX512_CORE"  # as the references were computed: AMX rounds bfloat16 elsewhere
 
 
@@ -40,3 +43,10 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 @pytest.fixture(params=["grpc", "http"])
 def protocol(request: pytest.FixtureRequest) -> str:
     return str(request.param)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Whoever asks the reference server asks a Triton."""
+    for item in items:
+        if "served" in getattr(item, "fixturenames", ()):
+            item.add_marker("triton")

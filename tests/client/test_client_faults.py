@@ -34,6 +34,8 @@ from rfm_client import (
 )
 from rfm_client.transport.shared_memory import FOLDER, MIN_SHARED_BYTES
 
+pytestmark = [pytest.mark.triton, pytest.mark.slow]
+
 PATIENCE_S = 60.0
 
 

@@ -31,6 +31,8 @@ from rfm_client import (
 from rfm_client.transport import host_names as names
 from rfm_serve import MODEL, PATIENCE_S, Serving, serving, wait_for
 
+pytestmark = [pytest.mark.triton, pytest.mark.slow]
+
 __all__ = ["references"]  # a fixture
 
 POISON = trajectory(99, mark=MARK)

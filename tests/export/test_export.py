@@ -30,6 +30,8 @@ from rfm_commands.cli import app
 from rfm_export import ExportDiffersError, ExportError
 from rfm_export.about import Origin
 
+pytestmark = pytest.mark.triton
+
 EMBEDDINGS = goldens.config("c1_t1_disc10")
 FRAMES = goldens.config("enc_c1_t1_disc10")
 REPOSITORY = ROOT / "model_repository"

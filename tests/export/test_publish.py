@@ -26,6 +26,8 @@ from rfm_commands.rollout import Rollout, previous_version
 from rfm_export.publish import staging
 from trajectories import random_trajectory
 
+pytestmark = pytest.mark.triton
+
 PLAIN = goldens.config("c1_t1_disc10")
 KEY = "a-key-that-only-tests-know"
 NOBODY = 65534

@@ -23,6 +23,8 @@ from rfm_commands.tune import Setting, Sweep, Trial, quickest, write_setting
 from rfm_export import ExportError
 from trajectories import random_trajectory
 
+pytestmark = [pytest.mark.triton, pytest.mark.slow]
+
 ONE, TWO, FOUR = Setting(1, 4, 64), Setting(2, 2, 64), Setting(4, 1, 64)
 
 

@@ -62,6 +62,8 @@ from rfm_client.status import read_status
 from rfm_commands.cli import app
 from rfm_gateway import state as gateway_state
 
+pytestmark = pytest.mark.triton
+
 Json: TypeAlias = dict[str, Any]
 Array: TypeAlias = npt.NDArray[Any]
 Ask: TypeAlias = Callable[..., requests.Response]

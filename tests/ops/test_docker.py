@@ -34,6 +34,8 @@ from paths import ROOT
 from rfm.supervise.installation import find_installation
 from rfm.supervise.process import Endpoints
 
+pytestmark = [pytest.mark.triton, pytest.mark.slow]
+
 DOCKER = ROOT / "docker"
 DOCKERFILE = (DOCKER / "Dockerfile").read_text()
 COMPOSE = yaml.safe_load((DOCKER / "compose.yaml").read_text())

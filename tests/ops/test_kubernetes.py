@@ -41,6 +41,8 @@ from rfm.supervise.process import KILL_AFTER_S, Endpoints
 from rfm_commands.cli import app
 from rfm_gateway.command import STOP_WITHIN_S
 
+pytestmark = pytest.mark.slow
+
 KUBERNETES = ROOT / "docker" / "kubernetes"
 BIN = Path(sys.executable).parent
 PROMETHEUS = yaml.safe_load((ROOT / "docker" / "prometheus" / "prometheus.yml").read_text())

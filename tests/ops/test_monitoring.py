@@ -31,6 +31,8 @@ from rfm.supervise.process import Endpoints
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, RewardClient, RewardError, Trajectory
 from trajectories import random_trajectory
 
+pytestmark = [pytest.mark.triton, pytest.mark.slow]
+
 PROMETHEUS = ROOT / "docker" / "prometheus"
 GRAFANA = ROOT / "docker" / "grafana"
 RUNBOOKS = ROOT / "docs" / "operations.md"

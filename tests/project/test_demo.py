@@ -23,6 +23,8 @@ from rfm_client import InvalidSampleError
 from rfm_client.data.video import frame_indices, read_video
 from rfm_commands.cli import app
 
+pytestmark = [pytest.mark.triton, pytest.mark.slow]
+
 REPOSITORY = ROOT / "model_repository"
 PNG = b"\x89PNG"
 

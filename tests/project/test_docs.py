@@ -26,6 +26,8 @@ from rfm.supervise.process import Endpoints, TritonServer
 from rfm_client import PreferenceSample, ProgressSample, Trajectory
 from rfm_client.cli.commands import app
 
+pytestmark = pytest.mark.triton
+
 CLIENT_README = ROOT / "client" / "README.md"
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 COMMAND = re.compile(r"^    (rfm-client [^#\n]*)", re.MULTILINE)

@@ -5,8 +5,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 import fuzz
 import kill_export
+
+pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
 REQUESTS = 1000
 KILLS = 6

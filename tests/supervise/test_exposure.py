@@ -44,6 +44,8 @@ from rfm_client.transport.loop_thread import LoopThread
 from rfm_commands.cli import app
 from trajectories import random_trajectory
 
+pytestmark = [pytest.mark.triton, pytest.mark.slow]
+
 PLAIN = goldens.config("c1_t1_disc10")
 TRAJECTORY = random_trajectory(0, 5)
 TOLERANCE = 1e-5

@@ -36,6 +36,8 @@ from rfm_client import (
 )
 from rfm_serve import MODEL, PATIENCE_S, RFM, TRUTH_S, Serving, children, serving, wait_for
 
+pytestmark = [pytest.mark.triton, pytest.mark.slow]
+
 SLOW = f"""
 
 _answer = TritonPythonModel.answer

@@ -44,6 +44,8 @@ from rfm_export.publish import read_config
 from rollout import NAME, RFM, WITH_ENCODERS, callers, difference, models
 from trajectories import random_trajectory
 
+pytestmark = [pytest.mark.triton, pytest.mark.slow]
+
 KEY = "a-key-that-only-tests-know"
 PLAIN = goldens.config("c1_t1_disc10")  # embeddings alone
 TOLERANCE = 1e-5

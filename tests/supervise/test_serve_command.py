@@ -25,6 +25,8 @@ from rfm.supervise.stubs import is_alive
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_serve import children, serving, wait_for
 
+pytestmark = [pytest.mark.triton, pytest.mark.slow]
+
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
 def test_the_committed_repository_is_served_until_a_signal(number: signal.Signals) -> None:

@@ -32,6 +32,8 @@ from rfm.supervise.status import NO_REASON, Status
 from rfm_commands.rollout import Rollout
 from rfm_serve import MODEL, Serving, serving, wait_for
 
+pytestmark = [pytest.mark.triton, pytest.mark.slow]
+
 __all__ = ["references"]  # a fixture
 
 KEY = "a-key-that-only-tests-know"

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from paths import ROOT
+from rfm.supervise.leftovers import REGION_PREFIX
 from rfm.supervise.process import Endpoints
-from rfm.supervise.stubs import SHARED_MEMORY
+from rfm.supervise.stubs import SHARED_MEMORY, is_alive
 from rfm_client import RewardClient
 
 REPOSITORY = ROOT / "model_repository"
@@ -22,6 +25,8 @@ RFM = Path(sys.executable).parent / "rfm"
 
 
 EXIT_S = 60
+RUN = "RFM_TEST_RUN"
+OWNER = re.compile(rf"{REGION_PREFIX}_(\d+)_")
 
 
 def command(repository: Path, endpoints: Endpoints) -> list[str]:
@@ -34,23 +39,35 @@ def command(repository: Path, endpoints: Endpoints) -> list[str]:
 
 
 def regions() -> set[str]:
-    return {path.name for path in SHARED_MEMORY.iterdir()}
+    """Names in shared memory, but for those of servers that others run on this machine."""
+    names = {path.name for path in SHARED_MEMORY.iterdir()}
+    owners = {name: int(match[1]) for name in names if (match := OWNER.search(name))}
+    return names - {name for name, pid in owners.items() if is_alive(pid) and not is_ours(pid)}
 
 
 def tritons() -> set[int]:
-    """Process ids of every tritonserver on this machine."""
+    """Process ids of every tritonserver that this run of the tests has started."""
     found = set()
     for folder in Path("/proc").glob("[0-9]*"):
         try:
-            if "tritonserver" in (folder / "cmdline").read_text().split("\0")[0]:
+            if "tritonserver" in (folder / "cmdline").read_text().split("\0")[0] and is_ours(int(folder.name)):
                 found.add(int(folder.name))
         except (FileNotFoundError, ProcessLookupError):  # it ended meanwhile
             continue
     return found
 
 
+def is_ours(pid: int) -> bool:
+    """Whether the process inherited what conftest.py wrote into the environment."""
+    try:
+        return f"{RUN}={os.environ[RUN]}" in Path("/proc", str(pid), "environ").read_text().split("\0")
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
 @contextmanager
 def nothing_left_behind() -> Iterator[None]:
+    """Within it, servers may start; behind it, none of this run is there, nor anything of it in shared memory."""
     regions_before, tritons_before = regions(), tritons()
     yield
     assert regions() <= regions_before

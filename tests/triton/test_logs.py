@@ -43,6 +43,8 @@ from rfm_client.contract import wire
 from rfm_client.contract.names import PROBE_PREFIX
 from trajectories import random_trajectory
 
+pytestmark = pytest.mark.triton
+
 CONFIG = goldens.config("c1_t1_disc10")
 DOCUMENT = ROOT / "docs" / "logs.md"
 NOBODY = "grpc://127.0.0.1:9"

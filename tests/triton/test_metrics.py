@@ -42,6 +42,8 @@ from rfm_client.contract import wire
 from rfm_client.contract.names import PROBE_PREFIX
 from trajectories import random_trajectory
 
+pytestmark = pytest.mark.triton
+
 PLAIN, FILM = goldens.config("c1_t1_disc10"), goldens.config("enc_c1_t1_disc10")
 MODEL, TWICE, SLOW = "rfm", "twice", "slow"  # MODEL has encoders, TWICE two instances
 WIDTHS, PLAIN_WIDTHS = (48, 32), (768, 384)

@@ -34,6 +34,8 @@ from rfm_client.contract.names import PROBE_PREFIX
 from rfm_serve import PATIENCE_S, serving
 from trajectories import random_trajectory
 
+pytestmark = [pytest.mark.triton, pytest.mark.slow]
+
 PLAIN = goldens.config("c1_t1_disc10")
 WIDTHS = (4, 3)
 CONFIG = {  # as Triton tells it to a model

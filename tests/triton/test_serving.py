@@ -36,6 +36,8 @@ from rfm_client.contract import wire
 from rfm_client.transport.calls import connect
 from trajectories import random_trajectory
 
+pytestmark = pytest.mark.triton
+
 VLM = "q3_tok_disc10"
 TOLERANCE = 1e-5
 NO_SUCH_MODEL = "not_served"
