@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Servers that restart, die or are full, and shared memory that outlives nobody. All with real servers."""
+"""Servers that stop, hang and come back, and connections that die."""
 
 from __future__ import annotations
 
 import shutil
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,13 +13,11 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-import numpy as np
 import pytest
-import tritonclient.grpc
 
+from faulty_servers import heavy, ours_in_dev_shm, regions, trajectory, url_of
 from mixtures import assert_same
 from one_model import OneModelServer, answered
-from paths import ROOT
 from rfm.supervise.process import Endpoints
 from rfm_client import (
     DeadlineExceededError,
@@ -30,51 +26,12 @@ from rfm_client import (
     Result,
     RewardClient,
     ServerUnavailableError,
-    Trajectory,
 )
-from rfm_client.transport.shared_memory import FOLDER, MIN_SHARED_BYTES
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
+
 PATIENCE_S = 60.0
-
-
-@pytest.fixture
-def repository(tmp_path: Path) -> Path:
-    """The demo's checkpoint on one thread."""
-    folder = tmp_path / "model_repository"
-    shutil.copytree(ROOT / "model_repository" / "rfm", folder / "rfm")
-    config = folder / "rfm" / "config.pbtxt"
-    text = config.read_text()
-    threads = 'key: "torch_threads"\n  value {\n    string_value: "%s"'
-    assert threads % 0 in text
-    config.write_text(text.replace(threads % 0, threads % 1))
-    return folder
-
-
-@pytest.fixture(params=["grpc", "http"])
-def protocol(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
-def url_of(endpoints: Endpoints, protocol: str) -> str:
-    return endpoints.grpc_url if protocol == "grpc" else endpoints.http_url
-
-
-def trajectory(seed: int, num_frames: int = 8) -> Trajectory:
-    random = np.random.default_rng(seed)
-    return Trajectory(
-        video_embeddings=random.standard_normal((num_frames, 64), np.float32),
-        text_embedding=random.standard_normal(32, np.float32),
-    )
-
-
-def heavy() -> Trajectory:
-    """Large enough for shared memory."""
-    heavy = trajectory(0, 2000)
-    assert heavy.video_embeddings is not None
-    assert heavy.video_embeddings.nbytes > MIN_SHARED_BYTES
-    return heavy
 
 
 class Outcomes:
@@ -352,138 +309,3 @@ def test_a_full_queue_is_waited_for(short_queue: Path, protocol: str) -> None:
     for outcome, answer in zip(outcomes, answers, strict=True):
         if not isinstance(outcome, Exception):
             assert_same(outcome, answer)
-
-
-def regions(endpoints: Endpoints) -> set[str]:
-    """Names of the regions that the server maps."""
-    with tritonclient.grpc.InferenceServerClient(endpoints.grpc_url.removeprefix("grpc://")) as client:
-        return set(client.get_system_shared_memory_status().regions)
-
-
-def ours_in_dev_shm() -> set[str]:
-    return {file.name for file in FOLDER.iterdir() if "rfm-client-" in file.name}
-
-
-def test_shared_memory_changes_no_answer_and_leaves_nothing(repository: Path, protocol: str) -> None:
-    endpoints = Endpoints.free()
-    samples = [ProgressSample(heavy(), frame_steps=2), ProgressSample(trajectory(1))]
-    before = ours_in_dev_shm()
-    with OneModelServer(repository, endpoints):
-        with RewardClient(url_of(endpoints, protocol)) as client:
-            expected = client.evaluate(samples)
-        with RewardClient(url_of(endpoints, protocol), shared_memory=True) as client:
-            assert regions(endpoints) == set()
-            for _ in range(3):
-                for answer, plain in zip(client.evaluate(samples), expected, strict=True):
-                    assert_same(answer, plain)
-            assert len(regions(endpoints)) == 1  # one, used again and again
-            left = ours_in_dev_shm() - before
-            assert [name.endswith(".lock") for name in left] == [True]  # its name is gone while it is in use
-        assert regions(endpoints) == set()
-    assert ours_in_dev_shm() == before
-
-
-def test_memory_of_cancelled_calls_never_mixes_with_that_of_others(repository: Path) -> None:
-    endpoints = Endpoints.free()
-    samples = [ProgressSample(trajectory(seed, 6000), frame_steps=2) for seed in range(6)]  # 1.5 MB: copied in a thread
-    with OneModelServer(repository, endpoints):
-        with RewardClient(endpoints.grpc_url) as client:
-            expected = [client.evaluate([sample])[0] for sample in samples]
-        with RewardClient(endpoints.grpc_url, shared_memory=True) as client:
-            for round_number in range(10):
-                late = [client.submit(sample, timeout_s=0.001 * (1 + round_number)) for sample in samples]
-                futures = [client.submit(sample) for sample in samples]
-                for future, plain in zip(futures, expected, strict=True):
-                    assert_same(future.result(), plain)
-                assert {type(future.exception()) for future in late} <= {DeadlineExceededError, type(None)}
-
-
-def test_shared_memory_serves_many_callers(repository: Path) -> None:
-    endpoints = Endpoints.free()
-    heavies = [ProgressSample(trajectory(seed, 300 + seed), frame_steps=2) for seed in range(24)]
-    with OneModelServer(repository, endpoints):
-        with RewardClient(endpoints.grpc_url) as client:
-            expected = [client.evaluate([sample])[0] for sample in heavies]
-        with RewardClient(endpoints.grpc_url, shared_memory=True) as client:
-            futures = [client.submit(sample) for sample in heavies]
-            for future, plain in zip(futures, expected, strict=True):
-                assert_same(future.result(), plain)
-        assert regions(endpoints) == set()
-
-
-def test_shared_memory_survives_a_restart_of_the_server(repository: Path) -> None:
-    endpoints = Endpoints.free()
-    with RewardClient(endpoints.grpc_url, shared_memory=True) as client:
-        with OneModelServer(repository, endpoints):
-            expected = client.progress(heavy(), frame_steps=2)
-        with OneModelServer(repository, endpoints):
-            assert_same(client.progress(heavy(), frame_steps=2), expected)
-            assert len(regions(endpoints)) == 1
-
-
-KILLED_CLIENT = """
-import os, signal, sys
-import numpy as np
-from rfm_client import RewardClient, Trajectory
-client = RewardClient(sys.argv[1], shared_memory=True)
-client.progress(Trajectory(video_embeddings=np.ones((2000, 64)), text_embedding=np.ones(32)), frame_steps=2)
-os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-def test_what_a_killed_client_shared_is_taken_back_by_the_next(repository: Path, protocol: str) -> None:
-    endpoints = Endpoints.free()
-    url = url_of(endpoints, protocol)
-    before = ours_in_dev_shm()
-    with OneModelServer(repository, endpoints):
-        killed = subprocess.run([sys.executable, "-c", KILLED_CLIENT, url], timeout=60)
-        assert killed.returncode == -signal.SIGKILL
-        assert all(name.endswith(".lock") for name in ours_in_dev_shm() - before)  # no data
-        orphans = regions(endpoints)
-        assert len(orphans) == 1
-        with RewardClient(url, shared_memory=True) as neighbour, RewardClient(url, shared_memory=True) as client:
-            neighbour.progress(heavy(), frame_steps=2)
-            assert not orphans & regions(endpoints)
-            client.progress(heavy(), frame_steps=2)
-            assert len(regions(endpoints)) == 2  # a living client keeps its own
-        assert regions(endpoints) == set()
-    assert ours_in_dev_shm() == before
-
-
-def test_a_server_without_the_extension_is_asked_through_the_socket(
-    repository: Path, protocol: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    endpoints = Endpoints.free()
-    option = "--grpc-restricted-protocol" if protocol == "grpc" else "--http-restricted-api"
-    before = ours_in_dev_shm()
-    with OneModelServer(repository, endpoints, f"{option}=shared-memory:key=value"):
-        with RewardClient(url_of(endpoints, protocol)) as client:
-            expected = client.progress(heavy(), frame_steps=2)
-        with RewardClient(url_of(endpoints, protocol), shared_memory=True) as client:
-            for _ in range(3):
-                assert_same(client.progress(heavy(), frame_steps=2), expected)
-    assert len(caplog.messages) == 1
-    assert "no shared memory, inputs go through the socket: " in caplog.messages[0]
-    assert ours_in_dev_shm() == before
-
-
-OUT_OF_MEMORY = """
-import resource, signal, sys
-import numpy as np
-from rfm_client import RewardClient, Trajectory
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16))  # as a full /dev/shm, for this process alone
-with RewardClient(sys.argv[1], shared_memory=True) as client:
-    trajectory = Trajectory(video_embeddings=np.ones((2000, 64)), text_embedding=np.ones(32))
-    print(client.progress(trajectory, frame_steps=2).last_progress)
-"""
-
-
-def test_a_full_dev_shm_kills_nobody(repository: Path) -> None:
-    endpoints = Endpoints.free()
-    with OneModelServer(repository, endpoints):
-        command = [sys.executable, "-c", OUT_OF_MEMORY, endpoints.grpc_url]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    assert float(done.stdout) > 0
-    assert "no shared memory, inputs go through the socket: [Errno 27] File too large" in done.stderr

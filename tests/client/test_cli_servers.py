@@ -1,21 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""``rfm-client``: what it writes is what RewardClient gives, and how it ends tells a script what happened."""
+"""rfm-client status, wait, sample and bench-input; wrong usage and exit codes."""
 
 from __future__ import annotations
 
 import base64
 import json
-import os
 import re
 import signal
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -23,106 +19,43 @@ import numpy as np
 import pytest
 import tritonclient.http
 from typer.main import get_command
-from typer.testing import CliRunner, Result
 
-import clip
-from engines import load_engine
+from client_commands import (
+    MODEL,
+    RFM_CLIENT,
+    TASK,
+    TOLERANCE,
+    WIDTHS,
+    ask,
+    assert_scores,
+    columns,
+    invoke,
+    run,
+    web_server,
+)
 from reference_server import Served
 from rfm_client import (
     FrameScores,
-    PreferenceResult,
     PreferenceSample,
     ProgressResult,
     ProgressSample,
     RewardClient,
     Sample,
     SimilaritySample,
-    Trajectory,
 )
 from rfm_client.cli.commands import app
 from rfm_client.cli.options import EXIT_CODES, ExitCode
 from rfm_client.cli.outputs import frame_document
 from rfm_client.cli.perf_input import perf_analyzer_input
 from rfm_client.cli.scoring import unique_stems
-from rfm_client.cli.show import Panel, number, plot
+from rfm_client.cli.show import number
 from rfm_client.cli.toy import SampleKind, Toy, parse_lengths
 from rfm_client.contract import wire
 from rfm_client.contract.wire import encode_samples
-from rfm_client.data.inputs import load_trajectory
 from rfm_client.status import read_status
 from trajectories import random_trajectory
 
-RFM_CLIENT = Path(sys.executable).parent / "rfm-client"
-MODEL = "enc_c1_t1_disc10"
-MAX_FRAMES = 16  # of that checkpoint
-WIDTHS = (48, 32)  # of its video and text embeddings
-TASK = clip.TASK
-TOLERANCE = 1e-5
 COMMANDS = get_command(app).commands  # type: ignore[attr-defined]
-EVENLY = np.linspace(0, clip.NUM_FRAMES - 1, MAX_FRAMES).astype(int)
-
-
-@pytest.fixture(scope="session")
-def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    file = tmp_path_factory.mktemp("videos") / "clip.mp4"
-    clip.write(file)
-    return file
-
-
-@pytest.fixture(autouse=True)
-def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
-    monkeypatch.setenv("TERMINAL_WIDTH", "200")
-    monkeypatch.delenv("RFM_URL", raising=False)
-
-
-def invoke(*words: object) -> Result:
-    """The command in this process."""
-    return CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
-
-
-def ask(served: Served, *words: object, protocol: str = "grpc", model: str = MODEL) -> Result:
-    """A command about the served model, in this process."""
-    return invoke(*words, "--url", served.url(protocol), "--model", model)
-
-
-def run(*words: object, **environment: str) -> subprocess.CompletedProcess[str]:
-    """The command as a user calls it."""
-    return subprocess.run(
-        [str(RFM_CLIENT), *map(str, words)],
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-
-
-def columns(output: str, row: str) -> list[str]:
-    """The cells of the table row that begins so."""
-    (line,) = (line for line in output.splitlines() if line.strip().startswith(row))
-    return re.split(r"\s{2,}", line.strip())
-
-
-def assert_scores(document: dict[str, Any], scores: FrameScores) -> None:
-    np.testing.assert_allclose(document["progress"], scores.progress, rtol=0, atol=TOLERANCE)
-    np.testing.assert_allclose(document["success"], scores.success, rtol=0, atol=TOLERANCE)
-
-
-@contextmanager
-def web_server(folder: Path) -> Iterator[str]:
-    class Silent(SimpleHTTPRequestHandler):
-        def log_message(self, *_: object) -> None:
-            pass
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Silent, directory=str(folder))) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        try:
-            yield f"http://127.0.0.1:{server.server_port}"
-        finally:
-            server.shutdown()
-            thread.join()
 
 
 @contextmanager
@@ -130,225 +63,6 @@ def silent_server() -> Iterator[tuple[str, socket.socket]]:
     """A server that takes connections and never answers."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
         yield f"http://127.0.0.1:{listening.getsockname()[1]}", listening
-
-
-# score
-
-
-def test_score_writes_what_the_client_gives_and_one_bad_video_does_not_stop_the_others(
-    served: Served, protocol: str, video: Path, tmp_path: Path
-) -> None:
-    embeddings = tmp_path / "embeddings.npz"
-    seen = random_trajectory(3, 5, *WIDTHS)
-    np.savez(embeddings, video_embeddings=seen.video_embeddings, text_embedding=seen.text_embedding)
-    missing = tmp_path / "missing.mp4"
-    target = tmp_path / "scores.json"
-    plotted = tmp_path / "plot.png"
-    result = run(
-        *("score", video, missing, embeddings, "--task", TASK, "--fps", 10, "--model", MODEL),
-        *("--json", target, "--npy", tmp_path / "arrays", "--plot", plotted),
-        RFM_URL=served.url(protocol),
-    )
-    assert result.returncode == ExitCode.FAILED
-    assert result.stderr.splitlines() == [
-        f"rfm-client: note: {video}: 16 of 32 frames were scored, evenly spaced",
-        f"rfm-client: {missing}: video: expected a file with a video stream, got No such file or directory",
-    ]
-    with served.client(protocol, MODEL) as client:
-        filmed = client.progress(load_trajectory(video, task=TASK, fps=10), subsample=True)
-        embedded = client.progress(seen)
-
-    document = json.loads(target.read_text())
-    assert document["servers"] == [served.url(protocol)]
-    assert (document["model"], document["task"], document["fps"]) == (MODEL, TASK, 10)
-    first, failed, second = document["videos"]
-    assert_scores(first, filmed)
-    assert_scores(second, embedded)
-    assert (first["source"], first["num_frames"], first["model_version"]) == (str(video), 32, "1")
-    assert first["frame_indices"] == EVENLY.tolist()
-    np.testing.assert_allclose(first["frame_times_s"], EVENLY / clip.FPS)
-    assert second["frame_indices"] == list(range(5))
-    assert second["frame_times_s"] is None
-    assert failed["source"] == str(missing)
-    assert failed["error_type"] == "InvalidSampleError"
-
-    assert columns(result.stdout, str(video))[1:5] == [
-        *(f"{first[name][-1]:.4f}" for name in ("progress", "success")),
-        "16 of 32",
-        "3.1",
-    ]
-    assert columns(result.stdout, str(embeddings))[3:5] == ["5", "-"]
-
-    assert sorted(file.name for file in (tmp_path / "arrays").iterdir()) == ["clip.npy", "embeddings.npy"]
-    array = np.load(tmp_path / "arrays" / "clip.npy")
-    assert array.dtype == np.float32
-    np.testing.assert_array_equal(array, np.float32([first["progress"], first["success"]]).T)
-    assert plotted.read_bytes().startswith(b"\x89PNG")
-
-
-OPTIONS: dict[str, tuple[list[object], dict[str, Any]]] = {
-    "as it is": ([], {"subsample": True}),
-    "dense": (["--frame-steps", 4], {"frame_steps": 4}),
-    "resized": (["--resize"], {"subsample": True, "resize": True}),
-}
-
-
-@pytest.mark.parametrize(("words", "options"), OPTIONS.values(), ids=OPTIONS)
-def test_score_passes_its_options_on(served: Served, video: Path, words: list[object], options: dict[str, Any]) -> None:
-    result = ask(served, "score", video, "--task", TASK, *words, "--json")
-    assert (result.exit_code, result.stderr) == (0, "")
-    (scored,) = json.loads(result.stdout)["videos"]  # and nothing but JSON
-    with served.client("grpc", MODEL) as client:
-        expected = client.progress(load_trajectory(video, task=TASK, fps=3.0), **options)
-    assert_scores(scored, expected)
-    np.testing.assert_allclose(scored["frame_times_s"], np.linspace(0, 31, 10).astype(int) / clip.FPS)
-
-
-@pytest.mark.parametrize("limit", [4, 24])
-def test_score_takes_at_most_as_many_frames_as_it_is_told_and_the_checkpoint_reads(
-    served: Served, video: Path, limit: int
-) -> None:
-    result = ask(served, "score", video, "--task", TASK, "--fps", 10, "--max-frames", limit, "--json", "-")
-    (scored,) = json.loads(result.stdout)["videos"]
-    indices = np.linspace(0, clip.NUM_FRAMES - 1, min(limit, MAX_FRAMES)).astype(int)
-    assert scored["frame_indices"] == indices.tolist()
-    frames = load_trajectory(video, fps=10).frames
-    assert frames is not None
-    with served.client("grpc", MODEL) as client:
-        assert_scores(scored, client.progress(Trajectory(frames=frames[indices], task=TASK)))
-
-
-def test_score_leaves_no_frame_out_if_told_so(served: Served, video: Path) -> None:
-    result = ask(served, "score", video, "--task", TASK, "--fps", 10, "--no-subsample")
-    assert result.exit_code == ExitCode.FAILED
-    assert result.stderr.startswith(f"rfm-client: {video}: num_frames: expected at most 16")
-    assert result.stderr.count("\n") == 1
-    assert result.stdout == ""
-
-
-def test_score_reads_videos_behind_urls(served: Served, video: Path) -> None:
-    with web_server(video.parent) as url:
-        result = ask(served, "score", f"{url}/clip.mp4", video, "--task", TASK, "--json", "-")
-    remote, local = json.loads(result.stdout)["videos"]
-    np.testing.assert_allclose(remote["progress"], local["progress"], rtol=0, atol=TOLERANCE)
-    assert remote["frame_times_s"] is None
-
-
-def test_score_writes_one_video_to_a_file(served: Served, video: Path, tmp_path: Path) -> None:
-    result = ask(served, "score", video, "--task", TASK, "--npy", tmp_path / "rewards.npy")
-    assert result.exit_code == 0, result.stderr
-    assert np.load(tmp_path / "rewards.npy").shape == (10, 2)
-
-
-def test_score_asks_several_servers(served: Served, video: Path) -> None:
-    urls = f"{served.url('http')} {served.url('grpc')}"
-    result = CliRunner().invoke(
-        app, ["score", str(video), "--task", TASK, "--model", MODEL, "--json", "-"], env={"RFM_URL": urls}
-    )
-    assert json.loads(result.stdout)["servers"] == urls.split()
-
-
-def test_a_task_that_is_missing_is_told(served: Served, video: Path) -> None:
-    result = ask(served, "score", video)
-    assert result.exit_code == ExitCode.FAILED
-    assert result.stderr == f"rfm-client: {video}: trajectory.task: expected a task sentence with frames, got ''\n"
-
-
-# compare
-
-
-def test_compare_writes_what_the_client_gives(served: Served, protocol: str, video: Path, tmp_path: Path) -> None:
-    still = tmp_path / "still.npy"
-    np.save(still, np.repeat(load_trajectory(video, fps=1).frames, 8, axis=0)[:20])  # type: ignore[arg-type]
-    target = tmp_path / "scores.json"
-    result = ask(
-        *(served, "compare", video, still, "--task", TASK, "--json", target, "--plot", tmp_path / "both.pdf"),
-        protocol=protocol,
-    )
-    assert (result.exit_code, result.stderr) == (
-        0,
-        f"rfm-client: note: {still}: 16 of 20 frames were scored, evenly spaced\n",
-    )
-    first, second = load_trajectory(video, task=TASK, fps=3), load_trajectory(still)
-    with served.client(protocol, MODEL) as client:
-        expected = client.preference(first, second, subsample=True)
-    document = json.loads(target.read_text())
-    assert document["preference"] == pytest.approx(expected.preference, abs=TOLERANCE)
-    assert_scores(document["first"], expected.first)
-    assert_scores(document["second"], expected.second)
-    assert document["second"]["frame_indices"] == np.linspace(0, 19, 16).astype(int).tolist()
-    assert [document[name]["source"] for name in ("first", "second")] == [str(video), str(still)]
-    shares = [columns(result.stdout, str(name))[1] for name in (video, still)]
-    assert shares == [f"{document['preference']:.4f}", f"{1 - document['preference']:.4f}"]
-    assert (tmp_path / "both.pdf").read_bytes().startswith(b"%PDF")
-
-
-def test_compare_takes_videos_of_two_sizes(served: Served, protocol: str, video: Path, tmp_path: Path) -> None:
-    small = tmp_path / "small.npy"
-    np.save(small, np.random.default_rng(0).integers(0, 256, (2, 40, 30, 3), np.uint8))
-    target = tmp_path / "scores.json"
-    result = ask(served, "compare", video, small, "--task", TASK, "--json", target, protocol=protocol)
-    assert (result.exit_code, result.stderr) == (0, "")
-    first, second = load_trajectory(video, task=TASK, fps=3), load_trajectory(small)
-    assert first.positions.shape[1:] != second.positions.shape[1:]
-    (expected,) = load_engine(MODEL).evaluate([PreferenceSample(first, second)])
-    assert isinstance(expected, PreferenceResult)
-    document = json.loads(target.read_text())
-    assert document["preference"] == pytest.approx(expected.preference, abs=TOLERANCE)
-    assert_scores(document["first"], expected.first)
-    assert_scores(document["second"], expected.second)
-
-
-def test_compare_tells_what_cannot_be_compared(served: Served, video: Path, tmp_path: Path) -> None:
-    np.save(tmp_path / "embeddings.npy", np.zeros((2, 8), np.float32))
-    result = ask(served, "compare", video, tmp_path / "embeddings.npy", "--task", TASK)
-    assert result.exit_code == ExitCode.FAILED
-    expected = "second: expected frames, as the first trajectory, got video_embeddings"
-    assert result.stderr == f"rfm-client: {expected}\n"
-
-
-def test_a_lerobot_file_of_several_episodes_is_neither_scored_nor_compared(
-    served: Served, video: Path, tmp_path: Path
-) -> None:
-    film = tmp_path / "videos" / "observation.images.top" / "chunk-000" / "file-000.mp4"
-    film.parent.mkdir(parents=True)
-    film.write_bytes(video.read_bytes())
-    (tmp_path / "meta").mkdir()
-    (tmp_path / "meta" / "info.json").write_text('{"codebase_version": "v3.0", "total_episodes": 10}')
-    refused = "video: expected a film of one episode, got a LeRobot v3.0 file that holds 10 episodes: cut one episode "
-    for words in (("score", film), ("compare", video, film)):
-        result = ask(served, *words, "--task", TASK)
-        assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
-        assert refused in result.stderr
-        assert str(film) in result.stderr
-
-
-# plots
-
-
-def test_a_panel_shows_the_frames_that_were_scored() -> None:
-    frames = np.arange(30, dtype=np.uint8).reshape(10, 1, 1, 3)
-    indices = np.array([0, 4, 9])
-    scores = FrameScores(progress=np.zeros(3, np.float32), success=np.ones(3, np.float32), frame_indices=indices)
-    panel = Panel.of("title", scores, frames, np.arange(10) / 10)
-    assert panel.unit == "s"
-    assert panel.positions.tolist() == panel.strip_positions.tolist() == [0, 0.4, 0.9]
-    assert panel.strip is not None
-    np.testing.assert_array_equal(panel.strip, frames[indices])
-    untimed = Panel.of("title", scores)
-    assert (untimed.unit, untimed.positions.tolist(), untimed.strip) == ("frame", [0, 4, 9], None)
-
-
-def test_a_plot_has_a_strip_for_each_video_and_is_drawn_without_scores_too(tmp_path: Path) -> None:
-    told = FrameScores(progress=np.linspace(0, 1, 12, dtype=np.float32), success=np.full(12, np.nan, np.float32))
-    frames = np.random.default_rng(0).integers(0, 256, (12, 8, 8, 3), np.uint8)
-    panels = [Panel.of("costs $5_$ 漢字", told, frames), Panel.of("[embeddings]", told)]
-    plot(tmp_path / "plot.svg", panels, title="both")
-    drawn = (tmp_path / "plot.svg").read_text()
-    assert drawn.count("<image") == 8
-
-
-# status
 
 
 @pytest.fixture
@@ -414,15 +128,9 @@ def test_status_looks_for_metrics_at_the_server_s_host(served: Served) -> None:
     assert read_status(served.url("grpc")).metrics_url == "http://127.0.0.1:8002/metrics"
 
 
-# wait
-
-
 def test_wait_returns_when_the_model_is_ready(served: Served, protocol: str) -> None:
     result = ask(served, "wait", protocol=protocol)
     assert (result.exit_code, result.output) == (0, "")
-
-
-# sample, bench-input
 
 
 def toy_samples(client: RewardClient, kind: str, lengths: str = "8", *, use_frames: bool = False) -> list[Sample]:
@@ -535,9 +243,6 @@ def test_the_input_file_s_requests_are_answered(served: Served, triton: Any) -> 
         if scores is not None:
             progress = answer.as_numpy(wire.PROGRESS)[0, :3]
             np.testing.assert_allclose(progress, scores.progress, rtol=0, atol=TOLERANCE)
-
-
-# how it ends
 
 
 def free_url() -> str:
@@ -662,9 +367,6 @@ def test_a_missing_package_costs_a_line(served: Served, monkeypatch: pytest.Monk
     assert re.fullmatch(r'rfm-client: .*prometheus_client.*: pip install "./client\[cli\]"\n', result.stderr)
 
 
-# help
-
-
 def test_every_command_and_option_has_help() -> None:
     assert COMMANDS.keys() == {"score", "compare", "status", "wait", "sample", "bench-input", "gateway"}
     for name, command in COMMANDS.items():
@@ -697,9 +399,6 @@ def test_the_shell_can_complete_commands_and_options() -> None:
     assert run(**asked).stdout.split() == ["status"]
     shown = run("--show-completion", "bash", _TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION="1")
     assert (shown.returncode, shown.stdout.strip()) == (0, script.strip())
-
-
-# small parts
 
 
 def test_a_score_that_is_not_told_is_null_and_shown_as_a_dash() -> None:

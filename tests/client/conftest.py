@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: MIT
+"""Films, clients and a repository for the tests of the client."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import clip
+from environments import MODEL, LateClient
+from paths import ROOT
+from reference_server import Served
+from rfm_client import RewardClient
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("film") / "clip.mp4"
+    clip.write(file)
+    return file
+
+
+@pytest.fixture(scope="session")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("videos") / "clip.mp4"
+    clip.write(file)
+    return file
+
+
+@pytest.fixture(autouse=True)
+def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("TERMINAL_WIDTH", "200")
+    monkeypatch.delenv("RFM_URL", raising=False)
+
+
+@pytest.fixture
+def client(served: Served) -> Iterator[RewardClient]:
+    with served.client("grpc", MODEL) as client:
+        yield client
+
+
+@pytest.fixture
+def late(served: Served) -> Iterator[LateClient]:
+    with LateClient(served.url("grpc")) as client:
+        yield client
+
+
+@pytest.fixture
+def repository(tmp_path: Path) -> Path:
+    """The demo's checkpoint on one thread."""
+    folder = tmp_path / "model_repository"
+    shutil.copytree(ROOT / "model_repository" / "rfm", folder / "rfm")
+    config = folder / "rfm" / "config.pbtxt"
+    text = config.read_text()
+    threads = 'key: "torch_threads"\n  value {\n    string_value: "%s"'
+    assert threads % 0 in text
+    config.write_text(text.replace(threads % 0, threads % 1))
+    return folder

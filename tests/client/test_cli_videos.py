@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: MIT
+"""rfm-client score and compare."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import clip
+from client_commands import (
+    MODEL,
+    TASK,
+    TOLERANCE,
+    WIDTHS,
+    ask,
+    assert_scores,
+    columns,
+    run,
+    web_server,
+)
+from engines import load_engine
+from reference_server import Served
+from rfm_client import (
+    FrameScores,
+    PreferenceResult,
+    PreferenceSample,
+    Trajectory,
+)
+from rfm_client.cli.commands import app
+from rfm_client.cli.options import ExitCode
+from rfm_client.cli.show import Panel, plot
+from rfm_client.data.inputs import load_trajectory
+from trajectories import random_trajectory
+
+MAX_FRAMES = 16  # of that checkpoint
+
+
+EVENLY = np.linspace(0, clip.NUM_FRAMES - 1, MAX_FRAMES).astype(int)
+
+
+def test_score_writes_what_the_client_gives_and_one_bad_video_does_not_stop_the_others(
+    served: Served, protocol: str, video: Path, tmp_path: Path
+) -> None:
+    embeddings = tmp_path / "embeddings.npz"
+    seen = random_trajectory(3, 5, *WIDTHS)
+    np.savez(embeddings, video_embeddings=seen.video_embeddings, text_embedding=seen.text_embedding)
+    missing = tmp_path / "missing.mp4"
+    target = tmp_path / "scores.json"
+    plotted = tmp_path / "plot.png"
+    result = run(
+        *("score", video, missing, embeddings, "--task", TASK, "--fps", 10, "--model", MODEL),
+        *("--json", target, "--npy", tmp_path / "arrays", "--plot", plotted),
+        RFM_URL=served.url(protocol),
+    )
+    assert result.returncode == ExitCode.FAILED
+    assert result.stderr.splitlines() == [
+        f"rfm-client: note: {video}: 16 of 32 frames were scored, evenly spaced",
+        f"rfm-client: {missing}: video: expected a file with a video stream, got No such file or directory",
+    ]
+    with served.client(protocol, MODEL) as client:
+        filmed = client.progress(load_trajectory(video, task=TASK, fps=10), subsample=True)
+        embedded = client.progress(seen)
+
+    document = json.loads(target.read_text())
+    assert document["servers"] == [served.url(protocol)]
+    assert (document["model"], document["task"], document["fps"]) == (MODEL, TASK, 10)
+    first, failed, second = document["videos"]
+    assert_scores(first, filmed)
+    assert_scores(second, embedded)
+    assert (first["source"], first["num_frames"], first["model_version"]) == (str(video), 32, "1")
+    assert first["frame_indices"] == EVENLY.tolist()
+    np.testing.assert_allclose(first["frame_times_s"], EVENLY / clip.FPS)
+    assert second["frame_indices"] == list(range(5))
+    assert second["frame_times_s"] is None
+    assert failed["source"] == str(missing)
+    assert failed["error_type"] == "InvalidSampleError"
+
+    assert columns(result.stdout, str(video))[1:5] == [
+        *(f"{first[name][-1]:.4f}" for name in ("progress", "success")),
+        "16 of 32",
+        "3.1",
+    ]
+    assert columns(result.stdout, str(embeddings))[3:5] == ["5", "-"]
+
+    assert sorted(file.name for file in (tmp_path / "arrays").iterdir()) == ["clip.npy", "embeddings.npy"]
+    array = np.load(tmp_path / "arrays" / "clip.npy")
+    assert array.dtype == np.float32
+    np.testing.assert_array_equal(array, np.float32([first["progress"], first["success"]]).T)
+    assert plotted.read_bytes().startswith(b"\x89PNG")
+
+
+OPTIONS: dict[str, tuple[list[object], dict[str, Any]]] = {
+    "as it is": ([], {"subsample": True}),
+    "dense": (["--frame-steps", 4], {"frame_steps": 4}),
+    "resized": (["--resize"], {"subsample": True, "resize": True}),
+}
+
+
+@pytest.mark.parametrize(("words", "options"), OPTIONS.values(), ids=OPTIONS)
+def test_score_passes_its_options_on(served: Served, video: Path, words: list[object], options: dict[str, Any]) -> None:
+    result = ask(served, "score", video, "--task", TASK, *words, "--json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    (scored,) = json.loads(result.stdout)["videos"]  # and nothing but JSON
+    with served.client("grpc", MODEL) as client:
+        expected = client.progress(load_trajectory(video, task=TASK, fps=3.0), **options)
+    assert_scores(scored, expected)
+    np.testing.assert_allclose(scored["frame_times_s"], np.linspace(0, 31, 10).astype(int) / clip.FPS)
+
+
+@pytest.mark.parametrize("limit", [4, 24])
+def test_score_takes_at_most_as_many_frames_as_it_is_told_and_the_checkpoint_reads(
+    served: Served, video: Path, limit: int
+) -> None:
+    result = ask(served, "score", video, "--task", TASK, "--fps", 10, "--max-frames", limit, "--json", "-")
+    (scored,) = json.loads(result.stdout)["videos"]
+    indices = np.linspace(0, clip.NUM_FRAMES - 1, min(limit, MAX_FRAMES)).astype(int)
+    assert scored["frame_indices"] == indices.tolist()
+    frames = load_trajectory(video, fps=10).frames
+    assert frames is not None
+    with served.client("grpc", MODEL) as client:
+        assert_scores(scored, client.progress(Trajectory(frames=frames[indices], task=TASK)))
+
+
+def test_score_leaves_no_frame_out_if_told_so(served: Served, video: Path) -> None:
+    result = ask(served, "score", video, "--task", TASK, "--fps", 10, "--no-subsample")
+    assert result.exit_code == ExitCode.FAILED
+    assert result.stderr.startswith(f"rfm-client: {video}: num_frames: expected at most 16")
+    assert result.stderr.count("\n") == 1
+    assert result.stdout == ""
+
+
+def test_score_reads_videos_behind_urls(served: Served, video: Path) -> None:
+    with web_server(video.parent) as url:
+        result = ask(served, "score", f"{url}/clip.mp4", video, "--task", TASK, "--json", "-")
+    remote, local = json.loads(result.stdout)["videos"]
+    np.testing.assert_allclose(remote["progress"], local["progress"], rtol=0, atol=TOLERANCE)
+    assert remote["frame_times_s"] is None
+
+
+def test_score_writes_one_video_to_a_file(served: Served, video: Path, tmp_path: Path) -> None:
+    result = ask(served, "score", video, "--task", TASK, "--npy", tmp_path / "rewards.npy")
+    assert result.exit_code == 0, result.stderr
+    assert np.load(tmp_path / "rewards.npy").shape == (10, 2)
+
+
+def test_score_asks_several_servers(served: Served, video: Path) -> None:
+    urls = f"{served.url('http')} {served.url('grpc')}"
+    result = CliRunner().invoke(
+        app, ["score", str(video), "--task", TASK, "--model", MODEL, "--json", "-"], env={"RFM_URL": urls}
+    )
+    assert json.loads(result.stdout)["servers"] == urls.split()
+
+
+def test_a_task_that_is_missing_is_told(served: Served, video: Path) -> None:
+    result = ask(served, "score", video)
+    assert result.exit_code == ExitCode.FAILED
+    assert result.stderr == f"rfm-client: {video}: trajectory.task: expected a task sentence with frames, got ''\n"
+
+
+def test_compare_writes_what_the_client_gives(served: Served, protocol: str, video: Path, tmp_path: Path) -> None:
+    still = tmp_path / "still.npy"
+    np.save(still, np.repeat(load_trajectory(video, fps=1).frames, 8, axis=0)[:20])  # type: ignore[arg-type]
+    target = tmp_path / "scores.json"
+    result = ask(
+        *(served, "compare", video, still, "--task", TASK, "--json", target, "--plot", tmp_path / "both.pdf"),
+        protocol=protocol,
+    )
+    assert (result.exit_code, result.stderr) == (
+        0,
+        f"rfm-client: note: {still}: 16 of 20 frames were scored, evenly spaced\n",
+    )
+    first, second = load_trajectory(video, task=TASK, fps=3), load_trajectory(still)
+    with served.client(protocol, MODEL) as client:
+        expected = client.preference(first, second, subsample=True)
+    document = json.loads(target.read_text())
+    assert document["preference"] == pytest.approx(expected.preference, abs=TOLERANCE)
+    assert_scores(document["first"], expected.first)
+    assert_scores(document["second"], expected.second)
+    assert document["second"]["frame_indices"] == np.linspace(0, 19, 16).astype(int).tolist()
+    assert [document[name]["source"] for name in ("first", "second")] == [str(video), str(still)]
+    shares = [columns(result.stdout, str(name))[1] for name in (video, still)]
+    assert shares == [f"{document['preference']:.4f}", f"{1 - document['preference']:.4f}"]
+    assert (tmp_path / "both.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_compare_takes_videos_of_two_sizes(served: Served, protocol: str, video: Path, tmp_path: Path) -> None:
+    small = tmp_path / "small.npy"
+    np.save(small, np.random.default_rng(0).integers(0, 256, (2, 40, 30, 3), np.uint8))
+    target = tmp_path / "scores.json"
+    result = ask(served, "compare", video, small, "--task", TASK, "--json", target, protocol=protocol)
+    assert (result.exit_code, result.stderr) == (0, "")
+    first, second = load_trajectory(video, task=TASK, fps=3), load_trajectory(small)
+    assert first.positions.shape[1:] != second.positions.shape[1:]
+    (expected,) = load_engine(MODEL).evaluate([PreferenceSample(first, second)])
+    assert isinstance(expected, PreferenceResult)
+    document = json.loads(target.read_text())
+    assert document["preference"] == pytest.approx(expected.preference, abs=TOLERANCE)
+    assert_scores(document["first"], expected.first)
+    assert_scores(document["second"], expected.second)
+
+
+def test_compare_tells_what_cannot_be_compared(served: Served, video: Path, tmp_path: Path) -> None:
+    np.save(tmp_path / "embeddings.npy", np.zeros((2, 8), np.float32))
+    result = ask(served, "compare", video, tmp_path / "embeddings.npy", "--task", TASK)
+    assert result.exit_code == ExitCode.FAILED
+    expected = "second: expected frames, as the first trajectory, got video_embeddings"
+    assert result.stderr == f"rfm-client: {expected}\n"
+
+
+def test_a_lerobot_file_of_several_episodes_is_neither_scored_nor_compared(
+    served: Served, video: Path, tmp_path: Path
+) -> None:
+    film = tmp_path / "videos" / "observation.images.top" / "chunk-000" / "file-000.mp4"
+    film.parent.mkdir(parents=True)
+    film.write_bytes(video.read_bytes())
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").write_text('{"codebase_version": "v3.0", "total_episodes": 10}')
+    refused = "video: expected a film of one episode, got a LeRobot v3.0 file that holds 10 episodes: cut one episode "
+    for words in (("score", film), ("compare", video, film)):
+        result = ask(served, *words, "--task", TASK)
+        assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
+        assert refused in result.stderr
+        assert str(film) in result.stderr
+
+
+def test_a_panel_shows_the_frames_that_were_scored() -> None:
+    frames = np.arange(30, dtype=np.uint8).reshape(10, 1, 1, 3)
+    indices = np.array([0, 4, 9])
+    scores = FrameScores(progress=np.zeros(3, np.float32), success=np.ones(3, np.float32), frame_indices=indices)
+    panel = Panel.of("title", scores, frames, np.arange(10) / 10)
+    assert panel.unit == "s"
+    assert panel.positions.tolist() == panel.strip_positions.tolist() == [0, 0.4, 0.9]
+    assert panel.strip is not None
+    np.testing.assert_array_equal(panel.strip, frames[indices])
+    untimed = Panel.of("title", scores)
+    assert (untimed.unit, untimed.positions.tolist(), untimed.strip) == ("frame", [0, 4, 9], None)
+
+
+def test_a_plot_has_a_strip_for_each_video_and_is_drawn_without_scores_too(tmp_path: Path) -> None:
+    told = FrameScores(progress=np.linspace(0, 1, 12, dtype=np.float32), success=np.full(12, np.nan, np.float32))
+    frames = np.random.default_rng(0).integers(0, 256, (12, 8, 8, 3), np.uint8)
+    panels = [Panel.of("costs $5_$ 漢字", told, frames), Panel.of("[embeddings]", told)]
+    plot(tmp_path / "plot.svg", panels, title="both")
+    drawn = (tmp_path / "plot.svg").read_text()
+    assert drawn.count("<image") == 8

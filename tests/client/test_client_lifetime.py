@@ -1,0 +1,388 @@
+# SPDX-License-Identifier: MIT
+"""Clients that are closed, forked, or used from callbacks, and what is refused when one is made."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from client_calls import NOBODY
+from mixtures import MODEL, assert_same, mixed_samples, plug
+from paths import ROOT
+from reference_server import Served
+from rfm_client import (
+    AsyncRewardClient,
+    FrameScores,
+    InferenceFailedError,
+    InvalidSampleError,
+    ProgressResult,
+    ProgressSample,
+    RewardClient,
+    ServerUnavailableError,
+    Trajectory,
+)
+from rfm_client.contract import wire
+from rfm_client.data.fitting import evenly_spaced
+from rfm_client.transport.access import Access
+from rfm_client.transport.calls import Answer, GrpcTransport
+from trajectories import random_trajectory
+
+
+def test_a_closed_client_says_so(served: Served) -> None:
+    client = served.client("grpc")
+    client.close()
+    client.close()
+    with pytest.raises(RuntimeError, match="is closed"):
+        client.progress(random_trajectory(0, 2))
+
+
+def test_closing_cancels_what_is_under_way(served: Served) -> None:
+    with served.client("grpc") as client:
+        pending = [client.submit(sample) for sample in plug()]
+    assert all(future.done() for future in pending)
+    assert any(future.cancelled() for future in pending)
+
+
+def test_a_fork_is_told_to_make_its_own_client() -> None:
+    code = """
+import os
+from rfm_client import ProgressSample, RewardClient, Trajectory
+import numpy as np
+trajectory = Trajectory(video_embeddings=np.ones((1, 2)), text_embedding=np.ones(2))
+client = RewardClient("grpc://127.0.0.1:1")
+if os.fork() == 0:
+    try:
+        client.progress(trajectory)
+    except RuntimeError as error:
+        print(error, flush=True)
+        client.close()
+        os._exit(0)
+    os._exit(1)
+raise SystemExit(os.waitstatus_to_exitcode(os.wait()[1]))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert "which forked this one: make one in each process" in done.stdout
+
+
+def test_a_fork_of_what_used_grpc_is_told_so(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a fork: gRPC's own handlers may crash one."""
+    monkeypatch.setattr(GrpcTransport, "_first_process", 1)
+    expected = "gRPC was used in process 1, which forked this one: .* by spawn or forkserver"
+    with served.client("grpc") as client, pytest.raises(RuntimeError, match=expected):
+        client.is_ready()
+    with served.client("http") as client:
+        assert client.is_ready()
+
+
+def test_submitting_while_it_is_closed_leaves_no_future_open(served: Served) -> None:
+    for _ in range(20):
+        client = served.client("grpc")
+        futures: list[Future[ProgressResult]] = []
+
+        def submit(client: RewardClient = client, futures: list[Future[ProgressResult]] = futures) -> None:
+            with pytest.raises(RuntimeError, match="is closed"):
+                while True:
+                    futures.append(client.submit(ProgressSample(random_trajectory(0, 1))))
+
+        with ThreadPoolExecutor(2) as pool:
+            submitting = [pool.submit(submit) for _ in range(2)]
+            client.close()
+            for thread in submitting:
+                thread.result()
+        assert all(future.done() for future in futures)
+
+
+def test_embeddings_of_another_width_are_told_in_our_words(served: Served, protocol: str) -> None:
+    with served.client(protocol) as client:
+        with pytest.raises(
+            InvalidSampleError, match=r"^video_embeddings: expected \[-1,768\], got \[2,5\] \(request \S+\)$"
+        ):
+            client.progress(random_trajectory(0, 2, 5, 384))
+        with pytest.raises(InvalidSampleError, match=r"^text_embedding: expected \[384\], got \[7\] \(request \S+\)$"):
+            client.progress(random_trajectory(0, 2, 768, 7))
+
+
+def test_a_sample_is_shown_by_its_shapes() -> None:
+    shown = repr(ProgressSample(Trajectory(frames=np.zeros((2, 8, 8, 3), np.uint8), task="stack")))
+    assert shown == "ProgressSample(trajectory=Trajectory(frames=uint8 [2, 8, 8, 3], task='stack'), frame_steps=0)"
+
+
+def test_what_makes_the_samples_may_ask_the_client(served: Served) -> None:
+    with served.client("grpc") as client:
+        samples = (ProgressSample(random_trajectory(0, 2)) for _ in range(2) if client.is_ready())
+        assert len(client.evaluate(samples)) == 2
+
+
+def test_a_call_in_a_future_s_callback_is_refused_rather_than_waiting_for_itself(served: Served) -> None:
+    told: Future[str] = Future()
+    with served.client("grpc") as client:
+
+        def ask(_done: Future[ProgressResult]) -> None:
+            try:
+                client.is_ready()
+            except RuntimeError as error:
+                told.set_result(str(error))
+
+        client.submit(ProgressSample(random_trajectory(0, 2))).add_done_callback(ask)
+        assert "use submit" in told.result(timeout=30)
+
+
+def test_what_is_submitted_may_be_written_over(served: Served) -> None:
+    trajectory = random_trajectory(0, 8)
+    assert trajectory.video_embeddings is not None
+    with served.client("grpc") as client:
+        expected = client.progress(trajectory)
+        plugged = [client.submit(sample) for sample in plug()]
+        future = client.submit(ProgressSample(trajectory))
+        trajectory.video_embeddings[:] = 0
+        assert_same(future.result(), expected)
+        for other in plugged:
+            other.result()
+
+
+def test_a_future_keeps_its_client(served: Served) -> None:
+    assert served.client("grpc").submit(ProgressSample(random_trajectory(0, 2))).result().last_progress > 0
+
+
+def test_an_asyncio_client_that_is_closed_says_so(served: Served) -> None:
+    async def ask() -> None:
+        client = AsyncRewardClient(served.url("grpc"), model=MODEL)
+        await client.close()
+        await client.progress(random_trajectory(0, 2))
+
+    with pytest.raises(RuntimeError, match="this AsyncRewardClient is closed"):
+        asyncio.run(ask())
+
+
+def test_of_one_frame_the_newest_is_scored() -> None:
+    assert evenly_spaced(10, 1) == [9]
+    assert evenly_spaced(10, 2).tolist() == [0, 9]  # type: ignore[union-attr]
+    assert evenly_spaced(10, 10) is None
+
+
+def test_a_score_that_is_missing_fails_alone(served: Served) -> None:
+    class Losing(GrpcTransport):
+        """A real transport that loses the progress of one sample in answers to several."""
+
+        async def infer(self, model: str, inputs: wire.Tensors, *rest: Any, **options: Any) -> Answer:
+            answer = await super().infer(model, inputs, *rest, **options)
+            lost = inputs[wire.VIDEO_EMBEDDINGS].sum(axis=(1, 2)) == marked
+            progress = np.where(lost[:, None], np.nan, answer.tensors[wire.PROGRESS])
+            return replace(answer, tensors={**answer.tensors, wire.PROGRESS: progress})
+
+    url = served.url("grpc")
+    samples = [ProgressSample(random_trajectory(seed, 3)) for seed in range(4)]
+    marked = wire.encode_samples(samples[2:3])[wire.VIDEO_EMBEDDINGS].sum(axis=(1, 2))[0]
+    transport = Losing(url, Access(), shared_memory=False)
+    with RewardClient("", transports=[transport], model=MODEL) as client:
+        outcomes = client.evaluate(samples, return_errors=True)
+    assert [type(outcome) for outcome in outcomes] == [ProgressResult] * 2 + [InferenceFailedError, ProgressResult]
+
+
+def test_samples_that_fail_together_have_errors_of_their_own() -> None:
+    samples = mixed_samples(3)
+    with RewardClient(NOBODY, retry=False) as client:
+        outcomes = client.evaluate([samples[0], samples[0], samples[0]], return_errors=True)
+    assert len({id(outcome) for outcome in outcomes}) == 3
+    assert {type(outcome) for outcome in outcomes} == {ServerUnavailableError}
+
+
+def test_an_http_client_at_the_grpc_port_is_told_at_once(served: Served) -> None:
+    url = served.url("grpc").replace("grpc://", "http://")
+    with RewardClient(url) as client, pytest.raises(InferenceFailedError, match="no answer of an HTTP server"):
+        client.progress(random_trajectory(0, 2))
+
+
+def test_a_client_that_is_not_closed_does_not_keep_the_interpreter(served: Served) -> None:
+    code = f"""
+from rfm_client import RewardClient
+assert RewardClient({served.url("grpc")!r}, model={MODEL!r}).is_ready()
+client = RewardClient({served.url("http")!r}, model={MODEL!r})
+assert client.is_ready()
+"""
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("urls", "message"),
+    [
+        (
+            "localhost:8001",
+            "url: expected grpc://host:port or http://host:port, or grpcs:// or https://, got 'localhost:8001'",
+        ),
+        (
+            "grpc://localhost",
+            "url: expected grpc://host:port or http://host:port, or grpcs:// or https://, got 'grpc://localhost'",
+        ),
+        (
+            ["grpc://a:1", "ftp://b:2"],
+            "url: expected grpc://host:port or http://host:port, or grpcs:// or https://, got 'ftp://b:2'",
+        ),
+        ([], "url: expected at least one, got none"),
+    ],
+    ids=str,
+)
+def test_a_wrong_url_is_refused_when_the_client_is_made(urls: str | list[str], message: str) -> None:
+    with pytest.raises(ValueError, match="url") as raised:
+        RewardClient(urls)
+    assert str(raised.value) == message
+
+
+@pytest.mark.parametrize("timeout_s", [float("inf"), float("nan"), 0, -1, 2e9])
+def test_a_deadline_must_lie_ahead_and_within_reach(timeout_s: float) -> None:
+    wanted = f"timeout_s: expected a number of seconds above 0 and at most 1e+09, got {timeout_s}"
+    with RewardClient(NOBODY) as client:
+        calls: list[Callable[[], object]] = [
+            lambda: RewardClient(NOBODY, timeout_s=timeout_s),
+            lambda: client.progress(random_trajectory(0, 1), timeout_s=timeout_s),
+            lambda: client.submit(ProgressSample(random_trajectory(0, 1)), timeout_s=timeout_s).result(),
+            lambda: client.model_info(timeout_s=timeout_s),
+            lambda: client.is_ready(timeout_s=timeout_s),
+            lambda: client.wait_ready(timeout_s),
+        ]
+        for call in calls:
+            with pytest.raises(ValueError, match="timeout_s") as caught:
+                call()
+            assert str(caught.value) == wanted
+
+
+def test_a_call_may_take_very_long(served: Served, protocol: str) -> None:
+    with served.client(protocol) as client:
+        assert client.progress(random_trajectory(0, 1), timeout_s=1e9).progress.shape == (1,)
+
+
+@dataclass(frozen=True)
+class Voting:
+    """A vote over success probabilities, and what it should say."""
+
+    success: list[float]
+    last: int
+    threshold: float
+    expected: bool
+
+
+VOTES = {
+    "the last frame": Voting([0.1, 0.9], 1, 0.5, True),
+    "reaching is enough": Voting([0.5], 1, 0.5, True),
+    "two of three": Voting([0.9, 0.2, 0.9], 3, 0.5, True),
+    "half is no majority": Voting([0.9, 0.2], 2, 0.5, False),
+    "fewer frames than asked": Voting([0.9], 5, 0.5, True),
+    "a higher threshold": Voting([0.9], 1, 0.95, False),
+    "only the last count": Voting([0.9, 0.9, 0.1], 1, 0.5, False),
+}
+
+
+@pytest.mark.parametrize("vote", VOTES.values(), ids=VOTES)
+def test_success_is_voted_over_the_last_frames(vote: Voting) -> None:
+    scores = FrameScores(progress=np.zeros(1, np.float32), success=np.array(vote.success, np.float32))
+    assert scores.succeeded(last=vote.last, threshold=vote.threshold) is vote.expected
+
+
+def test_progress_becomes_a_reward() -> None:
+    progress = np.array([0.25, 0.5, 0.375], np.float32)
+    scores = FrameScores(progress=progress, success=progress)
+    assert scores.last_progress == 0.375
+    np.testing.assert_array_equal(scores.progress_deltas, np.array([0, 0.25, -0.125], np.float32))
+    with pytest.raises(ValueError, match="last: expected at least one frame, got 0"):
+        scores.succeeded(last=0)
+
+
+@pytest.mark.parametrize("name", ["last_progress", "progress_deltas", "succeeded"])
+def test_what_a_checkpoint_does_not_tell_becomes_no_number(name: str) -> None:
+    nothing = np.full(2, np.nan, np.float32)
+    scores = FrameScores(progress=nothing, success=nothing)
+    with pytest.raises(ValueError, match="got NaN: this checkpoint does not tell it"):
+        getattr(scores, name)() if name == "succeeded" else getattr(scores, name)
+
+
+def test_the_client_is_light_and_quick_to_import() -> None:
+    code = """
+import sys, time
+started = time.perf_counter()
+import rfm_client
+seconds = time.perf_counter() - started
+heavy = {"torch", "pandas", "av", "PIL", "gymnasium", "typer", "rich", "matplotlib", "grpc", "gevent", "aiohttp"}
+print(seconds, *sorted(heavy & set(sys.modules)))
+"""
+    outputs = [
+        subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
+        for _ in range(5)
+    ]
+    assert min(float(seconds) for seconds, *_ in outputs) < 0.3
+    assert all(len(output) == 1 for output in outputs), outputs[0]
+
+
+USER_FILE = """
+from concurrent.futures import Future
+
+import numpy as np
+from rfm_client import (
+    AsyncRewardClient, PreferenceSample, ProgressResult, ProgressSample, Result, RewardClient, RewardError, Trajectory
+)
+
+trajectory = Trajectory(frames=np.zeros((2, 8, 8, 3), np.uint8), task="stack the cups")
+with RewardClient(["grpc://a:8001", "http://b:8000"], model="rfm", timeout_s=5.0, shared_memory=True) as client:
+    reward: float = client.progress(trajectory, frame_steps=4, subsample=True).last_progress
+    future: Future[ProgressResult] = client.submit(ProgressSample(trajectory), timeout_s=1.0)
+    some: list[Result] = client.evaluate([ProgressSample(trajectory), PreferenceSample(trajectory, trajectory)])
+    each: list[Result | RewardError] = client.evaluate([ProgressSample(trajectory)], return_errors=True)
+    preference: float = client.preference(trajectory, trajectory).preference
+
+
+async def rewards() -> float:
+    async with AsyncRewardClient("grpc://a:8001") as client:
+        return (await client.similarity(trajectory, trajectory)).similarity
+"""
+
+
+WRONG_USES = {
+    'client.progress(trajectory, timeout="5")': "timeout",
+    "client.progress(trajectory, sub_sample=True)": "sub_sample",
+    "client.submit(ProgressSample(trajectory)).result().preference": "preference",
+}
+
+
+def test_a_user_s_file_type_checks_against_the_installed_wheel(tmp_path: Path) -> None:
+    source = ROOT / "client"
+    wheels, environment = tmp_path / "wheels", tmp_path / "environment"
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    copied = tmp_path / "client"
+    shutil.copytree(source, copied, ignore=shutil.ignore_patterns("build", "*.egg-info", "__pycache__"))
+    subprocess.run([*pip, "wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", wheels, copied], check=True)
+    venv.create(environment, with_pip=False)
+    installed = next(environment.glob("lib/python*/site-packages"))
+    subprocess.run([*pip, "install", "--no-deps", "--target", installed, *wheels.glob("*.whl")], check=True)
+    (installed / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+    user_file = tmp_path / "user.py"
+
+    def check(text: str) -> subprocess.CompletedProcess[str]:
+        user_file.write_text(text)
+        options = ["--strict", "--config-file=", f"--python-executable={environment}/bin/python"]
+        command = [sys.executable, "-m", "mypy", *options, user_file]
+        return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+
+    good = check(USER_FILE)
+    assert good.returncode == 0, good.stdout
+    bad = check(USER_FILE + "\n\n" + "\n".join(WRONG_USES))
+    for name in WRONG_USES.values():
+        assert f'"{name}"' in bad.stdout
+
+
+def test_tensors_hold_one_trajectory_without_a_copy() -> None:
+    frames = np.zeros((2, 4, 4, 3), np.uint8)
+    tensors = wire.encode_samples([ProgressSample(Trajectory(frames=frames, task="none"))])
+    assert np.shares_memory(tensors[wire.FRAMES], frames)

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: MIT
+"""A film of several LeRobot episodes is not one trajectory."""
+
+from __future__ import annotations
+
+import json
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pictures import TOP, numbered, numbers, write_video
+from rfm_client import InvalidSampleError
+from rfm_client.data.inputs import load_trajectory
+from rfm_client.data.video import read_video
+
+
+def lerobot_dataset(root: Path, version: str, video: str, episodes: int, more: dict[str, Any] | None = None) -> Path:
+    """A dataset's folder, as far as a video's reader looks: ``meta/info.json`` and one film. Gives the film."""
+    film = root / video
+    film.parent.mkdir(parents=True)
+    write_video(film, numbered(10))
+    (root / "meta").mkdir()
+    info = {"codebase_version": version, "total_episodes": episodes, **(more or {})}
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+    return film
+
+
+V30_FILM = f"videos/{TOP}/chunk-000/file-000.mp4"
+
+
+V21_FILM = f"videos/chunk-000/{TOP}/episode_000000.mp4"
+
+
+ONE_EPISODE = "video: expected a film of one episode, got "
+
+
+INSTEAD = "cut one episode out into a file of its own"
+
+
+def test_a_lerobot_v3_file_of_several_episodes_is_refused(tmp_path: Path) -> None:
+    film = lerobot_dataset(tmp_path, "v3.0", V30_FILM, 10)
+    for read in (read_video, load_trajectory):
+        with pytest.raises(InvalidSampleError) as caught:
+            read(film)
+        assert str(caught.value).startswith(f"{ONE_EPISODE}a LeRobot v3.0 file that holds 10 episodes: {INSTEAD}")
+        assert str(caught.value).endswith(f"({film})")
+
+
+def test_of_several_lerobot_v3_files_none_is_told_to_hold_all_episodes(tmp_path: Path) -> None:
+    film = lerobot_dataset(tmp_path, "v3.0", V30_FILM, 10)
+    film.with_name("file-001.mp4").write_bytes(film.read_bytes())
+    with pytest.raises(InvalidSampleError, match=r"v3\.0 file that holds some of the dataset's 10 episodes: "):
+        read_video(film)
+
+
+@pytest.mark.parametrize("version", ["v3.1", "v4.0", 3])
+def test_a_lerobot_version_that_is_not_known_to_keep_a_film_an_episode_is_refused(tmp_path: Path, version: Any) -> None:
+    film = lerobot_dataset(tmp_path, version, "films/000.mp4", 10)
+    with pytest.raises(InvalidSampleError, match=f"{ONE_EPISODE}a LeRobot {version} file that holds some of"):
+        read_video(film)
+
+
+def test_a_lerobot_v3_file_is_known_behind_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    film = lerobot_dataset(tmp_path / "data", "v3.0", V30_FILM, 10)
+    blob = tmp_path / "blob"
+    film.rename(blob)
+    film.symlink_to(blob)  # as a Hub download consists of links into a cache
+    outside = tmp_path / "film.mp4"
+    outside.symlink_to(lerobot_dataset(tmp_path / "other", "v3.0", V30_FILM, 10))
+    monkeypatch.chdir(film.parent)
+    for path in (film, Path(film.name), outside):
+        with pytest.raises(InvalidSampleError, match=r"a LeRobot v3\.0 file that holds 10 episodes"):
+            read_video(path)
+
+
+def test_a_lerobot_v3_file_without_its_dataset_is_known_by_its_path(tmp_path: Path) -> None:
+    film = lerobot_dataset(tmp_path, "v3.0", V30_FILM, 10)
+    (tmp_path / "meta" / "info.json").unlink()
+    with pytest.raises(
+        InvalidSampleError, match=f"{ONE_EPISODE}a file in the layout of LeRobot v3.0, which holds many"
+    ):
+        read_video(film)
+
+
+@pytest.mark.parametrize("camera", [TOP, TOP.replace(".", "%2E")])
+def test_a_lerobot_v3_file_behind_a_url_is_refused_and_not_downloaded(camera: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.setblocking(False)
+        url = f"http://127.0.0.1:{server.getsockname()[1]}/toy/resolve/main/videos/{camera}/chunk-000/file-000.mp4?a=b"
+        with pytest.raises(InvalidSampleError, match=f"{ONE_EPISODE}a file in the layout of LeRobot v3.0"):
+            load_trajectory(url)
+        with pytest.raises(BlockingIOError):
+            server.accept()
+
+
+@pytest.mark.parametrize(
+    ("version", "video", "episodes"),
+    [("v2.1", V21_FILM, 10), ("v2.0", V21_FILM, 10), ("v3.0", V30_FILM, 1)],
+    ids=["v2.1", "v2.0", "v3.0 with one episode in all"],
+)
+def test_a_lerobot_film_of_one_episode_is_read(tmp_path: Path, version: str, video: str, episodes: int) -> None:
+    film = lerobot_dataset(tmp_path, version, video, episodes)
+    assert numbers(read_video(film), 10) == list(range(10))
+
+
+def test_what_is_no_lerobot_dataset_is_read(tmp_path: Path) -> None:
+    film = lerobot_dataset(tmp_path, "v3.0", "films/file-000.mp4", 10)
+    (tmp_path / "meta" / "info.json").write_text('{"about": "another project"}')
+    assert numbers(read_video(film), 10) == list(range(10))
+
+
+def test_a_lerobot_dataset_that_cannot_be_read_is_an_error(tmp_path: Path) -> None:
+    film = lerobot_dataset(tmp_path, "v3.0", V30_FILM, 10)
+    (tmp_path / "meta" / "info.json").write_text('{"codebase_version": "v3')
+    with pytest.raises(InvalidSampleError, match=r"^meta/info\.json: expected a readable JSON file, got Unterminated"):
+        read_video(film)

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: MIT
+"""Trajectories from video files and URLs."""
+
+from __future__ import annotations
+
+import re
+import socket
+import struct
+import tracemalloc
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+
+import av
+import numpy as np
+import pytest
+
+import clip
+from paths import VIDEOS
+from pictures import numbered, numbers, write_video
+from rfm_client import InvalidSampleError
+from rfm_client.data.inputs import load_trajectory
+from rfm_client.data.video import read_video
+
+
+def test_a_video_is_read_whole_or_at_a_frame_rate(film: Path) -> None:
+    whole = load_trajectory(film, task=clip.TASK)
+    assert whole.task == clip.TASK
+    assert np.abs(whole.positions.astype(int) - clip.render()).mean() < 8  # lossy, but the same picture
+    sampled = load_trajectory(str(film), fps=3).positions
+    indices = np.linspace(0, clip.NUM_FRAMES - 1, round(clip.NUM_FRAMES * 3 / clip.FPS)).astype(int)
+    np.testing.assert_array_equal(sampled, whole.positions[indices])
+
+
+@pytest.mark.parametrize("fps", [0, -1, float("nan"), float("inf")])
+def test_a_frame_rate_is_a_number_above_0(film: Path, fps: float) -> None:
+    with pytest.raises(InvalidSampleError, match=rf"^fps: expected a number above 0, got {fps}$"):
+        read_video(film, fps)
+
+
+def test_frames_of_a_variable_rate_are_even_in_number(tmp_path: Path) -> None:
+    write_video(tmp_path / "film.mp4", numbered(10), [0, 1, 2, 3, 4, 5, 6, 20, 40, 60])  # 1.6 fps on average
+    assert numbers(read_video(tmp_path / "film.mp4"), 10) == list(range(10))
+    assert numbers(read_video(tmp_path / "film.mp4", 0.82), 10) == [0, 2, 4, 6, 9]
+
+
+def test_packets_without_a_frame_do_not_count(tmp_path: Path) -> None:
+    write_video(tmp_path / "film.mp4", numbered(10), shown_from=4)
+    with av.open(str(tmp_path / "film.mp4")) as container:
+        assert container.streams.video[0].frames == 10  # as the container tells, wrongly
+    assert numbers(read_video(tmp_path / "film.mp4"), 10) == [4, 5, 6, 7, 8, 9]
+    assert numbers(read_video(tmp_path / "film.mp4", 5), 10) == [4, 6, 9]
+
+
+# The display matrix of a track: (a, b, c, d) of x' = a x + c y, y' = b x + d y, y downwards (ISO 14496-12).
+TURNS: dict[str, tuple[tuple[int, int, int, int], int]] = {
+    "clockwise": ((0, 1, -1, 0), -1),
+    "upside down": ((-1, 0, 0, -1), 2),
+    "counter-clockwise": ((0, -1, 1, 0), 1),
+}
+
+
+@pytest.mark.parametrize(("matrix", "quarter_turns"), TURNS.values(), ids=TURNS)
+def test_a_turned_video_is_read_upright(tmp_path: Path, matrix: tuple[int, int, int, int], quarter_turns: int) -> None:
+    picture = np.zeros((1, 32, 64, 3), np.uint8)
+    picture[:, :16, :32], picture[:, :16, 32:], picture[:, 16:, :32] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
+    write_video(tmp_path / "film.mp4", picture)
+    content = (tmp_path / "film.mp4").read_bytes()
+    a, b, c, d = (value << 16 for value in matrix)
+    start = content.index(b"tkhd") + 4 + 40  # version 0: the matrix follows 40 bytes of other fields
+    turned = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    (tmp_path / "film.mp4").write_bytes(content[:start] + turned + content[start + len(turned) :])
+    upright = np.rot90(picture[0], quarter_turns)
+    read = read_video(tmp_path / "film.mp4")[0]
+    assert read.shape == upright.shape
+    assert np.abs(read.astype(int) - upright).mean() < 3
+
+
+def test_only_the_picked_frames_of_a_long_video_are_held(tmp_path: Path) -> None:
+    frames = numbered(200)
+    write_video(tmp_path / "film.mp4", frames)
+    read_video(tmp_path / "film.mp4", 0.1)  # imports done
+    tracemalloc.start()
+    picked = read_video(tmp_path / "film.mp4", 0.2)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert numbers(picked, 200) == [0, 66, 132, 199]
+    assert peak < 40 * frames[0].nbytes
+
+
+def test_a_sound_is_no_video(tmp_path: Path) -> None:
+    with av.open(str(tmp_path / "sound.mp4"), "w") as container:
+        stream = container.add_stream("aac", rate=16_000)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+        frame.sample_rate = 16_000
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    with pytest.raises(InvalidSampleError) as refused:
+        read_video(tmp_path / "sound.mp4")
+    assert str(refused.value) == f"video: expected a file with a video stream, got none ({tmp_path / 'sound.mp4'})"
+
+
+class FileServer(ThreadingHTTPServer):
+    """Serves the files of a folder, and notes what was asked for; ``/short/...`` ends before its end."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(("127.0.0.1", 0), FileRequest)
+        self.folder = folder
+        self.asked: list[str] = []
+
+    def url(self, path: str) -> str:
+        return f"http://127.0.0.1:{self.server_port}/{path}"
+
+
+class FileRequest(BaseHTTPRequestHandler):
+    server: FileServer
+
+    def do_GET(self) -> None:
+        self.server.asked.append(self.path)
+        file = self.server.folder / Path(self.path.partition("?")[0]).name
+        if not file.exists():
+            self.send_error(404)
+            return
+        content = file.read_bytes()
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content[:-9] if self.path.startswith("/short/") else content)
+
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+@contextmanager
+def serving(folder: Path) -> Iterator[FileServer]:
+    with FileServer(folder) as server:
+        thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def test_a_url_is_downloaded_once_and_read_as_the_file_is(film: Path) -> None:
+    with serving(film.parent) as server:
+        loaded = load_trajectory(server.url("clip.mp4?token=3"), task=clip.TASK, fps=3)
+        assert server.asked == ["/clip.mp4?token=3"]
+    np.testing.assert_array_equal(loaded.positions, read_video(film, 3))
+
+
+@pytest.mark.parametrize("file", sorted(VIDEOS.glob("*.mp4")), ids=lambda file: file.stem)
+def test_a_robot_video_is_the_same_behind_a_url(file: Path) -> None:
+    with serving(VIDEOS) as server:
+        np.testing.assert_array_equal(read_video(server.url(file.name), 3), read_video(file, 3))
+
+
+BAD_URLS = {
+    "not there": ("nothing.mp4", "HTTP Error 404: Not Found"),
+    "broken off": ("short/clip.mp4", "[0-9]+ of [0-9]+ bytes came"),
+    "no video": ("text.mp4", "Invalid data found when processing input"),
+}
+
+
+@pytest.mark.parametrize(("path", "reason"), BAD_URLS.values(), ids=BAD_URLS)
+def test_a_url_that_fails_is_told_with_its_reason(film: Path, path: str, reason: str) -> None:
+    (film.parent / "text.mp4").write_text("no video")
+    with serving(film.parent) as server, pytest.raises(InvalidSampleError) as refused:
+        load_trajectory(server.url(path))
+    expected = f"video: expected a file with a video stream, got {reason} "
+    assert re.fullmatch(expected + re.escape(f"({server.url(path)})"), str(refused.value))
+
+
+def test_a_server_that_says_nothing_is_given_up() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        url = f"http://127.0.0.1:{silent.getsockname()[1]}/clip.mp4"
+        with pytest.raises(InvalidSampleError, match=r"^video: expected .*, got timed out \(http://.*\)$"):
+            read_video(url, 3, timeout_s=0.1)
+    with pytest.raises(InvalidSampleError, match=r"^video: expected .*, got .*Connection refused.* \(http://.*\)$"):
+        read_video(url, 3)
+
+
+@pytest.mark.parametrize("url", ["http://", "http://localhost:none/", "http://local host/", "https://lücke/\n"])
+def test_a_url_that_is_none_is_refused(url: str) -> None:
+    with pytest.raises(InvalidSampleError, match=r"^video: expected a file with a video stream, got "):
+        read_video(url, 3)

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: MIT
+"""A Triton with three small models, and a gateway for each."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+import goldens
+import rfm_export
+from engines import serve_config
+from gateway_requests import (
+    FILM,
+    TINY,
+    TINY_CONFIG,
+    VIDEO,
+    Ask,
+    Triton,
+    ask_json,
+    ask_npy,
+    fixture_of,
+)
+from rfm import families
+from rfm.config import ServeConfig
+from rfm.rewind.network import RewindTransformer
+from rfm.supervise.installation import find_installation
+from rfm.supervise.leftovers import REGION_PREFIX
+from rfm.supervise.process import Endpoints, TritonServer
+from rfm.supervise.stubs import SHARED_MEMORY
+
+
+@pytest.fixture(scope="module")
+def tiny_network() -> RewindTransformer:
+    torch.manual_seed(0)
+    return RewindTransformer(TINY_CONFIG)
+
+
+@pytest.fixture(scope="module")
+def triton(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransformer) -> Iterator[Triton]:
+    folder = tmp_path_factory.mktemp("gateway_triton")
+    repository, checkpoint = folder / "model_repository", folder / "two_wide"
+    families.save(families.RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()), checkpoint)
+    rfm_export.export(checkpoint, repository, ServeConfig(name=TINY, num_gpus=0, torch_threads=1))
+    for config, name in ((goldens.config("enc_c1_t1_disc10"), FILM), (goldens.config("q25_video_last_l2"), VIDEO)):
+        rfm_export.export(config.checkpoint, repository, serve_config(config, name))
+    ours = f"{REGION_PREFIX}_{os.getpid()}_*"  # others test beside us
+    regions = set(SHARED_MEMORY.glob(ours))
+    with (
+        (folder / "tritonserver.log").open("wb") as log,
+        TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+    ):
+        assert server._process is not None
+        yield Triton(repository, server.endpoints, server._process.pid)
+    assert set(SHARED_MEMORY.glob(ours)) <= regions
+
+
+tiny, film, video = fixture_of(TINY), fixture_of(FILM), fixture_of(VIDEO)
+
+
+strict = fixture_of(TINY, "--timeout", "1", "--max-in-flight", "1", "--max-waiting", "0", "--max-body-mib", "1")
+
+
+@pytest.fixture(params=[ask_json, ask_npy], ids=["json", "npy"])
+def ask(request: pytest.FixtureRequest) -> Ask:
+    function: Ask = request.param
+    return function

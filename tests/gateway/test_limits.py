@@ -1,0 +1,290 @@
+# SPDX-License-Identifier: MIT
+"""Bodies, waiting and callers beyond what the gateway takes."""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import requests
+from prometheus_client.parser import text_string_to_metric_families
+
+import rfm_export
+from gateway_requests import (
+    FIRST,
+    MULTIPART,
+    NAMED,
+    SECOND,
+    TINY,
+    TINY_CONFIG,
+    TRUTH_S,
+    Ask,
+    Json,
+    Triton,
+    answered,
+    ask_json,
+    begun,
+    dumped,
+    expected,
+    failure,
+    numbers,
+    paused,
+    preference,
+    progress,
+)
+from gateways import Gateway, poll, running
+from rfm import families
+from rfm.config import ServeConfig
+from rfm.rewind.network import RewindTransformer
+from rfm.supervise.installation import find_installation
+from rfm.supervise.process import Endpoints, TritonServer
+from rfm_client import (
+    AsyncRewardClient,
+    ServerUnavailableError,
+)
+from rfm_gateway import state as gateway_state
+
+pytestmark = pytest.mark.triton
+
+
+def ended(connection: http.client.HTTPConnection) -> tuple[http.client.HTTPResponse, str]:
+    response = connection.getresponse()
+    detail = str(json.loads(response.read())["detail"])
+    connection.close()
+    return response, detail
+
+
+HALF = ({"Content-Length": "100"}, b'{"samples": [')
+
+
+MULTIPART_HALF = ({"Content-Length": "100", "Content-Type": MULTIPART}, NAMED)
+
+
+HALVES = {"/evaluate_batch": HALF, "/evaluate_batch_npy": MULTIPART_HALF}
+
+
+@pytest.mark.parametrize(("path", "half"), HALVES.items(), ids=HALVES)
+def test_a_body_that_does_not_come_is_a_408(strict: Gateway, path: str, half: Any) -> None:
+    response, detail = ended(begun(strict, *half, path=path))
+    assert (response.status, detail) == (408, "body: expected all of it in time, got a part")
+    assert response.getheader("Connection") == "close"
+
+
+CHUNK = b"40000\r\n" + b" " * 2**18 + b"\r\n"
+
+
+LARGE: dict[str, tuple[dict[str, str], list[bytes]]] = {
+    "announced": ({"Content-Length": str(2**20 + 1)}, []),
+    "in chunks": ({"Transfer-Encoding": "chunked"}, [CHUNK] * 5),
+}
+
+
+@pytest.mark.parametrize("path", HALVES)
+@pytest.mark.parametrize(("headers", "parts"), LARGE.values(), ids=LARGE)
+def test_too_large_a_body_is_a_413(strict: Gateway, headers: dict[str, str], parts: list[bytes], path: str) -> None:
+    beginning = [b"%x\r\n%b\r\n" % (len(NAMED), NAMED)] if parts and path.endswith("npy") else []
+    response, detail = ended(begun(strict, headers | {"Content-Type": MULTIPART}, *beginning, *parts, path=path))
+    assert (response.status, detail) == (413, "body: expected at most 1048576 bytes, got more")
+    assert answered(ask_json(strict, [progress(FIRST)]))
+
+
+def test_more_requests_than_allowed_are_a_503_and_health_is_not_one(strict: Gateway) -> None:
+    for path, half in HALVES.items():  # each is answered 408 in the end
+        connection = begun(strict, *half, path=path)
+        poll(lambda: strict.metric("requests_in_flight") == 1)
+        response = ask_json(strict, [progress(FIRST)])
+        assert failure(response, 503) == "expected at most 1 evaluations at a time, got more"
+        assert response.headers["Retry-After"] == "1"
+        assert requests.get(f"{strict.url}/health").ok
+        connection.close()
+        poll(lambda: strict.metric("requests_in_flight") == 0)
+        assert answered(ask_json(strict, [progress(FIRST)]))
+
+
+def test_a_caller_who_leaves_is_no_failure_of_the_gateway(tiny: Gateway) -> None:
+    for path, half in HALVES.items():
+        begun(tiny, *half, path=path).close()
+        poll(lambda path=path: tiny.metric("requests_total", endpoint=path, code="400") >= 1)  # type: ignore[misc]
+
+
+def post_body(gateway: Gateway, sample: Json) -> http.client.HTTPConnection:
+    """A connection on which a whole request has been sent."""
+    body = dumped([sample]).encode()
+    connection: http.client.HTTPConnection = begun(gateway, {"Content-Length": str(len(body))}, body)
+    return connection
+
+
+def test_three_hundred_callers_at_once_are_all_answered(triton: Triton, tiny: Gateway) -> None:
+    """Upstream's clients do not ask again: more than are scored at a time wait."""
+    answer = expected(tiny, [progress(FIRST)])
+    with paused(triton):
+        callers = [post_body(tiny, progress(FIRST)) for _ in range(300)]
+        poll(lambda: tiny.metric("requests_in_flight") + tiny.metric("requests_waiting") == 300)
+        assert tiny.metric("requests_waiting") == 300 - 256
+    for caller in callers:
+        response = caller.getresponse()
+        assert (response.status, json.loads(response.read())) == (200, numbers(answer))
+        caller.close()
+
+
+def test_a_caller_who_waits_too_long_is_a_503(triton: Triton, tmp_path: Path) -> None:
+    with running(triton.endpoints, tmp_path, TINY, "--timeout", "1", "--max-in-flight", "1") as gateway:
+        answered(ask_json(gateway, [progress(FIRST)]))
+        with paused(triton):
+            first = post_body(gateway, progress(FIRST))
+            poll(lambda: gateway.metric("requests_in_flight") == 1)
+            second, third = (post_body(gateway, progress(FIRST)) for _ in range(2))
+            codes = []
+            for caller in (first, second, third):
+                codes.append(caller.getresponse().status)
+                caller.close()
+        assert set(codes) == {503, 504}
+
+
+CLOSED_GATE = """
+
+_load = TritonPythonModel.load
+
+
+def load(self, version, device, settings):
+    _load(self, version, device, settings)
+    score = self.engine.family.score
+
+    def gated(rows, batch):
+        import time
+
+        while Path({gate!r}).exists():
+            time.sleep(0.01)
+        return score(rows, batch)
+
+    self.engine.family.score = gated
+
+
+TritonPythonModel.load = load
+"""
+
+
+@dataclass(frozen=True)
+class Gated:
+    """A gateway before a Triton whose model works on its batch for as long as the file ``gate`` is there."""
+
+    gateway: Gateway
+    endpoints: Endpoints
+    gate: Path
+
+    @contextmanager
+    def working(self) -> Iterator[http.client.HTTPConnection]:
+        """Within it, the model works on the request of the connection."""
+        self.gate.touch()
+        try:
+            caller = post_body(self.gateway, progress(FIRST))
+            poll(lambda: self.metric("rfm_batch_requests") == 1)
+            yield caller
+        finally:
+            self.gate.unlink()
+
+    def metric(self, name: str, **labels: str) -> float:
+        families = text_string_to_metric_families(requests.get(self.endpoints.metrics_url).text)
+        samples = (sample for family in families for sample in family.samples)
+        return sum(s.value for s in samples if s.name == name and labels.items() <= s.labels.items())
+
+
+@pytest.fixture(scope="module")
+def gated(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransformer) -> Iterator[Gated]:
+    folder = tmp_path_factory.mktemp("gated")
+    repository, checkpoint, gate = folder / "model_repository", folder / "two_wide", folder / "gate"
+    families.save(families.RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()), checkpoint)
+    rfm_export.export(checkpoint, repository, ServeConfig(name=TINY, num_gpus=0, torch_threads=1))
+    model = repository / TINY / "1" / "model.py"
+    model.write_text(model.read_text() + CLOSED_GATE.format(gate=str(gate)))
+    with (
+        (folder / "tritonserver.log").open("wb") as log,
+        TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+        running(server.endpoints, folder) as gateway,
+    ):
+        yield Gated(gateway, server.endpoints, gate)
+
+
+def test_callers_who_hang_up_cost_no_forward(gated: Gated) -> None:
+    """Preferences are asked last: once one is counted, a moment later, so is whatever was scored before it."""
+
+    def scored(sample_type: str) -> float:
+        return gated.metric("rfm_samples_total", outcome="scored", sample_type=sample_type)
+
+    samples = [progress(FIRST), preference(FIRST, SECOND)]
+    answers = [expected(gated.gateway, [sample]) for sample in samples]
+    poll(lambda: scored("preference") == 1)
+    progress_before = scored("progress")
+    with gated.working() as first:
+        leaving = [post_body(gated.gateway, progress(FIRST)) for _ in range(12)]
+        poll(lambda: gated.metric("nv_inference_pending_request_count") == len(leaving))
+        for caller in leaving:
+            caller.close()
+        poll(lambda: gated.gateway.metric("requests_total", code="499") == len(leaving))
+        last = post_body(gated.gateway, samples[1])  # behind what has told Triton that they left
+        poll(lambda: gated.metric("nv_inference_pending_request_count") >= 1)
+    for caller, answer in zip((first, last), answers, strict=True):
+        assert json.loads(caller.getresponse().read()) == numbers(answer)
+        caller.close()
+    poll(lambda: scored("preference") == 2)
+    assert scored("progress") == progress_before + 1
+    assert gated.gateway.metric("requests_in_flight") == 0
+
+
+def test_health_is_told_while_a_model_works(gated: Gated, monkeypatch: pytest.MonkeyPatch) -> None:
+    with gated.working() as first:
+        second = post_body(gated.gateway, progress(FIRST))
+        poll(lambda: gated.metric("nv_inference_pending_request_count") == 1)
+        began_s = time.monotonic()
+        response = requests.get(f"{gated.gateway.url}/health")
+        assert time.monotonic() - began_s < TRUTH_S
+        assert answered(response) == {"status": "healthy", "available_gpus": 0, "total_gpus": 1}
+        monkeypatch.setattr(gateway_state, "STALL_S", 0.0)  # nothing is finished for longer than that: it hangs
+
+        async def ask() -> None:
+            async with AsyncRewardClient(gated.endpoints.grpc_url) as client:
+                await gateway_state.State(client, gated.endpoints.grpc_url, gated.endpoints.metrics_url, TINY).health()
+
+        with pytest.raises(ServerUnavailableError, match=r"rfm: no answer within 1\.5 s, and nothing finished for 0 s"):
+            asyncio.run(ask())
+    for caller in (first, second):
+        assert caller.getresponse().status == 200
+        caller.close()
+
+
+def test_no_score_in_time_is_a_504(triton: Triton, strict: Gateway, ask: Ask) -> None:
+    assert answered(ask(strict, [progress(FIRST)]))
+    with paused(triton):
+        assert failure(ask(strict, [progress(FIRST)]), 504) == "Triton: no answer within 1 s"
+    assert answered(ask(strict, [progress(FIRST)]))
+
+
+def test_a_triton_that_is_down_is_a_503(tmp_path: Path, ask: Ask) -> None:
+    with running(Endpoints.free(), tmp_path) as gateway:
+        response = ask(gateway, [progress(FIRST)])
+        assert "connect" in failure(response, 503)
+        assert response.headers["Retry-After"] == "1"
+        for path in ("health", "gpu_status", "model_info"):
+            response = requests.get(f"{gateway.url}/{path}")
+            assert "connect" in failure(response, 503)
+            assert response.headers["Retry-After"] == "1"
+        assert gateway.metric("rejections_total", reason="unavailable") == 1
+
+
+def test_a_model_that_is_not_served_is_a_503(triton: Triton, tmp_path: Path) -> None:
+    with running(triton.endpoints, tmp_path, "nowhere") as gateway:
+        for response in (ask_json(gateway, [progress(FIRST)]), requests.get(f"{gateway.url}/health")):
+            assert "nowhere" in failure(response, 503)
+
+
+def test_unknown_paths_and_methods_are_told_as_json(tiny: Gateway) -> None:
+    assert failure(requests.get(f"{tiny.url}/evaluate"), 404) == "Not Found"
+    assert failure(requests.get(f"{tiny.url}/evaluate_batch"), 405) == "Method Not Allowed"

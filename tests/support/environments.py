@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: MIT
+"""Environments, and a client whose answers come late."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from concurrent.futures import Future
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.wrappers import AddRenderObservation
+
+from rfm_client import (
+    ProgressResult,
+    RewardClient,
+    Trajectory,
+)
+from rfm_client.contract import wire
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.transport.access import Access
+from rfm_client.transport.calls import Answer, GrpcTransport
+
+MODEL = "enc_c1_t1_disc10"
+
+
+MAX_FRAMES = 16  # of that checkpoint
+
+
+TASK = "balance the pole"
+
+
+PUSH_RIGHT = 1  # the pole falls within ten steps
+
+
+SIZE = 240, 160  # pixels; fewer would not show the cart
+
+
+TOLERANCE = 1e-5
+
+
+Film = list[UInt8Array]
+
+
+class Camera(gym.Wrapper[Any, Any, Any, Any]):
+    """Films each episode for the test: ``films[-1][t]`` is what was to be seen after step t."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.films: list[Film] = []
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        answer = self.env.reset(**options)
+        self.films.append([np.array(self.env.render())])
+        return answer
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        answer = self.env.step(action)
+        self.films[-1].append(np.array(self.env.render()))
+        return answer
+
+
+def cart_pole(**options: Any) -> gym.Env[Any, Any]:
+    env = gym.make("CartPole-v1", render_mode="rgb_array", **options)
+    env.unwrapped.screen_width, env.unwrapped.screen_height = SIZE  # type: ignore[attr-defined]
+    return env
+
+
+def cart_pole_with_pixels() -> gym.Env[Any, Any]:
+    return AddRenderObservation(cart_pole(), render_only=False, render_key="pixels", obs_key="state")
+
+
+def scores(client: RewardClient, film: Film, step: int, max_frames: int = MAX_FRAMES) -> ProgressResult:
+    """Of the frames up to a step, or as many of them as may be sent."""
+    picked = np.linspace(0, step, min(step + 1, max_frames)).astype(int)
+    return client.progress(Trajectory(frames=np.stack([film[index] for index in picked]), task=TASK))
+
+
+def progress(client: RewardClient, film: Film, steps: Sequence[int], max_frames: int = MAX_FRAMES) -> list[float]:
+    return [float(scores(client, film, step, max_frames).progress[-1]) for step in steps]
+
+
+def play(env: gym.Env[Any, Any], seed: int = 0) -> tuple[list[float], list[dict[str, Any]]]:
+    """Rewards and infos of an episode; the reset's info is the first."""
+    info = env.reset(seed=seed)[1]
+    rewards, infos = play_on(env)
+    return rewards, [info, *infos]
+
+
+def play_on(env: gym.Env[Any, Any]) -> tuple[list[float], list[dict[str, Any]]]:
+    """Rewards and infos from here to the end of the episode."""
+    rewards: list[float] = []
+    infos: list[dict[str, Any]] = []
+    ended = False
+    while not ended:
+        _, reward, terminated, truncated, info = env.step(PUSH_RIGHT)
+        rewards.append(float(reward))
+        infos.append(info)
+        ended = terminated or truncated
+    return rewards, infos
+
+
+def assert_close(left: Any, right: Any) -> None:
+    np.testing.assert_allclose(left, right, rtol=0, atol=TOLERANCE)
+
+
+class SlowConnection(GrpcTransport):
+    """To the real server; a question whose longest trajectory has a length that is held waits until it is let go."""
+
+    def __init__(self, url: str) -> None:
+        super().__init__(url, Access(), shared_memory=False)
+        self.held: dict[int, Future[None]] = {}
+        self.lengths: list[int] = []
+
+    async def infer(self, model: str, inputs: wire.Tensors, outputs: Any, timeout_s: float, **_id: str) -> Answer:
+        length = int(inputs[wire.NUM_FRAMES].max())
+        self.lengths.append(length)
+        if length in self.held:
+            await asyncio.shield(asyncio.wrap_future(self.held[length]))  # several questions may wait for it
+        return await super().infer(model, inputs, outputs, timeout_s)
+
+
+class LateClient(RewardClient):
+    """A client whose answers the test lets come when it wants."""
+
+    def __init__(self, url: str) -> None:
+        self.connection = SlowConnection(url)
+        super().__init__(url, transports=[self.connection], model=MODEL, retry=False)
+        self.submitted: list[Future[ProgressResult]] = []
+        self.answers: dict[int, Future[ProgressResult]] = {}  # by step
+
+    def hold(self, *steps: int) -> None:
+        self.connection.held |= {step + 1: Future() for step in steps}
+
+    def submit(self, sample: Any, **options: Any) -> Future[Any]:
+        answer = super().submit(sample, **options)
+        self.submitted.append(answer)
+        self.answers[sample.trajectory.num_frames - 1] = answer
+        return answer
+
+    def let_come(self, *steps: int) -> None:
+        for step in steps:
+            if step + 1 in self.connection.held:
+                self.connection.held.pop(step + 1).set_result(None)
+            self.answers[step].result()

@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: MIT
+"""Servers that stop, hang and come back, and calls that go on meanwhile."""
+
+from __future__ import annotations
+
+import numpy as np
+import tritonclient.grpc
+
+from rfm.supervise.process import Endpoints
+from rfm_client import (
+    Trajectory,
+)
+from rfm_client.transport.shared_memory import FOLDER, MIN_SHARED_BYTES
+
+
+def url_of(endpoints: Endpoints, protocol: str) -> str:
+    return endpoints.grpc_url if protocol == "grpc" else endpoints.http_url
+
+
+def trajectory(seed: int, num_frames: int = 8) -> Trajectory:
+    random = np.random.default_rng(seed)
+    return Trajectory(
+        video_embeddings=random.standard_normal((num_frames, 64), np.float32),
+        text_embedding=random.standard_normal(32, np.float32),
+    )
+
+
+def heavy() -> Trajectory:
+    """Large enough for shared memory."""
+    heavy = trajectory(0, 2000)
+    assert heavy.video_embeddings is not None
+    assert heavy.video_embeddings.nbytes > MIN_SHARED_BYTES
+    return heavy
+
+
+def regions(endpoints: Endpoints) -> set[str]:
+    """Names of the regions that the server maps."""
+    with tritonclient.grpc.InferenceServerClient(endpoints.grpc_url.removeprefix("grpc://")) as client:
+        return set(client.get_system_shared_memory_status().regions)
+
+
+def ours_in_dev_shm() -> set[str]:
+    return {file.name for file in FOLDER.iterdir() if "rfm-client-" in file.name}
