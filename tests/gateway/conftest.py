@@ -32,13 +32,13 @@ from rfm.supervise.process import Endpoints, TritonServer
 from rfm.supervise.stubs import SHARED_MEMORY
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="package")
 def tiny_network() -> RewindTransformer:
     torch.manual_seed(0)
     return RewindTransformer(TINY_CONFIG)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="package")
 def triton(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransformer) -> Iterator[Triton]:
     folder = tmp_path_factory.mktemp("gateway_triton")
     repository, checkpoint = folder / "model_repository", folder / "two_wide"
