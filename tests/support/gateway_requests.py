@@ -84,7 +84,7 @@ class Triton:
 
 
 def fixture_of(model: str, *options: str) -> Any:
-    @pytest.fixture(scope="module")
+    @pytest.fixture(scope="package")
     def gateway(triton: Triton, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
         with running(triton.endpoints, tmp_path_factory.mktemp("gateway"), model, *options) as started:
             yield started

@@ -44,7 +44,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "rfm/rewind/family.py": ("test_rewind", "test_encoders"),
     "rfm/rewind/checkpoint.py": ("test_checkpoint", "test_hostile_files", "test_properties"),
     "rfm/rewind/*.py": ("test_rewind",),
-    "rfm/vlm/images.py": ("test_vlm", "test_inputs", "test_encoders"),
+    "rfm/vlm/images.py": ("test_vlm", "test_frame_size", "test_encoders"),
     "rfm/vlm/checkpoint.py": ("test_vlm", "test_hostile_files", "test_properties"),
     "rfm/vlm/lora.py": ("test_vlm", "test_hostile_files"),
     "rfm/vlm/*.py": ("test_vlm",),
