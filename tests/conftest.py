@@ -12,6 +12,7 @@ import goldens
 import rfm_export
 from commands import RUN
 from engines import load_engine, serve_config
+from patients import references  # noqa: F401  a fixture
 from reference_server import Served
 from rfm.engine import Engine
 from rfm.supervise.installation import find_installation
