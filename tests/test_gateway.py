@@ -38,9 +38,9 @@ from prometheus_client.parser import text_string_to_metric_families
 from typer.testing import CliRunner
 
 import rfm_export
-from rfm import families
 from rfm.checkpoint.content import read_run_config
 from rfm.config import ServeConfig
+from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindConfig, RewindTransformer
 from rfm.supervise.installation import find_installation
 from rfm.supervise.leftovers import REGION_PREFIX
@@ -182,7 +182,7 @@ def tiny_network() -> RewindTransformer:
 def triton(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransformer) -> Iterator[Triton]:
     folder = tmp_path_factory.mktemp("gateway_triton")
     repository, checkpoint = folder / "model_repository", folder / "two_wide"
-    families.save(families.RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()), checkpoint)
+    RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()).save(checkpoint)
     rfm_export.export(checkpoint, repository, ServeConfig(name=TINY, num_gpus=0, torch_threads=1))
     for config, name in ((goldens.config("enc_c1_t1_disc10"), FILM), (goldens.config("q25_video_last_l2"), VIDEO)):
         rfm_export.export(config.checkpoint, repository, serve_config(config, name))
@@ -1079,7 +1079,7 @@ _load = TritonPythonModel.load
 
 def load(self, version, device, settings):
     _load(self, version, device, settings)
-    score = self.engine.family.score
+    score = self.engine.predictor.score
 
     def gated(rows, batch):
         import time
@@ -1088,7 +1088,7 @@ def load(self, version, device, settings):
             time.sleep(0.01)
         return score(rows, batch)
 
-    self.engine.family.score = gated
+    self.engine.predictor.score = gated
 
 
 TritonPythonModel.load = load
@@ -1124,7 +1124,7 @@ class Gated:
 def gated(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransformer) -> Iterator[Gated]:
     folder = tmp_path_factory.mktemp("gated")
     repository, checkpoint, gate = folder / "model_repository", folder / "two_wide", folder / "gate"
-    families.save(families.RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()), checkpoint)
+    RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()).save(checkpoint)
     rfm_export.export(checkpoint, repository, ServeConfig(name=TINY, num_gpus=0, torch_threads=1))
     model = repository / TINY / "1" / "model.py"
     model.write_text(model.read_text() + CLOSED_GATE.format(gate=str(gate)))

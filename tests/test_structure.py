@@ -20,7 +20,9 @@ SHARED = {  # what a family may import beside itself
     "rfm.execution",
     "rfm.family",
     "rfm.layers",
+    "rfm.predictor",
     "rfm.prefixes",
+    "rfm.version_folder",
     "rfm_client.contract",
 }
 FOLDERS = {

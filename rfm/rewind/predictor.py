@@ -10,15 +10,15 @@ import numpy as np
 import torch
 
 from rfm.execution import Execution
-from rfm.family import RowScores, checked, frame_scores, part_of
+from rfm.family import FrameEncoders
+from rfm.predictor import RowScores, are_finite, checked, frame_scores, part_of
 from rfm.rewind.collator import RewindCollator, Row
-from rfm.rewind.encoders import Encoders
 from rfm.rewind.network import RewindBatch, RewindTransformer
 from rfm_client.contract import InvalidSampleError, ProgressSample, RewardError, Sample, Trajectory
 from rfm_client.contract.samples import Footage
 
 
-class RewindFamily:
+class RewindPredictor:
     """A ReWiND network on a device; encoders are needed only for samples of raw frames.
 
     dtype: of the network; its encoders keep theirs. Others than float32 move scores by more than 1e-5
@@ -28,7 +28,7 @@ class RewindFamily:
         self,
         network: RewindTransformer,
         *,
-        encoders: Encoders | None,
+        encoders: FrameEncoders | None,
         device: torch.device,
         dtype: torch.dtype = torch.float32,
     ) -> None:
@@ -48,13 +48,9 @@ class RewindFamily:
                 outcomes.append(error)
         return outcomes
 
-    def lengths(self, row: Row) -> tuple[int, ...]:
+    def num_tokens(self, row: Row) -> int:
         """Tokens of the row."""
-        return (self.network.config.num_tokens(row.num_first, row.num_second),)
-
-    def num_tokens(self, lengths: Sequence[int]) -> int:
-        """Tokens of the row."""
-        return lengths[0]
+        return self.network.config.num_tokens(row.num_first, row.num_second)
 
     def collate(self, rows: Sequence[Row]) -> RewindBatch:
         """Rows of any kinds."""
@@ -82,7 +78,9 @@ class RewindFamily:
                 query = next(questions)[0 if row.is_similarity else 1]
             scored.append(RowScores(of_trajectories, query))
             start = end
-        return checked(scored, RowScores([frames], sum(logits)))
+        if are_finite([frames], logits):  # of all rows at once, which is faster
+            return list(scored)
+        return checked(scored)
 
     def _embedded(self, samples: Sequence[Sample], execution: Execution) -> list[Sample | RewardError]:
         """The samples with embeddings in place of raw frames."""
