@@ -214,7 +214,7 @@ def _cost(config: RewindConfig, batch_size: int, num_frames: int, rounds: int) -
 
 
 def _engine(config: RewindConfig) -> Engine:
-    return Engine(RewindPredictor(RewindTransformer(config), encoders=None, device=torch.device("cpu")))
+    return Engine(RewindPredictor(RewindTransformer(config), torch.device("cpu")))
 
 
 def _inputs(config: RewindConfig, batch_size: int, num_frames: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -15,6 +15,7 @@ import torch
 
 from rfm import families
 from rfm.config import DEFAULT_SAMPLE_TOKENS, DEFAULT_TOKEN_BUDGET
+from rfm.embedding import embedded
 from rfm.execution import Execution, memory_errors
 from rfm.family import Checkpoint, FrameEncoders
 from rfm.predictor import Predictor, RowScores
@@ -39,6 +40,7 @@ class Engine:
     """Scores samples with one network on one device.
 
     predictor: the network and how samples become its batches
+    encoders: on the same device, for samples of raw frames where the network scores embeddings
     token_budget: the most tokens, padding included, of one forward pass of several rows; a larger row runs alone
     max_sample_tokens: the most tokens of one row; a sample that needs more is refused
     """
@@ -47,10 +49,12 @@ class Engine:
         self,
         predictor: Predictor[Any, Any],
         *,
+        encoders: FrameEncoders | None = None,
         token_budget: int = DEFAULT_TOKEN_BUDGET,
         max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS,
     ) -> None:
         self.predictor = predictor
+        self.encoders = encoders
         self.token_budget = token_budget
         self.max_sample_tokens = max_sample_tokens
 
@@ -98,8 +102,10 @@ class Engine:
         encoders: for samples of raw frames, where the network scores embeddings
         dtype: of the network; None: float32, and a vision-language checkpoint's own on a GPU
         """
-        predictor = checkpoint.predictor(torch.device(device), dtype, encoders)
-        return cls(predictor, token_budget=token_budget, max_sample_tokens=max_sample_tokens)
+        on = torch.device(device)
+        predictor = checkpoint.predictor(on, dtype)
+        encoders = None if encoders is None else encoders.to(on)
+        return cls(predictor, encoders=encoders, token_budget=token_budget, max_sample_tokens=max_sample_tokens)
 
     def evaluate(self, samples: Sequence[Sample], execution: Execution | None = None) -> list[Outcome]:
         """The result of each sample, or the error of one that has none; neighbours make no difference.
@@ -114,10 +120,11 @@ class Engine:
         outcomes: dict[int, Outcome] = {}
         rows: list[Any] = []
         rows_of: dict[int, slice] = {}
-        for index, sample_rows in enumerate(self.predictor.rows(samples, execution)):
-            error = sample_rows if isinstance(sample_rows, RewardError) else self._too_long(sample_rows)
-            if isinstance(sample_rows, RewardError) or error is not None:
-                outcomes[index] = error  # type: ignore[assignment]
+        for index, sample in enumerate(self._embedded(samples, execution)):
+            try:
+                sample_rows = self._rows(sample)
+            except RewardError as error:
+                outcomes[index] = error
                 continue
             rows_of[index] = slice(len(rows), len(rows) + len(sample_rows))
             rows += sample_rows
@@ -130,12 +137,19 @@ class Engine:
             outcomes[index] = _outcome(samples[index], scores[of_sample], timing)
         return [outcomes[index] for index in range(len(samples))]
 
-    def _too_long(self, rows: Sequence[Any]) -> InvalidSampleError | None:
+    def _embedded(self, samples: Sequence[Sample], execution: Execution) -> Sequence[Sample | RewardError]:
+        return samples if self.encoders is None else embedded(samples, self.encoders, execution)
+
+    def _rows(self, sample: Sample | RewardError) -> list[Any]:
+        """The sample's rows. Raises the error that it is, and InvalidSampleError."""
+        if isinstance(sample, RewardError):
+            raise sample
+        rows = self.predictor.rows(sample)
         longest = max(self.predictor.num_tokens(row) for row in rows)
-        if longest <= self.max_sample_tokens:
-            return None
-        expected = f"at most {self.max_sample_tokens} tokens (max_sample_tokens of this server)"
-        return InvalidSampleError.at("num_frames", expected, f"{longest} tokens")
+        if longest > self.max_sample_tokens:
+            expected = f"at most {self.max_sample_tokens} tokens (max_sample_tokens of this server)"
+            raise InvalidSampleError.at("num_frames", expected, f"{longest} tokens")
+        return rows
 
     def _scores(self, rows: Sequence[Any], execution: Execution) -> list[RowScores | RewardError]:
         """Each row's scores. While a batch is in its forward pass the next is collated."""

@@ -47,6 +47,7 @@ class Description:
     trained_frames: the most frames of a trajectory in training; None: the checkpoint does not say
     frame_size: to what it brings each raw frame; None: that depends on the frame
     frames_per_value: frames that share their scores
+    is_large: its exports are verified on the device and in the type that serve it, since float32 on the CPU takes long
     """
 
     network_class: str
@@ -57,6 +58,7 @@ class Description:
     trained_frames: int | None = None
     frame_size: FrameSize | None = None
     frames_per_value: int = 1
+    is_large: bool = False
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ class FrameEncoders(Protocol):
     def to(self, device: torch.device) -> FrameEncoders:
         """Moves them to ``device``."""
 
-    def encode(self, samples: Sequence[Footage], execution: Execution | None = None) -> list[Trajectory | RewardError]:
+    def encode(self, samples: Sequence[Footage], execution: Execution) -> list[Trajectory | RewardError]:
         """The embeddings of each sample's frames, one trajectory after the other, and task, or why there are none.
 
         execution: what it took is added to it
@@ -117,13 +119,10 @@ class Checkpoint(Protocol):
     def encoders(self) -> FrameEncoders | None:
         """Its encoders; None: it has none. Raises CheckpointError if they cannot be had or do not fit."""
 
-    def predictor(
-        self, device: torch.device, dtype: torch.dtype | None = None, encoders: FrameEncoders | None = None
-    ) -> Predictor[Any, Any]:
+    def predictor(self, device: torch.device, dtype: torch.dtype | None = None) -> Predictor[Any, Any]:
         """Its network on ``device``. Raises CheckpointError.
 
         dtype: of the network; None: as checkpoint and device decide
-        encoders: for samples of raw frames, where the network scores embeddings
         """
 
     def save(self, folder: Path) -> None:

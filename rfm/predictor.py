@@ -10,7 +10,6 @@ from typing import Protocol, TypeVar
 import numpy as np
 from torch import Tensor
 
-from rfm.execution import Execution
 from rfm.layers.heads import progress_from_logits
 from rfm_client.contract import FrameScores, InferenceFailedError, RewardError, Sample
 
@@ -21,10 +20,10 @@ Batch = TypeVar("Batch")
 class Predictor(Protocol[Row, Batch]):
     """A network on a device, and how samples become its batches. A row is one token sequence of a forward."""
 
-    def rows(self, samples: Sequence[Sample], execution: Execution) -> list[list[Row] | RewardError]:
-        """Each sample's rows (in dense mode one a frame), or why this checkpoint cannot score it.
+    def rows(self, sample: Sample) -> list[Row]:
+        """The sample's rows, in dense mode one a frame; takes no forward pass.
 
-        execution: what forward passes for it took is added to it
+        Raises InvalidSampleError if this checkpoint cannot score it.
         """
 
     def num_tokens(self, row: Row) -> int:

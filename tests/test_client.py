@@ -294,7 +294,7 @@ def test_model_info_tells_what_the_checkpoint_takes(served: Served, protocol: st
     assert (info.video_dim, info.text_dim) == (config.video_feature_dim, config.text_feature_dim)
     assert info.progress_bins == frames.progress_bins == 10
     assert frames.max_frames == 16
-    preprocessor = load_engine(FRAMES_MODEL).predictor.encoders.preprocessor  # type: ignore[attr-defined]
+    preprocessor = load_engine(FRAMES_MODEL).encoders.preprocessor  # type: ignore[attr-defined]
     assert str(frames.frame_size) == f"shortest {preprocessor.resize_px}"
     assert (frames.video_dim, frames.text_dim) == (None, None)
 

@@ -27,10 +27,12 @@ class Pipelined:
 
     def __init__(self, batches: int) -> None:
         self.collated = [threading.Event() for _ in range(batches)]
+        self.num_rows = 0
         self.scored = 0
 
-    def rows(self, samples: Sequence[Sample], execution: Execution) -> list[list[int] | RewardError]:
-        return [[index] for index in range(len(samples))]
+    def rows(self, sample: Sample) -> list[int]:
+        self.num_rows += 1
+        return [self.num_rows - 1]
 
     def num_tokens(self, row: int) -> int:
         return 1
@@ -76,7 +78,7 @@ config = RewindConfig(
     video_feature_dim=8, text_feature_dim=8, hidden_dim=512, num_layers=1, num_attention_heads=8, max_len=8,
     causal_mask=True, use_per_frame_progress_token=False, progress_bins=1, has_similarity=False,
 )
-engine = Engine(RewindPredictor(RewindTransformer(config), encoders=None, device=torch.device("cpu")))
+engine = Engine(RewindPredictor(RewindTransformer(config), torch.device("cpu")))
 samples = [ProgressSample(random_trajectory(seed, 1000, 8, 8)) for seed in range(16)]
 expected = engine.evaluate(samples)  # each layer's widest activations take 128 MiB, of one sample 8
 pages = int(open("/proc/self/statm").read().split()[0])

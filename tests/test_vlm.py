@@ -87,7 +87,7 @@ def test_token_ids_and_pixels_are_those_of_the_original(case: goldens.Case) -> N
     for kind, samples in by_type(case.samples()).items():
         if f"{kind}.collated.input_ids" not in arrays:  # evaluated one by one
             continue
-        rows = [row for outcome in predictor.rows(samples, Execution()) if isinstance(outcome, list) for row in outcome]
+        rows = [row for sample in samples for row in predictor.rows(sample)]
         inputs = predictor.collate(rows).inputs
         for name in ("input_ids", "attention_mask", "image_grid_thw", "video_grid_thw"):
             if f"{kind}.collated.{name}" in arrays:

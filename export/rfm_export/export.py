@@ -57,22 +57,27 @@ def export(
     """
     if not other_machine:
         _check_gpus(serve.num_gpus)
+    loaded = _load(source, serve, family)
+    described = loaded.encoders.description if loaded.encoders is not None else None
+    names = [serve.name, encoder_name(serve.name), frames_name(serve.name)]
+    with alone(repository), staging(repository, names) as staged:
+        version = _version(loaded, serve, next_version(repository, names))
+        models = generated_models(loaded.checkpoint.description, described, version)
+        _check_replaceable(repository, models, serve)
+        _stage(loaded, models, version, staged)
+        _verify(loaded, version, staged)
+        publish(repository, staged, models)
+    return version.number
+
+
+def _load(source: str | Path, serve: ServeConfig, family: str | None) -> _Source:
+    """What is at ``source``, checked."""
     folder = families.find(source)
     kind = families.choose(folder, family)
     options = Options(serve.base_model, serve.resize_images, serve.image_encoder, serve.text_encoder)
     checkpoint = kind.load(folder, options)
     families.check(folder, checkpoint)
-    names = [serve.name, encoder_name(serve.name), frames_name(serve.name)]
-    with alone(repository), staging(repository, names) as staged:
-        exported = _Source(kind, checkpoint, checkpoint.encoders(), Origin.of(source, folder))
-        described = exported.encoders.description if exported.encoders is not None else None
-        version = _version(exported, serve, next_version(repository, names))
-        models = generated_models(checkpoint.description, described, version)
-        _check_replaceable(repository, models, serve)
-        _stage(exported, models, version, staged)
-        _verify(exported, version, staged)
-        publish(repository, staged, models)
-    return version.number
+    return _Source(kind, checkpoint, checkpoint.encoders(), Origin.of(source, folder))
 
 
 def _check_gpus(num_gpus: int | None) -> None:
@@ -98,16 +103,19 @@ def _stage(source: _Source, models: Sequence[GeneratedModel], version: Version, 
 
 
 def _verify(source: _Source, version: Version, staged: Path) -> None:
-    """Raises ExportDiffersError unless what was staged gives the checkpoint's numbers, on the device that serves it."""
-    device = "cuda" if torch.cuda.is_available() and version.serve.num_gpus != 0 else "cpu"
-    engine = partial(Engine.of, device=device, dtype=version.serve.torch_dtype)
+    """Raises ExportDiffersError unless what was staged gives the checkpoint's numbers."""
+    description, serve = source.checkpoint.description, version.serve
+    engine = partial(Engine.of, device="cpu", dtype=None)
+    if description.is_large:
+        on_gpu = torch.cuda.is_available() and serve.num_gpus != 0
+        engine = partial(Engine.of, device="cuda" if on_gpu else "cpu", dtype=serve.torch_dtype)
 
     def exported() -> Engine:
-        folder = _checkpoint_folder(source.checkpoint.description, version, staged)
+        checkpoint = source.family.load(_checkpoint_folder(description, version, staged), Options())
         encoders = None if source.encoders is None else type(source.encoders).load(_encoders_folder(version, staged))
-        return engine(source.family.load(folder, Options()), encoders=encoders)
+        return engine(checkpoint, encoders=encoders)
 
-    samples = probes(source.checkpoint.description, with_encoders=source.encoders is not None)
+    samples = probes(description, with_encoders=source.encoders is not None)
     verify(lambda: engine(source.checkpoint, encoders=source.encoders), exported, samples)
 
 

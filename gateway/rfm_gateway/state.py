@@ -18,7 +18,7 @@ from rfm_client.contract.errors import (
 )
 from rfm_client.contract.made_up import blank_trajectory
 from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.names import PROBE_PREFIX
+from rfm_client.contract.names import PROBE_PREFIX, encoder_name, frames_name
 from rfm_client.status import Device, ServerStatus, read_status
 from rfm_client.transport.access import Access
 from rfm_client.transport.deadline import Deadline, timeout
@@ -172,8 +172,8 @@ class _Stalled:
 def _gpu_status(status: ServerStatus, model: str) -> schema.GpuStatus:
     served = {name for device in status.devices for name in device.work}
     # An ensemble's work is that of its parts: it is left out, and a request counted where it is scored.
-    scorer = model if model in served else f"{model}_frames"
-    parts = {scorer, f"{model}_encoder"}
+    scorer = model if model in served else frames_name(model)
+    parts = {scorer, encoder_name(model)}
     devices = [device for device in status.devices if parts & device.work.keys()] or list(status.devices)
     if not devices:
         raise ServerUnavailableError(status.metrics_error or f"{status.metrics_url}: no device is told of")

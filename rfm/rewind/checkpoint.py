@@ -29,7 +29,7 @@ from rfm.checkpoint.files import (
     take_prefix,
     trained_frames,
 )
-from rfm.family import NETWORK, Description, FrameEncoders, Options
+from rfm.family import NETWORK, Description, Options
 from rfm.rewind.encoders import Encoders
 from rfm.rewind.network import RewindConfig, RewindTransformer
 from rfm.rewind.predictor import RewindPredictor
@@ -116,14 +116,12 @@ class RewindCheckpoint:
             raise CheckpointError(f"{where}: expected widths {expected}, got {widths}")
         return encoders
 
-    def predictor(
-        self, device: torch.device, dtype: torch.dtype | None = None, encoders: FrameEncoders | None = None
-    ) -> RewindPredictor:
-        """The network on ``device``, with encoders for samples of raw frames. Raises CheckpointError.
+    def predictor(self, device: torch.device, dtype: torch.dtype | None = None) -> RewindPredictor:
+        """The network on ``device``. Raises CheckpointError.
 
         dtype: of the network; None: float32
         """
-        return RewindPredictor(self.build(), encoders=encoders, device=device, dtype=dtype or torch.float32)
+        return RewindPredictor(self.build(), device, dtype or torch.float32)
 
     def save(self, folder: Path) -> None:
         """Writes network and configuration in the layout that ``load`` reads, without encoders."""

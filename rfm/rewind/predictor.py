@@ -1,52 +1,33 @@
 # SPDX-License-Identifier: MIT
-"""ReWiND: embeddings, or raw frames through the encoders, into the ReWiND transformer."""
+"""The ReWiND transformer as a predictor: samples of embeddings in, scores of rows out."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
-import numpy as np
 import torch
 
-from rfm.execution import Execution
-from rfm.family import FrameEncoders
 from rfm.predictor import RowScores, are_finite, checked, frame_scores, part_of
 from rfm.rewind.collator import RewindCollator, Row
 from rfm.rewind.network import RewindBatch, RewindTransformer
-from rfm_client.contract import InvalidSampleError, ProgressSample, RewardError, Sample, Trajectory
-from rfm_client.contract.samples import Footage
+from rfm_client.contract import RewardError, Sample
 
 
 class RewindPredictor:
-    """A ReWiND network on a device; encoders are needed only for samples of raw frames.
+    """A ReWiND network on a device.
 
-    dtype: of the network; its encoders keep theirs. Others than float32 move scores by more than 1e-5
+    dtype: of the network. Others than float32 move scores by more than 1e-5
     """
 
-    def __init__(
-        self,
-        network: RewindTransformer,
-        *,
-        encoders: FrameEncoders | None,
-        device: torch.device,
-        dtype: torch.dtype = torch.float32,
-    ) -> None:
+    def __init__(self, network: RewindTransformer, device: torch.device, dtype: torch.dtype = torch.float32) -> None:
         self.network = network.to(device, dtype).eval()
-        self.encoders = encoders.to(device) if encoders is not None else None
         self.device = device
         self.dtype = dtype
         self.collator = RewindCollator(network.config)
 
-    def rows(self, samples: Sequence[Sample], execution: Execution) -> list[list[Row] | RewardError]:
-        """Each sample's rows, or its error; the frames of all samples are encoded together."""
-        outcomes: list[list[Row] | RewardError] = []
-        for sample in self._embedded(samples, execution):
-            try:
-                outcomes.append(sample if isinstance(sample, RewardError) else self.collator.rows(sample))
-            except InvalidSampleError as error:
-                outcomes.append(error)
-        return outcomes
+    def rows(self, sample: Sample) -> list[Row]:
+        """The rows of a sample of embeddings. Raises InvalidSampleError."""
+        return self.collator.rows(sample)
 
     def num_tokens(self, row: Row) -> int:
         """Tokens of the row."""
@@ -81,28 +62,3 @@ class RewindPredictor:
         if are_finite([frames], logits):  # of all rows at once, which is faster
             return list(scored)
         return checked(scored)
-
-    def _embedded(self, samples: Sequence[Sample], execution: Execution) -> list[Sample | RewardError]:
-        """The samples with embeddings in place of raw frames."""
-        embedded: list[Sample | RewardError] = list(samples)
-        of_frames = {i: s for i, s in enumerate(samples) if s.trajectories[0].frames is not None}
-        raw = {index: Footage(sample.trajectories) for index, sample in of_frames.items()}
-        if raw and self.encoders is None:
-            missing = InvalidSampleError.at("frames", "video_embeddings (no encoders are loaded)", "frames")
-            return [missing if index in raw else sample for index, sample in enumerate(samples)]
-        if raw and self.encoders is not None:
-            for index, encoded in zip(raw, self.encoders.encode(list(raw.values()), execution), strict=True):
-                if isinstance(encoded, Trajectory):
-                    embedded[index] = _with_embeddings(samples[index], encoded)
-                else:
-                    embedded[index] = encoded
-        return embedded
-
-
-def _with_embeddings(sample: Sample, encoded: Trajectory) -> Sample:
-    bounds = np.cumsum([trajectory.num_frames for trajectory in sample.trajectories])[:-1]
-    videos = np.split(encoded.positions, bounds)
-    parts = [Trajectory(video_embeddings=video, text_embedding=encoded.text_embedding) for video in videos]
-    if isinstance(sample, ProgressSample):
-        return replace(sample, trajectory=parts[0])
-    return type(sample)(parts[0], parts[1])

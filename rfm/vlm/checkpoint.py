@@ -35,7 +35,7 @@ from rfm.checkpoint.files import (
     check_shapes,
     read_weights,
 )
-from rfm.family import NETWORK, Description, FrameEncoders, Options
+from rfm.family import NETWORK, Description, Options
 from rfm.version_folder import PROCESSOR_FOLDER
 from rfm.vlm.collator import VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP
@@ -86,6 +86,7 @@ class VlmCheckpoint:
             trained_frames=self.config.trained_frames,
             frame_size=frame_size(self.config),
             frames_per_value=1 if self.config.multi_image else FRAMES_PER_GROUP,
+            is_large=True,
         )
 
     @property
@@ -102,10 +103,8 @@ class VlmCheckpoint:
     def encoders(self) -> None:
         """It has none: the network reads raw frames."""
 
-    def predictor(
-        self, device: torch.device, dtype: torch.dtype | None = None, encoders: FrameEncoders | None = None
-    ) -> VlmPredictor:
-        """The network on ``device``; encoders are of no use to it.
+    def predictor(self, device: torch.device, dtype: torch.dtype | None = None) -> VlmPredictor:
+        """The network on ``device``. Raises CheckpointError.
 
         dtype: of the network; None: float32 on the CPU, else the checkpoint's own
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""RFM and Robometer: raw frames and a task as a conversation, into a vision-language backbone with reward heads."""
+"""A vision-language reward model as a predictor: samples of raw frames in, scores of conversations out."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from rfm.execution import Execution
 from rfm.layers.linear import speed_up
 from rfm.predictor import RowScores, checked, frame_scores, part_of
 from rfm.vlm.collator import VlmCollator, VlmRow
@@ -29,18 +28,10 @@ class VlmPredictor:
         self._dtype = next(network.parameters()).dtype
         self._max_tokens = int(network.model.config.get_text_config().max_position_embeddings)
 
-    def rows(self, samples: Sequence[Sample], execution: Execution) -> list[list[VlmRow] | RewardError]:
-        """Each sample's conversations, or its error; that takes no forward pass."""
-        outcomes: list[list[VlmRow] | RewardError] = []
-        for sample in samples:
-            try:
-                outcomes.append(self._checked(self.collator.rows(sample)))
-            except InvalidSampleError as error:
-                outcomes.append(error)
-        return outcomes
-
-    def _checked(self, rows: list[VlmRow]) -> list[VlmRow]:
-        """The backbone has learned no positions beyond its own; its scores of those would mean nothing."""
+    def rows(self, sample: Sample) -> list[VlmRow]:
+        """The conversations about a sample. Raises InvalidSampleError."""
+        rows = self.collator.rows(sample)
+        # The backbone has learned no positions beyond its own; its scores of those would mean nothing.
         longest = max(row.num_tokens for row in rows)
         if longest > self._max_tokens:
             expected = f"at most {self._max_tokens} tokens (max_position_embeddings of this checkpoint)"
