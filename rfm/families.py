@@ -16,8 +16,7 @@ from rfm.checkpoint.content import CheckpointError, read_run_config
 from rfm.checkpoint.files import best_tag, check_finite, check_links, find
 from rfm.family import Checkpoint, Family, FrameEncoders, Options
 
-# Packages in the order in which they are tried. The last reads what no other does: the first ReWiND checkpoints do
-# not say what they are.
+# Packages in the order in which they are tried. ReWiND's comes last: its first checkpoints do not say what they are.
 FAMILIES = ("rfm.vlm", "rfm.rewind")
 
 __all__ = [
@@ -60,8 +59,8 @@ def choose(folder: Path, package: str | None = None) -> Family:
     """The family of the checkpoint in a local folder: that of ``package``, else the first that reads the folder."""
     if package:
         return named(package)
-    *others, last = map(named, FAMILIES)
-    return next((family for family in others if family.reads(folder)), last)
+    known = [named(name) for name in FAMILIES]
+    return next((family for family in known if family.reads(folder)), known[-1])  # whose error says what was expected
 
 
 def load(

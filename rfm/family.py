@@ -134,7 +134,7 @@ class Family:
     """How checkpoints of one kind are told from others and loaded.
 
     name: the package that has this as its ``FAMILY``
-    reads: whether a folder holds a checkpoint of this kind
+    reads: whether a folder may hold a checkpoint of this kind; asked where nobody names the family
     load: the checkpoint in a local folder; raises CheckpointError
     encoders: the class of its checkpoints' encoders; None: they score raw frames
     """

@@ -50,6 +50,8 @@ TESTS: dict[str, tuple[str, ...]] = {
     "rfm/vlm/lora.py": ("test_vlm", "test_hostile_files"),
     "rfm/vlm/*.py": ("test_vlm",),
     "rfm/families.py": ("test_checkpoint", "test_vlm"),
+    "rfm/predictor.py": ("test_rewind", "test_vlm"),
+    "rfm/embedding.py": ("test_encoders",),
     "rfm/checkpoint/*.py": ("test_checkpoint", "test_hostile_files", "test_properties", "test_vlm"),
     "client/rfm_client/contract/wire.py": ("test_wire", "test_samples", "test_properties"),
     "rfm/triton_model/batch_model.py": ("test_batch_model", "test_poison", "test_logs"),

@@ -146,9 +146,9 @@ class RewindCheckpoint:
 
 
 def reads(folder: Path) -> bool:
-    """Whether the folder holds a checkpoint that says it is ReWiND's; the first ones say nothing."""
+    """Whether the folder does not say that it holds something else; the first ReWiND checkpoints say nothing."""
     config = folder / NETWORK_CONFIG
-    return is_there(config) and read_json(config).get("model_type") == MODEL_TYPE
+    return not is_there(config) or read_json(config).get("model_type", MODEL_TYPE) == MODEL_TYPE
 
 
 def load(folder: Path, options: Options) -> RewindCheckpoint:
