@@ -30,7 +30,6 @@ from rich.console import Console
 
 import rfm_export
 from rfm.config import ServeConfig
-from rfm.families import save
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindConfig, RewindTransformer
 
@@ -158,7 +157,7 @@ def checkpoint(size: str, folder: Path, threads: int) -> Checkpoint:
     else:
         torch.manual_seed(0)
         source, encoders = folder / size, None
-        save(RewindCheckpoint(DEFAULT_SIZE, RewindTransformer(DEFAULT_SIZE).state_dict()), source)
+        RewindCheckpoint(DEFAULT_SIZE, RewindTransformer(DEFAULT_SIZE).state_dict()).save(source)
         serve = ServeConfig(num_gpus=0, torch_threads=threads)
     rfm_export.export(source, repository, serve)
     return Checkpoint(size, source, repository, serve.instances, serve.torch_threads, encoders)

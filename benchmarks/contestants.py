@@ -71,7 +71,7 @@ class BareEngine:
     def __init__(self, checkpoint: Checkpoint) -> None:
         encoders = Encoders.from_pretrained(*checkpoint.encoders) if checkpoint.encoders else None
         self.engine = Engine.from_checkpoint(checkpoint.folder, encoders=encoders)
-        config = self.engine.family.network.config
+        config = self.engine.predictor.network.config
         self.widths = config.video_feature_dim, config.text_feature_dim
 
     def measure(self, load: Load, batch_size: int) -> Measured:

@@ -30,8 +30,8 @@ from torch._inductor import config as inductor
 
 from rfm.engine import Engine
 from rfm.layers.heads import progress_from_logits
-from rfm.rewind.family import RewindFamily
 from rfm.rewind.network import RewindBatch, RewindConfig, RewindTransformer
+from rfm.rewind.predictor import RewindPredictor
 from rfm_client import ProgressResult, ProgressSample, Trajectory
 
 BATCH_SIZES = (1, 2, 4, 8, 16, 32, 64)
@@ -214,7 +214,7 @@ def _cost(config: RewindConfig, batch_size: int, num_frames: int, rounds: int) -
 
 
 def _engine(config: RewindConfig) -> Engine:
-    return Engine(RewindFamily(RewindTransformer(config), encoders=None, device=torch.device("cpu")))
+    return Engine(RewindPredictor(RewindTransformer(config), torch.device("cpu")))
 
 
 def _inputs(config: RewindConfig, batch_size: int, num_frames: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -91,7 +91,6 @@ def _in_process(folder: Path) -> Evaluate:
     from rfm.rewind.encoders import Encoders
 
     loaded = families.load(folder / "checkpoint")
-    assert isinstance(loaded, families.RewindCheckpoint)
     encoders = Encoders.from_pretrained(
         folder / "image_encoder",
         folder / "text_encoder",

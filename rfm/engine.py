@@ -7,7 +7,6 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from itertools import groupby
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -16,11 +15,10 @@ import torch
 
 from rfm import families
 from rfm.config import DEFAULT_SAMPLE_TOKENS, DEFAULT_TOKEN_BUDGET
+from rfm.embedding import embedded
 from rfm.execution import Execution, memory_errors
-from rfm.family import Family, RowScores
-from rfm.rewind.encoders import Encoders
-from rfm.rewind.family import RewindFamily
-from rfm.vlm.family import VlmFamily
+from rfm.family import Checkpoint, FrameEncoders
+from rfm.predictor import Predictor, RowScores
 from rfm_client.contract import (
     BatchTiming,
     FrameScores,
@@ -37,25 +35,26 @@ from rfm_client.contract import (
 
 Outcome: TypeAlias = Result | RewardError
 
-PROCESSOR_FOLDER = "processor"  # in an exported vision-language checkpoint: its tokenizer and image preprocessing
-
 
 class Engine:
     """Scores samples with one network on one device.
 
-    family: the network and how samples become its batches
+    predictor: the network and how samples become its batches
+    encoders: on the same device, for samples of raw frames where the network scores embeddings
     token_budget: the most tokens, padding included, of one forward pass of several rows; a larger row runs alone
     max_sample_tokens: the most tokens of one row; a sample that needs more is refused
     """
 
     def __init__(
         self,
-        family: Family[Any, Any],
+        predictor: Predictor[Any, Any],
         *,
+        encoders: FrameEncoders | None = None,
         token_budget: int = DEFAULT_TOKEN_BUDGET,
         max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS,
     ) -> None:
-        self.family = family
+        self.predictor = predictor
+        self.encoders = encoders
         self.token_budget = token_budget
         self.max_sample_tokens = max_sample_tokens
 
@@ -64,7 +63,8 @@ class Engine:
         cls,
         source: str | Path,
         *,
-        encoders: Encoders | None = None,
+        family: str | None = None,
+        encoders: FrameEncoders | None = None,
         base_model: str | None = None,
         resize_images: bool | None = None,
         device: str | torch.device = "cpu",
@@ -74,16 +74,12 @@ class Engine:
     ) -> Engine:
         """The engine of a checkpoint folder or Hugging Face id. Raises CheckpointError.
 
-        encoders: of a ReWiND checkpoint, for samples of raw frames
-        base_model, resize_images: of a vision-language checkpoint, as in ``rfm.checkpoint.load``
-        dtype: of the network; None: float32, and a vision-language checkpoint's own on a GPU
+        family, base_model, resize_images: as in ``rfm.families.load``
+        others: as in ``of``
         """
-        folder = families.find(source)
-        own = folder / PROCESSOR_FOLDER
         return cls.of(
-            families.load(folder, base_model=base_model, resize_images=resize_images),
+            families.load(source, family=family, base_model=base_model, resize_images=resize_images),
             encoders=encoders,
-            processor=base_model or (own if own.is_dir() else None),
             device=device,
             dtype=dtype,
             token_budget=token_budget,
@@ -93,29 +89,23 @@ class Engine:
     @classmethod
     def of(
         cls,
-        checkpoint: families.Checkpoint,
+        checkpoint: Checkpoint,
         *,
-        encoders: Encoders | None = None,
-        processor: str | Path | None = None,
+        encoders: FrameEncoders | None = None,
         device: str | torch.device = "cpu",
         dtype: torch.dtype | None = None,
         token_budget: int = DEFAULT_TOKEN_BUDGET,
         max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS,
     ) -> Engine:
-        """The engine of a checkpoint in memory.
+        """The engine of a checkpoint in memory. Raises CheckpointError.
 
-        processor: folder or id of a vision-language checkpoint's tokenizer and image preprocessing; None: of the
-        base model that it names
+        encoders: for samples of raw frames, where the network scores embeddings
+        dtype: of the network; None: float32, and a vision-language checkpoint's own on a GPU
         """
         on = torch.device(device)
-        if isinstance(checkpoint, families.RewindCheckpoint):
-            family = RewindFamily(checkpoint.build(), encoders=encoders, device=on, dtype=dtype or torch.float32)
-            return cls(family, token_budget=token_budget, max_sample_tokens=max_sample_tokens)
-        if dtype is None and on.type == "cpu":
-            dtype = torch.float32
-        processor = processor or checkpoint.config.base_model_id
-        vlm = VlmFamily.of(checkpoint, processor, on, dtype)
-        return cls(vlm, token_budget=token_budget, max_sample_tokens=max_sample_tokens)
+        predictor = checkpoint.predictor(on, dtype)
+        encoders = None if encoders is None else encoders.to(on)
+        return cls(predictor, encoders=encoders, token_budget=token_budget, max_sample_tokens=max_sample_tokens)
 
     def evaluate(self, samples: Sequence[Sample], execution: Execution | None = None) -> list[Outcome]:
         """The result of each sample, or the error of one that has none; neighbours make no difference.
@@ -130,10 +120,11 @@ class Engine:
         outcomes: dict[int, Outcome] = {}
         rows: list[Any] = []
         rows_of: dict[int, slice] = {}
-        for index, sample_rows in enumerate(self.family.rows(samples, execution)):
-            error = sample_rows if isinstance(sample_rows, RewardError) else self._too_long(sample_rows)
-            if isinstance(sample_rows, RewardError) or error is not None:
-                outcomes[index] = error  # type: ignore[assignment]
+        for index, sample in enumerate(self._embedded(samples, execution)):
+            try:
+                sample_rows = self._rows(sample)
+            except RewardError as error:
+                outcomes[index] = error
                 continue
             rows_of[index] = slice(len(rows), len(rows) + len(sample_rows))
             rows += sample_rows
@@ -146,12 +137,19 @@ class Engine:
             outcomes[index] = _outcome(samples[index], scores[of_sample], timing)
         return [outcomes[index] for index in range(len(samples))]
 
-    def _too_long(self, rows: Sequence[Any]) -> InvalidSampleError | None:
-        longest = max(self.family.num_tokens(self.family.lengths(row)) for row in rows)
-        if longest <= self.max_sample_tokens:
-            return None
-        expected = f"at most {self.max_sample_tokens} tokens (max_sample_tokens of this server)"
-        return InvalidSampleError.at("num_frames", expected, f"{longest} tokens")
+    def _embedded(self, samples: Sequence[Sample], execution: Execution) -> Sequence[Sample | RewardError]:
+        return samples if self.encoders is None else embedded(samples, self.encoders, execution)
+
+    def _rows(self, sample: Sample | RewardError) -> list[Any]:
+        """The sample's rows. Raises the error that it is, and InvalidSampleError."""
+        if isinstance(sample, RewardError):
+            raise sample
+        rows = self.predictor.rows(sample)
+        longest = max(self.predictor.num_tokens(row) for row in rows)
+        if longest > self.max_sample_tokens:
+            expected = f"at most {self.max_sample_tokens} tokens (max_sample_tokens of this server)"
+            raise InvalidSampleError.at("num_frames", expected, f"{longest} tokens")
+        return rows
 
     def _scores(self, rows: Sequence[Any], execution: Execution) -> list[RowScores | RewardError]:
         """Each row's scores. While a batch is in its forward pass the next is collated."""
@@ -178,7 +176,7 @@ class Engine:
         """The batch of the rows; None if it does not fit in memory now."""
         try:
             with memory_errors():
-                return self.family.collate(rows)
+                return self.predictor.collate(rows)
         except torch.OutOfMemoryError:
             return None
 
@@ -186,27 +184,23 @@ class Engine:
         """Of one forward pass. batch: of all rows, if it is made"""
 
         def forward(part: Sequence[Any]) -> Sequence[RowScores | RewardError]:
-            of_part = batch if part is rows and batch is not None else self.family.collate(part)
-            scores = self.family.score(part, of_part)
-            execution.add_tokens(*self.family.occupancy(of_part))
+            of_part = batch if part is rows and batch is not None else self.predictor.collate(part)
+            scores = self.predictor.score(part, of_part)
+            execution.add_tokens(*self.predictor.occupancy(of_part))
             return scores
 
         return execution.run(forward, rows)
 
     def _micro_batches(self, rows: Sequence[Any]) -> Iterator[list[int]]:
-        """Indices of the rows of each forward: one kind, similar lengths, within the token budget."""
-        lengths = [self.family.lengths(row) for row in rows]
-        in_order = sorted(range(len(rows)), key=lambda index: (len(lengths[index]), lengths[index]))
-        for _, kind in groupby(in_order, key=lambda index: len(lengths[index])):
-            part: list[int] = []
-            padded: tuple[int, ...] = ()
-            for index in kind:
-                grown = tuple(map(max, padded, lengths[index])) if part else lengths[index]
-                if part and (len(part) + 1) * self.family.num_tokens(grown) > self.token_budget:
-                    yield part
-                    part, grown = [], lengths[index]
-                part.append(index)
-                padded = grown
+        """Indices of the rows of each forward: similar numbers of tokens, within the token budget."""
+        num_tokens = [self.predictor.num_tokens(row) for row in rows]
+        part: list[int] = []
+        for index in sorted(range(len(rows)), key=num_tokens.__getitem__):
+            if part and (len(part) + 1) * num_tokens[index] > self.token_budget:
+                yield part
+                part = []
+            part.append(index)
+        if part:
             yield part
 
 

@@ -9,42 +9,76 @@ construct nothing.
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
-from typing import TypeAlias
 
-from rfm.checkpoint.content import CheckpointError, is_there, read_json, read_run_config
-from rfm.checkpoint.files import NETWORK_CONFIG, best_tag, check_finite, check_links, find
-from rfm.rewind.checkpoint import RewindCheckpoint, load_rewind, save_rewind
-from rfm.vlm.checkpoint import ADAPTER_CONFIG, VlmCheckpoint, load_vlm, save_vlm
-from rfm.vlm.network import BACKBONES
+from rfm.checkpoint.content import CheckpointError, read_run_config
+from rfm.checkpoint.files import best_tag, check_finite, check_links, find
+from rfm.family import Checkpoint, Family, FrameEncoders, Options
 
-Checkpoint: TypeAlias = RewindCheckpoint | VlmCheckpoint
+# Packages in the order in which they are tried. ReWiND's comes last: its first checkpoints do not say what they are.
+FAMILIES = ("rfm.vlm", "rfm.rewind")
 
 __all__ = [
+    "FAMILIES",
     "Checkpoint",
     "CheckpointError",
-    "RewindCheckpoint",
-    "VlmCheckpoint",
     "best_tag",
     "check",
+    "choose",
+    "encoders_of",
     "find",
     "load",
+    "named",
     "read_run_config",
-    "save",
 ]
 
 
-def load(source: str | Path, *, base_model: str | None = None, resize_images: bool | None = None) -> Checkpoint:
+def named(package: str) -> Family:
+    """The family that a package holds as its ``FAMILY``. Raises CheckpointError if it holds none."""
+    try:
+        family = getattr(import_module(package), "FAMILY", None)
+    except ImportError as error:
+        raise CheckpointError(f"family: expected a package that can be imported, got {package}: {error}") from error
+    if not isinstance(family, Family):
+        raise CheckpointError(f"family: expected a package with a FAMILY, got {package}")
+    return family
+
+
+def encoders_of(package: str | None) -> type[FrameEncoders]:
+    """The class of the encoders of a family; None: of the one whose exports did not name it. Raises CheckpointError if
+    it has none.
+    """
+    encoders = named(package or FAMILIES[-1]).encoders
+    if encoders is None:
+        raise CheckpointError(f"family: expected one with encoders, got {package}, whose checkpoints score raw frames")
+    return encoders
+
+
+def choose(folder: Path, package: str | None = None) -> Family:
+    """The family of the checkpoint in a local folder: that of ``package``, else the first that reads the folder."""
+    if package:
+        return named(package)
+    known = [named(name) for name in FAMILIES]
+    return next((family for family in known if family.reads(folder)), known[-1])  # whose error says what was expected
+
+
+def load(
+    source: str | Path,
+    *,
+    family: str | None = None,
+    base_model: str | None = None,
+    resize_images: bool | None = None,
+    image_encoder: str | None = None,
+    text_encoder: str | None = None,
+) -> Checkpoint:
     """The checkpoint at a local folder or Hugging Face id. Raises CheckpointError.
 
-    base_model: folder or id of a vision-language checkpoint's backbone; else the one that the checkpoint names
-    resize_images: of a vision-language checkpoint that reads frames as images and whose run set a size for them:
-        whether it was trained with that size; None: such a checkpoint is refused
+    family: package of its family; None: as the folder's files tell
+    others: as in ``rfm.family.Options``
     """
     folder = find(source)
-    if is_there(folder / ADAPTER_CONFIG) or _model_type(folder) in BACKBONES:
-        return load_vlm(folder, base_model, resize_images)
-    return load_rewind(folder)
+    return choose(folder, family).load(folder, Options(base_model, resize_images, image_encoder, text_encoder))
 
 
 def check(folder: Path, checkpoint: Checkpoint) -> None:
@@ -52,22 +86,5 @@ def check(folder: Path, checkpoint: Checkpoint) -> None:
     refuses: links that lead out of it, and weights that are no numbers.
     """
     check_links(folder)
-    if isinstance(checkpoint, RewindCheckpoint):
-        for weights in (checkpoint.network, checkpoint.image_encoder, checkpoint.text_encoder):
-            check_finite(weights)
-    else:
-        check_finite(checkpoint.weights)
-
-
-def save(checkpoint: Checkpoint, folder: Path) -> None:
-    """Writes network and configuration in a layout that ``load`` reads; no encoders."""
-    if isinstance(checkpoint, RewindCheckpoint):
-        save_rewind(checkpoint, folder)
-    else:
-        save_vlm(checkpoint, folder)
-
-
-def _model_type(folder: Path) -> str | None:
-    config = folder / NETWORK_CONFIG
-    told = read_json(config).get("model_type") if is_there(config) else None
-    return told if isinstance(told, str) else None
+    for weights in checkpoint.parts.values():
+        check_finite(weights)

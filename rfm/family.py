@@ -1,88 +1,145 @@
 # SPDX-License-Identifier: MIT
-"""What the engine needs of a kind of checkpoint. One module in ``rfm.families`` for each."""
+"""What the engine and the export need of a family of checkpoints. A package with a ``FAMILY`` in it is one."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from pathlib import Path
+from typing import Any, Protocol
 
-import numpy as np
+import torch
 from torch import Tensor
 
 from rfm.execution import Execution
-from rfm.layers.heads import progress_from_logits
-from rfm_client.contract import FrameScores, InferenceFailedError, RewardError, Sample
+from rfm.predictor import Predictor
+from rfm_client.contract import FrameSize, RewardError, Trajectory
+from rfm_client.contract.samples import Footage
 
-Row = TypeVar("Row")
-Batch = TypeVar("Batch")
-
-
-@dataclass(frozen=True, eq=False)
-class RowScores:
-    """Scores of one row: of the frames of its trajectories, and of its question about two of them."""
-
-    frames: list[FrameScores]
-    query: float | None = None
+NETWORK = "network"  # in Checkpoint.parts: the weights of the network that scores
 
 
-def has_numbers(row: RowScores) -> bool:
-    """Whether the network gave a number for every score."""
-    arrays = [array for scores in row.frames for array in (scores.progress, scores.success)]
-    return all(np.isfinite(array).all() for array in arrays) and (row.query is None or bool(np.isfinite(row.query)))
+@dataclass(frozen=True)
+class Options:
+    """What a user may say of a checkpoint that its files do not tell. Each family reads its own.
 
-
-def checked(rows: Sequence[RowScores], batch: RowScores | None = None) -> list[RowScores | RewardError]:
-    """The rows, with an error in place of one that has a score that is no number.
-
-    batch: all scores that the rows are parts of, padding included; if it has numbers alone, so has every row
+    base_model: folder or id of a vision-language checkpoint's backbone; None: the one that the checkpoint names
+    resize_images: of a vision-language checkpoint that reads frames as images and whose run set a size for them:
+        whether it was trained with that size; None: such a checkpoint is refused
+    image_encoder, text_encoder: folders or ids of a ReWiND checkpoint's encoders; None: the usual ones, if the
+        checkpoint has weights of encoders
     """
-    if batch is not None and has_numbers(batch):
-        return list(rows)
-    failed = InferenceFailedError("the network gave a score that is not finite")
-    return [row if has_numbers(row) else failed for row in rows]
+
+    base_model: str | None = None
+    resize_images: bool | None = None
+    image_encoder: str | None = None
+    text_encoder: str | None = None
 
 
-class Family(Protocol[Row, Batch]):
-    """A network on a device, and how samples become its batches. A row is one token sequence of a forward."""
+@dataclass(frozen=True)
+class Description:
+    """What a checkpoint can be asked, and what it answers.
 
-    def rows(self, samples: Sequence[Sample], execution: Execution) -> list[list[Row] | RewardError]:
-        """Each sample's rows (in dense mode one a frame), or why this checkpoint cannot score it.
+    network_class: name of the network's class
+    widths: Dv and Dt of the embeddings that it scores; None: it scores raw frames
+    progress_bins: K; 1: continuous progress
+    max_frames: the longest trajectory that its network can take; None: any length
+    trained_frames: the most frames of a trajectory in training; None: the checkpoint does not say
+    frame_size: to what it brings each raw frame; None: that depends on the frame
+    frames_per_value: frames that share their scores
+    is_large: its exports are verified on the device and in the type that serve it, since float32 on the CPU takes long
+    """
 
-        execution: what forward passes for it took is added to it
+    network_class: str
+    widths: tuple[int, int] | None
+    progress_bins: int
+    has_similarity: bool
+    max_frames: int | None = None
+    trained_frames: int | None = None
+    frame_size: FrameSize | None = None
+    frames_per_value: int = 1
+    is_large: bool = False
+
+
+@dataclass(frozen=True)
+class EncodersDescription:
+    """What the export tells of encoders.
+
+    network_class: name of their class
+    frame_size: to what they bring each raw frame; None: that depends on the frame
+    """
+
+    network_class: str
+    frame_size: FrameSize | None = None
+
+
+class FrameEncoders(Protocol):
+    """Networks that make the embeddings that a checkpoint scores of raw frames and their task."""
+
+    @classmethod
+    def load(cls, folder: Path) -> FrameEncoders:
+        """Those that ``save`` wrote."""
+
+    @classmethod
+    def describe(cls, folder: Path) -> EncodersDescription:
+        """Of those that ``save`` wrote, without loading them."""
+
+    @property
+    def description(self) -> EncodersDescription:
+        """What the export tells of them."""
+
+    def save(self, folder: Path) -> None:
+        """Writes them into a folder that may be there, so that ``load`` needs no network."""
+
+    def to(self, device: torch.device) -> FrameEncoders:
+        """Moves them to ``device``."""
+
+    def encode(self, samples: Sequence[Footage], execution: Execution) -> list[Trajectory | RewardError]:
+        """The embeddings of each sample's frames, one trajectory after the other, and task, or why there are none.
+
+        execution: what it took is added to it
         """
 
-    def lengths(self, row: Row) -> tuple[int, ...]:
-        """What decides which rows share a batch: similar lengths do. Rows of unlike counts share none."""
 
-    def num_tokens(self, lengths: Sequence[int]) -> int:
-        """Tokens of a row of these lengths."""
+class Checkpoint(Protocol):
+    """A checkpoint in memory."""
 
-    def collate(self, rows: Sequence[Row]) -> Batch:
-        """One batch, on the CPU; may run while the device computes."""
+    @property
+    def config(self) -> Any:
+        """What its network looks like: a dataclass."""
 
-    def occupancy(self, batch: Batch) -> tuple[int, int]:
-        """Tokens of the batch's rows, and of its forward pass, padding included."""
+    @property
+    def description(self) -> Description:
+        """What it can be asked, and what it answers."""
 
-    def score(self, rows: Sequence[Row], batch: Batch) -> list[RowScores | RewardError]:
-        """One forward pass, read back to the CPU; an error for a row that has no scores."""
+    @property
+    def parts(self) -> Mapping[str, Mapping[str, Tensor]]:
+        """All weights by part and name. The part NETWORK is always there."""
+
+    def encoders(self) -> FrameEncoders | None:
+        """Its encoders; None: it has none. Raises CheckpointError if they cannot be had or do not fit."""
+
+    def predictor(self, device: torch.device, dtype: torch.dtype | None = None) -> Predictor[Any, Any]:
+        """Its network on ``device``. Raises CheckpointError.
+
+        dtype: of the network; None: as checkpoint and device decide
+        """
+
+    def save(self, folder: Path) -> None:
+        """Writes all but its encoders into a new folder that its family loads without options and without network."""
 
 
-def frame_scores(progress_logits: Tensor, success_logits: Tensor) -> FrameScores:
-    """On the CPU, from logits [..., K] and [...]: progress and success, and of discrete progress its logits."""
-    discrete = progress_logits.shape[-1] > 1
-    return FrameScores(
-        progress=progress_from_logits(progress_logits).cpu().numpy(),
-        success=success_logits.sigmoid().float().cpu().numpy(),
-        progress_logits=progress_logits.float().cpu().numpy() if discrete else None,
-    )
+@dataclass(frozen=True)
+class Family:
+    """How checkpoints of one kind are told from others and loaded.
 
+    name: the package that has this as its ``FAMILY``
+    reads: whether a folder may hold a checkpoint of this kind; asked where nobody names the family
+    load: the checkpoint in a local folder; raises CheckpointError
+    encoders: the class of its checkpoints' encoders; None: they score raw frames
+    """
 
-def part_of(scores: FrameScores, index: object) -> FrameScores:
-    """The scores at ``index`` of each array."""
-    logits = scores.progress_logits
-    return FrameScores(
-        progress=scores.progress[index],  # type: ignore[call-overload]
-        success=scores.success[index],  # type: ignore[call-overload]
-        progress_logits=None if logits is None else logits[index],  # type: ignore[call-overload]
-    )
+    name: str
+    reads: Callable[[Path], bool]
+    load: Callable[[Path, Options], Checkpoint]
+    encoders: type[FrameEncoders] | None = None

@@ -4,4 +4,5 @@
 THREADS_PARAMETER = "torch_threads"  # parameters of config.pbtxt; rfm_export writes them
 BUDGET_PARAMETER = "token_budget"
 SAMPLE_TOKENS_PARAMETER = "max_sample_tokens"
+FAMILY_PARAMETER = "family"  # the package of its checkpoint's family
 DTYPE_PARAMETER = "dtype"  # empty: as the checkpoint and the device decide

@@ -6,25 +6,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
-from rfm_client.contract import ProgressSample, Trajectory, wire
-
-_BLANK_FRAMES = 2
-_BLANK_PX = 64
+from rfm_client.contract import ProgressSample, wire
+from rfm_client.contract.made_up import blank_trajectory
 
 
 def blank_question(config: Mapping[str, Any]) -> wire.Tensors:
-    """The least that a model with this configuration can be asked: the inputs of one short sample of zeros."""
+    """The inputs of one blank sample, for a model with this configuration."""
     dims = {tensor["name"]: [int(dim) for dim in tensor["dims"]] for tensor in config["input"]}
+    widths = None
     if wire.VIDEO_EMBEDDINGS in dims:
-        (_, video_dim), (text_dim,) = dims[wire.VIDEO_EMBEDDINGS], dims[wire.TEXT_EMBEDDING]
-        trajectory = Trajectory(
-            video_embeddings=np.zeros((_BLANK_FRAMES, video_dim), np.float32),
-            text_embedding=np.zeros(text_dim, np.float32),
-        )
-    else:
-        blank = np.zeros((_BLANK_FRAMES, _BLANK_PX, _BLANK_PX, 3), np.uint8)
-        trajectory = Trajectory(frames=blank, task="canary")
-    tensors = wire.encode_samples([ProgressSample(trajectory)])
+        widths = dims[wire.VIDEO_EMBEDDINGS][-1], dims[wire.TEXT_EMBEDDING][-1]
+    tensors = wire.encode_samples([ProgressSample(blank_trajectory(widths))])
     return {name: tensor for name, tensor in tensors.items() if name in dims}

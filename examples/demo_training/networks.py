@@ -13,7 +13,6 @@ from torch import Tensor, nn
 
 from demo_training.groups import HINT_DIM
 from rfm.checkpoint.files import WEIGHTS
-from rfm.families import save
 from rfm.rewind.checkpoint import IMAGE_ENCODER_PREFIX, TEXT_ENCODER_PREFIX, RewindCheckpoint
 from rfm.rewind.encoders import Encoders, ImagePreprocessor
 from rfm.rewind.network import RewindConfig, RewindTransformer
@@ -90,7 +89,7 @@ def write_checkpoint(learner: Learner, folder: Path) -> None:
     """Writes ``checkpoint`` in upstream's layout, and ``image_encoder`` and ``text_encoder``, its base models."""
     encoders = learner.encoders
     encoders.save_pretrained(folder / "image_encoder", folder / "text_encoder")
-    save(RewindCheckpoint(CONFIG, learner.network.state_dict()), folder / "checkpoint")
+    RewindCheckpoint(CONFIG, learner.network.state_dict()).save(folder / "checkpoint")
     weights = load_file(folder / "checkpoint" / WEIGHTS)
     parts = ((IMAGE_ENCODER_PREFIX, encoders.image_model), (TEXT_ENCODER_PREFIX, encoders.text_model))
     for prefix, model in parts:

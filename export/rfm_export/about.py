@@ -17,11 +17,7 @@ from tritonclient.grpc import model_config_pb2 as pb
 from rfm.checkpoint.content import read_run_config
 from rfm.checkpoint.digest import weights_digest
 from rfm.checkpoint.files import find_run_config
-from rfm.families import Checkpoint
-from rfm.rewind.checkpoint import RewindCheckpoint
-from rfm.rewind.encoders import Encoders
-from rfm.rewind.network import RewindTransformer
-from rfm.vlm.network import VlmRewardModel
+from rfm.family import NETWORK, Checkpoint, EncodersDescription
 from rfm_client.contract.model_info import (
     DIGEST_PARAMETER,
     NETWORK_PARAMETER,
@@ -75,11 +71,11 @@ def about(checkpoint: Checkpoint, origin: Origin) -> dict[str, str]:
     return {**origin.parameters, NETWORK_PARAMETER: json.dumps(_network(checkpoint))}
 
 
-def about_encoders(of_scorer: Mapping[str, str]) -> dict[str, str]:
+def about_encoders(encoders: EncodersDescription, of_scorer: Mapping[str, str]) -> dict[str, str]:
     """Parameters of the encoders that were exported with a scorer of these parameters."""
     return {
         **{name: of_scorer[name] for name in (SOURCE_PARAMETER, REVISION_PARAMETER)},
-        NETWORK_PARAMETER: json.dumps({"class": Encoders.__name__}),
+        NETWORK_PARAMETER: json.dumps({"class": encoders.network_class}),
     }
 
 
@@ -106,13 +102,11 @@ def _is_secret(key: str, value: Any) -> bool:
 
 
 def _network(checkpoint: Checkpoint) -> dict[str, Any]:
-    is_rewind = isinstance(checkpoint, RewindCheckpoint)
-    weights = checkpoint.network if isinstance(checkpoint, RewindCheckpoint) else checkpoint.weights
     parameters: Counter[str] = Counter()
-    for name, tensor in weights.items():
+    for name, tensor in checkpoint.parts[NETWORK].items():
         parameters[name.partition(".")[0]] += tensor.numel()
     return {
-        "class": (RewindTransformer if is_rewind else VlmRewardModel).__name__,
+        "class": checkpoint.description.network_class,
         "config": asdict(checkpoint.config),
         "parameters": dict(parameters),
     }

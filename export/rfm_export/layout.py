@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
 """The models that serve a checkpoint, and every generated file of them.
 
-ReWiND: ``<name>`` scores embeddings. With encoders there are also ``<name>_encoder`` and ``<name>_frames``, the
-ensemble of the two that scores raw frames. Vision-language: ``<name>_frames`` alone.
+Of a checkpoint that scores embeddings ``<name>`` does so; with encoders there are also ``<name>_encoder`` and
+``<name>_frames``, the ensemble of the two, which scores raw frames. A checkpoint that scores raw frames itself is
+``<name>_frames`` alone.
 """
 
 from __future__ import annotations
@@ -11,16 +12,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 
-import numpy as np
 from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.config import ServeConfig
-from rfm.rewind.network import RewindConfig
-from rfm.vlm.family import SMOL_SIZE_PX
-from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, fitted_size
-from rfm.vlm.network import SMOL, VlmConfig
-from rfm_client.contract import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory, wire
-from rfm_client.contract.frame_size import FrameSize
+from rfm.family import Description, EncodersDescription
+from rfm.parameters import FAMILY_PARAMETER
+from rfm_client.contract import FrameSize, PreferenceSample, ProgressSample, Sample, SimilaritySample, wire
+from rfm_client.contract.made_up import blank_trajectory
 from rfm_client.contract.model_info import FRAME_SIZE_PARAMETER, FRAMES_PER_VALUE_PARAMETER, MAX_FRAMES_PARAMETER
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_export.about import about_encoders
@@ -31,8 +29,7 @@ MODEL_FILE = "model.py"
 WARMUP_FOLDER = "warmup"
 KEEP_FILE = ".keep"  # Triton wants an ensemble's version folder, and git forgets empty ones
 
-WARMUP_FRAMES = 2
-WARMUP_SIZE_PX = 64
+WARMUP_TASK = "warm up"
 
 
 @dataclass(frozen=True)
@@ -66,101 +63,79 @@ class GeneratedModel:
         return {f"{self.name}/{path}": content for path, content in contents.items()}
 
 
-def rewind_models(
-    config: RewindConfig,
-    serve: ServeConfig,
-    about: Mapping[str, str],
-    *,
-    num_gpus: int,
-    version: int,
-    frame_size: FrameSize | None,
-) -> list[GeneratedModel]:
-    """The models of a checkpoint; an ensemble stands behind what it is made of.
+@dataclass(frozen=True)
+class Version:
+    """What the models of one exported version have in common.
 
+    num_gpus: 0: the CPU
+    family: package of the checkpoint's family
     about: parameters that tell which checkpoint it is
-    frame_size: to what its encoders bring each frame; None: it has no encoders
     """
-    dims = config.video_feature_dim, config.text_feature_dim
-    outputs = wire.score_outputs(config.progress_bins if config.progress_bins > 1 else None)
-    limit = min((n for n in (config.trained_frames, config.max_frames) if n is not None), default=None)
-    scorer = Interface(serve.name, wire.embedding_inputs(*dims), outputs, {**_limits(limit), **about})
-    models = [
-        _python_model(
-            scorer, "rfm", serve, num_gpus, version, _warmups(_warmup_embeddings(config), config.has_similarity)
-        )
-    ]
-    if frame_size is not None:
-        encoder = Interface(
-            encoder_name(serve.name), wire.encoder_inputs(), wire.encoder_outputs(*dims), about_encoders(about)
-        )
-        frames = Interface(
-            frames_name(serve.name), wire.frame_inputs(), outputs, {**_limits(limit, frame_size), **about}
-        )
-        models.append(_python_model(encoder, "rfm_encoder", serve, num_gpus, version, [_encoder_warmup()]))
-        models.append(GeneratedModel(ensemble_config(frames, serve, version, encoder, scorer), version))
+
+    number: int
+    serve: ServeConfig
+    num_gpus: int
+    family: str
+    about: Mapping[str, str]
+
+
+def scorer_name(description: Description, name: str) -> str:
+    """Name of the model that has the checkpoint, of those that are served as ``name``."""
+    return frames_name(name) if description.widths is None else name
+
+
+def generated_models(
+    description: Description, encoders: EncodersDescription | None, version: Version
+) -> list[GeneratedModel]:
+    """The models of a checkpoint and its encoders, if it has some; an ensemble stands behind what it is made of."""
+    name, widths = version.serve.name, description.widths
+    outputs = wire.score_outputs(description.progress_bins if description.progress_bins > 1 else None)
+    inputs = wire.frame_inputs() if widths is None else wire.embedding_inputs(*widths)
+    about = {**_limits(description, description.frame_size), **version.about}
+    scorer = Interface(scorer_name(description, name), inputs, outputs, about)
+    models = [_python_model(scorer, "rfm", version, _warmups(description))]
+    if encoders is None or widths is None:
+        return models
+    about = about_encoders(encoders, version.about)
+    encoder = Interface(encoder_name(name), wire.encoder_inputs(), wire.encoder_outputs(*widths), about)
+    about = {**_limits(description, encoders.frame_size), **version.about}
+    frames = Interface(frames_name(name), wire.frame_inputs(), outputs, about)
+    models.append(_python_model(encoder, "rfm_encoder", version, [_encoder_warmup()]))
+    models.append(
+        GeneratedModel(ensemble_config(frames, version.serve, version.number, encoder, scorer), version.number)
+    )
     return models
 
 
-def vlm_models(
-    config: VlmConfig, serve: ServeConfig, about: Mapping[str, str], *, num_gpus: int, version: int
-) -> list[GeneratedModel]:
-    """The one model of a vision-language checkpoint."""
-    outputs = wire.score_outputs(config.progress_bins if config.progress_bins > 1 else None)
-    limits = _limits(config.trained_frames, _frame_size(config), 1 if config.multi_image else FRAMES_PER_GROUP)
-    frames = Interface(frames_name(serve.name), wire.frame_inputs(), outputs, {**limits, **about})
-    warmups = _warmups(_warmup_frames(), config.has_similarity)
-    return [_python_model(frames, "rfm", serve, num_gpus, version, warmups)]
-
-
-def _limits(max_frames: int | None, frame_size: FrameSize | None = None, frames_per_value: int = 1) -> dict[str, str]:
+def _limits(description: Description, frame_size: FrameSize | None) -> dict[str, str]:
     """What a client may want to know before it sends a trajectory; empty: no limit."""
+    limits = [n for n in (description.trained_frames, description.max_frames) if n is not None]
     return {
-        MAX_FRAMES_PARAMETER: "" if max_frames is None else str(max_frames),
+        MAX_FRAMES_PARAMETER: str(min(limits)) if limits else "",
         FRAME_SIZE_PARAMETER: "" if frame_size is None else str(frame_size),
-        FRAMES_PER_VALUE_PARAMETER: str(frames_per_value),
+        FRAMES_PER_VALUE_PARAMETER: str(description.frames_per_value),
     }
 
 
-def _frame_size(config: VlmConfig) -> FrameSize | None:
-    if config.family == SMOL:
-        return FrameSize("longest", (SMOL_SIZE_PX,))
-    if config.size_px is None:
-        return None
-    vision = config.backbone["vision_config"]
-    factor = vision["patch_size"] * MERGE * (1 if config.multi_image else FRAMES_PER_GROUP)
-    return FrameSize("exact", fitted_size(*config.size_px, factor))  # the first size to which the server resizes
-
-
-def _python_model(
-    interface: Interface, template: str, serve: ServeConfig, num_gpus: int, version: int, warmups: list[Warmup]
-) -> GeneratedModel:
+def _python_model(interface: Interface, template: str, version: Version, warmups: list[Warmup]) -> GeneratedModel:
     model_file = resources.files("rfm_export") / "templates" / template / MODEL_FILE
     files = {name: content for warmup in warmups for name, content in warmup.files().items()}
-    config = python_config(interface, serve, num_gpus, version, warmups)
-    return GeneratedModel(config, version, model_file.read_bytes(), files)
+    config = python_config(interface, version.serve, version.num_gpus, version.number, warmups)
+    config.parameters[FAMILY_PARAMETER].string_value = version.family
+    return GeneratedModel(config, version.number, model_file.read_bytes(), files)
 
 
-def _warmups(trajectory: Trajectory, has_similarity: bool) -> list[Warmup]:
+def _warmups(description: Description) -> list[Warmup]:
     """One sample of each type that the checkpoint can score."""
+    trajectory = blank_trajectory(description.widths, task=WARMUP_TASK)
     samples: dict[str, Sample] = {
         "progress": ProgressSample(trajectory),
         "preference": PreferenceSample(trajectory, trajectory),
     }
-    if has_similarity:
+    if description.has_similarity:
         samples["similarity"] = SimilaritySample(trajectory, trajectory)
     return [Warmup(name, wire.encode_samples([sample])) for name, sample in samples.items()]
 
 
-def _warmup_embeddings(config: RewindConfig) -> Trajectory:
-    return Trajectory(
-        video_embeddings=np.zeros((WARMUP_FRAMES, config.video_feature_dim), np.float32),
-        text_embedding=np.zeros(config.text_feature_dim, np.float32),
-    )
-
-
-def _warmup_frames() -> Trajectory:
-    return Trajectory(frames=np.zeros((WARMUP_FRAMES, WARMUP_SIZE_PX, WARMUP_SIZE_PX, 3), np.uint8), task="warm up")
-
-
 def _encoder_warmup() -> Warmup:
-    return Warmup("frames", wire.encode_frames(_warmup_frames()))
+    return Warmup("frames", wire.encode_frames(blank_trajectory(None, task=WARMUP_TASK)))

@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm.engine import Engine, Outcome
-from rfm.rewind.network import RewindConfig
-from rfm.vlm.network import VlmConfig
+from rfm.family import Description
 from rfm_client.contract import (
     FrameScores,
     PreferenceResult,
@@ -22,6 +21,7 @@ from rfm_client.contract import (
     SimilaritySample,
     Trajectory,
 )
+from rfm_client.contract.made_up import Widths, random_trajectory
 from rfm_export.errors import ExportDiffersError
 
 TOLERANCE = 1e-6  # same weights, same machine, same code: the numbers are the same but for rounding
@@ -31,31 +31,26 @@ PROBE_FRAME_STEPS = 2
 PROBE_SEED = 0
 
 
-def probes(config: RewindConfig | VlmConfig, *, with_embeddings: bool, with_frames: bool) -> list[Sample]:
-    """Random samples of each type that the checkpoint can score, of several lengths."""
+def probes(description: Description, *, with_encoders: bool) -> list[Sample]:
+    """Random samples of each type that the checkpoint can score, of several lengths.
+
+    with_encoders: there are encoders, so that a checkpoint that scores embeddings is asked about raw frames too
+    """
     random = np.random.default_rng(PROBE_SEED)
 
-    def embedded(num_frames: int) -> Trajectory:
-        assert isinstance(config, RewindConfig)  # no other takes embeddings
-        return Trajectory(
-            video_embeddings=random.standard_normal((num_frames, config.video_feature_dim), np.float32),
-            text_embedding=random.standard_normal(config.text_feature_dim, np.float32),
-        )
-
-    def filmed(num_frames: int) -> Trajectory:
-        frames = random.integers(0, 256, (num_frames, *PROBE_SIZE_PX, 3), np.uint8)
-        return Trajectory(frames=frames, task=f"pick up {num_frames} red cups")
+    def make(num_frames: int, widths: Widths) -> Trajectory:
+        task = f"pick up {num_frames} red cups"
+        return random_trajectory(random, num_frames, widths, task=task, size_px=PROBE_SIZE_PX)
 
     samples: list[Sample] = []
-    limit = config.max_frames if isinstance(config, RewindConfig) else None
-    for make in ([embedded] if with_embeddings else []) + ([filmed] if with_frames else []):
+    for widths in (description.widths, None) if with_encoders else (description.widths,):
         for num_frames in PROBE_FRAMES:
-            length = min(num_frames, limit or num_frames)
-            samples.append(ProgressSample(make(length)))
-            samples.append(ProgressSample(make(length), frame_steps=PROBE_FRAME_STEPS))
-            samples.append(PreferenceSample(make(length), make(1)))
-            if config.has_similarity:
-                samples.append(SimilaritySample(make(1), make(length)))
+            length = min(num_frames, description.max_frames or num_frames)
+            samples.append(ProgressSample(make(length, widths)))
+            samples.append(ProgressSample(make(length, widths), frame_steps=PROBE_FRAME_STEPS))
+            samples.append(PreferenceSample(make(length, widths), make(1, widths)))
+            if description.has_similarity:
+                samples.append(SimilaritySample(make(1, widths), make(length, widths)))
     return samples
 
 

@@ -8,8 +8,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from rfm_client.async_client import AsyncRewardClient
 from rfm_client.contract.errors import (
     DeadlineExceededError,
@@ -18,9 +16,9 @@ from rfm_client.contract.errors import (
     ServerError,
     ServerUnavailableError,
 )
+from rfm_client.contract.made_up import blank_trajectory
 from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.names import PROBE_PREFIX
-from rfm_client.contract.samples import Trajectory
+from rfm_client.contract.names import PROBE_PREFIX, encoder_name, frames_name
 from rfm_client.status import Device, ServerStatus, read_status
 from rfm_client.transport.access import Access
 from rfm_client.transport.deadline import Deadline, timeout
@@ -32,8 +30,6 @@ STALL_S = 30.0  # a busy model that finishes nothing for so long does not work: 
 HEALTH_KEPT_S = 1.0  # so that probes, which need no key, do not keep the models busy
 STATUS_TIMEOUT_S = 5.0
 MS_PER_S = 1e3
-_CANARY_FRAMES = 2
-_CANARY_PX = 64
 
 
 class State:
@@ -138,8 +134,9 @@ class State:
 
     async def _late(self, info: ModelInfo) -> str | None:
         """The model's name if it has no score in time. Raises RewardError."""
+        blank = blank_trajectory(info.widths)
         try:
-            await self._client.progress(_canary(info), timeout_s=PROBE_TIMEOUT_S, request_id=PROBE_PREFIX)
+            await self._client.progress(blank, timeout_s=PROBE_TIMEOUT_S, request_id=PROBE_PREFIX)
         except DeadlineExceededError:
             return info.name
         return None
@@ -172,21 +169,11 @@ class _Stalled:
     since_s: float
 
 
-def _canary(info: ModelInfo) -> Trajectory:
-    if info.video_dim is None or info.text_dim is None:
-        blank = np.zeros((_CANARY_FRAMES, _CANARY_PX, _CANARY_PX, 3), np.uint8)
-        return Trajectory(frames=blank, task="canary")
-    return Trajectory(
-        video_embeddings=np.zeros((_CANARY_FRAMES, info.video_dim), np.float32),
-        text_embedding=np.zeros(info.text_dim, np.float32),
-    )
-
-
 def _gpu_status(status: ServerStatus, model: str) -> schema.GpuStatus:
     served = {name for device in status.devices for name in device.work}
     # An ensemble's work is that of its parts: it is left out, and a request counted where it is scored.
-    scorer = model if model in served else f"{model}_frames"
-    parts = {scorer, f"{model}_encoder"}
+    scorer = model if model in served else frames_name(model)
+    parts = {scorer, encoder_name(model)}
     devices = [device for device in status.devices if parts & device.work.keys()] or list(status.devices)
     if not devices:
         raise ServerUnavailableError(status.metrics_error or f"{status.metrics_url}: no device is told of")

@@ -29,11 +29,17 @@ from rfm.checkpoint.files import (
     take_prefix,
     trained_frames,
 )
+from rfm.family import NETWORK, Description, Options
+from rfm.rewind.encoders import Encoders
 from rfm.rewind.network import RewindConfig, RewindTransformer
+from rfm.rewind.predictor import RewindPredictor
 
 MODEL_TYPE = "rewind_transformer"
 IMAGE_ENCODER_PREFIX = "image_encoder."
 TEXT_ENCODER_PREFIX = "text_encoder."
+# What upstream's checkpoints with encoders were trained from.
+USUAL_IMAGE_ENCODER = "facebook/dinov2-base"
+USUAL_TEXT_ENCODER = "sentence-transformers/all-MiniLM-L12-v2"
 
 # Upstream's configurations of before causal_mask, when no network had one, state all of these.
 _FIRST_FIELDS = {"video_feature_dim", "text_feature_dim", "hidden_dim", "num_layers", "num_attention_heads", "max_len"}
@@ -57,12 +63,73 @@ class RewindCheckpoint:
 
     network: weights of RewindTransformer
     image_encoder, text_encoder: encoder weights without their prefix; empty if the checkpoint has none
+    image_source, text_source: folders or ids of the encoders that the user names; None: the usual ones, if the
+        checkpoint has weights of encoders
     """
 
     config: RewindConfig
     network: dict[str, Tensor]
     image_encoder: dict[str, Tensor] = field(default_factory=dict)
     text_encoder: dict[str, Tensor] = field(default_factory=dict)
+    image_source: str | None = None
+    text_source: str | None = None
+
+    @property
+    def description(self) -> Description:
+        """What it can be asked, and what it answers."""
+        return Description(
+            network_class=RewindTransformer.__name__,
+            widths=(self.config.video_feature_dim, self.config.text_feature_dim),
+            progress_bins=self.config.progress_bins,
+            has_similarity=self.config.has_similarity,
+            max_frames=self.config.max_frames,
+            trained_frames=self.config.trained_frames,
+        )
+
+    @property
+    def parts(self) -> dict[str, dict[str, Tensor]]:
+        """All weights, by part and name."""
+        return {NETWORK: self.network, "image_encoder": self.image_encoder, "text_encoder": self.text_encoder}
+
+    def encoders(self) -> Encoders | None:
+        """The encoders of a checkpoint that has them, or for which the user names them; else None.
+
+        Raises CheckpointError if they cannot be had or do not fit the network.
+        """
+        in_checkpoint = bool(self.image_encoder or self.text_encoder)
+        if not (in_checkpoint or self.image_source or self.text_source):
+            return None
+        image_source, text_source = self.image_source or USUAL_IMAGE_ENCODER, self.text_source or USUAL_TEXT_ENCODER
+        where = f"encoders {image_source} and {text_source}"
+        try:
+            encoders = Encoders.from_pretrained(
+                image_source,
+                text_source,
+                image_weights=self.image_encoder or None,
+                text_weights=self.text_encoder or None,
+            )
+        except (ImportError, OSError, ValueError) as error:
+            hint = "name local folders with --image-encoder and --text-encoder"
+            raise CheckpointError(f"{where}: {error} ({hint})") from error
+        widths, expected = (encoders.video_feature_dim, encoders.text_feature_dim), self.description.widths
+        if widths != expected:
+            raise CheckpointError(f"{where}: expected widths {expected}, got {widths}")
+        return encoders
+
+    def predictor(self, device: torch.device, dtype: torch.dtype | None = None) -> RewindPredictor:
+        """The network on ``device``. Raises CheckpointError.
+
+        dtype: of the network; None: float32
+        """
+        return RewindPredictor(self.build(), device, dtype or torch.float32)
+
+    def save(self, folder: Path) -> None:
+        """Writes network and configuration in the layout that ``load`` reads, without encoders."""
+        folder.mkdir(parents=True)
+        config = {"model_type": MODEL_TYPE, **asdict(self.config)}
+        (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
+        tensors = {name: tensor.contiguous() for name, tensor in self.network.items()}
+        save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
 
     def build(self) -> RewindTransformer:
         """The network with these weights, on the CPU, ready to score. Raises CheckpointError."""
@@ -78,23 +145,21 @@ class RewindCheckpoint:
         check_shapes(network.state_dict(), self.network)
 
 
-def load_rewind(folder: Path) -> RewindCheckpoint:
+def reads(folder: Path) -> bool:
+    """Whether the folder does not say that it holds something else; the first ReWiND checkpoints say nothing."""
+    config = folder / NETWORK_CONFIG
+    return not is_there(config) or read_json(config).get("model_type", MODEL_TYPE) == MODEL_TYPE
+
+
+def load(folder: Path, options: Options) -> RewindCheckpoint:
     """The checkpoint in a local folder. Raises CheckpointError."""
-    weights = read_weights(folder)
-    image_encoder = take_prefix(weights, IMAGE_ENCODER_PREFIX)
-    text_encoder = take_prefix(weights, TEXT_ENCODER_PREFIX)
-    checkpoint = RewindCheckpoint(_rewind_config(folder, weights), weights, image_encoder, text_encoder)
+    network = read_weights(folder)
+    image_encoder = take_prefix(network, IMAGE_ENCODER_PREFIX)
+    text_encoder = take_prefix(network, TEXT_ENCODER_PREFIX)
+    sources = options.image_encoder, options.text_encoder
+    checkpoint = RewindCheckpoint(_rewind_config(folder, network), network, image_encoder, text_encoder, *sources)
     checkpoint.check()
     return checkpoint
-
-
-def save_rewind(checkpoint: RewindCheckpoint, folder: Path) -> None:
-    """Writes network and configuration in the layout that ``load_rewind`` reads, without encoders."""
-    folder.mkdir(parents=True)
-    config = {"model_type": MODEL_TYPE, **asdict(checkpoint.config)}
-    (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
-    tensors = {name: tensor.contiguous() for name, tensor in checkpoint.network.items()}
-    save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
 
 
 def _rewind_config(folder: Path, weights: Mapping[str, Tensor]) -> RewindConfig:
@@ -144,7 +209,7 @@ def _shape(weights: Mapping[str, Tensor], name: str, rank: int) -> torch.Size:
 
 
 def _trained_frames(folder: Path) -> int | None:
-    """As ``save_rewind`` wrote it to config.json, else as config.yaml tells it."""
+    """As ``RewindCheckpoint.save`` wrote it to config.json, else as config.yaml tells it."""
     if is_there(folder / NETWORK_CONFIG):
         saved = read_json(folder / NETWORK_CONFIG).get("trained_frames")
         if saved is not None:

@@ -68,6 +68,8 @@ class RewindCollator:
             supported = "progress or preference (this checkpoint has no similarity head)"
             raise InvalidSampleError.at("sample_type", supported, "similarity")
         frame_steps = sample.frame_steps if isinstance(sample, ProgressSample) else 0
+        if sample.trajectories[0].frames is not None:
+            raise InvalidSampleError.at("frames", "video_embeddings (no encoders are loaded)", "frames")
         text = self._text(sample.trajectories[0])
         videos = [self._video(trajectory, frame_steps) for trajectory in sample.trajectories]
         if frame_steps:

@@ -3,7 +3,7 @@
 
 A DINOv2-type image encoder (its pooled output) and a BERT-type sentence encoder (the mean of its last
 hidden state over the text's tokens, not normalised), both carried by ``transformers``.
-N images, C = 3 channels, H x W pixels, T frames, L tokens, Dv and Dt widths of the embeddings.
+C = 3 channels, H x W pixels, T frames, L tokens, Dv and Dt widths of the embeddings.
 """
 
 from __future__ import annotations
@@ -11,100 +11,28 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
-from safetensors.torch import save_file
 from torch import Tensor
 
-from rfm.checkpoint.preprocessor import MAX_UINT8, PIL_BICUBIC, PREPROCESSOR_CONFIG
+from rfm.checkpoint.content import read_json
+from rfm.checkpoint.preprocessor import PREPROCESSOR_CONFIG
 from rfm.execution import Execution
+from rfm.family import EncodersDescription
 from rfm.layers.linear import speed_up
 from rfm.layers.tensors import as_tensor
+from rfm.rewind.preprocessing import ImagePreprocessor
+from rfm.rewind.pretrained import load_model, load_preprocessor, load_tokenizer
+from rfm.version_folder import IMAGE_ENCODER_FOLDER, TEXT_ENCODER_FOLDER
 from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError, Trajectory
-from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.samples import Float32Array, Footage, UInt8Array, joined, stackable
 
 IMAGES_PER_FORWARD = 64
 MAX_ENCODER_ASPECT_RATIO = 50
-_LOADING_PROBLEMS = ("missing_keys", "unexpected_keys", "mismatched_keys")  # as transformers tells of a load
-
-
-@dataclass(frozen=True)
-class ImagePreprocessor:
-    """uint8 images -> normalised crops, bit for bit as the "fast" (torchvision) Bit image processor makes them.
-
-    Shortest edge to ``resize_px`` (bicubic, antialiased, on uint8), centre crop to ``crop_px`` = (height, width),
-    then per channel (value - 255 mean) / (255 std).
-    """
-
-    resize_px: int
-    crop_px: tuple[int, int]
-    mean: tuple[float, ...]
-    std: tuple[float, ...]
-
-    @property
-    def frame_size(self) -> FrameSize:
-        """What becomes of a frame before it is cropped."""
-        return FrameSize("shortest", (self.resize_px,))
-
-    @classmethod
-    def from_config(cls, config: Mapping[str, Any], where: str) -> ImagePreprocessor:
-        """From the fields of preprocessor_config.json. Raises ValueError for steps other than the above."""
-        crop = config.get("crop_size", {})
-        required = {
-            "do_resize": True,
-            "do_center_crop": True,
-            "do_rescale": True,
-            "do_normalize": True,
-            "resample": PIL_BICUBIC,
-        }
-        for name, value in required.items():
-            if config.get(name) != value:
-                raise ValueError(f"{where}: {name}: expected {value}, got {config.get(name)}")
-        if abs(config.get("rescale_factor", 0.0) - 1 / MAX_UINT8) > 1e-9:
-            raise ValueError(f"{where}: rescale_factor: expected 1/255, got {config.get('rescale_factor')}")
-        if set(config.get("size", {})) != {"shortest_edge"} or set(crop) != {"height", "width"}:
-            expected = "size {shortest_edge} and crop_size {height, width}"
-            raise ValueError(f"{where}: expected {expected}, got {config.get('size')} and {crop}")
-        return cls(
-            resize_px=config["size"]["shortest_edge"],
-            crop_px=(crop["height"], crop["width"]),
-            mean=tuple(config["image_mean"]),
-            std=tuple(config["image_std"]),
-        )
-
-    def __call__(self, images: Tensor) -> Tensor:
-        """uint8 [N, H, W, C] -> float32 [N, C, *crop_px], on the CPU."""
-        crops = self._crop(self._resize(images.permute(0, 3, 1, 2))).float()
-        mean, std = (torch.tensor(values).view(-1, 1, 1) * MAX_UINT8 for values in (self.mean, self.std))
-        return (crops - mean) / std
-
-    def _resize(self, images: Tensor) -> Tensor:
-        height, width = images.shape[-2:]
-        short, long = min(height, width), max(height, width)
-        resized = (self.resize_px, int(self.resize_px * long / short))
-        size = resized if height <= width else resized[::-1]
-        if size == (height, width):
-            return images
-        return F.interpolate(images, size, mode="bicubic", antialias=True)
-
-    def _crop(self, images: Tensor) -> Tensor:
-        height, width = images.shape[-2:]
-        crop_height, crop_width = self.crop_px
-        pad_height, pad_width = max(crop_height - height, 0), max(crop_width - width, 0)
-        if pad_height or pad_width:
-            sides = (pad_width // 2, (pad_width + 1) // 2, pad_height // 2, (pad_height + 1) // 2)
-            images = F.pad(images, sides)
-            height, width = images.shape[-2:]
-        top, left = round((height - crop_height) / 2), round((width - crop_width) / 2)
-        return images[..., top : top + crop_height, left : left + crop_width]
 
 
 class Encoders:
@@ -133,38 +61,45 @@ class Encoders:
         that does not fit.
         """
         try:
-            from transformers import AutoTokenizer
-            from transformers.utils.hub import cached_file
+            import transformers  # noqa: F401
         except ImportError as error:
             raise ImportError('raw frames need transformers: pip install ".[encoders]"') from error
-        preprocessor_file = cached_file(str(image_source), PREPROCESSOR_CONFIG)
-        preprocessor_config = json.loads(Path(str(preprocessor_file)).read_text())
+        preprocessor = load_preprocessor(image_source)
         return cls(
-            _load_model(image_source, image_weights),
-            ImagePreprocessor.from_config(preprocessor_config, f"{image_source}/{PREPROCESSOR_CONFIG}"),
-            _load_model(text_source, text_weights),
-            AutoTokenizer.from_pretrained(str(text_source), use_fast=True, trust_remote_code=False),
+            load_model(image_source, image_weights),
+            preprocessor,
+            load_model(text_source, text_weights),
+            load_tokenizer(text_source),
         )
 
     def save_pretrained(self, image_folder: Path, text_folder: Path) -> None:
         """Writes both so that ``from_pretrained`` needs no network."""
         self.image_model.save_pretrained(image_folder)
-        preprocessor = {
-            "do_resize": True,
-            "size": {"shortest_edge": self.preprocessor.resize_px},
-            "resample": PIL_BICUBIC,
-            "do_center_crop": True,
-            "crop_size": dict(zip(("height", "width"), self.preprocessor.crop_px, strict=True)),
-            "do_rescale": True,
-            "rescale_factor": 1 / MAX_UINT8,
-            "do_normalize": True,
-            "image_mean": self.preprocessor.mean,
-            "image_std": self.preprocessor.std,
-            "image_processor_type": "BitImageProcessor",
-        }
-        (image_folder / PREPROCESSOR_CONFIG).write_text(json.dumps(preprocessor, indent=2) + "\n")
+        content = json.dumps(self.preprocessor.to_config(), indent=2)
+        (image_folder / PREPROCESSOR_CONFIG).write_text(content + "\n")
         self.text_model.save_pretrained(text_folder)
         self.tokenizer.save_pretrained(text_folder)
+
+    @classmethod
+    def load(cls, folder: Path) -> Encoders:
+        """Those that ``save`` wrote."""
+        return cls.from_pretrained(folder / IMAGE_ENCODER_FOLDER, folder / TEXT_ENCODER_FOLDER)
+
+    def save(self, folder: Path) -> None:
+        """Writes both into ``folder``."""
+        self.save_pretrained(folder / IMAGE_ENCODER_FOLDER, folder / TEXT_ENCODER_FOLDER)
+
+    @classmethod
+    def describe(cls, folder: Path) -> EncodersDescription:
+        """Of those that ``save`` wrote, without loading them."""
+        file = folder / IMAGE_ENCODER_FOLDER / PREPROCESSOR_CONFIG
+        preprocessor = ImagePreprocessor.from_config(read_json(file), str(file))
+        return EncodersDescription(cls.__name__, preprocessor.frame_size)
+
+    @property
+    def description(self) -> EncodersDescription:
+        """What the export tells of them."""
+        return EncodersDescription(type(self).__name__, self.preprocessor.frame_size)
 
     def to(self, device: torch.device) -> Encoders:
         """Moves both encoders to ``device``."""
@@ -296,32 +231,3 @@ def _check_shape(trajectory: Trajectory) -> None:
     if max(height, width) > MAX_ENCODER_ASPECT_RATIO * min(height, width):
         expected = f"frames at most {MAX_ENCODER_ASPECT_RATIO} times as long as wide"
         raise InvalidSampleError.at("frames", expected, f"{height} x {width}")
-
-
-def _load_model(source: str | Path, weights: Mapping[str, Tensor] | None) -> Any:
-    """The model of ``source``, with ``weights`` in place of its own. Raises ValueError unless they fit to the letter.
-
-    transformers does the loading, since it knows how names of weights changed from release to release.
-    """
-    from transformers import AutoConfig, AutoModel
-
-    with TemporaryDirectory() as folder:
-        if weights is not None:
-            AutoConfig.from_pretrained(str(source), trust_remote_code=False).save_pretrained(folder)
-            tensors = {name: tensor.contiguous() for name, tensor in weights.items()}
-            save_file(tensors, Path(folder) / "model.safetensors", metadata={"format": "pt"})
-        try:
-            model, loaded = AutoModel.from_pretrained(
-                str(source) if weights is None else folder,
-                use_safetensors=True,
-                trust_remote_code=False,  # None would ask the user
-                dtype=torch.float32,
-                output_loading_info=True,
-            )
-        except RuntimeError as error:  # shapes
-            raise ValueError(f"{source}: the encoder's weights do not fit: {error}") from error
-    problems = ("missing_keys", "mismatched_keys") if weights is None else _LOADING_PROBLEMS
-    found = {name: sorted(map(str, loaded[name])) for name in problems if loaded[name]}
-    if found:  # transformers would leave missing ones random, and others out
-        raise ValueError(f"{source}: the encoder's weights do not fit: {found}")
-    return model

@@ -11,6 +11,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +35,14 @@ from rfm.checkpoint.files import (
     check_shapes,
     read_weights,
 )
+from rfm.family import NETWORK, Description, Options
+from rfm.version_folder import PROCESSOR_FOLDER
+from rfm.vlm.collator import VlmCollator
+from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm.vlm.lora import LORA_NAME, merged, scaling
 from rfm.vlm.network import BACKBONES, SMOL, VlmConfig, VlmRewardModel, build_backbone
+from rfm.vlm.predictor import VlmPredictor
+from rfm.vlm.processor import frame_size, load_collator, save_processor
 from rfm.vlm.run_config import RunConfig
 
 ADAPTER_CONFIG = "adapter_config.json"
@@ -58,10 +65,62 @@ MAX_LAYERS = 1024
 
 @dataclass(frozen=True)
 class VlmCheckpoint:
-    """A vision-language checkpoint in memory: weights of VlmRewardModel."""
+    """A vision-language checkpoint in memory.
+
+    weights: of VlmRewardModel
+    processor: folder or id with its tokenizer and image preprocessing; None: those of the base model that it names
+    """
 
     config: VlmConfig
     weights: dict[str, Tensor]
+    processor: str | Path | None = None
+
+    @property
+    def description(self) -> Description:
+        """What it can be asked, and what it answers."""
+        return Description(
+            network_class=VlmRewardModel.__name__,
+            widths=None,
+            progress_bins=self.config.progress_bins,
+            has_similarity=self.config.has_similarity,
+            trained_frames=self.config.trained_frames,
+            frame_size=frame_size(self.config),
+            frames_per_value=1 if self.config.multi_image else FRAMES_PER_GROUP,
+            is_large=True,
+        )
+
+    @property
+    def parts(self) -> dict[str, dict[str, Tensor]]:
+        """All weights, which are the network's."""
+        return {NETWORK: self.weights}
+
+    @cached_property
+    def collator(self) -> VlmCollator:
+        """What makes batches of samples. Raises CheckpointError if the processor cannot be had or does not fit."""
+        embedding = next(t for name, t in self.weights.items() if name.endswith("embed_tokens.weight"))
+        return load_collator(self.config, len(embedding), self.processor or self.config.base_model_id)
+
+    def encoders(self) -> None:
+        """It has none: the network reads raw frames."""
+
+    def predictor(self, device: torch.device, dtype: torch.dtype | None = None) -> VlmPredictor:
+        """The network on ``device``. Raises CheckpointError.
+
+        dtype: of the network; None: float32 on the CPU, else the checkpoint's own
+        """
+        if dtype is None and device.type == "cpu":
+            dtype = torch.float32
+        return VlmPredictor(self.build(dtype), self.collator, device)
+
+    def save(self, folder: Path) -> None:
+        """Writes merged weights, one config.json that says all, and the processor."""
+        folder.mkdir(parents=True)
+        settings = {name: value for name, value in asdict(self.config).items() if name != "backbone"}
+        config = {**self.config.backbone, SETTINGS: settings}
+        (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
+        tensors = {name: tensor.contiguous() for name, tensor in self.weights.items()}
+        save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
+        save_processor(self.collator, folder / PROCESSOR_FOLDER)
 
     def build(self, dtype: torch.dtype | None = None, attention: str | None = None) -> VlmRewardModel:
         """The network with these weights, on the CPU, ready to score, in ``dtype`` (None: its own)."""
@@ -83,36 +142,35 @@ class VlmCheckpoint:
         return VlmRewardModel(self.config, build_backbone(self.config, dtype, attention))
 
 
-def load_vlm(folder: Path, base_model: str | None = None, resize_images: bool | None = None) -> VlmCheckpoint:
-    """The checkpoint in a local folder; other arguments as in ``rfm.checkpoint.load``. Raises CheckpointError."""
+def reads(folder: Path) -> bool:
+    """Whether the folder holds an adapter, or a network on one of the known backbones."""
+    if is_there(folder / ADAPTER_CONFIG):
+        return True
+    model_type = read_json(folder / NETWORK_CONFIG).get("model_type") if is_there(folder / NETWORK_CONFIG) else None
+    return isinstance(model_type, str) and model_type in BACKBONES
+
+
+def load(folder: Path, options: Options) -> VlmCheckpoint:
+    """The checkpoint in a local folder. Raises CheckpointError."""
     with expecting("a vision-language checkpoint", folder):
         is_adapter = is_there(folder / ADAPTER_CONFIG)
         backbone = {} if is_adapter else read_json(folder / NETWORK_CONFIG)
-        if SETTINGS in backbone:  # written by save_vlm, which says all
+        if SETTINGS in backbone:  # written by VlmCheckpoint.save, which says all
             config = _saved_config(backbone)
             weights = _renamed(read_weights(folder), _renames(config.family))
         else:
             run = RunConfig.of(folder)
             run.check_model_type()
             if is_adapter:
-                backbone, weights = _adapted(folder, base_model or _base_model_id(run))
+                backbone, weights = _adapted(folder, options.base_model or _base_model_id(run))
             else:
                 weights = _whole(folder, backbone, run)
-            config = _trained_config(folder, backbone, run, weights, resize_images)
+            config = _trained_config(folder, backbone, run, weights, options.resize_images)
         weights = {name: tensor for name, tensor in weights.items() if name not in _UNUSED}
-    checkpoint = VlmCheckpoint(config, weights)
+    own = folder / PROCESSOR_FOLDER
+    checkpoint = VlmCheckpoint(config, weights, options.base_model or (own if own.is_dir() else None))
     checkpoint.check()
     return checkpoint
-
-
-def save_vlm(checkpoint: VlmCheckpoint, folder: Path) -> None:
-    """Writes merged weights and one config.json that says all."""
-    folder.mkdir(parents=True)
-    settings = {name: value for name, value in asdict(checkpoint.config).items() if name != "backbone"}
-    config = {**checkpoint.config.backbone, SETTINGS: settings}
-    (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
-    tensors = {name: tensor.contiguous() for name, tensor in checkpoint.weights.items()}
-    save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
 
 
 def _base_model_id(run: RunConfig) -> str:

@@ -272,11 +272,11 @@ def test_model_info_tells_what_the_checkpoint_takes(served: Served, protocol: st
         info, frames = client.model_info(), client.model_info(frames=True)
     assert (info.name, info.versions, info.max_batch_size) == (FRAMES_MODEL, ("1",), 64)
     assert (info.max_frames, info.frame_size) == (16, None)
-    config = load_engine(FRAMES_MODEL).family.network.config  # type: ignore[attr-defined]
+    config = load_engine(FRAMES_MODEL).predictor.network.config  # type: ignore[attr-defined]
     assert (info.video_dim, info.text_dim) == (config.video_feature_dim, config.text_feature_dim)
     assert info.progress_bins == frames.progress_bins == 10
     assert frames.max_frames == 16
-    preprocessor = load_engine(FRAMES_MODEL).family.encoders.preprocessor  # type: ignore[attr-defined]
+    preprocessor = load_engine(FRAMES_MODEL).encoders.preprocessor  # type: ignore[attr-defined]
     assert str(frames.frame_size) == f"shortest {preprocessor.resize_px}"
     assert (frames.video_dim, frames.text_dim) == (None, None)
 

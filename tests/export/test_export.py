@@ -22,8 +22,9 @@ import rfm_export
 from engines import serve_config
 from paths import ROOT
 from repositories import forget_input
-from rfm.checkpoint.content import read_run_config
+from rfm.checkpoint.content import CheckpointError, read_run_config
 from rfm.config import ServeConfig
+from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer
 from rfm_client.contract import wire
 from rfm_commands.cli import app
@@ -213,14 +214,12 @@ def test_an_export_that_dies_at_any_moment_leaves_a_repository_that_loads(
 def test_an_export_that_differs_from_its_checkpoint_is_not_published(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from rfm import families
-
-    def save_wrongly(checkpoint: families.RewindCheckpoint, folder: Path) -> None:
+    def save_wrongly(checkpoint: RewindCheckpoint, folder: Path) -> None:
         weights = {name: tensor * 1.001 for name, tensor in checkpoint.network.items()}
         original_save(replace(checkpoint, network=weights), folder)
 
-    original_save = families.save
-    monkeypatch.setattr(families, "save", save_wrongly)
+    original_save = RewindCheckpoint.save
+    monkeypatch.setattr(RewindCheckpoint, "save", save_wrongly)
     with pytest.raises(ExportDiffersError, match="expected the checkpoint's scores, got a difference of"):
         export(EMBEDDINGS, tmp_path / "repository")
     assert list(tmp_path.rglob("*")) == [tmp_path / "repository"]
@@ -271,12 +270,12 @@ def test_an_ensemble_does_not_lose_its_encoder(tmp_path: Path) -> None:
 
 def test_encoders_of_another_width_are_refused(tmp_path: Path) -> None:
     encoders = {"image_encoder": str(FRAMES.image_encoder), "text_encoder": str(FRAMES.text_encoder)}
-    with pytest.raises(ExportError, match=r"expected widths \(768, 384\), got \(48, 32\)"):
+    with pytest.raises(CheckpointError, match=r"expected widths \(768, 384\), got \(48, 32\)"):
         export(EMBEDDINGS, tmp_path, **encoders)
 
 
 def test_encoders_that_cannot_be_had_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ExportError, match=r"encoders /no/such/folder and .*--image-encoder and --text-encoder"):
+    with pytest.raises(CheckpointError, match=r"encoders /no/such/folder and .*--image-encoder and --text-encoder"):
         export(FRAMES, tmp_path, image_encoder="/no/such/folder")
 
 

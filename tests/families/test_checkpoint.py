@@ -68,7 +68,7 @@ def test_config_yaml_is_found_above_the_checkpoint(tmp_path: Path) -> None:
 
 def test_saving_and_loading_changes_nothing(tmp_path: Path) -> None:
     original = families.load(goldens.config(IN_RUN_FOLDER).checkpoint)
-    families.save(original, tmp_path / "saved")
+    original.save(tmp_path / "saved")
     copy = families.load(tmp_path / "saved")
     assert copy.config == original.config
     assert copy.network.keys() == original.network.keys()

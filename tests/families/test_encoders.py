@@ -16,7 +16,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 import goldens
-from engines import load_engine, rewind_of
+from engines import load_engine
 from rfm.checkpoint.preprocessor import PREPROCESSOR_CONFIG
 from rfm.execution import Execution
 from rfm.rewind.encoders import Encoders, ImagePreprocessor
@@ -40,7 +40,7 @@ EMBEDDING_TOLERANCE = 5e-6  # seen: 6e-7
 
 @pytest.fixture
 def encoders() -> Encoders:
-    encoders = rewind_of(NAME).encoders
+    encoders = load_engine(NAME).encoders
     assert encoders is not None
     return encoders
 
@@ -81,7 +81,7 @@ def test_pixels_are_those_of_the_original(case: goldens.Case, encoders: Encoders
 @pytest.mark.reference
 @pytest.mark.parametrize("case", [case for case in CASES if "steps" not in case.content["kind"]], ids=str)
 def test_embeddings_are_those_of_the_original(case: goldens.Case) -> None:
-    encoders = rewind_of(case.config.name).encoders
+    encoders = load_engine(case.config.name).encoders
     assert encoders is not None
     arrays = cases_arrays(case)
     samples = case.samples()
@@ -211,7 +211,7 @@ def test_a_task_that_does_not_fit_in_memory_fails_alone(encoders: Encoders, monk
 def test_what_the_encoders_take_is_forward_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """By a clock that says that each of their forward passes takes an hour."""
     engine = load_engine(NAME)
-    encoders = rewind_of(NAME).encoders
+    encoders = load_engine(NAME).encoders
     assert encoders is not None
     hours = [0]
     seconds = time.perf_counter

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The engine with a made-up family, where the order of things is known."""
+"""The engine with a made-up predictor, where the order of things is known."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 from paths import ROOT
 from rfm.engine import Engine
 from rfm.execution import Execution
-from rfm.family import RowScores
+from rfm.predictor import RowScores
 from rfm_client import FrameScores, ProgressResult, ProgressSample, RewardError, Sample
 from trajectories import random_trajectory
 
@@ -23,19 +23,18 @@ WAIT_S = 30
 
 
 class Pipelined:
-    """A family whose forward waits until the next batch has been collated."""
+    """A predictor whose forward waits until the next batch has been collated."""
 
     def __init__(self, batches: int) -> None:
         self.collated = [threading.Event() for _ in range(batches)]
+        self.num_rows = 0
         self.scored = 0
 
-    def rows(self, samples: Sequence[Sample], execution: Execution) -> list[list[int] | RewardError]:
-        return [[index] for index in range(len(samples))]
+    def rows(self, sample: Sample) -> list[int]:
+        self.num_rows += 1
+        return [self.num_rows - 1]
 
-    def lengths(self, row: int) -> tuple[int, ...]:
-        return (row,)
-
-    def num_tokens(self, lengths: Sequence[int]) -> int:
+    def num_tokens(self, row: int) -> int:
         return 1
 
     def collate(self, rows: Sequence[int]) -> Any:
@@ -53,11 +52,11 @@ class Pipelined:
 
 
 def test_the_next_batch_is_collated_while_the_current_one_runs() -> None:
-    family = Pipelined(batches=4)
+    predictor = Pipelined(batches=4)
     samples = [ProgressSample(random_trajectory(0, 1))] * 4
     passes: list[int] = []
-    execution = Execution(on_forward=lambda: passes.append(family.scored))
-    outcomes = Engine(family, token_budget=1).evaluate(samples, execution)
+    execution = Execution(on_forward=lambda: passes.append(predictor.scored))
+    outcomes = Engine(predictor, token_budget=1).evaluate(samples, execution)
     assert passes == [1, 2, 3, 4]
     results = [outcome for outcome in outcomes if isinstance(outcome, ProgressResult)]
     assert [result.progress[0] for result in results] == [0, 1, 2, 3]
@@ -69,7 +68,7 @@ import numpy as np, torch
 from trajectories import random_trajectory
 from rfm.engine import Engine
 from rfm.execution import Execution
-from rfm.rewind.family import RewindFamily
+from rfm.rewind.predictor import RewindPredictor
 from rfm.rewind.network import RewindConfig, RewindTransformer
 from rfm_client import InferenceFailedError, ProgressResult, ProgressSample
 
@@ -79,7 +78,7 @@ config = RewindConfig(
     video_feature_dim=8, text_feature_dim=8, hidden_dim=512, num_layers=1, num_attention_heads=8, max_len=8,
     causal_mask=True, use_per_frame_progress_token=False, progress_bins=1, has_similarity=False,
 )
-engine = Engine(RewindFamily(RewindTransformer(config), encoders=None, device=torch.device("cpu")))
+engine = Engine(RewindPredictor(RewindTransformer(config), torch.device("cpu")))
 samples = [ProgressSample(random_trajectory(seed, 1000, 8, 8)) for seed in range(16)]
 expected = engine.evaluate(samples)  # each layer's widest activations take 128 MiB, of one sample 8
 pages = int(open("/proc/self/statm").read().split()[0])

@@ -22,6 +22,7 @@ import goldens
 from rfm import families
 from rfm.checkpoint.content import CheckpointError
 from rfm.engine import Engine
+from rfm.family import Options
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindConfig, RewindTransformer
 from rfm_client import (
@@ -205,7 +206,7 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
         RewindConfig(VIDEO_DIM, TEXT_DIM, 8, 1, 2, MAX_LEN, True, True, 3, True, trained_frames=4),
         RewindTransformer(RewindConfig(VIDEO_DIM, TEXT_DIM, 8, 1, 2, MAX_LEN, True, True, 3, True)).state_dict(),
     )
-    families.save(checkpoint, folder)
+    checkpoint.save(folder)
     (folder / "config.yaml").write_text(
         "model:\n  rewind: {causal_mask: true, max_len: 7}\ndata: &d {max_frames: 4}\nmore: *d\n"
     )
@@ -292,7 +293,7 @@ def test_any_yaml_is_read_or_refused(original: Path, text: str) -> None:
 @SLOW
 @given(data=st.data(), value=JSON_VALUES)
 def test_any_setting_of_a_vision_language_checkpoint_is_taken_or_refused(data: st.DataObject, value: Any) -> None:
-    from rfm.vlm.checkpoint import load_vlm
+    from rfm.vlm import FAMILY
 
     config = goldens.config("q25_mean_l2")
     content = json.loads((config.checkpoint / "config.json").read_text())
@@ -305,6 +306,6 @@ def test_any_setting_of_a_vision_language_checkpoint_is_taken_or_refused(data: s
         shutil.copytree(config.checkpoint, copy, copy_function=shutil.copyfile)
         (copy / "config.json").write_text(json.dumps(content))
         try:
-            load_vlm(copy)
+            FAMILY.load(copy, Options())
         except CheckpointError as error:
             assert 0 < len(str(error)) < 10_000

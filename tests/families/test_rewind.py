@@ -18,9 +18,9 @@ from rfm.engine import Engine, Outcome
 from rfm.layers.heads import PredictionHead, progress_from_logits
 from rfm.prefixes import prefix_indices
 from rfm.rewind.collator import MAX_EMBEDDING, RewindCollator
-from rfm.rewind.family import RewindFamily
 from rfm.rewind.network import RewindBatch, RewindConfig, RewindTransformer
 from rfm.rewind.packing import Packing, rounded_up
+from rfm.rewind.predictor import RewindPredictor
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,
@@ -68,7 +68,7 @@ def build(config: RewindConfig, seed: int = 0) -> RewindTransformer:
 
 
 def engine_of(network: RewindTransformer, *, device: str = "cpu", token_budget: int = DEFAULT_TOKEN_BUDGET) -> Engine:
-    return Engine(RewindFamily(network, encoders=None, device=torch.device(device)), token_budget=token_budget)
+    return Engine(RewindPredictor(network, torch.device(device)), token_budget=token_budget)
 
 
 def trajectory(seed: int, num_frames: int) -> Trajectory:
@@ -214,7 +214,7 @@ def test_a_row_over_the_token_budget_runs_alone() -> None:
 
 
 def test_a_sample_over_the_servers_limit_is_refused_alone() -> None:
-    engine = Engine(RewindFamily(build(BASE), encoders=None, device=torch.device("cpu")), max_sample_tokens=16)
+    engine = Engine(RewindPredictor(build(BASE), torch.device("cpu")), max_sample_tokens=16)
     refused, scored = engine.evaluate([ProgressSample(trajectory(0, 8)), ProgressSample(trajectory(0, 7))])
     assert isinstance(refused, InvalidSampleError)
     assert str(refused) == "num_frames: expected at most 16 tokens (max_sample_tokens of this server), got 17 tokens"

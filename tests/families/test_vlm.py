@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import shutil
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -31,12 +32,12 @@ from rfm.checkpoint.content import CheckpointError
 from rfm.config import ServeConfig
 from rfm.engine import Engine
 from rfm.execution import Execution
-from rfm.family import RowScores
+from rfm.predictor import RowScores
 from rfm.vlm.checkpoint import VlmCheckpoint
 from rfm.vlm.collator import QWEN3, VISION_START, VlmRow
-from rfm.vlm.family import VlmFamily, load_collator, save_processor
 from rfm.vlm.images import Normalisation, QwenImages, fitted_size
 from rfm.vlm.network import VlmBatch
+from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.prompts import SPLIT_TOKEN
 from rfm_client import (
     InferenceFailedError,
@@ -60,10 +61,10 @@ PIXEL_TOLERANCE = 1e-6  # relative, of a sum over all pixels
 MIXED_TOLERANCE = 5e-6  # seen: 1e-6
 
 
-def family_of(name: str) -> VlmFamily:
-    family = load_engine(name).family
-    assert isinstance(family, VlmFamily)
-    return family
+def predictor_of(name: str) -> VlmPredictor:
+    predictor = load_engine(name).predictor
+    assert isinstance(predictor, VlmPredictor)
+    return predictor
 
 
 def arrays_of(case: goldens.Case) -> dict[str, np.ndarray]:
@@ -83,12 +84,12 @@ BATCHED = [case for case in goldens.VLM_CASES if not case.is_refused and case.co
 @pytest.mark.reference
 @pytest.mark.parametrize("case", BATCHED, ids=str)
 def test_token_ids_and_pixels_are_those_of_the_original(case: goldens.Case) -> None:
-    family, arrays, content = family_of(case.config.name), arrays_of(case), case.content
+    predictor, arrays, content = predictor_of(case.config.name), arrays_of(case), case.content
     for kind, samples in by_type(case.samples()).items():
         if f"{kind}.collated.input_ids" not in arrays:  # evaluated one by one
             continue
-        rows = [row for outcome in family.rows(samples, Execution()) if isinstance(outcome, list) for row in outcome]
-        inputs = family.collate(rows).inputs
+        rows = [row for sample in samples for row in predictor.rows(sample)]
+        inputs = predictor.collate(rows).inputs
         for name in ("input_ids", "attention_mask", "image_grid_thw", "video_grid_thw"):
             if f"{kind}.collated.{name}" in arrays:
                 np.testing.assert_array_equal(inputs[name].numpy(), arrays[f"{kind}.collated.{name}"])
@@ -115,11 +116,11 @@ def test_the_engine_gives_every_reference_answer(case: goldens.Case) -> None:
 BFLOAT16_CASES = goldens.config(BFLOAT16).cases()
 
 
-def engine_in_bfloat16() -> tuple[Engine, VlmFamily]:
+def engine_in_bfloat16() -> tuple[Engine, VlmPredictor]:
     config = goldens.config(BFLOAT16)
     engine = Engine.from_checkpoint(config.checkpoint, base_model=str(config.base_model), dtype=torch.bfloat16)
-    assert isinstance(engine.family, VlmFamily)
-    return engine, engine.family
+    assert isinstance(engine.predictor, VlmPredictor)
+    return engine, engine.predictor
 
 
 def round_frequencies(network: torch.nn.Module) -> None:
@@ -141,9 +142,9 @@ def excesses(engine: Engine, case: goldens.Case, *, bfloat16: bool, tolerances: 
 @pytest.mark.reference
 @pytest.mark.parametrize("case", BFLOAT16_CASES, ids=str)
 def test_bfloat16_is_the_original_s_bfloat16(case: goldens.Case) -> None:
-    engine, family = engine_in_bfloat16()
+    engine, predictor = engine_in_bfloat16()
     assert max(excesses(engine, case, bfloat16=True, tolerances=goldens.BFLOAT16_TOLERANCES)) <= 1
-    round_frequencies(family.network)
+    round_frequencies(predictor.network)
     if goldens.HAS_AVX512:  # elsewhere the rounding of sums moves scores as far as that fault does: see below
         assert max(excesses(engine, case, bfloat16=True, tolerances=goldens.BFLOAT16_TOLERANCES)) > 1
 
@@ -152,10 +153,10 @@ def test_bfloat16_is_the_original_s_bfloat16(case: goldens.Case) -> None:
 @pytest.mark.parametrize("case", [case for case in BFLOAT16_CASES if case.has_float32], ids=str)
 def test_a_network_in_bfloat16_holds_the_original_s_numbers(case: goldens.Case) -> None:
     """Computed in float32, where a CPU's rounding is a thousandth of what a rounded frequency does."""
-    _, family = engine_in_bfloat16()
-    engine = Engine(VlmFamily(family.network.float(), family.collator, torch.device("cpu")))
+    _, predictor = engine_in_bfloat16()
+    engine = Engine(VlmPredictor(predictor.network.float(), predictor.collator, torch.device("cpu")))
     assert max(excesses(engine, case, bfloat16=False, tolerances=case.tolerances)) <= 1
-    round_frequencies(family.network)
+    round_frequencies(predictor.network)
     assert min(excesses(engine, case, bfloat16=False, tolerances=case.tolerances)) > 10
 
 
@@ -200,7 +201,7 @@ def assert_close(left: object, right: object, tolerance: float) -> None:
 )
 def test_a_mixture_equals_its_samples_alone(name: str, token_budget: int) -> None:
     samples = mixture()
-    engine = Engine(load_engine(name).family, token_budget=token_budget)
+    engine = Engine(load_engine(name).predictor, token_budget=token_budget)
     order = np.random.default_rng(0).permutation(len(samples))
     together = engine.evaluate([samples[index] for index in order])
     for index, outcome in zip(order, together, strict=True):
@@ -211,7 +212,7 @@ def test_an_ordinary_film_over_the_token_budget_is_scored() -> None:
     """The budget decides which samples share a forward pass, not which are scored."""
     samples = [ProgressSample(film(0, 12, 280, 420)), PreferenceSample(film(1, 6, 280, 420), film(2, 7, 280, 420))]
     samples.append(ProgressSample(film(3, 5, 84, 84), frame_steps=4))
-    engine = Engine(load_engine(PLAIN).family, token_budget=100)
+    engine = Engine(load_engine(PLAIN).predictor, token_budget=100)
     for outcome, other in zip(engine.evaluate(samples), load_engine(PLAIN).evaluate(samples), strict=True):
         assert_close(outcome, other, MIXED_TOLERANCE)
 
@@ -224,9 +225,9 @@ def test_a_mixture_over_the_wire_equals_its_samples_alone(served: Served, protoc
             assert_close(result, expected, MIXED_TOLERANCE)
 
 
-def spliced(left: VlmRow, right: VlmRow, family: VlmFamily) -> tuple[np.ndarray, int]:
+def spliced(left: VlmRow, right: VlmRow, predictor: VlmPredictor) -> tuple[np.ndarray, int]:
     """The tokens of one row up to its split token and those of another from there, by which they are moved."""
-    split = family.collator.tokenizer.convert_tokens_to_ids(SPLIT_TOKEN)
+    split = predictor.collator.tokenizer.convert_tokens_to_ids(SPLIT_TOKEN)
     ends, start = (int(np.flatnonzero(row.input_ids == split)[0]) for row in (left, right))
     return np.concatenate([left.input_ids[:ends], right.input_ids[start:]]), ends - start
 
@@ -244,41 +245,41 @@ def spliced_pixels(left: VlmBatch, right: VlmBatch, counts: tuple[int, int]) -> 
     return {grid: torch.cat(grids), pixels: torch.cat(both)}
 
 
-def on_videos(name: str) -> VlmFamily:
+def on_videos(name: str) -> VlmPredictor:
     """A checkpoint that reads images, as if it had been trained on videos."""
     checkpoint = load(name)
     config = replace(checkpoint.config, multi_image=False, per_frame_progress_token=False)
     base = str(goldens.config(name).base_model)
-    return VlmFamily.of(replace(checkpoint, config=config), base, torch.device("cpu"), torch.float32)
+    return replace(checkpoint, config=config, processor=base).predictor(torch.device("cpu"))
 
 
-TWO_SIZES: dict[str, Callable[[], VlmFamily]] = {
-    **{config.name: partial(family_of, config.name) for config in goldens.VLM},
+TWO_SIZES: dict[str, Callable[[], VlmPredictor]] = {
+    **{config.name: partial(predictor_of, config.name) for config in goldens.VLM},
     f"{PLAIN} on videos": lambda: on_videos(PLAIN),
 }
 
 
 @pytest.mark.parametrize("make", TWO_SIZES.values(), ids=TWO_SIZES)
 def test_a_pair_of_two_frame_sizes_is_read_as_its_trajectories_are_beside_one_of_their_own_size(
-    make: Callable[[], VlmFamily],
+    make: Callable[[], VlmPredictor],
 ) -> None:
     """The reference is put together by hand from two pairs of one size each, and scored by the network."""
-    family = make()
+    predictor = make()
     wide, tall = film(0, 3, 56, 140), film(1, 4, 130, 84)
     pairs = [(wide, tall), (wide, film(2, 4, 56, 140)), (film(3, 3, 130, 84), tall)]
-    (row,), (left,), (right,) = (family.collator.rows(PreferenceSample(*pair)) for pair in pairs)
-    ids, moved = spliced(left, right, family)
+    (row,), (left,), (right,) = (predictor.collator.rows(PreferenceSample(*pair)) for pair in pairs)
+    ids, moved = spliced(left, right, predictor)
     np.testing.assert_array_equal(row.input_ids, ids)
 
-    batch, of_left, of_right = (family.collate([each]) for each in (row, left, right))
-    counts = (3, 4) if family.network.config.multi_image else (1, 1)
+    batch, of_left, of_right = (predictor.collate([each]) for each in (row, left, right))
+    counts = (3, 4) if predictor.network.config.multi_image else (1, 1)
     pixels = spliced_pixels(of_left, of_right, counts)
     for name, tensor in pixels.items():
         torch.testing.assert_close(batch.inputs[name], tensor, rtol=0, atol=0)
 
-    if not family.network.config.multi_image and family.network.config.family == QWEN3:
+    if not predictor.network.config.multi_image and predictor.network.config.family == QWEN3:
         # There a trajectory's states are read from the vision start of its number on, in the first one's frames.
-        start = family.collator.tokenizer.convert_tokens_to_ids(VISION_START)
+        start = predictor.collator.tokenizer.convert_tokens_to_ids(VISION_START)
         second = [int(np.flatnonzero(tokens == start)[1]) for tokens in (ids, right.input_ids)]
         moved_spans = second[0] - second[1]
     else:
@@ -287,8 +288,8 @@ def test_a_pair_of_two_frame_sizes_is_read_as_its_trajectories_are_beside_one_of
     assert right.query is not None
     inputs = {**batch.inputs, **pixels, "input_ids": torch.from_numpy(ids)[None]}
     by_hand = VlmBatch(inputs, torch.tensor(spans), torch.tensor([0]), torch.tensor([right.query + moved]))
-    (expected,) = family.score([row], by_hand)
-    (outcome,) = Engine(family).evaluate([PreferenceSample(wide, tall)])
+    (expected,) = predictor.score([row], by_hand)
+    (outcome,) = Engine(predictor).evaluate([PreferenceSample(wide, tall)])
     assert isinstance(outcome, PreferenceResult)
     assert isinstance(expected, RowScores)
     assert outcome.preference == pytest.approx(expected.query, rel=0, abs=1e-6)
@@ -353,7 +354,7 @@ def test_what_is_unusual_is_scored(sample: ProgressSample) -> None:
 
 
 def test_the_task_is_not_a_template() -> None:
-    tokens = family_of(PLAIN).collator
+    tokens = predictor_of(PLAIN).collator
     (row,) = tokens.rows(ProgressSample(film(0, 1, 56, 56, "put {task} there")))
     assert "'put {task} there'" in tokens.tokenizer.decode(row.input_ids)
 
@@ -370,17 +371,17 @@ def test_both_frames_of_a_group_carry_its_value() -> None:
 
 def test_out_of_memory_halves_the_batch_and_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     """The CPU has no memory of a device that could run out: the network refuses larger batches in its place."""
-    engine = Engine(load_engine(PLAIN).family)
+    engine = Engine(load_engine(PLAIN).predictor)
     samples = [ProgressSample(film(seed, 2, 56, 56)) for seed in range(5)]
     expected = engine.evaluate(samples)
-    score = engine.family.score
+    score = engine.predictor.score
 
     def refusing(rows: Sequence[Any], batch: Any) -> Any:
         if len(rows) > 2:
             raise torch.OutOfMemoryError("made up")
         return score(rows, batch)
 
-    monkeypatch.setattr(engine.family, "score", refusing)
+    monkeypatch.setattr(engine.predictor, "score", refusing)
     execution = Execution()
     for result, other in zip(engine.evaluate(samples, execution), expected, strict=True):
         assert_close(result, other, MIXED_TOLERANCE)
@@ -388,15 +389,15 @@ def test_out_of_memory_halves_the_batch_and_is_counted(monkeypatch: pytest.Monke
 
 
 def test_a_sample_that_does_not_fit_in_memory_fails_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    engine = Engine(load_engine(PLAIN).family)
-    score = engine.family.score
+    engine = Engine(load_engine(PLAIN).predictor)
+    score = engine.predictor.score
 
     def refusing(rows: Sequence[Any], batch: Any) -> Any:
         if any(len(row.frames[0]) > 2 for row in rows):
             raise torch.OutOfMemoryError("made up")
         return score(rows, batch)
 
-    monkeypatch.setattr(engine.family, "score", refusing)
+    monkeypatch.setattr(engine.predictor, "score", refusing)
     small, large = ProgressSample(film(0, 2, 56, 56)), ProgressSample(film(0, 3, 56, 56))
     first, failed, last = engine.evaluate([small, large, small])
     assert isinstance(failed, InferenceFailedError)
@@ -425,7 +426,7 @@ def copied(tmp_path: Path) -> Callable[[str], Path]:
 
 def test_saving_and_loading_changes_nothing(tmp_path: Path) -> None:
     original = load(LORA_INSIDE)
-    families.save(original, tmp_path / "saved")
+    original.save(tmp_path / "saved")
     copy = families.load(tmp_path / "saved")
     assert isinstance(copy, VlmCheckpoint)
     assert copy.config == original.config
@@ -600,7 +601,7 @@ def test_config_yaml_is_found_above_the_checkpoint(copied: Callable[[str], Path]
 
 
 def test_what_was_exported_needs_no_config_yaml(tmp_path: Path) -> None:
-    families.save(load(PLAIN), tmp_path / "saved")
+    load(PLAIN).save(tmp_path / "saved")
     assert not (tmp_path / "saved" / "config.yaml").exists()
     assert families.load(tmp_path / "saved").config == load(PLAIN).config
 
@@ -687,12 +688,12 @@ def test_the_processor_s_chat_template_wins_over_the_tokenizer_s(tmp_path: Path)
     file.write_text(json.dumps(json.loads(file.read_text()) | other))
 
     def prompt() -> str:
-        collator = load_collator(load(PLAIN), base)
-        save_processor(collator, tmp_path / "saved")
-        assert (
-            load_collator(load(PLAIN), tmp_path / "saved").tokenizer.chat_template == collator.tokenizer.chat_template
-        )
-        return str(collator.tokenizer.chat_template)
+        template = str(load(PLAIN, base=str(base)).collator.tokenizer.chat_template)
+        with tempfile.TemporaryDirectory() as folder:
+            saved = Path(folder, "saved")
+            load(PLAIN, base=str(base)).save(saved)
+            assert families.load(saved).collator.tokenizer.chat_template == template
+        return template
 
     assert prompt() == json.loads((base / "chat_template.json").read_text())["chat_template"]
     (base / "chat_template.json").unlink()
@@ -716,7 +717,7 @@ class Largest(TorchDispatchMode):
 
 @pytest.mark.parametrize("name", ["q25_attention_disc10", "q25_mean_l2"])
 def test_a_long_span_costs_the_short_ones_no_memory(name: str) -> None:
-    network = family_of(name).network
+    network = predictor_of(name).network
     width, long, short = network.config.hidden_dim, 4000, 500
     hidden = torch.randn(2, long, width, generator=torch.Generator().manual_seed(0))
     spans = torch.tensor([[0, 0, long], *([1, 2 * at, 2 * at + 2] for at in range(short))])

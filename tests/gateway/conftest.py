@@ -23,8 +23,8 @@ from gateway_requests import (
     ask_npy,
     fixture_of,
 )
-from rfm import families
 from rfm.config import ServeConfig
+from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer
 from rfm.supervise.installation import find_installation
 from rfm.supervise.leftovers import REGION_PREFIX
@@ -42,7 +42,7 @@ def tiny_network() -> RewindTransformer:
 def triton(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransformer) -> Iterator[Triton]:
     folder = tmp_path_factory.mktemp("gateway_triton")
     repository, checkpoint = folder / "model_repository", folder / "two_wide"
-    families.save(families.RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()), checkpoint)
+    RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()).save(checkpoint)
     rfm_export.export(checkpoint, repository, ServeConfig(name=TINY, num_gpus=0, torch_threads=1))
     for config, name in ((goldens.config("enc_c1_t1_disc10"), FILM), (goldens.config("q25_video_last_l2"), VIDEO)):
         rfm_export.export(config.checkpoint, repository, serve_config(config, name))

@@ -41,8 +41,8 @@ from gateway_requests import (
     progress,
 )
 from gateways import Gateway, poll, running
-from rfm import families
 from rfm.config import ServeConfig
+from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer
 from rfm.supervise.installation import find_installation
 from rfm.supervise.process import Endpoints, TritonServer
@@ -156,7 +156,7 @@ _load = TritonPythonModel.load
 
 def load(self, version, device, settings):
     _load(self, version, device, settings)
-    score = self.engine.family.score
+    score = self.engine.predictor.score
 
     def gated(rows, batch):
         import time
@@ -165,7 +165,7 @@ def load(self, version, device, settings):
             time.sleep(0.01)
         return score(rows, batch)
 
-    self.engine.family.score = gated
+    self.engine.predictor.score = gated
 
 
 TritonPythonModel.load = load
@@ -201,7 +201,7 @@ class Gated:
 def gated(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransformer) -> Iterator[Gated]:
     folder = tmp_path_factory.mktemp("gated")
     repository, checkpoint, gate = folder / "model_repository", folder / "two_wide", folder / "gate"
-    families.save(families.RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()), checkpoint)
+    RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()).save(checkpoint)
     rfm_export.export(checkpoint, repository, ServeConfig(name=TINY, num_gpus=0, torch_threads=1))
     model = repository / TINY / "1" / "model.py"
     model.write_text(model.read_text() + CLOSED_GATE.format(gate=str(gate)))

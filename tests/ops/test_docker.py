@@ -275,7 +275,7 @@ def test_the_image_holds_what_serving_needs_in_locked_versions_and_nothing_else(
 @pytest.mark.parametrize(
     "words",
     [
-        ["python", "-c", "import rfm_export, rfm.vlm.family, rfm.rewind.family, rfm.rewind.encoders"],
+        ["python", "-c", "import rfm_export, rfm.vlm, rfm.rewind"],
         ["python", "-c", "import rfm_gateway.app"],
         ["rfm", "--help"],
         ["rfm-client", "--help"],

@@ -20,9 +20,12 @@ SHARED = {  # what a family may import beside itself
     "rfm.execution",
     "rfm.family",
     "rfm.layers",
+    "rfm.predictor",
     "rfm.prefixes",
+    "rfm.version_folder",
     "rfm_client.contract",
 }
+FAMILIES = {"rewind", "vlm"}
 FOLDERS = {
     "rfm": ".",
     "rfm_client": "client",
@@ -124,6 +127,14 @@ def test_the_domain_knows_nothing_of_triton() -> None:
     for file in (ROOT / "rfm").rglob("*.py"):
         if not {"supervise", "triton_model"} & set(file.parts):
             assert not [name for name in imports(file) if "triton" in name.replace("rfm_triton", "")], file
+
+
+def test_only_its_own_folder_knows_a_family() -> None:
+    """Others ask rfm.families, which finds a family by its name."""
+    own = {ROOT / "rfm" / family for family in FAMILIES}
+    for file in (file for part in ("rfm", "export") for file in (ROOT / part).rglob("*.py")):
+        if not own & set(file.parents):
+            assert not [name for name in imports(file) if is_part(name, {f"rfm.{family}" for family in FAMILIES})], file
 
 
 def test_every_command_and_option_is_documented() -> None:

@@ -9,8 +9,7 @@ import goldens
 from rfm import families
 from rfm.config import ServeConfig
 from rfm.engine import Engine
-from rfm.rewind.family import RewindFamily
-from rfm_export.export import load_encoders
+from rfm.rewind.predictor import RewindPredictor
 
 
 def serve_config(config: goldens.Config, name: str = "rfm") -> ServeConfig:
@@ -29,15 +28,17 @@ def serve_config(config: goldens.Config, name: str = "rfm") -> ServeConfig:
 def load_engine(name: str) -> Engine:
     """The engine of a reference checkpoint, with its encoders if it has some."""
     config = goldens.config(name)
-    if config.is_vlm:
-        return Engine.from_checkpoint(config.checkpoint, base_model=str(config.base_model))
-    checkpoint = families.load(config.checkpoint)
-    assert isinstance(checkpoint, families.RewindCheckpoint)
-    return Engine.of(checkpoint, encoders=load_encoders(checkpoint, serve_config(config)))
+    sources = {
+        option: str(source)
+        for option in ("base_model", "image_encoder", "text_encoder")
+        if (source := getattr(config, option)) is not None
+    }
+    checkpoint = families.load(config.checkpoint, **sources)
+    return Engine.of(checkpoint, encoders=checkpoint.encoders())
 
 
-def rewind_of(name: str) -> RewindFamily:
+def rewind_of(name: str) -> RewindPredictor:
     """What of a reference checkpoint's engine is ReWiND's own."""
-    family = load_engine(name).family
-    assert isinstance(family, RewindFamily)
-    return family
+    predictor = load_engine(name).predictor
+    assert isinstance(predictor, RewindPredictor)
+    return predictor

@@ -57,7 +57,7 @@ _load = TritonPythonModel.load
 
 def load(self, version, device, settings):
     _load(self, version, device, settings)
-    score = self.engine.family.score
+    score = self.engine.predictor.score
 
     def slow(rows, batch):
         import time
@@ -66,7 +66,7 @@ def load(self, version, device, settings):
             time.sleep({HANG_S / 4})
         return score(rows, batch)
 
-    self.engine.family.score = slow
+    self.engine.predictor.score = slow
 
 
 TritonPythonModel.load = load

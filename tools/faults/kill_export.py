@@ -245,11 +245,10 @@ def _export_as(how: dict[str, Any]) -> NoReturn:
 
 def _load(checkpoint: Path) -> Engine:
     from rfm import families
-    from rfm_export.export import load_encoders
 
-    loaded = families.load(checkpoint)
-    assert isinstance(loaded, families.RewindCheckpoint)
-    return Engine.of(loaded, encoders=load_encoders(loaded, serve_config(CHECKPOINT)))
+    serve = serve_config(CHECKPOINT)
+    loaded = families.load(checkpoint, image_encoder=serve.image_encoder, text_encoder=serve.text_encoder)
+    return Engine.of(loaded, encoders=loaded.encoders())
 
 
 def _changed(checkpoint: Path, folder: Path) -> Path:

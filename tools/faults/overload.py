@@ -29,7 +29,6 @@ from callers import (
 )
 from chaos_site import Row, Site, site, wait_healthy
 from control import SCORE, control
-from rfm.families import save
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindConfig, RewindTransformer
 from rfm.supervise.process import Endpoints
@@ -68,7 +67,7 @@ def large_site(folder: Path, **settings: int) -> Iterator[Site]:
     """What is overloaded: a checkpoint of random weights."""
     torch.manual_seed(0)
     checkpoint = folder / "checkpoint"
-    save(RewindCheckpoint(LARGE, RewindTransformer(LARGE).state_dict()), checkpoint)
+    RewindCheckpoint(LARGE, RewindTransformer(LARGE).state_dict()).save(checkpoint)
     with site(folder, checkpoint, **settings) as served:
         yield served
 

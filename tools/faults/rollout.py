@@ -41,7 +41,6 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.async_client import DEFAULT_TIMEOUT_S
-from rfm_export.export import load_encoders
 from trajectories import random_trajectory
 
 NAME = "rfm"
@@ -120,9 +119,9 @@ def questions() -> list[Sample]:
 
 def answers(checkpoint: Path, samples: Sequence[Sample]) -> list[Outcome]:
     """What the checkpoint itself says."""
-    loaded = families.load(checkpoint)
-    assert isinstance(loaded, families.RewindCheckpoint)
-    return Engine.of(loaded, encoders=load_encoders(loaded, serve_config(WITH_ENCODERS))).evaluate(samples)
+    serve = serve_config(WITH_ENCODERS)
+    loaded = families.load(checkpoint, image_encoder=serve.image_encoder, text_encoder=serve.text_encoder)
+    return Engine.of(loaded, encoders=loaded.encoders()).evaluate(samples)
 
 
 def numbers(outcome: object) -> np.ndarray:

@@ -12,10 +12,10 @@ from enum import Enum
 import numpy as np
 
 from rfm_client.client import RewardClient
+from rfm_client.contract.made_up import random_trajectory
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 
-FRAME_SIZE_PX = 64
 TASK = "put the block in the bowl"
 
 _LENGTHS = re.compile(r"([1-9][0-9]{0,3})(?:-([1-9][0-9]{0,3}))?")  # a longer one would only fill the memory
@@ -51,14 +51,7 @@ class Toy:
 
     def _trajectories(self, random: np.random.Generator, info: ModelInfo) -> Iterator[Trajectory]:
         for length in itertools.cycle(random.permutation(self.lengths).tolist()):
-            if info.video_dim is None or info.text_dim is None:
-                shape = (length, FRAME_SIZE_PX, FRAME_SIZE_PX, 3)
-                yield Trajectory(frames=random.integers(0, 256, shape, np.uint8), task=TASK)
-            else:
-                yield Trajectory(
-                    video_embeddings=random.standard_normal((length, info.video_dim), np.float32),
-                    text_embedding=random.standard_normal(info.text_dim, np.float32),
-                )
+            yield random_trajectory(random, length, info.widths, task=TASK)
 
 
 def parse_lengths(text: str) -> list[int]:

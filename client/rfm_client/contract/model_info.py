@@ -54,6 +54,11 @@ class ModelInfo:
     network: Mapping[str, Any] = field(default_factory=dict)
     run_config: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def widths(self) -> tuple[int, int] | None:
+        """D and Dt of the embeddings that it reads; None: it reads raw frames."""
+        return None if self.video_dim is None or self.text_dim is None else (self.video_dim, self.text_dim)
+
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> ModelInfo:
         """From Triton's model configuration, as its HTTP API writes it.

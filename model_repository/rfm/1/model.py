@@ -10,8 +10,9 @@ import torch
 
 from rfm.engine import Engine, Outcome
 from rfm.execution import Execution
-from rfm.parameters import BUDGET_PARAMETER, DTYPE_PARAMETER, SAMPLE_TOKENS_PARAMETER
+from rfm.parameters import BUDGET_PARAMETER, DTYPE_PARAMETER, FAMILY_PARAMETER, SAMPLE_TOKENS_PARAMETER
 from rfm.triton_model.batch_model import BatchModel
+from rfm.version_folder import CHECKPOINT_FOLDER
 from rfm_client.contract import Result, Sample, wire
 
 
@@ -20,7 +21,8 @@ class TritonPythonModel(BatchModel[Sample, Result]):
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
         self.engine = Engine.from_checkpoint(
-            version / "checkpoint",
+            version / CHECKPOINT_FOLDER,
+            family=settings.get(FAMILY_PARAMETER),  # older configurations do not name it
             device=device,
             dtype=getattr(torch, settings[DTYPE_PARAMETER]) if settings[DTYPE_PARAMETER] else None,
             token_budget=int(settings[BUDGET_PARAMETER]),

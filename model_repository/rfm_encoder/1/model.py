@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Triton <-> Encoders: frames and task in, the embeddings that the reward model reads out."""
+"""Triton <-> FrameEncoders: frames and task in, the embeddings that the reward model reads out."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from pathlib import Path
 
 import torch
 
+from rfm import families
 from rfm.execution import Execution
-from rfm.rewind.encoders import Encoders
+from rfm.parameters import FAMILY_PARAMETER
 from rfm.triton_model.batch_model import BatchModel
 from rfm_client.contract import RewardError, Trajectory, wire
 from rfm_client.contract.samples import Footage
@@ -19,8 +20,7 @@ class TritonPythonModel(BatchModel[Footage, Trajectory]):
     """One instance: one pair of encoders on one device."""
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
-        encoders = Encoders.from_pretrained(version / "image_encoder", version / "text_encoder")
-        self.encoders = encoders.to(device)
+        self.encoders = families.encoders_of(settings.get(FAMILY_PARAMETER)).load(version).to(device)
 
     def decode(self, tensors: wire.Tensors) -> list[Footage]:
         return wire.decode_trajectories(tensors)

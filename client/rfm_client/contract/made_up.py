@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: MIT
+"""Made-up trajectories: blank ones, to see whether a model answers, and random ones, to compare answers.
+
+``widths`` are Dv and Dt of the embeddings that a model reads; None: it reads raw frames.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+
+from rfm_client.contract.samples import Trajectory
+
+Widths: TypeAlias = tuple[int, int] | None
+
+BLANK_FRAMES = 2
+SIDE_PX = 64
+PROBE_TASK = "canary"  # of a blank trajectory: every probe asks the same question, by which a model knows it
+
+
+def blank_trajectory(widths: Widths, task: str = PROBE_TASK) -> Trajectory:
+    """Two embeddings, or frames, of zeros."""
+    if widths is None:
+        return Trajectory(frames=np.zeros((BLANK_FRAMES, SIDE_PX, SIDE_PX, 3), np.uint8), task=task)
+    video_dim, text_dim = widths
+    return Trajectory(
+        video_embeddings=np.zeros((BLANK_FRAMES, video_dim), np.float32), text_embedding=np.zeros(text_dim, np.float32)
+    )
+
+
+def random_trajectory(
+    random: np.random.Generator,
+    num_frames: int,
+    widths: Widths,
+    *,
+    task: str,
+    size_px: tuple[int, int] = (SIDE_PX, SIDE_PX),
+) -> Trajectory:
+    """Normal embeddings, or frames of noise with the height and width ``size_px`` and the task."""
+    if widths is None:
+        return Trajectory(frames=random.integers(0, 256, (num_frames, *size_px, 3), np.uint8), task=task)
+    video_dim, text_dim = widths
+    return Trajectory(
+        video_embeddings=random.standard_normal((num_frames, video_dim), np.float32),
+        text_embedding=random.standard_normal(text_dim, np.float32),
+    )

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: MIT
+"""What the engine needs of a network: how samples become its batches, and batches scores."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import numpy as np
+from torch import Tensor
+
+from rfm.layers.heads import progress_from_logits
+from rfm_client.contract import FrameScores, InferenceFailedError, RewardError, Sample
+
+Row = TypeVar("Row")
+Batch = TypeVar("Batch")
+
+
+class Predictor(Protocol[Row, Batch]):
+    """A network on a device, and how samples become its batches. A row is one token sequence of a forward."""
+
+    def rows(self, sample: Sample) -> list[Row]:
+        """The sample's rows, in dense mode one a frame; takes no forward pass.
+
+        Raises InvalidSampleError if this checkpoint cannot score it.
+        """
+
+    def num_tokens(self, row: Row) -> int:
+        """Tokens of the row. Rows of similar numbers share a batch."""
+
+    def collate(self, rows: Sequence[Row]) -> Batch:
+        """One batch, on the CPU; may run while the device computes."""
+
+    def occupancy(self, batch: Batch) -> tuple[int, int]:
+        """Tokens of the batch's rows, and of its forward pass, padding included."""
+
+    def score(self, rows: Sequence[Row], batch: Batch) -> list[RowScores | RewardError]:
+        """One forward pass, read back to the CPU; an error for a row that has no scores."""
+
+
+@dataclass(frozen=True, eq=False)
+class RowScores:
+    """Scores of one row: of the frames of its trajectories, and of its question about two of them."""
+
+    frames: list[FrameScores]
+    query: float | None = None
+
+
+def are_finite(frames: Iterable[FrameScores], queries: Iterable[float]) -> bool:
+    """Whether all scores of frames and all answers to questions are numbers."""
+    arrays = (array for scores in frames for array in (scores.progress, scores.success))
+    return all(np.isfinite(array).all() for array in arrays) and bool(np.isfinite(list(queries)).all())
+
+
+def checked(rows: Iterable[RowScores]) -> list[RowScores | RewardError]:
+    """The rows, with an error in place of one that has a score that is not finite."""
+    failed = InferenceFailedError("the network gave a score that is not finite")
+    return [row if are_finite(row.frames, [] if row.query is None else [row.query]) else failed for row in rows]
+
+
+def frame_scores(progress_logits: Tensor, success_logits: Tensor) -> FrameScores:
+    """On the CPU, from logits [..., K] and [...]: progress and success, and of discrete progress its logits."""
+    discrete = progress_logits.shape[-1] > 1
+    return FrameScores(
+        progress=progress_from_logits(progress_logits).cpu().numpy(),
+        success=success_logits.sigmoid().float().cpu().numpy(),
+        progress_logits=progress_logits.float().cpu().numpy() if discrete else None,
+    )
+
+
+def part_of(scores: FrameScores, index: object) -> FrameScores:
+    """The scores at ``index`` of each array."""
+    logits = scores.progress_logits
+    return FrameScores(
+        progress=scores.progress[index],  # type: ignore[call-overload]
+        success=scores.success[index],  # type: ignore[call-overload]
+        progress_logits=None if logits is None else logits[index],  # type: ignore[call-overload]
+    )

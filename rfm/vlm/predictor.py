@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: MIT
+"""A vision-language reward model as a predictor: samples of raw frames in, scores of conversations out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from rfm.layers.linear import speed_up
+from rfm.predictor import RowScores, checked, frame_scores, part_of
+from rfm.vlm.collator import VlmCollator, VlmRow
+from rfm.vlm.images import FRAMES_PER_GROUP
+from rfm.vlm.network import VlmBatch
+from rfm_client.contract import FrameScores, InvalidSampleError, RewardError, Sample
+
+
+class VlmPredictor:
+    """A vision-language reward model on a device."""
+
+    def __init__(self, network: Any, collator: VlmCollator, device: torch.device) -> None:
+        self.network = network.to(device).eval()
+        speed_up(self.network)
+        self.collator = collator
+        self.device = device
+        self._dtype = next(network.parameters()).dtype
+        self._max_tokens = int(network.model.config.get_text_config().max_position_embeddings)
+
+    def rows(self, sample: Sample) -> list[VlmRow]:
+        """The conversations about a sample. Raises InvalidSampleError."""
+        rows = self.collator.rows(sample)
+        # The backbone has learned no positions beyond its own; its scores of those would mean nothing.
+        longest = max(row.num_tokens for row in rows)
+        if longest > self._max_tokens:
+            expected = f"at most {self._max_tokens} tokens (max_position_embeddings of this checkpoint)"
+            raise InvalidSampleError.at("num_frames", expected, f"{longest} tokens")
+        return rows
+
+    def num_tokens(self, row: VlmRow) -> int:
+        """Tokens of the conversation."""
+        return row.num_tokens
+
+    def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
+        """Conversations of any kind; here their pixels are made."""
+        return self.collator.collate(rows)
+
+    def occupancy(self, batch: VlmBatch) -> tuple[int, int]:
+        """Of conversations, padded to the longest."""
+        mask = batch.inputs["attention_mask"]
+        return int(mask.sum()), mask.numel()
+
+    @torch.inference_mode()
+    def score(self, rows: Sequence[VlmRow], batch: VlmBatch) -> list[RowScores | RewardError]:
+        """One forward pass."""
+        output = self.network(batch.to(self.device, self._dtype))
+        scores = frame_scores(output.progress, output.success)
+        preference = output.preference.sigmoid().float().tolist()
+        similarity = [] if output.similarity is None else output.similarity.float().tolist()
+        of_rows, read, asked = [], 0, 0
+        for row in rows:
+            frames = []
+            for spans, num_frames in zip(row.spans, row.num_frames, strict=True):
+                frames.append(self._per_frame(part_of(scores, slice(read, read + len(spans))), num_frames))
+                read += len(spans)
+            query = None
+            if row.query is not None:
+                query = (similarity if row.is_similarity else preference)[asked]
+                asked += 1
+            of_rows.append(RowScores(frames, query))
+        return checked(of_rows)
+
+    def _per_frame(self, scores: FrameScores, num_frames: int) -> FrameScores:
+        """In video mode both frames of a temporal group carry its value."""
+        if self.network.config.multi_image:
+            return scores
+        return part_of(scores, np.arange(num_frames) // FRAMES_PER_GROUP)

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: MIT
+"""A base model's tokenizer and image preprocessing, read and written in transformers' files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from rfm.checkpoint.content import CheckpointError, read_json
+from rfm.checkpoint.preprocessor import PREPROCESSOR_CONFIG
+from rfm.vlm.collator import QwenCollator, SmolCollator, VlmCollator
+from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, Normalisation, QwenImages, SmolImages, fitted_size
+from rfm.vlm.network import SMOL, VlmConfig
+from rfm.vlm.prompts import SPECIAL_TOKENS
+from rfm_client.contract import FrameSize
+
+SMOL_SIZE_PX = 512  # what upstream sets, whatever the base model says; so no image is split
+
+
+def frame_size(config: VlmConfig) -> FrameSize | None:
+    """To what a checkpoint brings each frame first; None: that depends on the frame."""
+    if config.family == SMOL:
+        return FrameSize("longest", (SMOL_SIZE_PX,))
+    if config.size_px is None:
+        return None
+    factor = config.backbone["vision_config"]["patch_size"] * MERGE * (1 if config.multi_image else FRAMES_PER_GROUP)
+    return FrameSize("exact", fitted_size(*config.size_px, factor))
+
+
+def load_collator(config: VlmConfig, num_tokens: int, processor: str | Path) -> VlmCollator:
+    """The collator of a checkpoint. Raises CheckpointError for a processor that cannot be had or does not fit.
+
+    num_tokens: rows of the checkpoint's embedding
+    processor: folder or id with the tokenizer and image preprocessing
+    """
+    from transformers import AutoTokenizer
+    from transformers.utils.hub import cached_file
+
+    try:
+        tokenizer = AutoTokenizer.from_pretrained(str(processor), use_fast=True, trust_remote_code=False)
+        preprocessor = read_json(Path(str(cached_file(str(processor), PREPROCESSOR_CONFIG))))
+        tokenizer.chat_template = _chat_template(processor, tokenizer)
+    except (LookupError, OSError, ValueError) as error:
+        hint = "name its folder with --base-model"
+        raise CheckpointError(f"base model {processor}: tokenizer and processor: {error} ({hint})") from error
+    tokenizer.add_tokens(list(SPECIAL_TOKENS), special_tokens=True)
+    if len(tokenizer) != num_tokens:  # upstream resizes the embedding to it
+        expected = f"a tokenizer of {num_tokens} tokens with the special ones, as the checkpoint's embedding"
+        raise CheckpointError(f"base model {processor}: expected {expected}, got {len(tokenizer)}")
+    return _collator(config, tokenizer, preprocessor, processor)
+
+
+def _chat_template(processor: str | Path, tokenizer: Any) -> str:
+    """The processor's, by which upstream prompts; the tokenizer's where the processor has none. Raises ValueError."""
+    from transformers import ProcessorMixin
+
+    of_processor = ProcessorMixin.get_processor_dict(str(processor))[0].get("chat_template")
+    template = tokenizer.chat_template if of_processor is None else of_processor
+    if isinstance(template, dict):  # several, by name
+        template = template.get("default")
+    if not isinstance(template, str):
+        raise ValueError("expected a chat template, got none")
+    return template
+
+
+def save_processor(collator: VlmCollator, folder: Path) -> None:
+    """Writes what ``load_collator`` reads, so that serving needs no network."""
+    collator.tokenizer.save_pretrained(folder)
+    (folder / PREPROCESSOR_CONFIG).write_text(json.dumps(collator.images.to_config(), indent=2) + "\n")
+
+
+def _collator(config: VlmConfig, tokenizer: Any, preprocessor: dict[str, Any], where: str | Path) -> VlmCollator:
+    if abs(preprocessor.get("rescale_factor", 1 / 255) - 1 / 255) > 1e-9:  # Qwen's own files leave the default out
+        raise CheckpointError(f"{where}: rescale_factor: expected 1/255, got {preprocessor.get('rescale_factor')}")
+    normalisation = Normalisation(tuple(preprocessor["image_mean"]), tuple(preprocessor["image_std"]))
+    if config.family != SMOL:
+        images = QwenImages(preprocessor["patch_size"], normalisation, config.size_px)
+        return QwenCollator(config, tokenizer, images)
+    vision = config.backbone["vision_config"]
+    tokens = (vision["image_size"] // vision["patch_size"] // config.backbone["scale_factor"]) ** 2
+    return SmolCollator(config, tokenizer, SmolImages(SMOL_SIZE_PX, preprocessor["resample"], tokens, normalisation))

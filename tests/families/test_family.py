@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: MIT
+"""Families that the product does not know, and configurations that name none."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sysconfig
+import venv
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import rfm_export
+import toy_family
+from paths import ROOT
+from rfm import families
+from rfm.checkpoint.content import CheckpointError
+from rfm.config import ServeConfig
+from rfm.engine import Engine
+from rfm.parameters import FAMILY_PARAMETER
+from rfm.supervise.installation import Installation, find_installation
+from rfm.supervise.process import Endpoints, TritonServer
+from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, RewardClient, SimilaritySample, Trajectory
+from rfm_export.layout import CONFIG_FILE
+from rfm_export.pbtxt import parse, render
+
+TESTS = ROOT / "tests" / "support"
+DEMO = ROOT / "model_repository"
+TOY = ServeConfig(name="toy", num_gpus=0, torch_threads=1)
+SLOPE = torch.tensor([[4.0, 0.0, -1.0]])  # of red, green and blue
+
+
+def film(red: list[float]) -> Trajectory:
+    """Frames that are red to these degrees 0..1, and else black."""
+    frames = np.zeros((len(red), 6, 8, 3), np.uint8)
+    frames[..., 0] = np.round(255 * np.array(red))[:, None, None]
+    return Trajectory(frames=frames, task="paint it red")
+
+
+def progress(red: list[float]) -> np.ndarray:
+    """What the toy checkpoint says of ``film(red)``."""
+    return 1 / (1 + np.exp(2 - 4 * np.round(255 * np.array(red)) / 255))
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("toy") / "checkpoint"
+    weights = {"line.weight": SLOPE, "line.bias": torch.tensor([-2.0])}
+    toy_family.ToyCheckpoint(toy_family.ToyConfig(), weights).save(folder)
+    return folder
+
+
+@dataclass(frozen=True)
+class Running:
+    """A server with the toy checkpoint as ``toy``, and the demo's as ``rfm``, whose configurations name no family."""
+
+    repository: Path
+    url: str
+
+
+def with_family(installation: Installation, folder: Path) -> Installation:
+    """The server with a Python environment that has the toy family installed, besides what this one has."""
+    venv.create(folder)
+    (packages,) = folder.glob("lib/python*/site-packages")
+    ours = sysconfig.get_path("purelib")
+    (packages / "toy.pth").write_text(f"import site; site.addsitedir({ours!r})\n{TESTS}\n")
+    path = os.pathsep.join([str(folder / "bin"), installation.environment.get("PATH", os.environ["PATH"])])
+    return replace(installation, environment={**installation.environment, "PATH": path})
+
+
+@pytest.fixture(scope="module")
+def running(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    folder = tmp_path_factory.mktemp("served")
+    repository = shutil.copytree(DEMO, folder / "model_repository")
+    for name in ("rfm", "rfm_encoder"):
+        file = repository / name / CONFIG_FILE
+        config = parse(file.read_text())
+        del config.parameters[FAMILY_PARAMETER]
+        file.write_text(render(config))
+    rfm_export.export(checkpoint, repository, TOY, family=toy_family.__name__)
+    installation = with_family(find_installation(), folder / "environment")
+    with (
+        (folder / "tritonserver.log").open("wb") as log,
+        TritonServer(repository, Endpoints.free(), installation, log=log) as server,
+    ):
+        yield Running(repository, server.endpoints.grpc_url)
+
+
+def test_a_family_from_elsewhere_is_served_on_raw_frames(running: Running) -> None:
+    first, second = [0.1, 0.5, 0.9], [0.8, 0.2]
+    samples = [
+        ProgressSample(film(first)),
+        ProgressSample(film(first), frame_steps=2),
+        PreferenceSample(film(first), film(second)),
+    ]
+    with RewardClient(running.url, model="toy") as client:
+        whole, dense, pair = client.evaluate(samples)
+        np.testing.assert_allclose(whole.progress, progress(first), atol=1e-6)
+        np.testing.assert_allclose(dense.progress, progress(first), atol=1e-6)
+        np.testing.assert_allclose(pair.second.progress, progress(second), atol=1e-6)
+        logits = 4 * np.round(255 * np.array([0.9, 0.2])) / 255
+        assert pair.preference == pytest.approx(1 / (1 + np.exp(logits[1] - logits[0])), abs=1e-6)
+        with pytest.raises(InvalidSampleError, match="sample_type: expected progress or preference, got similarity"):
+            client.evaluate([SimilaritySample(film(first), film(second))])
+
+
+def test_a_family_from_elsewhere_is_served_on_embeddings(running: Running) -> None:
+    colours = np.array([[0.5, 0.25, 1.0]], np.float32)
+    sample = ProgressSample(Trajectory(video_embeddings=colours, text_embedding=np.zeros(1, np.float32)))
+    with RewardClient(running.url, model="toy") as client:
+        (result,) = client.evaluate([sample])
+    np.testing.assert_allclose(result.progress, 1 / (1 + np.exp(2 - 4 * 0.5 + 1.0)), atol=1e-6)
+
+
+def test_what_a_family_from_elsewhere_generates_is_checked(running: Running) -> None:
+    assert rfm_export.check(running.repository, TOY) == []
+    config = parse((running.repository / "toy" / CONFIG_FILE).read_text())
+    network = json.loads(config.parameters["network"].string_value)
+    assert network == {"class": "Redness", "config": {"num_colours": 3}, "parameters": {"line": 4}}
+
+
+def test_a_configuration_that_names_no_family_serves_what_its_folder_holds(running: Running) -> None:
+    demo = running.repository / "rfm" / "1" / "checkpoint"
+    encoders = families.encoders_of(None).load(running.repository / "rfm_encoder" / "1")
+    sample = ProgressSample(film([0.1, 0.5, 0.9]))
+    (expected,) = Engine.from_checkpoint(demo, encoders=encoders).evaluate([sample])
+    with RewardClient(running.url) as client:
+        (result,) = client.evaluate([sample])
+    np.testing.assert_allclose(result.progress, expected.progress, atol=1e-5)
+
+
+NOT_NAMED = "model_type: expected rewind_transformer, got redness"
+
+
+@pytest.mark.parametrize(
+    ("loaded", "message"),
+    [
+        (lambda folder: families.load(folder), NOT_NAMED),
+        (
+            lambda folder: families.load(folder, family="no.such.package"),
+            "can be imported, got no.such.package: No mod",
+        ),
+        (lambda folder: families.load(folder, family="json"), "family: expected a package with a FAMILY, got json"),
+        (lambda folder: families.encoders_of("rfm.vlm"), "family: expected one with encoders, got rfm.vlm"),
+    ],
+    ids=["unknown", "not there", "no family", "no encoders"],
+)
+def test_what_is_no_family_s_is_refused(checkpoint: Path, loaded: Callable[[Path], object], message: str) -> None:
+    with pytest.raises(CheckpointError, match=message):
+        loaded(checkpoint)

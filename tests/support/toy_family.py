@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: MIT
+"""A family that the product does not know: how red a frame is, is how far the task has come.
+
+Its encoders give each frame's mean colour, and of the task the number of its letters. Its network is one line.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from rfm.checkpoint.files import NETWORK_CONFIG, WEIGHTS
+from rfm.execution import Execution
+from rfm.family import NETWORK, Description, EncodersDescription, Family, Options
+from rfm.predictor import RowScores, frame_scores
+from rfm.prefixes import prefix_indices
+from rfm_client.contract import InvalidSampleError, ProgressSample, RewardError, Sample, SimilaritySample, Trajectory
+from rfm_client.contract.samples import Footage
+
+MODEL_TYPE = "redness"
+PALETTE = "palette.safetensors"
+
+
+@dataclass(frozen=True)
+class ToyConfig:
+    num_colours: int = 3
+
+
+class Redness(nn.Module):
+    """float32 [..., 3] colours -> logits [...]."""
+
+    def __init__(self, config: ToyConfig) -> None:
+        super().__init__()
+        self.line = nn.Linear(config.num_colours, 1)
+
+    def forward(self, colours: Tensor) -> Tensor:
+        return self.line(colours)
+
+
+class Palette:
+    """The encoders: ``scale`` times mean colours."""
+
+    def __init__(self, scale: Tensor) -> None:
+        self.scale = scale
+
+    @classmethod
+    def load(cls, folder: Path) -> Palette:
+        return cls(load_file(folder / PALETTE)["scale"])
+
+    @classmethod
+    def describe(cls, folder: Path) -> EncodersDescription:
+        return EncodersDescription(cls.__name__)
+
+    @property
+    def description(self) -> EncodersDescription:
+        return EncodersDescription(type(self).__name__)
+
+    def save(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        save_file({"scale": self.scale}, folder / PALETTE, {"format": "pt"})
+
+    def to(self, device: torch.device) -> Palette:
+        return Palette(self.scale.to(device))
+
+    def encode(self, samples: Sequence[Footage], execution: Execution) -> list[Trajectory | RewardError]:
+        return [self._encoded(sample) for sample in samples]
+
+    def _encoded(self, sample: Footage) -> Trajectory:
+        colours = np.concatenate([each.positions.mean(axis=(1, 2)) for each in sample.trajectories])
+        letters = np.full(1, len(sample.trajectories[0].task), np.float32)
+        embeddings = self.scale.cpu().numpy() * colours.astype(np.float32)
+        return Trajectory(video_embeddings=embeddings, text_embedding=letters)
+
+
+@dataclass(frozen=True)
+class ToyPredictor:
+    """A row is the embeddings of a sample's trajectories."""
+
+    network: Redness
+
+    def rows(self, sample: Sample) -> list[list[np.ndarray]]:
+        if isinstance(sample, SimilaritySample):
+            raise InvalidSampleError.at("sample_type", "progress or preference", "similarity")
+        videos = [trajectory.positions for trajectory in sample.trajectories]
+        if isinstance(sample, ProgressSample) and sample.frame_steps:
+            return [[videos[0][picked]] for picked in prefix_indices(len(videos[0]), sample.frame_steps)]
+        return [videos]
+
+    def num_tokens(self, row: list[np.ndarray]) -> int:
+        return sum(map(len, row))
+
+    def collate(self, rows: Sequence[list[np.ndarray]]) -> Tensor:
+        return torch.from_numpy(np.concatenate([video for row in rows for video in row]))
+
+    def occupancy(self, batch: Tensor) -> tuple[int, int]:
+        return len(batch), len(batch)
+
+    @torch.inference_mode()
+    def score(self, rows: Sequence[list[np.ndarray]], batch: Tensor) -> list[RowScores | RewardError]:
+        logits = iter(self.network(batch).split([len(video) for row in rows for video in row]))
+        scored: list[RowScores | RewardError] = []
+        for row in rows:
+            of_row = [next(logits) for _ in row]
+            query = (of_row[0][-1] - of_row[1][-1]).sigmoid().item() if len(row) == 2 else None
+            scored.append(RowScores([frame_scores(each, each[:, 0]) for each in of_row], query))
+        return scored
+
+
+@dataclass(frozen=True)
+class ToyCheckpoint:
+    config: ToyConfig
+    weights: dict[str, Tensor]
+
+    @property
+    def description(self) -> Description:
+        return Description(Redness.__name__, (self.config.num_colours, 1), progress_bins=1, has_similarity=False)
+
+    @property
+    def parts(self) -> dict[str, dict[str, Tensor]]:
+        return {NETWORK: self.weights}
+
+    def encoders(self) -> Palette:
+        return Palette(torch.full((self.config.num_colours,), 1 / 255))
+
+    def predictor(self, device: torch.device, dtype: torch.dtype | None = None) -> ToyPredictor:
+        network = Redness(self.config)
+        network.load_state_dict(self.weights)
+        return ToyPredictor(network)
+
+    def save(self, folder: Path) -> None:
+        folder.mkdir(parents=True)
+        (folder / NETWORK_CONFIG).write_text(json.dumps({"model_type": MODEL_TYPE, **asdict(self.config)}))
+        save_file(self.weights, folder / WEIGHTS, {"format": "pt"})
+
+
+def reads(folder: Path) -> bool:
+    file = folder / NETWORK_CONFIG
+    return file.exists() and json.loads(file.read_text()).get("model_type") == MODEL_TYPE
+
+
+def load(folder: Path, options: Options) -> ToyCheckpoint:
+    content = json.loads((folder / NETWORK_CONFIG).read_text())
+    return ToyCheckpoint(ToyConfig(content["num_colours"]), load_file(folder / WEIGHTS))
+
+
+FAMILY = Family(name=__name__, reads=reads, load=load, encoders=Palette)
