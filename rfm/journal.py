@@ -29,13 +29,13 @@ class Journal:
 
     @classmethod
     def create(cls, file: Path, capacity: int) -> Journal:
-        """This process', for batches of up to ``capacity`` requests."""
+        """The journal of this process, for batches of up to ``capacity`` requests."""
         file.write_bytes(_HEADER.pack(os.getpid(), 0, 0.0, 0) + bytes(DIGEST_BYTES * capacity))
         return cls(file)
 
     @classmethod
     def open(cls, file: Path) -> Journal | None:
-        """None: there is none."""
+        """The journal in ``file``; None: there is none."""
         try:
             return cls(file)
         except (OSError, ValueError):  # gone, or not written yet
@@ -43,12 +43,12 @@ class Journal:
 
     @property
     def pid(self) -> int:
-        """Whose it is."""
+        """The process that wrote it."""
         return int(self._header[0])
 
     @property
     def num_refused(self) -> int:
-        """Requests that were refused as poison."""
+        """Requests that the quarantine has refused."""
         return int(self._header[1])
 
     @property
@@ -59,7 +59,7 @@ class Journal:
 
     @property
     def digests(self) -> list[bytes]:
-        """Of the batch."""
+        """The digests of the batch's requests."""
         count = self._header[3] if self._header[2] else 0
         places = range(_HEADER.size, _HEADER.size + DIGEST_BYTES * count, DIGEST_BYTES)
         return [self._memory[place : place + DIGEST_BYTES] for place in places]
@@ -80,7 +80,7 @@ class Journal:
         self._write(time.monotonic(), self._header[3])
 
     def count_refused(self) -> None:
-        """One more."""
+        """Counts one more request that was refused."""
         _HEADER.pack_into(self._memory, 0, self.pid, self.num_refused + 1, *self._header[2:])
 
     def forget(self, unsuspected: bytes) -> None:

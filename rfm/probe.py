@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The least that a model can be asked: by itself, and by those who watch it."""
+"""The request of a health probe: the smallest one that a model can answer."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _BLANK_PX = 64
 
 
 def blank_question(config: Mapping[str, Any]) -> wire.Tensors:
-    """The least that a model with this configuration can be asked: the inputs of one short sample of zeros."""
+    """The inputs of one short sample of zeros, for a model with this configuration."""
     dims = {tensor["name"]: [int(dim) for dim in tensor["dims"]] for tensor in config["input"]}
     if wire.VIDEO_EMBEDDINGS in dims:
         (_, video_dim), (text_dim,) = dims[wire.VIDEO_EMBEDDINGS], dims[wire.TEXT_EMBEDDING]

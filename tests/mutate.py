@@ -51,6 +51,8 @@ TESTS: dict[str, tuple[str, ...]] = {
     "rfm/checkpoint/*.py": ("test_checkpoint", "test_hostile_files", "test_properties", "test_vlm"),
     "client/rfm_client/contract/wire.py": ("test_wire", "test_samples", "test_properties"),
     "rfm/triton_model/batch_model.py": ("test_batch_model", "test_poison", "test_logs"),
+    "rfm/triton_model/cancellation.py": ("test_batch_model",),
+    "rfm/triton_model/request.py": ("test_batch_model", "test_poison"),
     "rfm/supervise/healing.py": ("test_healing",),
 }
 

@@ -23,12 +23,14 @@ import numpy as np
 import pytest
 from rfm_serve import MODEL, PATIENCE_S, RFM, ROOT, TRUTH_S, Serving, children, serving, wait_for
 
+from rfm.journal import SUFFIX
 from rfm.supervise import leftovers, restarts
 from rfm.supervise.installation import find_installation
 from rfm.supervise.process import Endpoints, TritonServer
 from rfm.supervise.restarts import CrashLoopError, Restarts
 from rfm.supervise.stubs import SHARED_MEMORY, is_alive
-from rfm.triton_model import quarantine as poison
+from rfm.triton_model.digest import digest
+from rfm.triton_model.quarantine import Quarantine
 from rfm.triton_model.self_check import FAILED_BATCHES
 from rfm_client import (
     InferenceFailedError,
@@ -283,7 +285,7 @@ def test_what_a_killed_container_left_is_removed_and_what_a_living_one_has_is_no
     try:
         wait_for(folders)
         names += [folder.name.removeprefix("rfm-backends-").replace("-", "_") for folder in folders()]
-        wait_for(lambda: any(path.name.endswith(poison.SUFFIX) for path in left()))  # a model process of it runs
+        wait_for(lambda: any(path.name.endswith(SUFFIX) for path in left()))  # a model process of it runs
         own = left()
         assert not own & set(leftovers.clear())
         assert own <= left()
@@ -459,23 +461,23 @@ def test_a_full_queue_refuses_at_once_and_a_long_wait_is_cut_short(tmp_path: Pat
 
 def test_a_journal_outlives_its_process_and_tells_what_it_was_working_on(tmp_path: Path) -> None:
     tensors = {"a": np.arange(100_000, dtype=np.float32), "task": np.array([[b"stack"]], np.object_)}
-    first = poison.digest(tensors)
-    assert first == poison.digest({name: array.copy() for name, array in tensors.items()})
+    first = digest(tensors)
+    assert first == digest({name: array.copy() for name, array in tensors.items()})
     changed = dict(tensors, a=tensors["a"].copy())
     changed["a"] += 1
-    others = [poison.digest(changed), poison.digest(dict(tensors, task=np.array([[b"sort"]], np.object_)))]
+    others = [digest(changed), digest(dict(tensors, task=np.array([[b"sort"]], np.object_)))]
     assert len({first, *others}) == 3
 
     def die(name: str) -> None:
         """A process that dies while it works on two requests."""
-        code = "import os, sys; from pathlib import Path; from rfm.triton_model.quarantine import Poison; folder = Path(sys.argv[1])\n"
-        code += "poison = Poison(folder / sys.argv[2], sorted(folder.glob('*_batch')), 4)\n"
-        code += "with poison.at_work_on([bytes.fromhex(word) for word in sys.argv[3:]]): os._exit(1)"
+        code = "import os, sys; from pathlib import Path; from rfm.triton_model.quarantine import Quarantine; folder = Path(sys.argv[1])\n"
+        code += "own = Quarantine(folder / sys.argv[2], sorted(folder.glob('*_batch')), 4)\n"
+        code += "with own.at_work_on([bytes.fromhex(word) for word in sys.argv[3:]]): os._exit(1)"
         words = [told.hex() for told in (first, others[0])]
         subprocess.run([sys.executable, "-c", code, tmp_path, name, *words], check=False, timeout=PATIENCE_S)
 
     die("1_batch")
-    one = poison.Poison(tmp_path / "2_batch", tmp_path.glob("1_batch"), 4)
+    one = Quarantine(tmp_path / "2_batch", tmp_path.glob("1_batch"), 4)
     assert [one.is_suspect(told) for told in (first, *others)] == [True, True, False]
     one.check(first)
     with one.at_work_on([others[0]]):
@@ -483,7 +485,7 @@ def test_a_journal_outlives_its_process_and_tells_what_it_was_working_on(tmp_pat
     assert [one.is_suspect(told) for told in (first, *others)] == [True, False, False]
     one.close()
     die("3_batch")
-    two = poison.Poison(tmp_path / "4_batch", sorted(tmp_path.glob("*_batch")), 4)
+    two = Quarantine(tmp_path / "4_batch", sorted(tmp_path.glob("*_batch")), 4)
     with pytest.raises(InvalidSampleError, match="ended its process 2 times"):
         two.check(first)
     two.check(others[0])  # once: it was survived meanwhile

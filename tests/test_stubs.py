@@ -9,10 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from rfm.journal import Journal
+from rfm.journal import SUFFIX, Journal
 from rfm.supervise import stubs
 from rfm.supervise.stubs import Stub, StubWatch
-from rfm.triton_model import quarantine as poison
 
 TRITON = 10
 MODEL = "rfm"
@@ -46,7 +45,7 @@ class Machine:
         (self.proc / str(pid)).rmdir()
 
     def journal(self, pid: int) -> Journal:
-        return Journal.create(self.memory / f"region_{pid}_{MODEL}{poison.SUFFIX}", 1)
+        return Journal.create(self.memory / f"region_{pid}_{MODEL}{SUFFIX}", 1)
 
     def _write(self, pid: int, state: str, started_ticks: int) -> None:
         zeros = " ".join(["0"] * 17)
