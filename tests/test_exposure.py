@@ -31,9 +31,9 @@ from typer.testing import CliRunner
 
 import rfm_export
 from rfm.config import ConfigError, ServeConfig
+from rfm.supervise.cleanup import REGION_PREFIX
 from rfm.supervise.exposure import MAX_HTTP_BYTES, GrpcTls, check_version, size_limits
 from rfm.supervise.installation import Installation, ServerStartError, find_installation
-from rfm.supervise.leftovers import REGION_PREFIX
 from rfm.supervise.own_tls import OwnTls
 from rfm.supervise.process import Endpoints, TritonServer
 from rfm_client import AccessDeniedError, ProgressSample, RewardClient, ServerUnavailableError

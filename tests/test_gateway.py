@@ -42,8 +42,8 @@ from rfm import families
 from rfm.checkpoint.content import read_run_config
 from rfm.config import ServeConfig
 from rfm.rewind.network import RewindConfig, RewindTransformer
+from rfm.supervise.cleanup import REGION_PREFIX
 from rfm.supervise.installation import find_installation
-from rfm.supervise.leftovers import REGION_PREFIX
 from rfm.supervise.process import Endpoints, TritonServer
 from rfm.supervise.stubs import SHARED_MEMORY
 from rfm_client import (

@@ -24,7 +24,7 @@ import pytest
 from rfm_serve import MODEL, PATIENCE_S, RFM, ROOT, TRUTH_S, Serving, children, serving, wait_for
 
 from rfm.journal import SUFFIX
-from rfm.supervise import leftovers, restarts
+from rfm.supervise import cleanup, restarts
 from rfm.supervise.installation import find_installation
 from rfm.supervise.process import Endpoints, TritonServer
 from rfm.supervise.restarts import CrashLoopError, Restarts
@@ -256,7 +256,7 @@ def test_a_server_that_is_killed_leaves_nothing_running_and_the_next_removes_the
         wait_for(lambda: not any(path.exists() for path in left))
         served.wait_ready()
         assert list(SHARED_MEMORY.glob(f"*_rfm_{served.process.pid}_*"))
-        leftovers.clear()
+        cleanup.clear()
         assert list(SHARED_MEMORY.glob(f"*_rfm_{served.process.pid}_*"))  # it lives
     assert any(f"removed {left[0]}" in line for line in served.said)
     assert not list(Path(tempfile.gettempdir()).glob(f"rfm-backends-{killed.pid}-*"))
@@ -287,12 +287,12 @@ def test_what_a_killed_container_left_is_removed_and_what_a_living_one_has_is_no
         names += [folder.name.removeprefix("rfm-backends-").replace("-", "_") for folder in folders()]
         wait_for(lambda: any(path.name.endswith(SUFFIX) for path in left()))  # a model process of it runs
         own = left()
-        assert not own & set(leftovers.clear())
+        assert not own & set(cleanup.clear())
         assert own <= left()
     finally:
         container.kill()
         container.wait(PATIENCE_S)
-    wait_for(lambda: leftovers.clear() or not own & left())  # its processes have ended
+    wait_for(lambda: cleanup.clear() or not own & left())  # its processes have ended
     assert not own & left()
 
 

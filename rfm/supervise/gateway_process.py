@@ -7,7 +7,7 @@ import subprocess
 import time
 from collections.abc import Sequence
 
-from rfm.supervise.leftovers import ending_with_parent
+from rfm.supervise.cleanup import ending_with_parent
 from rfm.supervise.process import KILL_AFTER_S
 from rfm.supervise.restarts import Restarts
 

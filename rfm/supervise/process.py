@@ -22,9 +22,9 @@ from tritonclient.utils import InferenceServerException
 from rfm.config import DEFAULT_HOST, ServeConfig
 from rfm.supervise.admin_key import VARIABLE, http_headers, new_key, restrictions
 from rfm.supervise.arguments import check_arguments
+from rfm.supervise.cleanup import Claim, ending_with_parent
 from rfm.supervise.exposure import GrpcTls, check_before_start, check_version, size_limits
 from rfm.supervise.installation import Installation, ServerStartError
-from rfm.supervise.leftovers import Claim, ending_with_parent
 from rfm.supervise.own_tls import OwnTls
 from rfm.supervise.repository_api import one_line
 from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
@@ -139,18 +139,18 @@ class TritonServer:
 
     @property
     def models(self) -> list[str]:
-        """Of the repository."""
+        """The names of the models in the repository."""
         return sorted(file.parent.name for file in self.repository.glob("*/config.pbtxt"))
 
     @property
     def pid(self) -> int:
-        """Of the process that was started last."""
+        """The id of the process that was started last."""
         assert self._process is not None  # started
         return self._process.pid
 
     @property
     def exit_status(self) -> int | None:
-        """None: it runs."""
+        """The process' exit status; None: it runs."""
         assert self._process is not None  # started
         return self._process.poll()
 
