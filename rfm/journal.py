@@ -16,6 +16,7 @@ DIGEST_BYTES = 8
 NO_DIGEST = bytes(DIGEST_BYTES)  # of what is no suspect whatever happens
 SUFFIX = "_batch"
 
+_ZOMBIE = "Z"
 _HEADER = struct.Struct("<QQdQ")  # process id, requests refused, when the batch last got on (0: idle), its requests
 
 
@@ -45,6 +46,11 @@ class Journal:
     def pid(self) -> int:
         """The process that wrote it."""
         return int(self._header[0])
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the process that wrote it has not ended."""
+        return is_alive(self.pid)
 
     @property
     def num_refused(self) -> int:
@@ -101,3 +107,12 @@ class Journal:
 
     def _write(self, since_s: float, count: int) -> None:
         _HEADER.pack_into(self._memory, 0, self.pid, self.num_refused, since_s, count)
+
+
+def is_alive(pid: int) -> bool:
+    """Whether there is a process of this id that has not ended."""
+    try:
+        stat = Path("/proc", str(pid), "stat").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return stat.rpartition(")")[2].split()[0] != _ZOMBIE

@@ -20,7 +20,7 @@ from rfm_serve import MODEL, RFM, TRUTH_S, children, wait_for
 
 import rfm_export
 from rfm.config import ServeConfig
-from rfm.supervise.stubs import is_alive
+from rfm.journal import is_alive
 from rfm_client import RewardClient
 from rfm_client.transport.shared_memory import FOLDER
 from rfm_export.publish import read_config

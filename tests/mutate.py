@@ -54,8 +54,9 @@ TESTS: dict[str, tuple[str, ...]] = {
     "rfm/triton_model/cancellation.py": ("test_batch_model",),
     "rfm/triton_model/request.py": ("test_batch_model", "test_poison"),
     "rfm/supervise/lifecycle.py": ("test_lifecycle",),
-    "rfm/supervise/served_model.py": ("test_lifecycle", "test_healing"),
-    "rfm/supervise/reload.py": ("test_served", "test_healing"),
+    "rfm/supervise/served_model.py": ("test_served_model",),
+    "rfm/supervise/reload.py": ("test_served_model",),
+    "rfm/supervise/model_probe.py": ("test_served_model",),
 }
 
 

@@ -32,10 +32,11 @@ from typer.testing import CliRunner
 import rfm_export
 from rfm.config import ConfigError, ServeConfig
 from rfm.supervise.cleanup import REGION_PREFIX
-from rfm.supervise.exposure import MAX_HTTP_BYTES, GrpcTls, check_version, size_limits
 from rfm.supervise.installation import Installation, ServerStartError, find_installation
-from rfm.supervise.own_tls import OwnTls
+from rfm.supervise.listen_address import check_version
 from rfm.supervise.process import Endpoints, TritonServer
+from rfm.supervise.tls import GrpcTls, OwnTls
+from rfm.supervise.triton_options import MAX_HTTP_BYTES, size_limits
 from rfm_client import AccessDeniedError, ProgressSample, RewardClient, ServerUnavailableError
 from rfm_client.status import read_status
 from rfm_client.transport.access import Access

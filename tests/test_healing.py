@@ -21,14 +21,15 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from clock import Clock
 from rfm_serve import MODEL, PATIENCE_S, RFM, ROOT, TRUTH_S, Serving, children, serving, wait_for
 
-from rfm.journal import SUFFIX
+from rfm.journal import SUFFIX, is_alive
 from rfm.supervise import cleanup, restarts
 from rfm.supervise.installation import find_installation
 from rfm.supervise.process import Endpoints, TritonServer
 from rfm.supervise.restarts import CrashLoopError, Restarts
-from rfm.supervise.stubs import SHARED_MEMORY, is_alive
+from rfm.supervise.stubs import SHARED_MEMORY
 from rfm.triton_model.digest import digest
 from rfm.triton_model.quarantine import Quarantine
 from rfm.triton_model.self_check import FAILED_BATCHES
@@ -376,16 +377,6 @@ def test_a_server_that_is_killed_again_and_again_is_given_up(tmp_path: Path) -> 
     wanted = r"rfm: tritonserver: expected to run, got 6 ends, each within 60 s of a start; the last: .*exit status -9"
     assert re.fullmatch(wanted, served.said[-1]), served.said
     assert len(killed) == restarts.MOST + 1
-
-
-class Clock:
-    """A ``time`` module whose time passes when the test says so."""
-
-    def __init__(self) -> None:
-        self.now_s = 0.0
-
-    def monotonic(self) -> float:
-        return self.now_s
 
 
 def test_what_ran_for_long_is_no_part_of_a_crash_loop(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,10 +22,11 @@ import numpy as np
 import pytest
 from rfm_serve import children, serving, wait_for
 
+from rfm.journal import is_alive
 from rfm.supervise import installation
 from rfm.supervise.installation import ServerStartError, find_installation
 from rfm.supervise.process import Endpoints, TritonServer
-from rfm.supervise.stubs import SHARED_MEMORY, is_alive
+from rfm.supervise.stubs import SHARED_MEMORY
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 
 REPOSITORY = Path(__file__).parents[1] / "model_repository"

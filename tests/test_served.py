@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import re
 import shutil
@@ -21,15 +20,12 @@ import rollout
 from rfm_serve import MODEL, Serving, serving, wait_for
 from test_healing import Callers, make_repository, references, trajectory
 
-from rfm.supervise import reload, triton_watch
+from rfm.supervise import triton_watch
 from rfm.supervise.http import Http
 from rfm.supervise.installation import find_installation
-from rfm.supervise.lifecycle import Event
-from rfm.supervise.model_probe import ModelProbe
 from rfm.supervise.process import Endpoints, TritonServer
-from rfm.supervise.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
+from rfm.supervise.repository_api import RepositoryApi, RepositoryApiError
 from rfm.supervise.served import NOT_LOADED, SILENT, Served
-from rfm.supervise.served_model import ServedModel
 from rfm.supervise.status import NO_REASON, Status
 from rfm.supervise.triton_watch import TritonWatch
 from rfm_commands.rollout import Rollout
@@ -290,96 +286,3 @@ def test_a_triton_that_is_gone_is_the_supervisor_s_to_see() -> None:
         assert not about.ready[0]
     finally:
         served.close()
-
-
-def unprobed() -> ModelProbe:
-    """A probe of a model that nobody serves."""
-    endpoints = Endpoints.free()
-    return ModelProbe(Http(endpoints.http_host, endpoints.http_port), MODEL, 1.0, 1.0, lambda _: None)
-
-
-def model_of(probe: ModelProbe) -> ServedModel:
-    """A model of a server that has no processes."""
-    watch = SimpleNamespace(of_model=lambda _: [], bury=lambda _: None, is_getting_on=lambda _: False)
-    server = SimpleNamespace(endpoints=Endpoints.free(), admin_key=KEY, grpc_options={})
-    return ServedModel(MODEL, probe, server, watch, Status(), print)  # type: ignore[arg-type]
-
-
-def test_what_is_closed_heals_nothing_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    api = Administered("READY")
-    monkeypatch.setattr(reload, "RepositoryApi", lambda *_: api)
-    model = model_of(unprobed())
-    monkeypatch.setattr(api, "unload", lambda name: api.asked.append("unload") or model.close())
-    assert model.look("its process is dead", {}) == "its process is dead"
-    wait_for(lambda: model.look(None, {}) or not model.is_healing)
-    assert api.asked == ["unload"]  # what Triton is told next may be another's
-
-
-def test_what_fails_is_tried_again_after_longer_and_longer_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
-
-    def refuse(*_: object) -> None:
-        asked.append(time.monotonic())
-        raise RepositoryApiError("refused")
-
-    monkeypatch.setattr(reload, "RepositoryApi", refuse)
-    model = model_of(unprobed())
-    assert model.look("its process is dead", {}) == "its process is dead"
-    wait_for(lambda: model.look(None, {}) or len(asked) == 4)  # the next is 4 s away
-    wait_for(lambda: model.look(None, {}) or model.reason == "it is loaded anew, after: refused")
-    pauses_s = [later - earlier for earlier, later in itertools.pairwise(asked)]
-    assert [least <= pause_s for least, pause_s in zip((0.5, 1.0, 2.0), pauses_s, strict=True)] == [True] * 3
-    assert model.is_healing
-
-
-class Administered:
-    """A fake of the API, of a server where a load goes wrong, and somebody else loads another version."""
-
-    def __init__(self, state: str, reason: str = "") -> None:
-        self.entry = ModelVersion(MODEL, 1, state, reason)
-        self.asked: list[str] = []
-
-    def __enter__(self) -> Administered:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def index(self) -> list[ModelVersion]:
-        return [self.entry]
-
-    def config(self, model: str, version: int) -> dict[str, Any]:
-        return {"name": model, "of": version}
-
-    def unload(self, model: str) -> None:
-        self.asked.append("unload")
-
-    def load(self, model: str, config: Any) -> None:
-        self.asked.append(f"load {config['of']}")
-        self.entry = ModelVersion(MODEL, 2, "READY", "")
-        raise RepositoryApiError("the weights are damaged")
-
-
-@pytest.mark.parametrize(
-    ("state", "reason", "asked"),
-    [("READY", "", ["unload", "load 1"]), ("UNAVAILABLE", "unloaded", [])],
-    ids=["somebody has loaded another version", "somebody has unloaded it"],
-)
-def test_what_others_did_while_a_model_is_healed_stays(
-    monkeypatch: pytest.MonkeyPatch, state: str, reason: str, asked: list[str]
-) -> None:
-    api = Administered(state, reason)
-    monkeypatch.setattr(reload, "RepositoryApi", lambda *_: api)
-    model = model_of(unprobed())
-    assert model.look("its process is dead", {}) is not None
-    wait_for(lambda: model.look(None, {}) or not model.is_healing)
-    assert model.look(None, {}) is None  # not once more
-    assert api.asked == asked
-    model.close()
-
-
-def test_a_model_of_a_triton_that_tells_nothing_does_not_hang() -> None:
-    """It may be busy with a model that it loads; and if it is not, it is Triton that is started again."""
-    endpoints = Endpoints.free()
-    probe = ModelProbe(Http(endpoints.http_host, endpoints.http_port), MODEL, 0.1, 0.0, lambda _: None)
-    wait_for(lambda: probe.look() is Event.LATE)

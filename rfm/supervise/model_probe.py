@@ -70,7 +70,10 @@ class ModelProbe:
         self._body: bytes | None = None
         self._due_s = 0.0
         self._waiting_since_s: float | None = None
-        self._last_success: tuple[Any, float] | None = None
+        self._stats: Future[list[int]] | None = None
+        self._successes: list[int] | None = None  # requests that each version has answered
+        self._last_success_s = 0.0  # when they were last seen to grow
+        self._has_stats = False  # else Triton gives no answer; the model may
         self._took_s: deque[float] = deque(maxlen=_KEPT)
         self._num_failures = 0
         self._has_succeeded = False
@@ -84,31 +87,38 @@ class ModelProbe:
         if self._probe is None and time.monotonic() >= self._due_s:
             self._waiting_since_s = self._waiting_since_s or time.monotonic()
             self._probe = in_background(f"rfm-probe-{self._model}", self._ask)
+        if self._waiting_since_s is not None and time.monotonic() - self._waiting_since_s > LATE_S / 2:
+            self._look_at_stats()
         return self._judged()
 
     def _judged(self) -> Event | None:
         if self._waiting_since_s is None or self._known in (Event.DEAD, Event.BROKEN):
             return self._known
-        waited_s = time.monotonic() - self._waiting_since_s
-        last_success_s: float | None = 0.0
-        if waited_s > LATE_S / 2:
-            last_success_s = self._last_success_s()
-            waited_s = min(waited_s, time.monotonic() - (last_success_s or 0.0))
+        waited_s = time.monotonic() - max(self._waiting_since_s, self._last_success_s)
         slowest_s = LATE_FACTOR * max(self._took_s, default=0.0)
-        if waited_s > max(self._hang_s, slowest_s) and last_success_s is not None:
+        if waited_s > max(self._hang_s, slowest_s) and self._has_stats:
             return Event.HUNG
         return Event.LATE if waited_s > max(LATE_S, slowest_s) else self._known
 
-    def _last_success_s(self) -> float | None:
-        """When the model was last seen to have answered anybody; None: Triton gives no answer, the model may."""
-        try:
-            versions = self._http.get_json(f"/v2/models/{self._model}/stats")["model_stats"]
-            count = [version["inference_stats"]["success"].get("count", 0) for version in versions]
-        except NO_ANSWER:
-            return None
-        if self._last_success is None or self._last_success[0] != count:
-            self._last_success = count, (time.monotonic() if self._last_success else 0.0)
-        return self._last_success[1]
+    def _look_at_stats(self) -> None:
+        """Sees whether the model answers anybody, as Triton counts it."""
+        if self._stats is not None and self._stats.done():
+            try:
+                successes = self._stats.result()
+            except NO_ANSWER:
+                self._has_stats = False
+            else:
+                if self._successes is not None and successes != self._successes:
+                    self._last_success_s = time.monotonic()
+                self._successes, self._has_stats = successes, True
+            self._stats = None
+        if self._stats is None:
+            self._stats = in_background(f"rfm-stats-{self._model}", self._ask_stats)
+
+    def _ask_stats(self) -> list[int]:
+        """Runs in a thread of its own, and changes nothing."""
+        versions = self._http.get_json(f"/v2/models/{self._model}/stats")["model_stats"]
+        return [version["inference_stats"]["success"].get("count", 0) for version in versions]
 
     def _ask(self) -> Reply:
         """Runs in a thread of its own, and changes nothing."""
@@ -126,7 +136,7 @@ class ModelProbe:
         self._body = reply.body
         known = self._event_of(reply)
         if known is not None:
-            self._known, self._waiting_since_s = known, None
+            self._known, self._waiting_since_s, self._has_stats = known, None, False
             self._took_s.append(reply.took_s)
             self._observe(reply.took_s)
 

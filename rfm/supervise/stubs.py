@@ -155,12 +155,6 @@ class StubWatch:
         self._stubs = known | {stub for stub in found if stub is not None} - self._buried
 
 
-def is_alive(pid: int) -> bool:
-    """Whether there is a process that has not ended."""
-    fields = _stat(pid)
-    return bool(fields) and fields[0] != _ZOMBIE
-
-
 def _stat(pid: int) -> list[str]:
     """State, parent and so on: what stands behind the name, which may hold anything."""
     try:

@@ -20,7 +20,7 @@ from rfm.supervise.admin_key import http_headers
 from rfm.supervise.background import in_background
 from rfm.supervise.http import NO_ANSWER, Http
 from rfm.supervise.process import TritonServer
-from rfm.supervise.repository_api import READY, ModelVersion, versions_of
+from rfm.supervise.repository_api import INDEX_PATH, READY, ModelVersion, versions_of
 
 INTERVAL_S = 1.0
 LOOKS = 3  # without any answer, at least, before it has to be started again
@@ -151,8 +151,8 @@ class TritonWatch:
 
     def _new_snapshot(self) -> Snapshot:
         asked_s = time.monotonic()
-        path = "/v2/repository/index"
-        versions = versions_of(self._http.get_json(path, _INDEX_TIMEOUT_S, method="POST", headers=self._headers))
+        index = self._http.get_json(INDEX_PATH, _INDEX_TIMEOUT_S, method="POST", headers=self._headers)
+        versions = versions_of(index)
         loaded = sorted({entry.name for entry in versions if entry.is_ready})
         configs = {} if self.snapshot is None else dict(self.snapshot.configs)
         for model in loaded:

@@ -28,7 +28,6 @@ DEATHS = 2  # after which a request is refused
 
 _FOLDER = Path("/dev/shm")
 _STUB_REGION = 2  # which argument of a model process names its shared memory
-_ZOMBIE = "Z"
 
 
 class Quarantine:
@@ -102,18 +101,10 @@ def journals(folder: Path, region: str, model: str) -> list[Path]:
 def _of_the_dead(file: Path) -> Journal | None:
     """The journal of a dead process, if it names suspects. One that names none, or no more, is removed."""
     journal = Journal.open(file)
-    if journal is None or _is_alive(journal.pid):
+    if journal is None or journal.is_alive:
         return None
     if not 0 < journal.busy_s < QUARANTINE_S:
         with suppress(OSError):
             journal.close()
         return None
     return journal
-
-
-def _is_alive(pid: int) -> bool:
-    try:
-        stat = Path("/proc", str(pid), "stat").read_text()
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-    return stat.rpartition(")")[2].split()[0] != _ZOMBIE
