@@ -25,10 +25,10 @@ from clock import Clock
 from rfm_serve import MODEL, PATIENCE_S, RFM, ROOT, TRUTH_S, Serving, children, serving, wait_for
 
 from rfm.journal import SUFFIX, is_alive
-from rfm.supervise import cleanup, restarts
+from rfm.supervise import back_off, cleanup
+from rfm.supervise.back_off import BackOff, CrashLoopError
 from rfm.supervise.installation import find_installation
 from rfm.supervise.process import Endpoints, TritonServer
-from rfm.supervise.restarts import CrashLoopError, Restarts
 from rfm.supervise.stubs import SHARED_MEMORY
 from rfm.triton_model.digest import digest
 from rfm.triton_model.quarantine import Quarantine
@@ -376,38 +376,38 @@ def test_a_server_that_is_killed_again_and_again_is_given_up(tmp_path: Path) -> 
     assert served.process.returncode == 1
     wanted = r"rfm: tritonserver: expected to run, got 6 ends, each within 60 s of a start; the last: .*exit status -9"
     assert re.fullmatch(wanted, served.said[-1]), served.said
-    assert len(killed) == restarts.MOST + 1
+    assert len(killed) == back_off.MOST + 1
 
 
 def test_what_ran_for_long_is_no_part_of_a_crash_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
-    monkeypatch.setattr(restarts, "time", clock)
-    ends = Restarts("gateway")
+    monkeypatch.setattr(back_off, "time", clock)
+    ends = BackOff("gateway")
 
     def run(duration_s: float) -> float:
         ends.started()
         clock.now_s += duration_s
         return ends.pause_s("why")
 
-    assert [run(1.0) for _ in range(restarts.MOST)] == [0, 0.5, 1, 2, 4]
-    assert run(restarts.STEADY_S) == 0
-    for _ in range(restarts.MOST - 1):
+    assert [run(1.0) for _ in range(back_off.MOST)] == [0, 0.5, 1, 2, 4]
+    assert run(back_off.STEADY_S) == 0
+    for _ in range(back_off.MOST - 1):
         run(1.0)
     with pytest.raises(CrashLoopError, match="gateway: expected to run, got 6 ends, each within 60 s"):
         run(1.0)
 
 
-@pytest.mark.parametrize("attempt_s", [1.0, 2 * restarts.STEADY_S])
+@pytest.mark.parametrize("attempt_s", [1.0, 2 * back_off.STEADY_S])
 def test_starts_that_fail_are_a_crash_loop_however_long_it_ran_before(
     monkeypatch: pytest.MonkeyPatch, attempt_s: float
 ) -> None:
     clock = Clock()
-    monkeypatch.setattr(restarts, "time", clock)
-    ends = Restarts("tritonserver")
+    monkeypatch.setattr(back_off, "time", clock)
+    ends = BackOff("tritonserver")
     ends.started()
-    clock.now_s += 5 * restarts.STEADY_S
+    clock.now_s += 5 * back_off.STEADY_S
     pauses = []
-    for _ in range(restarts.MOST):
+    for _ in range(back_off.MOST):
         pauses.append(ends.pause_s("it does not start"))
         clock.now_s += attempt_s
     assert pauses == [0, 0.5, 1, 2, 4]

@@ -12,7 +12,7 @@ import pytest
 from clock import Clock
 from rfm_serve import MODEL, wait_for
 
-from rfm.supervise import model_probe, reload, restarts, served_model
+from rfm.supervise import back_off, model_probe, reload, served_model
 from rfm.supervise.http import Http
 from rfm.supervise.lifecycle import Event, State
 from rfm.supervise.model_probe import ModelProbe
@@ -80,7 +80,7 @@ class Bench:
         self.probed: Event | None = None
         self.is_getting_on = False
         self.renewed = 0
-        for module in (restarts, served_model, reload):
+        for module in (back_off, served_model, reload):
             monkeypatch.setattr(module, "time", self.clock)
         monkeypatch.setattr(reload, "RepositoryApi", lambda *_: self.triton)
         monkeypatch.setattr(served_model, "in_background", at_once)
@@ -206,9 +206,9 @@ def test_what_fails_is_tried_again_after_longer_and_longer_pauses_and_then_seldo
 
 
 def test_what_dies_again_and_again_is_taken_out_and_loaded_by_somebody(bench: Bench) -> None:
-    for _ in range(restarts.MOST):
+    for _ in range(back_off.MOST):
         bench.look(died="its process is dead")
-        bench.wait(restarts.LONGEST_PAUSE_S)
+        bench.wait(back_off.LONGEST_PAUSE_S)
         assert bench.model.state is State.NEW
     bench.look(died="its process is dead")
     bench.wait(0.0)

@@ -155,7 +155,7 @@ class Served:
     def _new_model(self, name: str, config: Config) -> ServedModel:
         probe = None
         if can_be_probed(config):
-            observe = self._status.canary_seconds.labels(name).observe
+            observe = self._status.probe_seconds.labels(name).observe
             probe = ModelProbe(self._http, name, self._canary_s, self._hang_s, observe)
         return ServedModel(name, probe, self._server, self._stubs, self._status, self._say)
 

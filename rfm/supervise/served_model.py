@@ -8,12 +8,12 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from functools import partial
 
+from rfm.supervise.back_off import BackOff, CrashLoopError
 from rfm.supervise.background import in_background
 from rfm.supervise.lifecycle import CRASH_LOOPING, FAULTS, HEALING, Action, Event, Lifecycle, State
 from rfm.supervise.model_probe import ModelProbe
 from rfm.supervise.process import TritonServer
 from rfm.supervise.reload import Reload
-from rfm.supervise.restarts import CrashLoopError, Restarts
 from rfm.supervise.status import NO_REASON, Status
 from rfm.supervise.stubs import StubWatch
 from rfm.supervise.triton_watch import Config
@@ -45,8 +45,8 @@ class ServedModel:
         self._status = status
         self._say = say
         self._lifecycle = Lifecycle(State.WAITING if probe is None else State.NEW)
-        self._restarts = Restarts(f"model {name}")
-        self._restarts.started()
+        self._back_off = BackOff(f"model {name}")
+        self._back_off.started()
         self._reload: Reload | None = None
         self._attempt: Future[None] | None = None
         self._due_s = 0.0  # the next attempt
@@ -156,7 +156,7 @@ class ServedModel:
 
     def _pause(self) -> None:
         try:
-            self._due_s = time.monotonic() + self._restarts.pause_s(self._trouble or self._why)
+            self._due_s = time.monotonic() + self._back_off.pause_s(self._trouble or self._why)
         except CrashLoopError as error:
             self._trouble = self._trouble or self._why
             self._say(f"{error}; it is not ready, and tried again every {RETRY_S / 60:g} minutes")
@@ -168,7 +168,7 @@ class ServedModel:
         self._attempt = in_background(f"rfm-heal-{self.name}", partial(attempt, self._watch.of_model(self.name)))
 
     def _renew(self) -> None:
-        self._restarts.started()
+        self._back_off.started()
         self._reload = None
         if self._probe is not None:
             self._probe.renew()

@@ -36,8 +36,8 @@ class Status:
         self._reason = Gauge(
             "rfm_serve_not_ready", "1: the model is not ready, and why.", ["model", "reason"], registry=self._registry
         )
-        self._canary_ok = Gauge("rfm_serve_canary_ok", "1: the last health probe was answered.", **labelled)  # type: ignore[arg-type]
-        self.canary_seconds = Histogram(
+        self._probe_ok = Gauge("rfm_serve_canary_ok", "1: the last health probe was answered.", **labelled)  # type: ignore[arg-type]
+        self.probe_seconds = Histogram(
             "rfm_serve_canary_seconds",
             "From a health probe to its answer.",
             ["model"],
@@ -70,7 +70,7 @@ class Status:
             self._ready.remove(model)
         for model in gone & self._probed:
             self._probed.remove(model)
-            self._canary_ok.remove(model)
+            self._probe_ok.remove(model)
 
     def record_down(self, reason: str) -> None:
         """Takes in why no model is ready."""
@@ -81,7 +81,7 @@ class Status:
     def record_probe(self, model: str, *, is_ok: bool) -> None:
         """Takes in whether a model's last probe was answered."""
         self._probed.add(model)
-        self._canary_ok.labels(model).set(is_ok)
+        self._probe_ok.labels(model).set(is_ok)
 
     @property
     def ready(self) -> tuple[bool, dict[str, Any]]:

@@ -10,10 +10,10 @@ from contextlib import closing, nullcontext
 from types import FrameType
 
 from rfm.supervise import cleanup
+from rfm.supervise.back_off import BackOff
 from rfm.supervise.gateway_process import GatewayProcess
 from rfm.supervise.installation import ServerStartError
 from rfm.supervise.process import POLL_S, STOP_SIGNALS, TritonServer
-from rfm.supervise.restarts import Restarts
 from rfm.supervise.served import Served
 from rfm.supervise.status import Status, StatusServer
 from rfm.supervise.triton_watch import Config, names_what_was_served
@@ -50,7 +50,7 @@ class Supervisor:
         self._say = say
         self._status = Status()
         self._is_to_stop = threading.Event()
-        self._triton_restarts = Restarts("tritonserver")
+        self._back_off = BackOff("tritonserver")
         self._served: Served | None = None  # None: it is started, or has ended
         self._configs: dict[str, Config] | None = None  # of what was served last; None: what the files say
 
@@ -107,7 +107,7 @@ class Supervisor:
         urls = f"{ends.grpc_url}, {ends.http_url}, metrics at {ends.metrics_url}"
         if self._configs is None:
             self._say(f"ready: {', '.join(self._server.models)} at {urls}")
-        self._triton_restarts.started()
+        self._back_off.started()
         self._served = Served(
             self._server,
             self._status,
@@ -148,7 +148,7 @@ class Supervisor:
             self._close_served()
             self._status.record_down(f"tritonserver is started again, after {why}")
             self._server.stop()  # what is left of it
-            if self._is_to_stop.wait(self._triton_restarts.pause_s(why)):
+            if self._is_to_stop.wait(self._back_off.pause_s(why)):
                 return
             try:
                 self._start()

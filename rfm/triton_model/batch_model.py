@@ -16,7 +16,7 @@ from rfm.parameters import THREADS_PARAMETER
 from rfm.probe import blank_question
 from rfm.triton_model.cancellation import Cancellation
 from rfm.triton_model.digest import digest
-from rfm.triton_model.ending import end_with_triton
+from rfm.triton_model.exit import exit_with_triton
 from rfm.triton_model.metrics import Counted, Metrics
 from rfm.triton_model.quarantine import Quarantine
 from rfm.triton_model.request import SAMPLE_TYPES, CancelledError, Origins, Request
@@ -41,7 +41,7 @@ class BatchModel(Generic[Question, Answer]):
 
     def initialize(self, args: Mapping[str, str]) -> None:
         """Called once by Triton when the model is loaded."""
-        end_with_triton()
+        exit_with_triton()
         config = json.loads(args["model_config"])
         settings = {name: value["string_value"] for name, value in config["parameters"].items()}
         self.input_names = [spec["name"] for spec in config["input"]]
