@@ -16,6 +16,7 @@ DIGEST_BYTES = 8
 NO_DIGEST = bytes(DIGEST_BYTES)  # of what is no suspect whatever happens
 SUFFIX = "_batch"
 
+_ZOMBIE = "Z"
 _HEADER = struct.Struct("<QQdQ")  # process id, requests refused, when the batch last got on (0: idle), its requests
 
 
@@ -29,13 +30,13 @@ class Journal:
 
     @classmethod
     def create(cls, file: Path, capacity: int) -> Journal:
-        """This process', for batches of up to ``capacity`` requests."""
+        """The journal of this process, for batches of up to ``capacity`` requests."""
         file.write_bytes(_HEADER.pack(os.getpid(), 0, 0.0, 0) + bytes(DIGEST_BYTES * capacity))
         return cls(file)
 
     @classmethod
     def open(cls, file: Path) -> Journal | None:
-        """None: there is none."""
+        """The journal in ``file``; None: there is none."""
         try:
             return cls(file)
         except (OSError, ValueError):  # gone, or not written yet
@@ -43,12 +44,17 @@ class Journal:
 
     @property
     def pid(self) -> int:
-        """Whose it is."""
+        """The process that wrote it."""
         return int(self._header[0])
 
     @property
+    def is_alive(self) -> bool:
+        """Whether the process that wrote it has not ended."""
+        return is_alive(self.pid)
+
+    @property
     def num_refused(self) -> int:
-        """Requests that were refused as poison."""
+        """Requests that the quarantine has refused."""
         return int(self._header[1])
 
     @property
@@ -59,7 +65,7 @@ class Journal:
 
     @property
     def digests(self) -> list[bytes]:
-        """Of the batch."""
+        """The digests of the batch's requests."""
         count = self._header[3] if self._header[2] else 0
         places = range(_HEADER.size, _HEADER.size + DIGEST_BYTES * count, DIGEST_BYTES)
         return [self._memory[place : place + DIGEST_BYTES] for place in places]
@@ -80,7 +86,7 @@ class Journal:
         self._write(time.monotonic(), self._header[3])
 
     def count_refused(self) -> None:
-        """One more."""
+        """Counts one more request that was refused."""
         _HEADER.pack_into(self._memory, 0, self.pid, self.num_refused + 1, *self._header[2:])
 
     def forget(self, unsuspected: bytes) -> None:
@@ -101,3 +107,12 @@ class Journal:
 
     def _write(self, since_s: float, count: int) -> None:
         _HEADER.pack_into(self._memory, 0, self.pid, self.num_refused, since_s, count)
+
+
+def is_alive(pid: int) -> bool:
+    """Whether there is a process of this id that has not ended."""
+    try:
+        stat = Path("/proc", str(pid), "stat").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return stat.rpartition(")")[2].split()[0] != _ZOMBIE

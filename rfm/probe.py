@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The least that a model can be asked: by itself, and by those who watch it."""
+"""The request of a health probe: the smallest one that a model can answer."""
 
 from __future__ import annotations
 

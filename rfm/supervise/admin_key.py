@@ -38,10 +38,10 @@ def take_key(file: Path | None, environment: MutableMapping[str, str]) -> str | 
 
     It is taken out of ``environment``, so that no process that is started has it. Raises AdminKeyError.
     """
-    told = environment.pop(VARIABLE, None)
+    given = environment.pop(VARIABLE, None)
     if file is not None:
         return _checked(_read(file), f"--admin-key-file: {file}")
-    return None if told is None else _checked(told, VARIABLE)
+    return None if given is None else _checked(given, VARIABLE)
 
 
 def restrictions(key: str) -> list[str]:

@@ -7,9 +7,9 @@ import subprocess
 import time
 from collections.abc import Sequence
 
-from rfm.supervise.leftovers import ending_with_parent
+from rfm.supervise.back_off import BackOff
+from rfm.supervise.cleanup import ending_with_parent
 from rfm.supervise.process import KILL_AFTER_S
-from rfm.supervise.restarts import Restarts
 
 
 class GatewayProcess:
@@ -17,7 +17,7 @@ class GatewayProcess:
 
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
-        self._restarts = Restarts("gateway")
+        self._back_off = BackOff("gateway")
         self._process: subprocess.Popen[bytes] | None = None
         self._due_s: float | None = None
 
@@ -26,7 +26,7 @@ class GatewayProcess:
         self._process = subprocess.Popen(
             self._command, stdin=subprocess.DEVNULL, preexec_fn=ending_with_parent(), start_new_session=True
         )
-        self._restarts.started()
+        self._back_off.started()
 
     def look(self) -> str | None:
         """Why it was started again; None: it was not. Raises CrashLoopError."""
@@ -34,7 +34,7 @@ class GatewayProcess:
             return None
         why = f"exit status {self._process.returncode}"
         if self._due_s is None:
-            self._due_s = time.monotonic() + self._restarts.pause_s(why)
+            self._due_s = time.monotonic() + self._back_off.pause_s(why)
         if time.monotonic() < self._due_s:
             return None
         self._due_s = None

@@ -11,26 +11,24 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from http.client import HTTPException
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
-import tritonclient.http
-from tritonclient.utils import InferenceServerException
-
 from rfm.config import DEFAULT_HOST, ServeConfig
 from rfm.supervise.admin_key import VARIABLE, http_headers, new_key, restrictions
-from rfm.supervise.arguments import check_arguments
-from rfm.supervise.exposure import GrpcTls, check_before_start, check_version, size_limits
+from rfm.supervise.cleanup import Claim, ending_with_parent
+from rfm.supervise.http import NO_ANSWER, Http
 from rfm.supervise.installation import Installation, ServerStartError
-from rfm.supervise.leftovers import Claim, ending_with_parent
-from rfm.supervise.own_tls import OwnTls
-from rfm.supervise.repository_api import one_line
+from rfm.supervise.listen_address import check_before_start, check_version
+from rfm.supervise.repository_api import INDEX_PATH, versions_of
+from rfm.supervise.tls import GrpcTls, OwnTls
+from rfm.supervise.triton_options import check_arguments, size_limits
 from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
 
 POLL_S = 0.1
 EXIT_TIMEOUT_S = 10  # Triton waits this long for requests in flight, and for a stub that is dead
+ANSWER_TIMEOUT_S = 10.0  # of one that starts
 KILL_AFTER_S = 2 * EXIT_TIMEOUT_S
 NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # a `load` would load all versions anew: their folders have changed
 SECRETS = (VARIABLE, GATEWAY_KEY_VARIABLE)  # variables that neither Triton nor a model process needs
@@ -135,22 +133,22 @@ class TritonServer:
         self._claim: Claim | None = None
         self._own_tls: OwnTls | None = None
         self._process: subprocess.Popen[bytes] | None = None
-        self._loading: frozenset[str] = frozenset()  # what it was told to load at its start
+        self._loading: frozenset[str] = frozenset()  # what it is to load at its start
 
     @property
     def models(self) -> list[str]:
-        """Of the repository."""
+        """The names of the models in the repository."""
         return sorted(file.parent.name for file in self.repository.glob("*/config.pbtxt"))
 
     @property
     def pid(self) -> int:
-        """Of the process that was started last."""
+        """The id of the process that was started last."""
         assert self._process is not None  # started
         return self._process.pid
 
     @property
     def exit_status(self) -> int | None:
-        """None: it runs."""
+        """The process' exit status; None: it runs."""
         assert self._process is not None  # started
         return self._process.poll()
 
@@ -185,7 +183,7 @@ class TritonServer:
             raise ServerStartError(f"repository: expected a folder of models, got {self.repository}")
         own = self._arguments(sorted(models if restored is None else restored))
         check_arguments(self._more_arguments, [*own, _REGIONS])
-        self._check_exposure()
+        self._check_listen_address()
         self.endpoints.check_free()
         self._claim = Claim()
         arguments = [*own, f"{_REGIONS}{self._claim.region_prefix}"]
@@ -211,26 +209,22 @@ class TritonServer:
     def wait_ready(self) -> None:
         """Returns when every model is ready. Raises ServerStartError with the reason of one that is not."""
         assert self._process is not None  # started
-        client = tritonclient.http.InferenceServerClient(f"{self.endpoints.http_host}:{self.endpoints.http_port}")
-        try:
-            while self._process.poll() is None:
-                try:
-                    index = client.get_model_repository_index(headers=http_headers(self._admin_key))
-                except (OSError, EOFError, HTTPException, InferenceServerException):
-                    time.sleep(POLL_S)  # Triton answers nothing while it loads
-                    continue
-                failed = [model for model in index if model.get("state") != "READY" and model["name"] in self._loading]
-                if not failed:
-                    version = client.get_server_metadata().get("version", "")
-                    check_version(self.endpoints.host, version, accepted=self._accepts_known_vulnerabilities)
-                    return
-                reasons = "; ".join(
-                    f"{m['name']}: {one_line(m.get('reason', 'not loaded')) or 'unknown'}" for m in failed
-                )
+        triton = Http(self.endpoints.http_host, self.endpoints.http_port)
+        headers = http_headers(self._admin_key)
+        while self._process.poll() is None:
+            try:
+                version = triton.get_json("/v2", ANSWER_TIMEOUT_S).get("version", "")
+                index = triton.get_json(INDEX_PATH, ANSWER_TIMEOUT_S, method="POST", headers=headers)
+            except NO_ANSWER:
+                time.sleep(POLL_S)  # Triton answers nothing while it loads
+                continue
+            failed = [entry for entry in versions_of(index) if not entry.is_ready and entry.name in self._loading]
+            if failed:
+                reasons = "; ".join(f"{entry.name}: {entry.reason or 'not loaded'}" for entry in failed)
                 raise ServerStartError(f"models: expected all to be ready, got {reasons}")
-            raise ServerStartError(f"tritonserver: expected to run, got exit status {self._process.returncode}")
-        finally:
-            client.close()
+            check_version(self.endpoints.host, version, accepted=self._accepts_known_vulnerabilities)
+            return
+        raise ServerStartError(f"tritonserver: expected to run, got exit status {self._process.returncode}")
 
     def stop(self) -> int:
         """Ends the server gracefully, by force after KILL_AFTER_S, and gives its exit status (0 if it never ran)."""
@@ -283,7 +277,7 @@ class TritonServer:
         own = {name: value for name, value in os.environ.items() if name not in SECRETS}
         return {**own, **self._installation.environment, **NO_BYTECODE}
 
-    def _check_exposure(self) -> None:
+    def _check_listen_address(self) -> None:
         check_before_start(self.endpoints.host, self._installation, accepted=self._accepts_known_vulnerabilities)
         if self.endpoints.grpc_tls is not None:
             self.endpoints.grpc_tls.check()

@@ -23,6 +23,7 @@ from rfm_client.contract.addresses import split_url
 from rfm_client.contract.names import PROBE_PREFIX
 from rfm_client.contract.wire import Tensors
 
+INDEX_PATH = "/v2/repository/index"  # over HTTP
 READY, LOADING, UNLOADING = "READY", "LOADING", "UNLOADING"
 POLL_S = 0.1
 CONNECT_S = 10.0
@@ -127,7 +128,7 @@ class RepositoryApi:
         raise RepositoryApiError(f"{model}: expected its old versions to finish within {FINISH_S:g} s, got no end")
 
     def infer(self, model: str, version: int, inputs: Tensors, outputs: Collection[str]) -> Tensors:
-        """What one version answers. By its id it is told from callers' requests in logs."""
+        """What one version answers. Its id tells it from callers' requests in logs."""
         tensors = []
         for name, array in inputs.items():
             tensors.append(tritonclient.grpc.InferInput(name, array.shape, np_to_triton_dtype(array.dtype)))

@@ -1,19 +1,38 @@
 # SPDX-License-Identifier: MIT
-"""The models of a Triton that runs: which there are, which of them are ready, and healing for those that are not."""
+"""The models of a Triton that runs: which there are, which of them are ready, and healing for those that are not.
+
+What is watched, and the fault that no other watch sees:
+
+| watch | the fault that it alone sees |
+|---|---|
+| Triton's exit status (``supervisor``) | Triton has ended |
+| Triton's doors ``/v2`` and ``/metrics`` (``TritonWatch``) | Triton lives and does nothing |
+| Triton's repository index (``TritonWatch``) | somebody has loaded or unloaded a model; an ensemble is not ready |
+| zombies among Triton's children (``StubWatch``) | one of several processes is dead: probes go to the others |
+| stopped children (``StubWatch``) | one of several processes is stopped (SIGSTOP) while it is idle |
+| the journals of model processes (``StubWatch``) | one of several processes hangs in a forward pass |
+| a probe of each model (``ModelProbe``): no answer | a process hangs between two batches, where no journal tells |
+| a probe: "is not healthy" | a dead process that Triton has reaped, so that it is no zombie |
+| a probe: failures in a row | requests fail before they reach ``model.py``, in Triton's Python backend |
+| the self check in each process (``rfm.triton_model``) | one of several processes fails at whatever it is asked |
+
+All of this is looked at in one thread, which feeds each model's lifecycle. What may wait runs in the background.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
 
-from rfm.supervise.canary import Canary, can_be_asked
-from rfm.supervise.healing import ModelHealth, Reload
 from rfm.supervise.http import Http
-from rfm.supervise.inquiry import Config, Inquiry, Told
+from rfm.supervise.lifecycle import State
+from rfm.supervise.model_probe import ModelProbe, can_be_probed
 from rfm.supervise.process import TritonServer
 from rfm.supervise.repository_api import LOADING, READY, UNLOADING
+from rfm.supervise.served_model import ServedModel
 from rfm.supervise.status import NO_REASON, Status
 from rfm.supervise.stubs import StubWatch
+from rfm.supervise.triton_watch import Config, Snapshot, TritonWatch
 
 LOOK_INTERVAL_S = 0.3
 UNREADABLE = "its configuration cannot be read"
@@ -43,130 +62,123 @@ class Served:
         self._status = status
         self._canary_s = canary_s
         self._hang_s = hang_s
-        self._http = Http(server.endpoints.http_host, server.endpoints.http_port)
-        self._watch = StubWatch(server.pid, hang_s)
-        self._inquiry = Inquiry(server, triton_silent_s)
-        self._told: Told | None = None
         self._say = say
-        self._models = dict(restored)
-        self._health: dict[str, ModelHealth] = {}  # of those that have processes of ours
+        self._http = Http(server.endpoints.http_host, server.endpoints.http_port)
+        self._stubs = StubWatch(server.pid, hang_s)
+        self._triton = TritonWatch(server, triton_silent_s)
+        self._snapshot: Snapshot | None = None  # the latest that was taken in
+        self._configs = dict(restored)
+        self._models: dict[str, ServedModel] = {}  # those that have processes of ours, and ensembles that were restored
         self._leaving: set[str] = set()
         self._looked_s = 0.0
         self._num_refused: dict[int, int] = {}  # by process
         self._killed: dict[int, str] = {}  # processes that hung, and how
-        # Those of ``restored`` that have none, ensembles say, and are not loaded yet.
-        self._owed = {model: config for model, config in restored.items() if not can_be_asked(config)}
-        self._reloads: dict[str, Reload] = {}  # of some of them
-        for model in restored.keys() - self._owed.keys():
-            self._health[model] = self._healthy(model)
-            self._health[model].restore(restored[model])
-        self._inquiry.start()
+        for name, config in restored.items():
+            self._models[name] = self._new_model(name, config)
+            if not self._models[name].is_ensemble:
+                self._models[name].restore(config)
 
     @property
     def is_silent(self) -> bool:
         """Whether Triton itself does not answer."""
-        return self._inquiry.is_silent
+        return self._triton.is_silent
 
     @property
     def configs(self) -> dict[str, Config] | None:
-        """Of what is served, or should be; None: that is not known yet."""
-        return dict(self._models) if self._models or self._told is not None else None
+        """The configurations of what is served, or should be; None: they are not known yet."""
+        return dict(self._configs) if self._configs or self._snapshot is not None else None
 
     def look(self) -> list[tuple[str, str]]:
-        """Heals what needs to be, and tells which models, and why."""
-        told = self._inquiry.told
-        if told is None or time.monotonic() - self._looked_s < LOOK_INTERVAL_S:
+        """Heals what needs to be. Gives the models that are healed from now on, and why."""
+        if time.monotonic() - self._looked_s < LOOK_INTERVAL_S:
             return []
         self._looked_s = time.monotonic()
-        if told is not self._told:
-            self._told = told
-            self._watch.tell(told.in_state(READY), told.in_state(LOADING, UNLOADING), told.asked_s)
-            self._keep_up(told)
-            self._load_owed(told)
-        died = {stub.model: self._killed.pop(stub.pid, "its process is dead") for stub in self._watch.dead()}
-        for stub, how in self._watch.hung():
-            if stub.model in self._health:
-                self._killed[stub.pid] = how
-                stub.kill()
-        healed = [
-            (model, why)
-            for model, health in self._health.items()
-            if (why := health.look(died.get(model), self._models[model]))
-        ]
+        self._triton.look()
+        snapshot = self._triton.snapshot
+        if snapshot is None:
+            return []
+        if snapshot is not self._snapshot:
+            self._snapshot = snapshot
+            self._stubs.update(snapshot.in_state(READY), snapshot.in_state(LOADING, UNLOADING), snapshot.asked_s)
+            self._keep_up(snapshot)
+        died = self._died()
+        looks = [(name, model.look(died.get(name), self._configs[name])) for name, model in self._models.items()]
         self._count_refused()
-        unreadable = dict.fromkeys(told.unreadable, UNREADABLE)
-        reasons = {model: self._reason(model, told) for model in self._models} | unreadable
-        self._status.tell(reasons if self._inquiry.is_answered else dict.fromkeys(reasons, SILENT))
-        return healed
+        self._record(snapshot)
+        return [(name, why) for name, why in looks if why is not None]
 
     def close(self) -> None:
         """Looks after them no more."""
-        self._inquiry.close()
-        for health in self._health.values():
-            health.close()
-        for reload in self._reloads.values():
-            reload.close()
+        for model in self._models.values():
+            model.close()
 
-    def _keep_up(self, told: Told) -> None:
+    def _died(self) -> dict[str, str]:
+        """How a process of each model has died. One that hangs is killed, and found dead by the next look."""
+        died = {stub.model: self._killed.pop(stub.pid, "its process is dead") for stub in self._stubs.dead()}
+        for stub, how in self._stubs.hung():
+            if stub.model in self._models:
+                self._killed[stub.pid] = how
+                stub.kill()
+        return died
+
+    def _keep_up(self, snapshot: Snapshot) -> None:
         """Takes in what was loaded, and leaves out what somebody unloaded, once that was seen twice in a row."""
-        for model, config in told.configs.items():
-            if told.is_unloaded(model):
+        for name, config in snapshot.configs.items():
+            if snapshot.is_unloaded(name):
                 continue
-            if model not in self._models:
-                self._status.restarts.labels(model)  # 0, so that already the first is an increase
-            self._models[model] = config
-            if model not in self._health and can_be_asked(config):
-                self._health[model] = self._healthy(model)
-            if model in self._health and model in told.ready:
-                self._health[model].tell_ready(told.asked_s)
-        leaving = {model for model in self._models if self._is_unloaded(model, told)}
-        for model in leaving & self._leaving:
-            del self._models[model]
-            if model in self._health:
-                self._health.pop(model).close()
+            if name not in self._configs:
+                self._status.restarts.labels(name)  # 0, so that already the first is an increase
+            self._configs[name] = config
+            if name not in self._models and can_be_probed(config):
+                self._models[name] = self._new_model(name, config)
+            if name in self._models and name in snapshot.ready:
+                self._models[name].note_ready(snapshot.asked_s)
+        leaving = {name for name in self._configs if self._is_unloaded(name, snapshot)}
+        for name in leaving & self._leaving:
+            del self._configs[name]
+            if name in self._models:
+                self._models.pop(name).close()
         self._leaving = leaving
+        for name, model in self._models.items():
+            config = self._configs[name]
+            if model.state is State.WAITING and all(snapshot.has(*part) for part in _parts(config)):
+                model.restore(config)
 
-    def _load_owed(self, told: Told) -> None:
-        """Loads an ensemble when its parts are ready."""
-        for model, config in list(self._owed.items()):
-            if model in told.ready:
-                del self._owed[model]
-            elif model not in self._reloads and all(told.has(*part) for part in _parts(config)):
-                self._reloads[model] = Reload(model, self._server, self._watch, lambda: None, self._say)
-                self._reloads[model].begin("tritonserver was started again", config, is_out=True)
-
-    def _is_unloaded(self, model: str, told: Told) -> bool:
+    def _is_unloaded(self, name: str, snapshot: Snapshot) -> bool:
         """Whether somebody wanted that. Triton says the same of what is loaded anew, and of what that is a part of."""
-        if model in self._owed:
+        model = self._models.get(name)
+        if model is not None and (model.is_healing or (model.is_ensemble and model.state is not State.READY)):
             return False
-        if model in self._health and self._health[model].is_healing:
-            return False
-        parts = _parts(self._models[model])
-        return told.is_unloaded(model) and all(told.has(*part) or part[0] not in self._models for part in parts)
+        parts = _parts(self._configs[name])
+        return snapshot.is_unloaded(name) and all(snapshot.has(*p) or p[0] not in self._configs for p in parts)
 
-    def _healthy(self, model: str) -> ModelHealth:
-        canary = Canary(
-            self._http, model, self._canary_s, self._hang_s, self._status.canary_seconds.labels(model).observe
-        )
-        canary.start()
-        return ModelHealth(self._server, canary, self._watch, self._status, self._say)
+    def _new_model(self, name: str, config: Config) -> ServedModel:
+        probe = None
+        if can_be_probed(config):
+            observe = self._status.probe_seconds.labels(name).observe
+            probe = ModelProbe(self._http, name, self._canary_s, self._hang_s, observe)
+        return ServedModel(name, probe, self._server, self._stubs, self._status, self._say)
 
-    def _reason(self, model: str, told: Told) -> str:
-        """Why it is not ready. An ensemble has to be, and all its parts."""
-        if model in self._health:
-            return self._health[model].reason
-        if model not in self._models:
+    def _record(self, snapshot: Snapshot) -> None:
+        reasons = {name: self._reason(name, snapshot) for name in self._configs}
+        reasons |= dict.fromkeys(snapshot.unreadable, UNREADABLE)
+        self._status.record(reasons if self._triton.is_answered else dict.fromkeys(reasons, SILENT))
+
+    def _reason(self, name: str, snapshot: Snapshot) -> str:
+        """Why a model is not ready. An ensemble has to be, and all its parts."""
+        model = self._models.get(name)
+        if model is not None and (model.is_healing or not model.is_ensemble):
+            return model.reason
+        if name not in self._configs:
             return NOT_LOADED
-        if model in self._reloads and self._reloads[model].is_active:
-            return self._reloads[model].reason
-        parts = dict.fromkeys(part for part, _ in _parts(self._models[model]))
-        reasons = [f"{part}: {why}" for part in parts if (why := self._reason(part, told)) != NO_REASON]
+        parts = dict.fromkeys(part for part, _ in _parts(self._configs[name]))
+        reasons = [f"{part}: {why}" for part in parts if (why := self._reason(part, snapshot)) != NO_REASON]
         if reasons:
             return "; ".join(reasons)
-        return NO_REASON if model in told.ready else NOT_LOADED
+        return NO_REASON if name in snapshot.ready else NOT_LOADED
 
     def _count_refused(self) -> None:
-        for stub in self._watch.all:
+        for stub in self._stubs.all:
             journal = stub.journal
             if journal is not None:
                 self._status.poison_refused.inc(journal.num_refused - self._num_refused.get(stub.pid, 0))
@@ -174,6 +186,6 @@ class Served:
 
 
 def _parts(config: Config) -> list[tuple[str, int]]:
-    """Models and versions of an ensemble."""
+    """Models and versions that an ensemble is made of."""
     steps = config.get("ensemble_scheduling", {}).get("step", ())
     return [(step["model_name"], int(step["model_version"])) for step in steps]

@@ -25,19 +25,19 @@ _BUCKETS_S = tuple(digit * 10.0**power for power in range(-3, 2) for digit in (1
 
 
 class Status:
-    """What is told. ``tell`` is for who knows, the rest for who asks."""
+    """What is known of the models. ``record`` and its kin are for the supervisor, the rest for the status port."""
 
     def __init__(self) -> None:
         self._reasons: Mapping[str, str] = {}
-        self._asked: set[str] = set()  # models that have a canary
+        self._probed: set[str] = set()  # models that have a probe
         self._registry = CollectorRegistry()
         labelled = {"labelnames": ["model"], "registry": self._registry}
         self._ready = Gauge("rfm_serve_ready", "1: the model is ready.", **labelled)  # type: ignore[arg-type]
         self._reason = Gauge(
             "rfm_serve_not_ready", "1: the model is not ready, and why.", ["model", "reason"], registry=self._registry
         )
-        self._canary_ok = Gauge("rfm_serve_canary_ok", "1: the last health probe was answered.", **labelled)  # type: ignore[arg-type]
-        self.canary_seconds = Histogram(
+        self._probe_ok = Gauge("rfm_serve_canary_ok", "1: the last health probe was answered.", **labelled)  # type: ignore[arg-type]
+        self.probe_seconds = Histogram(
             "rfm_serve_canary_seconds",
             "From a health probe to its answer.",
             ["model"],
@@ -56,8 +56,8 @@ class Status:
             registry=self._registry,
         )
 
-    def tell(self, reasons: Mapping[str, str]) -> None:
-        """By model why it is not ready; NO_REASON for one that is. There are no other models."""
+    def record(self, reasons: Mapping[str, str]) -> None:
+        """Takes in, by model, why it is not ready; NO_REASON for one that is. There are no other models."""
         gone, before, self._reasons = self._reasons.keys() - reasons.keys(), self._reasons, dict(reasons)
         for model, reason in before.items():
             if reason not in (NO_REASON, reasons.get(model)):
@@ -68,41 +68,36 @@ class Status:
                 self._reason.labels(model, reason).set(1)
         for model in gone:
             self._ready.remove(model)
-        for model in gone & self._asked:
-            self._asked.remove(model)
-            self._canary_ok.remove(model)
+        for model in gone & self._probed:
+            self._probed.remove(model)
+            self._probe_ok.remove(model)
 
-    def tell_down(self, reason: str) -> None:
-        """Why none is ready."""
-        self.tell(dict.fromkeys(self._reasons, reason))
-        for model in self._asked:
-            self.tell_canary(model, is_ok=False)
+    def record_down(self, reason: str) -> None:
+        """Takes in why no model is ready."""
+        self.record(dict.fromkeys(self._reasons, reason))
+        for model in self._probed:
+            self.record_probe(model, is_ok=False)
 
-    def tell_canary(self, model: str, *, is_ok: bool) -> None:
-        """Whether a model's last probe was answered."""
-        self._asked.add(model)
-        self._canary_ok.labels(model).set(is_ok)
-
-    @property
-    def models(self) -> list[str]:
-        """Of which it was told."""
-        return list(self._reasons)
+    def record_probe(self, model: str, *, is_ok: bool) -> None:
+        """Takes in whether a model's last probe was answered."""
+        self._probed.add(model)
+        self._probe_ok.labels(model).set(is_ok)
 
     @property
     def ready(self) -> tuple[bool, dict[str, Any]]:
-        """Whether all models are ready, and what is told of it."""
+        """Whether all models are ready, and the body of ``/ready``."""
         reasons = self._reasons
         is_ready = bool(reasons) and all(reason == NO_REASON for reason in reasons.values())
         models = {model: {"ready": reason == NO_REASON, "reason": reason} for model, reason in reasons.items()}
         return is_ready, {"ready": is_ready, "models": models}
 
     def metrics(self) -> bytes:
-        """For Prometheus."""
+        """What Prometheus reads."""
         return generate_latest(self._registry)
 
 
 class StatusServer:
-    """Tells a Status over HTTP, at ``/live``, ``/ready`` and ``/metrics``. Raises ServerStartError for a taken port."""
+    """Serves a Status over HTTP: ``/live``, ``/ready`` and ``/metrics``. Raises ServerStartError for a taken port."""
 
     def __init__(self, host: str, port: int, status: Status) -> None:
         try:
@@ -113,7 +108,7 @@ class StatusServer:
         self._thread.start()
 
     def close(self) -> None:
-        """Tells no more."""
+        """Ends the server."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
@@ -164,9 +159,9 @@ def _handler(status: Status) -> type[BaseHTTPRequestHandler]:
             if self.path == "/live":
                 self._answer(HTTPStatus.OK, b"{}", "application/json")
             elif self.path == "/ready":
-                is_ready, told = status.ready
+                is_ready, body = status.ready
                 code = HTTPStatus.OK if is_ready else HTTPStatus.SERVICE_UNAVAILABLE
-                self._answer(code, json.dumps(told).encode(), "application/json")
+                self._answer(code, json.dumps(body).encode(), "application/json")
             elif self.path == "/metrics":
                 self._answer(HTTPStatus.OK, status.metrics(), CONTENT_TYPE_LATEST)
             else:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 import time
 from collections.abc import Collection, Iterable
 from contextlib import suppress
@@ -51,19 +50,19 @@ class Stub:
 
     @property
     def state(self) -> str | None:
-        """As the kernel has it; None: there is no such process."""
+        """Its state, as the kernel has it; None: there is no such process."""
         fields = _stat(self.pid)
         return fields[0] if fields and int(fields[_STARTED]) == self.started_ticks else None
 
     @property
     def started_s(self) -> float:
-        """When, by time.monotonic."""
+        """When it was started, by time.monotonic."""
         age_s = time.clock_gettime(time.CLOCK_BOOTTIME) - self.started_ticks / _TICKS_PER_S
         return time.monotonic() - age_s
 
     @property
     def journal(self) -> Journal | None:
-        """What it is working on; None: it does not tell."""
+        """What it is working on; None: it has written nothing."""
         return Journal.open(SHARED_MEMORY / f"{self.region}_{self.model}{SUFFIX}")
 
     def kill(self) -> None:
@@ -87,31 +86,29 @@ class StubWatch:
         self._watched: set[Stub] = set()
         self._buried: set[Stub] = set()
         self._since: dict[tuple[Stub, str], float] = {}  # stub and state: when it was first seen so
-        self._lock = threading.Lock()
 
-    def tell(self, ready: Collection[tuple[str, int]], going: Collection[tuple[str, int]], asked_s: float) -> None:
-        """Which versions of which models were ready at ``asked_s``, and which were on their way to or from that.
+    def update(self, ready: Collection[tuple[str, int]], going: Collection[tuple[str, int]], asked_s: float) -> None:
+        """Takes in which versions of models were ready at ``asked_s``, and which were on their way to or from that.
 
         The stubs of a version that is ready have loaded. A version that is loaded once more stays ready meanwhile, so
         its new stubs have loaded when the old ones are gone.
         """
         self._scan()
-        with self._lock:
-            self._loaded &= self._stubs
-            old = {stub.serves for stub in self._loaded}
-            new = {stub for stub in self._stubs if stub.serves in ready and stub.serves not in old}
-            self._loaded |= {stub for stub in new if stub.started_s < asked_s}
-            self._watched = {stub for stub in self._loaded if stub.serves not in going}
+        self._loaded &= self._stubs
+        old = {stub.serves for stub in self._loaded}
+        new = {stub for stub in self._stubs if stub.serves in ready and stub.serves not in old}
+        self._loaded |= {stub for stub in new if stub.started_s < asked_s}
+        self._watched = {stub for stub in self._loaded if stub.serves not in going}
 
     def dead(self) -> list[Stub]:
         """Those that have died and were not buried."""
         self._look()
-        return [stub for stub in self._now_watched if self._has_been(stub, _ZOMBIE, CONFIRM_S)]
+        return [stub for stub in self._watched if self._has_been(stub, _ZOMBIE, CONFIRM_S)]
 
     def hung(self) -> list[tuple[Stub, str]]:
         """Those that are alive and get nowhere, and why."""
         found = []
-        for stub in self._now_watched:
+        for stub in self._watched:
             journal = stub.journal
             if self._has_been(stub, _STOPPED, STOPPED_S):
                 found.append((stub, f"stopped for {STOPPED_S:g} s"))
@@ -121,7 +118,7 @@ class StubWatch:
 
     def is_getting_on(self, model: str) -> bool:
         """Whether one of the model's stubs is at work, and none of its forward passes takes too long."""
-        journals = [stub.journal for stub in self._now_watched if stub.model == model and stub.is_alive]
+        journals = [stub.journal for stub in self._watched if stub.model == model and stub.is_alive]
         return any(journal is not None and 0 < journal.busy_s <= self._hang_s for journal in journals)
 
     def of_model(self, model: str) -> list[Stub]:
@@ -131,26 +128,19 @@ class StubWatch:
 
     @property
     def all(self) -> list[Stub]:
-        """Those that are known."""
-        with self._lock:
-            return list(self._stubs)
+        """All that are known."""
+        return list(self._stubs)
 
     def bury(self, stubs: Iterable[Stub]) -> None:
-        """Stubs that are of no more interest."""
-        with self._lock:
-            self._buried.update(stubs)
-            self._stubs -= self._buried
-            self._loaded -= self._buried
-            self._watched -= self._buried
-
-    @property
-    def _now_watched(self) -> list[Stub]:
-        with self._lock:
-            return list(self._watched)
+        """Forgets stubs, which are of no more interest."""
+        self._buried.update(stubs)
+        self._stubs -= self._buried
+        self._loaded -= self._buried
+        self._watched -= self._buried
 
     def _look(self) -> None:
         now_s = time.monotonic()
-        states = {stub: stub.state for stub in self._now_watched}
+        states = {stub: stub.state for stub in self._watched}
         seen = {(stub, state) for stub, state in states.items() if state in (_ZOMBIE, _STOPPED)}
         self._since = {key: self._since.get(key, now_s) for key in seen}
 
@@ -159,17 +149,10 @@ class StubWatch:
         return since_s is not None and time.monotonic() - since_s >= duration_s
 
     def _scan(self) -> None:
-        with self._lock:
-            known = {stub for stub in self._stubs if stub.state is not None}  # a zombie tells nothing of itself
-            found = (_stub(folder, self._triton_pid) for folder in _PROC.glob("[0-9]*"))
-            self._buried = {stub for stub in self._buried if stub.state is not None}
-            self._stubs = known | {stub for stub in found if stub is not None} - self._buried
-
-
-def is_alive(pid: int) -> bool:
-    """Whether there is a process that has not ended."""
-    fields = _stat(pid)
-    return bool(fields) and fields[0] != _ZOMBIE
+        known = {stub for stub in self._stubs if stub.state is not None}  # a zombie tells nothing of itself
+        found = (_stub(folder, self._triton_pid) for folder in _PROC.glob("[0-9]*"))
+        self._buried = {stub for stub in self._buried if stub.state is not None}
+        self._stubs = known | {stub for stub in found if stub is not None} - self._buried
 
 
 def _stat(pid: int) -> list[str]:

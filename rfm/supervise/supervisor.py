@@ -9,14 +9,14 @@ from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext
 from types import FrameType
 
-from rfm.supervise import leftovers
+from rfm.supervise import cleanup
+from rfm.supervise.back_off import BackOff
 from rfm.supervise.gateway_process import GatewayProcess
-from rfm.supervise.inquiry import Config, names_what_was_served
 from rfm.supervise.installation import ServerStartError
 from rfm.supervise.process import POLL_S, STOP_SIGNALS, TritonServer
-from rfm.supervise.restarts import Restarts
 from rfm.supervise.served import Served
 from rfm.supervise.status import Status, StatusServer
+from rfm.supervise.triton_watch import Config, names_what_was_served
 
 
 class Supervisor:
@@ -24,10 +24,10 @@ class Supervisor:
 
     gateway: command line of a gateway that runs beside the server; None: there is none
     status_port: of the status (``status``), on the server's host; None: there is none
-    canary_s: how often each model is asked
+    canary_s: how often each model is probed
     hang_s: how long a model may take to get one forward pass further, or answer nobody, before it counts as hung
     triton_silent_s: how long Triton may give no answer to several looks in a row before it is killed
-    say: is told what happened, a line each
+    say: takes what happened, a line each
     """
 
     def __init__(
@@ -49,16 +49,16 @@ class Supervisor:
         self._triton_silent_s = triton_silent_s
         self._say = say
         self._status = Status()
-        self._told_to_stop = threading.Event()
-        self._triton_restarts = Restarts("tritonserver")
+        self._is_to_stop = threading.Event()
+        self._back_off = BackOff("tritonserver")
         self._served: Served | None = None  # None: it is started, or has ended
         self._configs: dict[str, Config] | None = None  # of what was served last; None: what the files say
 
     def run(self) -> int:
         """Gives Triton's exit status. Raises ServerStartError for what does not start, or ends again and again."""
-        for path in leftovers.clear():
+        for path in cleanup.clear():
             self._say(f"removed {path}, which a server left that was killed")
-        self._status.tell(dict.fromkeys(self._server.models, "it is loaded"))
+        self._status.record(dict.fromkeys(self._server.models, "it is loaded"))
         for what in ("triton", *self._server.models, *(() if self._gateway is None else ("gateway",))):
             self._status.restarts.labels(what)  # 0, so that already the first is an increase
         previous = {number: signal.signal(number, self._stop) for number in STOP_SIGNALS}
@@ -71,7 +71,7 @@ class Supervisor:
                 signal.signal(number, handler)
 
     def _stop(self, number: int, _frame: FrameType | None) -> None:
-        self._told_to_stop.set()
+        self._is_to_stop.set()
         if self._served is None:  # it loads, and would not look
             self._server.signal(signal.SIGTERM if number == signal.SIGHUP else number)
 
@@ -80,13 +80,13 @@ class Supervisor:
             self._start()
             if self._gateway is not None and self._served is not None:
                 self._gateway.start()
-            while not self._told_to_stop.wait(POLL_S):
+            while not self._is_to_stop.wait(POLL_S):
                 self._look()
         except ServerStartError:
-            if not self._told_to_stop.is_set():  # else it ended since it was told to
+            if not self._is_to_stop.is_set():  # else it ended since it was told to
                 raise
         finally:
-            self._status.tell_down("it is told to stop")
+            self._status.record_down("it is told to stop")
             if self._gateway is not None:  # it answers what it has begun, and then the server is stopped
                 self._gateway.stop()
             self._close_served()
@@ -100,14 +100,14 @@ class Supervisor:
         not keep the others from being served.
         """
         self._server.start(self._restored())
-        if self._told_to_stop.is_set():  # before there was a process to pass it to
+        if self._is_to_stop.is_set():  # before there was a process to pass it to
             return
         self._server.wait_ready()
         ends = self._server.endpoints
         urls = f"{ends.grpc_url}, {ends.http_url}, metrics at {ends.metrics_url}"
         if self._configs is None:
             self._say(f"ready: {', '.join(self._server.models)} at {urls}")
-        self._triton_restarts.started()
+        self._back_off.started()
         self._served = Served(
             self._server,
             self._status,
@@ -143,12 +143,12 @@ class Supervisor:
 
     def _start_again(self, why: str) -> None:
         """Returns when Triton is ready, or this is told to stop. Raises CrashLoopError."""
-        while not self._told_to_stop.is_set():
+        while not self._is_to_stop.is_set():
             self._count("triton", why)
             self._close_served()
-            self._status.tell_down(f"tritonserver is started again, after {why}")
+            self._status.record_down(f"tritonserver is started again, after {why}")
             self._server.stop()  # what is left of it
-            if self._told_to_stop.wait(self._triton_restarts.pause_s(why)):
+            if self._is_to_stop.wait(self._back_off.pause_s(why)):
                 return
             try:
                 self._start()

@@ -10,14 +10,14 @@ from __future__ import annotations
 import threading
 import traceback
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from typing import Any
 
 from rfm.execution import Execution
-from rfm.triton_model.asked import OUTCOMES, UNKNOWN_TYPE
+from rfm.triton_model.request import OUTCOMES, SCORED, UNKNOWN_TYPE, Request
 
 FLUSH_INTERVAL_S = 0.25
 IDLE_INTERVAL_S = 5.0  # while nothing is asked
@@ -45,7 +45,7 @@ _HISTOGRAMS = {
 
 @dataclass
 class Counted:
-    """What came of one batch.
+    """What came of callers' requests in one batch.
 
     samples: how many, by (sample type, outcome)
     num_frames: of the samples that were scored
@@ -57,12 +57,26 @@ class Counted:
     num_executed: int = 0
     execution: Execution = field(default_factory=Execution)
 
+    @classmethod
+    def of(cls, batch: Iterable[Request[Any]], execution: Execution) -> Counted:
+        """Counts a batch that ``execution`` was spent on."""
+        counted = cls(execution=execution)
+        for request in batch:
+            if not request.is_counted:
+                continue
+            for sample_type, count in request.sample_types.items():
+                counted.samples[sample_type, request.outcome] += count
+            if request.outcome == SCORED:
+                counted.num_frames += request.num_frames
+            counted.num_executed += len(request.answers)
+        return counted
+
     def totals(self) -> dict[str, int]:
-        """By name of a counter."""
+        """What each counter grows by, by its name."""
         return {FRAMES: self.num_frames, RETRIES: self.execution.out_of_memory_count}
 
     def observed(self) -> dict[str, float]:
-        """By name of a histogram; nothing if no forward pass was spent on anybody."""
+        """What each histogram observes, by its name; nothing if no forward pass was spent on a caller."""
         if not (self.num_executed and self.execution.num_slots):
             return {}
         return {
@@ -74,7 +88,7 @@ class Counted:
 
 
 class Metrics:
-    """Those of one instance; to be closed. Whatever goes wrong with them is logged once, and fails no request.
+    """The metrics of one instance; to be closed. Whatever goes wrong with them is logged once, and fails no request.
 
     labels: that tell the instance
     checkpoint: labels of rfm_checkpoint_info
@@ -95,11 +109,14 @@ class Metrics:
         self._thread = threading.Thread(target=self._flush_for_ever, name="rfm-metrics", daemon=True)
         self._thread.start()
 
-    def at_work_on(self, num_requests: int) -> None:
-        """Tells the size of the batch that is worked on from now on; 0: there is none."""
-        if self._thread is not None and num_requests != self._at_work:
-            self._at_work = num_requests
-            self._queue.put(None)
+    @contextmanager
+    def at_work_on(self, batch: Iterable[Request[Any]]) -> Iterator[None]:
+        """Within it, the gauge of requests that are worked on shows how many of the batch are callers'."""
+        self._set_at_work(sum(request.is_counted for request in batch))
+        try:
+            yield
+        finally:
+            self._set_at_work(0)
 
     def add(self, counted: Counted) -> None:
         """Counts what came of a batch."""
@@ -107,13 +124,18 @@ class Metrics:
             self._queue.put(counted)
 
     def close(self) -> None:
-        """Returns when all that was added is told, and that the checkpoint is served no more."""
+        """Returns when Triton knows all that was added, and that the checkpoint is served no more."""
         if self._thread is None:
             return
         self._closing.set()
         self._queue.put(None)
         self._thread.join()
-        self._tell(is_served=False)
+        self._flush(is_served=False)
+
+    def _set_at_work(self, num_requests: int) -> None:
+        if self._thread is not None and num_requests != self._at_work:
+            self._at_work = num_requests
+            self._queue.put(None)
 
     def _flush_for_ever(self) -> None:
         while not self._closing.is_set():
@@ -121,12 +143,12 @@ class Metrics:
             with suppress(Empty):
                 first = self._queue.get(timeout=IDLE_INTERVAL_S)
             self._closing.wait(FLUSH_INTERVAL_S)
-            self._tell(first, is_served=True)
+            self._flush(first, is_served=True)
 
-    def _tell(self, first: Counted | None = None, *, is_served: bool) -> None:
+    def _flush(self, first: Counted | None = None, *, is_served: bool) -> None:
         try:
             batches = [batch for batch in (first, *_drained(self._queue)) if batch is not None]
-            self._series.tell(batches, at_work=self._at_work, is_served=is_served)
+            self._series.add(batches, at_work=self._at_work, is_served=is_served)
         except Exception:  # noqa: BLE001  requests are answered all the same
             self._log_once()
 
@@ -159,11 +181,11 @@ class _Series:
         }
         at_work = self._family("batch_requests", GAUGE, "Requests of the batch that is worked on now; 0: idle.")
         self._at_work = at_work.Metric(labels=dict(labels))
-        self._told_at_work: int | None = None
+        self._shown_at_work: int | None = None
         info = self._family("checkpoint_info", GAUGE, "1: the checkpoint is served.")
         model = {name: labels[name] for name in ("model", "version")}
         self._checkpoint = info.Metric(labels={**model, **checkpoint})
-        self.tell([], at_work=0, is_served=True)
+        self.add([], at_work=0, is_served=True)
 
     def _family(self, name: str, kind: str, description: str) -> Any:
         import triton_python_backend_utils as pb_utils
@@ -172,7 +194,7 @@ class _Series:
         self._families.append(pb_utils.MetricFamily(name=f"rfm_{name}", description=description, kind=kind))
         return self._families[-1]
 
-    def tell(self, batches: Iterable[Counted], *, at_work: int, is_served: bool) -> None:
+    def add(self, batches: Iterable[Counted], *, at_work: int, is_served: bool) -> None:
         """Adds what came of ``batches``."""
         samples: Counter[tuple[str, str]] = Counter()
         totals: Counter[str] = Counter()
@@ -185,9 +207,9 @@ class _Series:
             self._samples[key].increment(count)
         for name, total in totals.items():
             self._totals[name].increment(total)
-        if at_work != self._told_at_work:
+        if at_work != self._shown_at_work:
             self._at_work.set(at_work)
-            self._told_at_work = at_work
+            self._shown_at_work = at_work
         # Every time: where a model is reloaded, the instance that goes says 0 when the one that comes has said 1.
         self._checkpoint.set(float(is_served))
 

@@ -1,53 +1,37 @@
 # SPDX-License-Identifier: MIT
-"""Requests that kill the model process: told by what it was working on when it died, and refused for a while.
+"""Requests that kill the model process: known by what it was working on when it died, and refused for a while.
 
 Each model process keeps a journal, a small file in shared memory, of the batch that it is working on, and of when that
 batch last got on, by which a process that hangs is known. The journal outlives the process. The next process of the
 model reads the journals of the dead: what stands in one is a suspect, which is worked on alone from then on, so that no
 neighbour is blamed for it. A suspect that is survived is none any more; one that was there twice when a process died is
-refused for POISON_S.
+refused for QUARANTINE_S.
 """
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
-from rfm.journal import DIGEST_BYTES, NO_DIGEST, SUFFIX, Journal
+from rfm.journal import NO_DIGEST, SUFFIX, Journal
+from rfm.triton_model.request import Request
 from rfm_client.contract.errors import DEADLY, InvalidSampleError
 
-POISON_S = 600.0
+QUARANTINE_S = 600.0
 DEATHS = 2  # after which a request is refused
 
 _FOLDER = Path("/dev/shm")
-_SAMPLED_BYTES = 2**14  # of each tensor: a digest shall cost microseconds, whatever the size
-_BLOCK_BYTES = 2**9
 _STUB_REGION = 2  # which argument of a model process names its shared memory
-_ZOMBIE = "Z"
 
 
-def digest(tensors: Mapping[str, npt.NDArray[Any]]) -> bytes:
-    """8 bytes that tell a request's inputs from others; of large tensors shape and an even sample of the content."""
-    told = hashlib.sha1(usedforsecurity=False)
-    for name in sorted(tensors):
-        array = tensors[name]
-        told.update(f"{name}{array.shape}".encode())
-        told.update(_sampled(array))
-    return told.digest()[:DIGEST_BYTES]
-
-
-class Poison:
-    """What one model process knows of requests that kill it.
+class Quarantine:
+    """The requests that have killed processes of one model, as the next process knows them.
 
     file: its own journal
     others: journals of the model's processes, from which those of the dead are read
@@ -55,27 +39,34 @@ class Poison:
 
     def __init__(self, file: Path, others: Iterable[Path], capacity: int) -> None:
         self._dead = [journal for other in others if (journal := _of_the_dead(other))]
-        self._deaths = Counter(told for journal in self._dead for told in journal.digests if told != NO_DIGEST)
-        self._until_s = time.monotonic() + POISON_S
+        self._deaths = Counter(digest for journal in self._dead for digest in journal.digests if digest != NO_DIGEST)
+        self._until_s = time.monotonic() + QUARANTINE_S
         self._journal = Journal.create(file, capacity)
 
     @classmethod
-    def of_this_process(cls, model: str, capacity: int) -> Poison:
-        """That of the process that runs, which Triton has started for ``model``."""
+    def of_this_process(cls, model: str, capacity: int) -> Quarantine:
+        """The quarantine of the running process, which Triton has started for ``model``."""
         region = os.fsdecode(Path("/proc/self/cmdline").read_bytes().split(b"\0")[_STUB_REGION])
         return cls(_FOLDER / f"{region}_{model}{SUFFIX}", journals(_FOLDER, region, model), capacity)
 
-    def is_suspect(self, told: bytes) -> bool:
-        """Whether a process has died while it worked on this request."""
-        return self._deaths[told] > 0 if self._deaths else False
+    def is_suspect(self, digest: bytes) -> bool:
+        """Whether a process has died while it worked on a request of this digest."""
+        return self._deaths[digest] > 0 if self._deaths else False
 
-    def check(self, told: bytes) -> None:
+    def check(self, digest: bytes) -> None:
         """Raises InvalidSampleError for a request that is refused."""
-        if self.is_suspect(told) and self._deaths[told] >= DEATHS and time.monotonic() < self._until_s:
+        deaths = self._deaths[digest] if self._deaths else 0
+        if deaths >= DEATHS and time.monotonic() < self._until_s:
             self._journal.count_refused()
-            got = f"one that has ended its process {self._deaths[told]} times"
-            until = f"it is refused for {POISON_S / 60:g} minutes"
+            got = f"one that has ended its process {deaths} times"
+            until = f"it is refused for {QUARANTINE_S / 60:g} minutes"
             raise InvalidSampleError(f"{DEADLY}, got {got}: {until}")
+
+    def groups(self, batch: Sequence[Request[Any]]) -> list[list[Request[Any]]]:
+        """The requests, in groups that are worked on together: each suspect alone, and the others."""
+        suspects = [[request] for request in batch if self.is_suspect(request.digest)]
+        others = [request for request in batch if not self.is_suspect(request.digest)]
+        return [*suspects, others] if others else suspects
 
     @contextmanager
     def at_work_on(self, digests: Sequence[bytes]) -> Iterator[None]:
@@ -84,22 +75,22 @@ class Poison:
             with self._journal.at_work_on(digests):
                 yield
         finally:
-            for told in digests if self._deaths else ():
-                if self._deaths.pop(told, 0):
+            for digest in digests if self._deaths else ():
+                if self._deaths.pop(digest, 0):
                     for journal in self._dead:
-                        journal.forget(told)
+                        journal.forget(digest)
 
     def renew(self) -> None:
-        """What is worked on has got on."""
+        """Notes that the batch has got one forward pass further."""
         self._journal.renew()
 
     def close(self) -> None:
-        """The process ends as it should."""
+        """Removes the journal of a process that ends as it should."""
         self._journal.close()
 
 
 def journals(folder: Path, region: str, model: str) -> list[Path]:
-    """Those of the model's processes, of the server whose process has the shared memory ``region``.
+    """The journals of the model's processes, of the server whose process has the shared memory ``region``.
 
     Regions of one server differ behind the last underscore, and names of models may hold any number of them.
     """
@@ -108,32 +99,12 @@ def journals(folder: Path, region: str, model: str) -> list[Path]:
 
 
 def _of_the_dead(file: Path) -> Journal | None:
-    """A journal that tells of suspects. One that tells of nothing, or no more, is removed."""
+    """The journal of a dead process, if it names suspects. One that names none, or no more, is removed."""
     journal = Journal.open(file)
-    if journal is None or _is_alive(journal.pid):
+    if journal is None or journal.is_alive:
         return None
-    if not 0 < journal.busy_s < POISON_S:
+    if not 0 < journal.busy_s < QUARANTINE_S:
         with suppress(OSError):
             journal.close()
         return None
     return journal
-
-
-def _is_alive(pid: int) -> bool:
-    try:
-        stat = Path("/proc", str(pid), "stat").read_text()
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-    return stat.rpartition(")")[2].split()[0] != _ZOMBIE
-
-
-def _sampled(array: npt.NDArray[Any]) -> bytes | memoryview:
-    """The content, or blocks of it at even distances."""
-    if array.dtype == np.object_:
-        return b"\0".join(bytes(item) for item in array.ravel())
-    content = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
-    if content.nbytes <= _SAMPLED_BYTES:
-        return content.data
-    blocks = content[-(content.nbytes // _BLOCK_BYTES) * _BLOCK_BYTES :].reshape(-1, _BLOCK_BYTES)
-    step = -(-len(blocks) * _BLOCK_BYTES // _SAMPLED_BYTES)
-    return np.ascontiguousarray(blocks[::step]).data

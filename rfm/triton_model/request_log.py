@@ -8,47 +8,47 @@ import traceback
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rfm.triton_model.asked import FAILED, Asked
+from rfm.triton_model.request import FAILED, Request
 
 
 class RequestLog:
-    """Writes with ``labels``, which tell the model.
+    """Writes with ``labels``, which name the model.
 
-    What failed is an error. What was refused or cancelled is only said where Triton's verbose log is on, so that
+    What failed is an error. What was refused or cancelled is only written where Triton's verbose log is on, so that
     no client can fill the log.
     """
 
     def __init__(self, labels: Mapping[str, str]) -> None:
         self._labels = dict(labels)
 
-    def tell(self, asked: Asked[Any]) -> None:
-        """Says what became of a request that has an error."""
-        assert asked.error is not None
-        said = {
-            "request_id": asked.request_id,
-            "sample_type": ",".join(sorted(asked.sample_types)),
-            "error": str(asked.error),
+    def report(self, request: Request[Any]) -> None:
+        """Writes down what became of a request that has an error."""
+        assert request.error is not None
+        fields = {
+            "request_id": request.request_id,
+            "sample_type": ",".join(sorted(request.sample_types)),
+            "error": str(request.error),
         }
-        self._write(asked.outcome, said, asked.error.__cause__)
+        self._write(request.outcome, fields, request.error.__cause__)
 
-    def tell_of_batch(self, batch: Sequence[Asked[Any]], error: Exception) -> None:
-        """Says that requests failed together; each is answered alone then."""
-        said = {"request_ids": [asked.request_id for asked in batch], "error": repr(error)}
-        self._write(FAILED, said, error, event="batch_failed")
+    def report_batch(self, batch: Sequence[Request[Any]], error: Exception) -> None:
+        """Writes down that requests failed together. Each is served alone then."""
+        fields = {"request_ids": [request.request_id for request in batch], "error": repr(error)}
+        self._write(FAILED, fields, error, event="batch_failed")
 
-    def tell_of_end(self, error: Exception) -> None:
-        """Says that the process ends, since it cannot score a blank sample any more."""
+    def report_end(self, error: Exception) -> None:
+        """Writes down that the process ends, since it cannot score a blank sample any more."""
         self._write(FAILED, {"error": repr(error)}, error, event="instance_broken")
 
     def _write(
-        self, outcome: str, said: Mapping[str, Any], cause: BaseException | None, event: str | None = None
+        self, outcome: str, fields: Mapping[str, Any], cause: BaseException | None, event: str | None = None
     ) -> None:
         import triton_python_backend_utils as pb_utils
 
-        told = {"event": event or f"request_{outcome}", **self._labels, **said}
+        entry = {"event": event or f"request_{outcome}", **self._labels, **fields}
         if cause is not None:
-            told["traceback"] = "".join(traceback.format_exception(cause))
-        line = json.dumps(told)
+            entry["traceback"] = "".join(traceback.format_exception(cause))
+        line = json.dumps(entry)
         if outcome == FAILED:
             pb_utils.Logger.log_error(line)
         else:

@@ -9,38 +9,44 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
-from rfm.triton_model.asked import FAILED, SCORED, Asked
+from rfm.triton_model.request import FAILED, SCORED, Request
 
 FAILED_BATCHES = 3  # in a row, before the blank sample is scored
 ANSWERED_S = 1.0  # for Triton to pass on the errors and the log of the last batch
 
 
 class SelfCheck:
-    """Is told every batch.
+    """Counts batches that failed, and ends an instance that is broken.
 
     score_blank: scores the blank sample; raises whatever goes wrong
-    tell: is told the error of an instance that ends
+    report: takes the error of an instance that ends
     """
 
-    def __init__(self, score_blank: Callable[[], None], tell: Callable[[Exception], None]) -> None:
+    def __init__(self, score_blank: Callable[[], None], report: Callable[[Exception], None]) -> None:
         self._score_blank = score_blank
-        self._tell = tell
+        self._report = report
         self._num_failed = 0
         self._has_scored_blank = False  # else a failure says nothing
         self._ending: threading.Timer | None = None  # of a broken instance
 
-    def before_batch(self) -> None:
-        """Begins nothing of the batch in a broken process, so that no request is a suspect when it ends."""
+    @contextmanager
+    def around(self, batch: Sequence[Request[Any]]) -> Iterator[None]:
+        """Within it the batch is served. Afterwards the instance is checked, if need be.
+
+        Nothing begins in a broken process, so that no request is a suspect when it ends.
+        """
         if self._ending is not None:
             self._ending.join()
+        yield
+        self._count(batch)
 
-    def after_batch(self, batch: Sequence[Asked[Any]]) -> None:
-        """Checks the instance if need be. One that is broken ends when Triton has passed on this batch's errors."""
-        outcomes = {asked.outcome for asked in batch}
-        if any(asked.outcome == SCORED and not asked.is_counted for asked in batch):  # a probe, or a warm-up
+    def _count(self, batch: Sequence[Request[Any]]) -> None:
+        outcomes = {request.outcome for request in batch}
+        if any(request.outcome == SCORED and not request.is_counted for request in batch):  # a probe, or a warm-up
             self._has_scored_blank = True
         if SCORED in outcomes:
             self._num_failed = 0
@@ -54,7 +60,7 @@ class SelfCheck:
         try:
             self._score_blank()
         except Exception as error:  # noqa: BLE001  whatever it is: the instance scored this before
-            self._tell(error)
+            self._report(error)
             self._ending = threading.Timer(ANSWERED_S, _end)
             self._ending.daemon = True
             self._ending.start()

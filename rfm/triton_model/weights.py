@@ -13,23 +13,23 @@ from rfm.checkpoint.digest import weights_digest
 from rfm_client.contract.model_info import DIGEST_PARAMETER
 
 
-def check_digest(version: Path, told: str) -> None:
+def check_digest(version: Path, expected: str) -> None:
     """Raises CheckpointError if the weights in the folder ``version`` are not those that were exported.
 
-    told: the digest in the model's configuration, which may be that of a newer version; each version folder keeps the
-    configuration of its own export. Empty: of an export that told none
+    expected: the digest in the model's configuration, which may be that of a newer version. Each version folder keeps
+    the configuration of its own export. Empty: the export named none
     """
     kept = version / "config.pbtxt"
     if is_there(kept):
-        told = _digest_in(kept)
-    if told and (got := weights_digest([version])) != told:
+        expected = _digest_in(kept)
+    if expected and (got := weights_digest([version])) != expected:
         raise CheckpointError(
-            f"{version}: expected the weights that were exported ({told}), got others ({got}); export them again"
+            f"{version}: expected the weights that were exported ({expected}), got others ({got}); export them again"
         )
 
 
 def _digest_in(file: Path) -> str:
-    """The digest that an exported configuration tells; empty if it tells none."""
+    """The digest that an exported configuration names; empty if it names none."""
     try:
         config = text_format.Parse(file.read_text(), pb.ModelConfig())
     except (OSError, ValueError, text_format.ParseError) as error:

@@ -26,8 +26,8 @@ from gateway_requests import (
 from rfm.config import ServeConfig
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer
+from rfm.supervise.cleanup import REGION_PREFIX
 from rfm.supervise.installation import find_installation
-from rfm.supervise.leftovers import REGION_PREFIX
 from rfm.supervise.process import Endpoints, TritonServer
 from rfm.supervise.stubs import SHARED_MEMORY
 

@@ -14,9 +14,9 @@ import trustme
 import rfm_export
 from commands import EXIT_S, command, wait_for_http
 from engines import serve_config
-from rfm.supervise.exposure import GrpcTls
 from rfm.supervise.installation import find_installation
 from rfm.supervise.process import Endpoints
+from rfm.supervise.tls import GrpcTls
 from secured import (
     PLAIN,
     PUBLIC_HOST,

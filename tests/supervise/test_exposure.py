@@ -10,10 +10,11 @@ from typing import Any
 import pytest
 
 from rfm.config import ConfigError, ServeConfig
-from rfm.supervise.exposure import MAX_HTTP_BYTES, check_version, size_limits
+from rfm.supervise.cleanup import REGION_PREFIX
 from rfm.supervise.installation import Installation, ServerStartError, find_installation
-from rfm.supervise.leftovers import REGION_PREFIX
+from rfm.supervise.listen_address import check_version
 from rfm.supervise.process import Endpoints, TritonServer
+from rfm.supervise.triton_options import MAX_HTTP_BYTES, size_limits
 from secured import (
     Papers,
     nothing_left_behind,

@@ -20,13 +20,16 @@ import httpx
 import numpy as np
 import pytest
 
+from clock import Clock
 from patients import CALLERS, DEADLY, MARK, TOLERANCE, Callers, make_repository, trajectory
-from rfm.supervise import leftovers, restarts
+from rfm.journal import SUFFIX, is_alive
+from rfm.supervise import back_off, cleanup
+from rfm.supervise.back_off import BackOff, CrashLoopError
 from rfm.supervise.installation import find_installation
 from rfm.supervise.process import Endpoints, TritonServer
-from rfm.supervise.restarts import CrashLoopError, Restarts
-from rfm.supervise.stubs import SHARED_MEMORY, is_alive
-from rfm.triton_model import quarantine as poison
+from rfm.supervise.stubs import SHARED_MEMORY
+from rfm.triton_model.digest import digest
+from rfm.triton_model.quarantine import Quarantine
 from rfm.triton_model.self_check import FAILED_BATCHES
 from rfm_client import (
     InferenceFailedError,
@@ -160,7 +163,7 @@ def test_a_server_that_is_killed_leaves_nothing_running_and_the_next_removes_the
         wait_for(lambda: not any(path.exists() for path in left))
         served.wait_ready()
         assert list(SHARED_MEMORY.glob(f"*_rfm_{served.process.pid}_*"))
-        leftovers.clear()
+        cleanup.clear()
         assert list(SHARED_MEMORY.glob(f"*_rfm_{served.process.pid}_*"))  # it lives
     assert any(f"removed {left[0]}" in line for line in served.said)
     assert not list(Path(tempfile.gettempdir()).glob(f"rfm-backends-{killed.pid}-*"))
@@ -189,14 +192,14 @@ def test_what_a_killed_container_left_is_removed_and_what_a_living_one_has_is_no
     try:
         wait_for(folders)
         names += [folder.name.removeprefix("rfm-backends-").replace("-", "_") for folder in folders()]
-        wait_for(lambda: any(path.name.endswith(poison.SUFFIX) for path in left()))  # a model process of it runs
+        wait_for(lambda: any(path.name.endswith(SUFFIX) for path in left()))  # a model process of it runs
         own = left()
-        assert not own & set(leftovers.clear())
+        assert not own & set(cleanup.clear())
         assert own <= left()
     finally:
         container.kill()
         container.wait(PATIENCE_S)
-    wait_for(lambda: leftovers.clear() or not own & left())  # its processes have ended
+    wait_for(lambda: cleanup.clear() or not own & left())  # its processes have ended
     assert not own & left()
 
 
@@ -279,48 +282,38 @@ def test_a_server_that_is_killed_again_and_again_is_given_up(tmp_path: Path) -> 
     assert served.process.returncode == 1
     wanted = r"rfm: tritonserver: expected to run, got 6 ends, each within 60 s of a start; the last: .*exit status -9"
     assert re.fullmatch(wanted, served.said[-1]), served.said
-    assert len(killed) == restarts.MOST + 1
-
-
-class Clock:
-    """A ``time`` module whose time passes when the test says so."""
-
-    def __init__(self) -> None:
-        self.now_s = 0.0
-
-    def monotonic(self) -> float:
-        return self.now_s
+    assert len(killed) == back_off.MOST + 1
 
 
 def test_what_ran_for_long_is_no_part_of_a_crash_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
-    monkeypatch.setattr(restarts, "time", clock)
-    ends = Restarts("gateway")
+    monkeypatch.setattr(back_off, "time", clock)
+    ends = BackOff("gateway")
 
     def run(duration_s: float) -> float:
         ends.started()
         clock.now_s += duration_s
         return ends.pause_s("why")
 
-    assert [run(1.0) for _ in range(restarts.MOST)] == [0, 0.5, 1, 2, 4]
-    assert run(restarts.STEADY_S) == 0
-    for _ in range(restarts.MOST - 1):
+    assert [run(1.0) for _ in range(back_off.MOST)] == [0, 0.5, 1, 2, 4]
+    assert run(back_off.STEADY_S) == 0
+    for _ in range(back_off.MOST - 1):
         run(1.0)
     with pytest.raises(CrashLoopError, match="gateway: expected to run, got 6 ends, each within 60 s"):
         run(1.0)
 
 
-@pytest.mark.parametrize("attempt_s", [1.0, 2 * restarts.STEADY_S])
+@pytest.mark.parametrize("attempt_s", [1.0, 2 * back_off.STEADY_S])
 def test_starts_that_fail_are_a_crash_loop_however_long_it_ran_before(
     monkeypatch: pytest.MonkeyPatch, attempt_s: float
 ) -> None:
     clock = Clock()
-    monkeypatch.setattr(restarts, "time", clock)
-    ends = Restarts("tritonserver")
+    monkeypatch.setattr(back_off, "time", clock)
+    ends = BackOff("tritonserver")
     ends.started()
-    clock.now_s += 5 * restarts.STEADY_S
+    clock.now_s += 5 * back_off.STEADY_S
     pauses = []
-    for _ in range(restarts.MOST):
+    for _ in range(back_off.MOST):
         pauses.append(ends.pause_s("it does not start"))
         clock.now_s += attempt_s
     assert pauses == [0, 0.5, 1, 2, 4]
@@ -365,23 +358,23 @@ def test_a_full_queue_refuses_at_once_and_a_long_wait_is_cut_short(tmp_path: Pat
 
 def test_a_journal_outlives_its_process_and_tells_what_it_was_working_on(tmp_path: Path) -> None:
     tensors = {"a": np.arange(100_000, dtype=np.float32), "task": np.array([[b"stack"]], np.object_)}
-    first = poison.digest(tensors)
-    assert first == poison.digest({name: array.copy() for name, array in tensors.items()})
+    first = digest(tensors)
+    assert first == digest({name: array.copy() for name, array in tensors.items()})
     changed = dict(tensors, a=tensors["a"].copy())
     changed["a"] += 1
-    others = [poison.digest(changed), poison.digest(dict(tensors, task=np.array([[b"sort"]], np.object_)))]
+    others = [digest(changed), digest(dict(tensors, task=np.array([[b"sort"]], np.object_)))]
     assert len({first, *others}) == 3
 
     def die(name: str) -> None:
         """A process that dies while it works on two requests."""
-        code = "import os, sys; from pathlib import Path; from rfm.triton_model.quarantine import Poison; folder = Path(sys.argv[1])\n"
-        code += "poison = Poison(folder / sys.argv[2], sorted(folder.glob('*_batch')), 4)\n"
-        code += "with poison.at_work_on([bytes.fromhex(word) for word in sys.argv[3:]]): os._exit(1)"
+        code = "import os, sys; from pathlib import Path; from rfm.triton_model.quarantine import Quarantine; folder = Path(sys.argv[1])\n"
+        code += "own = Quarantine(folder / sys.argv[2], sorted(folder.glob('*_batch')), 4)\n"
+        code += "with own.at_work_on([bytes.fromhex(word) for word in sys.argv[3:]]): os._exit(1)"
         words = [told.hex() for told in (first, others[0])]
         subprocess.run([sys.executable, "-c", code, tmp_path, name, *words], check=False, timeout=PATIENCE_S)
 
     die("1_batch")
-    one = poison.Poison(tmp_path / "2_batch", tmp_path.glob("1_batch"), 4)
+    one = Quarantine(tmp_path / "2_batch", tmp_path.glob("1_batch"), 4)
     assert [one.is_suspect(told) for told in (first, *others)] == [True, True, False]
     one.check(first)
     with one.at_work_on([others[0]]):
@@ -389,7 +382,7 @@ def test_a_journal_outlives_its_process_and_tells_what_it_was_working_on(tmp_pat
     assert [one.is_suspect(told) for told in (first, *others)] == [True, False, False]
     one.close()
     die("3_batch")
-    two = poison.Poison(tmp_path / "4_batch", sorted(tmp_path.glob("*_batch")), 4)
+    two = Quarantine(tmp_path / "4_batch", sorted(tmp_path.glob("*_batch")), 4)
     with pytest.raises(InvalidSampleError, match="ended its process 2 times"):
         two.check(first)
     two.check(others[0])  # once: it was survived meanwhile

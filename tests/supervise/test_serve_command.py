@@ -18,10 +18,10 @@ import pytest
 
 import clip
 from commands import EXIT_S, REPOSITORY, RFM, command, nothing_left_behind, wait_for_http
+from rfm.journal import is_alive
 from rfm.supervise import installation
 from rfm.supervise.installation import ServerStartError, find_installation
 from rfm.supervise.process import Endpoints, TritonServer
-from rfm.supervise.stubs import is_alive
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_serve import children, serving, wait_for
 

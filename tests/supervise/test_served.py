@@ -18,23 +18,20 @@ import numpy as np
 import pytest
 
 import rollout
-from patients import Callers, make_repository, references, trajectory
-from rfm.supervise import healing
-from rfm.supervise.canary import Canary, Verdict
-from rfm.supervise.healing import ModelHealth
+from patients import Callers, make_repository, trajectory
+from rfm.supervise import triton_watch
 from rfm.supervise.http import Http
-from rfm.supervise.inquiry import Inquiry
 from rfm.supervise.installation import find_installation
 from rfm.supervise.process import Endpoints, TritonServer
-from rfm.supervise.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
+from rfm.supervise.repository_api import RepositoryApi, RepositoryApiError
 from rfm.supervise.served import NOT_LOADED, SILENT, Served
 from rfm.supervise.status import NO_REASON, Status
+from rfm.supervise.triton_watch import TritonWatch
 from rfm_commands.rollout import Rollout
 from rfm_serve import MODEL, Serving, serving, wait_for
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
-__all__ = ["references"]  # a fixture
 
 KEY = "a-key-that-only-tests-know"
 OTHER = f"{MODEL}_b"
@@ -255,12 +252,12 @@ def test_a_triton_has_to_miss_several_looks(monkeypatch: pytest.MonkeyPatch) -> 
     """However long one look takes, and however little time is given."""
     server = SimpleNamespace(endpoints=Endpoints.free(), admin_key=KEY, pid=os.getpid())
     asked: list[str] = []
+    monkeypatch.setattr(triton_watch, "INTERVAL_S", 0.0)
     monkeypatch.setattr(Http, "request", lambda *words, **_: asked.append(words[2]) or refuse())
-    ask = Inquiry(server, 1e-9)  # type: ignore[arg-type]
-    assert not ask.is_silent
-    for looks in range(1, 4):
-        ask.look()
-        assert (len(asked), ask.is_answered, ask.is_silent) == (2 * looks, False, looks == 3)
+    watch = TritonWatch(server, 1e-9)  # type: ignore[arg-type]
+    wait_for(lambda: watch.look() or watch.is_silent)
+    assert not watch.is_answered
+    assert 3 <= len(asked) / 2 <= 4  # two doors; the fourth look has begun, perhaps
 
 
 def refuse() -> None:
@@ -281,93 +278,12 @@ def test_what_is_exported_while_triton_starts_does_not_matter(tmp_path: Path) ->
 
 def test_a_triton_that_is_gone_is_the_supervisor_s_to_see() -> None:
     about = Status()
-    about.tell({MODEL: "it is loaded"})
+    about.record({MODEL: "it is loaded"})
     server = SimpleNamespace(endpoints=Endpoints.free(), admin_key=KEY, pid=os.getpid())
     served = Served(server, about, canary_s=1.0, hang_s=1.0, triton_silent_s=1.0, say=print, restored={})  # type: ignore[arg-type]
     try:
-        wait_for(lambda: served.is_silent)
+        wait_for(lambda: served.look() or served.is_silent)
         assert served.look() == []
         assert not about.ready[0]
     finally:
         served.close()
-
-
-def test_what_is_closed_heals_nothing_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
-
-    def refuse(*_: object) -> None:
-        asked.append(time.monotonic())
-        raise RepositoryApiError("refused")
-
-    monkeypatch.setattr(healing, "RepositoryApi", refuse)
-    endpoints = Endpoints.free()
-    canary = Canary(Http(endpoints.http_host, endpoints.http_port), MODEL, 1.0, 1.0, lambda _: None)
-    server = SimpleNamespace(endpoints=endpoints, admin_key=KEY, grpc_options={})  # nobody is to end it
-    health = ModelHealth(server, canary, SimpleNamespace(), Status(), print)  # type: ignore[arg-type]
-    assert health.look("its process is dead", {}) == "its process is dead"
-    wait_for(lambda: len(asked) == 4)  # the next is 4 s away
-    assert health.reason == "it is loaded anew, after: refused"
-    health.close()
-    wait_for(lambda: not health.is_healing, 1.0)
-    assert len(asked) == 4
-
-
-class Administered:
-    """A fake of the API, of a server where a load goes wrong, and somebody else loads another version."""
-
-    def __init__(self, state: str, reason: str = "") -> None:
-        self.entry = ModelVersion(MODEL, 1, state, reason)
-        self.asked: list[str] = []
-
-    def __enter__(self) -> Administered:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def index(self) -> list[ModelVersion]:
-        return [self.entry]
-
-    def config(self, model: str, version: int) -> dict[str, Any]:
-        return {"name": model, "of": version}
-
-    def unload(self, model: str) -> None:
-        self.asked.append("unload")
-
-    def load(self, model: str, config: Any) -> None:
-        self.asked.append(f"load {config['of']}")
-        self.entry = ModelVersion(MODEL, 2, "READY", "")
-        raise RepositoryApiError("the weights are damaged")
-
-
-@pytest.mark.parametrize(
-    ("state", "reason", "asked"),
-    [("READY", "", ["unload", "load 1"]), ("UNAVAILABLE", "unloaded", [])],
-    ids=["somebody has loaded another version", "somebody has unloaded it"],
-)
-def test_what_others_did_while_a_model_is_healed_stays(
-    monkeypatch: pytest.MonkeyPatch, state: str, reason: str, asked: list[str]
-) -> None:
-    api = Administered(state, reason)
-    monkeypatch.setattr(healing, "RepositoryApi", lambda *_: api)
-    endpoints = Endpoints.free()
-    canary = Canary(Http(endpoints.http_host, endpoints.http_port), MODEL, 1.0, 1.0, lambda _: None)
-    watch = SimpleNamespace(of_model=lambda _: [], bury=lambda _: None, is_getting_on=lambda _: False)
-    server = SimpleNamespace(endpoints=endpoints, admin_key=KEY, grpc_options={})
-    health = ModelHealth(server, canary, watch, Status(), print)  # type: ignore[arg-type]
-    assert health.look("its process is dead", {}) is not None
-    wait_for(lambda: not health.is_healing)
-    assert health.look(None, {}) is None  # not once more
-    assert api.asked == asked
-    health.close()
-
-
-def test_a_model_of_a_triton_that_tells_nothing_does_not_hang() -> None:
-    """It may be busy with a model that it loads; and if it is not, it is Triton that is started again."""
-    endpoints = Endpoints.free()
-    canary = Canary(Http(endpoints.http_host, endpoints.http_port), MODEL, 0.1, 0.0, lambda _: None)
-    canary.start()
-    try:
-        wait_for(lambda: canary.verdict() is Verdict.LATE)
-    finally:
-        canary.stop()

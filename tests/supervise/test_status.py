@@ -74,19 +74,19 @@ def told(about: Status) -> dict[str, float]:
 
 def test_nothing_is_told_of_what_there_was(port: int) -> None:
     about = Status()
-    about.tell({"a": NO_REASON, "b": NO_REASON, "a_frames": NO_REASON})
+    about.record({"a": NO_REASON, "b": NO_REASON, "a_frames": NO_REASON})
     for model in ("a", "b"):
-        about.tell_canary(model, is_ok=True)
-    about.tell({"a": NO_REASON, "a_frames": NO_REASON})
+        about.record_probe(model, is_ok=True)
+    about.record({"a": NO_REASON, "a_frames": NO_REASON})
     assert told(about) == {"rfm_serve_ready a": 1, "rfm_serve_ready a_frames": 1, "rfm_serve_canary_ok a": 1}
-    about.tell_down("tritonserver is started again")
+    about.record_down("tritonserver is started again")
     assert told(about) == {"rfm_serve_ready a": 0, "rfm_serve_ready a_frames": 0, "rfm_serve_canary_ok a": 0}
     text = about.metrics().decode()
     assert 'rfm_serve_not_ready{model="a",reason="tritonserver is started again"} 1.0' in text
-    about.tell({"a": "it is loaded", "a_frames": NO_REASON})
+    about.record({"a": "it is loaded", "a_frames": NO_REASON})
     text = about.metrics().decode()
     assert [line for line in text.splitlines() if line.startswith("rfm_serve_not_ready{")] == [
         'rfm_serve_not_ready{model="a",reason="it is loaded"} 1.0'
     ]
-    about.tell_down("tritonserver is started again")
+    about.record_down("tritonserver is started again")
     assert about.ready[1]["models"]["a_frames"] == {"ready": False, "reason": "tritonserver is started again"}

@@ -9,10 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from rfm.journal import Journal
+from rfm.journal import SUFFIX, Journal
 from rfm.supervise import stubs
 from rfm.supervise.stubs import Stub, StubWatch
-from rfm.triton_model import quarantine as poison
 
 TRITON = 10
 MODEL = "rfm"
@@ -46,7 +45,7 @@ class Machine:
         (self.proc / str(pid)).rmdir()
 
     def journal(self, pid: int) -> Journal:
-        return Journal.create(self.memory / f"region_{pid}_{MODEL}{poison.SUFFIX}", 1)
+        return Journal.create(self.memory / f"region_{pid}_{MODEL}{SUFFIX}", 1)
 
     def _write(self, pid: int, state: str, started_ticks: int) -> None:
         zeros = " ".join(["0"] * 17)
@@ -75,7 +74,7 @@ def test_the_dead_of_a_version_that_is_ready_are_told_until_they_are_buried(mach
     watch = StubWatch(TRITON, 30.0)
     machine.start(21, 1)
     machine.start(22, 1)
-    watch.tell({ONE}, set(), later_s())
+    watch.update({ONE}, set(), later_s())
     assert watch.dead() == []
     machine.die(22)
     assert pids(watch.dead()) == [22]
@@ -91,26 +90,26 @@ def test_a_version_that_loads_is_left_to_triton(machine: Machine) -> None:
     for pid, version in ((21, 1), (31, 2), (32, 2)):
         machine.start(pid, version)
     with machine.journal(21).at_work_on([b"12345678"]), machine.journal(32).at_work_on([b"12345678"]):
-        watch.tell({ONE}, {TWO}, later_s())
+        watch.update({ONE}, {TWO}, later_s())
         machine.die(31)
         assert watch.dead() == []
         assert pids([stub for stub, _ in watch.hung()]) == [21]
-        watch.tell({ONE, TWO}, set(), later_s())
+        watch.update({ONE, TWO}, set(), later_s())
         assert pids([stub for stub, _ in watch.hung()]) == [21, 32]
 
 
 def test_of_a_version_that_is_loaded_once_more_the_old_ones_count_until_they_are_gone(machine: Machine) -> None:
     watch = StubWatch(TRITON, 30.0)
     machine.start(21, 1)
-    watch.tell({ONE}, set(), later_s())
+    watch.update({ONE}, set(), later_s())
     machine.start(22, 1)
-    watch.tell({ONE}, set(), later_s())
+    watch.update({ONE}, set(), later_s())
     machine.die(22)
     assert watch.dead() == []
     machine.die(21)
     assert pids(watch.dead()) == [21]
     machine.reap(21)
-    watch.tell({ONE}, set(), later_s())
+    watch.update({ONE}, set(), later_s())
     assert pids(watch.dead()) == [22]
 
 
@@ -118,7 +117,7 @@ def test_what_was_started_after_triton_was_asked_is_not_loaded(machine: Machine)
     watch = StubWatch(TRITON, 30.0)
     asked_s = time.monotonic() - 5.0
     machine.start(21, 1)
-    watch.tell({ONE}, set(), asked_s)
+    watch.update({ONE}, set(), asked_s)
     machine.die(21)
     assert watch.dead() == []
 
@@ -126,25 +125,9 @@ def test_what_was_started_after_triton_was_asked_is_not_loaded(machine: Machine)
 def test_another_process_of_the_same_id_is_another(machine: Machine) -> None:
     watch = StubWatch(TRITON, 30.0)
     machine.start(21, 1, started_s=1.0)
-    watch.tell({ONE}, set(), later_s())
+    watch.update({ONE}, set(), later_s())
     (old,) = watch.all
     machine.start(21, 1, started_s=2.0)
     assert not old.is_alive
     watch.bury([old])
     assert pids(watch.of_model(MODEL)) == [21]
-
-
-def test_a_stub_may_be_buried_while_it_is_looked_at(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Models are loaded anew in threads of their own."""
-    watch = StubWatch(TRITON, 30.0)
-    machine.start(21, 1)
-    watch.tell({ONE}, set(), later_s())
-    told = stubs._stat
-
-    def bury_and_tell(pid: int) -> list[str]:
-        watch.bury(watch.all)
-        machine.reap(pid)
-        return told(pid)
-
-    monkeypatch.setattr(stubs, "_stat", bury_and_tell)
-    assert watch.dead() == []

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from paths import ROOT
-from rfm.supervise.leftovers import REGION_PREFIX
+from rfm.journal import is_alive
+from rfm.supervise.cleanup import REGION_PREFIX
 from rfm.supervise.process import Endpoints
-from rfm.supervise.stubs import SHARED_MEMORY, is_alive
+from rfm.supervise.stubs import SHARED_MEMORY
 from rfm_client import RewardClient
 
 REPOSITORY = ROOT / "model_repository"

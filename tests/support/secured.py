@@ -18,7 +18,7 @@ import pytest
 import goldens
 from commands import EXIT_S, REPOSITORY, command, regions
 from engines import load_engine
-from rfm.supervise.leftovers import REGION_PREFIX
+from rfm.supervise.cleanup import REGION_PREFIX
 from rfm.supervise.process import Endpoints, TritonServer
 from rfm_client import AccessDeniedError, ProgressSample, RewardClient
 from trajectories import random_trajectory

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,10 +17,14 @@ import pytest
 
 from rfm.execution import Execution
 from rfm.probe import blank_question
-from rfm.triton_model import batch_model
+from rfm.triton_model import batch_model, cancellation
 from rfm.triton_model.batch_model import BatchModel
+from rfm.triton_model.cancellation import Cancellation
+from rfm.triton_model.digest import digest
 from rfm.triton_model.metrics import Counted
-from rfm.triton_model.quarantine import Poison, digest
+from rfm.triton_model.quarantine import Quarantine
+from rfm.triton_model.request import Origins
+from rfm.triton_model.request import Request as ModelRequest
 from rfm.triton_model.self_check import SelfCheck
 from rfm_client import (
     FrameScores,
@@ -80,16 +85,22 @@ class Model(BatchModel[Sample, Result]):
         self.at_work: list[int] = []
         self.batches: list[int] = []
         self.logged: list[str] = []
-        self._num_warmups = warmups
-        self._poison = Poison(folder / "1_batch", (), 8)
+        self._quarantine = Quarantine(folder / "1_batch", (), 8)
+        self._cancellation = Cancellation()
         self._blank_tensors = blank_question(CONFIG)
-        self._blank = digest(self._blank_tensors)
+        self._origins = Origins(warmups, digest(self._blank_tensors))
         self._self_check = SelfCheck(self._score_blank, lambda error: self.logged.append(f"ended: {error}"))
-        self._metrics = SimpleNamespace(at_work_on=self.at_work.append, add=self.counted.append)  # type: ignore[assignment]
+        self._metrics = SimpleNamespace(at_work_on=self.working, add=self.counted.append)  # type: ignore[assignment]
         self._log = SimpleNamespace(  # type: ignore[assignment]
-            tell=lambda asked: self.logged.append(str(asked.error)),
-            tell_of_batch=lambda batch, error: self.logged.append(f"{len(batch)}: {error}"),
+            report=lambda request: self.logged.append(str(request.error)),
+            report_batch=lambda batch, error: self.logged.append(f"{len(batch)}: {error}"),
         )
+
+    @contextmanager
+    def working(self, batch: Sequence[ModelRequest[Sample]]) -> Iterator[None]:
+        self.at_work.append(sum(request.is_counted for request in batch))
+        yield
+        self.at_work.append(0)
 
     def decode(self, tensors: wire.Tensors) -> list[Sample]:
         return wire.decode_samples(tensors)
@@ -191,10 +202,10 @@ def test_a_request_that_breaks_a_batch_is_found(tmp_path: Path) -> None:
     assert model.samples == {("progress", "scored"): 2, ("progress", "failed"): 1}
 
 
-@pytest.mark.parametrize("answer_s", [batch_model.WORTH_ASKING_S, 0.0])
-def test_a_cancelled_request_costs_nothing_where_it_is_worth_asking(tmp_path: Path, answer_s: float) -> None:
+@pytest.mark.parametrize("answer_s", [cancellation.WORTH_CHECKING_S, 0.0])
+def test_a_cancelled_request_costs_nothing_where_it_is_worth_a_question(tmp_path: Path, answer_s: float) -> None:
     model = Model(tmp_path)
-    model.answer_s = answer_s
+    model._cancellation.answer_s = answer_s
     cancelled, _ = model.execute([request(1, is_given_up=True), request(5)])
     if answer_s:
         assert cancelled.error == ("cancelled", "cancelled by the client")
@@ -214,10 +225,10 @@ def test_the_first_batch_asks_who_has_cancelled(tmp_path: Path) -> None:
 
 def test_what_an_answer_takes_is_that_of_a_question(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     times = iter([10.0, 16.0])
-    monkeypatch.setattr(batch_model, "time", SimpleNamespace(perf_counter=lambda: next(times)))
+    monkeypatch.setattr(cancellation, "time", SimpleNamespace(perf_counter=lambda: next(times)))
     model = Model(tmp_path)
     model.execute([request(1), request(1, 1)])
-    assert model.answer_s == 2
+    assert model._cancellation.answer_s == 2
 
 
 def test_warm_ups_and_probes_are_not_counted(tmp_path: Path) -> None:

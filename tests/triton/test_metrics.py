@@ -24,8 +24,8 @@ from rfm.execution import Execution
 from rfm.supervise.installation import find_installation
 from rfm.supervise.process import Endpoints, TritonServer
 from rfm.supervise.repository_api import RepositoryApi
-from rfm.triton_model.asked import OUTCOMES, UNKNOWN_TYPE
 from rfm.triton_model.metrics import BUCKETS_S, PADDING_BUCKETS, SAMPLES_BUCKETS
+from rfm.triton_model.request import OUTCOMES, UNKNOWN_TYPE
 from rfm_client import (
     DeadlineExceededError,
     InferenceFailedError,
@@ -120,15 +120,17 @@ import time
 
 
 class TritonPythonModel(TritonPythonModel):
-    def _read(self, asked):
+    def _serve(self, batch, execution):
         ends_s = time.monotonic() + {PATIENCE_S}
-        if asked.request_id.startswith("{UNTIL_CANCELLED}"):
-            while not asked.request.is_cancelled() and time.monotonic() < ends_s:
-                time.sleep(0.01)
-            self.answer_s = 1.0
-        super()._read(asked)
-        if asked.request_id.startswith("{TO_FAIL}"):
+        for request in batch:
+            if request.request_id.startswith("{UNTIL_CANCELLED}"):
+                while not request.inference.is_cancelled() and time.monotonic() < ends_s:
+                    time.sleep(0.01)
+                self._cancellation.answer_s = 1.0
+        responses = super()._serve(batch, execution)
+        if any(request.request_id.startswith("{TO_FAIL}") for request in batch):
             raise ZeroDivisionError("a fault of the model's")
+        return responses
 """
 
 

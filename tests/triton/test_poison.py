@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,16 +18,19 @@ import numpy as np
 import pytest
 
 import goldens
+import rfm.journal
 import rfm_export
 from engines import load_engine, serve_config
 from rfm.execution import Execution
 from rfm.journal import Journal
 from rfm.probe import blank_question
 from rfm.supervise.status import NO_REASON
-from rfm.triton_model import quarantine as poison
 from rfm.triton_model.batch_model import BatchModel
+from rfm.triton_model.cancellation import Cancellation
+from rfm.triton_model.digest import digest
 from rfm.triton_model.metrics import Counted
-from rfm.triton_model.quarantine import Poison, digest, journals
+from rfm.triton_model.quarantine import Quarantine, journals
+from rfm.triton_model.request import Origins
 from rfm.triton_model.self_check import SelfCheck
 from rfm_client import InferenceFailedError, ProgressResult, ProgressSample, Result, Sample
 from rfm_client.contract import wire
@@ -119,8 +123,8 @@ def test_a_journal_tells_since_when_nothing_has_come_of_a_batch(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now_s = 100.0
-    monkeypatch.setattr(poison, "time", SimpleNamespace(monotonic=lambda: now_s))
-    own = Poison(tmp_path / "1_batch", (), 4)
+    monkeypatch.setattr(rfm.journal, "time", SimpleNamespace(monotonic=lambda: now_s))
+    own = Quarantine(tmp_path / "1_batch", (), 4)
     journal = Journal.open(tmp_path / "1_batch")
     assert journal is not None
     with own.at_work_on([b"12345678"]):
@@ -171,16 +175,16 @@ class TritonError(Exception):
 class Model(BatchModel[Sample, Result]):
     """Never gets an answer, and says how many questions it was asked."""
 
-    def __init__(self, deadly: Poison) -> None:
+    def __init__(self, deadly: Quarantine) -> None:
         self.input_names = [tensor["name"] for tensor in CONFIG["input"]]
-        self.told: list[Counted] = []
+        self.counted: list[Counted] = []
         self.asked = 0
-        self._num_warmups = 0
-        self._poison = deadly
-        self._blank = digest(blank_question(CONFIG))
+        self._quarantine = deadly
+        self._cancellation = Cancellation()
+        self._origins = Origins(0, digest(blank_question(CONFIG)))
         self._self_check = SelfCheck(lambda: None, lambda error: None)
-        self._metrics = SimpleNamespace(at_work_on=lambda count: None, add=self.told.append)  # type: ignore[assignment]
-        self._log = SimpleNamespace(tell=lambda asked: None)  # type: ignore[assignment]
+        self._metrics = SimpleNamespace(at_work_on=lambda batch: nullcontext(), add=self.counted.append)  # type: ignore[assignment]
+        self._log = SimpleNamespace(report=lambda request: None)  # type: ignore[assignment]
 
     def decode(self, tensors: wire.Tensors) -> list[Sample]:
         return wire.decode_samples(tensors)
@@ -212,14 +216,14 @@ def sample_of(seed: int) -> wire.Tensors:
     return wire.encode_samples([ProgressSample(random_trajectory(seed, 3, *WIDTHS))])
 
 
-def deadly(folder: Path, tensors: wire.Tensors) -> Poison:
+def deadly(folder: Path, tensors: wire.Tensors) -> Quarantine:
     """What a process knows when two before it have died of these inputs."""
     code = "import os, sys; from pathlib import Path; from rfm.triton_model.quarantine import Journal\n"
     code += "with Journal.create(Path(sys.argv[1]), 1).at_work_on([bytes.fromhex(sys.argv[2])]): os._exit(1)"
     dead = [folder / "1_batch", folder / "2_batch"]
     for file in dead:
         subprocess.run([sys.executable, "-c", code, file, digest(tensors).hex()], check=False, timeout=PATIENCE_S)
-    return Poison(folder / "3_batch", dead, 4)
+    return Quarantine(folder / "3_batch", dead, 4)
 
 
 @pytest.mark.usefixtures("backend")
@@ -228,7 +232,7 @@ def test_poison_is_refused_and_counted_whoever_it_says_it_is_from(tmp_path: Path
     model = Model(deadly(tmp_path, sample_of(0)))
     model.execute([Request(request_id, sample_of(0)), Request("", sample_of(1))])
     assert model.asked == 1
-    (counted,) = model.told
+    (counted,) = model.counted
     assert counted.samples == {("progress", "refused"): 1, ("progress", "failed"): 1}
     assert counted.num_executed == 1  # what was refused took no part in it
 
@@ -238,4 +242,4 @@ def test_the_blank_question_of_a_probe_is_answered_and_not_counted(tmp_path: Pat
     blank = blank_question(CONFIG)
     model = Model(deadly(tmp_path, blank))
     model.execute([Request(f"{PROBE_PREFIX}-rfm", blank)])
-    assert (model.asked, model.told) == (1, [Counted()])
+    assert (model.asked, model.counted) == (1, [Counted()])

@@ -19,7 +19,7 @@ import rfm_export
 from callers import Callers, direct, through_gateway
 from chaos_site import BACK_S, CALLERS, CHECKPOINT, Row, Site, wait_healthy
 from rfm.config import ServeConfig
-from rfm.supervise.stubs import is_alive
+from rfm.journal import is_alive
 from rfm_client import RewardClient
 from rfm_client.transport.shared_memory import FOLDER
 from rfm_export.publish import read_config

@@ -56,7 +56,12 @@ TESTS: dict[str, tuple[str, ...]] = {
     "rfm/checkpoint/*.py": ("test_checkpoint", "test_hostile_files", "test_properties", "test_vlm"),
     "client/rfm_client/contract/wire.py": ("test_wire", "test_samples", "test_properties"),
     "rfm/triton_model/batch_model.py": ("test_batch_model", "test_poison", "test_logs"),
-    "rfm/supervise/healing.py": ("test_healing",),
+    "rfm/triton_model/cancellation.py": ("test_batch_model",),
+    "rfm/triton_model/request.py": ("test_batch_model", "test_poison"),
+    "rfm/supervise/lifecycle.py": ("test_lifecycle",),
+    "rfm/supervise/served_model.py": ("test_served_model",),
+    "rfm/supervise/reload.py": ("test_served_model",),
+    "rfm/supervise/model_probe.py": ("test_served_model",),
 }
 
 

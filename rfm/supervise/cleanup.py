@@ -65,7 +65,7 @@ class Claim:
 
 
 def clear() -> list[Path]:
-    """Removes what servers left of which no process lives, and tells what it was."""
+    """Removes what servers left of which no process lives, and gives their paths."""
     locks = [
         *SHARED_MEMORY.glob(f"{REGION_PREFIX}_*_{_LOCK}"),
         *Path(tempfile.gettempdir()).glob(f"{BACKENDS_PREFIX}*/{_LOCK}"),

@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Which of tritonserver's options may be given to ``rfm serve`` behind ``--``: those that it does not depend on."""
+"""tritonserver's options: those that may be given to ``rfm serve`` behind ``--``, and the limit of a request's size."""
 
 from __future__ import annotations
 
+import mmap
 import re
 from collections.abc import Sequence
+from pathlib import Path
 
-from rfm.supervise.installation import ServerStartError
+from rfm.supervise.installation import Installation, ServerStartError
+
+MAX_HTTP_BYTES = 256 * 2**20  # of a request's body, as in the gateway; over gRPC Triton takes 2 GiB
 
 # Beside those that are set: other names of them, and what would take away what a start waits for.
 _KEPT = {
@@ -26,6 +30,7 @@ _KEPT = {
 }
 # May be given again, for other APIs: Triton refuses to start with two keys for one.
 _REPEATED = {"--http-restricted-api", "--grpc-restricted-protocol"}
+_SIZE_OPTION = "http-max-input-size"
 _ARGUMENT = re.compile(r"(--[a-z][a-z0-9-]+)=.*")
 
 
@@ -38,3 +43,19 @@ def check_arguments(more: Sequence[str], own: Sequence[str]) -> None:
             raise ServerStartError(f"tritonserver: expected --option=value, got {argument.partition('=')[0]}")
         if match[1] not in _REPEATED and any(option.startswith(match[1]) for option in kept):
             raise ServerStartError(f"tritonserver: expected an option that rfm serve leaves open, got {match[1]}")
+
+
+def size_limits(installation: Installation, given: Sequence[str]) -> list[str]:
+    """Arguments of tritonserver, as far as it has such options (2.51 has none) and they are not ``given``."""
+    if any(argument.startswith(f"--{_SIZE_OPTION}=") for argument in given):
+        return []
+    return [f"--{_SIZE_OPTION}={MAX_HTTP_BYTES}"] if _knows(installation.executable, _SIZE_OPTION) else []
+
+
+def _knows(program: Path, option: str) -> bool:
+    """Whether the option's name stands in the program: asking by --help would start it."""
+    try:
+        with program.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            return content.find(option.encode()) >= 0
+    except (OSError, ValueError):  # it cannot be read, or is empty: starting it tells why
+        return False

@@ -17,8 +17,8 @@ class CrashLoopError(ServerStartError):
     """Something ends again and again."""
 
 
-class Restarts:
-    """Of one process. The first comes at once; those that follow close behind one another come after longer pauses."""
+class BackOff:
+    """The pauses before one thing is started again: none at first, longer ones where the starts follow closely."""
 
     def __init__(self, what: str) -> None:
         self._what = what
@@ -26,7 +26,7 @@ class Restarts:
         self._running_since_s: float | None = None  # None: it has ended
 
     def started(self) -> None:
-        """It runs now."""
+        """Notes that it runs now."""
         self._running_since_s = time.monotonic()
 
     def pause_s(self, reason: str) -> float:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""What a Triton says of itself, asked again and again: does it answer at all, and what does it serve?"""
+"""What a Triton says of itself: does it answer at all, and what does it serve?"""
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Collection, Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
@@ -17,9 +17,10 @@ from google.protobuf import text_format
 from tritonclient.grpc.model_config_pb2 import ModelConfig
 
 from rfm.supervise.admin_key import http_headers
+from rfm.supervise.background import in_background
 from rfm.supervise.http import NO_ANSWER, Http
 from rfm.supervise.process import TritonServer
-from rfm.supervise.repository_api import READY, ModelVersion, versions_of
+from rfm.supervise.repository_api import INDEX_PATH, READY, ModelVersion, versions_of
 
 INTERVAL_S = 1.0
 LOOKS = 3  # without any answer, at least, before it has to be started again
@@ -31,11 +32,12 @@ Config = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Told:
-    """One answer.
+class Snapshot:
+    """What a Triton serves.
 
     asked_s: when it was asked for, by time.monotonic
-    configs: of each model, when it was last ready; unreadable: models that are ready, and do not tell theirs
+    configs: of each model, when it was last ready
+    unreadable: models that are ready, and whose configuration cannot be read
     """
 
     asked_s: float
@@ -54,7 +56,7 @@ class Told:
         return bool(ready) if version == -1 else version in ready
 
     def in_state(self, *states: str) -> set[tuple[str, int]]:
-        """Models and versions."""
+        """Models and versions that are in one of these states."""
         return {(entry.name, entry.version or 0) for entry in self.versions if entry.state in states}
 
 
@@ -72,8 +74,17 @@ def names_what_was_served(repository: Path, model: str, served: Config) -> bool:
     return bool(list(config.version_policy.specific.versions) == served["version_policy"]["specific"]["versions"])
 
 
-class Inquiry:
-    """Asks a server that is ready, in a thread.
+@dataclass(frozen=True)
+class Look:
+    """What came of one look. snapshot: None if the repository gave no answer"""
+
+    started_s: float
+    is_answered: bool
+    snapshot: Snapshot | None = None
+
+
+class TritonWatch:
+    """Looks every INTERVAL_S whether a server that is ready answers, and what it serves.
 
     silent_s: how long it may give no answer, to LOOKS looks in a row, before it has to be started again
     """
@@ -84,52 +95,52 @@ class Inquiry:
         # While the threads of HTTP wait for models that are loaded, this one answers still.
         self._metrics = Http(endpoints.host, endpoints.metrics_port)
         self._headers = http_headers(server.admin_key)
-        self._configs: dict[str, Config] = {}
         self._silent_s = silent_s
         self._door_timeout_s = min(silent_s / LOOKS / 2, _DOOR_TIMEOUT_S)
         self._silent_since_s: float | None = None
         self._failed_looks = 0
-        self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._ask_for_ever, name="rfm-inquiry", daemon=True)
-        self.told: Told | None = None  # the latest
+        self._look: Future[Look] | None = None
+        self._due_s = 0.0
+        self.snapshot: Snapshot | None = None  # the latest
 
-    def start(self) -> None:
-        """Asks from now on."""
-        self._thread.start()
-
-    def close(self) -> None:
-        """Asks no more."""
-        self._closed.set()
+    def look(self) -> None:
+        """Takes in what came of a look, and begins the next when it is due."""
+        if self._look is not None and self._look.done():
+            self._take(self._look.result())
+            self._look = None
+        if self._look is None and time.monotonic() >= self._due_s:
+            self._due_s = time.monotonic() + INTERVAL_S
+            self._look = in_background("rfm-triton-watch", self._looked)
 
     @property
     def is_silent(self) -> bool:
         """Whether it has not answered for ``silent_s``, and has to be started again."""
-        silent_since_s = self._silent_since_s
-        if silent_since_s is None or self._failed_looks < LOOKS:
+        if self._silent_since_s is None or self._failed_looks < LOOKS:
             return False
-        return time.monotonic() - silent_since_s >= self._silent_s
+        return time.monotonic() - self._silent_since_s >= self._silent_s
 
     @property
     def is_answered(self) -> bool:
         """Whether it has answered the last look."""
         return self._silent_since_s is None
 
-    def _ask_for_ever(self) -> None:
-        while not self._closed.is_set():
-            asked_s = time.monotonic()
-            self.look()
-            self._closed.wait(max(INTERVAL_S - (time.monotonic() - asked_s), 0.0))
-
-    def look(self) -> None:
-        """Asks once."""
-        asked_s = time.monotonic()
-        if self._answers(self._http, "/v2") or self._answers(self._metrics, "/metrics"):
+    def _take(self, look: Look) -> None:
+        if look.is_answered:
             self._silent_since_s, self._failed_looks = None, 0
-            with suppress(*NO_ANSWER):  # it is asked again
-                self.told = self._ask()
+            self.snapshot = look.snapshot or self.snapshot  # if there is none it is asked for again
         else:
             self._failed_looks += 1
-            self._silent_since_s = self._silent_since_s or asked_s
+            self._silent_since_s = self._silent_since_s or look.started_s
+
+    def _looked(self) -> Look:
+        """Runs in a thread of its own, and changes nothing."""
+        started_s = time.monotonic()
+        if not (self._answers(self._http, "/v2") or self._answers(self._metrics, "/metrics")):
+            return Look(started_s, is_answered=False)
+        try:
+            return Look(started_s, is_answered=True, snapshot=self._new_snapshot())
+        except NO_ANSWER:
+            return Look(started_s, is_answered=True)
 
     def _answers(self, door: Http, path: str) -> bool:
         try:
@@ -138,22 +149,23 @@ class Inquiry:
             return False
         return True
 
-    def _ask(self) -> Told:
+    def _new_snapshot(self) -> Snapshot:
         asked_s = time.monotonic()
-        path = "/v2/repository/index"
-        versions = versions_of(self._http.get_json(path, _INDEX_TIMEOUT_S, method="POST", headers=self._headers))
+        index = self._http.get_json(INDEX_PATH, _INDEX_TIMEOUT_S, method="POST", headers=self._headers)
+        versions = versions_of(index)
         loaded = sorted({entry.name for entry in versions if entry.is_ready})
+        configs = {} if self.snapshot is None else dict(self.snapshot.configs)
         for model in loaded:
             numbers = [entry.version for entry in versions if entry.name == model and entry.is_ready and entry.version]
             path = f"/v2/models/{quote(model, safe='')}/versions/{max(numbers, default=1)}/config"
             with suppress(*NO_ANSWER):  # the others are looked after
-                self._configs[model] = serving_just(self._http.get_json(path), numbers)
-        known = [model for model in loaded if model in self._configs]
-        ready = frozenset(model for model in known if self._is_ready(self._configs[model]))
-        return Told(asked_s, versions, dict(self._configs), ready, frozenset(loaded) - frozenset(known))
+                configs[model] = serving_just(self._http.get_json(path), numbers)
+        known = [model for model in loaded if model in configs]
+        ready = frozenset(model for model in known if self._is_ready(configs[model]))
+        return Snapshot(asked_s, versions, configs, ready, frozenset(loaded) - frozenset(known))
 
     def _is_ready(self, config: Config) -> bool:
-        """An ensemble, which nobody else asks, is asked; a model that is not made of others has a canary."""
+        """Whether Triton calls an ensemble ready. A model that is not made of others has a probe of its own."""
         if "ensemble_scheduling" not in config:
             return True
         path = f"/v2/models/{quote(config['name'], safe='')}/ready"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A model process ends when Triton has ended."""
+"""A model process exits when Triton has."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import time
 _WATCH_INTERVAL_S = 1.0
 
 
-def end_with_triton() -> None:
-    """For a model process: it ends when Triton has, however that ended, and whatever it waits for."""
+def exit_with_triton() -> None:
+    """Has this model process exit when Triton has, however that ended, and whatever the process waits for."""
     triton = os.getppid()
 
     def watch() -> None:
@@ -19,4 +19,4 @@ def end_with_triton() -> None:
             time.sleep(_WATCH_INTERVAL_S)
         os._exit(1)
 
-    threading.Thread(target=watch, name="rfm-end-with-triton", daemon=True).start()
+    threading.Thread(target=watch, name="rfm-exit-with-triton", daemon=True).start()

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""How ``rfm serve`` itself reaches its Triton over gRPC with TLS, whatever certificates the configuration names.
+"""TLS of Triton's gRPC port, and how ``rfm serve`` itself gets through it, whatever certificates are configured.
 
-It trusts the server's own certificate, and no authority. Where clients need a certificate it makes one for itself, a
-new one at each start of Triton. Triton trusts that certificate beside the authorities of ``--grpc-client-ca``. Its key
-stays in this process.
+``rfm serve`` trusts the server's own certificate, and no authority. Where clients need a certificate it makes one for
+itself, a new one at each start of Triton. Triton trusts that certificate beside the authorities of
+``--grpc-client-ca``. Its key stays in this process.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
@@ -18,14 +19,48 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from rfm.supervise.exposure import GrpcTls
+from rfm.config import ServeConfig
 from rfm.supervise.installation import ServerStartError
+from rfm_client.contract.addresses import check_authorities, check_certificate
 
 NAME = "rfm serve"
 VALID = timedelta(days=3650)
 CLOCKS_DIFFER = timedelta(days=1)
 
 _ANY_HOST = "*", "any"  # a name that a wildcard stands for
+
+
+@dataclass(frozen=True)
+class GrpcTls:
+    """Files (PEM) that Triton serves gRPC with. client_ca: who may vouch for clients, which then need a certificate"""
+
+    certificate: Path
+    key: Path
+    client_ca: Path | None = None
+
+    @classmethod
+    def of(cls, config: ServeConfig) -> GrpcTls | None:
+        """As the configuration names them; None: gRPC is served without TLS."""
+        if config.grpc_certificate is None or config.grpc_key is None:
+            return None
+        client_ca = None if config.grpc_client_ca is None else Path(config.grpc_client_ca)
+        return cls(Path(config.grpc_certificate), Path(config.grpc_key), client_ca)
+
+    def check(self) -> None:
+        """Raises ServerStartError for files that Triton could not serve with."""
+        try:
+            check_certificate(self.certificate, self.key, "grpc_certificate, grpc_key")
+            if self.client_ca is not None:
+                check_authorities(self.client_ca, "grpc_client_ca")
+        except ValueError as error:
+            raise ServerStartError(str(error)) from None
+
+    def arguments(self) -> list[str]:
+        """Arguments of tritonserver."""
+        files = [f"--grpc-server-cert={self.certificate}", f"--grpc-server-key={self.key}"]
+        if self.client_ca is None:
+            return ["--grpc-use-ssl=true", *files]
+        return ["--grpc-use-ssl-mutual=true", *files, f"--grpc-root-cert={self.client_ca}"]
 
 
 class OwnTls:
@@ -48,7 +83,7 @@ class OwnTls:
         self.options = {"creds": credentials, "channel_args": [("grpc.ssl_target_name_override", name)]}
 
     def arguments(self, folder: Path) -> list[str]:
-        """Of tritonserver. What it is to read beside the files of the configuration is written into ``folder``."""
+        """Arguments of tritonserver. A file of certificates that it is to read is written into ``folder``."""
         if self._tls.client_ca is None:
             return self._tls.arguments()
         clients = folder / "clients.pem"

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: MIT
+"""Unloads a model whose processes are dead or hung, and loads what it served before."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+from rfm.supervise.process import TritonServer
+from rfm.supervise.repository_api import RepositoryApi
+from rfm.supervise.stubs import Stub
+from rfm.supervise.triton_watch import Config, serving_just
+
+DRAIN_S = 2.0  # for what the model's other processes are working on
+POLL_S = 0.1
+
+
+class Reload:
+    """The reload of one model, in attempts. One attempt runs at a time, and takes as long as Triton does.
+
+    config: what the model served when it was last ready
+    is_out: the model is not loaded now
+    was_hung: its processes are killed for what they are working on
+    """
+
+    def __init__(
+        self, model: str, server: TritonServer, config: Config, *, is_out: bool = False, was_hung: bool = False
+    ) -> None:
+        self._model = model
+        self._server = server
+        self._config = config
+        self._was_hung = was_hung
+        self._served: Config | None = config if is_out else None
+        self._is_closed = False
+        self.out_since_s: float | None = time.monotonic() if is_out else None  # it was unloaded then
+        self.ended: list[Stub] = []  # its processes that have ended since
+
+    def close(self) -> None:
+        """Lets an attempt that runs change nothing more."""
+        self._is_closed = True
+
+    def load(self, stubs: Sequence[Stub]) -> None:
+        """Loads the model anew, unless somebody has loaded or unloaded it. Raises RepositoryApiError.
+
+        Ensembles that the model is a part of are unloaded and loaded with it, as they were.
+
+        stubs: its processes, dead or alive
+        """
+        with self._api() as api:
+            if self.out_since_s is not None and any(e.is_ready for e in api.index() if e.name == self._model):
+                return  # somebody has loaded it meanwhile
+            self._take_out(api, stubs)
+            if self._served is not None and not self._is_closed:  # else Triton may be another
+                # Triton 2.51 never finishes to unload a model of which a request met a dead process. A load goes on.
+                api.load(self._model, self._served)
+
+    def unload(self, stubs: Sequence[Stub]) -> None:
+        """Unloads the model, so that nobody waits for it, and a load by somebody is seen. Raises RepositoryApiError."""
+        with self._api() as api:
+            self._take_out(api, stubs)
+
+    def _api(self) -> RepositoryApi:
+        server = self._server
+        return RepositoryApi(server.endpoints.grpc_url, server.admin_key, server.grpc_options)
+
+    def _take_out(self, api: RepositoryApi, stubs: Sequence[Stub]) -> None:
+        """Unloads the model, unless somebody has done so: then it is to stay unloaded."""
+        if self.out_since_s is not None:
+            return
+        self._served = self._served or self._serves(api)
+        if self._served is not None:
+            api.unload(self._model)
+            self.out_since_s = time.monotonic()
+            self._end(stubs)
+
+    def _serves(self, api: RepositoryApi) -> Config | None:
+        """The configuration of the versions that it serves, and of no others: a rollout may have changed its file."""
+        versions = [entry for entry in api.index() if entry.name == self._model]
+        ready = [entry.version for entry in versions if entry.is_ready and entry.version is not None]
+        if not ready:
+            return None if all(entry.is_unloaded for entry in versions) else self._config
+        return serving_just(api.config(self._model, max(ready)), ready)
+
+    def _end(self, stubs: Sequence[Stub]) -> None:
+        """Returns when none of them lives: not even those that Triton keeps, with their share of a GPU's memory."""
+        deadline_s = time.monotonic() + DRAIN_S
+        while any(stub.is_alive for stub in stubs) and time.monotonic() < deadline_s:
+            time.sleep(POLL_S)
+        for stub in stubs:
+            if stub.is_alive:
+                stub.kill()
+                if not self._was_hung and stub.journal is not None:
+                    stub.journal.close()  # what it was working on is not why it ends
+        self.ended = [*self.ended, *stubs]

@@ -1,0 +1,415 @@
+# SPDX-License-Identifier: MIT
+"""How one model is probed and healed, against a Triton that is a list of what it was asked to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from clock import Clock
+from rfm.supervise import back_off, model_probe, reload, served_model
+from rfm.supervise.http import Http
+from rfm.supervise.lifecycle import Event, State
+from rfm.supervise.model_probe import ModelProbe
+from rfm.supervise.process import Endpoints
+from rfm.supervise.repository_api import ModelVersion, RepositoryApiError
+from rfm.supervise.served_model import RETRY_S, ServedModel
+from rfm.supervise.status import NO_REASON, Status
+from rfm_serve import MODEL, wait_for
+
+CONFIG = {"name": MODEL, "of": 1}
+LOADED, UNLOADED = ("READY", ""), ("UNAVAILABLE", "unloaded")
+
+
+class Triton:
+    """Its repository API, with one model. while_loading: what happens within a load"""
+
+    def __init__(self, state: tuple[str, str] = LOADED) -> None:
+        self.asked: list[str] = []
+        self.while_loading: Callable[[], object] = lambda: None
+        self.be(*state)
+
+    def be(self, state: str, reason: str = "", version: int = 1) -> None:
+        self.entry = ModelVersion(MODEL, version, state, reason)
+
+    def __enter__(self) -> Triton:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def index(self) -> list[ModelVersion]:
+        return [self.entry]
+
+    def config(self, model: str, version: int) -> dict[str, Any]:
+        return {"name": model, "of": version}
+
+    def unload(self, model: str) -> None:
+        self.asked.append("unload")
+        self.be(*UNLOADED)
+
+    def load(self, model: str, config: Mapping[str, Any]) -> None:
+        self.asked.append(f"load {config['of']}")
+        self.while_loading()
+        self.be(*LOADED)
+
+
+class Stub:
+    """A process of the model that ends when it is killed."""
+
+    def __init__(self) -> None:
+        self.is_alive, self.is_blamed = True, True
+        self.journal = SimpleNamespace(close=lambda: setattr(self, "is_blamed", False))
+
+    def kill(self) -> None:
+        self.is_alive = False
+
+
+class Bench:
+    """A model under test: its clock, its Triton, its probe's next answer, and what is known of its processes."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, is_ensemble: bool = False) -> None:
+        self.clock, self.triton, self.status = Clock(), Triton(), Status()
+        self.said: list[str] = []
+        self.stubs: list[Stub] = []
+        self.buried: list[Stub] = []
+        self.probed: Event | None = None
+        self.is_getting_on = False
+        self.renewed = 0
+        for module in (back_off, served_model, reload):
+            monkeypatch.setattr(module, "time", self.clock)
+        monkeypatch.setattr(reload, "RepositoryApi", lambda *_: self.triton)
+        monkeypatch.setattr(served_model, "in_background", at_once)
+        probe = SimpleNamespace(look=lambda: self.probed, renew=self.renew)
+        watch = SimpleNamespace(
+            of_model=lambda _: list(self.stubs), bury=self.buried.extend, is_getting_on=lambda _: self.is_getting_on
+        )
+        server = SimpleNamespace(endpoints=Endpoints.free(), admin_key="", grpc_options={})
+        given = None if is_ensemble else probe
+        self.model = ServedModel(MODEL, given, server, watch, self.status, self.said.append)  # type: ignore[arg-type]
+
+    def renew(self) -> None:
+        self.renewed += 1
+
+    def look(self, probed: Event | None = None, died: str | None = None) -> str | None:
+        self.probed = probed
+        return self.model.look(died, CONFIG)
+
+    def wait(self, duration_s: float) -> None:
+        """Time passes, and the model is looked at often enough."""
+        self.clock.now_s += duration_s
+        for _ in range(4):
+            self.look()
+
+    @property
+    def is_probe_ok(self) -> bool:
+        return f'rfm_serve_canary_ok{{model="{MODEL}"}} 1.0' in self.status.metrics().decode()
+
+
+def at_once(_: str, call: Callable[[], None]) -> Future[None]:
+    """A call that has ended when it has begun."""
+    future: Future[None] = Future()
+    try:
+        future.set_result(call())
+    except RepositoryApiError as error:
+        future.set_exception(error)
+    return future
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
+    return Bench(monkeypatch)
+
+
+def damaged() -> None:
+    raise RepositoryApiError("the weights are damaged")
+
+
+def test_readiness_follows_the_probe(bench: Bench) -> None:
+    said = []
+    for event in (None, Event.LATE, Event.ANSWERED, Event.LATE, Event.ABSENT):
+        assert bench.look(event) is None
+        said.append((bench.model.reason, bench.is_probe_ok))
+    assert said == [
+        ("it was not asked yet", False),
+        ("it gives no answer in time", False),
+        (NO_REASON, True),
+        (NO_REASON, False),
+        ("it is not loaded", False),
+    ]
+    assert bench.triton.asked == []
+
+
+@pytest.mark.parametrize("probed", [Event.LATE, Event.HUNG])
+def test_who_works_on_a_batch_that_gets_on_is_ready(bench: Bench, probed: Event) -> None:
+    bench.is_getting_on = True
+    assert bench.look(probed) is None
+    assert (bench.model.reason, bench.is_probe_ok) == (NO_REASON, False)
+
+
+@pytest.mark.parametrize("fault", [Event.HUNG, Event.DEAD, Event.BROKEN])
+def test_a_fault_is_healed_at_once(bench: Bench, fault: Event) -> None:
+    bench.look(Event.ANSWERED)
+    bench.stubs = [Stub()]
+    assert bench.look(fault) == fault.value
+    assert (bench.model.is_healing, bench.model.reason, bench.is_probe_ok) == (True, "it is loaded anew", False)
+    assert bench.triton.asked == ["unload", "load 1"]
+    assert bench.look(fault) is None  # of the old processes
+    assert (bench.model.state, bench.buried, bench.renewed) == (State.NEW, bench.stubs, 1)
+    assert [stub.is_alive for stub in bench.stubs] == [False]
+    assert bench.clock.now_s == pytest.approx(reload.DRAIN_S)  # they had this time
+    # What a process worked on is to blame if it hung, and not if it was killed for another's fault.
+    assert bench.stubs[0].is_blamed is (fault is Event.HUNG)
+
+
+def test_a_process_that_has_died_says_how(bench: Bench) -> None:
+    assert bench.look(Event.ANSWERED, died="stopped for 3 s") == "stopped for 3 s"
+
+
+def test_processes_that_have_ended_are_not_waited_for(bench: Bench) -> None:
+    bench.stubs = [Stub()]
+    bench.stubs[0].kill()
+    bench.look(died="its process is dead")
+    assert (bench.clock.now_s, bench.stubs[0].is_blamed) == (0.0, True)
+
+
+def test_what_fails_is_tried_again_after_longer_and_longer_pauses_and_then_seldom(bench: Bench) -> None:
+    bench.triton.while_loading = damaged
+    bench.look(Event.ANSWERED)
+    bench.look(died="its process is dead")
+    tried = []
+    for pause_s in (0.5, 1.0, 2.0, 4.0):
+        bench.wait(0.0)
+        assert bench.model.reason == "it is loaded anew, after: the weights are damaged"
+        bench.wait(pause_s - 0.01)
+        tried.append(bench.triton.asked.count("load 1"))
+        bench.wait(0.01)
+    assert tried == [1, 2, 3, 4]
+    wanted = "model rfm: expected to run, got 6 ends, each within 60 s of a start; the last: the weights are damaged"
+    assert bench.said == [f"{wanted}; it is not ready, and tried again every 5 minutes"]
+    assert bench.model.state is State.GIVEN_UP
+    assert bench.model.reason == "it is loaded anew every 5 minutes, after: the weights are damaged"
+    bench.wait(RETRY_S - 0.01)
+    assert bench.triton.asked.count("load 1") == 5
+    bench.wait(0.01)
+    assert bench.triton.asked.count("load 1") == 6
+    assert (len(bench.said), bench.model.state) == (1, State.GIVEN_UP)
+    bench.triton.while_loading = lambda: None
+    bench.wait(RETRY_S)
+    bench.look(Event.ANSWERED)
+    assert bench.model.reason == NO_REASON
+    assert bench.triton.asked.count("unload") == 1
+
+
+def test_what_dies_again_and_again_is_taken_out_and_loaded_by_somebody(bench: Bench) -> None:
+    for _ in range(back_off.MOST):
+        bench.look(died="its process is dead")
+        bench.wait(back_off.LONGEST_PAUSE_S)
+        assert bench.model.state is State.NEW
+    bench.look(died="its process is dead")
+    bench.wait(0.0)
+    assert bench.model.reason == "it is loaded anew every 5 minutes, after: its process is dead"
+    assert bench.triton.asked[-1] == "unload"  # so that nobody waits for it
+    out_s = bench.clock.now_s
+    bench.triton.be("READY", version=2)
+    bench.model.note_ready(out_s)  # Triton was asked before, or at once
+    bench.look()
+    assert bench.model.state is State.GIVEN_UP
+    bench.model.note_ready(out_s + 1.0)
+    bench.look()
+    assert bench.model.state is State.NEW
+    assert bench.triton.asked[-1] == "unload"
+
+
+def test_what_was_served_is_loaded_also_where_it_cannot_be_read_any_more(bench: Bench) -> None:
+    bench.triton.be("UNAVAILABLE", "its process is dead")
+    bench.look(died="its process is dead")
+    assert bench.triton.asked == ["unload", "load 1"]
+
+
+def test_what_somebody_has_unloaded_stays_so(bench: Bench) -> None:
+    bench.triton.be(*UNLOADED)
+    assert bench.look(died="its process is dead") is not None
+    bench.wait(0.0)
+    assert (bench.triton.asked, bench.model.is_healing) == ([], False)
+
+
+def test_what_somebody_has_loaded_meanwhile_stays(bench: Bench) -> None:
+    def somebody_loads() -> None:
+        bench.triton.be("READY", version=2)
+        damaged()
+
+    bench.triton.while_loading = somebody_loads
+    bench.look(died="its process is dead")
+    bench.wait(0.0)
+    bench.wait(1.0)
+    assert (bench.triton.asked, bench.model.state) == (["unload", "load 1"], State.NEW)
+
+
+def test_what_is_closed_changes_nothing_more(bench: Bench) -> None:
+    unload = bench.triton.unload
+    bench.triton.unload = lambda model: (unload(model), bench.model.close())  # type: ignore[method-assign,assignment,func-returns-value]
+    bench.look(died="its process is dead")
+    assert bench.triton.asked == ["unload"]  # what is loaded next may be another Triton's
+
+
+def test_a_model_is_restored_into_a_new_triton(bench: Bench) -> None:
+    bench.triton.be(*UNLOADED)
+    bench.model.restore(CONFIG)
+    bench.wait(0.0)
+    assert (bench.triton.asked, bench.model.state) == (["load 1"], State.NEW)
+
+
+def test_an_ensemble_is_restored_once_and_ready_when_triton_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench(monkeypatch, is_ensemble=True)
+    bench.triton.be(*UNLOADED)
+    assert bench.look() is None
+    assert bench.model.state is State.WAITING
+    bench.model.restore(CONFIG)
+    bench.wait(0.0)
+    assert (bench.triton.asked, bench.model.state) == (["load 1"], State.NEW)
+    bench.model.note_ready(bench.clock.now_s)
+    assert bench.model.state is State.READY
+
+
+# The probe
+
+
+class Answers:
+    """An Http that answers a probe with what it is given, and says how many requests the model has answered."""
+
+    def __init__(self) -> None:
+        self.next: tuple[int, str] | None = (200, "{}")
+        self.success: list[int] | None = [0]
+        self.sent: list[bytes] = []
+
+    def request(self, method: str, path: str, timeout_s: float, body: bytes) -> tuple[int, str]:
+        self.sent.append(body)
+        if self.next is None:
+            raise TimeoutError
+        return self.next
+
+    def get_json(self, path: str) -> Any:
+        if path.endswith("/stats"):
+            if self.success is None:
+                raise TimeoutError
+            return {"model_stats": [{"inference_stats": {"success": {"count": count}}} for count in self.success]}
+        inputs = [{"name": "num_frames", "dims": [2]}, {"name": "frames", "dims": [-1, -1, -1, 3]}]
+        return {"input": inputs, "output": [{"name": "progress"}, {"name": "success"}]}
+
+
+class Prober:
+    """A probe under test, with a clock of its own. observed: what answers took"""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.clock, self.http = Clock(), Answers()
+        self.clock.now_s = 100.0
+        self.observed: list[float] = []
+        monkeypatch.setattr(model_probe, "time", self.clock)
+        monkeypatch.setattr(model_probe, "in_background", self.at_once)
+        self.took_s = 0.0
+        self.probe = ModelProbe(self.http, MODEL, 2.0, 30.0, self.observed.append)  # type: ignore[arg-type]
+
+    def at_once(self, _: str, call: Callable[[], Any]) -> Future[Any]:
+        future: Future[Any] = Future()
+        try:
+            future.set_result(call())
+        except TimeoutError as error:
+            future.set_exception(error)
+        return future
+
+    def after(self, duration_s: float) -> Event | None:
+        """What is known then; an answer of just now included."""
+        self.clock.now_s += duration_s
+        self.probe.look()
+        return self.probe.look()
+
+
+@pytest.fixture
+def prober(monkeypatch: pytest.MonkeyPatch) -> Prober:
+    return Prober(monkeypatch)
+
+
+@pytest.mark.parametrize(
+    ("answer", "event"),
+    [
+        ((200, "{}"), Event.ANSWERED),
+        ((400, "frames: expected others"), Event.ANSWERED),
+        ((500, "scoring failed"), Event.ANSWERED),  # blank frames need not be readable
+        ((500, "Stub process 'rfm' is not healthy."), Event.DEAD),
+        ((400, "Request for unknown model: 'rfm' is not found"), Event.ABSENT),
+        ((503, "Exceeds maximum queue size"), None),
+        (None, None),
+    ],
+)
+def test_an_answer_says_what_a_model_does(prober: Prober, answer: tuple[int, str] | None, event: Event | None) -> None:
+    prober.http.next = answer
+    assert prober.after(0.0) is event
+    assert len(prober.observed) == (event is not None)
+
+
+def test_a_model_is_broken_that_fails_three_times_at_what_it_could_answer(prober: Prober) -> None:
+    assert prober.after(0.0) is Event.ANSWERED
+    prober.http.next = (500, "scoring failed")
+    assert [prober.after(2.0) for _ in range(2)] == [Event.ANSWERED] * 2
+    prober.http.next = (200, "{}")
+    assert prober.after(2.0) is Event.ANSWERED
+    prober.http.next = (500, "scoring failed")
+    assert [prober.after(2.0) for _ in range(3)] == [Event.ANSWERED, Event.ANSWERED, Event.BROKEN]
+    prober.probe.renew()
+    assert [prober.after(2.0) for _ in range(4)] == [Event.ANSWERED] * 4
+
+
+def test_a_probe_without_an_answer_is_late_and_then_hung(prober: Prober) -> None:
+    assert prober.after(0.0) is Event.ANSWERED
+    prober.http.next = None
+    assert prober.after(2.0) is Event.ANSWERED
+    assert prober.after(2.5) is Event.ANSWERED
+    assert prober.after(0.1) is Event.LATE
+    assert prober.after(27.4) is Event.LATE
+    assert prober.after(0.1) is Event.HUNG
+    prober.http.next = (200, "{}")
+    assert prober.after(2.0) is Event.ANSWERED
+
+
+def test_who_answers_others_is_not_late(prober: Prober) -> None:
+    assert prober.after(0.0) is Event.ANSWERED
+    prober.http.next = None
+    prober.after(2.0)
+    for number in range(40):
+        prober.http.success = [number]
+        assert prober.after(2.0) in ({Event.ANSWERED} if number else {Event.ANSWERED, Event.LATE})
+    assert prober.after(2.6) is Event.LATE
+
+
+def test_a_triton_that_says_nothing_of_a_model_leaves_it_late(prober: Prober) -> None:
+    prober.http.next = prober.http.success = None
+    prober.after(0.0)
+    assert prober.after(100.0) is Event.LATE
+
+
+def test_probes_take_a_tenth_of_a_model_s_time_at_most(prober: Prober) -> None:
+    ask = prober.http.request
+
+    def slow(*words: Any) -> tuple[int, str]:
+        prober.clock.now_s += 1.0
+        return ask(*words)
+
+    prober.http.request = slow  # type: ignore[method-assign]
+    prober.after(0.0)
+    assert prober.observed == [1.0]
+    prober.after(9.9)
+    assert len(prober.http.sent) == 1
+    prober.after(0.2)
+    assert len(prober.http.sent) == 2
+
+
+def test_a_model_of_a_triton_that_tells_nothing_does_not_hang() -> None:
+    """It may be busy with a model that it loads; and if it is not, it is Triton that is started again."""
+    endpoints = Endpoints.free()
+    probe = ModelProbe(Http(endpoints.http_host, endpoints.http_port), MODEL, 0.1, 0.0, lambda _: None)
+    wait_for(lambda: probe.look() is Event.LATE)
