@@ -43,7 +43,7 @@ README_LINES = 150
 COMPLETION = ("install_completion", "show_completion", "help")  # typer's own
 
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
-COMMAND = re.compile(r"^    (rfm-client [^#\n]*)", re.MULTILINE)
+COMMAND = re.compile(r"^ {4,}(rfm-client [^#\n]*)", re.MULTILINE)
 ANY_COMMAND = re.compile(r"^ {4,}(?:[^#\n`]*[;&|] *)?((?:\.venv/bin/)?rfm(?:-client)? (?:\\\n|[^#\n])*)", re.MULTILINE)
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 HEADING = re.compile(r"^#+ (.*)", re.MULTILINE)
