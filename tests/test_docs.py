@@ -48,7 +48,7 @@ ANY_COMMAND = re.compile(r"^ {4,}(?:[^#\n`]*[;&|] *)?((?:\.venv/bin/)?rfm(?:-cli
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 HEADING = re.compile(r"^#+ (.*)", re.MULTILINE)
 CODE = re.compile(r"```.*?```|`[^`\n]*`", re.DOTALL)
-PATH = re.compile(r"`([\w.-]+/[\w./-]*)`")
+PATH = re.compile(r"[` ](?!\.venv)([\w.-]+/[\w./-]*\w/?)(?=[` ])")
 SERVED_AS = {"--model first": "--model rfm", "--model second": "--model rfm"}  # the guides', by this server's names
 
 
@@ -255,8 +255,9 @@ def slug(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
-def test_the_architecture_names_files_that_are_there() -> None:
-    paths = PATH.findall(ARCHITECTURE.read_text())
+@pytest.mark.parametrize("document", [ARCHITECTURE, ROOT / "CONTRIBUTING.md"], ids=lambda file: file.name)
+def test_every_file_that_is_named_is_there(document: Path) -> None:
+    paths = PATH.findall(document.read_text())
     assert paths
     assert [path for path in paths if not (ROOT / path).exists()] == []
 
