@@ -1,86 +1,94 @@
-# make demo    a first look: serves a small trained checkpoint, scores clips, draws their curves
-# make test    lint, types, generated files, and the tests that take minutes
-# make test-all    all that CI runs: also what kills, waits, restarts, or needs programs of Debian
-# make ops-check    what runs around the server: alerts, dashboards, containers, Kubernetes
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed
 TOOL := PYTHONPATH=tests/support:tools/faults $(BIN)/python
 
-.PHONY: demo test test-all check parity rollout bench bench-full perf chaos chaos-full soak format model_repository clean \
+# `make help` shows the first line of the comment above each target.
+.PHONY: help demo test test-all check parity rollout bench bench-full perf chaos chaos-full soak format model_repository clean \
   ops-check ops-tools audit lock mutate
 
+# What can be made: this list.
+help:
+	@awk '/^#/ { if (!comment) comment = substr($$0, 3); next } \
+	  /^[a-z_-]+:/ { split($$1, target, ":"); printf "make %-18s%s\n", target[1], comment } { comment = "" }' Makefile
+
+# A first look: serve a small trained checkpoint, score clips, draw their curves.
 demo: $(INSTALLED)
 	$(BIN)/python examples/demo.py
 
+# Lint, types, generated files, and the tests that take minutes.
 test: check
 	$(BIN)/pytest -m "not gpu and not slow"
 
-# The tests that kill, wait and restart, and those that need programs of Debian, too.
+# All that CI runs: also the tests that kill, wait or restart, or need programs of Debian.
 test-all: check ops-tools
 	$(BIN)/pytest
 
+# Lint, format, types, generated files; no tests.
 check: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/rfm export --check --repository model_repository --config model_repository/serve.yaml
 
-# Every reference case through Triton: how far are the scores from the original's?
+# How far the scores are from the original's: every reference case, through Triton.
 parity: $(INSTALLED)
 	$(TOOL) tools/parity.py
 
-# Two versions take turns while 32 callers ask, half over gRPC and half over HTTP: is a request lost?
+# Is a request lost while two versions take turns? 32 callers ask, half over gRPC and half over HTTP.
 rollout: $(INSTALLED)
 	$(TOOL) tools/faults/rollout.py
 
-# This server beside the bare engine, the FastAPI server's design, LitServe and mosec, in one run.
+# Measure this server beside the bare engine, the FastAPI server's design, LitServe and mosec.
 bench: $(INSTALLED)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[bench]"
 	$(BIN)/python benchmarks/bench.py
 
-# All loads (half an hour), and the engine without a server: beside the original's forward, and as the work grows.
+# The same with all loads, half an hour.
+# Before it the engine without a server: beside the original's forward, and as the work grows.
 bench-full: $(INSTALLED)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[bench]"
 	$(BIN)/python benchmarks/forward.py
 	$(BIN)/python benchmarks/bench.py --full
 
-# Triton's own perf_analyzer on checkpoints of both sizes.
+# Measure with Triton's own perf_analyzer, checkpoints of both sizes.
 perf: $(INSTALLED)
 	$(BIN)/python benchmarks/perf_analyzer.py --size small
 	$(BIN)/python benchmarks/perf_analyzer.py --size default
 
-# Faults while callers ask: processes killed and stopped, full memory and disks, overload, broken requests, killed exports.
+# Cause faults while callers ask, ten minutes.
+# Processes killed and stopped, full memory and disks, overload, broken requests, killed exports.
 chaos: $(INSTALLED)
 	$(TOOL) tools/faults/chaos.py
 	$(TOOL) tools/faults/fuzz.py
 	$(TOOL) tools/faults/kill_export.py --kills 10
 
-# The same with 100 killed exports. A quarter of an hour.
+# The same with 100 killed exports, a quarter of an hour.
 chaos-full: $(INSTALLED)
 	$(TOOL) tools/faults/chaos.py
 	$(TOOL) tools/faults/fuzz.py
 	$(TOOL) tools/faults/kill_export.py --kills 100
 
-# Half an hour at half of what can be served: do memory and latency stay?
+# Do memory and latency stay the same? Half an hour at half of the load that can be served.
 soak: $(INSTALLED)
 	$(TOOL) tools/faults/chaos.py --soak
 
-# Do the tests see small faults? 220 changes of one operator, constant, index or branch, each tried by the tests of its
-# file. Three quarters of an hour on two cores.
+# Do the tests see small faults? Three quarters of an hour.
+# 220 changes of one operator, constant, index or branch; the tests of the changed file run on each.
 mutate: $(INSTALLED)
 	$(TOOL) tools/mutation/mutate.py
 
-# What docker/ holds, as far as it can be checked without a container engine or a cluster: alerts and recording rules on
-# made-up series, they and the dashboard on a live Prometheus and Triton; Dockerfile and compose file; Kubernetes.
+# Test what docker/ holds: alerts, dashboard, image, compose file, Kubernetes.
+# No container engine and no cluster are needed. Rules run on made-up series, then on a live Prometheus and Triton.
 ops-check: ops-tools
 	$(BIN)/pytest tests/ops
 
-# Programs of Debian and Ubuntu that tests run. Prometheus is unpacked into $(VENV): installed, it starts a service.
 AS_ROOT = $(shell if [ "$$(id -u)" = 0 ]; then :; elif sudo -n true 2>/dev/null; then echo sudo -n; else echo false; fi)
 MISSING = { echo "make ops-tools: expected $(1) in PATH, got none; install it (Debian, Ubuntu: $(2))" >&2; exit 1; }
 
+# Get the programs of Debian and Ubuntu that tests run: Prometheus, docker-compose.
+# Prometheus is unpacked into $(VENV), since its package starts a service when it is installed.
 ops-tools: $(INSTALLED)
 	@test -x $(BIN)/promtool || { command -v promtool && command -v prometheus; } >/dev/null || \
 	  { $(AS_ROOT) apt-get update -qq; cd $(VENV) && apt-get -qq -o APT::Sandbox::User=root download prometheus && \
@@ -92,13 +100,13 @@ ops-tools: $(INSTALLED)
 	  $(AS_ROOT) apt-get install --yes -qq --no-install-recommends docker-compose; } || \
 	  $(call MISSING,docker-compose,apt-get install docker-compose)
 
-# Known vulnerabilities of the pinned packages, as PyPI tells them: a report, which needs the network.
+# Report known vulnerabilities of the pinned packages. Needs the network.
 audit: $(INSTALLED)
 	$(PYTHON) -m venv $(VENV)/audit
 	$(VENV)/audit/bin/pip install --quiet --disable-pip-version-check pip-audit
 	$(VENV)/audit/bin/pip-audit --strict --requirement constraints.txt --no-deps --disable-pip
 
-# Writes docker/requirements.txt: hashes of what the image installs, for constraints.txt as it is. Needs the network.
+# Write docker/requirements.txt: the hashes of the image's packages. Needs the network.
 lock:
 	$(PYTHON) -m venv $(VENV)/lock
 	$(VENV)/lock/bin/pip install --quiet --disable-pip-version-check uv
@@ -110,11 +118,12 @@ lock:
 	  --extra encoders --extra vlm client/pyproject.toml gateway/pyproject.toml pyproject.toml; } > $(VENV)/lock/requirements.txt
 	mv $(VENV)/lock/requirements.txt docker/requirements.txt
 
+# Format the code.
 format: $(INSTALLED)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Trains the demo's checkpoint anew and exports it as version 1. Takes a quarter of an hour.
+# Train the demo's checkpoint and export it as version 1, a quarter of an hour.
 model_repository: $(INSTALLED)
 	rm -rf build/demo_checkpoint
 	$(BIN)/python examples/train_demo_checkpoint.py build/demo_checkpoint
@@ -130,5 +139,6 @@ $(INSTALLED): pyproject.toml client/pyproject.toml gateway/pyproject.toml constr
 	  --editable "client[cli,gym]" --editable gateway --editable ".[encoders,vlm,triton,demo,dev]"
 	touch $@
 
+# Remove what make has made.
 clean:
 	rm -rf $(VENV) build client/build demo_output

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""What the documentation shows is run as it stands there, but for the server's address."""
+"""The documentation: its examples run as they stand there, and what it must tell it tells."""
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import shlex
@@ -10,34 +11,54 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
+from click import Command, Context, Parameter
 from typer.main import get_command
 
 import clip
 from paths import ROOT
+from rfm.config import ServeConfig
 from rfm.supervise.installation import find_installation
 from rfm.supervise.process import Endpoints, TritonServer
 from rfm_client import PreferenceSample, ProgressSample, Trajectory
 from rfm_client.cli.commands import app
+from rfm_client.contract import wire
+from rfm_commands.cli import app as rfm
 
 pytestmark = pytest.mark.triton
 
 CLIENT_README = ROOT / "client" / "README.md"
+CONTRACT = ROOT / "docs" / "contract.md"
+CONFIGURATION = ROOT / "docs" / "configuration.md"
+ARCHITECTURE = ROOT / "docs" / "architecture.md"
+GUIDES = sorted((ROOT / "docs" / "guides").glob("*.md"))
+RUN = (ROOT / "README.md", CLIENT_README, *GUIDES)  # whose examples and client commands are run
+DOCUMENTS = sorted({*ROOT.glob("*.md"), *ROOT.glob("[!.]*/**/*.md")} - {*ROOT.glob("build/**/*.md")})
+README_LINES = 150
+COMPLETION = ("install_completion", "show_completion", "help")  # typer's own
+
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
-COMMAND = re.compile(r"^    (rfm-client [^#\n]*)", re.MULTILINE)
+COMMAND = re.compile(r"^ {4,}(rfm-client [^#\n]*)", re.MULTILINE)
+ANY_COMMAND = re.compile(r"^ {4,}(?:[^#\n`]*[;&|] *)?((?:\.venv/bin/)?rfm(?:-client)? (?:\\\n|[^#\n])*)", re.MULTILINE)
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+HEADING = re.compile(r"^#+ (.*)", re.MULTILINE)
+CODE = re.compile(r"```.*?```|`[^`\n]*`", re.DOTALL)
+PATH = re.compile(r"[` ](?!\.venv)([\w.-]+/[\w./-]*\w/?)(?=[` ])")
+SERVED_AS = {"--model first": "--model rfm", "--model second": "--model rfm"}  # the guides', by this server's names
 
 
-def found(pattern: re.Pattern[str]) -> list[Any]:
-    """Each match in each README, named by file and number."""
+def found(pattern: re.Pattern[str], files: Iterable[Path] = RUN) -> list[Any]:
+    """Each match in each document, named by file and number."""
     matches = [
         pytest.param(match, id=f"{file.relative_to(ROOT)} {number}")
-        for file in (ROOT / "README.md", CLIENT_README)
+        for file in files
         for number, match in enumerate(pattern.findall(file.read_text()))
     ]
     assert matches
@@ -59,7 +80,7 @@ def demo_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Endpoints]
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The files that the documentation speaks of."""
-    for name in ("film.mp4", "a.mp4", "b.mp4"):
+    for name in ("film.mp4", "a.mp4", "b.mp4", "success.mp4", "failure.mp4"):
         clip.write(tmp_path / name)
     np.savez(tmp_path / "episode.npz", frames=pictures(0), task="stack the cups")
     monkeypatch.chdir(tmp_path)
@@ -87,6 +108,9 @@ def names() -> dict[str, Any]:
         "trajectories": [filmed, rewound],
         "dataset": steps,
         "images": pictures(4),
+        "models": ["rfm"],
+        "successes": [filmed],
+        "failures": [Trajectory(frames=pictures(5), task="stack the cups")],
     }
 
 
@@ -107,6 +131,8 @@ def test_every_command_line_runs(demo_server: Endpoints, folder: Path, command: 
     if command.startswith("rfm-client gateway"):
         check_gateway(demo_server, command)
         return
+    for shown, served in SERVED_AS.items():
+        command = command.replace(shown, served)
     environment = {
         **os.environ,
         "RFM_URL": demo_server.grpc_url,
@@ -158,3 +184,95 @@ def test_every_option_of_the_client_is_shown() -> None:
     for options, table in ((ClientOptions, of_clients), (CallOptions, of_calls)):
         for name in options.__annotations__:
             assert f"`{name}" in table.split("\n\n")[0], name
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text().splitlines()) <= README_LINES
+
+
+@pytest.mark.parametrize("command", found(ANY_COMMAND, DOCUMENTS))
+def test_every_command_line_is_one_that_the_commands_take(command: str) -> None:
+    """Parsed by the command itself, not run."""
+    words = shlex.split(command.replace("\\\n", " "))
+    if "..." in words or any("[" in word for word in words):
+        return  # a pattern
+    program, *arguments = itertools.takewhile(lambda word: word not in ("|", ";", "&&"), words)
+    parse(get_command(rfm if Path(program).name == "rfm" else app), arguments)
+
+
+def parse(command: Command, arguments: Sequence[str], parent: Context | None = None) -> None:
+    """Raises click's UsageError for what the command does not take."""
+    subcommands: dict[str, Command] = getattr(command, "commands", {})
+    end = next((index for index, word in enumerate(arguments, 1) if word in subcommands), len(arguments))
+    context = command.make_context(command.name, list(arguments[:end]), parent)
+    if subcommands:
+        parse(subcommands[arguments[end - 1]], arguments[end:], context)
+
+
+def test_every_command_and_option_is_documented() -> None:
+    configuration = CONFIGURATION.read_text()
+    for name, command in get_command(rfm).commands.items():  # type: ignore[attr-defined]
+        assert command.help, name
+        assert f"`rfm {name}`" in configuration
+        for parameter in options(command):
+            for option in (*parameter.opts, *parameter.secondary_opts):
+                assert f"`{option.replace('--gateway-', '--')}`" in configuration or f"`{option}`" in configuration
+
+
+def options(command: Command) -> Iterator[Parameter]:
+    """Those of a command and of its subcommands, each of which has a help text."""
+    for parameter in command.params:
+        if parameter.param_type_name == "option" and parameter.name not in COMPLETION:
+            assert parameter.help, (command.name, parameter.name)  # type: ignore[attr-defined]
+            yield parameter
+    for subcommand in getattr(command, "commands", {}).values():
+        yield from options(subcommand)
+
+
+def test_every_tensor_of_the_contract_is_documented() -> None:
+    contract = CONTRACT.read_text()
+    specs = (*wire.embedding_inputs(1, 1), *wire.frame_inputs(), *wire.score_outputs(10))
+    for spec in specs:
+        assert f"| `{spec.name}` |" in contract
+
+
+def test_every_key_of_the_configuration_is_documented() -> None:
+    documented = re.findall(r"`(\w+)`", "".join(re.findall(r"^\|([^|]*)\|", CONFIGURATION.read_text(), re.MULTILINE)))
+    assert [field.name for field in fields(ServeConfig) if documented.count(field.name) != 1] == []
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda file: str(file.relative_to(ROOT)))
+def test_every_link_leads_somewhere(document: Path) -> None:
+    for link in LINK.findall(CODE.sub("", document.read_text())):
+        if "://" in link:
+            continue
+        name, _, anchor = link.partition("#")
+        target = (document.parent / name).resolve() if name else document
+        assert target.exists(), link
+        assert not anchor or anchor in map(slug, HEADING.findall(target.read_text())), link
+
+
+def slug(heading: str) -> str:
+    """The anchor of a heading, as GitHub makes it."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
+@pytest.mark.parametrize("document", [ARCHITECTURE, ROOT / "CONTRIBUTING.md"], ids=lambda file: file.name)
+def test_every_file_that_is_named_is_there(document: Path) -> None:
+    paths = PATH.findall(document.read_text())
+    assert paths
+    assert [path for path in paths if not (ROOT / path).exists()] == []
+
+
+def test_make_help_has_a_line_for_every_target() -> None:
+    text = (ROOT / "Makefile").read_text()
+    (names,) = re.findall(r"^\.PHONY:((?:[^\n]*\\\n)*[^\n]*)", text, re.MULTILINE)
+    help_text = subprocess.run(["make", "help"], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    told = dict(re.findall(r"^make (\S+) +(\S.*)$", help_text, re.MULTILINE))
+    assert sorted(told) == sorted(names.replace("\\", "").split())
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda file: str(file.relative_to(ROOT)))
+def test_every_make_command_is_a_target(document: Path) -> None:
+    for target in re.findall(r"^    make ([\w-]+)|`make ([\w-]+)`", document.read_text(), re.MULTILINE):
+        assert re.search(rf"^{target[0] or target[1]}:", (ROOT / "Makefile").read_text(), re.MULTILINE), target

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What may import what, and what is said where."""
+"""What may import what."""
 
 from __future__ import annotations
 
@@ -10,10 +10,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from typer.main import get_command
 
 from paths import ROOT
-from rfm_commands.cli import app
 
 SHARED = {  # what a family may import beside itself
     "rfm.checkpoint",
@@ -135,35 +133,6 @@ def test_only_its_own_folder_knows_a_family() -> None:
     for file in (file for part in ("rfm", "export") for file in (ROOT / part).rglob("*.py")):
         if not own & set(file.parents):
             assert not [name for name in imports(file) if is_part(name, {f"rfm.{family}" for family in FAMILIES})], file
-
-
-def test_every_command_and_option_is_documented() -> None:
-    readme = (ROOT / "README.md").read_text()
-    for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]
-        assert command.help, name
-        assert f"rfm {name}" in readme
-        for parameter in command.params:
-            if parameter.name != "help":
-                assert parameter.help, (name, parameter.name)
-
-
-def test_every_tensor_of_the_contract_is_documented() -> None:
-    from rfm_client.contract import wire
-
-    readme = (ROOT / "README.md").read_text()
-    specs = (*wire.embedding_inputs(1, 1), *wire.frame_inputs(), *wire.score_outputs(10))
-    for spec in specs:
-        assert f"`{spec.name}`" in readme
-
-
-def test_every_key_of_the_configuration_is_documented() -> None:
-    from dataclasses import fields
-
-    from rfm.config import ServeConfig
-
-    readme = (ROOT / "README.md").read_text()
-    for field in fields(ServeConfig):
-        assert f"`{field.name}`" in readme, field.name
 
 
 def test_files_say_their_licence() -> None:
