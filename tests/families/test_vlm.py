@@ -1,41 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""Vision-language checkpoints: prompts, pixels, forms of checkpoints, batches, bad input."""
+"""RFM and Robometer: scores against the original's, alone and in any company."""
 
 from __future__ import annotations
 
-import importlib.metadata
-import json
-import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-import yaml
-from google.protobuf import text_format
-from PIL import Image
-from safetensors.torch import load_file, save_file
-from torch.utils._python_dispatch import TorchDispatchMode
-from tritonclient.grpc import model_config_pb2 as pb
 
 import goldens
-import rfm_export
 from engines import load_engine
 from reference_server import Served
-from rfm import families
-from rfm.checkpoint.content import CheckpointError
-from rfm.config import ServeConfig
 from rfm.engine import Engine
 from rfm.execution import Execution
 from rfm.predictor import RowScores
-from rfm.vlm.checkpoint import VlmCheckpoint
 from rfm.vlm.collator import QWEN3, VISION_START, VlmRow
-from rfm.vlm.images import Normalisation, QwenImages, fitted_size
 from rfm.vlm.network import VlmBatch
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.prompts import SPLIT_TOKEN
@@ -50,21 +33,15 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.contract.model_info import FRAME_SIZE_PARAMETER
+from vlm import BFLOAT16, PLAIN, assert_close, film, load, predictor_of
 
 WITH_SIMILARITY = "q25_peft_adapter_disc10"  # in the copied references too
-BFLOAT16 = "q3_tok_disc10_bf16"
-PLAIN = "q3_tok_disc10"
-ADAPTER = "q25_peft_adapter_disc10"
-LORA_INSIDE = "q3_lora_full_disc10"
+
+
 PIXEL_TOLERANCE = 1e-6  # relative, of a sum over all pixels
+
+
 MIXED_TOLERANCE = 5e-6  # seen: 1e-6
-
-
-def predictor_of(name: str) -> VlmPredictor:
-    predictor = load_engine(name).predictor
-    assert isinstance(predictor, VlmPredictor)
-    return predictor
 
 
 def arrays_of(case: goldens.Case) -> dict[str, np.ndarray]:
@@ -160,11 +137,6 @@ def test_a_network_in_bfloat16_holds_the_original_s_numbers(case: goldens.Case) 
     assert min(excesses(engine, case, bfloat16=False, tolerances=case.tolerances)) > 10
 
 
-def film(seed: int, num_frames: int, height: int, width: int, task: str = "stack the blocks") -> Trajectory:
-    frames = np.random.default_rng(seed).integers(0, 256, (num_frames, height, width, 3), np.uint8)
-    return Trajectory(frames=frames, task=task)
-
-
 def mixture() -> list[Sample]:
     """T = 2, 8, 16; three image sizes, in some pairs two; all three types."""
     samples: list[Sample] = []
@@ -177,17 +149,6 @@ def mixture() -> list[Sample]:
         samples.append(PreferenceSample(film(seed, num_frames, height, width), film(seed + 70, 3, 84, 112)))
         samples.append(SimilaritySample(film(seed, 1, 60, 60), film(seed + 80, num_frames, height, width)))
     return samples
-
-
-def assert_close(left: object, right: object, tolerance: float) -> None:
-    assert not isinstance(left, Exception), left
-    assert not isinstance(right, Exception), right
-    for a, b in zip(goldens.frame_scores(left), goldens.frame_scores(right), strict=True):  # type: ignore[arg-type]
-        np.testing.assert_allclose(a.progress, b.progress, rtol=0, atol=tolerance)
-        np.testing.assert_allclose(a.success, b.success, rtol=0, atol=tolerance)
-    for name in ("preference", "similarity"):
-        if hasattr(left, name):
-            assert abs(getattr(left, name) - getattr(right, name)) <= tolerance
 
 
 @pytest.mark.parametrize(
@@ -403,373 +364,3 @@ def test_a_sample_that_does_not_fit_in_memory_fails_alone(monkeypatch: pytest.Mo
     assert isinstance(failed, InferenceFailedError)
     assert str(failed) == "the sample does not fit in the device's memory"
     assert_close(first, last, MIXED_TOLERANCE)
-
-
-def load(name: str, folder: Path | None = None, base: str | None = None) -> VlmCheckpoint:
-    config = goldens.config(name)
-    checkpoint = families.load(folder or config.checkpoint, base_model=base or str(config.base_model))
-    assert isinstance(checkpoint, VlmCheckpoint)
-    return checkpoint
-
-
-@pytest.fixture
-def copied(tmp_path: Path) -> Callable[[str], Path]:
-    def copy(name: str) -> Path:
-        folder = tmp_path / name
-        shutil.copytree(goldens.config(name).checkpoint, folder)
-        for file in folder.iterdir():
-            file.chmod(0o644)
-        return folder
-
-    return copy
-
-
-def test_saving_and_loading_changes_nothing(tmp_path: Path) -> None:
-    original = load(LORA_INSIDE)
-    original.save(tmp_path / "saved")
-    copy = families.load(tmp_path / "saved")
-    assert isinstance(copy, VlmCheckpoint)
-    assert copy.config == original.config
-    assert all(torch.equal(copy.weights[name], original.weights[name]) for name in original.weights)
-
-
-def test_settings_are_read_from_the_training_run() -> None:
-    assert load("q25_video_last_l2").config.size_px == (56, 84)
-    assert load(PLAIN).config.progress_in_preference
-    assert load(PLAIN).config.per_frame_progress_token
-    assert load(BFLOAT16).config.dtype == "bfloat16"
-    assert not load("smol_mean_disc10").config.progress_in_preference
-
-
-def change_yaml(old: str, new: str) -> Callable[[Path], None]:
-    def spoil(folder: Path) -> None:
-        text = (folder / "config.yaml").read_text()
-        assert old in text
-        (folder / "config.yaml").write_text(text.replace(old, new))
-
-    return spoil
-
-
-def change_tensors(file: str, change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
-    def spoil(folder: Path) -> None:
-        weights = load_file(folder / file)
-        change(weights)
-        save_file(weights, folder / file)
-
-    return spoil
-
-
-def change_adapter(**changes: object) -> Callable[[Path], None]:
-    def spoil(folder: Path) -> None:
-        file = folder / "adapter_config.json"
-        file.write_text(json.dumps(json.loads(file.read_text()) | changes))
-
-    return spoil
-
-
-def drop_first(part: str) -> Callable[[dict[str, Any]], object]:
-    return lambda weights: weights.pop(next(name for name in weights if part in name))
-
-
-SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
-    "missing and unexpected keys": (
-        PLAIN,
-        change_tensors("model.safetensors", lambda w: w.update(surplus=w.pop("success_head.4.bias"))),
-        r"missing keys: \['success_head.4.bias'\]; unexpected keys: \['surplus'\]",
-    ),
-    "no reward heads": (
-        PLAIN,
-        change_tensors("model.safetensors", lambda w: w.pop("progress_head.4.weight")),
-        r"expected reward heads, got no progress_head.4.weight",
-    ),
-    "a video whose size is not told": (
-        "q25_video_last_l2",
-        change_yaml("  resized_height: 56\n", ""),
-        r"data\.resized_height: expected a number or null, got no such key",
-    ),
-    "a size that is none": (PLAIN, change_yaml("resized_width: null", "resized_width: wide"), r"data\.resized_width: expected a whole number"),
-    "a run of nothing": (PLAIN, lambda folder: (folder / "config.yaml").write_text("{}") and None, r"config\.yaml: model: expected the settings"),
-    "text for a truth": (PLAIN, change_yaml("average_temporal_patches: false", "average_temporal_patches: 'false'"), r"average_temporal_patches: expected bool, got 'false'"),
-    "a temperature of zero": (PLAIN, change_yaml("attn_temperature: 1.0", "attn_temperature: 0.0"), r"temperature: expected a number above 0, got 0.0"),
-    "pairwise progress": (PLAIN, change_yaml("  model_type: default", "  pairwise_progress: true"), r"model\.pairwise_progress: expected false .*, got true"),
-    "a pooling that is none": (PLAIN, change_yaml("frame_pooling: mean", "frame_pooling: max"), r"frame_pooling: expected"),
-    "a type that is none": (PLAIN, change_yaml("torch_dtype: float32", "torch_dtype: int8"), r"torch_dtype: expected"),
-    "tokens without images": (PLAIN, change_yaml("use_multi_image: true", "use_multi_image: false"), r"use_multi_image with per-frame progress tokens: expected true"),
-    "answers in generated text": (
-        PLAIN,
-        change_yaml("model_type: default", "model_type: vqa"),
-        r"model\.model_type: expected default, got 'vqa': .* upstream's successor dropped the type",
-    ),
-    "another model type": (PLAIN, change_yaml("model_type: default", "model_type: dpo"), r"model_type: expected default, got 'dpo'$"),
-    "LoRA without alpha": (LORA_INSIDE, change_yaml("lora_alpha: 8", "lora_beta: 8"), r"expected lora_alpha and r of the LoRA weights"),
-    "half a LoRA pair": (LORA_INSIDE, change_tensors("model.safetensors", drop_first("lora_B")), r"expected a weight and LoRA factors A and B, got \['A'\]"),
-    "LoRA of another kind": (ADAPTER, change_adapter(use_dora=True), r"expected plain LoRA, got use_dora"),
-    "an adapter without its embedding": (
-        ADAPTER,
-        change_tensors("adapter_model.safetensors", drop_first("embed_tokens")),
-        r"expected the embedding of the special tokens, got none",
-    ),
-    "an adapter of another model": (
-        ADAPTER,
-        change_tensors("adapter_model.safetensors", lambda w: w.update({"base_model.model.other.weight": torch.zeros(1)})),
-        r"got also \['model.other.weight'\]",
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("name", "spoil", "message"), SPOILED.values(), ids=SPOILED)
-def test_a_spoiled_checkpoint_is_refused(
-    copied: Callable[[str], Path], name: str, spoil: Callable[[Path], None], message: str
-) -> None:
-    folder = copied(name)
-    spoil(folder)
-    with pytest.raises(CheckpointError, match=message):
-        load(name, folder).build()
-
-
-def test_an_adapter_whose_base_model_is_missing_is_refused(copied: Callable[[str], Path]) -> None:
-    with pytest.raises(CheckpointError, match=r"base model /no/such/base: cannot be had: .*--base-model"):
-        load(ADAPTER, copied(ADAPTER), base="/no/such/base")
-
-
-def test_smolvlm_is_refused_where_its_scores_would_differ(monkeypatch: pytest.MonkeyPatch) -> None:
-    checkpoint = load("smol_mean_disc10")
-    monkeypatch.setattr(importlib.metadata, "version", lambda _name: "5.0.0")
-    with pytest.raises(CheckpointError, match=r"transformers: expected transformers < 5 for a SmolVLM checkpoint"):
-        checkpoint.build()
-
-
-def test_a_processor_of_another_model_is_refused() -> None:
-    other = str(goldens.config(ADAPTER).base_model)
-    with pytest.raises(CheckpointError, match=r"expected a tokenizer of 451 tokens .*, got 447"):
-        Engine.from_checkpoint(goldens.config(PLAIN).checkpoint, base_model=other)
-
-
-def test_a_preprocessor_file_as_qwen_publishes_it_is_read(tmp_path: Path) -> None:
-    """With few fields, where the references have all that transformers writes."""
-    base = tmp_path / "base"
-    shutil.copytree(str(goldens.config(PLAIN).base_model), base)
-    file = base / "preprocessor_config.json"
-    few = ("size", "patch_size", "temporal_patch_size", "merge_size", "image_mean", "image_std")
-    fields = {name: value for name, value in json.loads(file.read_text()).items() if name in few}
-    file.chmod(0o644)
-    file.write_text(json.dumps(fields))
-    Engine.from_checkpoint(goldens.config(PLAIN).checkpoint, base_model=str(base))
-
-
-def test_a_thin_video_is_refused() -> None:
-    sample = ProgressSample(film(0, 2, 1, 500))
-    (outcome,) = load_engine("q25_video_last_l2").evaluate([sample])
-    assert isinstance(outcome, InvalidSampleError)
-    assert str(outcome) == "frames: expected an image at most 200 times as long as wide, got 1 x 500"
-
-
-def rewritten(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    """The folder's config.yaml, changed."""
-    file = folder / "config.yaml"
-    content = yaml.safe_load(file.read_text())
-    change(content)
-    file.write_text(yaml.safe_dump(content))
-
-
-def test_fields_that_an_old_upstream_did_not_have_are_what_it_did(copied: Callable[[str], Path]) -> None:
-    folder = copied("q25_video_last_l2")
-    (folder / "config.yaml").write_text(
-        "model: {base_model_id: some/base}\ndata: {resized_height: 56, resized_width: 84}\n"
-    )
-    config = load("q25_video_last_l2", folder).config
-    assert not config.multi_image
-    assert not config.per_frame_progress_token
-    assert not config.progress_in_preference
-    assert not config.average_temporal_patches
-    assert (config.frame_pooling, config.pooling_temperature, config.size_px) == ("mean", 1.0, (56, 84))
-    assert (config.dtype, config.trained_frames) == ("bfloat16", None)
-
-
-@pytest.mark.parametrize("name", [PLAIN, ADAPTER, "q25_mean_l2", "q25_video_avg_disc10"])
-def test_without_config_yaml_nothing_is_guessed(copied: Callable[[str], Path], name: str) -> None:
-    folder = copied(name)
-    (folder / "config.yaml").unlink()
-    with pytest.raises(CheckpointError, match=r"expected config\.yaml of the training run there, in the folder above"):
-        load(name, folder)
-
-
-def test_config_yaml_is_found_above_the_checkpoint(copied: Callable[[str], Path]) -> None:
-    folder = copied(PLAIN)
-    (folder / "config.yaml").rename(folder.parent / "config.yaml")
-    assert load(PLAIN, folder).config == load(PLAIN).config
-
-
-def test_what_was_exported_needs_no_config_yaml(tmp_path: Path) -> None:
-    load(PLAIN).save(tmp_path / "saved")
-    assert not (tmp_path / "saved" / "config.yaml").exists()
-    assert families.load(tmp_path / "saved").config == load(PLAIN).config
-
-
-TWICE = ("use_multi_image", "use_per_frame_progress_token")
-
-
-@pytest.mark.parametrize("section", ["model", "data"])
-def test_either_section_tells_how_frames_are_shown(copied: Callable[[str], Path], section: str) -> None:
-    folder = copied(PLAIN)
-    rewritten(folder, lambda run: [run[section].pop(key) for key in TWICE])
-    assert load(PLAIN, folder).config == load(PLAIN).config
-
-
-@pytest.mark.parametrize("key", TWICE)
-def test_sections_that_disagree_are_refused(copied: Callable[[str], Path], key: str) -> None:
-    folder = copied(PLAIN)
-    rewritten(folder, lambda run: run["data"].update({key: False}))
-    expected = rf"expected model\.{key} and data\.{key} to agree, got model\.{key} true and data\.{key} false"
-    with pytest.raises(CheckpointError, match=expected):
-        load(PLAIN, folder)
-
-
-SIZED = {"resized_height": 112, "resized_width": 84}
-
-
-@pytest.fixture
-def sized(copied: Callable[[str], Path]) -> Path:
-    """A multi-image checkpoint whose run set a size for frames."""
-    folder = copied(PLAIN)
-    rewritten(folder, lambda run: run["data"].update(SIZED))
-    return folder
-
-
-def test_a_size_for_images_is_asked_about(sized: Path) -> None:
-    with pytest.raises(CheckpointError, match=r"got 112 and 84: .* --resize-images .* --no-resize-images"):
-        load(PLAIN, sized)
-
-
-@pytest.mark.parametrize(("resize_images", "side_px"), [(True, (112, 84)), (False, None)])
-def test_a_size_for_images_is_kept_or_ignored_as_told(
-    sized: Path, tmp_path: Path, resize_images: bool, side_px: tuple[int, int] | None
-) -> None:
-    base = str(goldens.config(PLAIN).base_model)
-    sample = ProgressSample(film(0, 2, 48, 80))
-    resized = ProgressSample(film(0, 2, 48, 80))
-    engine = Engine.from_checkpoint(sized, base_model=base, resize_images=resize_images)
-    (result,) = engine.evaluate([sample])
-    plain = load_engine(PLAIN)
-    if side_px is not None:  # what the checkpoint without a size says of frames that were brought to it before
-        frames = sample.trajectory.frames
-        assert frames is not None
-        fitted = fitted_size(*side_px, 32)
-        small = np.stack(
-            [np.asarray(Image.fromarray(f).resize(fitted[::-1], Image.Resampling.BICUBIC)) for f in frames]
-        )
-        resized = ProgressSample(Trajectory(frames=small, task=sample.trajectory.task))
-    (expected,) = plain.evaluate([resized])
-    assert_close(result, expected, 1e-6)
-
-    serve = ServeConfig(num_gpus=0, torch_threads=1, base_model=base, resize_images=resize_images)
-    rfm_export.export(sized, tmp_path / "repository", serve)
-    text = (tmp_path / "repository" / "rfm_frames" / "config.pbtxt").read_text()
-    told = text_format.Parse(text, pb.ModelConfig()).parameters[FRAME_SIZE_PARAMETER].string_value
-    assert told == ("" if side_px is None else "exact 128x96")
-    exported = families.load(tmp_path / "repository" / "rfm_frames" / "1" / "checkpoint")
-    assert isinstance(exported, VlmCheckpoint)
-    assert exported.config.size_px == side_px
-
-
-@pytest.mark.parametrize("resize_images", [True, False, None])
-def test_a_size_for_videos_always_holds(resize_images: bool | None) -> None:
-    checkpoint = families.load(goldens.config("q25_video_last_l2").checkpoint, resize_images=resize_images)
-    assert isinstance(checkpoint, VlmCheckpoint)
-    assert checkpoint.config.size_px == (56, 84)
-
-
-def test_the_processor_s_chat_template_wins_over_the_tokenizer_s(tmp_path: Path) -> None:
-    """Upstream prompts by the processor."""
-    base = tmp_path / "base"
-    shutil.copytree(str(goldens.config(PLAIN).base_model), base, copy_function=shutil.copyfile)
-    file = base / "tokenizer_config.json"
-    other = {"chat_template": "{% for message in messages %}of the tokenizer{% endfor %}"}
-    file.write_text(json.dumps(json.loads(file.read_text()) | other))
-
-    def prompt() -> str:
-        template = str(load(PLAIN, base=str(base)).collator.tokenizer.chat_template)
-        with tempfile.TemporaryDirectory() as folder:
-            saved = Path(folder, "saved")
-            load(PLAIN, base=str(base)).save(saved)
-            assert families.load(saved).collator.tokenizer.chat_template == template
-        return template
-
-    assert prompt() == json.loads((base / "chat_template.json").read_text())["chat_template"]
-    (base / "chat_template.json").unlink()
-    assert prompt() == other["chat_template"]
-    (base / "chat_template.jinja").write_text("of the processor, in its newer file")
-    assert prompt() == "of the processor, in its newer file"
-
-
-class Largest(TorchDispatchMode):
-    """Remembers the most elements of a tensor that was made."""
-
-    elements = 0
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        made = func(*args, **(kwargs or {}))
-        for tensor in made if isinstance(made, (tuple, list)) else [made]:
-            if isinstance(tensor, torch.Tensor):
-                self.elements = max(self.elements, tensor.numel())
-        return made
-
-
-@pytest.mark.parametrize("name", ["q25_attention_disc10", "q25_mean_l2"])
-def test_a_long_span_costs_the_short_ones_no_memory(name: str) -> None:
-    network = predictor_of(name).network
-    width, long, short = network.config.hidden_dim, 4000, 500
-    hidden = torch.randn(2, long, width, generator=torch.Generator().manual_seed(0))
-    spans = torch.tensor([[0, 0, long], *([1, 2 * at, 2 * at + 2] for at in range(short))])
-    with torch.inference_mode(), Largest() as largest:
-        together = network._frame_states(hidden, spans)
-    assert largest.elements <= (long + 2 * short) * width
-    with torch.inference_mode():
-        for index in (0, 1, short):
-            alone = network._frame_states(hidden, spans[index : index + 1])
-            torch.testing.assert_close(together[index : index + 1], alone, rtol=0, atol=1e-6)
-        tokens = hidden[0]
-        weights = torch.full((long, 1), 1 / long)
-        if network.config.frame_pooling == "attention":
-            weights = (network.frame_pool_attn(tokens) / network.config.pooling_temperature).softmax(dim=0)
-        torch.testing.assert_close(together[0], (weights * tokens).sum(dim=0), rtol=0, atol=1e-6)
-
-
-SIZES = {
-    "rounded": ((60, 90), 28, (56, 84)),
-    "at least four tokens": ((1, 1), 28, (56, 56)),
-    "at most 16384 tokens": ((4000, 5000), 28, (3192, 4004)),
-}
-
-
-@pytest.mark.parametrize(("size", "factor", "expected"), SIZES.values(), ids=SIZES)
-def test_images_are_fitted(size: tuple[int, int], factor: int, expected: tuple[int, int]) -> None:
-    fitted = fitted_size(*size, factor)
-    assert fitted == expected
-    assert 4 <= fitted[0] * fitted[1] / factor**2 <= 16_384
-
-
-def test_patches_hold_every_pixel_once() -> None:
-    images = QwenImages(2, Normalisation((0.0,) * 3, (1 / 255,) * 3))
-    frame = np.arange(8 * 8 * 3, dtype=np.uint8).reshape(1, 8, 8, 3)
-    (pixels,) = images.images(frame)
-    assert pixels.patches.shape == (16, 3 * 2 * 2 * 2)
-    first = pixels.patches[0].reshape(3, 2, 2, 2)  # C, frame of the group, rows, columns
-    np.testing.assert_allclose(first[:, 0].permute(1, 2, 0).numpy(), frame[0, :2, :2], atol=1e-4)
-    assert sorted(pixels.patches.round().int().flatten().tolist()) == sorted(frame.flatten().tolist() * 2)
-
-
-@pytest.mark.gpu
-def test_bfloat16_on_a_gpu_is_near_float32_on_the_cpu() -> None:
-    config = goldens.config(BFLOAT16)
-    samples = [sample for case in config.cases() for sample in case.samples()]
-    on_cpu = load_engine(BFLOAT16).evaluate(samples)
-    on_gpu = Engine.from_checkpoint(config.checkpoint, base_model=str(config.base_model), device="cuda").evaluate(
-        samples
-    )
-    for left, right in zip(on_cpu, on_gpu, strict=True):
-        assert not isinstance(left, Exception), left
-        assert not isinstance(right, Exception), right
-        for a, b in zip(goldens.frame_scores(left), goldens.frame_scores(right), strict=True):
-            np.testing.assert_allclose(a.progress, b.progress, rtol=0, atol=5e-3)
-            np.testing.assert_allclose(a.success, b.success, rtol=0, atol=1.5e-2)

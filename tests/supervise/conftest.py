@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the tests of this folder ask."""
+"""Certificates, servers with TLS and keys, and one with versions to roll out."""
 
 from __future__ import annotations
 
@@ -12,11 +12,14 @@ import pytest
 import trustme
 
 import rfm_export
+import rollout
+from administered import KEY, Running
 from commands import EXIT_S, command, wait_for_http
 from engines import serve_config
 from rfm.supervise.installation import find_installation
-from rfm.supervise.process import Endpoints
+from rfm.supervise.process import Endpoints, TritonServer
 from rfm.supervise.tls import GrpcTls
+from rollout import WITH_ENCODERS
 from secured import (
     PLAIN,
     PUBLIC_HOST,
@@ -90,3 +93,19 @@ def mutual(
             process.terminate()
             assert process.wait(EXIT_S) == 0, log.read_text()
             assert not regions_of(process.pid)
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    folder = tmp_path_factory.mktemp("running")
+    repository, key_file = folder / "repository", folder / "key"
+    key_file.touch(0o600)
+    key_file.write_text(f"{KEY}\n")
+    rollout.export(WITH_ENCODERS.checkpoint, repository)
+    log = folder / "tritonserver.log"
+    with (
+        log.open("wb") as lines,
+        TritonServer(repository, Endpoints.free(), find_installation(), log=lines, admin_key=KEY) as server,
+    ):
+        yield Running(repository, server.endpoints, key_file, log)
+    assert KEY not in log.read_text()

@@ -1,0 +1,333 @@
+# SPDX-License-Identifier: MIT
+"""Vision-language checkpoints: what decides each setting, and what is refused."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from google.protobuf import text_format
+from PIL import Image
+from safetensors.torch import load_file, save_file
+from tritonclient.grpc import model_config_pb2 as pb
+
+import goldens
+import rfm_export
+from engines import load_engine
+from rfm import families
+from rfm.checkpoint.content import CheckpointError
+from rfm.config import ServeConfig
+from rfm.engine import Engine
+from rfm.vlm.checkpoint import VlmCheckpoint
+from rfm.vlm.images import fitted_size
+from rfm_client import (
+    InvalidSampleError,
+    ProgressSample,
+    Trajectory,
+)
+from rfm_client.contract.model_info import FRAME_SIZE_PARAMETER
+from vlm import BFLOAT16, PLAIN, assert_close, film, load
+
+ADAPTER = "q25_peft_adapter_disc10"
+
+
+LORA_INSIDE = "q3_lora_full_disc10"
+
+
+@pytest.fixture
+def copied(tmp_path: Path) -> Callable[[str], Path]:
+    def copy(name: str) -> Path:
+        folder = tmp_path / name
+        shutil.copytree(goldens.config(name).checkpoint, folder)
+        for file in folder.iterdir():
+            file.chmod(0o644)
+        return folder
+
+    return copy
+
+
+def test_saving_and_loading_changes_nothing(tmp_path: Path) -> None:
+    original = load(LORA_INSIDE)
+    original.save(tmp_path / "saved")
+    copy = families.load(tmp_path / "saved")
+    assert isinstance(copy, VlmCheckpoint)
+    assert copy.config == original.config
+    assert all(torch.equal(copy.weights[name], original.weights[name]) for name in original.weights)
+
+
+def test_settings_are_read_from_the_training_run() -> None:
+    assert load("q25_video_last_l2").config.size_px == (56, 84)
+    assert load(PLAIN).config.progress_in_preference
+    assert load(PLAIN).config.per_frame_progress_token
+    assert load(BFLOAT16).config.dtype == "bfloat16"
+    assert not load("smol_mean_disc10").config.progress_in_preference
+
+
+def change_yaml(old: str, new: str) -> Callable[[Path], None]:
+    def spoil(folder: Path) -> None:
+        text = (folder / "config.yaml").read_text()
+        assert old in text
+        (folder / "config.yaml").write_text(text.replace(old, new))
+
+    return spoil
+
+
+def change_tensors(file: str, change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
+    def spoil(folder: Path) -> None:
+        weights = load_file(folder / file)
+        change(weights)
+        save_file(weights, folder / file)
+
+    return spoil
+
+
+def change_adapter(**changes: object) -> Callable[[Path], None]:
+    def spoil(folder: Path) -> None:
+        file = folder / "adapter_config.json"
+        file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+
+    return spoil
+
+
+def drop_first(part: str) -> Callable[[dict[str, Any]], object]:
+    return lambda weights: weights.pop(next(name for name in weights if part in name))
+
+
+SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
+    "missing and unexpected keys": (
+        PLAIN,
+        change_tensors("model.safetensors", lambda w: w.update(surplus=w.pop("success_head.4.bias"))),
+        r"missing keys: \['success_head.4.bias'\]; unexpected keys: \['surplus'\]",
+    ),
+    "no reward heads": (
+        PLAIN,
+        change_tensors("model.safetensors", lambda w: w.pop("progress_head.4.weight")),
+        r"expected reward heads, got no progress_head.4.weight",
+    ),
+    "a video whose size is not told": (
+        "q25_video_last_l2",
+        change_yaml("  resized_height: 56\n", ""),
+        r"data\.resized_height: expected a number or null, got no such key",
+    ),
+    "a size that is none": (PLAIN, change_yaml("resized_width: null", "resized_width: wide"), r"data\.resized_width: expected a whole number"),
+    "a run of nothing": (PLAIN, lambda folder: (folder / "config.yaml").write_text("{}") and None, r"config\.yaml: model: expected the settings"),
+    "text for a truth": (PLAIN, change_yaml("average_temporal_patches: false", "average_temporal_patches: 'false'"), r"average_temporal_patches: expected bool, got 'false'"),
+    "a temperature of zero": (PLAIN, change_yaml("attn_temperature: 1.0", "attn_temperature: 0.0"), r"temperature: expected a number above 0, got 0.0"),
+    "pairwise progress": (PLAIN, change_yaml("  model_type: default", "  pairwise_progress: true"), r"model\.pairwise_progress: expected false .*, got true"),
+    "a pooling that is none": (PLAIN, change_yaml("frame_pooling: mean", "frame_pooling: max"), r"frame_pooling: expected"),
+    "a type that is none": (PLAIN, change_yaml("torch_dtype: float32", "torch_dtype: int8"), r"torch_dtype: expected"),
+    "tokens without images": (PLAIN, change_yaml("use_multi_image: true", "use_multi_image: false"), r"use_multi_image with per-frame progress tokens: expected true"),
+    "answers in generated text": (
+        PLAIN,
+        change_yaml("model_type: default", "model_type: vqa"),
+        r"model\.model_type: expected default, got 'vqa': .* upstream's successor dropped the type",
+    ),
+    "another model type": (PLAIN, change_yaml("model_type: default", "model_type: dpo"), r"model_type: expected default, got 'dpo'$"),
+    "LoRA without alpha": (LORA_INSIDE, change_yaml("lora_alpha: 8", "lora_beta: 8"), r"expected lora_alpha and r of the LoRA weights"),
+    "half a LoRA pair": (LORA_INSIDE, change_tensors("model.safetensors", drop_first("lora_B")), r"expected a weight and LoRA factors A and B, got \['A'\]"),
+    "LoRA of another kind": (ADAPTER, change_adapter(use_dora=True), r"expected plain LoRA, got use_dora"),
+    "an adapter without its embedding": (
+        ADAPTER,
+        change_tensors("adapter_model.safetensors", drop_first("embed_tokens")),
+        r"expected the embedding of the special tokens, got none",
+    ),
+    "an adapter of another model": (
+        ADAPTER,
+        change_tensors("adapter_model.safetensors", lambda w: w.update({"base_model.model.other.weight": torch.zeros(1)})),
+        r"got also \['model.other.weight'\]",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "spoil", "message"), SPOILED.values(), ids=SPOILED)
+def test_a_spoiled_checkpoint_is_refused(
+    copied: Callable[[str], Path], name: str, spoil: Callable[[Path], None], message: str
+) -> None:
+    folder = copied(name)
+    spoil(folder)
+    with pytest.raises(CheckpointError, match=message):
+        load(name, folder).build()
+
+
+def test_an_adapter_whose_base_model_is_missing_is_refused(copied: Callable[[str], Path]) -> None:
+    with pytest.raises(CheckpointError, match=r"base model /no/such/base: cannot be had: .*--base-model"):
+        load(ADAPTER, copied(ADAPTER), base="/no/such/base")
+
+
+def test_smolvlm_is_refused_where_its_scores_would_differ(monkeypatch: pytest.MonkeyPatch) -> None:
+    checkpoint = load("smol_mean_disc10")
+    monkeypatch.setattr(importlib.metadata, "version", lambda _name: "5.0.0")
+    with pytest.raises(CheckpointError, match=r"transformers: expected transformers < 5 for a SmolVLM checkpoint"):
+        checkpoint.build()
+
+
+def test_a_processor_of_another_model_is_refused() -> None:
+    other = str(goldens.config(ADAPTER).base_model)
+    with pytest.raises(CheckpointError, match=r"expected a tokenizer of 451 tokens .*, got 447"):
+        Engine.from_checkpoint(goldens.config(PLAIN).checkpoint, base_model=other)
+
+
+def test_a_preprocessor_file_as_qwen_publishes_it_is_read(tmp_path: Path) -> None:
+    """With few fields, where the references have all that transformers writes."""
+    base = tmp_path / "base"
+    shutil.copytree(str(goldens.config(PLAIN).base_model), base)
+    file = base / "preprocessor_config.json"
+    few = ("size", "patch_size", "temporal_patch_size", "merge_size", "image_mean", "image_std")
+    fields = {name: value for name, value in json.loads(file.read_text()).items() if name in few}
+    file.chmod(0o644)
+    file.write_text(json.dumps(fields))
+    Engine.from_checkpoint(goldens.config(PLAIN).checkpoint, base_model=str(base))
+
+
+def test_a_thin_video_is_refused() -> None:
+    sample = ProgressSample(film(0, 2, 1, 500))
+    (outcome,) = load_engine("q25_video_last_l2").evaluate([sample])
+    assert isinstance(outcome, InvalidSampleError)
+    assert str(outcome) == "frames: expected an image at most 200 times as long as wide, got 1 x 500"
+
+
+def rewritten(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """The folder's config.yaml, changed."""
+    file = folder / "config.yaml"
+    content = yaml.safe_load(file.read_text())
+    change(content)
+    file.write_text(yaml.safe_dump(content))
+
+
+def test_fields_that_an_old_upstream_did_not_have_are_what_it_did(copied: Callable[[str], Path]) -> None:
+    folder = copied("q25_video_last_l2")
+    (folder / "config.yaml").write_text(
+        "model: {base_model_id: some/base}\ndata: {resized_height: 56, resized_width: 84}\n"
+    )
+    config = load("q25_video_last_l2", folder).config
+    assert not config.multi_image
+    assert not config.per_frame_progress_token
+    assert not config.progress_in_preference
+    assert not config.average_temporal_patches
+    assert (config.frame_pooling, config.pooling_temperature, config.size_px) == ("mean", 1.0, (56, 84))
+    assert (config.dtype, config.trained_frames) == ("bfloat16", None)
+
+
+@pytest.mark.parametrize("name", [PLAIN, ADAPTER, "q25_mean_l2", "q25_video_avg_disc10"])
+def test_without_config_yaml_nothing_is_guessed(copied: Callable[[str], Path], name: str) -> None:
+    folder = copied(name)
+    (folder / "config.yaml").unlink()
+    with pytest.raises(CheckpointError, match=r"expected config\.yaml of the training run there, in the folder above"):
+        load(name, folder)
+
+
+def test_config_yaml_is_found_above_the_checkpoint(copied: Callable[[str], Path]) -> None:
+    folder = copied(PLAIN)
+    (folder / "config.yaml").rename(folder.parent / "config.yaml")
+    assert load(PLAIN, folder).config == load(PLAIN).config
+
+
+def test_what_was_exported_needs_no_config_yaml(tmp_path: Path) -> None:
+    load(PLAIN).save(tmp_path / "saved")
+    assert not (tmp_path / "saved" / "config.yaml").exists()
+    assert families.load(tmp_path / "saved").config == load(PLAIN).config
+
+
+TWICE = ("use_multi_image", "use_per_frame_progress_token")
+
+
+@pytest.mark.parametrize("section", ["model", "data"])
+def test_either_section_tells_how_frames_are_shown(copied: Callable[[str], Path], section: str) -> None:
+    folder = copied(PLAIN)
+    rewritten(folder, lambda run: [run[section].pop(key) for key in TWICE])
+    assert load(PLAIN, folder).config == load(PLAIN).config
+
+
+@pytest.mark.parametrize("key", TWICE)
+def test_sections_that_disagree_are_refused(copied: Callable[[str], Path], key: str) -> None:
+    folder = copied(PLAIN)
+    rewritten(folder, lambda run: run["data"].update({key: False}))
+    expected = rf"expected model\.{key} and data\.{key} to agree, got model\.{key} true and data\.{key} false"
+    with pytest.raises(CheckpointError, match=expected):
+        load(PLAIN, folder)
+
+
+SIZED = {"resized_height": 112, "resized_width": 84}
+
+
+@pytest.fixture
+def sized(copied: Callable[[str], Path]) -> Path:
+    """A multi-image checkpoint whose run set a size for frames."""
+    folder = copied(PLAIN)
+    rewritten(folder, lambda run: run["data"].update(SIZED))
+    return folder
+
+
+def test_a_size_for_images_is_asked_about(sized: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"got 112 and 84: .* --resize-images .* --no-resize-images"):
+        load(PLAIN, sized)
+
+
+@pytest.mark.parametrize(("resize_images", "side_px"), [(True, (112, 84)), (False, None)])
+def test_a_size_for_images_is_kept_or_ignored_as_told(
+    sized: Path, tmp_path: Path, resize_images: bool, side_px: tuple[int, int] | None
+) -> None:
+    base = str(goldens.config(PLAIN).base_model)
+    sample = ProgressSample(film(0, 2, 48, 80))
+    resized = ProgressSample(film(0, 2, 48, 80))
+    engine = Engine.from_checkpoint(sized, base_model=base, resize_images=resize_images)
+    (result,) = engine.evaluate([sample])
+    plain = load_engine(PLAIN)
+    if side_px is not None:  # what the checkpoint without a size says of frames that were brought to it before
+        frames = sample.trajectory.frames
+        assert frames is not None
+        fitted = fitted_size(*side_px, 32)
+        small = np.stack(
+            [np.asarray(Image.fromarray(f).resize(fitted[::-1], Image.Resampling.BICUBIC)) for f in frames]
+        )
+        resized = ProgressSample(Trajectory(frames=small, task=sample.trajectory.task))
+    (expected,) = plain.evaluate([resized])
+    assert_close(result, expected, 1e-6)
+
+    serve = ServeConfig(num_gpus=0, torch_threads=1, base_model=base, resize_images=resize_images)
+    rfm_export.export(sized, tmp_path / "repository", serve)
+    text = (tmp_path / "repository" / "rfm_frames" / "config.pbtxt").read_text()
+    told = text_format.Parse(text, pb.ModelConfig()).parameters[FRAME_SIZE_PARAMETER].string_value
+    assert told == ("" if side_px is None else "exact 128x96")
+    exported = families.load(tmp_path / "repository" / "rfm_frames" / "1" / "checkpoint")
+    assert isinstance(exported, VlmCheckpoint)
+    assert exported.config.size_px == side_px
+
+
+@pytest.mark.parametrize("resize_images", [True, False, None])
+def test_a_size_for_videos_always_holds(resize_images: bool | None) -> None:
+    checkpoint = families.load(goldens.config("q25_video_last_l2").checkpoint, resize_images=resize_images)
+    assert isinstance(checkpoint, VlmCheckpoint)
+    assert checkpoint.config.size_px == (56, 84)
+
+
+def test_the_processor_s_chat_template_wins_over_the_tokenizer_s(tmp_path: Path) -> None:
+    """Upstream prompts by the processor."""
+    base = tmp_path / "base"
+    shutil.copytree(str(goldens.config(PLAIN).base_model), base, copy_function=shutil.copyfile)
+    file = base / "tokenizer_config.json"
+    other = {"chat_template": "{% for message in messages %}of the tokenizer{% endfor %}"}
+    file.write_text(json.dumps(json.loads(file.read_text()) | other))
+
+    def prompt() -> str:
+        template = str(load(PLAIN, base=str(base)).collator.tokenizer.chat_template)
+        with tempfile.TemporaryDirectory() as folder:
+            saved = Path(folder, "saved")
+            load(PLAIN, base=str(base)).save(saved)
+            assert families.load(saved).collator.tokenizer.chat_template == template
+        return template
+
+    assert prompt() == json.loads((base / "chat_template.json").read_text())["chat_template"]
+    (base / "chat_template.json").unlink()
+    assert prompt() == other["chat_template"]
+    (base / "chat_template.jinja").write_text("of the processor, in its newer file")
+    assert prompt() == "of the processor, in its newer file"
