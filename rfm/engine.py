@@ -155,9 +155,8 @@ class Engine:
         """Each row's scores. While a batch is in its forward pass the next is collated."""
         scores: dict[int, RowScores | RewardError] = {}
         for part, batch in self._collated(rows, list(self._micro_batches(rows))):
-            started_s = time.perf_counter()
-            scores.update(zip(part, self._score([rows[i] for i in part], batch, execution), strict=True))
-            execution.forward_s += time.perf_counter() - started_s
+            with execution.forwarding():
+                scores.update(zip(part, self._score([rows[i] for i in part], batch, execution), strict=True))
         return [scores[index] for index in range(len(rows))]
 
     def _collated(self, rows: Sequence[Any], parts: Sequence[list[int]]) -> Iterator[tuple[list[int], Any]]:

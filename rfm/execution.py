@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 import re
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -76,6 +77,20 @@ class Execution:
             return [InferenceFailedError("the sample does not fit in the device's memory")]
         half = len(rows) // 2
         return [*self.run(forward, rows[:half]), *self.run(forward, rows[half:])]
+
+    @contextmanager
+    def collating(self) -> Iterator[None]:
+        """Within it no forward pass runs: its time is collate time."""
+        started_s = time.perf_counter()
+        yield
+        self.collate_s += time.perf_counter() - started_s
+
+    @contextmanager
+    def forwarding(self) -> Iterator[None]:
+        """Within it forward passes run: its time is forward time, but for what is spent in ``collating``."""
+        started_s, collated_s = time.perf_counter(), self.collate_s
+        yield
+        self.forward_s += time.perf_counter() - started_s - (self.collate_s - collated_s)
 
     def add_tokens(self, num_tokens: int, num_slots: int) -> None:
         """Counts those of one more forward pass."""

@@ -9,7 +9,6 @@ C = 3 channels, H x W pixels, T frames, L tokens, Dv and Dt widths of the embedd
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
@@ -123,7 +122,10 @@ class Encoders:
         execution: what it took is added to it; its tokens are those of images, which have no padding, and of tasks
         """
         execution = execution or Execution()
-        began_s, collated_s = time.perf_counter(), execution.collate_s
+        with execution.forwarding():
+            return self._encoded(samples, execution)
+
+    def _encoded(self, samples: Sequence[Footage], execution: Execution) -> list[Trajectory | RewardError]:
         outcomes: dict[int, Trajectory | RewardError] = {}
         for index, footage in enumerate(samples):
             try:
@@ -140,7 +142,6 @@ class Encoders:
             encoded = iter(videos)
             for (index, of_sample), text in zip(parts.items(), texts, strict=True):
                 outcomes[index] = _embedded(list(islice(encoded, len(of_sample))), text)
-        execution.forward_s += time.perf_counter() - began_s - (execution.collate_s - collated_s)
         return [outcomes[index] for index in range(len(samples))]
 
     @torch.inference_mode()
@@ -185,9 +186,8 @@ class Encoders:
                 if sum(map(len, waiting)) + len(images) > IMAGES_PER_FORWARD:
                     yield torch.cat(waiting)
                     waiting = []
-                started_s = time.perf_counter()
-                waiting.append(self.preprocessor(images))  # on the CPU: nowhere else is uint8 resized antialiased
-                execution.collate_s += time.perf_counter() - started_s
+                with execution.collating():
+                    waiting.append(self.preprocessor(images))  # on the CPU: nowhere else is uint8 resized antialiased
         yield torch.cat(waiting)
 
     def _check_task(self, task: str) -> None:
