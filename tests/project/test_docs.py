@@ -47,6 +47,9 @@ COMPLETION = ("install_completion", "show_completion", "help")  # typer's own
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 COMMAND = re.compile(r"^ {4,}(rfm-client [^#\n]*)", re.MULTILINE)
 ANY_COMMAND = re.compile(r"^ {4,}(?:[^#\n`]*[;&|] *)?((?:\.venv/bin/)?rfm(?:-client)? (?:\\\n|[^#\n])*)", re.MULTILINE)
+IN_A_SCRIPT = re.compile(r"^ {0,3}(rfm(?:-client)? (?:-|\w+ -)(?:\\\n|[^#\n])*)", re.MULTILINE)  # not indented: fenced
+VARIABLE = re.compile(r"\$\(\(.*?\)\)|\$\w+")
+ENDS = ("|", "||", "&", "&&", ";", ">")  # what follows is no argument
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 HEADING = re.compile(r"^#+ (.*)", re.MULTILINE)
 CODE = re.compile(r"```.*?```|`[^`\n]*`", re.DOTALL)
@@ -190,13 +193,13 @@ def test_the_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text().splitlines()) <= README_LINES
 
 
-@pytest.mark.parametrize("command", found(ANY_COMMAND, DOCUMENTS))
+@pytest.mark.parametrize("command", [*found(ANY_COMMAND, DOCUMENTS), *found(IN_A_SCRIPT, DOCUMENTS)])
 def test_every_command_line_is_one_that_the_commands_take(command: str) -> None:
     """Parsed by the command itself, not run."""
-    words = shlex.split(command.replace("\\\n", " "))
+    words = shlex.split(VARIABLE.sub("1", command.replace("\\\n", " ")))
     if "..." in words or any("[" in word for word in words):
         return  # a pattern
-    program, *arguments = itertools.takewhile(lambda word: word not in ("|", ";", "&&"), words)
+    program, *arguments = itertools.takewhile(lambda word: word not in ENDS, words)
     parse(get_command(rfm if Path(program).name == "rfm" else app), arguments)
 
 
