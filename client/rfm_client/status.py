@@ -19,6 +19,7 @@ from typing import Any
 
 from tritonclient.utils import InferenceServerException
 
+from rfm_client.contract import triton
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import (
     AccessDeniedError,
@@ -26,7 +27,7 @@ from rfm_client.contract.errors import (
     InferenceFailedError,
     ServerUnavailableError,
 )
-from rfm_client.transport.access import Access, is_denied
+from rfm_client.transport.access import Access
 
 METRICS_PORT = 8002
 DEVICE_METRICS = "nv_cpu_utilization, nv_gpu_utilization, nv_*_memory_*_bytes"
@@ -37,7 +38,6 @@ _DEVICE_METRIC = re.compile("nv_(cpu|gpu)_(utilization|memory_used_bytes|memory_
 _REQUESTS_METRIC = "nv_inference_request_success_total"
 _COMPUTE_METRIC = "nv_inference_compute_infer_duration_us_total"
 _SAMPLED_METRIC = "nv_cpu_memory_used_bytes"
-_RESTRICTED = "is restricted, expecting header"  # what Triton says over HTTP and gRPC
 _SAMPLING_S = 2.5  # Triton looks at the machine every two seconds; until the first time it tells zeros
 _POLL_S = 0.2
 _REASON_CHARACTERS = 120
@@ -149,7 +149,7 @@ def read_status(
         metrics = _read_metrics(metrics_url, timeout_s)
         models = tuple(_models(server, metrics))
     except InferenceServerException as error:
-        if is_denied(error):
+        if triton.is_denied(str(error.status()), error.message() or ""):
             raise AccessDeniedError(f"{url}: access denied: {error.message()}") from error
         in_time = "DEADLINE_EXCEEDED" not in str(error.status())
         kind = ServerUnavailableError if in_time else DeadlineExceededError
@@ -212,7 +212,7 @@ def _if_open(ask: Callable[[], Any]) -> Any:
     try:
         return ask()
     except InferenceServerException as error:
-        if _RESTRICTED not in (error.message() or ""):
+        if triton.RESTRICTED not in (error.message() or ""):
             raise
         return {}
 

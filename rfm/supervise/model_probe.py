@@ -22,7 +22,7 @@ from rfm.probe import blank_question
 from rfm.supervise.background import in_background
 from rfm.supervise.http import NO_ANSWER, Http
 from rfm.supervise.lifecycle import Event
-from rfm_client.contract import wire
+from rfm_client.contract import triton, wire
 from rfm_client.contract.names import PROBE_PREFIX
 
 LATE_S = 2.5  # without any answer: the model is not ready
@@ -32,8 +32,6 @@ BROKEN_COUNT = 3  # failures, one after the other, of a model that could answer 
 
 _KEPT = 20  # answers
 _OUTPUTS = (wire.PROGRESS, wire.VIDEO_EMBEDDINGS)
-_DEAD = "is not healthy"
-_ABSENT = ("unknown model", "no available versions", "is not ready")
 
 
 @dataclass(frozen=True)
@@ -142,9 +140,9 @@ class ModelProbe:
 
     def _event_of(self, reply: Reply) -> Event | None:
         failed = reply.status >= HTTPStatus.INTERNAL_SERVER_ERROR
-        if _DEAD in reply.text and failed:
+        if triton.PROCESS_ENDED in reply.text and failed:
             return Event.DEAD
-        if any(words in reply.text for words in _ABSENT) and reply.status != HTTPStatus.OK:
+        if triton.is_absent(reply.text) and reply.status != HTTPStatus.OK:
             return Event.ABSENT
         if reply.status == HTTPStatus.SERVICE_UNAVAILABLE:
             return None  # its queue is full, or it was not its turn in time

@@ -19,6 +19,7 @@ from google.protobuf.json_format import MessageToDict
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
 from rfm.supervise.admin_key import VARIABLE, grpc_metadata
+from rfm_client.contract import triton
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.names import PROBE_PREFIX
 from rfm_client.contract.wire import Tensors
@@ -39,8 +40,7 @@ _CHANNEL = [
     ("grpc.min_reconnect_backoff_ms", int(CONNECT_S * _MS_PER_S)),  # how long it may take to connect, too
     ("grpc.enable_http_proxy", 0),
 ]
-_RESTRICTED = "is restricted, expecting header"
-_OF_SERVER = ("StatusCode.UNAVAILABLE", "StatusCode.DEADLINE_EXCEEDED", "StatusCode.CANCELLED")
+_OF_SERVER = (*triton.UNAVAILABLE, *triton.OUT_OF_TIME, *triton.CANCELLED)
 _GOING = (READY, UNLOADING)
 _NOT_LOADED = "not loaded"  # Triton tells no state
 _UNAVAILABLE, _UNLOADED = "UNAVAILABLE", "unloaded"
@@ -148,7 +148,7 @@ class RepositoryApi:
             return call(*arguments, headers=self._headers, client_timeout=ANSWER_S, **options)
         except InferenceServerException as error:
             message = one_line(error.message() or "no reason given")
-            if _RESTRICTED in message:
+            if triton.RESTRICTED in message:
                 got = "another" if self._headers else "none"
                 raise RepositoryApiError(
                     f"admin key: expected that of the server at {self._url} (--admin-key-file or {VARIABLE}), got {got}"

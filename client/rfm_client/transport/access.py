@@ -11,18 +11,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypedDict, cast
 
-from tritonclient.utils import InferenceServerException
-
 from rfm_client.contract.addresses import check_authorities, load_certificate
 
 SECURE_SCHEMES = ("grpcs", "https")
 AUTHORIZATION = "authorization"
 
-_REFUSALS = ("401", "403", "StatusCode.UNAUTHENTICATED", "StatusCode.PERMISSION_DENIED")
-_NO_CONNECTION = "StatusCode.UNAVAILABLE"
-_NO_TRUST = re.compile(  # how gRPC tells why TLS did not come about, and Triton that it wants a key
-    "CERTIFICATE|certificate|[Vv]erification [Cc]heck failed|WRONG_VERSION_NUMBER|is restricted, expecting header"
-)
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*")
 _VALUE = re.compile("[!-~]([ -~]*[!-~])?")  # visible ASCII; blanks inside
 
@@ -133,9 +126,3 @@ class Access:
             request.headers = {**request.headers, **shown}
 
         client.register_plugin(show)
-
-
-def is_denied(error: InferenceServerException) -> bool:
-    """Whether one side refused the other."""
-    status = str(error.status())
-    return status in _REFUSALS or (status == _NO_CONNECTION and _NO_TRUST.search(error.message() or "") is not None)

@@ -7,7 +7,6 @@ import asyncio
 import io
 import logging
 import os
-import re
 import ssl
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping
 from contextlib import asynccontextmanager
@@ -18,41 +17,17 @@ from typing import Any, Protocol, TypeVar
 import numpy.typing as npt
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
-from rfm_client.contract import errors
+from rfm_client.contract import errors, triton
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.wire import SECOND_FRAMES, Tensors
-from rfm_client.transport.access import SECURE_SCHEMES, Access, is_denied
+from rfm_client.contract.wire import Tensors
+from rfm_client.transport.access import SECURE_SCHEMES, Access
 from rfm_client.transport.connection import GRPC_OPTIONS, Connection
 from rfm_client.transport.deadline import timeout
 from rfm_client.transport.off_loop import off_loop
 from rfm_client.transport.shared_memory import Region, SharedMemory
 
 Answered = TypeVar("Answered")
-
-# What a status means to the caller: as gRPC names it, or as HTTP numbers it.
-_STATUS_ERRORS: dict[str, type[errors.RewardError]] = {
-    "StatusCode.INVALID_ARGUMENT": errors.InvalidSampleError,
-    "400": errors.InvalidSampleError,
-    "StatusCode.NOT_FOUND": errors.ModelNotFoundError,
-    "404": errors.ModelNotFoundError,
-    "StatusCode.UNAVAILABLE": errors.ServerUnavailableError,
-    "503": errors.ServerUnavailableError,
-    "StatusCode.CANCELLED": errors.ServerUnavailableError,  # not by us: the server is stopping
-    "499": errors.ServerUnavailableError,
-    "StatusCode.DEADLINE_EXCEEDED": errors.DeadlineExceededError,
-    "504": errors.DeadlineExceededError,
-}
-_LOST_REGION = "Unable to find shared memory region"
-# Triton answers these with other statuses, but the sample is not at fault and another try may succeed.
-_UNAVAILABLE = re.compile(f"{_LOST_REGION}|has no available versions")
-_PROCESS_ENDED = re.compile("Stub process .* is not healthy")
-_REQUEST_ID = re.compile(r"^\[request id: [^\]]*\] ")
-_WRONG_SHAPE = re.compile(  # behind the batch axis, which the caller did not make
-    r"unexpected shape for input '(?P<name>\w+)'.*?Expected \[-1,(?P<expected>[^\]]*)\], got \[\d+,(?P<got>[^\]]*)\]"
-)
-_NO_SECOND_FRAMES = re.compile(rf"expected \d+ inputs but got .*'{SECOND_FRAMES}'|unexpected .*input '{SECOND_FRAMES}'")
-_IN_ENSEMBLE = re.compile(r"^in ensemble '[^']*', ")  # what Triton puts before a message; the caller knows the model
 
 _US_PER_S = 1_000_000
 
@@ -177,7 +152,7 @@ class _TritonTransport:
             try:
                 yield region
             except InferenceServerException as error:
-                if region is not None and _LOST_REGION in (error.message() or ""):
+                if region is not None and triton.LOST_REGION in (error.message() or ""):
                     self._shared_memory.forget(region)
                 raise
 
@@ -205,9 +180,10 @@ class _TritonTransport:
             async with timeout(timeout_s):
                 return await self._heard(ask)
         except InferenceServerException as error:
-            if is_denied(error):
-                raise errors.AccessDeniedError(f"{self.url}: access denied: {error.message()}") from error
-            raise _mapped(error, bad_request) from error
+            status, message = str(error.status()), error.message() or ""
+            if triton.is_denied(status, message):
+                raise errors.AccessDeniedError(f"{self.url}: access denied: {message}") from error
+            raise triton.error_of(status, message, bad_request) from error
         except (asyncio.TimeoutError, TimeoutError) as error:  # in Python 3.10 two
             raise errors.DeadlineExceededError(f"{self.url}: no answer in time") from error
         except self.protocol_errors as error:
@@ -389,20 +365,3 @@ def _outputs(answer: Any, names: Collection[str]) -> Tensors:
     if absent:
         raise errors.InferenceFailedError(f"outputs: expected {', '.join(names)}, got no {', '.join(absent)}")
     return arrays
-
-
-def _mapped(error: InferenceServerException, bad_request: type[errors.RewardError]) -> errors.RewardError:
-    message = _IN_ENSEMBLE.sub("", _REQUEST_ID.sub("", error.message() or "no reason given"))
-    shape = _WRONG_SHAPE.search(message)
-    if shape is not None:
-        return bad_request(f"{shape['name']}: expected [{shape['expected']}], got [{shape['got']}]")
-    if _NO_SECOND_FRAMES.search(message):
-        expected = "a model that takes pairs of two frame sizes"
-        got = "one that was exported before there was this input: export it again, or resize a trajectory"
-        return bad_request(f"{SECOND_FRAMES}: expected {expected}, got {got}")
-    if _PROCESS_ENDED.search(message):
-        return errors.ProcessEndedError(message)
-    if _UNAVAILABLE.search(message):
-        return errors.ServerUnavailableError(message)
-    kind = _STATUS_ERRORS.get(str(error.status()), errors.InferenceFailedError)
-    return (bad_request if kind is errors.InvalidSampleError else kind)(message)

@@ -29,6 +29,7 @@ import numpy as np
 import numpy.typing as npt
 from tritonclient.utils import InferenceServerException
 
+from rfm_client.contract import triton
 from rfm_client.transport.deadline import timeout
 from rfm_client.transport.off_loop import off_loop
 
@@ -39,7 +40,6 @@ ANSWER_TIMEOUT_S = 2.0  # of a server that is to unmap a region, or to tell whic
 _PREFIX = "rfm-client-"
 _LOCK_SUFFIX = ".lock"
 _REGION_NAME = re.compile(rf"{_PREFIX}(?P<owner>[0-9a-f]{{32}})-\d+")
-_IS_DOWN = ("StatusCode.UNAVAILABLE", "StatusCode.DEADLINE_EXCEEDED", "503")
 
 logger = logging.getLogger("rfm_client")
 
@@ -151,7 +151,7 @@ class SharedMemory:
             return await self._new_region(max(MIN_REGION_BYTES, 1 << (byte_size - 1).bit_length()))
         except InferenceServerException as error:
             reason = error.message() or "no reason given"
-            if str(error.status()) in _IS_DOWN and "restricted" not in reason:
+            if str(error.status()) in (*triton.UNAVAILABLE, *triton.OUT_OF_TIME) and triton.RESTRICTED not in reason:
                 raise
         except _LocalError as error:
             reason = str(error)
