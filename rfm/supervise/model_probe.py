@@ -8,6 +8,7 @@ model has finished nobody's request for some time either.
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -66,15 +67,14 @@ class ModelProbe:
         self._known: Event | None = None
         self._probe: Future[Reply] | None = None
         self._body: bytes | None = None
-        self._due_s = 0.0
+        self._due_s = time.monotonic()
         self._waiting_since_s: float | None = None
         self._stats: Future[list[int]] | None = None
         self._successes: list[int] | None = None  # requests that each version has answered
-        self._last_success_s = 0.0  # when they were last seen to grow
+        self._last_success_s = -math.inf  # when they were last seen to grow
         self._has_stats = False  # else Triton gives no answer; the model may
         self._took_s: deque[float] = deque(maxlen=_KEPT)
-        self._num_failures = 0
-        self._has_succeeded = False
+        self._num_failures: int | None = None  # in a row; None: it has never answered as it should
 
     def look(self) -> Event | None:
         """What is known of the model now; None: nothing yet. Sends the next probe when it is due."""
@@ -147,11 +147,12 @@ class ModelProbe:
         if reply.status == HTTPStatus.SERVICE_UNAVAILABLE:
             return None  # its queue is full, or it was not its turn in time
         if not failed:
-            self._num_failures, self._has_succeeded = 0, True
+            self._num_failures = 0
             return Event.ANSWERED
-        self._num_failures += 1  # it answers; blank frames need not give a readable answer
-        is_broken = self._has_succeeded and self._num_failures >= BROKEN_COUNT
-        return Event.BROKEN if is_broken else Event.ANSWERED
+        if self._num_failures is None:
+            return Event.ANSWERED  # it answers; blank frames need not give a readable answer
+        self._num_failures += 1
+        return Event.BROKEN if self._num_failures >= BROKEN_COUNT else Event.ANSWERED
 
     def _request(self) -> bytes:
         config = self._http.get_json(f"/v2/models/{self._model}/config")

@@ -23,9 +23,7 @@ class Reload:
     was_hung: its processes are killed for what they are working on
     """
 
-    def __init__(
-        self, model: str, server: TritonServer, config: Config, *, is_out: bool = False, was_hung: bool = False
-    ) -> None:
+    def __init__(self, model: str, server: TritonServer, config: Config, *, is_out: bool, was_hung: bool) -> None:
         self._model = model
         self._server = server
         self._config = config

@@ -85,7 +85,7 @@ class ServedModel:
 
     def restore(self, config: Config) -> None:
         """Loads it into a Triton that was started again."""
-        self._heal(Event.LOST, "tritonserver was started again", config, is_out=True)
+        self._heal(Event.LOST, "tritonserver was started again", config)
 
     def note_ready(self, asked_s: float) -> None:
         """Takes in that Triton called it ready at ``asked_s``: if it is unloaded, somebody may have loaded it."""
@@ -108,7 +108,7 @@ class ServedModel:
         if event in FAULTS:
             why = died or event.value
             self._status.record_probe(self.name, is_ok=False)
-            self._heal(event, why, config, was_hung=event is Event.HUNG)
+            self._heal(event, why, config)
             return why
         if event is not None:
             self._feed(event)
@@ -124,8 +124,9 @@ class ServedModel:
         self._status.record_probe(self.name, is_ok=event is Event.ANSWERED)
         return event
 
-    def _heal(self, event: Event, why: str, config: Config, *, is_out: bool = False, was_hung: bool = False) -> None:
+    def _heal(self, event: Event, why: str, config: Config) -> None:
         self._why, self._trouble = why, ""
+        is_out, was_hung = event is Event.LOST, event is Event.HUNG
         self._reload = Reload(self.name, self._server, config, is_out=is_out, was_hung=was_hung)
         self._feed(event)
         self._go_on()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from types import SimpleNamespace
@@ -14,7 +15,7 @@ from clock import Clock
 from rfm.supervise import back_off, model_probe, reload, served_model
 from rfm.supervise.http import Http
 from rfm.supervise.lifecycle import Event, State
-from rfm.supervise.model_probe import ModelProbe
+from rfm.supervise.model_probe import ModelProbe, can_be_probed
 from rfm.supervise.process import Endpoints
 from rfm.supervise.repository_api import ModelVersion, RepositoryApiError
 from rfm.supervise.served_model import RETRY_S, ServedModel
@@ -161,7 +162,7 @@ def test_a_fault_is_healed_at_once(bench: Bench, fault: Event) -> None:
     assert bench.look(fault) is None  # of the old processes
     assert (bench.model.state, bench.buried, bench.renewed) == (State.NEW, bench.stubs, 1)
     assert [stub.is_alive for stub in bench.stubs] == [False]
-    assert bench.clock.now_s == pytest.approx(reload.DRAIN_S)  # they had this time
+    assert bench.clock.now_s == pytest.approx(2.0)  # they had this time
     # What a process worked on is to blame if it hung, and not if it was killed for another's fault.
     assert bench.stubs[0].is_blamed is (fault is Event.HUNG)
 
@@ -225,6 +226,12 @@ def test_what_dies_again_and_again_is_taken_out_and_loaded_by_somebody(bench: Be
     assert bench.triton.asked[-1] == "unload"
 
 
+def test_the_version_that_is_served_is_loaded_and_not_what_was_known(bench: Bench) -> None:
+    bench.triton.be("READY", version=3)
+    bench.look(died="its process is dead")
+    assert bench.triton.asked == ["unload", "load 3"]
+
+
 def test_what_was_served_is_loaded_also_where_it_cannot_be_read_any_more(bench: Bench) -> None:
     bench.triton.be("UNAVAILABLE", "its process is dead")
     bench.look(died="its process is dead")
@@ -284,21 +291,25 @@ class Answers:
 
     def __init__(self) -> None:
         self.next: tuple[int, str] | None = (200, "{}")
-        self.success: list[int] | None = [0]
+        self.success: list[dict[str, int]] | None = [{}]
         self.sent: list[bytes] = []
+        self.timeouts_s: set[float] = set()
+        self.got: list[str] = []
 
     def request(self, method: str, path: str, timeout_s: float, body: bytes) -> tuple[int, str]:
         self.sent.append(body)
+        self.timeouts_s.add(timeout_s)
         if self.next is None:
             raise TimeoutError
         return self.next
 
     def get_json(self, path: str) -> Any:
+        self.got.append(path.rpartition("/")[2])
         if path.endswith("/stats"):
             if self.success is None:
                 raise TimeoutError
-            return {"model_stats": [{"inference_stats": {"success": {"count": count}}} for count in self.success]}
-        inputs = [{"name": "num_frames", "dims": [2]}, {"name": "frames", "dims": [-1, -1, -1, 3]}]
+            return {"model_stats": [{"inference_stats": {"success": success}} for success in self.success]}
+        inputs = [{"name": "num_frames", "dims": [2]}, {"name": "task", "dims": [1]}]
         return {"input": inputs, "output": [{"name": "progress"}, {"name": "success"}]}
 
 
@@ -311,11 +322,13 @@ class Prober:
         self.observed: list[float] = []
         monkeypatch.setattr(model_probe, "time", self.clock)
         monkeypatch.setattr(model_probe, "in_background", self.at_once)
-        self.took_s = 0.0
+        self.has_stats = True  # else that they never come
         self.probe = ModelProbe(self.http, MODEL, 2.0, 30.0, self.observed.append)  # type: ignore[arg-type]
 
-    def at_once(self, _: str, call: Callable[[], Any]) -> Future[Any]:
+    def at_once(self, name: str, call: Callable[[], Any]) -> Future[Any]:
         future: Future[Any] = Future()
+        if "stats" in name and not self.has_stats:
+            return future
         try:
             future.set_result(call())
         except TimeoutError as error:
@@ -381,15 +394,85 @@ def test_who_answers_others_is_not_late(prober: Prober) -> None:
     prober.http.next = None
     prober.after(2.0)
     for number in range(40):
-        prober.http.success = [number]
+        prober.http.success = [{"count": number}]
         assert prober.after(2.0) in ({Event.ANSWERED} if number else {Event.ANSWERED, Event.LATE})
     assert prober.after(2.6) is Event.LATE
 
 
-def test_a_triton_that_says_nothing_of_a_model_leaves_it_late(prober: Prober) -> None:
-    prober.http.next = prober.http.success = None
+def test_the_first_request_that_a_model_answers_counts(prober: Prober) -> None:
+    prober.http.next = None
     prober.after(0.0)
+    assert prober.after(2.6) is Event.LATE
+    prober.http.success = [{"count": 1}]
+    prober.after(0.1)
+    assert prober.after(2.5) is None  # nothing is known of it, but that it answers somebody
+
+
+@pytest.mark.parametrize("has_stats", [True, False], ids=["they cannot be had", "they do not come"])
+@pytest.mark.parametrize("first", [None, (200, "{}")], ids=["never answered", "answered once"])
+def test_a_model_does_not_hang_as_long_as_triton_gives_no_statistics(
+    prober: Prober, first: tuple[int, str] | None, has_stats: bool
+) -> None:
+    prober.http.next, prober.http.success, prober.has_stats = first, None, has_stats
+    prober.after(0.0)
+    prober.http.next = None
+    prober.after(2.0)
     assert prober.after(100.0) is Event.LATE
+
+
+def test_statistics_are_only_asked_of_a_model_that_is_half_late(prober: Prober) -> None:
+    prober.http.next = None
+    prober.after(0.0)
+    prober.after(model_probe.LATE_S / 2)
+    assert "stats" not in prober.http.got
+    prober.after(0.01)
+    assert "stats" in prober.http.got
+
+
+def test_a_model_that_has_never_answered_is_late_as_any(prober: Prober) -> None:
+    prober.http.next = None
+    assert prober.after(0.0) is None
+    assert prober.after(2.5) is None
+    assert prober.after(0.01) is Event.LATE
+    assert len(prober.http.sent) == 2  # and is asked again all the same
+    assert prober.http.timeouts_s == {60.0}
+
+
+def test_a_probe_is_a_small_request_that_is_made_once(prober: Prober) -> None:
+    prober.after(0.0)
+    prober.after(2.0)
+    assert prober.http.got == ["config"]
+    first, second = prober.http.sent
+    assert first == second
+    assert json.loads(first)["outputs"] == [{"name": "progress"}]
+
+
+@pytest.mark.parametrize("num_fast", [19, 20])
+def test_who_was_slow_of_late_may_be_three_times_as_slow(prober: Prober, num_fast: int) -> None:
+    ask = prober.http.request
+
+    def slow(*words: Any) -> tuple[int, str]:
+        prober.clock.now_s += 1.0
+        return ask(*words)
+
+    prober.http.request = slow  # type: ignore[method-assign]
+    prober.after(0.0)
+    prober.http.request = ask  # type: ignore[method-assign]
+    for _ in range(num_fast):
+        prober.after(10.0)
+    assert len(prober.observed) == 1 + num_fast
+    prober.http.next = None
+    prober.after(10.0)
+    assert prober.after(2.9) is (Event.ANSWERED if num_fast == 19 else Event.LATE)  # the 20 last answers count
+    assert prober.after(0.11) is Event.LATE
+
+
+@pytest.mark.parametrize(
+    ("backend", "tensor", "is_ours"),
+    [("python", "num_frames", True), ("python", "INPUT0", False), ("onnxruntime", "num_frames", False)],
+)
+def test_only_models_of_ours_are_probed(backend: str, tensor: str, is_ours: bool) -> None:
+    assert can_be_probed({"backend": backend, "input": [{"name": tensor}]}) is is_ours
 
 
 def test_probes_take_a_tenth_of_a_model_s_time_at_most(prober: Prober) -> None:
