@@ -61,7 +61,7 @@ class Origin:
 
     @property
     def parameters(self) -> dict[str, str]:
-        """By name."""
+        """Where the checkpoint is from, as parameters of config.pbtxt by name."""
         of_run = {RUN_CONFIG_PARAMETER: self.run_config} if self.run_config else {}
         return {SOURCE_PARAMETER: self.source, REVISION_PARAMETER: self.revision, **of_run}
 

@@ -50,7 +50,7 @@ class State:
         self._stalled: dict[str, _Stalled] = {}
 
     async def gpu_status(self) -> schema.GpuStatus:
-        """Raises ServerError."""
+        """The answer of ``/gpu_status``, from Triton's metrics. Raises ServerError."""
         status = await asyncio.to_thread(
             read_status,
             self._url,
@@ -76,7 +76,7 @@ class State:
         return schema.Health(status="healthy", available_gpus=devices.available_gpus, total_gpus=devices.total_gpus)
 
     async def model_info(self) -> schema.ModelInformation:
-        """Raises ServerError."""
+        """The answer of ``/model_info``, from the model's configuration. Raises ServerError."""
         deadline = Deadline(STATUS_TIMEOUT_S)
         info = (await self._infos(deadline))[0]
         parts = info.network.get("parameters", {})

@@ -40,7 +40,7 @@ class Stub:
 
     @property
     def serves(self) -> tuple[str, int]:
-        """Model and version."""
+        """Name and version of the model that this process runs."""
         return self.model, self.version
 
     @property
@@ -128,7 +128,7 @@ class StubWatch:
 
     @property
     def all(self) -> list[Stub]:
-        """All that are known."""
+        """All processes of models that are known now."""
         return list(self._stubs)
 
     def bury(self, stubs: Iterable[Stub]) -> None:

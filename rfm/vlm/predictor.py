@@ -39,7 +39,7 @@ class VlmPredictor:
         return rows
 
     def num_tokens(self, row: VlmRow) -> int:
-        """Tokens of the conversation."""
+        """Number of tokens of the row's conversation."""
         return row.num_tokens
 
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
@@ -53,7 +53,7 @@ class VlmPredictor:
 
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch) -> list[RowScores | RewardError]:
-        """One forward pass."""
+        """The scores of each row of the batch, or why it has none, from one forward pass."""
         output = self.network(batch.to(self.device, self._dtype))
         scores = frame_scores(output.progress, output.success)
         preference = output.preference.sigmoid().float().tolist()

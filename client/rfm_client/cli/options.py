@@ -103,7 +103,7 @@ class OneLineCommand(TyperCommand):
         return super().parse_args(ctx, completed)
 
     def invoke(self, ctx: Any) -> Any:
-        """Runs the command."""
+        """Runs the command, and reports an error on one line."""
         with told_on_one_line():
             return super().invoke(ctx)
 

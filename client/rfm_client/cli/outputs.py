@@ -30,12 +30,12 @@ def write_json(target: str, document: Mapping[str, Any]) -> None:
 
 
 def origin(server: Server) -> dict[str, Any]:
-    """Where scores come from."""
+    """URLs of the servers and name of the model that gave the scores."""
     return {"servers": server.urls, "model": server.model}
 
 
 def score_document(server: Server, question: Question, outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """What ``score --json`` writes."""
+    """The JSON document that ``score --json`` writes."""
     asked = {"task": question.task, "fps": question.fps, "frame_steps": question.frame_steps}
     return {**origin(server), **asked, "videos": [_outcome(outcome) for outcome in outcomes]}
 
@@ -50,7 +50,7 @@ def comparison_document(server: Server, question: Question, comparison: Comparis
 
 
 def samples_document(server: Server, kind: str, outcomes: Sequence[Result | RewardError]) -> dict[str, Any]:
-    """What ``sample --json`` writes."""
+    """The JSON document that ``sample --json`` writes."""
     samples = [
         _error(outcome, str(outcome)) if isinstance(outcome, RewardError) else result_document(outcome)
         for outcome in outcomes
@@ -83,7 +83,7 @@ def frame_document(scores: FrameScores, times_s: Times | None) -> dict[str, Any]
 
 
 def status_document(statuses: Sequence[ServerStatus]) -> dict[str, Any]:
-    """What ``status --json`` writes."""
+    """The JSON document that ``status --json`` writes."""
     servers = []
     for status in statuses:
         models = [

@@ -84,7 +84,7 @@ class Scored:
     took_s: float
 
     def row(self) -> tuple[str, ...]:
-        """Its row in ``scored_table``."""
+        """The row of this source in ``scored_table``."""
         progress, success = self.result.progress, self.result.success
         frames = str(len(progress)) if len(progress) == self.num_frames else f"{len(progress)} of {self.num_frames}"
         seconds = "-" if self.times_s is None else f"{self.times_s[-1]:.1f}"
@@ -119,7 +119,7 @@ class Comparison:
         return (self.first, self.result.first, preference), (self.second, self.result.second, 1 - preference)
 
     def table(self) -> Table:
-        """One row a source."""
+        """A table of the two sources, one row for each."""
         rows = [
             (
                 source.name,
@@ -167,7 +167,7 @@ def compare(server: Server, names: tuple[str, str], question: Question) -> Compa
 
 
 def scored_table(scored: Sequence[Scored]) -> Table:
-    """One row a source."""
+    """A table of the scored sources, one row for each."""
     columns = ("video", "last progress", "last success", "frames", "last at s", "took s", "version")
     return table("", columns, [outcome.row() for outcome in scored])
 

@@ -75,7 +75,7 @@ class Trajectory:
 
     @property
     def num_frames(self) -> int:
-        """T."""
+        """T, the number of frames."""
         return int(self.positions.shape[0])
 
 

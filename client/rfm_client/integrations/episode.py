@@ -155,7 +155,7 @@ class Episode:
 
     @property
     def step(self) -> int:
-        """Steps since the reset."""
+        """Number of steps since the reset."""
         return len(self._frames) - 1
 
     @property
@@ -165,7 +165,7 @@ class Episode:
 
     @property
     def num_pending(self) -> int:
-        """Questions without an answer."""
+        """Number of requests that have no answer yet."""
         return len(self._pending)
 
     def add(self, frame: Any) -> None:

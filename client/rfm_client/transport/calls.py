@@ -84,7 +84,7 @@ class Transport(Protocol):
         """Whether the server answers and ``model`` is ready."""
 
     async def close(self) -> None:
-        """Closes the connection."""
+        """Closes the connection to the server."""
 
 
 def connect(

@@ -60,7 +60,7 @@ class Connection:
             self._close_if_unused()
 
     def hear(self) -> None:
-        """Something has come."""
+        """Records that the server has just sent something."""
         self._silent_since_s = None
 
     @property

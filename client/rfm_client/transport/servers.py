@@ -104,7 +104,7 @@ class Servers:
                 probe.cancel()
 
     async def close(self) -> None:
-        """Closes all connections."""
+        """Closes the connections to all servers."""
         self._retry = False
         if self._looking_up is not None:
             self._looking_up.cancel()
