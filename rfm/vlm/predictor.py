@@ -58,7 +58,7 @@ class VlmPredictor:
         scores = frame_scores(output.progress, output.success)
         preference = output.preference.sigmoid().float().tolist()
         similarity = [] if output.similarity is None else output.similarity.float().tolist()
-        of_rows, read, asked = [], 0, 0
+        of_rows, read, num_queries = [], 0, 0
         for row in rows:
             frames = []
             for spans, num_frames in zip(row.spans, row.num_frames, strict=True):
@@ -66,8 +66,8 @@ class VlmPredictor:
                 read += len(spans)
             query = None
             if row.query is not None:
-                query = (similarity if row.is_similarity else preference)[asked]
-                asked += 1
+                query = (similarity if row.is_similarity else preference)[num_queries]
+                num_queries += 1
             of_rows.append(RowScores(frames, query))
         return checked(of_rows)
 

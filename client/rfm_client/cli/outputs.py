@@ -36,8 +36,8 @@ def origin(server: Server) -> dict[str, Any]:
 
 def score_document(server: Server, question: Question, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """The JSON document that ``score --json`` writes."""
-    asked = {"task": question.task, "fps": question.fps, "frame_steps": question.frame_steps}
-    return {**origin(server), **asked, "videos": [_outcome(outcome) for outcome in outcomes]}
+    parameters = {"task": question.task, "fps": question.fps, "frame_steps": question.frame_steps}
+    return {**origin(server), **parameters, "videos": [_outcome(outcome) for outcome in outcomes]}
 
 
 def comparison_document(server: Server, question: Question, comparison: Comparison) -> dict[str, Any]:
@@ -75,8 +75,8 @@ def frame_document(scores: FrameScores, times_s: Times | None) -> dict[str, Any]
     """Scores of each frame; frame_indices among the frames that were read."""
     indices = np.arange(len(scores.progress)) if scores.frame_indices is None else scores.frame_indices
     return {
-        "progress": _told(scores.progress),
-        "success": _told(scores.success),
+        "progress": _or_null(scores.progress),
+        "success": _or_null(scores.success),
         "frame_indices": indices.tolist(),
         "frame_times_s": None if times_s is None else times_s.tolist(),
     }
@@ -122,6 +122,6 @@ def _error(error: Exception, message: str) -> dict[str, Any]:
     return {"error": message, "error_type": type(error).__name__}
 
 
-def _told(scores: npt.NDArray[np.float32]) -> list[float] | None:
+def _or_null(scores: npt.NDArray[np.float32]) -> list[float] | None:
     """Each as the float64 that is equal to it; None if the checkpoint does not tell them."""
     return None if np.isnan(scores).all() else scores.tolist()

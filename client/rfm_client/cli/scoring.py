@@ -163,7 +163,7 @@ def compare(server: Server, names: tuple[str, str], question: Question) -> Compa
     with server.connected() as client:
         first, second = (Source.read(name, question) for name in names)
         sample = PreferenceSample(first.trajectory, second.trajectory)
-        return Comparison(first, second, cast(PreferenceResult, _ask(client, sample, question)))
+        return Comparison(first, second, cast(PreferenceResult, _evaluate(client, sample, question)))
 
 
 def scored_table(scored: Sequence[Scored]) -> Table:
@@ -193,7 +193,7 @@ def _score(client: RewardClient, name: str, question: Question) -> Outcome:
     started_s = time.monotonic()
     try:
         source = Source.read(name, question)
-        result = cast(ProgressResult, _ask(client, ProgressSample(source.trajectory), question))
+        result = cast(ProgressResult, _evaluate(client, ProgressSample(source.trajectory), question))
     except ImportError as error:
         return Failed(name, error, missing_package(error))
     except (RewardError, OSError) as error:
@@ -208,17 +208,17 @@ def _score(client: RewardClient, name: str, question: Question) -> Outcome:
     )
 
 
-def _ask(client: RewardClient, sample: Sample, question: Question) -> Result:
+def _evaluate(client: RewardClient, sample: Sample, question: Question) -> Result:
     """Its frames are left out here rather than by the client, which knows of no other limit than the checkpoint's."""
     info = client.model_info(frames=sample.trajectories[0].frames is not None)
     dense = question.frame_steps > 0  # then the server samples each prefix
     limits = (question.max_frames, info.max_frames if question.subsample and not dense else None)
     limit = min((frames for frames in limits if frames is not None), default=None)
     fit = fitted(sample, replace(info, max_frames=limit), subsample=True, resize=question.resize)
-    asked = fit.sample
-    if isinstance(asked, ProgressSample):
-        asked = replace(asked, frame_steps=question.frame_steps)
-    return with_frame_indices(client.evaluate([asked])[0], fit.frame_indices)
+    sent = fit.sample
+    if isinstance(sent, ProgressSample):
+        sent = replace(sent, frame_steps=question.frame_steps)
+    return with_frame_indices(client.evaluate([sent])[0], fit.frame_indices)
 
 
 @contextmanager

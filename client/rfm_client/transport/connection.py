@@ -59,7 +59,7 @@ class Connection:
             self._num_calls -= 1
             self._close_if_unused()
 
-    def hear(self) -> None:
+    def record_answer(self) -> None:
         """Records that the server has just sent something."""
         self._silent_since_s = None
 
