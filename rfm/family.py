@@ -78,7 +78,7 @@ class FrameEncoders(Protocol):
 
     @classmethod
     def load(cls, folder: Path) -> FrameEncoders:
-        """Those that ``save`` wrote."""
+        """The encoders that ``save`` wrote into ``folder``."""
 
     @classmethod
     def describe(cls, folder: Path) -> EncodersDescription:
@@ -92,7 +92,7 @@ class FrameEncoders(Protocol):
         """Writes them into a folder that may be there, so that ``load`` needs no network."""
 
     def to(self, device: torch.device) -> FrameEncoders:
-        """Moves them to ``device``."""
+        """Moves the encoders to ``device``, and returns them."""
 
     def encode(self, samples: Sequence[Footage], execution: Execution) -> list[Trajectory | RewardError]:
         """The embeddings of each sample's frames, one trajectory after the other, and task, or why there are none.
@@ -102,7 +102,7 @@ class FrameEncoders(Protocol):
 
 
 class Checkpoint(Protocol):
-    """A checkpoint in memory."""
+    """A checkpoint in memory, with its weights."""
 
     @property
     def config(self) -> Any:

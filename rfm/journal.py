@@ -97,7 +97,7 @@ class Journal:
                 self._memory[place : place + DIGEST_BYTES] = NO_DIGEST
 
     def close(self) -> None:
-        """Removes the file."""
+        """Unmaps the journal and removes its file."""
         self._memory.close()
         self.file.unlink(missing_ok=True)
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 from torch import Tensor
 
 from rfm.layers.heads import progress_from_logits
@@ -69,11 +70,11 @@ def frame_scores(progress_logits: Tensor, success_logits: Tensor) -> FrameScores
     )
 
 
-def part_of(scores: FrameScores, index: object) -> FrameScores:
+def part_of(scores: FrameScores, index: slice | npt.NDArray[np.intp]) -> FrameScores:
     """The scores at ``index`` of each array."""
     logits = scores.progress_logits
     return FrameScores(
-        progress=scores.progress[index],  # type: ignore[call-overload]
-        success=scores.success[index],  # type: ignore[call-overload]
-        progress_logits=None if logits is None else logits[index],  # type: ignore[call-overload]
+        progress=scores.progress[index],
+        success=scores.success[index],
+        progress_logits=None if logits is None else logits[index],
     )

@@ -87,7 +87,7 @@ class CallOptions(TypedDict, total=False):
 
 
 @dataclass(frozen=True)
-class _Asking:
+class _Call:
     """What the requests of one call share. request_ids: one for each"""
 
     deadline: Deadline
@@ -230,29 +230,29 @@ class AsyncRewardClient:
 
     async def _outcomes(self, samples: Sequence[Sample], options: CallOptions) -> list[Result | RewardError]:
         _check_known(options, CallOptions)
-        asking = _Asking(
+        call = _Call(
             self._deadline(options.get("timeout_s")), _outputs(options), _request_ids(options.get("request_id"))
         )
-        deadline = asking.deadline
+        deadline = call.deadline
         fits, outcomes = await self._fitted(samples, options, deadline)
         sent = {index: fit.sample for index, fit in fits.items()}
 
-        async def ask_group(model: str, group: Sequence[int]) -> None:
+        async def request_group(model: str, group: Sequence[int]) -> None:
             try:
                 limit = (await self._model_info(model, deadline)).max_batch_size if len(group) > 1 else 1
             except RewardError as error:
                 outcomes.update(zip(group, _for_each(error, len(group)), strict=True))
                 return
-            await _together([ask_part(model, part) for part in parts(sent, group, limit)])
+            await _together([request_part(model, part) for part in parts(sent, group, limit)])
 
-        async def ask_part(model: str, part: Sequence[int]) -> None:
-            answers = await self._ask(model, [sent[index] for index in part], asking)
+        async def request_part(model: str, part: Sequence[int]) -> None:
+            answers = await self._request(model, [sent[index] for index in part], call)
             for index, answer in zip(part, answers, strict=True):
                 outcomes[index] = (
                     answer if isinstance(answer, RewardError) else with_frame_indices(answer, fits[index].frame_indices)
                 )
 
-        await _together([ask_group(model, group) for model, group in groups(sent, self._model)])
+        await _together([request_group(model, group) for model, group in groups(sent, self._model)])
         return [outcomes[index] for index in range(len(samples))]
 
     async def _fitted(
@@ -275,14 +275,14 @@ class AsyncRewardClient:
                 failed[index] = error
         return fits, failed
 
-    async def _ask(self, model: str, samples: Sequence[Sample], asking: _Asking) -> Sequence[Result | RewardError]:
+    async def _request(self, model: str, samples: Sequence[Sample], call: _Call) -> Sequence[Result | RewardError]:
         """One request. It fails whole if one sample cannot be scored; then each sample is asked about alone.
 
         A request that is refused because it has ended its process is not taken apart: all its samples fail.
         """
-        request_id = next(asking.request_ids)
+        request_id = next(call.request_ids)
         try:
-            answer = await self._infer(model, samples, asking, request_id)
+            answer = await self._infer(model, samples, call, request_id)
             return wire.decode_results(answer.tensors, samples, answer.model_version)
         except (InvalidSampleError, InferenceFailedError) as error:
             error.request_id = request_id
@@ -292,16 +292,16 @@ class AsyncRewardClient:
                 return _for_each(error, len(samples))  # alone, the one that is would end two more processes
         except RewardError as error:
             return _for_each(error, len(samples))
-        alone = await asyncio.gather(*(self._ask(model, [sample], asking) for sample in samples))
+        alone = await asyncio.gather(*(self._request(model, [sample], call) for sample in samples))
         return [outcome for (outcome,) in alone]
 
-    async def _infer(self, model: str, samples: Sequence[Sample], asking: _Asking, request_id: str) -> Answer:
+    async def _infer(self, model: str, samples: Sequence[Sample], call: _Call, request_id: str) -> Answer:
         num_bytes = padded_bytes(samples)
         async with self._in_flight.room(
-            num_bytes, asking.deadline
+            num_bytes, call.deadline
         ):  # arrays are made in turn, so that they do not pile up
             tensors = await off_loop(num_bytes, wire.encode_samples, samples)
-            answer = await self._servers.infer(model, tensors, asking.outputs, asking.deadline, request_id=request_id)
+            answer = await self._servers.infer(model, tensors, call.outputs, call.deadline, request_id=request_id)
         known = self._model_infos.get(model)
         if known is not None and known.versions and answer.model_version not in known.versions:
             del self._model_infos[model]

@@ -143,8 +143,8 @@ def read_status(
     """
     scheme, address = split_url(url)
     try:
-        ask = _ask_grpc if scheme.startswith("grpc") else _ask_http
-        server = ask(scheme, address, timeout_s, access or Access())
+        read_server = _read_over_grpc if scheme.startswith("grpc") else _read_over_http
+        server = read_server(scheme, address, timeout_s, access or Access())
         metrics_url = metrics_url or f"http://{address.rpartition(':')[0]}:{METRICS_PORT}/metrics"
         metrics = _read_metrics(metrics_url, timeout_s)
         models = tuple(_models(server, metrics))
@@ -175,7 +175,7 @@ class _Server:
     statistics: list[dict[str, Any]]
 
 
-def _ask_http(scheme: str, address: str, timeout_s: float, access: Access) -> _Server:
+def _read_over_http(scheme: str, address: str, timeout_s: float, access: Access) -> _Server:
     import tritonclient.http
 
     client = tritonclient.http.InferenceServerClient(
@@ -191,7 +191,7 @@ def _ask_http(scheme: str, address: str, timeout_s: float, access: Access) -> _S
         client.close()
 
 
-def _ask_grpc(scheme: str, address: str, timeout_s: float, access: Access) -> _Server:
+def _read_over_grpc(scheme: str, address: str, timeout_s: float, access: Access) -> _Server:
     import tritonclient.grpc
 
     client = tritonclient.grpc.InferenceServerClient(address, **access.grpc_options(scheme))
@@ -207,10 +207,10 @@ def _ask_grpc(scheme: str, address: str, timeout_s: float, access: Access) -> _S
         client.close()
 
 
-def _if_open(ask: Callable[[], Any]) -> Any:
+def _if_open(read: Callable[[], Any]) -> Any:
     """The answer; nothing where only a key would give it."""
     try:
-        return ask()
+        return read()
     except InferenceServerException as error:
         if triton.RESTRICTED not in (error.message() or ""):
             raise
@@ -276,12 +276,12 @@ def _read_metrics(url: str, timeout_s: float) -> _Metrics:
         devices=tuple(
             Device(
                 name,
-                told.get("utilization"),
-                told.get("memory_used_bytes"),
-                told.get("memory_total_bytes"),
+                values.get("utilization"),
+                values.get("memory_used_bytes"),
+                values.get("memory_total_bytes"),
                 _work(samples, name),
             )
-            for name, told in devices.items()
+            for name, values in devices.items()
         ),
         pending={
             (sample.labels["model"], sample.labels["version"]): int(sample.value)

@@ -27,5 +27,5 @@ def score_video(endpoints: Endpoints, video: Path, task: str, fps: float, pictur
 
 
 def show_metrics(endpoints: Endpoints, console: Console) -> None:
-    """What Triton counted meanwhile."""
+    """Prints what Triton counted while the demo ran."""
     console.print(*status_tables(read_status(endpoints.http_url, metrics_url=endpoints.metrics_url)), sep="\n")

@@ -78,12 +78,12 @@ def previous_version(repository: Path, name: str, server: RepositoryApi) -> int:
 
 @dataclass(frozen=True)
 class Rollout:
-    """What is changed, on which server. tell: is told each step"""
+    """What is changed, on which server. report: is called with a line for each step"""
 
     repository: Path
     name: str
     server: RepositoryApi
-    tell: Callable[[str], None]
+    report: Callable[[str], None]
 
     def to(self, version: int) -> None:
         """Has ``version`` served, alone. Raises RolloutError, RepositoryApiError when nothing has been changed."""
@@ -105,8 +105,8 @@ class Rollout:
         except (RepositoryApiError, RewardError, OSError) as error:
             became = self._go_back(old, served)
             raise RolloutError(f"{self.name} version {version}: {error} ({became})") from error
-        except BaseException:  # told to stop
-            self.tell(self._go_back(old, served))
+        except BaseException:  # a signal to stop
+            self.report(self._go_back(old, served))
             raise
 
     def _switch(self, new: Configs, served: Mapping[str, Sequence[int]], version: int) -> None:
@@ -122,7 +122,7 @@ class Rollout:
 
     def _go_back(self, old: Configs, served: Mapping[str, Sequence[int]]) -> str:
         """What became of it, in words."""
-        self.tell("going back")
+        self.report("going back")
         ends_s = time.monotonic() + RETURN_S
         failed: dict[str, str | None] = dict.fromkeys(reversed(list(served)))  # the ensemble before what it names
         while True:
@@ -149,7 +149,7 @@ class Rollout:
 
     def _serve(self, config: pb.ModelConfig, versions: Sequence[int]) -> None:
         self._write(serving_versions(config, versions))
-        self.tell(f"{config.name}: loading {_words(versions)}")
+        self.report(f"{config.name}: loading {_words(versions)}")
         self.server.load(config.name)
 
     def _write(self, config: pb.ModelConfig) -> None:

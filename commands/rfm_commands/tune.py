@@ -55,7 +55,7 @@ class Sweep:
     """Trials on a copy of a repository, whose own files stay as they are.
 
     name: of its models; callers: at a time, with one sample each; seconds: of each measurement
-    tell: is told each measurement as it is made
+    report: is called with a line for each measurement
     """
 
     repository: Path
@@ -65,7 +65,7 @@ class Sweep:
     rounds: int = 3
     use_frames: bool = False
     tritonserver: Path | None = None
-    tell: Callable[[str], None] = print
+    report: Callable[[str], None] = print
 
     def best(self) -> Setting:
         """Instances and threads first, then the size of batches for the best of those.
@@ -98,7 +98,7 @@ class Sweep:
             for setting, of_setting in measured.items():
                 of_setting.append(self._measured(setting))
                 rate, p50_ms = of_setting[-1]
-                self.tell(f"round {number + 1}: {setting}: {rate:.0f} samples/s, one caller waits {p50_ms:.1f} ms")
+                self.report(f"round {number + 1}: {setting}: {rate:.0f} samples/s, one caller waits {p50_ms:.1f} ms")
         return [
             Trial(setting, *map(statistics.median, zip(*values, strict=True))) for setting, values in measured.items()
         ]
@@ -116,8 +116,8 @@ class Sweep:
                     toy = Toy(SampleKind.progress, NUM_SAMPLES, [min(frames, NUM_FRAMES)], self.use_frames, seed=0)
                     samples = toy.samples(client)
                     client.evaluate(samples)  # whatever is made at first use
-                alone = asyncio.run(_ask(url, self.name, samples, 1, self.seconds))
-                together = asyncio.run(_ask(url, self.name, samples, self.callers, self.seconds))
+                alone = asyncio.run(_measure_latencies(url, self.name, samples, 1, self.seconds))
+                together = asyncio.run(_measure_latencies(url, self.name, samples, self.callers, self.seconds))
         return len(together) / self.seconds, statistics.median(alone) * 1e3 if alone else math.inf
 
 
@@ -138,7 +138,9 @@ def write_setting(setting: Setting, file: Path, config: Path | None) -> None:
     file.write_text("# Measured by `rfm tune`.\n" + yaml.safe_dump(keys | asdict(setting), sort_keys=False))
 
 
-async def _ask(url: str, model: str, samples: Sequence[Sample], callers: int, seconds: float) -> list[float]:
+async def _measure_latencies(
+    url: str, model: str, samples: Sequence[Sample], callers: int, seconds: float
+) -> list[float]:
     """Latencies in seconds of what is answered within ``seconds``, once the client is connected.
 
     ``callers`` each ask about one sample after the other.
@@ -147,11 +149,11 @@ async def _ask(url: str, model: str, samples: Sequence[Sample], callers: int, se
 
     async def call(first: int, end_s: float) -> None:
         index = first
-        while (asked_s := time.perf_counter()) < end_s:
+        while (sent_s := time.perf_counter()) < end_s:
             await client.score(samples[index % len(samples)])
             answered_s = time.perf_counter()
             if answered_s <= end_s:
-                latencies_s.append(answered_s - asked_s)
+                latencies_s.append(answered_s - sent_s)
             index += callers
 
     async with AsyncRewardClient(url, model=model, max_in_flight=2 * callers) as client:

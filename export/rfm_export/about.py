@@ -26,7 +26,7 @@ from rfm_client.contract.model_info import (
     SOURCE_PARAMETER,
 )
 
-_TOLD_PARTS = 2  # of a path; all of it is nobody else's business
+_NAMED_PARTS = 2  # of a path; all of it is nobody else's business
 _SECRET = re.compile(r"(^|_)(token|secret|password|key)$", re.IGNORECASE)  # such as hub_token, wandb_api_key
 
 
@@ -50,24 +50,24 @@ class Origin:
         file = find_run_config(folder)
         run_config = "" if file is None else json.dumps(_public(read_run_config(file)))
         if str(source) and named.is_dir():
-            return cls("/".join(named.resolve().parts[-_TOLD_PARTS:]), "", run_config)
+            return cls("/".join(named.resolve().parts[-_NAMED_PARTS:]), "", run_config)
         return cls(str(source), folder.name, run_config)
 
     @classmethod
-    def told(cls, config: pb.ModelConfig) -> Origin:
-        """As an exported configuration tells it."""
+    def from_config(cls, config: pb.ModelConfig) -> Origin:
+        """The origin that an exported configuration names."""
         names = (SOURCE_PARAMETER, REVISION_PARAMETER, RUN_CONFIG_PARAMETER)
         return cls(*(config.parameters[name].string_value if name in config.parameters else "" for name in names))
 
     @property
     def parameters(self) -> dict[str, str]:
-        """By name."""
+        """Where the checkpoint is from, as parameters of config.pbtxt by name."""
         of_run = {RUN_CONFIG_PARAMETER: self.run_config} if self.run_config else {}
         return {SOURCE_PARAMETER: self.source, REVISION_PARAMETER: self.revision, **of_run}
 
 
 def about(checkpoint: Checkpoint, origin: Origin) -> dict[str, str]:
-    """Parameters by name, but for what tells the weights, which are to be written yet."""
+    """Parameters by name, without the digest of the weights: those are not written yet."""
     return {**origin.parameters, NETWORK_PARAMETER: json.dumps(_network(checkpoint))}
 
 
@@ -79,8 +79,8 @@ def about_encoders(encoders: EncodersDescription, of_scorer: Mapping[str, str]) 
     }
 
 
-def tell_weights(config: pb.ModelConfig, version: int, repository: Path) -> None:
-    """Sets the parameter that tells a version's weights in ``repository``: those of an ensemble's parts together."""
+def record_weights(config: pb.ModelConfig, version: int, repository: Path) -> None:
+    """Sets the digest of a version's weights in ``repository``; an ensemble has one of all its parts."""
     parts = [step.model_name for step in config.ensemble_scheduling.step] or [config.name]
     digest = weights_digest(repository / part / str(version) for part in parts)
     config.parameters[DIGEST_PARAMETER].string_value = digest

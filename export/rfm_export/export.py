@@ -20,7 +20,7 @@ from rfm.family import Checkpoint, Description, Family, FrameEncoders, Options
 from rfm.parameters import FAMILY_PARAMETER
 from rfm.version_folder import CHECKPOINT_FOLDER
 from rfm_client.contract.names import encoder_name, frames_name
-from rfm_export.about import Origin, about, tell_weights
+from rfm_export.about import Origin, about, record_weights
 from rfm_export.errors import ExportError
 from rfm_export.layout import GeneratedModel, Version, generated_models, scorer_name
 from rfm_export.publish import alone, next_version, publish, read_config, staging
@@ -140,7 +140,7 @@ def check(repository: Path, serve: ServeConfig) -> list[str]:
     checkpoint = family.load(folder, Options())
     encoders = repository / encoder_name(serve.name) / str(number)
     described = family.encoders.describe(encoders) if family.encoders is not None and encoders.exists() else None
-    version = _version(_Source(family, checkpoint, None, Origin.told(config)), serve, number)
+    version = _version(_Source(family, checkpoint, None, Origin.from_config(config)), serve, number)
     models = generated_models(checkpoint.description, described, version)
     differences = []
     for path, content in _generated(models, repository).items():
@@ -154,7 +154,7 @@ def check(repository: Path, serve: ServeConfig) -> list[str]:
 def _generated(models: Sequence[GeneratedModel], repository: Path) -> dict[str, bytes]:
     """Contents of the generated files by path in the repository, where the models' weights lie."""
     for model in models:
-        tell_weights(model.config, model.version, repository)
+        record_weights(model.config, model.version, repository)
     return {path: content for model in models for path, content in model.files().items()}
 
 

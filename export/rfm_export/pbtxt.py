@@ -107,7 +107,7 @@ def serving_versions(config: pb.ModelConfig, versions: Sequence[int]) -> pb.Mode
 
 
 def render(config: pb.ModelConfig) -> str:
-    """Text of config.pbtxt."""
+    """The text of config.pbtxt for this configuration."""
     return HEADER + str(text_format.MessageToString(config))
 
 

@@ -77,7 +77,7 @@ def staging(repository: Path, names: Sequence[str]) -> Iterator[Path]:
 
 
 def _models(repository: Path) -> list[Path]:
-    """Their folders."""
+    """The folders of all models in the repository, sorted."""
     return sorted(file.parent for file in repository.glob(f"[!.]*/{CONFIG_FILE}"))
 
 

@@ -158,7 +158,7 @@ def _guarded(settings: GatewaySettings, scorer: Scorer, state: State, metrics: M
 
     @router.get("/model_info", responses=_failures(502, 503, 504))
     async def model_info() -> schema.ModelInformation:
-        """Which checkpoint is served."""
+        """Which checkpoint the server serves."""
         return await state.model_info()
 
     @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})

@@ -131,7 +131,7 @@ class _Form(MultiPartParser):
         super().on_header_end()
 
     async def parse(self) -> FormData:
-        """Raises HTTPException."""
+        """The fields of the form. Raises HTTPException (400) for a body that is none."""
         try:
             return await super().parse()
         except MultiPartException as error:

@@ -173,9 +173,9 @@ def _check_width(where: str, array: Float32Array, width: int | None) -> None:
 
 def refused(errors: Mapping[int, InvalidSampleError]) -> RequestValidationError:
     """One error that tells of all samples that cannot be scored, each at its field as the caller named it."""
-    told: list[Any] = []
+    details: list[Any] = []
     for index, error in errors.items():
         where, _, message = error.message.partition(": ")
         path: list[str | int] = [int(word) if word.isdecimal() else _SIDES.get(word, word) for word in where.split(".")]
-        told += invalid(("samples", index, *path), message).errors()
-    return RequestValidationError(told)
+        details += invalid(("samples", index, *path), message).errors()
+    return RequestValidationError(details)

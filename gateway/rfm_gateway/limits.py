@@ -71,5 +71,5 @@ def with_limits(prefix: str = "") -> Callable[[Callable[..., None]], Callable[..
 
 
 def _option(name: str, kind: type, default: Any, metadata: Any) -> inspect.Parameter:
-    told = typer.Option(**metadata)
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, told])
+    option = typer.Option(**metadata)
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option])

@@ -39,7 +39,7 @@ class Memory:
             self._freed.set()
 
     async def reserve(self, share: Share, num_bytes: int, deadline: Deadline) -> None:
-        """As Share.reserve."""
+        """Waits until ``num_bytes`` are free for ``share``, as Share.reserve describes it."""
         num_bytes = min(num_bytes, self._most_bytes)  # what is too much for one is refused when it is taken
         try:
             async with timeout(deadline.remaining_s()), self._turn:  # first come, first served
@@ -52,7 +52,7 @@ class Memory:
             ) from None
 
     def take(self, share: Share, num_bytes: int) -> None:
-        """As Share.take."""
+        """Counts ``num_bytes`` as held by ``share``, as Share.take describes it."""
         with self._counting:
             more_bytes = max(num_bytes - share.reserved_bytes, 0)
             if share.held_bytes + more_bytes > self._most_bytes:

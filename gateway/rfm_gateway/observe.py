@@ -41,7 +41,7 @@ _BUCKETS_S = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0
 
 
 class Metrics:
-    """One gateway's."""
+    """The Prometheus metrics of one gateway."""
 
     def __init__(self) -> None:
         self._registry = CollectorRegistry()
@@ -65,7 +65,7 @@ class Metrics:
         self.waiting = Gauge("rfm_gateway_requests_waiting", "Evaluations not begun.", registry=self._registry)
 
     def text(self) -> bytes:
-        """As Prometheus scrapes it."""
+        """The metrics in the text format of Prometheus."""
         return generate_latest(self._registry)
 
 

@@ -229,7 +229,7 @@ class FieldError(BaseModel):
 
 
 class InvalidRequest(BaseModel):
-    """Answer 422."""
+    """Body of an answer with status 422."""
 
     detail: list[FieldError]
 
@@ -272,7 +272,7 @@ class Health(BaseModel):
 
 
 class ModelInformation(BaseModel):
-    """The served checkpoint."""
+    """What the gateway knows of the served checkpoint."""
 
     model_path: str | None = Field(description="Hub id, or name of the folder, that was exported.")
     model_version: str | None = Field(description="Version in the model repository.")

@@ -43,14 +43,14 @@ class State:
         self._metrics_url = metrics_url
         self._model = model
         self._access = access
-        self._asking = asyncio.Lock()
-        self._asked_s = -HEALTH_KEPT_S
+        self._refreshing = asyncio.Lock()
+        self._refreshed_s = -HEALTH_KEPT_S
         self._problem: str | None = None
         self._devices: schema.GpuStatus | None = None
         self._stalled: dict[str, _Stalled] = {}
 
     async def gpu_status(self) -> schema.GpuStatus:
-        """Raises ServerError."""
+        """The answer of ``/gpu_status``, from Triton's metrics. Raises ServerError."""
         status = await asyncio.to_thread(
             read_status,
             self._url,
@@ -62,12 +62,12 @@ class State:
 
     async def health(self) -> schema.Health:
         """Within HEALTH_TIMEOUT_S. Raises ServerUnavailableError with the reason when a model does not answer."""
-        async with self._asking:
-            if time.monotonic() - self._asked_s >= HEALTH_KEPT_S:
+        async with self._refreshing:
+            if time.monotonic() - self._refreshed_s >= HEALTH_KEPT_S:
                 deadline = Deadline(HEALTH_TIMEOUT_S)
-                self._problem = await self._ask_all(deadline)
+                self._problem = await self._probe_all(deadline)
                 self._devices = await self._read_devices(deadline) if self._problem is None else None
-                self._asked_s = time.monotonic()
+                self._refreshed_s = time.monotonic()
             problem, devices = self._problem, self._devices
         if problem is not None:
             raise ServerUnavailableError(problem)
@@ -76,7 +76,7 @@ class State:
         return schema.Health(status="healthy", available_gpus=devices.available_gpus, total_gpus=devices.total_gpus)
 
     async def model_info(self) -> schema.ModelInformation:
-        """Raises ServerError."""
+        """The answer of ``/model_info``, from the model's configuration. Raises ServerError."""
         deadline = Deadline(STATUS_TIMEOUT_S)
         info = (await self._infos(deadline))[0]
         parts = info.network.get("parameters", {})
@@ -120,7 +120,7 @@ class State:
             raise missing
         return infos
 
-    async def _ask_all(self, deadline: Deadline) -> str | None:
+    async def _probe_all(self, deadline: Deadline) -> str | None:
         """Asks every model for a score of next to nothing; the reason of the first that neither has one nor works."""
         try:
             infos = await self._infos(deadline)

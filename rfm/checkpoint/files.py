@@ -185,8 +185,8 @@ def check_keys(expected: Iterable[str], got: Iterable[str]) -> None:
     """Raises CheckpointError that lists the missing and the unexpected."""
     missing, unexpected = sorted(set(expected) - set(got)), sorted(set(got) - set(expected))
     if missing or unexpected:
-        told = [listed(names) if names else "none" for names in (missing, unexpected)]
-        raise CheckpointError(f"{WEIGHTS}: missing keys: {told[0]}; unexpected keys: {told[1]}")
+        named = [listed(names) if names else "none" for names in (missing, unexpected)]
+        raise CheckpointError(f"{WEIGHTS}: missing keys: {named[0]}; unexpected keys: {named[1]}")
 
 
 def _listing(folder: Path) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""numpy arrays as tensors."""
+"""Conversion of numpy arrays to tensors."""
 
 from __future__ import annotations
 

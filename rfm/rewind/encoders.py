@@ -81,11 +81,11 @@ class Encoders:
 
     @classmethod
     def load(cls, folder: Path) -> Encoders:
-        """Those that ``save`` wrote."""
+        """The encoders that ``save`` wrote into ``folder``."""
         return cls.from_pretrained(folder / IMAGE_ENCODER_FOLDER, folder / TEXT_ENCODER_FOLDER)
 
     def save(self, folder: Path) -> None:
-        """Writes both into ``folder``."""
+        """Writes the image and the text encoder into ``folder``."""
         self.save_pretrained(folder / IMAGE_ENCODER_FOLDER, folder / TEXT_ENCODER_FOLDER)
 
     @classmethod
@@ -108,12 +108,12 @@ class Encoders:
 
     @property
     def video_feature_dim(self) -> int:
-        """Dv."""
+        """Dv, the width of a frame's embedding."""
         return int(self.image_model.config.hidden_size)
 
     @property
     def text_feature_dim(self) -> int:
-        """Dt."""
+        """Dt, the width of a task's embedding."""
         return int(self.text_model.config.hidden_size)
 
     def encode(self, samples: Sequence[Footage], execution: Execution | None = None) -> list[Trajectory | RewardError]:

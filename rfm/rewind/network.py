@@ -229,7 +229,7 @@ class RewindTransformer(nn.Module):
             self.similarity_head = PredictionHead(width, 1)
 
     def forward(self, batch: RewindBatch) -> RewindOutput:
-        """Raw scores."""
+        """The raw scores of the batch: progress and success of each frame, and one score of each query."""
         hidden = self.transformer(self._tokens(batch), batch.packing, batch.read_at)
         num_frames, num_queries = len(batch.frame_at), len(batch.query_at)
         query = self._query_scores(hidden[num_frames : num_frames + num_queries], batch)

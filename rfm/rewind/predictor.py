@@ -30,11 +30,11 @@ class RewindPredictor:
         return self.collator.rows(sample)
 
     def num_tokens(self, row: Row) -> int:
-        """Tokens of the row."""
+        """Number of tokens that the row takes in the transformer."""
         return self.network.config.num_tokens(row.num_first, row.num_second)
 
     def collate(self, rows: Sequence[Row]) -> RewindBatch:
-        """Rows of any kinds."""
+        """One batch of rows, which may be of different kinds."""
         return self.collator.collate(rows)
 
     def occupancy(self, batch: RewindBatch) -> tuple[int, int]:
@@ -43,7 +43,7 @@ class RewindPredictor:
 
     @torch.inference_mode()
     def score(self, rows: Sequence[Row], batch: RewindBatch) -> list[RowScores | RewardError]:
-        """One forward pass."""
+        """The scores of each row of the batch, or why it has none, from one forward pass."""
         output = self.network(batch.to(self.device, self.dtype))
         frames = frame_scores(output.progress, output.success)
         logits, probabilities = output.query.float().tolist(), output.query.sigmoid().float().tolist()

@@ -29,7 +29,7 @@ class AdminKeyError(Exception):
 
 
 def new_key() -> str:
-    """One that nobody knows."""
+    """A new random key, as text that fits in a URL."""
     return secrets.token_urlsafe(_RANDOM_BYTES)
 
 
@@ -45,7 +45,7 @@ def take_key(file: Path | None, environment: MutableMapping[str, str]) -> str | 
 
 
 def restrictions(key: str) -> list[str]:
-    """Arguments of tritonserver."""
+    """Arguments of tritonserver that refuse administrative requests without ``key``."""
     return [
         f"--{option}={_RESTRICTED}:{HEADER}={key}" for option in ("http-restricted-api", "grpc-restricted-protocol")
     ]

@@ -57,7 +57,7 @@ class Claim:
         new_folder.rename(self.backends)
 
     def release(self) -> None:
-        """Removes all of it."""
+        """Removes the lock files and closes them."""
         _remove(self._lock)
         _remove(self.backends / _LOCK)
         for file in self.lock_files:

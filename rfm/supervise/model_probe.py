@@ -84,7 +84,7 @@ class ModelProbe:
             self._due_s = time.monotonic() + max(self._interval_s, min(self._took_s, default=0.0) / SHARE)
         if self._probe is None and time.monotonic() >= self._due_s:
             self._waiting_since_s = self._waiting_since_s or time.monotonic()
-            self._probe = in_background(f"rfm-probe-{self._model}", self._ask)
+            self._probe = in_background(f"rfm-probe-{self._model}", self._send_probe)
         if self._waiting_since_s is not None and time.monotonic() - self._waiting_since_s > LATE_S / 2:
             self._look_at_stats()
         return self._judged()
@@ -111,15 +111,15 @@ class ModelProbe:
                 self._successes, self._has_stats = successes, True
             self._stats = None
         if self._stats is None:
-            self._stats = in_background(f"rfm-stats-{self._model}", self._ask_stats)
+            self._stats = in_background(f"rfm-stats-{self._model}", self._read_stats)
 
-    def _ask_stats(self) -> list[int]:
-        """Runs in a thread of its own, and changes nothing."""
+    def _read_stats(self) -> list[int]:
+        """Answered requests of each version, as Triton counts them. Runs in a thread of its own."""
         versions = self._http.get_json(f"/v2/models/{self._model}/stats")["model_stats"]
         return [version["inference_stats"]["success"].get("count", 0) for version in versions]
 
-    def _ask(self) -> Reply:
-        """Runs in a thread of its own, and changes nothing."""
+    def _send_probe(self) -> Reply:
+        """The reply to one probe, and how long it took. Runs in a thread of its own."""
         started_s = time.monotonic()
         body = self._body or self._request()
         status, text = self._http.request("POST", f"/v2/models/{self._model}/infer", self._hang_s * 2, body)

@@ -62,22 +62,22 @@ class Endpoints:
 
     @property
     def http_url(self) -> str:
-        """For RewardClient, over HTTP."""
+        """URL at which RewardClient reaches the server over HTTP."""
         return f"http://{self.http_host}:{self.http_port}"
 
     @property
     def http_host(self) -> str:
-        """Where HTTP listens."""
+        """Listen address of the server's HTTP port."""
         return self.host if self.grpc_tls is None else DEFAULT_HOST
 
     @property
     def grpc_url(self) -> str:
-        """For RewardClient, over gRPC."""
+        """URL at which RewardClient reaches the server over gRPC."""
         return f"{'grpc' if self.grpc_tls is None else 'grpcs'}://{self.host}:{self.grpc_port}"
 
     @property
     def metrics_url(self) -> str:
-        """What Prometheus scrapes."""
+        """URL of the metrics that Prometheus scrapes."""
         return f"http://{self.host}:{self.metrics_port}/metrics"
 
     def check_free(self) -> None:

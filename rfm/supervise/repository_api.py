@@ -91,7 +91,7 @@ class RepositoryApi:
 
     def index(self) -> list[ModelVersion]:
         """Everything in the repository, by name and version."""
-        answer = self._ask(self._client.get_model_repository_index)
+        answer = self._request(self._client.get_model_repository_index)
         return versions_of(MessageToDict(entry) for entry in answer.models)
 
     def ready_versions(self, model: str) -> list[int]:
@@ -101,7 +101,7 @@ class RepositoryApi:
 
     def config(self, model: str, version: int) -> dict[str, Any]:
         """With which it was loaded."""
-        answer = self._ask(self._client.get_model_config, model, str(version))
+        answer = self._request(self._client.get_model_config, model, str(version))
         config: dict[str, Any] = MessageToDict(answer.config, preserving_proto_field_name=True)
         return config
 
@@ -111,11 +111,11 @@ class RepositoryApi:
         config: instead of the one in the model's file
         """
         instead = None if config is None else json.dumps(config)
-        self._ask(self._client.load_model, model, config=instead)
+        self._request(self._client.load_model, model, config=instead)
 
     def unload(self, model: str) -> None:
         """Has the server forget the model, after the requests that it is working on."""
-        self._ask(self._client.unload_model, model)
+        self._request(self._client.unload_model, model)
 
     def wait_gone(self, model: str, kept: Collection[int] = ()) -> None:
         """Returns when no version of the model but ``kept`` works on a request."""
@@ -133,7 +133,7 @@ class RepositoryApi:
         for name, array in inputs.items():
             tensors.append(tritonclient.grpc.InferInput(name, array.shape, np_to_triton_dtype(array.dtype)))
             tensors[-1].set_data_from_numpy(array)
-        answer = self._ask(
+        answer = self._request(
             self._client.infer,
             model,
             tensors,
@@ -143,7 +143,7 @@ class RepositoryApi:
         )
         return {name: answer.as_numpy(name) for name in outputs}
 
-    def _ask(self, call: Any, *arguments: Any, **options: Any) -> Any:
+    def _request(self, call: Any, *arguments: Any, **options: Any) -> Any:
         try:
             return call(*arguments, headers=self._headers, client_timeout=ANSWER_S, **options)
         except InferenceServerException as error:

@@ -99,7 +99,7 @@ class Served:
             return []
         if snapshot is not self._snapshot:
             self._snapshot = snapshot
-            self._stubs.update(snapshot.in_state(READY), snapshot.in_state(LOADING, UNLOADING), snapshot.asked_s)
+            self._stubs.update(snapshot.in_state(READY), snapshot.in_state(LOADING, UNLOADING), snapshot.requested_s)
             self._keep_up(snapshot)
         died = self._died()
         looks = [(name, model.look(died.get(name), self._configs[name])) for name, model in self._models.items()]
@@ -132,7 +132,7 @@ class Served:
             if name not in self._models and can_be_probed(config):
                 self._models[name] = self._new_model(name, config)
             if name in self._models and name in snapshot.ready:
-                self._models[name].note_ready(snapshot.asked_s)
+                self._models[name].note_ready(snapshot.requested_s)
         leaving = {name for name in self._configs if self._is_unloaded(name, snapshot)}
         for name in leaving & self._leaving:
             del self._configs[name]

@@ -87,12 +87,12 @@ class ServedModel:
         """Loads it into a Triton that was started again."""
         self._heal(Event.LOST, "tritonserver was started again", config)
 
-    def note_ready(self, asked_s: float) -> None:
-        """Takes in that Triton called it ready at ``asked_s``: if it is unloaded, somebody may have loaded it."""
+    def note_ready(self, requested_s: float) -> None:
+        """Takes in that Triton called it ready at ``requested_s``: if it is unloaded, somebody may have loaded it."""
         if self.is_ensemble:
             self._feed(Event.ANSWERED)
         out_since_s = None if self._reload is None else self._reload.out_since_s
-        if out_since_s is not None and asked_s > out_since_s:
+        if out_since_s is not None and requested_s > out_since_s:
             self._feed(Event.SEEN_READY)
 
     def look(self, died: str | None, config: Config) -> str | None:

@@ -31,12 +31,12 @@ class Status:
         self._reasons: Mapping[str, str] = {}
         self._probed: set[str] = set()  # models that have a probe
         self._registry = CollectorRegistry()
-        labelled = {"labelnames": ["model"], "registry": self._registry}
-        self._ready = Gauge("rfm_serve_ready", "1: the model is ready.", **labelled)  # type: ignore[arg-type]
+        labelled: dict[str, Any] = {"labelnames": ["model"], "registry": self._registry}
+        self._ready = Gauge("rfm_serve_ready", "1: the model is ready.", **labelled)
         self._reason = Gauge(
             "rfm_serve_not_ready", "1: the model is not ready, and why.", ["model", "reason"], registry=self._registry
         )
-        self._probe_ok = Gauge("rfm_serve_canary_ok", "1: the last health probe was answered.", **labelled)  # type: ignore[arg-type]
+        self._probe_ok = Gauge("rfm_serve_canary_ok", "1: the last health probe was answered.", **labelled)
         self.probe_seconds = Histogram(
             "rfm_serve_canary_seconds",
             "From a health probe to its answer.",
@@ -92,7 +92,7 @@ class Status:
         return is_ready, {"ready": is_ready, "models": models}
 
     def metrics(self) -> bytes:
-        """What Prometheus reads."""
+        """The metrics in the text format of Prometheus."""
         return generate_latest(self._registry)
 
 
@@ -108,7 +108,7 @@ class StatusServer:
         self._thread.start()
 
     def close(self) -> None:
-        """Ends the server."""
+        """Ends the HTTP server and its thread."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
@@ -175,6 +175,6 @@ def _handler(status: Status) -> type[BaseHTTPRequestHandler]:
             self.wfile.write(body)
 
         def log_message(self, *_: Any) -> None:
-            """Probes are no news."""
+            """Logs nothing: probes come every few seconds."""
 
     return Handler

@@ -40,7 +40,7 @@ class Stub:
 
     @property
     def serves(self) -> tuple[str, int]:
-        """Model and version."""
+        """Name and version of the model that this process runs."""
         return self.model, self.version
 
     @property
@@ -87,8 +87,10 @@ class StubWatch:
         self._buried: set[Stub] = set()
         self._since: dict[tuple[Stub, str], float] = {}  # stub and state: when it was first seen so
 
-    def update(self, ready: Collection[tuple[str, int]], going: Collection[tuple[str, int]], asked_s: float) -> None:
-        """Takes in which versions of models were ready at ``asked_s``, and which were on their way to or from that.
+    def update(
+        self, ready: Collection[tuple[str, int]], going: Collection[tuple[str, int]], requested_s: float
+    ) -> None:
+        """Takes in which versions of models were ready at ``requested_s``, and which were on their way to or from that.
 
         The stubs of a version that is ready have loaded. A version that is loaded once more stays ready meanwhile, so
         its new stubs have loaded when the old ones are gone.
@@ -97,7 +99,7 @@ class StubWatch:
         self._loaded &= self._stubs
         old = {stub.serves for stub in self._loaded}
         new = {stub for stub in self._stubs if stub.serves in ready and stub.serves not in old}
-        self._loaded |= {stub for stub in new if stub.started_s < asked_s}
+        self._loaded |= {stub for stub in new if stub.started_s < requested_s}
         self._watched = {stub for stub in self._loaded if stub.serves not in going}
 
     def dead(self) -> list[Stub]:
@@ -128,7 +130,7 @@ class StubWatch:
 
     @property
     def all(self) -> list[Stub]:
-        """All that are known."""
+        """All processes of models that are known now."""
         return list(self._stubs)
 
     def bury(self, stubs: Iterable[Stub]) -> None:

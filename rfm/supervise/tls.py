@@ -56,7 +56,7 @@ class GrpcTls:
             raise ServerStartError(str(error)) from None
 
     def arguments(self) -> list[str]:
-        """Arguments of tritonserver."""
+        """Arguments of tritonserver that encrypt its gRPC port."""
         files = [f"--grpc-server-cert={self.certificate}", f"--grpc-server-key={self.key}"]
         if self.client_ca is None:
             return ["--grpc-use-ssl=true", *files]

@@ -35,12 +35,12 @@ Config = Mapping[str, Any]
 class Snapshot:
     """What a Triton serves.
 
-    asked_s: when it was asked for, by time.monotonic
+    requested_s: when it was requested, by time.monotonic
     configs: of each model, when it was last ready
     unreadable: models that are ready, and whose configuration cannot be read
     """
 
-    asked_s: float
+    requested_s: float
     versions: Collection[ModelVersion]
     configs: Mapping[str, Config]
     ready: frozenset[str]  # models
@@ -150,7 +150,7 @@ class TritonWatch:
         return True
 
     def _new_snapshot(self) -> Snapshot:
-        asked_s = time.monotonic()
+        requested_s = time.monotonic()
         index = self._http.get_json(INDEX_PATH, _INDEX_TIMEOUT_S, method="POST", headers=self._headers)
         versions = versions_of(index)
         loaded = sorted({entry.name for entry in versions if entry.is_ready})
@@ -162,7 +162,7 @@ class TritonWatch:
                 configs[model] = serving_just(self._http.get_json(path), numbers)
         known = [model for model in loaded if model in configs]
         ready = frozenset(model for model in known if self._is_ready(configs[model]))
-        return Snapshot(asked_s, versions, configs, ready, frozenset(loaded) - frozenset(known))
+        return Snapshot(requested_s, versions, configs, ready, frozenset(loaded) - frozenset(known))
 
     def _is_ready(self, config: Config) -> bool:
         """Whether Triton calls an ensemble ready. A model that is not made of others has a probe of its own."""

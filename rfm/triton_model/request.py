@@ -84,7 +84,7 @@ class Request(Generic[Question]):
 
     @property
     def is_counted(self) -> bool:
-        """Whether metrics count it."""
+        """Whether the metrics count this request: a caller sent it."""
         return self.origin is Origin.CALLER
 
     @property
@@ -101,7 +101,7 @@ class Request(Generic[Question]):
 
     @property
     def outcome(self) -> str:
-        """One of OUTCOMES."""
+        """How the request ended: one of OUTCOMES."""
         if self.error is None:
             return SCORED
         if isinstance(self.error, CancelledError):

@@ -240,7 +240,7 @@ def _renamed(weights: Mapping[str, Tensor], renames: _Renames) -> dict[str, Tens
 
 
 def _whole(folder: Path, backbone: Mapping[str, Any], run: RunConfig) -> dict[str, Tensor]:
-    """All weights, LoRA's merged."""
+    """All weights of the network by name; those of a LoRA adapter are merged into them."""
     weights = read_weights(folder)
     if any(LORA_NAME.fullmatch(name) for name in weights):
         weights = merged(_renamed(weights, _LORA_INSIDE), scaling(run.file, run.sections["peft"]))

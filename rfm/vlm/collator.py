@@ -65,7 +65,7 @@ class VlmRow:
 
     @property
     def num_tokens(self) -> int:
-        """L."""
+        """L, the number of tokens of the conversation."""
         return len(self.input_ids)
 
 

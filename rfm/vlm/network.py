@@ -66,7 +66,7 @@ class VlmConfig:
 
     @property
     def hidden_dim(self) -> int:
-        """D."""
+        """D, the width of the language model."""
         return int(self.backbone["text_config"]["hidden_size"])
 
     @property

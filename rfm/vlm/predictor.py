@@ -39,7 +39,7 @@ class VlmPredictor:
         return rows
 
     def num_tokens(self, row: VlmRow) -> int:
-        """Tokens of the conversation."""
+        """Number of tokens of the row's conversation."""
         return row.num_tokens
 
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
@@ -53,12 +53,12 @@ class VlmPredictor:
 
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch) -> list[RowScores | RewardError]:
-        """One forward pass."""
+        """The scores of each row of the batch, or why it has none, from one forward pass."""
         output = self.network(batch.to(self.device, self._dtype))
         scores = frame_scores(output.progress, output.success)
         preference = output.preference.sigmoid().float().tolist()
         similarity = [] if output.similarity is None else output.similarity.float().tolist()
-        of_rows, read, asked = [], 0, 0
+        of_rows, read, num_queries = [], 0, 0
         for row in rows:
             frames = []
             for spans, num_frames in zip(row.spans, row.num_frames, strict=True):
@@ -66,8 +66,8 @@ class VlmPredictor:
                 read += len(spans)
             query = None
             if row.query is not None:
-                query = (similarity if row.is_similarity else preference)[asked]
-                asked += 1
+                query = (similarity if row.is_similarity else preference)[num_queries]
+                num_queries += 1
             of_rows.append(RowScores(frames, query))
         return checked(of_rows)
 

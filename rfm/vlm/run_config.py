@@ -55,14 +55,14 @@ class RunConfig:
 
     def check_model_type(self) -> None:
         """Raises CheckpointError for a checkpoint that upstream does not score by reward heads as they are today."""
-        told, why = self.get("model.model_type", HEADS), ""
-        if told == VQA:
+        model_type, why = self.get("model.model_type", HEADS), ""
+        if model_type == VQA:
             why = (
                 ": such a checkpoint answers in generated text, upstream's server and its training collator prompt it "
                 "in different ways, and upstream's successor dropped the type"
             )
-        if told != HEADS:
-            raise CheckpointError(f"{self.file}: model.model_type: expected {HEADS}, got {shown(told)}{why}")
+        if model_type != HEADS:
+            raise CheckpointError(f"{self.file}: model.model_type: expected {HEADS}, got {shown(model_type)}{why}")
         for section in ("model", "data"):
             for key in _DROPPED:
                 if self.get(f"{section}.{key}", False):
@@ -132,9 +132,9 @@ class RunConfig:
     def _of_either(self, key: str) -> bool:
         """Upstream has it twice: its network reads that of ``model``, its collator that of ``data``."""
         places = [f"{name}.{key}" for name in ("model", "data") if self.sections[name].get(key) is not None]
-        told = {place: self.get(place, False) for place in places}
-        if len(set(told.values())) > 1:
-            got = " and ".join(f"{place} {str(value).lower()}" for place, value in told.items())
+        values = {place: self.get(place, False) for place in places}
+        if len(set(values.values())) > 1:
+            got = " and ".join(f"{place} {str(value).lower()}" for place, value in values.items())
             mend = "set both to how the run showed frames"
             raise CheckpointError(f"{self.file}: expected {' and '.join(places)} to agree, got {got}; {mend}")
-        return any(told.values())
+        return any(values.values())

@@ -54,7 +54,7 @@ def test_every_setting_is_served_and_measured(repository: Path, monkeypatch: pyt
     monkeypatch.setattr(tune, "BATCH_SIZES", (8, 64))
     before = {file: file.read_bytes() for file in repository.rglob("*") if file.is_file()}
     told: list[str] = []
-    best = Sweep(repository, "rfm", callers=4, seconds=0.3, rounds=1, tell=told.append).best()
+    best = Sweep(repository, "rfm", callers=4, seconds=0.3, rounds=1, report=told.append).best()
     cores = len(os.sched_getaffinity(0))
     settings = [Setting(count, cores // count, 64) for count in (1, 2, 4, 8, 16, 32, 64) if count <= cores]
     assert best in [*settings, *(Setting(s.instances, s.torch_threads, 8) for s in settings)]
@@ -83,13 +83,13 @@ class Lagging:
 @pytest.mark.parametrize(("seconds", "count"), [(1.0, 2), (0.4, 1), (4.2, 10)])
 def test_only_what_is_answered_in_time_is_counted(monkeypatch: pytest.MonkeyPatch, seconds: float, count: int) -> None:
     Lagging(monkeypatch)
-    latencies_s = asyncio.run(tune._ask("", "rfm", [ProgressSample(random_trajectory(0, 1))], 1, seconds))
+    latencies_s = asyncio.run(tune._measure_latencies("", "rfm", [ProgressSample(random_trajectory(0, 1))], 1, seconds))
     assert latencies_s == pytest.approx([0.4] * count)
 
 
 def test_a_setting_that_answers_nobody_in_time_is_the_slowest(monkeypatch: pytest.MonkeyPatch) -> None:
     Lagging(monkeypatch)
-    assert asyncio.run(tune._ask("", "rfm", [ProgressSample(random_trajectory(0, 1))], 1, 0.3)) == []
+    assert asyncio.run(tune._measure_latencies("", "rfm", [ProgressSample(random_trajectory(0, 1))], 1, 0.3)) == []
     slow, slower = Trial(ONE, 0.5, 2000.0), Trial(TWO, 0.0, math.inf)
     assert quickest([slower, slow]) == slow
     with pytest.raises(ExportError, match=r"--seconds: expected time for an answer, got none in time with any setting"):

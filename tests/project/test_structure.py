@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import re
 import subprocess
 import sys
@@ -66,6 +67,7 @@ EXCEPTIONS = {
     "benchmarks/peers/message.py": {"rfm"},
     "benchmarks/peers/upstream_forward.py": {"rfm"},
 }
+FEWEST_WORDS = 4  # of a docstring
 LIGHT = {"numpy", "tritonclient", "aiohttp", "typing_extensions"}  # the last for type checkers only
 # What only an extra brings, and which files need it.
 EXTRAS = {
@@ -133,6 +135,31 @@ def test_only_its_own_folder_knows_a_family() -> None:
     for file in (file for part in ("rfm", "export") for file in (ROOT / part).rglob("*.py")):
         if not own & set(file.parents):
             assert not [name for name in imports(file) if is_part(name, {f"rfm.{family}" for family in FAMILIES})], file
+
+
+@pytest.mark.parametrize("package", FOLDERS)
+def test_every_docstring_stands_alone(package: str) -> None:
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    for file in (ROOT / FOLDERS[package] / package).rglob("*.py"):
+        nodes = [node for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, documented)]
+        texts = [text for node in nodes if (text := ast.get_docstring(node)) is not None]
+        assert not [text for text in texts if len(text.split()) < FEWEST_WORDS], file
+
+
+@pytest.mark.parametrize("package", FOLDERS)
+def test_every_ignored_type_error_has_a_code_and_a_reason(package: str) -> None:
+    for file in (ROOT / FOLDERS[package] / package).rglob("*.py"):
+        ignores = re.findall(r"# type: ignore.*", file.read_text())
+        assert not [ignore for ignore in ignores if not re.match(r"# type: ignore\[[\w,-]+\]  # \w", ignore)], file
+
+
+@pytest.mark.parametrize("package", ["rfm_client", "rfm_client.contract", "rfm_client.gym"])
+def test_a_package_exports_all_that_it_imports_for_its_users(package: str) -> None:
+    module = importlib.import_module(package)
+    assert module.__file__ is not None
+    nodes = [node for node in ast.parse(Path(module.__file__).read_text()).body if isinstance(node, ast.ImportFrom)]
+    names = {alias.asname or alias.name for node in nodes if node.module != "__future__" for alias in node.names}
+    assert sorted(module.__all__) == sorted(name for name in names if not name.startswith("_"))
 
 
 def test_files_say_their_licence() -> None:

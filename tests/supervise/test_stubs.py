@@ -115,9 +115,9 @@ def test_of_a_version_that_is_loaded_once_more_the_old_ones_count_until_they_are
 
 def test_what_was_started_after_triton_was_asked_is_not_loaded(machine: Machine) -> None:
     watch = StubWatch(TRITON, 30.0)
-    asked_s = time.monotonic() - 5.0
+    requested_s = time.monotonic() - 5.0
     machine.start(21, 1)
-    watch.update({ONE}, set(), asked_s)
+    watch.update({ONE}, set(), requested_s)
     machine.die(21)
     assert watch.dead() == []
 

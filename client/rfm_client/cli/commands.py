@@ -41,8 +41,8 @@ UseFrames = Annotated[bool, typer.Option("--use-frames", help="Random frames ins
 Seed = Annotated[int, typer.Option(min=0, help="Of the random numbers.")]
 
 
-def _tell_version(asked: bool) -> None:
-    if asked:
+def _print_version(is_wanted: bool) -> None:
+    if is_wanted:
         typer.echo(f"rfm-client {importlib.metadata.version('rfm-client')}")
         raise typer.Exit
 
@@ -55,7 +55,7 @@ def main(
     client_key: options.ClientKey = None,
     api_key_file: options.ApiKeyFile = None,
     version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=_tell_version, help="Tell the version and end.")
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Tell the version and end.")
     ] = False,
 ) -> None:
     """Asks a served reward model about videos, and its server how it is."""
@@ -111,7 +111,7 @@ def score(
     scored = [outcome for outcome in outcomes if isinstance(outcome, Scored)]
     for outcome in outcomes:
         if isinstance(outcome, Failed):
-            options.tell(f"{outcome.name}: {outcome.message}")
+            options.report(f"{outcome.name}: {outcome.message}")
         else:
             _note(outcome.name, len(outcome.result.progress), outcome.num_frames)
     if json != STANDARD_OUTPUT and scored:
@@ -224,7 +224,7 @@ def sample(
     failures = [outcome for outcome in outcomes if isinstance(outcome, RewardError)]
     for index, outcome in enumerate(outcomes):
         if isinstance(outcome, RewardError):
-            options.tell(f"samples[{index}]: {outcome}")
+            options.report(f"samples[{index}]: {outcome}")
     rows = [(f"{index}", outcome) for index, outcome in enumerate(outcomes) if not isinstance(outcome, RewardError)]
     if json != STANDARD_OUTPUT and rows:
         _print(scores_table(f"{kind.value} of random {'frames' if use_frames else 'embeddings'}", rows))
@@ -284,7 +284,7 @@ def _check_arrays(npy: Path | None, videos: list[str]) -> None:
 
 def _note(name: str, num_scored: int, num_frames: int) -> None:
     if num_scored < num_frames:
-        options.tell(f"note: {name}: {num_scored} of {num_frames} frames were scored, evenly spaced")
+        options.report(f"note: {name}: {num_scored} of {num_frames} frames were scored, evenly spaced")
 
 
 def _print(*tables: object) -> None:

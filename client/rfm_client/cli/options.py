@@ -103,8 +103,8 @@ class OneLineCommand(TyperCommand):
         return super().parse_args(ctx, completed)
 
     def invoke(self, ctx: Any) -> Any:
-        """Runs the command."""
-        with told_on_one_line():
+        """Runs the command, and reports an error on one line."""
+        with errors_on_one_line():
             return super().invoke(ctx)
 
 
@@ -163,14 +163,14 @@ def exit_code_of(failures: Sequence[Exception], *, some_succeeded: bool) -> Exit
     return codes.pop() if len(codes) == 1 and not some_succeeded else ExitCode.FAILED
 
 
-def tell(message: str) -> None:
-    """A line on standard error."""
+def report(message: str) -> None:
+    """Writes the message as one line to standard error."""
     typer.echo(f"rfm-client: {' '.join(message.split())}", err=True)
 
 
 def fail(message: str, code: ExitCode) -> NoReturn:
-    """Tells the message and ends the command."""
-    tell(message)
+    """Reports the message and ends the command."""
+    report(message)
     raise typer.Exit(code)
 
 
@@ -184,7 +184,7 @@ def usage_errors(option: str) -> Iterator[None]:
 
 
 @contextmanager
-def told_on_one_line() -> Iterator[None]:
+def errors_on_one_line() -> Iterator[None]:
     """Whatever can be expected to go wrong ends the command with a line and its exit code."""
     try:
         yield

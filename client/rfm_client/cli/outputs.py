@@ -30,14 +30,14 @@ def write_json(target: str, document: Mapping[str, Any]) -> None:
 
 
 def origin(server: Server) -> dict[str, Any]:
-    """Where scores come from."""
+    """URLs of the servers and name of the model that gave the scores."""
     return {"servers": server.urls, "model": server.model}
 
 
 def score_document(server: Server, question: Question, outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """What ``score --json`` writes."""
-    asked = {"task": question.task, "fps": question.fps, "frame_steps": question.frame_steps}
-    return {**origin(server), **asked, "videos": [_outcome(outcome) for outcome in outcomes]}
+    """The JSON document that ``score --json`` writes."""
+    parameters = {"task": question.task, "fps": question.fps, "frame_steps": question.frame_steps}
+    return {**origin(server), **parameters, "videos": [_outcome(outcome) for outcome in outcomes]}
 
 
 def comparison_document(server: Server, question: Question, comparison: Comparison) -> dict[str, Any]:
@@ -50,7 +50,7 @@ def comparison_document(server: Server, question: Question, comparison: Comparis
 
 
 def samples_document(server: Server, kind: str, outcomes: Sequence[Result | RewardError]) -> dict[str, Any]:
-    """What ``sample --json`` writes."""
+    """The JSON document that ``sample --json`` writes."""
     samples = [
         _error(outcome, str(outcome)) if isinstance(outcome, RewardError) else result_document(outcome)
         for outcome in outcomes
@@ -75,15 +75,15 @@ def frame_document(scores: FrameScores, times_s: Times | None) -> dict[str, Any]
     """Scores of each frame; frame_indices among the frames that were read."""
     indices = np.arange(len(scores.progress)) if scores.frame_indices is None else scores.frame_indices
     return {
-        "progress": _told(scores.progress),
-        "success": _told(scores.success),
+        "progress": _or_null(scores.progress),
+        "success": _or_null(scores.success),
         "frame_indices": indices.tolist(),
         "frame_times_s": None if times_s is None else times_s.tolist(),
     }
 
 
 def status_document(statuses: Sequence[ServerStatus]) -> dict[str, Any]:
-    """What ``status --json`` writes."""
+    """The JSON document that ``status --json`` writes."""
     servers = []
     for status in statuses:
         models = [
@@ -122,6 +122,6 @@ def _error(error: Exception, message: str) -> dict[str, Any]:
     return {"error": message, "error_type": type(error).__name__}
 
 
-def _told(scores: npt.NDArray[np.float32]) -> list[float] | None:
+def _or_null(scores: npt.NDArray[np.float32]) -> list[float] | None:
     """Each as the float64 that is equal to it; None if the checkpoint does not tell them."""
     return None if np.isnan(scores).all() else scores.tolist()

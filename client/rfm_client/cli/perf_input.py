@@ -28,7 +28,7 @@ def perf_analyzer_input(samples: Sequence[Sample]) -> dict[str, Any]:
 
 
 def write_perf_analyzer_input(file: Path, samples: Sequence[Sample]) -> None:
-    """Writes the document."""
+    """Writes the samples to ``file``, in perf_analyzer's JSON format."""
     file.write_text(json.dumps(perf_analyzer_input(samples)))
 
 

@@ -84,7 +84,7 @@ class Scored:
     took_s: float
 
     def row(self) -> tuple[str, ...]:
-        """Its row in ``scored_table``."""
+        """The row of this source in ``scored_table``."""
         progress, success = self.result.progress, self.result.success
         frames = str(len(progress)) if len(progress) == self.num_frames else f"{len(progress)} of {self.num_frames}"
         seconds = "-" if self.times_s is None else f"{self.times_s[-1]:.1f}"
@@ -119,7 +119,7 @@ class Comparison:
         return (self.first, self.result.first, preference), (self.second, self.result.second, 1 - preference)
 
     def table(self) -> Table:
-        """One row a source."""
+        """A table of the two sources, one row for each."""
         rows = [
             (
                 source.name,
@@ -163,11 +163,11 @@ def compare(server: Server, names: tuple[str, str], question: Question) -> Compa
     with server.connected() as client:
         first, second = (Source.read(name, question) for name in names)
         sample = PreferenceSample(first.trajectory, second.trajectory)
-        return Comparison(first, second, cast(PreferenceResult, _ask(client, sample, question)))
+        return Comparison(first, second, cast(PreferenceResult, _evaluate(client, sample, question)))
 
 
 def scored_table(scored: Sequence[Scored]) -> Table:
-    """One row a source."""
+    """A table of the scored sources, one row for each."""
     columns = ("video", "last progress", "last success", "frames", "last at s", "took s", "version")
     return table("", columns, [outcome.row() for outcome in scored])
 
@@ -193,7 +193,7 @@ def _score(client: RewardClient, name: str, question: Question) -> Outcome:
     started_s = time.monotonic()
     try:
         source = Source.read(name, question)
-        result = cast(ProgressResult, _ask(client, ProgressSample(source.trajectory), question))
+        result = cast(ProgressResult, _evaluate(client, ProgressSample(source.trajectory), question))
     except ImportError as error:
         return Failed(name, error, missing_package(error))
     except (RewardError, OSError) as error:
@@ -208,17 +208,17 @@ def _score(client: RewardClient, name: str, question: Question) -> Outcome:
     )
 
 
-def _ask(client: RewardClient, sample: Sample, question: Question) -> Result:
+def _evaluate(client: RewardClient, sample: Sample, question: Question) -> Result:
     """Its frames are left out here rather than by the client, which knows of no other limit than the checkpoint's."""
     info = client.model_info(frames=sample.trajectories[0].frames is not None)
     dense = question.frame_steps > 0  # then the server samples each prefix
     limits = (question.max_frames, info.max_frames if question.subsample and not dense else None)
     limit = min((frames for frames in limits if frames is not None), default=None)
     fit = fitted(sample, replace(info, max_frames=limit), subsample=True, resize=question.resize)
-    asked = fit.sample
-    if isinstance(asked, ProgressSample):
-        asked = replace(asked, frame_steps=question.frame_steps)
-    return with_frame_indices(client.evaluate([asked])[0], fit.frame_indices)
+    sent = fit.sample
+    if isinstance(sent, ProgressSample):
+        sent = replace(sent, frame_steps=question.frame_steps)
+    return with_frame_indices(client.evaluate([sent])[0], fit.frame_indices)
 
 
 @contextmanager

@@ -22,7 +22,7 @@ _LENGTHS = re.compile(r"([1-9][0-9]{0,3})(?:-([1-9][0-9]{0,3}))?")  # a longer o
 
 
 class SampleKind(str, Enum):
-    """What a sample asks."""
+    """The type of a sample, by its name on the command line."""
 
     progress = "progress"
     preference = "preference"

@@ -40,7 +40,7 @@ class FrameScores:
     @property
     def last_progress(self) -> float:
         """Progress at the last frame. Raises ValueError if the checkpoint does not tell it."""
-        return float(_told("progress", self.progress)[-1])
+        return float(_known("progress", self.progress)[-1])
 
     @property
     def progress_deltas(self) -> Float32Array:
@@ -48,7 +48,7 @@ class FrameScores:
 
         Raises ValueError if the checkpoint does not tell progress.
         """
-        progress = _told("progress", self.progress)
+        progress = _known("progress", self.progress)
         return np.diff(progress, prepend=progress[:1])
 
     def succeeded(self, *, last: int = 1, threshold: float = SUCCESS_THRESHOLD) -> bool:
@@ -58,7 +58,7 @@ class FrameScores:
         """
         if last < 1:
             raise ValueError(f"last: expected at least one frame, got {last}")
-        votes = _told("success", self.success)[-last:] >= threshold
+        votes = _known("success", self.success)[-last:] >= threshold
         return bool(2 * np.count_nonzero(votes) > len(votes))
 
 
@@ -98,7 +98,7 @@ class SimilarityResult:
 Result: TypeAlias = ProgressResult | PreferenceResult | SimilarityResult
 
 
-def _told(name: str, scores: Float32Array) -> Float32Array:
+def _known(name: str, scores: Float32Array) -> Float32Array:
     if np.isnan(scores).any():
         raise ValueError(f"{name}: expected a score of each frame, got NaN: this checkpoint does not tell it")
     return scores

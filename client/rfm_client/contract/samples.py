@@ -63,8 +63,8 @@ class Trajectory:
     def __repr__(self) -> str:
         """With shapes in place of values, which would fill pages."""
         arrays = {"frames": self.frames, "video_embeddings": self.video_embeddings, "text": self.text_embedding}
-        told = [f"{name}={array.dtype} {list(array.shape)}" for name, array in arrays.items() if array is not None]
-        return f"Trajectory({', '.join([*told, f'task={self.task!r}'])})"
+        shapes = [f"{name}={array.dtype} {list(array.shape)}" for name, array in arrays.items() if array is not None]
+        return f"Trajectory({', '.join([*shapes, f'task={self.task!r}'])})"
 
     @property
     def positions(self) -> npt.NDArray[Any]:
@@ -75,7 +75,7 @@ class Trajectory:
 
     @property
     def num_frames(self) -> int:
-        """T."""
+        """T, the number of frames."""
         return int(self.positions.shape[0])
 
 

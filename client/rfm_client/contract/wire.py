@@ -211,7 +211,7 @@ def encode_trajectories(trajectories: Sequence[Trajectory], num_positions: int, 
 
 
 def num_positions(inputs: Mapping[str, npt.NDArray[Any]]) -> int:
-    """P of one request."""
+    """P, the frame positions of one request: its widths of the time axis, added up."""
     return sum(int(inputs[name].shape[1]) for name in (FRAMES, SECOND_FRAMES, VIDEO_EMBEDDINGS) if name in inputs)
 
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Rewards inside other libraries."""
+"""Rewards for other libraries, each in a module of its own."""

@@ -155,7 +155,7 @@ class Episode:
 
     @property
     def step(self) -> int:
-        """Steps since the reset."""
+        """Number of steps since the reset."""
         return len(self._frames) - 1
 
     @property
@@ -165,7 +165,7 @@ class Episode:
 
     @property
     def num_pending(self) -> int:
-        """Questions without an answer."""
+        """Number of requests that have no answer yet."""
         return len(self._pending)
 
     def add(self, frame: Any) -> None:
@@ -230,9 +230,9 @@ class Episode:
 
     def info(self) -> Info:
         """What is known, and how late."""
-        told = {"progress": self._progress, "success": self._success, "step": self._known_step}
-        told |= {"lag": self.step - self._known_step, "skipped": self.num_skipped}
-        return told if self._options.terminate_on_success is None else told | {"succeeded": self.succeeded}
+        known = {"progress": self._progress, "success": self._success, "step": self._known_step}
+        known |= {"lag": self.step - self._known_step, "skipped": self.num_skipped}
+        return known if self._options.terminate_on_success is None else known | {"succeeded": self.succeeded}
 
     def _located(self, error: RewardError) -> RewardError:
         return error.inside(self._where) if self._where and isinstance(error, InvalidSampleError) else error

@@ -21,7 +21,7 @@ _VALUE = re.compile("[!-~]([ -~]*[!-~])?")  # visible ASCII; blanks inside
 
 
 class AccessOptions(TypedDict, total=False):
-    """As Access has them."""
+    """The fields of Access as keyword arguments, each optional."""
 
     ca_file: str | Path | None
     client_certificate: str | Path | None
@@ -87,7 +87,7 @@ class Access:
 
     @cached_property
     def ssl_context(self) -> ssl.SSLContext:
-        """For HTTP."""
+        """The TLS context for connections over HTTP."""
         if self.ca_file is not None:
             check_authorities(self.ca_file, "ca_file")
         context = ssl.create_default_context(cafile=self.ca_file)

@@ -59,7 +59,7 @@ class Transport(Protocol):
         """Whether the server answers and ``model`` is ready."""
 
     async def close(self) -> None:
-        """Closes the connection."""
+        """Closes the connection to the server."""
 
 
 def connect(
@@ -95,21 +95,21 @@ class _TritonTransport:
     async def infer(
         self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
     ) -> Answer:
-        ask = partial(self._infer, model, inputs, outputs, request_id, timeout_s)
-        return await self._call(ask, timeout_s)
+        request = partial(self._infer, model, inputs, outputs, request_id, timeout_s)
+        return await self._call(request, timeout_s)
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
-        async def ask(client: Any) -> ModelInfo:
+        async def request(client: Any) -> ModelInfo:
             return ModelInfo.from_config(await self._model_config(client, model))
 
-        return await self._call(ask, timeout_s, bad_request=errors.ModelNotFoundError)
+        return await self._call(request, timeout_s, bad_request=errors.ModelNotFoundError)
 
     async def is_ready(self, model: str, timeout_s: float) -> bool:
-        async def ask(client: Any) -> bool:
+        async def request(client: Any) -> bool:
             return bool(await client.is_server_ready() and await client.is_model_ready(model))
 
         try:
-            return await self._call(ask, timeout_s)
+            return await self._call(request, timeout_s)
         except errors.ServerError:
             return False
 
@@ -169,7 +169,7 @@ class _TritonTransport:
 
     async def _call(
         self,
-        ask: Callable[[Any], Awaitable[Answered]],
+        request: Callable[[Any], Awaitable[Answered]],
         timeout_s: float,
         *,
         bad_request: type[errors.RewardError] = errors.InvalidSampleError,
@@ -178,7 +178,7 @@ class _TritonTransport:
         try:
             # Not by a deadline of gRPC: Triton 2.51 overlooks that one has passed, but not that a call is cancelled.
             async with timeout(timeout_s):
-                return await self._heard(ask)
+                return await self._answer(request)
         except InferenceServerException as error:
             status, message = str(error.status()), error.message() or ""
             if triton.is_denied(status, message):
@@ -198,16 +198,16 @@ class _TritonTransport:
         except (ValueError, LookupError, TypeError) as error:  # while reading what is no answer of a KServe server
             raise errors.InferenceFailedError(f"{self.url}: the answer cannot be read: {error!r}") from error
 
-    async def _heard(self, ask: Callable[[Any], Awaitable[Answered]]) -> Answered:
+    async def _answer(self, request: Callable[[Any], Awaitable[Answered]]) -> Answered:
         """What the server answers; a connection over which nothing comes is left to those who use it already."""
         connection = self._connected()
         try:
             with connection.used() as client:
-                answer = await ask(client)
-            connection.hear()
+                answer = await request(client)
+            connection.record_answer()
             return answer
         except InferenceServerException:
-            connection.hear()  # or gRPC knows itself that the connection has ended
+            connection.record_answer()  # or gRPC knows itself that the connection has ended
             raise
         except asyncio.CancelledError:
             if connection.is_silent and connection is self._connection:

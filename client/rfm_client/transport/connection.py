@@ -59,8 +59,8 @@ class Connection:
             self._num_calls -= 1
             self._close_if_unused()
 
-    def hear(self) -> None:
-        """Something has come."""
+    def record_answer(self) -> None:
+        """Records that the server has just sent something."""
         self._silent_since_s = None
 
     @property

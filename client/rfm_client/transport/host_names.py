@@ -22,10 +22,10 @@ _WHOLE_NAME = ""  # the key of a transport that leaves the addresses to gRPC
 
 
 class Connect(Protocol):
-    """How transports are made."""
+    """A function that makes the transport to one server."""
 
     def __call__(self, url: str, *, named: str | None = None) -> Transport:
-        """As ``transport.connect``."""
+        """The transport to ``url``, as ``calls.connect`` makes it."""
 
 
 class Name:

@@ -28,7 +28,7 @@ class Server:
     def __init__(self, transport: Transport) -> None:
         self.transport = transport
         self.outstanding = 0
-        self.last_asked = 0
+        self.last_request = 0
         self.failures = 0
         self.comeback: asyncio.Task[bool] | None = None  # whether it was seen to be healed
         self._has_ended_process = False
@@ -46,10 +46,10 @@ class Server:
         return self._has_ended_process and self.is_left_out
 
     @contextmanager
-    def asked(self) -> Iterator[None]:
-        """Within it, a request is under way."""
+    def request_under_way(self) -> Iterator[None]:
+        """A context in which a request to this server is under way."""
         self.outstanding += 1
-        self.last_asked = next(self._moments)
+        self.last_request = next(self._moments)
         try:
             yield
         finally:

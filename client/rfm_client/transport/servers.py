@@ -40,7 +40,7 @@ from rfm_client.transport.host_names import REFRESH_S, Name
 from rfm_client.transport.server import HEALED_WITHIN_S, LONGEST_RETRY_PAUSE_S, Server, pause_s
 
 Answered = TypeVar("Answered")
-Ask = Callable[[Transport, float], Awaitable[Answered]]
+Request = Callable[[Transport, float], Awaitable[Answered]]
 
 logger = logging.getLogger("rfm_client")
 
@@ -73,18 +73,18 @@ class Servers:
     ) -> Answer:
         """The named ``outputs`` of ``model`` for ``inputs``. Raises RewardError, which names the request."""
 
-        def ask(server: Transport, left_s: float) -> Awaitable[Answer]:
+        def request(server: Transport, left_s: float) -> Awaitable[Answer]:
             return server.infer(model, inputs, outputs, left_s, request_id=request_id)
 
         try:
-            return await self._ask(model, ask, deadline)
+            return await self._request(model, request, deadline)
         except RewardError as error:
             error.request_id = request_id
             raise
 
     async def model_info(self, model: str, deadline: Deadline) -> ModelInfo:
         """What a server tells of ``model``. Raises RewardError."""
-        return await self._ask(model, lambda server, left_s: server.model_info(model, left_s), deadline)
+        return await self._request(model, lambda server, left_s: server.model_info(model, left_s), deadline)
 
     async def is_ready(self, models: Sequence[str], timeout_s: float) -> bool:
         """Whether at least one server has one of the models ready. The first that has is enough."""
@@ -104,31 +104,33 @@ class Servers:
                 probe.cancel()
 
     async def close(self) -> None:
-        """Closes all connections."""
+        """Closes the connections to all servers."""
         self._retry = False
         if self._looking_up is not None:
             self._looking_up.cancel()
         await asyncio.gather(*(server.close() for server in (*self._servers, *self._gone)))
 
-    async def _ask(self, model: str, ask: Ask[Answered], deadline: Deadline) -> Answered:
+    async def _request(self, model: str, request: Request[Answered], deadline: Deadline) -> Answered:
         """As the module's text has it."""
         self._keep_up()
         try:
-            return await self._ask_among(None, model, ask, deadline)
+            return await self._request_among(None, model, request, deadline)
         except _EndedAtError as ended:
             first, error = ended.server, ended.error
         if not self._retry or deadline.ends_within(0):
             raise error
         if await first.is_healed(min(HEALED_WITHIN_S, deadline.remaining_s() / 2)):
-            return await self._ask_among(first, model, ask, deadline)
+            return await self._request_among(first, model, request, deadline)
         try:
-            return await self._ask_among(None, model, ask, deadline)
+            return await self._request_among(None, model, request, deadline)
         except _EndedAtError as ended:
             where = f"{first.transport.url} and {ended.server.transport.url}"
-            told = f"{where}: a process of the model ended at each while it had this request, so no other is asked"
-            raise ProcessEndedError(f"{told}: {ended.error.message}") from ended.error
+            message = f"{where}: a process of the model ended at each while it had this request, so no other is asked"
+            raise ProcessEndedError(f"{message}: {ended.error.message}") from ended.error
 
-    async def _ask_among(self, only: Server | None, model: str, ask: Ask[Answered], deadline: Deadline) -> Answered:
+    async def _request_among(
+        self, only: Server | None, model: str, request: Request[Answered], deadline: Deadline
+    ) -> Answered:
         """only: no other is asked; None: any, and of several _EndedAtError is raised where a process has ended."""
         refusals: dict[Server, RewardError] = {}
         for attempt in itertools.count():
@@ -137,8 +139,8 @@ class Servers:
                 raise ServerUnavailableError(f"{server.transport.url}: its name does not stand for it any more")
             left_s = deadline.remaining_s()
             try:
-                with server.asked():
-                    answer = await ask(server.transport, left_s)
+                with server.request_under_way():
+                    answer = await request(server.transport, left_s)
                 server.failures = 0
                 for other in refusals:  # not before: what all refuse is no fault of one
                     self._leave_out(other, model)
@@ -183,7 +185,7 @@ class Servers:
 
     def _least_busy(self, avoided: Collection[Server]) -> Server:
         def rank(server: Server) -> tuple[bool, bool, bool, int, int]:
-            return server in avoided, server.is_dead, server.is_left_out, server.outstanding, server.last_asked
+            return server in avoided, server.is_dead, server.is_left_out, server.outstanding, server.last_request
 
         return min(self._servers, key=rank)
 

@@ -51,7 +51,7 @@ class RegionServer(Protocol):
 
     @property
     def connection_errors(self) -> tuple[type[Exception], ...]:
-        """How a connection fails."""
+        """The exceptions that this client raises when its connection fails."""
 
     async def register_region(self, name: str, byte_size: int) -> None:
         """The server maps the memory ``name``."""
