@@ -72,7 +72,7 @@ def shown(value: object) -> str:
 
 def cut(text: str, most: int = 1000) -> str:
     """The text, or its beginning, on one line."""
-    line = " ".join(text[: most + 1].split())
+    line = " ".join(text[:most].split())
     return line if len(text) <= most else f"{line}..."
 
 

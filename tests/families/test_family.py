@@ -24,6 +24,7 @@ from rfm.checkpoint.content import CheckpointError
 from rfm.config import ServeConfig
 from rfm.engine import Engine
 from rfm.parameters import FAMILY_PARAMETER
+from rfm.rewind.encoders import Encoders
 from rfm.supervise.installation import Installation, find_installation
 from rfm.supervise.process import Endpoints, TritonServer
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, RewardClient, SimilaritySample, Trajectory
@@ -154,3 +155,9 @@ NOT_NAMED = "model_type: expected rewind_transformer, got redness"
 def test_what_is_no_family_s_is_refused(checkpoint: Path, loaded: Callable[[Path], object], message: str) -> None:
     with pytest.raises(CheckpointError, match=message):
         loaded(checkpoint)
+
+
+def test_encoders_of_an_export_that_names_no_family_are_rewind_s() -> None:
+    assert families.encoders_of(None) is families.encoders_of("rfm.rewind") is Encoders
+    with pytest.raises(families.CheckpointError, match=r"expected one with encoders, got rfm\.vlm"):
+        families.encoders_of("rfm.vlm")

@@ -386,3 +386,18 @@ def test_half_precision_scores_are_near_those_of_float32() -> None:
         assert isinstance(exact, ProgressResult) and isinstance(near, ProgressResult)
         assert near.progress.dtype == np.float32
         assert 0 < np.abs(near.progress - exact.progress).max() < 0.02
+
+
+@pytest.mark.parametrize("name", ["c1_t1_disc10", "legacy_keys_l2"])
+def test_only_discrete_progress_has_logits_and_they_are_those_of_the_progress(
+    engine: Callable[[str], Engine], name: str
+) -> None:
+    (result,) = engine(name).evaluate([ProgressSample(random_trajectory(0, 3))])
+    assert isinstance(result, ProgressResult)
+    if name.endswith("l2"):
+        assert result.progress_logits is None
+    else:
+        assert result.progress_logits is not None
+        assert result.progress_logits.shape == (3, 10)
+        expected = progress_from_logits(torch.from_numpy(result.progress_logits))
+        np.testing.assert_allclose(result.progress, expected.numpy(), rtol=0, atol=TOLERANCE)

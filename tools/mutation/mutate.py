@@ -50,7 +50,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "rfm/vlm/checkpoint.py": ("test_vlm_checkpoint", "test_vlm", "test_hostile_files", "test_properties"),
     "rfm/vlm/lora.py": ("test_vlm", "test_vlm_checkpoint", "test_hostile_files"),
     "rfm/vlm/*.py": ("test_vlm", "test_vlm_checkpoint", "test_vlm_network"),
-    "rfm/families.py": ("test_checkpoint", "test_vlm", "test_vlm_checkpoint"),
+    "rfm/families.py": ("test_checkpoint", "test_family", "test_vlm", "test_vlm_checkpoint"),
     "rfm/predictor.py": ("test_rewind", "test_vlm"),
     "rfm/embedding.py": ("test_encoders",),
     "rfm/checkpoint/*.py": (
