@@ -38,7 +38,7 @@ _REQUESTS_METRIC = "nv_inference_request_success_total"
 _COMPUTE_METRIC = "nv_inference_compute_infer_duration_us_total"
 _SAMPLED_METRIC = "nv_cpu_memory_used_bytes"
 _RESTRICTED = "is restricted, expecting header"  # what Triton says over HTTP and gRPC
-_SAMPLING_S = 2.5  # Triton looks at the machine every two seconds; until the first time it tells zeros
+_SAMPLING_S = 2.5  # Triton looks at the machine every two seconds; until the first time it reports zeros
 _POLL_S = 0.2
 _REASON_CHARACTERS = 120
 _NS_PER_MS = 1e6
@@ -50,7 +50,7 @@ _US_PER_S = 1e6
 class ModelStatus:
     """One version of a model.
 
-    requests_pending: requests that wait for their turn now; None: the metrics do not tell
+    requests_pending: requests that wait for their turn now; None: the metrics do not say
     samples, executions: of all requests together; a batch is executed once
     queue_ms, compute_ms: of all requests in the queue, of all executions in the model
     last_used_s: Unix time of the last request; None: there was none
@@ -134,7 +134,7 @@ def read_status(
 ) -> ServerStatus:
     """The state of the server at ``grpc://host:port`` or ``http://host:port``, or with TLS ``grpcs://`` or ``https://``.
 
-    metrics_url: where it shows its metrics; None: port METRICS_PORT of the same host. What only they tell is missing
+    metrics_url: where it shows its metrics; None: port METRICS_PORT of the same host. What only they contain is missing
         if they cannot be read.
     access: certificates, and what is shown with each request, but not to the metrics
 

@@ -25,7 +25,7 @@ from rfm_export.errors import ExportError
 from rfm_export.layout import CONFIG_FILE
 from rfm_export.pbtxt import parse, render
 
-AS_FAST = 0.95  # of the highest rate: closer than that, rates do not tell settings apart
+AS_FAST = 0.95  # of the highest rate: closer than that, rates do not separate settings
 INSTANCES_PER_GPU = (1, 2, 3)
 BATCH_SIZES = (8, 32, 128)
 NUM_SAMPLES = 64

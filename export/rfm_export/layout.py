@@ -69,7 +69,7 @@ class Version:
 
     num_gpus: 0: the CPU
     family: package of the checkpoint's family
-    about: parameters that tell which checkpoint it is
+    about: parameters that name the checkpoint
     """
 
     number: int

@@ -36,7 +36,7 @@ READ_JSON_GROWTH = 5  # times as large it is usually: what waits for room before
 CHARSETS = ("utf-8", "utf8", "us-ascii", "ascii", "iso-8859-1", "iso8859-1", "latin-1", "latin1")
 
 _NUMBER_BYTES, _LIST_BYTES, _TEXT_BYTES, _OBJECT_BYTES = 48, 88, 96, 208  # what Python takes for one, at the most
-_ERROR_BYTES = 2048  # of a field, as it is told
+_ERROR_BYTES = 2048  # of a field, as the error shows it
 _PART_BYTES, _HEADER_BYTES = 2560, 384  # what a part of a multipart body takes besides its content, and a header of it
 
 _ANY_SAMPLE_FIELD = re.compile(r"sample_[0-9]+")
@@ -62,7 +62,7 @@ class Batch:
 
 
 def invalid(loc: tuple[str | int, ...], message: str, kind: str = "value_error") -> RequestValidationError:
-    """The error at a field of the body, as FastAPI tells its own."""
+    """The error at a field of the body, in the form of FastAPI's own errors."""
     return RequestValidationError([{"type": kind, "loc": ["body", *loc], "msg": message}])
 
 
@@ -297,8 +297,9 @@ def _checked(
 
 
 def _field_error(error: ErrorDetails) -> dict[str, Any]:
-    """As this gateway tells its own: ``expected X, got Y`` at a path without the sample's type, which pydantic puts
-    behind its index.
+    """pydantic's error in the form of this gateway's own: ``expected X, got Y`` at a path.
+
+    The path leaves out the sample's type, which pydantic puts behind the sample's index.
     """
     kind, given, loc = error["type"], error["input"], [*error["loc"][:1], *error["loc"][2:]]
     message = error["msg"].removeprefix("Value error, ")

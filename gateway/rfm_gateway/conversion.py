@@ -56,7 +56,10 @@ class Conversion:
     frame_steps: int
 
     def samples(self, samples: Sequence[schema.Sample]) -> list[Sample]:
-        """Raises RequestValidationError that tells of all that cannot be scored, and HTTPException as NamedFiles."""
+        """The samples as the client takes them.
+
+        Raises RequestValidationError that lists all that cannot be scored, and HTTPException as NamedFiles does.
+        """
         converted: list[Sample] = []
         errors: dict[int, InvalidSampleError] = {}
         for index, sample in enumerate(samples):
@@ -172,7 +175,7 @@ def _check_width(where: str, array: Float32Array, width: int | None) -> None:
 
 
 def refused(errors: Mapping[int, InvalidSampleError]) -> RequestValidationError:
-    """One error that tells of all samples that cannot be scored, each at its field as the caller named it."""
+    """One error that lists all samples that cannot be scored, each at its field as the caller named it."""
     details: list[Any] = []
     for index, error in errors.items():
         where, _, message = error.message.partition(": ")

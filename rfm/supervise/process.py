@@ -260,7 +260,7 @@ class TritonServer:
             *(f"--load-model={model}" for model in models),
             "--disable-auto-complete-config",
             "--strict-readiness=false",  # else one version that cannot be loaded makes all not ready
-            "--exit-on-error=false",  # so that the reason of each model that fails can be asked for
+            "--exit-on-error=false",  # so that the reason of each model that fails can be read
             f"--exit-timeout-secs={EXIT_TIMEOUT_S}",
             f"--http-address={endpoints.http_host}",
             f"--http-port={endpoints.http_port}",

@@ -42,7 +42,7 @@ _CHANNEL = [
 _RESTRICTED = "is restricted, expecting header"
 _OF_SERVER = ("StatusCode.UNAVAILABLE", "StatusCode.DEADLINE_EXCEEDED", "StatusCode.CANCELLED")
 _GOING = (READY, UNLOADING)
-_NOT_LOADED = "not loaded"  # Triton tells no state
+_NOT_LOADED = "not loaded"  # Triton gives no state
 _UNAVAILABLE, _UNLOADED = "UNAVAILABLE", "unloaded"
 
 
@@ -128,7 +128,7 @@ class RepositoryApi:
         raise RepositoryApiError(f"{model}: expected its old versions to finish within {FINISH_S:g} s, got no end")
 
     def infer(self, model: str, version: int, inputs: Tensors, outputs: Collection[str]) -> Tensors:
-        """What one version answers. Its id tells it from callers' requests in logs."""
+        """What one version answers to a probe. The probe's request id sets it apart from callers' requests in logs."""
         tensors = []
         for name, array in inputs.items():
             tensors.append(tritonclient.grpc.InferInput(name, array.shape, np_to_triton_dtype(array.dtype)))

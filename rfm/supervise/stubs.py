@@ -151,7 +151,7 @@ class StubWatch:
         return since_s is not None and time.monotonic() - since_s >= duration_s
 
     def _scan(self) -> None:
-        known = {stub for stub in self._stubs if stub.state is not None}  # a zombie tells nothing of itself
+        known = {stub for stub in self._stubs if stub.state is not None}  # of a zombie nothing can be read
         found = (_stub(folder, self._triton_pid) for folder in _PROC.glob("[0-9]*"))
         self._buried = {stub for stub in self._buried if stub.state is not None}
         self._stubs = known | {stub for stub in found if stub is not None} - self._buried

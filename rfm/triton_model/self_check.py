@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A model process that finds out by itself that it is broken, by a lost CUDA context say, and ends.
 
-Probes cannot tell one broken instance of several: they go to whichever instance is free. A process that has ended is
+Probes do not find one broken instance among several: they go to whichever instance is free. A process that has ended is
 dead, and healed as such. Inputs may fail too, so a blank sample decides: who can score that is not broken.
 """
 

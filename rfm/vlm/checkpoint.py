@@ -77,7 +77,7 @@ class VlmCheckpoint:
 
     @property
     def description(self) -> Description:
-        """What it can be asked, and what it answers."""
+        """What the checkpoint takes, and what it answers."""
         return Description(
             network_class=VlmRewardModel.__name__,
             widths=None,

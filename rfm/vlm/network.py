@@ -26,7 +26,7 @@ SMOL = "smolvlm"
 
 @dataclass(frozen=True)
 class VlmConfig:
-    """What a checkpoint's network looks like and how it was trained to be asked.
+    """What a checkpoint's network looks like, and which prompts it was trained with.
 
     backbone: transformers' configuration of it (config.json)
     dtype: of all parameters, heads included

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""config.yaml of a vision-language training run: the settings that weights do not tell.
+"""config.yaml of a vision-language training run: the settings that weights do not hold.
 
 docs/checkpoints.md lists every setting, and what decides it where the file lacks its key.
 """

@@ -34,7 +34,7 @@ Times = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked of each source.
+    """The settings with which each source is scored.
 
     max_frames: frames that are sent at most, besides the checkpoint's own limit, which ``subsample`` applies
     """
@@ -139,7 +139,7 @@ class Comparison:
 
 
 def score_all(server: Server, names: Sequence[str], question: Question) -> list[Outcome]:
-    """The outcome of each source, in order. Raises RewardError if the server cannot be asked at all."""
+    """The outcome of each source, in order. Raises RewardError if the server gives no answer at all."""
     with ThreadPoolExecutor(WORKERS) as pool, server.connected() as client, _progress_bar(len(names)) as advance:
         futures: list[Future[Outcome]] = []
         try:
@@ -197,7 +197,7 @@ def _score(client: RewardClient, name: str, question: Question) -> Outcome:
     except ImportError as error:
         return Failed(name, error, missing_package(error))
     except (RewardError, OSError) as error:
-        return Failed(name, error, str(error).removesuffix(f" ({name})"))  # it is told with the name in any case
+        return Failed(name, error, str(error).removesuffix(f" ({name})"))  # the report names the source in any case
     return Scored(
         name=name,
         result=result,

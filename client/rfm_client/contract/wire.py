@@ -223,7 +223,7 @@ def encode_results(results: Sequence[Result], num_positions: int, outputs: Colle
 def decode_results(
     tensors: Mapping[str, npt.NDArray[Any]], samples: Sequence[Sample], model_version: str | None = None
 ) -> list[Result]:
-    """The results of the samples that a request asked about, and that ``model_version`` answered.
+    """The results of the samples of one request, which ``model_version`` answered.
 
     Raises InferenceFailedError for an answer that lacks a score: a missing reward is no reward of 0 or NaN.
     """

@@ -13,7 +13,7 @@ than the one in use is ignored; with ``max_pending`` questions open nothing is s
 Even then the frame of the reset is waited for, so that there is a score from the start, and the last step is, unless
 ``await_last=False``; older questions are needless then, and cancelled.
 
-``info["reward_model"]``: ``progress`` and ``success`` (NaN: the checkpoint does not tell it) of the newest known
+``info["reward_model"]``: ``progress`` and ``success`` (NaN: the checkpoint does not predict it) of the newest known
 answer; the ``step`` of the episode that it is about, and its ``lag`` in steps; the steps ``skipped`` in this episode;
 after a step the ``env_reward``; with ``terminate_on_success`` whether the episode has ``succeeded``.
 
@@ -48,11 +48,11 @@ _DEFAULTS = RewardOptions()
 
 
 class RewardModelWrapper(gymnasium.Wrapper):
-    """An environment paid by a reward model; the module's text tells how.
+    """An environment paid by a reward model; the module's docstring says how.
 
     client: a RewardClient, which stays open; or what makes one, at the first reset, which ``close()`` closes. For
         environments that are made in another process than they work in (AsyncVectorEnv) only the latter is right.
-    task: the task sentence, or what tells it from the info of each reset
+    task: the task sentence, or a function that reads it from the info of each reset
 
     Raises ValueError if frames cannot come from where ``options`` says.
     """

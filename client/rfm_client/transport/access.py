@@ -20,7 +20,7 @@ AUTHORIZATION = "authorization"
 
 _REFUSALS = ("401", "403", "StatusCode.UNAUTHENTICATED", "StatusCode.PERMISSION_DENIED")
 _NO_CONNECTION = "StatusCode.UNAVAILABLE"
-_NO_TRUST = re.compile(  # how gRPC tells why TLS did not come about, and Triton that it wants a key
+_NO_TRUST = re.compile(  # how gRPC reports a failure of TLS, and Triton a missing key
     "CERTIFICATE|certificate|[Vv]erification [Cc]heck failed|WRONG_VERSION_NUMBER|is restricted, expecting header"
 )
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*")
@@ -39,7 +39,7 @@ class AccessOptions(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Access:
-    """What a connection takes beyond a URL. Raises ValueError for what cannot be used, without telling a key.
+    """What a connection takes beyond a URL. Raises ValueError for what cannot be used, without showing a key.
 
     ca_file: certificates (PEM) of the authorities that may vouch for the server; None: those of the system
     client_certificate, client_key: files (PEM) by which a server knows this client (mutual TLS); both or none
@@ -62,7 +62,7 @@ class Access:
             if not _VALUE.fullmatch(value):
                 raise ValueError(f"{name}: expected visible ASCII characters, got others or none")
         if self.uses_tls:
-            self.ssl_context  # noqa: B018  # what cannot be read is told now, not when it is first needed
+            self.ssl_context  # noqa: B018  # a file that cannot be read is an error now, not at first use
 
     @property
     def uses_tls(self) -> bool:

@@ -78,7 +78,7 @@ class Transport(Protocol):
         """The named ``outputs`` of ``model`` for ``inputs``. request_id: what the server calls the request"""
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
-        """What the server tells of ``model``. ModelNotFoundError when it is not served."""
+        """What the server says of ``model``. ModelNotFoundError when it is not served."""
 
     async def is_ready(self, model: str, timeout_s: float) -> bool:
         """Whether the server answers and ``model`` is ready."""

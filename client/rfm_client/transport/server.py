@@ -21,7 +21,11 @@ _HEAL_POLL_S = 0.2  # while it loads its model anew, which takes seconds, it is 
 
 
 class Server:
-    """failures: one after the other, up to now; is_gone: it is asked no more, and closed as soon as nobody uses it"""
+    """One server of several: its transport, its load and its failures.
+
+    failures: number of requests that failed since the last success
+    is_gone: it gets no more requests, and is closed as soon as nobody uses it
+    """
 
     _moments = itertools.count(1)
 
@@ -57,7 +61,7 @@ class Server:
             self._close_if_unused()
 
     def leave_out(self, model: str) -> None:
-        """Until it says that it is ready; the more often it has failed, the later it is asked."""
+        """Until it says that it is ready; the more often it has failed, the later it is probed."""
         if not self.is_left_out and not self.is_gone:
             self._has_ended_process = False
             self.comeback = asyncio.create_task(self._rest(model))
