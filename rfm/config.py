@@ -159,7 +159,7 @@ class ServeConfig:
 
     @property
     def torch_dtype(self) -> torch.dtype | None:
-        """``dtype`` as torch has it."""
+        """The torch type that ``dtype`` names; None: ``dtype`` is not set."""
         import torch  # here, since only few of those who read a configuration need it
 
         return getattr(torch, self.dtype) if self.dtype else None

@@ -119,10 +119,10 @@ class Checkpoint(Protocol):
         """All weights by part and name. The part NETWORK is always there."""
 
     def encoders(self) -> FrameEncoders | None:
-        """Its encoders; None: it has none. Raises CheckpointError if they cannot be had or do not fit."""
+        """The checkpoint's encoders; None: it has none. Raises CheckpointError if they cannot be had or do not fit."""
 
     def predictor(self, device: torch.device, dtype: torch.dtype | None = None) -> Predictor[Any, Any]:
-        """Its network on ``device``. Raises CheckpointError.
+        """The checkpoint's network on ``device``, as a predictor. Raises CheckpointError.
 
         dtype: of the network; None: as checkpoint and device decide
         """

@@ -259,7 +259,7 @@ class AsyncRewardClient:
     async def _fitted(
         self, samples: Sequence[Sample], options: CallOptions, deadline: Deadline
     ) -> tuple[dict[int, FittedSample], dict[int, Result | RewardError]]:
-        """By index: the samples as they are sent, and the errors of those that cannot be."""
+        """The samples as they are sent, and the errors of those that cannot be sent, by index."""
         subsample, resize = options.get("subsample", False), options.get("resize", False)
         fits: dict[int, FittedSample] = {}
         failed: dict[int, Result | RewardError] = {}
@@ -309,7 +309,7 @@ class AsyncRewardClient:
         return answer
 
     def _deadline(self, timeout_s: float | None) -> Deadline:
-        """That of a call which begins now; None: the client's."""
+        """Deadline of a call which begins now; timeout_s: None: the client's."""
         if self._is_closed:
             raise RuntimeError("this AsyncRewardClient is closed")
         return Deadline(self._timeout_s if timeout_s is None else timeout_s)
@@ -350,7 +350,7 @@ def _check_known(options: Mapping[str, object], known: type[ClientOptions] | typ
 
 
 def _request_ids(prefix: str | None) -> Iterator[str]:
-    """Of the requests of one call, which begin alike. Raises ValueError for a prefix that is none."""
+    """Request ids of one call, which begin alike. Raises ValueError for a prefix that is not allowed."""
     if prefix is not None and not wire.REQUEST_ID.fullmatch(prefix):
         raise ValueError(f"request_id: expected 1 to 64 letters, digits or any of ._:/+=@-, got {prefix!r}")
     prefix = prefix or secrets.token_hex(_ID_BYTES)

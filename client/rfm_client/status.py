@@ -101,8 +101,10 @@ class Device:
 
 @dataclass(frozen=True)
 class DeviceWork:
-    """Of one model on one device, all its versions together. requests: answered; compute_s: their
-    computing, in seconds; a batch counts for each of its requests
+    """The work of one model on one device, all its versions together.
+
+    requests: number of requests answered; compute_s: seconds of computation, in which a batch counts once for each of
+    its requests
     """
 
     requests: int
@@ -218,7 +220,7 @@ def _if_open(read: Callable[[], Any]) -> Any:
 
 
 def _index(statistics: list[dict[str, Any]], is_ready: Callable[[str, str], bool]) -> list[dict[str, Any]]:
-    """As the repository's index has it, of what is loaded."""
+    """The entries of the repository's index for the models that are loaded, made from their statistics."""
     keys = sorted((entry["name"], int(entry["version"])) for entry in statistics)
     return [
         {"name": name, "version": str(version), "state": "READY" if is_ready(name, str(version)) else "UNAVAILABLE"}
@@ -292,7 +294,10 @@ def _read_metrics(url: str, timeout_s: float) -> _Metrics:
 
 
 def _work(samples: list[Any], device: str) -> dict[str, DeviceWork]:
-    """By model. Triton names the GPU of a count; what it names none for is the processor's."""
+    """The work on one device by model.
+
+    Triton names the GPU of a count. A count without a GPU is the processor's.
+    """
     counts: dict[str, dict[str, float]] = {}
     for sample in samples:
         if sample.name in (_REQUESTS_METRIC, _COMPUTE_METRIC) and sample.labels.get("gpu_uuid", _PROCESSOR) == device:

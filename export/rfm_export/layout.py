@@ -47,7 +47,7 @@ class GeneratedModel:
 
     @property
     def name(self) -> str:
-        """Its name in the repository."""
+        """The model's name in the repository."""
         return str(self.config.name)
 
     @property

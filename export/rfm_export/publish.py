@@ -152,7 +152,7 @@ def _settle(staged: Path) -> None:
 
 
 def _keep_config(repository: Path, name: str, scratch: Path) -> None:
-    """For a version whose export kept none."""
+    """Keeps the served version's configuration in its folder, where its export kept none."""
     current = read_config(repository, name)
     kept = repository / name / str(max(current.version_policy.specific.versions)) / CONFIG_FILE
     if not kept.exists():

@@ -254,7 +254,7 @@ def _answer_errors(app: FastAPI) -> None:
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:
-    """With the schemas of bodies, which are read from the stream and not declared as parameters."""
+    """The OpenAPI document with the schemas of bodies, which are read from the stream and no declared parameters."""
     if app.openapi_schema is None:
         document = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
         _, models = models_json_schema([(model, "validation") for model in _MODELS], ref_template=_REFERENCE)

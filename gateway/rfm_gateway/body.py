@@ -74,7 +74,7 @@ class Admitted:
     share: Share
 
     async def wait_for_room(self, deadline: Deadline) -> None:
-        """Until there is memory for the body that is announced. Raises HTTPException 503."""
+        """Waits until there is memory for the announced body. Raises HTTPException 503."""
         announced = self.request.headers.get("content-length", "")
         growth = 1 if self.request.url.path.endswith(NPY_ENDPOINT) else READ_JSON_GROWTH
         await self.share.reserve(int(announced) * growth if announced.isdecimal() else 0, deadline)
@@ -208,7 +208,7 @@ class BodyLimits:
 
 
 def _ending(request: Request) -> bytes:
-    """With what the body of a multipart request ends; empty for the JSON endpoint."""
+    """The bytes with which a multipart body ends; empty for the JSON endpoint."""
     if not request.url.path.endswith(NPY_ENDPOINT):
         return b""
     kind, options = parse_options_header(request.headers.get("content-type", ""))
@@ -260,7 +260,7 @@ def _unwrapped(document: Any) -> tuple[list[Any], bool]:
 
 
 def _sample_fields(fields: Mapping[str, str]) -> list[str]:
-    """``sample_0``, ``sample_1`` and so on, without a gap: one left out would shift the answers of the others."""
+    """The fields ``sample_0``, ``sample_1`` and so on. A gap is refused: it would shift later answers."""
     numbers = []
     for name in filter(_ANY_SAMPLE_FIELD.fullmatch, fields):
         if not _SAMPLE_FIELD.fullmatch(name):

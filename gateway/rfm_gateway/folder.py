@@ -110,7 +110,7 @@ class NamedFiles:
 
 
 def _unpacked_bytes(file: Path) -> int:
-    """Of the arrays in a .npy or .npz file."""
+    """Bytes of the unpacked arrays in a .npy or .npz file."""
     if file.suffix.lower() == ".npz":
         with ZipFile(file) as archive:
             return sum(entry.file_size for entry in archive.infolist())

@@ -79,7 +79,7 @@ def _check_leaves(array: list[Any]) -> None:
 
 
 def _frames(value: Any, info: ValidationInfo) -> Any:
-    """As ``_array``; or a list of names of image files."""
+    """The frames as ``_array`` reads them, or a list of names of image files."""
     if isinstance(value, list) and value and all(isinstance(name, str) for name in value):
         return value
     return _array(value, info)
@@ -132,7 +132,7 @@ class ProgressSample(BaseModel):
 
     @property
     def named_trajectories(self) -> dict[str, Trajectory]:
-        """By field name, in the order in which they are scored."""
+        """The trajectories by field name, in the order in which they are scored."""
         return {"trajectory": self.trajectory}
 
 
@@ -147,7 +147,7 @@ class PreferenceSample(BaseModel):
 
     @property
     def named_trajectories(self) -> dict[str, Trajectory]:
-        """By field name, in the order in which they are scored."""
+        """The trajectories by field name, in the order in which they are scored."""
         return {"chosen_trajectory": self.chosen_trajectory, "rejected_trajectory": self.rejected_trajectory}
 
 
@@ -163,7 +163,7 @@ class SimilaritySample(BaseModel):
 
     @property
     def named_trajectories(self) -> dict[str, Trajectory]:
-        """By field name, in the order in which they are scored."""
+        """The trajectories by field name, in the order in which they are scored."""
         return {"ref_trajectory": self.ref_trajectory, "sim_trajectory": self.sim_trajectory}
 
 

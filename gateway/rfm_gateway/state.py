@@ -61,7 +61,9 @@ class State:
         return _gpu_status(status, self._model)
 
     async def health(self) -> schema.Health:
-        """Within HEALTH_TIMEOUT_S. Raises ServerUnavailableError with the reason when a model does not answer."""
+        """The answer of ``/health``, within HEALTH_TIMEOUT_S. Raises ServerUnavailableError when a model does not
+        answer.
+        """
         async with self._refreshing:
             if time.monotonic() - self._refreshed_s >= HEALTH_KEPT_S:
                 deadline = Deadline(HEALTH_TIMEOUT_S)
@@ -98,7 +100,7 @@ class State:
         )
 
     async def _read_devices(self, deadline: Deadline) -> schema.GpuStatus | None:
-        """None where the metrics cannot be read: scoring does not need them."""
+        """State of the devices; None where the metrics cannot be read: scoring does not need them."""
         try:
             async with timeout(deadline.remaining_s()):
                 return await self.gpu_status()
@@ -106,7 +108,7 @@ class State:
             return None
 
     async def _infos(self, deadline: Deadline) -> list[ModelInfo]:
-        """Of the models for embeddings and for raw frames, as far as they are served now: another version may be."""
+        """What is known of the models for embeddings and for raw frames, as far as they are served now."""
         infos = []
         missing = None
         for frames in (False, True):

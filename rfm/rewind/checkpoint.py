@@ -209,7 +209,7 @@ def _shape(weights: Mapping[str, Tensor], name: str, rank: int) -> torch.Size:
 
 
 def _trained_frames(folder: Path) -> int | None:
-    """As ``RewindCheckpoint.save`` wrote it to config.json, else as config.yaml has it."""
+    """The most frames of a trajectory in training, as ``save`` wrote it to config.json, else as config.yaml has it."""
     if is_there(folder / NETWORK_CONFIG):
         saved = read_json(folder / NETWORK_CONFIG).get("trained_frames")
         if saved is not None:

@@ -54,7 +54,8 @@ class Encoders:
         image_weights: Mapping[str, Tensor] | None = None,
         text_weights: Mapping[str, Tensor] | None = None,
     ) -> Encoders:
-        """From local folders or Hugging Face ids; given weights (a checkpoint's own) win over the source's.
+        """The encoders in local folders or of Hugging Face ids. Weights that are given (a checkpoint's own) win over
+        theirs.
 
         Raises ImportError without transformers, OSError for a source that cannot be had, ValueError for one
         that does not fit.

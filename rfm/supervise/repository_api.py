@@ -95,12 +95,12 @@ class RepositoryApi:
         return versions_of(MessageToDict(entry) for entry in answer.models)
 
     def ready_versions(self, model: str) -> list[int]:
-        """Those that are served now."""
+        """The versions of ``model`` that are served now."""
         ready = (entry for entry in self.index() if entry.name == model and entry.is_ready)
         return [entry.version for entry in ready if entry.version is not None]
 
     def config(self, model: str, version: int) -> dict[str, Any]:
-        """With which it was loaded."""
+        """The configuration with which the version was loaded."""
         answer = self._request(self._client.get_model_config, model, str(version))
         config: dict[str, Any] = MessageToDict(answer.config, preserving_proto_field_name=True)
         return config

@@ -111,7 +111,7 @@ class Metrics:
 
     @contextmanager
     def at_work_on(self, batch: Iterable[Request[Any]]) -> Iterator[None]:
-        """Within it, the gauge of requests that are worked on shows how many of the batch are callers'."""
+        """A context in which the gauge of requests in work counts the callers' requests of the batch."""
         self._set_at_work(sum(request.is_counted for request in batch))
         try:
             yield

@@ -35,7 +35,7 @@ class SelfCheck:
 
     @contextmanager
     def around(self, batch: Sequence[Request[Any]]) -> Iterator[None]:
-        """Within it the batch is served. Afterwards the instance is checked, if need be.
+        """A context in which the batch is served. Afterwards it checks the instance, if the batch failed.
 
         Nothing begins in a broken process, so that no request is a suspect when it ends.
         """

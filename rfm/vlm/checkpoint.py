@@ -101,7 +101,7 @@ class VlmCheckpoint:
         return load_collator(self.config, len(embedding), self.processor or self.config.base_model_id)
 
     def encoders(self) -> None:
-        """It has none: the network reads raw frames."""
+        """None: the network reads raw frames, and needs no encoders."""
 
     def predictor(self, device: torch.device, dtype: torch.dtype | None = None) -> VlmPredictor:
         """The network on ``device``. Raises CheckpointError.

@@ -31,7 +31,7 @@ MAX_VIDEO_SIDE_PX = 480  # longer frames are scaled down before anything else, i
 
 @dataclass(frozen=True)
 class Normalisation:
-    """Per channel (value - 255 mean) / (255 std)."""
+    """Normalisation of pixels per channel: (value - 255 mean) / (255 std)."""
 
     mean: tuple[float, ...]
     std: tuple[float, ...]

@@ -61,7 +61,7 @@ class VlmConfig:
 
     @property
     def pads_left(self) -> bool:
-        """On which side the checkpoint was trained to be padded."""
+        """Whether padding stands before the tokens, as in the checkpoint's training."""
         return self.family == SMOL
 
     @property
@@ -71,7 +71,7 @@ class VlmConfig:
 
     @property
     def torch_dtype(self) -> torch.dtype:
-        """``dtype`` as torch has it."""
+        """The torch type that ``dtype`` names."""
         return {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}[self.dtype]
 
 

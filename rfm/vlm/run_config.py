@@ -36,7 +36,9 @@ class RunConfig:
 
     @classmethod
     def of(cls, folder: Path) -> RunConfig:
-        """That of the checkpoint in ``folder``. Raises CheckpointError if there is none, or none of upstream's."""
+        """The run configuration of the checkpoint in ``folder``. Raises CheckpointError if there is none, or none of
+        upstream's.
+        """
         file = find_run_config(folder)
         if file is None:
             raise CheckpointError(

@@ -288,7 +288,7 @@ def _note(name: str, num_scored: int, num_frames: int) -> None:
 
 
 def _print(*tables: object) -> None:
-    """As wide as the terminal; in a file or a pipe, as wide as it takes."""
+    """Prints as wide as the terminal; into a file or a pipe, as wide as the content."""
     from rich.console import Console
 
     console = Console()

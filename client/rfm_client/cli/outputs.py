@@ -24,7 +24,7 @@ from rfm_client.status import ServerStatus
 
 
 def write_json(target: str, document: Mapping[str, Any]) -> None:
-    """To a file or standard output."""
+    """Writes the document to a file, or to standard output."""
     text = json.dumps(document, indent=2, allow_nan=False)
     if target == STANDARD_OUTPUT:
         typer.echo(text)

@@ -57,7 +57,7 @@ class Source:
 
     @classmethod
     def read(cls, name: str, question: Question) -> Source:
-        """From a file or URL. Raises InvalidSampleError."""
+        """The source that a file or URL holds. Raises InvalidSampleError."""
         from rfm_client.data.inputs import ARRAY_SUFFIXES, load_trajectory
         from rfm_client.data.video import frame_times_s, is_url
 
@@ -209,7 +209,10 @@ def _score(client: RewardClient, name: str, question: Question) -> Outcome:
 
 
 def _evaluate(client: RewardClient, sample: Sample, question: Question) -> Result:
-    """Its frames are left out here rather than by the client, which knows of no other limit than the checkpoint's."""
+    """The result of one sample, with frames left out as the question and the checkpoint require.
+
+    The frames are left out here: the client knows of no other limit than the checkpoint's.
+    """
     info = client.model_info(frames=sample.trajectories[0].frames is not None)
     dense = question.frame_steps > 0  # then the server samples each prefix
     limits = (question.max_frames, info.max_frames if question.subsample and not dense else None)
@@ -223,7 +226,7 @@ def _evaluate(client: RewardClient, sample: Sample, question: Question) -> Resul
 
 @contextmanager
 def _progress_bar(total: int) -> Iterator[Callable[[], None]]:
-    """On standard error, and only on a terminal. What it gives is called for each that is done."""
+    """A progress bar on standard error, shown only on a terminal. It gives a function to call after each source."""
     from rich.console import Console
     from rich.progress import MofNCompleteColumn, Progress
 

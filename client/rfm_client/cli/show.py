@@ -118,7 +118,7 @@ class Panel:
         frames: UInt8Array | None = None,
         times_s: npt.NDArray[np.float64] | None = None,
     ) -> Panel:
-        """From the scores of a trajectory, all its frames and their times [T], as far as they are known.
+        """The panel of a trajectory's scores, with all its frames and their times [T], as far as they are known.
 
         Of the frames it keeps only copies of those that it shows.
         """

@@ -14,7 +14,7 @@ _URL = re.compile(r"((?P<scheme>grpcs?|https?)://|dns:///)(?P<address>[^/]+:(?P<
 
 
 def split_url(url: str) -> tuple[str, str]:
-    """``grpc``, ``http``, ``grpcs`` or ``https``, and ``host:port``. Raises ValueError.
+    """The parts of a URL: ``grpc``, ``http``, ``grpcs`` or ``https``, and ``host:port``. Raises ValueError.
 
     ``dns:///host:port``, as gRPC writes it, is ``grpc://host:port``.
     """

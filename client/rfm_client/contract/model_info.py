@@ -61,7 +61,7 @@ class ModelInfo:
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> ModelInfo:
-        """From Triton's model configuration, as its HTTP API writes it.
+        """What Triton's model configuration, as its HTTP API writes it, says of the model.
 
         Raises ValueError, LookupError or TypeError for what is none.
         """

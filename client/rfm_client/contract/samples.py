@@ -61,7 +61,7 @@ class Trajectory:
             object.__setattr__(self, "text_embedding", text)
 
     def __repr__(self) -> str:
-        """With shapes in place of values, which would fill pages."""
+        """The trajectory with shapes in place of values, which would fill pages."""
         arrays = {"frames": self.frames, "video_embeddings": self.video_embeddings, "text": self.text_embedding}
         shapes = [f"{name}={array.dtype} {list(array.shape)}" for name, array in arrays.items() if array is not None]
         return f"Trajectory({', '.join([*shapes, f'task={self.task!r}'])})"

@@ -71,7 +71,7 @@ class Access:
 
     @classmethod
     def of(cls, options: AccessOptions) -> Access:
-        """From what is of it among a client's options."""
+        """The access that a client's options describe; options of other kinds are left out."""
         given = cast("dict[str, Any]", options)
         return cls(**{name: given[name] for name in AccessOptions.__annotations__ if name in given})
 

@@ -199,7 +199,10 @@ class _TritonTransport:
         *,
         bad_request: type[errors.RewardError] = errors.InvalidSampleError,
     ) -> Answered:
-        """``bad_request``: what a 400 means; Triton answers it for an unknown model too."""
+        """What the server answers to ``request``, within ``timeout_s``.
+
+        bad_request: the error for a 400, with which Triton answers for an unknown model, too
+        """
         try:
             # Not by a deadline of gRPC: Triton 2.51 overlooks that one has passed, but not that a call is cancelled.
             async with timeout(timeout_s):

@@ -194,13 +194,13 @@ class Servers:
         return min(self._servers, key=rank)
 
     def _note(self, server: Server, model: str, error: ServerUnavailableError) -> None:
-        """That a server is not to be had."""
+        """Records that a server does not answer, and leaves it out."""
         if not server.failures and self._retry:
             logger.warning("%s: trying again: %s", server.transport.url, error)
         self._leave_out(server, model, is_dead=isinstance(error, ProcessEndedError))
 
     def _leave_out(self, server: Server, model: str, *, is_dead: bool = False) -> None:
-        """Until it is ready, or healed. The only server there is stays in."""
+        """Leaves a server out until it is ready, or healed. The only server stays in."""
         server.failures += 1
         if len(self._servers) > 1:
             (server.leave_out_dead if is_dead else server.leave_out)(model)

@@ -195,17 +195,22 @@ class SharedMemory:
             self._free.append(region)
 
     async def _give_up(self, region: Region) -> None:
-        """It is free again if the server keeps it."""
+        """Unregisters a region. It is free again if the server keeps it."""
         await self._unregister(region)
         self._release(region)
 
     async def _drop(self, region: Region) -> None:
-        """Of one that nobody has used: a server that does not answer does not map it, as its name is gone."""
+        """Drops a region that no request has used.
+
+        A server that does not answer cannot map it later: its name is gone.
+        """
         await self._unregister(region)
         self._known.discard(region)
 
     async def _unregister(self, region: Region) -> None:
-        """It stays known if a cancelled request still uses it, or the server cannot be reached."""
+        """Has the server unmap a region. It stays known if a cancelled request still uses it, or the server does not
+        answer.
+        """
         with self._unanswered():
             async with timeout(ANSWER_TIMEOUT_S):
                 await self._server.unregister_region(region.name)
