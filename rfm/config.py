@@ -60,15 +60,15 @@ class ServeConfig:
     instances: of each model, on each GPU or on the CPU; ``rfm tune`` measures what serves fastest
     torch_threads: CPU threads of each model instance; 0: on the CPU all instances of a model share its cores
     grpc_port, metrics_port: Triton's other two ports
-    gateway_port: of the FastAPI evaluation server's endpoints before it; null: there are none
-    status_port: of what ``rfm serve`` tells of itself; null: there is none
+    gateway_port: port of the gateway with the FastAPI evaluation server's endpoints; null: no gateway
+    status_port: port on which ``rfm serve`` reports its own state; null: it opens none
     max_queue_size: requests that may wait for a model; more are refused at once; null: any number
     queue_timeout_ms: the longest that a request may wait; then it is refused. A request may ask for less; null: any
         time. With either, Triton 2.51 misses requests for half a second at a time where a model has one instance
     grpc_certificate, grpc_key: files (PEM) to serve gRPC with TLS; HTTP, which Triton cannot encrypt, is then open on
         127.0.0.1 alone
     grpc_client_ca: file (PEM) of who may vouch for gRPC's clients, which then need a certificate
-    canary_s: how often ``rfm serve`` asks each model whether it answers
+    canary_s: seconds between two probes that ``rfm serve`` sends to a model
     hang_s: how long a model may take to get one forward pass further, or answer nobody, before ``rfm serve`` loads it
         anew
     triton_silent_s: how long Triton may give no answer, to three looks in a row, before ``rfm serve`` restarts it
@@ -152,14 +152,14 @@ class ServeConfig:
 
     @property
     def host(self) -> str:
-        """``server_url`` as an address to listen on."""
+        """The listen address that ``server_url`` names."""
         host = self.server_url.partition("://")[2] or self.server_url
         host = host.rstrip("/")
         return DEFAULT_HOST if host == "localhost" else host
 
     @property
     def torch_dtype(self) -> torch.dtype | None:
-        """``dtype`` as torch has it."""
+        """The torch type that ``dtype`` names; None: ``dtype`` is not set."""
         import torch  # here, since only few of those who read a configuration need it
 
         return getattr(torch, self.dtype) if self.dtype else None

@@ -180,7 +180,10 @@ class Engine:
             return None
 
     def _score(self, rows: Sequence[Any], batch: Any, execution: Execution) -> Sequence[RowScores | RewardError]:
-        """Of one forward pass. batch: of all rows, if it is made"""
+        """The scores of each row from one forward pass.
+
+        batch: the batch of all rows; None: it is made here
+        """
 
         def forward(part: Sequence[Any]) -> Sequence[RowScores | RewardError]:
             of_part = batch if part is rows and batch is not None else self.predictor.collate(part)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""What the answers to one batch took. Whoever answers adds to it; who asked may read it."""
+"""What one batch took: times, tokens, failures of memory.
+
+The code that answers adds to it. The caller may read it afterwards."""
 
 from __future__ import annotations
 
@@ -30,7 +32,7 @@ def _nothing() -> None:
 
 @contextmanager
 def memory_errors() -> Iterator[None]:
-    """Within it, memory that runs out is a torch.OutOfMemoryError: a GPU's, and on the CPU PyTorch's or Python's."""
+    """A context in which every lack of memory is a torch.OutOfMemoryError: a GPU's, PyTorch's on the CPU, Python's."""
     try:
         yield
     except MemoryError as error:
@@ -80,20 +82,20 @@ class Execution:
 
     @contextmanager
     def collating(self) -> Iterator[None]:
-        """Within it no forward pass runs: its time is collate time."""
+        """A context in which no forward pass runs: its time counts as collate time."""
         started_s = time.perf_counter()
         yield
         self.collate_s += time.perf_counter() - started_s
 
     @contextmanager
     def forwarding(self) -> Iterator[None]:
-        """Within it forward passes run: its time is forward time, but for what is spent in ``collating``."""
+        """A context in which forward passes run: its time, without that in ``collating``, counts as forward time."""
         started_s, collated_s = time.perf_counter(), self.collate_s
         yield
         self.forward_s += time.perf_counter() - started_s - (self.collate_s - collated_s)
 
     def add_tokens(self, num_tokens: int, num_slots: int) -> None:
-        """Counts those of one more forward pass."""
+        """Counts the tokens and slots of one more forward pass."""
         self.num_tokens += num_tokens
         self.num_slots += num_slots
 

@@ -74,7 +74,7 @@ def load(
 ) -> Checkpoint:
     """The checkpoint at a local folder or Hugging Face id. Raises CheckpointError.
 
-    family: package of its family; None: as the folder's files tell
+    family: package of its family; None: the family that reads the folder's files
     others: as in ``rfm.family.Options``
     """
     folder = find(source)

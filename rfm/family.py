@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""What the engine and the export need of a family of checkpoints. A package with a ``FAMILY`` in it is one."""
+"""The seam of a family of checkpoints: what the engine and the export need of it.
+
+A package that holds a ``FAMILY`` is one."""
 
 from __future__ import annotations
 
@@ -21,7 +23,7 @@ NETWORK = "network"  # in Checkpoint.parts: the weights of the network that scor
 
 @dataclass(frozen=True)
 class Options:
-    """What a user may say of a checkpoint that its files do not tell. Each family reads its own.
+    """What a user may say of a checkpoint that its files do not hold. Each family reads its own fields.
 
     base_model: folder or id of a vision-language checkpoint's backbone; None: the one that the checkpoint names
     resize_images: of a vision-language checkpoint that reads frames as images and whose run set a size for them:
@@ -38,7 +40,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Description:
-    """What a checkpoint can be asked, and what it answers.
+    """What a checkpoint takes, and what it answers.
 
     network_class: name of the network's class
     widths: Dv and Dt of the embeddings that it scores; None: it scores raw frames
@@ -63,7 +65,7 @@ class Description:
 
 @dataclass(frozen=True)
 class EncodersDescription:
-    """What the export tells of encoders.
+    """What the export records of encoders.
 
     network_class: name of their class
     frame_size: to what they bring each raw frame; None: that depends on the frame
@@ -82,11 +84,11 @@ class FrameEncoders(Protocol):
 
     @classmethod
     def describe(cls, folder: Path) -> EncodersDescription:
-        """Of those that ``save`` wrote, without loading them."""
+        """The description of the encoders that ``save`` wrote into ``folder``, without loading them."""
 
     @property
     def description(self) -> EncodersDescription:
-        """What the export tells of them."""
+        """What the export records of these encoders."""
 
     def save(self, folder: Path) -> None:
         """Writes them into a folder that may be there, so that ``load`` needs no network."""
@@ -110,17 +112,17 @@ class Checkpoint(Protocol):
 
     @property
     def description(self) -> Description:
-        """What it can be asked, and what it answers."""
+        """What the checkpoint takes, and what it answers."""
 
     @property
     def parts(self) -> Mapping[str, Mapping[str, Tensor]]:
         """All weights by part and name. The part NETWORK is always there."""
 
     def encoders(self) -> FrameEncoders | None:
-        """Its encoders; None: it has none. Raises CheckpointError if they cannot be had or do not fit."""
+        """The checkpoint's encoders; None: it has none. Raises CheckpointError if they cannot be had or do not fit."""
 
     def predictor(self, device: torch.device, dtype: torch.dtype | None = None) -> Predictor[Any, Any]:
-        """Its network on ``device``. Raises CheckpointError.
+        """The checkpoint's network on ``device``, as a predictor. Raises CheckpointError.
 
         dtype: of the network; None: as checkpoint and device decide
         """
@@ -131,10 +133,10 @@ class Checkpoint(Protocol):
 
 @dataclass(frozen=True)
 class Family:
-    """How checkpoints of one kind are told from others and loaded.
+    """How checkpoints of one kind are recognised and loaded.
 
     name: the package that has this as its ``FAMILY``
-    reads: whether a folder may hold a checkpoint of this kind; asked where nobody names the family
+    reads: whether a folder may hold a checkpoint of this kind; used where nobody names the family
     load: the checkpoint in a local folder; raises CheckpointError
     encoders: the class of its checkpoints' encoders; None: they score raw frames
     """

@@ -72,7 +72,7 @@ class Journal:
 
     @contextmanager
     def at_work_on(self, digests: Sequence[bytes]) -> Iterator[None]:
-        """Within it, the batch is these requests."""
+        """A context in which the journal names these requests as the batch in work."""
         content = b"".join(digests)
         self._memory[_HEADER.size : _HEADER.size + len(content)] = content
         self._write(time.monotonic(), len(digests))

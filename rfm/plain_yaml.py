@@ -39,7 +39,10 @@ def read_yaml(file: Path, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> An
 
 
 def _num_values(node: yaml.Node, known: dict[int, int | None]) -> int:
-    """Of a node with its aliases written out. Raises ValueError for a node inside itself and a key told twice."""
+    """Number of values in a node with its aliases written out.
+
+    Raises ValueError for a node inside itself and for a key that stands twice.
+    """
     if id(node) in known:
         count = known[id(node)]
         if count is None:

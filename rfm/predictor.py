@@ -61,7 +61,7 @@ def checked(rows: Iterable[RowScores]) -> list[RowScores | RewardError]:
 
 
 def frame_scores(progress_logits: Tensor, success_logits: Tensor) -> FrameScores:
-    """On the CPU, from logits [..., K] and [...]: progress and success, and of discrete progress its logits."""
+    """Scores on the CPU, from progress logits [..., K] and success logits [...]; with the logits where K > 1."""
     discrete = progress_logits.shape[-1] > 1
     return FrameScores(
         progress=progress_from_logits(progress_logits).cpu().numpy(),

@@ -52,7 +52,7 @@ class ClientOptions(AccessOptions, total=False):
 
     model: name under which the checkpoint was exported (``rfm``); raw frames go to ``<model>_frames``
     timeout_s: the longest that a call may take, retries included, at most 1e9; there is no endless wait (60)
-    retry: ask again what failed because a server was down, restarting or full, until the time is up (True)
+    retry: send again what failed because a server was down, restarting or full, until the time is up (True)
     max_in_flight: requests under way at a time (128); more wait their turn
     shared_memory: large inputs go through memory that client and server map, if both are on one host (False)
     ca_file, client_certificate, client_key, headers, api_key: as Access has them
@@ -72,7 +72,7 @@ class CallOptions(TypedDict, total=False):
     logits: with the raw scores of the progress bins, which only discrete checkpoints have
     timing: with the server's time for the batch
     subsample: of a trajectory longer than the checkpoint was trained on (``ModelInfo.max_frames``) so many frames are
-        scored, evenly from the first to the last; the result's ``frame_indices`` tells which (None: all)
+        scored, evenly from the first to the last; the result's ``frame_indices`` names them (None: all)
     resize: frames are made as small as the checkpoint reads them before they are sent (needs Pillow); ReWiND's scores
         differ slightly from those of the frames as they are
     request_id: with which the ids of the call's requests begin, in errors and in the server's log (None: a random one)
@@ -101,7 +101,8 @@ class AsyncRewardClient:
     Arrays of samples must not change while a call is awaited: they are sent as they are when it is their turn.
 
     urls: ``grpc://host:8001`` or ``http://host:8000``, with TLS ``grpcs://`` or ``https://``, one or several. The
-        server with the fewest requests under way is asked; one that fails is left out until it is ready again.
+        server with the fewest requests under way gets the next one. A server that fails is left out until it is
+        ready again.
     transports: instead of connections to ``urls``, for tests and unusual networks
     """
 
@@ -161,7 +162,7 @@ class AsyncRewardClient:
         """The results of any number and mix of samples, in order.
 
         return_errors: a sample that fails gives its error in its place and the others their results; otherwise the
-            first error is raised, told as ``samples[3].num_frames: expected X, got Y``
+            first error is raised, as ``samples[3].num_frames: expected X, got Y``
         """
         samples = list(samples)
         outcomes = await self._outcomes(samples, options)
@@ -178,7 +179,7 @@ class AsyncRewardClient:
         self, trajectory: Trajectory, *, timeout_s: float | None = None, request_id: str | None = None
     ) -> Trajectory:
         """The trajectory with embeddings of its frames and its task in place of the frames, for a checkpoint that is
-        served with encoders. What is asked often is then encoded once. Raises RewardError.
+        served with encoders. A trajectory that is scored often is then encoded once. Raises RewardError.
         """
         if trajectory.frames is None:
             raise InvalidSampleError.at("trajectory", "frames", "video_embeddings")
@@ -206,9 +207,9 @@ class AsyncRewardClient:
     async def model_info(
         self, *, frames: bool = False, refresh: bool = False, timeout_s: float | None = None
     ) -> ModelInfo:
-        """What the server tells of the model for embeddings or, ``frames``, for raw frames.
+        """What the server says of its model for embeddings or, with ``frames``, for raw frames.
 
-        refresh: ask even if it is known. What is known is forgotten when another version of the model answers.
+        refresh: request it even if it is known. It is forgotten when another version of the model answers.
 
         Raises ModelNotFoundError if it is not served.
         """
@@ -258,7 +259,7 @@ class AsyncRewardClient:
     async def _fitted(
         self, samples: Sequence[Sample], options: CallOptions, deadline: Deadline
     ) -> tuple[dict[int, FittedSample], dict[int, Result | RewardError]]:
-        """By index: the samples as they are sent, and the errors of those that cannot be."""
+        """The samples as they are sent, and the errors of those that cannot be sent, by index."""
         subsample, resize = options.get("subsample", False), options.get("resize", False)
         fits: dict[int, FittedSample] = {}
         failed: dict[int, Result | RewardError] = {}
@@ -276,7 +277,7 @@ class AsyncRewardClient:
         return fits, failed
 
     async def _request(self, model: str, samples: Sequence[Sample], call: _Call) -> Sequence[Result | RewardError]:
-        """One request. It fails whole if one sample cannot be scored; then each sample is asked about alone.
+        """One request. It fails whole if one sample cannot be scored; then each sample is sent alone.
 
         A request that is refused because it has ended its process is not taken apart: all its samples fail.
         """
@@ -308,7 +309,7 @@ class AsyncRewardClient:
         return answer
 
     def _deadline(self, timeout_s: float | None) -> Deadline:
-        """That of a call which begins now; None: the client's."""
+        """Deadline of a call which begins now; timeout_s: None: the client's."""
         if self._is_closed:
             raise RuntimeError("this AsyncRewardClient is closed")
         return Deadline(self._timeout_s if timeout_s is None else timeout_s)
@@ -349,7 +350,7 @@ def _check_known(options: Mapping[str, object], known: type[ClientOptions] | typ
 
 
 def _request_ids(prefix: str | None) -> Iterator[str]:
-    """Of the requests of one call, which begin alike. Raises ValueError for a prefix that is none."""
+    """Request ids of one call, which begin alike. Raises ValueError for a prefix that is not allowed."""
     if prefix is not None and not wire.REQUEST_ID.fullmatch(prefix):
         raise ValueError(f"request_id: expected 1 to 64 letters, digits or any of ._:/+=@-, got {prefix!r}")
     prefix = prefix or secrets.token_hex(_ID_BYTES)

@@ -18,7 +18,7 @@ def model_of(sample: Sample, model: str) -> str:
 
 
 def groups(samples: Mapping[int, Sample], model: str) -> Iterator[tuple[str, list[int]]]:
-    """For each set of samples that fit the same arrays: the model to ask, and their indices, short ones first."""
+    """The samples in groups that fit the same arrays: the model of each group, and its indices, short ones first."""
 
     def key(index: int) -> tuple[str, list[tuple[int, ...]], tuple[int, ...]]:
         trajectories = samples[index].trajectories
@@ -57,5 +57,5 @@ def num_positions(sample: Sample) -> int:
 
 
 def _array_bytes(sample: Sample) -> list[int]:
-    """Of the positions, in each of the arrays that hold them."""
+    """Bytes of the sample's frame positions in each of the arrays that hold them."""
     return [sum(t.positions.nbytes for t in together) for together in stackable(sample.trajectories)]

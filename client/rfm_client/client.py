@@ -93,7 +93,7 @@ class RewardClient:
         self, trajectory: Trajectory, *, timeout_s: float | None = None, request_id: str | None = None
     ) -> Trajectory:
         """The trajectory with embeddings of its frames and its task in place of the frames, for a checkpoint that is
-        served with encoders. What is asked often is then encoded once. Raises RewardError.
+        served with encoders. A trajectory that is scored often is then encoded once. Raises RewardError.
         """
         return self._loop.wait(self._client.encode(trajectory, timeout_s=timeout_s, request_id=request_id))
 
@@ -106,9 +106,9 @@ class RewardClient:
         self._loop.wait(self._client.wait_ready(timeout_s))
 
     def model_info(self, *, frames: bool = False, refresh: bool = False, timeout_s: float | None = None) -> ModelInfo:
-        """What the server tells of the model for embeddings or, ``frames``, for raw frames.
+        """What the server says of its model for embeddings or, with ``frames``, for raw frames.
 
-        refresh: ask even if it is known. What is known is forgotten when another version of the model answers.
+        refresh: request it even if it is known. It is forgotten when another version of the model answers.
 
         Raises ModelNotFoundError if it is not served.
         """

@@ -38,7 +38,7 @@ _DEVICE_METRIC = re.compile("nv_(cpu|gpu)_(utilization|memory_used_bytes|memory_
 _REQUESTS_METRIC = "nv_inference_request_success_total"
 _COMPUTE_METRIC = "nv_inference_compute_infer_duration_us_total"
 _SAMPLED_METRIC = "nv_cpu_memory_used_bytes"
-_SAMPLING_S = 2.5  # Triton looks at the machine every two seconds; until the first time it tells zeros
+_SAMPLING_S = 2.5  # Triton looks at the machine every two seconds; until the first time it reports zeros
 _POLL_S = 0.2
 _REASON_CHARACTERS = 120
 _NS_PER_MS = 1e6
@@ -50,7 +50,7 @@ _US_PER_S = 1e6
 class ModelStatus:
     """One version of a model.
 
-    requests_pending: requests that wait for their turn now; None: the metrics do not tell
+    requests_pending: requests that wait for their turn now; None: the metrics do not say
     samples, executions: of all requests together; a batch is executed once
     queue_ms, compute_ms: of all requests in the queue, of all executions in the model
     last_used_s: Unix time of the last request; None: there was none
@@ -101,8 +101,10 @@ class Device:
 
 @dataclass(frozen=True)
 class DeviceWork:
-    """Of one model on one device, all its versions together. requests: answered; compute_s: their
-    computing, in seconds; a batch counts for each of its requests
+    """The work of one model on one device, all its versions together.
+
+    requests: number of requests answered; compute_s: seconds of computation, in which a batch counts once for each of
+    its requests
     """
 
     requests: int
@@ -134,7 +136,7 @@ def read_status(
 ) -> ServerStatus:
     """The state of the server at ``grpc://host:port`` or ``http://host:port``, or with TLS ``grpcs://`` or ``https://``.
 
-    metrics_url: where it shows its metrics; None: port METRICS_PORT of the same host. What only they tell is missing
+    metrics_url: where it shows its metrics; None: port METRICS_PORT of the same host. What only they contain is missing
         if they cannot be read.
     access: certificates, and what is shown with each request, but not to the metrics
 
@@ -218,7 +220,7 @@ def _if_open(read: Callable[[], Any]) -> Any:
 
 
 def _index(statistics: list[dict[str, Any]], is_ready: Callable[[str, str], bool]) -> list[dict[str, Any]]:
-    """As the repository's index has it, of what is loaded."""
+    """The entries of the repository's index for the models that are loaded, made from their statistics."""
     keys = sorted((entry["name"], int(entry["version"])) for entry in statistics)
     return [
         {"name": name, "version": str(version), "state": "READY" if is_ready(name, str(version)) else "UNAVAILABLE"}
@@ -292,7 +294,10 @@ def _read_metrics(url: str, timeout_s: float) -> _Metrics:
 
 
 def _work(samples: list[Any], device: str) -> dict[str, DeviceWork]:
-    """By model. Triton names the GPU of a count; what it names none for is the processor's."""
+    """The work on one device by model.
+
+    Triton names the GPU of a count. A count without a GPU is the processor's.
+    """
     counts: dict[str, dict[str, float]] = {}
     for sample in samples:
         if sample.name in (_REQUESTS_METRIC, _COMPUTE_METRIC) and sample.labels.get("gpu_uuid", _PROCESSOR) == device:

@@ -110,7 +110,7 @@ def serve(
         int | None, typer.Option(help="Port of the FastAPI evaluation server's endpoints, too (see rfm gateway).")
     ] = None,
     status_port: Annotated[
-        int | None, typer.Option(help="Port that tells of rfm serve itself: /live, /ready and /metrics.")
+        int | None, typer.Option(help="Port of rfm serve's own state: /live, /ready and /metrics.")
     ] = None,
     triton_silent_s: Annotated[
         int | None, typer.Option(help="Seconds that Triton may give no answer before it is killed and restarted (10).")
@@ -135,9 +135,9 @@ def serve(
     *,
     limits: Limits,
 ) -> None:
-    """Run tritonserver on a model repository until it is told to stop.
+    """Run tritonserver on a model repository until a signal stops it.
 
-    Its models, logging and tracing are changed with the admin key alone; without one there is none that anybody knows.
+    Only requests with the admin key can change its models, logging and tracing. Without an admin key, nobody can.
     """
     settings = _serve_config(
         config,

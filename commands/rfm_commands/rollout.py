@@ -4,14 +4,14 @@
 Files and server go in step, so that a restart serves what ran. A checkpoint with encoders is three models: its encoder
 and its scorer (parts), and an ensemble, whose configuration names the versions of both. In this order:
 
-1. Parts serve the new version beside the old. It is warmed up first, and one that cannot be loaded is never asked.
+1. Parts serve the new version beside the old. It is warmed up first, and one that cannot be loaded gets no request.
 2. The new version of each part answers a probe that names it.
 3. The ensemble goes over to the new version, and Triton finishes what the old one has begun.
 4. Parts serve the new version alone; Triton finishes again.
 
 Whatever fails on the way, the versions that were served before are loaded again with their own configurations. Those
 are put back even if the server is gone, so that a restart serves what was served before; a server that comes back
-within RETURN_S is told to load them.
+within RETURN_S gets a request to load them.
 
 Requests that name no version are answered by the highest one that is ready: by the new one from step 1 on, in a
 rollback from step 4 on. Since one configuration holds for all versions of a model, step 1 has Triton load the old
@@ -163,7 +163,7 @@ class Rollout:
 def probe(server: RepositoryApi, config: pb.ModelConfig, version: int) -> None:
     """Raises RepositoryApiError or RewardError unless the version answers with numbers.
 
-    A model without warm-up generates text: what it says to noise need not be an answer, and it is not asked.
+    A model without warm-up generates text: what it answers to noise need not be valid, so it gets no probe.
     """
     if not (config.model_warmup or _is_ensemble(config)):
         return

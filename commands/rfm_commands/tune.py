@@ -25,7 +25,7 @@ from rfm_export.errors import ExportError
 from rfm_export.layout import CONFIG_FILE
 from rfm_export.pbtxt import parse, render
 
-AS_FAST = 0.95  # of the highest rate: closer than that, rates do not tell settings apart
+AS_FAST = 0.95  # of the highest rate: closer than that, rates do not separate settings
 INSTANCES_PER_GPU = (1, 2, 3)
 BATCH_SIZES = (8, 32, 128)
 NUM_SAMPLES = 64
@@ -80,7 +80,7 @@ class Sweep:
         return fastest.setting if best.samples_per_s < AS_FAST * fastest.samples_per_s else best.setting
 
     def _instances(self) -> list[Setting]:
-        """On a GPU a few instances; on the CPU as many as share its cores evenly."""
+        """The settings to try: on a GPU a few instances; on the CPU as many as share its cores evenly."""
         batched = [config for config in _configs(self.repository).values() if config.instance_group]
         if not batched:
             raise ExportError(f"{self.repository}: expected an exported repository, got no model of one")
@@ -92,7 +92,7 @@ class Sweep:
         return [Setting(count, cores // count, batch_size) for count in (1 << n for n in range(cores.bit_length()))]
 
     def _trials(self, settings: Sequence[Setting]) -> list[Trial]:
-        """In rounds, so that a machine that drifts hits all settings alike."""
+        """What each setting gave. They are measured in rounds, so that a machine that drifts affects all alike."""
         measured: dict[Setting, list[tuple[float, float]]] = {setting: [] for setting in settings}
         for number in range(self.rounds):
             for setting, of_setting in measured.items():
@@ -122,7 +122,7 @@ class Sweep:
 
 
 def quickest(trials: Sequence[Trial]) -> Trial:
-    """Of those that are about as fast as the fastest, the one with the shortest wait for a single caller.
+    """Of the trials about as fast as the fastest, the one with the shortest wait for a single caller.
 
     Raises ExportError if none has answered.
     """

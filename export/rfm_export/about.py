@@ -45,7 +45,10 @@ class Origin:
 
     @classmethod
     def of(cls, source: str | Path, folder: Path) -> Origin:
-        """source: as the user named it; folder: where its files lie, of the Hub's a snapshot named by its commit"""
+        """The origin of a checkpoint.
+
+        source: as the user named it; folder: where its files lie, of the Hub's a snapshot named by its commit
+        """
         named = Path(source).expanduser()
         file = find_run_config(folder)
         run_config = "" if file is None else json.dumps(_public(read_run_config(file)))

@@ -47,7 +47,7 @@ class GeneratedModel:
 
     @property
     def name(self) -> str:
-        """Its name in the repository."""
+        """The model's name in the repository."""
         return str(self.config.name)
 
     @property
@@ -69,7 +69,7 @@ class Version:
 
     num_gpus: 0: the CPU
     family: package of the checkpoint's family
-    about: parameters that tell which checkpoint it is
+    about: parameters that name the checkpoint
     """
 
     number: int

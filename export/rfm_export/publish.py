@@ -4,11 +4,12 @@
 New version folders appear whole (written aside, then renamed) and are not served until the configurations,
 replaced one by one, name them. The order in which that happens keeps every intermediate state consistent.
 
-What is written aside lies in the repository, since nothing else need be writable, or be the same file system. Triton
-takes every folder there for a model, unless it is told which to load, but ignores a model's folders that have no number
-for a name. So the scratch folder is a model's. Only while there is none yet, it is the repository's.
+The scratch folder lies in the repository, since nothing else need be writable, or be the same file system. Triton takes
+every folder of a repository for a model, unless its arguments name those to load. Inside a model's folder it ignores
+folders whose name is no number. So the scratch folder lies inside a model's folder. Only a repository without models
+holds it itself.
 
-A model has one configuration for all its versions, which tells the checkpoint of the newest. So each version folder
+A model has one configuration for all its versions, which names the checkpoint of the newest. So each version folder
 keeps the one that it was exported with, for the day when it is served again (``rollout``).
 """
 
@@ -64,9 +65,10 @@ def alone(repository: Path) -> Iterator[None]:
 
 @contextmanager
 def staging(repository: Path, names: Sequence[str]) -> Iterator[Path]:
-    """A scratch folder in the repository, gone afterwards. names: of the models that change, if they are there
+    """A scratch folder in the repository, which is removed afterwards.
 
-    It lies in one of those: with another folder in it, a model is loaded anew when Triton is told to load it meanwhile.
+    names: the models that change, as far as they are there. The folder lies in one of theirs: Triton loads a model
+        with one more folder anew if it gets a load request meanwhile.
     """
     changing = [repository / name for name in names if (repository / name / CONFIG_FILE).is_file()]
     folder = Path(tempfile.mkdtemp(prefix=_SCRATCH, dir=next(iter([*changing, *_models(repository)]), repository)))
@@ -150,7 +152,7 @@ def _settle(staged: Path) -> None:
 
 
 def _keep_config(repository: Path, name: str, scratch: Path) -> None:
-    """For a version whose export kept none."""
+    """Keeps the served version's configuration in its folder, where its export kept none."""
     current = read_config(repository, name)
     kept = repository / name / str(max(current.version_policy.specific.versions)) / CONFIG_FILE
     if not kept.exists():

@@ -34,7 +34,7 @@ PROBE_SEED = 0
 def probes(description: Description, *, with_encoders: bool) -> list[Sample]:
     """Random samples of each type that the checkpoint can score, of several lengths.
 
-    with_encoders: there are encoders, so that a checkpoint that scores embeddings is asked about raw frames too
+    with_encoders: there are encoders, so that a checkpoint that scores embeddings is compared on raw frames, too
     """
     random = np.random.default_rng(PROBE_SEED)
 

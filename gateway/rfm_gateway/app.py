@@ -84,7 +84,7 @@ def create_app(settings: GatewaySettings) -> FastAPI:
         settings.triton_url,
         model=settings.model,
         timeout_s=settings.limits.timeout,
-        retry=False,  # whoever asks is told at once, and decides
+        retry=False,  # the caller gets the error at once, and decides
         max_in_flight=settings.limits.max_in_flight,
         **settings.access.options,
     )
@@ -220,7 +220,7 @@ def _key_check(key: str) -> Callable[..., None]:
 
 
 def _answer_errors(app: FastAPI) -> None:
-    """Every error is told as JSON, and none of bad input is a 500."""
+    """Every error is answered as JSON, and none of bad input is a 500."""
 
     @app.exception_handler(RequestValidationError)
     async def invalid(_request: Request, error: RequestValidationError) -> JSONResponse:
@@ -254,7 +254,7 @@ def _answer_errors(app: FastAPI) -> None:
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:
-    """With the schemas of bodies, which are read from the stream and not declared as parameters."""
+    """The OpenAPI document with the schemas of bodies, which are read from the stream and no declared parameters."""
     if app.openapi_schema is None:
         document = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
         _, models = models_json_schema([(model, "validation") for model in _MODELS], ref_template=_REFERENCE)

@@ -36,7 +36,7 @@ READ_JSON_GROWTH = 5  # times as large it is usually: what waits for room before
 CHARSETS = ("utf-8", "utf8", "us-ascii", "ascii", "iso-8859-1", "iso8859-1", "latin-1", "latin1")
 
 _NUMBER_BYTES, _LIST_BYTES, _TEXT_BYTES, _OBJECT_BYTES = 48, 88, 96, 208  # what Python takes for one, at the most
-_ERROR_BYTES = 2048  # of a field, as it is told
+_ERROR_BYTES = 2048  # of a field, as the error shows it
 _PART_BYTES, _HEADER_BYTES = 2560, 384  # what a part of a multipart body takes besides its content, and a header of it
 
 _ANY_SAMPLE_FIELD = re.compile(r"sample_[0-9]+")
@@ -62,7 +62,7 @@ class Batch:
 
 
 def invalid(loc: tuple[str | int, ...], message: str, kind: str = "value_error") -> RequestValidationError:
-    """The error at a field of the body, as FastAPI tells its own."""
+    """The error at a field of the body, in the form of FastAPI's own errors."""
     return RequestValidationError([{"type": kind, "loc": ["body", *loc], "msg": message}])
 
 
@@ -74,7 +74,7 @@ class Admitted:
     share: Share
 
     async def wait_for_room(self, deadline: Deadline) -> None:
-        """Until there is memory for the body that is announced. Raises HTTPException 503."""
+        """Waits until there is memory for the announced body. Raises HTTPException 503."""
         announced = self.request.headers.get("content-length", "")
         growth = 1 if self.request.url.path.endswith(NPY_ENDPOINT) else READ_JSON_GROWTH
         await self.share.reserve(int(announced) * growth if announced.isdecimal() else 0, deadline)
@@ -208,7 +208,7 @@ class BodyLimits:
 
 
 def _ending(request: Request) -> bytes:
-    """With what the body of a multipart request ends; empty for the JSON endpoint."""
+    """The bytes with which a multipart body ends; empty for the JSON endpoint."""
     if not request.url.path.endswith(NPY_ENDPOINT):
         return b""
     kind, options = parse_options_header(request.headers.get("content-type", ""))
@@ -260,7 +260,7 @@ def _unwrapped(document: Any) -> tuple[list[Any], bool]:
 
 
 def _sample_fields(fields: Mapping[str, str]) -> list[str]:
-    """``sample_0``, ``sample_1`` and so on, without a gap: one left out would shift the answers of the others."""
+    """The fields ``sample_0``, ``sample_1`` and so on. A gap is refused: it would shift later answers."""
     numbers = []
     for name in filter(_ANY_SAMPLE_FIELD.fullmatch, fields):
         if not _SAMPLE_FIELD.fullmatch(name):
@@ -297,8 +297,9 @@ def _checked(
 
 
 def _field_error(error: ErrorDetails) -> dict[str, Any]:
-    """As this gateway tells its own: ``expected X, got Y`` at a path without the sample's type, which pydantic puts
-    behind its index.
+    """pydantic's error in the form of this gateway's own: ``expected X, got Y`` at a path.
+
+    The path leaves out the sample's type, which pydantic puts behind the sample's index.
     """
     kind, given, loc = error["type"], error["input"], [*error["loc"][:1], *error["loc"][2:]]
     message = error["msg"].removeprefix("Value error, ")

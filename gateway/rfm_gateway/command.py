@@ -82,7 +82,7 @@ def gateway(
     except (ValueError, OSError) as error:
         raise typer.BadParameter(str(error)) from None
     if api_key is None and not is_loopback(host):
-        logger.warning("%s is no loopback address, and no key is asked for: whoever reaches it may use it", host)
+        logger.warning("%s is no loopback address, and no key is required: whoever reaches it may use it", host)
     uvicorn.run(
         app,
         host=host,

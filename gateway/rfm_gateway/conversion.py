@@ -48,7 +48,10 @@ class Served:
 
 @dataclass(frozen=True)
 class Conversion:
-    """Of the samples of one request. texts: of tasks; files: that its samples name; frame_steps: of progress samples"""
+    """Converts the samples of one request.
+
+    texts: embeddings of tasks; files: those that the samples name; frame_steps: of progress samples
+    """
 
     served: Served
     texts: Texts
@@ -56,7 +59,10 @@ class Conversion:
     frame_steps: int
 
     def samples(self, samples: Sequence[schema.Sample]) -> list[Sample]:
-        """Raises RequestValidationError that tells of all that cannot be scored, and HTTPException as NamedFiles."""
+        """The samples as the client takes them.
+
+        Raises RequestValidationError that lists all that cannot be scored, and HTTPException as NamedFiles does.
+        """
         converted: list[Sample] = []
         errors: dict[int, InvalidSampleError] = {}
         for index, sample in enumerate(samples):
@@ -122,13 +128,13 @@ class Conversion:
 
 
 def has_embeddings(trajectory: schema.Trajectory) -> bool:
-    """Its own, or in a file that counts."""
+    """Whether the trajectory has embeddings: its own, or those of a file where it has no frames."""
     in_file = trajectory.embeddings_path is not None and trajectory.frames is None
     return trajectory.video_embeddings is not None or in_file
 
 
 def num_bytes(sample: schema.Sample) -> int:
-    """Of its arrays; files that it names may have any size."""
+    """Bytes of the sample's arrays; MIN_BYTES if it names files, whose size is not known yet."""
     trajectories = sample.named_trajectories.values()
     if any(isinstance(t.frames, list) or t.embeddings_path is not None for t in trajectories):
         return MIN_BYTES
@@ -137,7 +143,7 @@ def num_bytes(sample: schema.Sample) -> int:
 
 
 def converted_bytes(sample: schema.Sample) -> int:
-    """Of the copies that are made of its arrays, where they are not of the types that are scored."""
+    """Bytes of the copies that are made of the sample's arrays whose types are not those that are scored."""
     copies = 0
     for trajectory in sample.named_trajectories.values():
         floats = ((array, np.float32) for array in (trajectory.video_embeddings, trajectory.text_embedding))
@@ -148,8 +154,10 @@ def converted_bytes(sample: schema.Sample) -> int:
 
 
 def _uint8(frames: Any) -> UInt8Array:
-    """As the evaluation server made images: whole numbers as they are, floats clipped and truncated; one frame is a
-    film of one, and of RGBA the colours count.
+    """uint8 [T, H, W, C], as the evaluation server made images.
+
+    Whole numbers stay as they are, floats are clipped and truncated. One frame is a film of one. Of RGBA the colours
+    count.
     """
     array = as_array(frames)
     if array.ndim == 3:
@@ -172,7 +180,7 @@ def _check_width(where: str, array: Float32Array, width: int | None) -> None:
 
 
 def refused(errors: Mapping[int, InvalidSampleError]) -> RequestValidationError:
-    """One error that tells of all samples that cannot be scored, each at its field as the caller named it."""
+    """One error that lists all samples that cannot be scored, each at its field as the caller named it."""
     details: list[Any] = []
     for index, error in errors.items():
         where, _, message = error.message.partition(": ")

@@ -82,7 +82,7 @@ class NamedFiles:
         self._take(num_bytes, "embeddings_path")
         try:
             trajectory = load_trajectory(file)
-        except InvalidSampleError:  # which tells the whole path
+        except InvalidSampleError:  # which shows the whole path
             raise unreadable from None
         if trajectory.video_embeddings is None:
             raise InvalidSampleError.at("embeddings_path", "a file of embeddings", "frames")
@@ -110,7 +110,7 @@ class NamedFiles:
 
 
 def _unpacked_bytes(file: Path) -> int:
-    """Of the arrays in a .npy or .npz file."""
+    """Bytes of the unpacked arrays in a .npy or .npz file."""
     if file.suffix.lower() == ".npz":
         with ZipFile(file) as archive:
             return sum(entry.file_size for entry in archive.infolist())

@@ -17,7 +17,7 @@ RETRY_AFTER = {"Retry-After": "1"}
 
 
 class Memory:
-    """``most_bytes`` for all requests, counted before they are taken."""
+    """The memory of all requests: at most ``most_bytes``, which are counted before they are taken."""
 
     def __init__(self, most_bytes: int) -> None:
         self._most_bytes = most_bytes

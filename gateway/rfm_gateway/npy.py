@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from rfm_client.data.inputs import BROKEN_NPY
 
-_format: Any = np.lib.format  # numpy does not tell its types
+_format: Any = np.lib.format  # numpy declares no types for it
 _HEADERS = {(1, 0): _format.read_array_header_1_0, (2, 0): _format.read_array_header_2_0}
 
 

@@ -79,7 +79,7 @@ def _check_leaves(array: list[Any]) -> None:
 
 
 def _frames(value: Any, info: ValidationInfo) -> Any:
-    """As ``_array``; or a list of names of image files."""
+    """The frames as ``_array`` reads them, or a list of names of image files."""
     if isinstance(value, list) and value and all(isinstance(name, str) for name in value):
         return value
     return _array(value, info)
@@ -132,7 +132,7 @@ class ProgressSample(BaseModel):
 
     @property
     def named_trajectories(self) -> dict[str, Trajectory]:
-        """By field name, in the order in which they are asked about."""
+        """The trajectories by field name, in the order in which they are scored."""
         return {"trajectory": self.trajectory}
 
 
@@ -147,7 +147,7 @@ class PreferenceSample(BaseModel):
 
     @property
     def named_trajectories(self) -> dict[str, Trajectory]:
-        """By field name, in the order in which they are asked about."""
+        """The trajectories by field name, in the order in which they are scored."""
         return {"chosen_trajectory": self.chosen_trajectory, "rejected_trajectory": self.rejected_trajectory}
 
 
@@ -163,7 +163,7 @@ class SimilaritySample(BaseModel):
 
     @property
     def named_trajectories(self) -> dict[str, Trajectory]:
-        """By field name, in the order in which they are asked about."""
+        """The trajectories by field name, in the order in which they are scored."""
         return {"ref_trajectory": self.ref_trajectory, "sim_trajectory": self.sim_trajectory}
 
 
@@ -212,7 +212,7 @@ class SimilarityOutputs(BaseModel):
 
 
 class EvaluateBatchAnswer(BaseModel):
-    """Null where no sample of that type was sent, and where the checkpoint does not tell success."""
+    """Null where no sample of that type was sent, and where the checkpoint does not predict success."""
 
     outputs_preference: PreferenceOutputs | None = None
     outputs_progress: ProgressOutputs | None = None
@@ -248,7 +248,7 @@ class GpuStats(BaseModel):
     total_requests: int = Field(description="Requests that Triton has answered there, each counted once.")
     total_processing_time: float = Field(description="Seconds that models computed there.")
     last_used: float | None = Field(description="Unix time of the last request to any device; null: none yet.")
-    utilization: float | None = Field(description="0..1, now; null where Triton does not tell.")
+    utilization: float | None = Field(description="0..1, now; null where Triton does not report it.")
     memory_used_bytes: float | None
     memory_total_bytes: float | None
 

@@ -39,13 +39,13 @@ class Scorer:
     async def evaluate(self, batch: Batch, share: Share, request_id: str) -> schema.EvaluateBatchAnswer:
         """The answer to a batch, whole: one that lacked a sample would shift the others', or be read as a reward of 0.
 
-        Raises RequestValidationError for samples that cannot be scored, all of them told, HTTPException as ``share``
+        Raises RequestValidationError for samples that cannot be scored, all of them listed, HTTPException as ``share``
         does, and ServerError.
         """
         deadline = Deadline(self._timeout_s)
         try:
             return await self._evaluate(batch, share, deadline, request_id)
-        except DeadlineExceededError as error:  # which tells what was left for one of several calls
+        except DeadlineExceededError as error:  # which names what was left for one of several calls
             raise deadline.exceeded("Triton") from error
 
     async def _evaluate(
@@ -76,7 +76,11 @@ class Scorer:
         return _answer(batch.samples, scored, group)
 
     async def _served(self, samples: Sequence[schema.Sample], deadline: Deadline) -> Served:
-        """Asks about the model for frames only if a sample may need it: what is not served is asked for every time."""
+        """The models that may score the samples.
+
+        It reads the model for frames only if a sample may need it: the client does not remember that a model is not
+        served, and would send a request every time.
+        """
         trajectories = [t for sample in samples for t in sample.named_trajectories.values()]
         needs_embeddings = any(has_embeddings(trajectory) for trajectory in trajectories)
         embeddings = await self._model_info(deadline, frames=False) if needs_embeddings else None
@@ -116,7 +120,7 @@ class Scorer:
             encoded = await self._client.encode(
                 Trajectory(frames=blank, task=task), timeout_s=deadline.remaining_s(), request_id=request_id
             )
-        except InvalidSampleError as error:  # of one task; the others' samples are told of theirs
+        except InvalidSampleError as error:  # of one task; the others' samples have errors of their own
             return error
         assert encoded.text_embedding is not None
         return encoded.text_embedding

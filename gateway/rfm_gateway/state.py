@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What ``/gpu_status``, ``/health`` and ``/model_info`` tell, from Triton's metrics, statistics and configuration."""
+"""What ``/gpu_status``, ``/health`` and ``/model_info`` answer, from Triton's metrics, statistics and configuration."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from rfm_client.transport.access import Access
 from rfm_client.transport.deadline import Deadline, timeout
 from rfm_gateway import schema
 
-HEALTH_TIMEOUT_S = 3.5  # of all that is asked; with HEALTH_KEPT_S less than the 5 s within which it is to be true
+HEALTH_TIMEOUT_S = 3.5  # of all probes; with HEALTH_KEPT_S less than the 5 s within which it is to be true
 PROBE_TIMEOUT_S = 1.5  # of that: a model that takes longer may be busy
 STALL_S = 30.0  # a busy model that finishes nothing for so long does not work: what rfm serve calls a hang
 HEALTH_KEPT_S = 1.0  # so that probes, which need no key, do not keep the models busy
@@ -61,7 +61,9 @@ class State:
         return _gpu_status(status, self._model)
 
     async def health(self) -> schema.Health:
-        """Within HEALTH_TIMEOUT_S. Raises ServerUnavailableError with the reason when a model does not answer."""
+        """The answer of ``/health``, within HEALTH_TIMEOUT_S. Raises ServerUnavailableError when a model does not
+        answer.
+        """
         async with self._refreshing:
             if time.monotonic() - self._refreshed_s >= HEALTH_KEPT_S:
                 deadline = Deadline(HEALTH_TIMEOUT_S)
@@ -98,7 +100,7 @@ class State:
         )
 
     async def _read_devices(self, deadline: Deadline) -> schema.GpuStatus | None:
-        """None where the metrics cannot be read: scoring does not need them."""
+        """State of the devices; None where the metrics cannot be read: scoring does not need them."""
         try:
             async with timeout(deadline.remaining_s()):
                 return await self.gpu_status()
@@ -106,7 +108,7 @@ class State:
             return None
 
     async def _infos(self, deadline: Deadline) -> list[ModelInfo]:
-        """Of the models for embeddings and for raw frames, as far as they are served now: another version may be."""
+        """What is known of the models for embeddings and for raw frames, as far as they are served now."""
         infos = []
         missing = None
         for frames in (False, True):
@@ -176,7 +178,7 @@ def _gpu_status(status: ServerStatus, model: str) -> schema.GpuStatus:
     parts = {scorer, encoder_name(model)}
     devices = [device for device in status.devices if parts & device.work.keys()] or list(status.devices)
     if not devices:
-        raise ServerUnavailableError(status.metrics_error or f"{status.metrics_url}: no device is told of")
+        raise ServerUnavailableError(status.metrics_error or f"{status.metrics_url}: it names no device")
     is_waiting = any(entry.requests_pending for entry in status.models)
     last_used = max((entry.last_used_s for entry in status.models if entry.last_used_s), default=None)
     stats = {
@@ -203,7 +205,7 @@ def _gpu_status(status: ServerStatus, model: str) -> schema.GpuStatus:
 
 
 def _busy_s(status: ServerStatus, device: Device, model: str) -> float:
-    """Seconds of a model's batches on one device: of all that Triton tells, the share that its requests had there."""
+    """Seconds of a model's batches on one device: of all that Triton reports, the share that its requests had there."""
     on_all = sum(each.work[model].compute_s for each in status.devices if model in each.work)
     if model not in device.work or not on_all:
         return 0.0

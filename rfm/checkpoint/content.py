@@ -63,7 +63,7 @@ def expecting(what: str, where: object) -> Iterator[None]:
 
 
 def shown(value: object) -> str:
-    """The value as an error tells it: on one line, and not long."""
+    """The value as it stands in an error: on one line, and not long."""
     try:
         return _short.repr(value)
     except ValueError:  # a number of more digits than Python writes out
@@ -77,7 +77,7 @@ def cut(text: str, most: int = 1000) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """As Python writes a list; the first of many names."""
+    """The names as Python writes a list; of many names the first."""
     more = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
     return cut(repr(list(names[:_MAX_LISTED])), 4000) + more
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What tells weights from others."""
+"""A digest of weights, which identifies a checkpoint."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import hashlib
 from collections.abc import Iterable
 from pathlib import Path
 
-DIGEST_DIGITS = 16  # of 64: enough to tell checkpoints apart, and damage
+DIGEST_DIGITS = 16  # of 64: enough to identify a checkpoint, and to find damage
 
 _CHUNK_BYTES = 2**22
 

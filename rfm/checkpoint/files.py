@@ -99,7 +99,7 @@ def check_links(folder: Path) -> None:
 
 
 def trained_frames(run: Mapping[str, Any], file: Path) -> int | None:
-    """The most frames of a trajectory in training, as config.yaml tells it; None if it does not."""
+    """The most frames of a trajectory in training, as config.yaml has it; None if it has none."""
     data = run.get("data") or {}
     if not isinstance(data, dict):
         raise CheckpointError(f"{file}: data: expected a mapping, got {shown(data)}")
@@ -138,7 +138,7 @@ def _fetch_run_config_of_main(repo_id: str) -> None:
 
     try:
         hf_hub_download(repo_id, RUN_CONFIG)
-    except LocalEntryNotFoundError:  # the Hub was not asked
+    except LocalEntryNotFoundError:  # the cache lacks it, and the Hub was not tried
         raise
     except EntryNotFoundError:
         return

@@ -16,7 +16,7 @@ WORTH_ONEDNN = 1 << 21  # multiplications; of fewer, to begin costs more than is
 
 
 class Linear(nn.Linear):
-    """``nn.Linear`` whose product is ``linear``'s."""
+    """An ``nn.Linear`` that multiplies by the function ``linear``."""
 
     def forward(self, input: Tensor, *, relu: bool = False, plus: Tensor | None = None) -> Tensor:
         """[..., K] -> [..., N]."""
@@ -49,7 +49,7 @@ def speed_up(network: nn.Module) -> None:
 
 
 def _by_onednn(x: Tensor, weight: Tensor, bias: Tensor | None) -> bool:
-    """It has no gradient, and reads the bias as if its numbers lay side by side."""
+    """Whether oneDNN computes the product: it has no gradient, and needs a bias without gaps in memory."""
     return (
         x.device.type == "cpu"
         and x.dtype is torch.float32

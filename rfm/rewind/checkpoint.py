@@ -76,7 +76,7 @@ class RewindCheckpoint:
 
     @property
     def description(self) -> Description:
-        """What it can be asked, and what it answers."""
+        """What the checkpoint takes, and what it answers."""
         return Description(
             network_class=RewindTransformer.__name__,
             widths=(self.config.video_feature_dim, self.config.text_feature_dim),
@@ -193,7 +193,7 @@ def _rewind_config(folder: Path, weights: Mapping[str, Tensor]) -> RewindConfig:
 
 
 def _required(stated: Mapping[str, Any], name: str, folder: Path) -> Any:
-    """Raises CheckpointError for what neither weights nor configurations tell."""
+    """Raises CheckpointError for a value that neither weights nor configurations hold."""
     if name not in stated:
         places = f"{NETWORK_CONFIG} or model.rewind of {RUN_CONFIG}"
         raise CheckpointError(f"{folder}: {name}: expected it in {places}, got it in neither; weights do not tell it")
@@ -209,7 +209,7 @@ def _shape(weights: Mapping[str, Tensor], name: str, rank: int) -> torch.Size:
 
 
 def _trained_frames(folder: Path) -> int | None:
-    """As ``RewindCheckpoint.save`` wrote it to config.json, else as config.yaml tells it."""
+    """The most frames of a trajectory in training, as ``save`` wrote it to config.json, else as config.yaml has it."""
     if is_there(folder / NETWORK_CONFIG):
         saved = read_json(folder / NETWORK_CONFIG).get("trained_frames")
         if saved is not None:
@@ -241,7 +241,7 @@ def _stated(folder: Path) -> dict[str, Any]:
         for source, value in values.items():
             if type(value) is not kind:
                 raise CheckpointError(f"{folder}: {name} in {source}: expected {kind.__name__}, got {shown(value)}")
-        if name != "max_len" and len(set(values.values())) > 1:  # weights tell max_len where it matters
+        if name != "max_len" and len(set(values.values())) > 1:  # weights show max_len where it matters
             raise CheckpointError(f"{folder}: {name}: expected {' and '.join(values)} to agree, got {values}")
         if values:
             stated[name] = next(iter(values.values()))

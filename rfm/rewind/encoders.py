@@ -54,7 +54,8 @@ class Encoders:
         image_weights: Mapping[str, Tensor] | None = None,
         text_weights: Mapping[str, Tensor] | None = None,
     ) -> Encoders:
-        """From local folders or Hugging Face ids; given weights (a checkpoint's own) win over the source's.
+        """The encoders in local folders or of Hugging Face ids. Weights that are given (a checkpoint's own) win over
+        theirs.
 
         Raises ImportError without transformers, OSError for a source that cannot be had, ValueError for one
         that does not fit.
@@ -90,14 +91,14 @@ class Encoders:
 
     @classmethod
     def describe(cls, folder: Path) -> EncodersDescription:
-        """Of those that ``save`` wrote, without loading them."""
+        """The description of the encoders that ``save`` wrote into ``folder``, without loading them."""
         file = folder / IMAGE_ENCODER_FOLDER / PREPROCESSOR_CONFIG
         preprocessor = ImagePreprocessor.from_config(read_json(file), str(file))
         return EncodersDescription(cls.__name__, preprocessor.frame_size)
 
     @property
     def description(self) -> EncodersDescription:
-        """What the export tells of them."""
+        """What the export records of these encoders."""
         return EncodersDescription(type(self).__name__, self.preprocessor.frame_size)
 
     def to(self, device: torch.device) -> Encoders:

@@ -67,7 +67,7 @@ class RewindBatch:
     """Rows of any lengths and kinds, packed. F frames of all rows' trajectories, Q rows of two trajectories.
 
     text: float32 [B, Dt]
-    video: float32 [V, Dv], embeddings of frames; as many as F, or more that mean nothing, unless ``shown`` tells
+    video: float32 [V, Dv], embeddings of frames; as many as F, or more that mean nothing, unless ``shown`` says which
     shown: int64 [F], which of ``video`` each frame of a row is (dense mode shows one in many rows); None: in order
     is_similarity: bool [Q], asks for similarity rather than preference; None: all ask for preference
     packing: where tokens lie; ``*_at`` are positions in its packed tokens

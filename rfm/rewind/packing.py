@@ -43,7 +43,7 @@ class Packing:
 
     @classmethod
     def of(cls, lengths: npt.NDArray[np.int64]) -> Packing:
-        """Of rows of int64 [B] tokens."""
+        """The packing of rows with so many tokens each; lengths: int64 [B]."""
         num_rows, longest, num_tokens = len(lengths), int(lengths.max()), int(lengths.sum())
         at = np.zeros(rounded_up(num_tokens), np.int64)
         at[:num_tokens] = np.arange(num_tokens) + np.repeat(np.arange(num_rows) * longest - starts(lengths), lengths)
@@ -53,7 +53,7 @@ class Packing:
         return cls(num_rows, longest, num_tokens, torch.from_numpy(at), mask)
 
     def to(self, device: torch.device) -> Packing:
-        """With its tensors on ``device``."""
+        """The packing with its tensors on ``device``."""
         return replace(self, at=self.at.to(device), mask=None if self.mask is None else self.mask.to(device))
 
     def empty(self, width: int, like: Tensor) -> Tensor:

@@ -38,7 +38,7 @@ class RewindPredictor:
         return self.collator.collate(rows)
 
     def occupancy(self, batch: RewindBatch) -> tuple[int, int]:
-        """Of packed tokens, which everything but attention is computed of; a few behind the last mean nothing."""
+        """Number of tokens of the rows, and of slots that the network computes, the last few of which hold no token."""
         return batch.packing.num_tokens, len(batch.packing.at)
 
     @torch.inference_mode()

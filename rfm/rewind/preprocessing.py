@@ -35,7 +35,7 @@ class ImagePreprocessor:
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], where: str) -> ImagePreprocessor:
-        """From the fields of preprocessor_config.json. Raises ValueError for steps other than the above."""
+        """The preprocessing that preprocessor_config.json describes. Raises ValueError for other steps."""
         crop = config.get("crop_size", {})
         required = {
             "do_resize": True,

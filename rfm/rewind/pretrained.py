@@ -16,7 +16,7 @@ from torch import Tensor
 from rfm.checkpoint.preprocessor import PREPROCESSOR_CONFIG
 from rfm.rewind.preprocessing import ImagePreprocessor
 
-_LOADING_PROBLEMS = ("missing_keys", "unexpected_keys", "mismatched_keys")  # as transformers tells of a load
+_LOADING_PROBLEMS = ("missing_keys", "unexpected_keys", "mismatched_keys")  # as transformers reports a load
 
 
 def load_preprocessor(source: str | Path) -> ImagePreprocessor:

@@ -27,7 +27,7 @@ _prctl = ctypes.CDLL(None).prctl
 
 
 def ending_with_parent() -> Callable[[], None]:
-    """For ``preexec_fn``: the process is killed when the thread that starts it ends, however that ends."""
+    """A ``preexec_fn`` with which the kernel kills the new process as soon as the thread that started it ends."""
     parent = os.getpid()
 
     def bind() -> None:
@@ -42,7 +42,7 @@ class Claim:
     """What one server has on this machine beside its processes: regions of shared memory, and a folder.
 
     Each of the two has a lock, which is held as long as a process lives that has ``lock_files``: this one, and those
-    that inherit them. A process id would not tell: another container may share the memory, or have left it.
+    that inherit them. A process id would prove nothing: another container may share the memory, or have left it.
     """
 
     def __init__(self) -> None:

@@ -14,7 +14,7 @@ class State(Enum):
     """What a model is doing."""
 
     WAITING = "an ensemble that is to be loaded when its parts are ready"
-    NEW = "it was not asked yet"
+    NEW = "it was not probed yet"
     READY = "it answers"
     LATE = "it gives no answer in time"
     ABSENT = "it is not loaded"

@@ -15,7 +15,7 @@ _VERSION = re.compile(r"(\d+)\.(\d+)")
 
 
 def check_before_start(host: str, installation: Installation, *, accepted: bool) -> None:
-    """As check_version, where the version can be known before anything listens."""
+    """Checks the version as check_version does, where it is known before the server starts."""
     if installation.wheel is not None:
         check_version(host, WHEEL_VERSION, accepted=accepted)
 

@@ -99,7 +99,7 @@ class ModelProbe:
         return Event.LATE if waited_s > max(LATE_S, slowest_s) else self._known
 
     def _look_at_stats(self) -> None:
-        """Sees whether the model answers anybody, as Triton counts it."""
+        """Reads Triton's counts of answered requests: a model that answers others is not hung."""
         if self._stats is not None and self._stats.done():
             try:
                 successes = self._stats.result()

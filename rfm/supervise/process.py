@@ -159,7 +159,7 @@ class TritonServer:
 
     @property
     def grpc_options(self) -> Mapping[str, Any]:
-        """With which a RepositoryApi reaches it, once it is started."""
+        """The options with which a RepositoryApi reaches the server, once it is started."""
         return {} if self._own_tls is None else self._own_tls.options
 
     def signal(self, number: int) -> None:
@@ -260,7 +260,7 @@ class TritonServer:
             *(f"--load-model={model}" for model in models),
             "--disable-auto-complete-config",
             "--strict-readiness=false",  # else one version that cannot be loaded makes all not ready
-            "--exit-on-error=false",  # so that the reason of each model that fails can be asked for
+            "--exit-on-error=false",  # so that the reason of each model that fails can be read
             f"--exit-timeout-secs={EXIT_TIMEOUT_S}",
             f"--http-address={endpoints.http_host}",
             f"--http-port={endpoints.http_port}",
@@ -273,7 +273,7 @@ class TritonServer:
         ]
 
     def _environment(self) -> dict[str, str]:
-        """That of this process, without its secrets."""
+        """Environment of tritonserver: that of this process, without its secrets."""
         own = {name: value for name, value in os.environ.items() if name not in SECRETS}
         return {**own, **self._installation.environment, **NO_BYTECODE}
 

@@ -42,7 +42,7 @@ _CHANNEL = [
 ]
 _OF_SERVER = (*triton.UNAVAILABLE, *triton.OUT_OF_TIME, *triton.CANCELLED)
 _GOING = (READY, UNLOADING)
-_NOT_LOADED = "not loaded"  # Triton tells no state
+_NOT_LOADED = "not loaded"  # Triton gives no state
 _UNAVAILABLE, _UNLOADED = "UNAVAILABLE", "unloaded"
 
 
@@ -95,12 +95,12 @@ class RepositoryApi:
         return versions_of(MessageToDict(entry) for entry in answer.models)
 
     def ready_versions(self, model: str) -> list[int]:
-        """Those that are served now."""
+        """The versions of ``model`` that are served now."""
         ready = (entry for entry in self.index() if entry.name == model and entry.is_ready)
         return [entry.version for entry in ready if entry.version is not None]
 
     def config(self, model: str, version: int) -> dict[str, Any]:
-        """With which it was loaded."""
+        """The configuration with which the version was loaded."""
         answer = self._request(self._client.get_model_config, model, str(version))
         config: dict[str, Any] = MessageToDict(answer.config, preserving_proto_field_name=True)
         return config
@@ -128,7 +128,7 @@ class RepositoryApi:
         raise RepositoryApiError(f"{model}: expected its old versions to finish within {FINISH_S:g} s, got no end")
 
     def infer(self, model: str, version: int, inputs: Tensors, outputs: Collection[str]) -> Tensors:
-        """What one version answers. Its id tells it from callers' requests in logs."""
+        """What one version answers to a probe. The probe's request id sets it apart from callers' requests in logs."""
         tensors = []
         for name, array in inputs.items():
             tensors.append(tritonclient.grpc.InferInput(name, array.shape, np_to_triton_dtype(array.dtype)))

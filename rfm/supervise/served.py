@@ -11,10 +11,10 @@ What is watched, and the fault that no other watch sees:
 | zombies among Triton's children (``StubWatch``) | one of several processes is dead: probes go to the others |
 | stopped children (``StubWatch``) | one of several processes is stopped (SIGSTOP) while it is idle |
 | the journals of model processes (``StubWatch``) | one of several processes hangs in a forward pass |
-| a probe of each model (``ModelProbe``): no answer | a process hangs between two batches, where no journal tells |
+| a probe of each model (``ModelProbe``): no answer | a process hangs between two batches, which no journal shows |
 | a probe: "is not healthy" | a dead process that Triton has reaped, so that it is no zombie |
 | a probe: failures in a row | requests fail before they reach ``model.py``, in Triton's Python backend |
-| the self check in each process (``rfm.triton_model``) | one of several processes fails at whatever it is asked |
+| the self check in each process (``rfm.triton_model``) | one of several processes fails at every request |
 
 All of this is looked at in one thread, which feeds each model's lifecycle. What may wait runs in the background.
 """

@@ -50,7 +50,7 @@ class Stub:
 
     @property
     def state(self) -> str | None:
-        """Its state, as the kernel has it; None: there is no such process."""
+        """State of the process, as the kernel has it; None: there is no such process."""
         fields = _stat(self.pid)
         return fields[0] if fields and int(fields[_STARTED]) == self.started_ticks else None
 
@@ -73,7 +73,8 @@ class Stub:
 
 
 class StubWatch:
-    """Sees which stubs of the tritonserver ``triton_pid`` have died, or hang. Those that still load are Triton's.
+    """Finds the stubs of the tritonserver ``triton_pid`` that have died, or hang. It leaves those that still load to
+    Triton.
 
     hang_s: what one forward pass may take before its stub counts as hung
     """
@@ -103,12 +104,12 @@ class StubWatch:
         self._watched = {stub for stub in self._loaded if stub.serves not in going}
 
     def dead(self) -> list[Stub]:
-        """Those that have died and were not buried."""
+        """The stubs that have died and were not buried."""
         self._look()
         return [stub for stub in self._watched if self._has_been(stub, _ZOMBIE, CONFIRM_S)]
 
     def hung(self) -> list[tuple[Stub, str]]:
-        """Those that are alive and get nowhere, and why."""
+        """The stubs that live and make no progress, and why."""
         found = []
         for stub in self._watched:
             journal = stub.journal
@@ -151,7 +152,7 @@ class StubWatch:
         return since_s is not None and time.monotonic() - since_s >= duration_s
 
     def _scan(self) -> None:
-        known = {stub for stub in self._stubs if stub.state is not None}  # a zombie tells nothing of itself
+        known = {stub for stub in self._stubs if stub.state is not None}  # of a zombie nothing can be read
         found = (_stub(folder, self._triton_pid) for folder in _PROC.glob("[0-9]*"))
         self._buried = {stub for stub in self._buried if stub.state is not None}
         self._stubs = known | {stub for stub in found if stub is not None} - self._buried
@@ -166,7 +167,10 @@ def _stat(pid: int) -> list[str]:
 
 
 def _stub(folder: Path, parent: int) -> Stub | None:
-    """Its arguments are .../<model>/<version>/model.py, the name of its shared memory, and others."""
+    """The stub with this folder in /proc, if it is one of ``parent``'s.
+
+    A stub's arguments are .../<model>/<version>/model.py, the name of its shared memory, and others.
+    """
     pid = int(folder.name)
     fields = _stat(pid)
     if not fields or int(fields[_PARENT]) != parent:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What ``rfm serve`` runs: Triton, and perhaps a gateway, kept answering until it is told to stop."""
+"""What ``rfm serve`` runs: Triton, and perhaps a gateway, kept answering until a signal stops it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rfm.supervise.triton_watch import Config, names_what_was_served
 
 
 class Supervisor:
-    """Serves until told to stop (STOP_SIGNALS). To be run by the main thread.
+    """Serves until one of STOP_SIGNALS comes. Run it in the main thread.
 
     gateway: command line of a gateway that runs beside the server; None: there is none
     status_port: of the status (``status``), on the server's host; None: there is none
@@ -83,10 +83,10 @@ class Supervisor:
             while not self._is_to_stop.wait(POLL_S):
                 self._look()
         except ServerStartError:
-            if not self._is_to_stop.is_set():  # else it ended since it was told to
+            if not self._is_to_stop.is_set():  # else it ended as it should
                 raise
         finally:
-            self._status.record_down("it is told to stop")
+            self._status.record_down("it is stopping")
             if self._gateway is not None:  # it answers what it has begun, and then the server is stopped
                 self._gateway.stop()
             self._close_served()
@@ -142,7 +142,7 @@ class Supervisor:
                 self._count(model, why)
 
     def _start_again(self, why: str) -> None:
-        """Returns when Triton is ready, or this is told to stop. Raises CrashLoopError."""
+        """Returns when Triton is ready, or a signal has come. Raises CrashLoopError."""
         while not self._is_to_stop.is_set():
             self._count("triton", why)
             self._close_served()

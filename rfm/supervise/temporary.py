@@ -16,7 +16,7 @@ from rfm.supervise.process import STOP_SIGNALS, Endpoints, TritonServer
 
 @contextmanager
 def stopped_by_signals() -> Iterator[None]:
-    """Within it a signal to stop raises SystemExit, so that whatever was started is stopped."""
+    """A context in which a signal to stop raises SystemExit, so that what was started is stopped."""
 
     def leave(number: int, _frame: FrameType | None) -> NoReturn:
         raise SystemExit(128 + number)

@@ -40,7 +40,7 @@ class GrpcTls:
 
     @classmethod
     def of(cls, config: ServeConfig) -> GrpcTls | None:
-        """As the configuration names them; None: gRPC is served without TLS."""
+        """The files that the configuration names; None: gRPC is served without TLS."""
         if config.grpc_certificate is None or config.grpc_key is None:
             return None
         client_ca = None if config.grpc_client_ca is None else Path(config.grpc_client_ca)

@@ -57,5 +57,5 @@ def _knows(program: Path, option: str) -> bool:
     try:
         with program.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             return content.find(option.encode()) >= 0
-    except (OSError, ValueError):  # it cannot be read, or is empty: starting it tells why
+    except (OSError, ValueError):  # it cannot be read, or is empty: starting it gives the reason
         return False

@@ -127,7 +127,7 @@ class TritonWatch:
     def _take(self, look: Look) -> None:
         if look.is_answered:
             self._silent_since_s, self._failed_looks = None, 0
-            self.snapshot = look.snapshot or self.snapshot  # if there is none it is asked for again
+            self.snapshot = look.snapshot or self.snapshot  # if there is none, the next look requests it again
         else:
             self._failed_looks += 1
             self._silent_since_s = self._silent_since_s or look.started_s

@@ -172,7 +172,7 @@ def _failure(error: Exception) -> Any:
 
 
 def _sample_types(input_names: Sequence[str]) -> list[str]:
-    """What a model with these inputs can be asked about."""
+    """The types of samples that a model with these inputs scores."""
     of_samples = wire.SAMPLE_TYPE in input_names
     return [name for kind, name in SAMPLE_TYPES.items() if issubclass(kind, Footage) != of_samples]
 

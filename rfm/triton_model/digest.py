@@ -17,7 +17,10 @@ _BLOCK_BYTES = 2**9
 
 
 def digest(tensors: Mapping[str, npt.NDArray[Any]]) -> bytes:
-    """8 bytes that tell a request's inputs from others; of large tensors shape and an even sample of the content."""
+    """A digest of a request's inputs, 8 bytes.
+
+    Of a large tensor it covers the shape and an even sample of the content.
+    """
     content_hash = hashlib.sha1(usedforsecurity=False)
     for name in sorted(tensors):
         array = tensors[name]

@@ -20,7 +20,7 @@ from rfm.execution import Execution
 from rfm.triton_model.request import OUTCOMES, SCORED, UNKNOWN_TYPE, Request
 
 FLUSH_INTERVAL_S = 0.25
-IDLE_INTERVAL_S = 5.0  # while nothing is asked
+IDLE_INTERVAL_S = 5.0  # while no request comes
 
 COUNTER, GAUGE, HISTOGRAM = "COUNTER", "GAUGE", "HISTOGRAM"  # as Triton names them
 FRAMES, RETRIES = "frames_total", "out_of_memory_retries_total"
@@ -90,9 +90,9 @@ class Counted:
 class Metrics:
     """The metrics of one instance; to be closed. Whatever goes wrong with them is logged once, and fails no request.
 
-    labels: that tell the instance
+    labels: the labels that name the instance
     checkpoint: labels of rfm_checkpoint_info
-    sample_types: that the model can be asked about
+    sample_types: the types of samples that the model scores
     """
 
     def __init__(self, labels: Mapping[str, str], checkpoint: Mapping[str, str], sample_types: Collection[str]) -> None:
@@ -111,7 +111,7 @@ class Metrics:
 
     @contextmanager
     def at_work_on(self, batch: Iterable[Request[Any]]) -> Iterator[None]:
-        """Within it, the gauge of requests that are worked on shows how many of the batch are callers'."""
+        """A context in which the gauge of requests in work counts the callers' requests of the batch."""
         self._set_at_work(sum(request.is_counted for request in batch))
         try:
             yield
@@ -157,7 +157,7 @@ class Metrics:
 
         if not self._has_failed:
             self._has_failed = True
-            pb_utils.Logger.log_error(f"metrics cannot be told: {traceback.format_exc()}")
+            pb_utils.Logger.log_error(f"metrics cannot be reported: {traceback.format_exc()}")
 
 
 class _Series:

@@ -70,7 +70,7 @@ class Quarantine:
 
     @contextmanager
     def at_work_on(self, digests: Sequence[bytes]) -> Iterator[None]:
-        """Within it, these requests are worked on. If it ends, none of them is a suspect any more."""
+        """A context in which these requests are worked on. When it ends, none of them is a suspect any more."""
         try:
             with self._journal.at_work_on(digests):
                 yield

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A model process that finds out by itself that it is broken, by a lost CUDA context say, and ends.
 
-Probes cannot tell one broken instance of several: they go to whichever instance is free. A process that has ended is
+Probes do not find one broken instance among several: they go to whichever instance is free. A process that has ended is
 dead, and healed as such. Inputs may fail too, so a blank sample decides: who can score that is not broken.
 """
 
@@ -35,7 +35,7 @@ class SelfCheck:
 
     @contextmanager
     def around(self, batch: Sequence[Request[Any]]) -> Iterator[None]:
-        """Within it the batch is served. Afterwards the instance is checked, if need be.
+        """A context in which the batch is served. Afterwards it checks the instance, if the batch failed.
 
         Nothing begins in a broken process, so that no request is a suspect when it ends.
         """

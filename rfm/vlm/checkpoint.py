@@ -77,7 +77,7 @@ class VlmCheckpoint:
 
     @property
     def description(self) -> Description:
-        """What it can be asked, and what it answers."""
+        """What the checkpoint takes, and what it answers."""
         return Description(
             network_class=VlmRewardModel.__name__,
             widths=None,
@@ -101,7 +101,7 @@ class VlmCheckpoint:
         return load_collator(self.config, len(embedding), self.processor or self.config.base_model_id)
 
     def encoders(self) -> None:
-        """It has none: the network reads raw frames."""
+        """None: the network reads raw frames, and needs no encoders."""
 
     def predictor(self, device: torch.device, dtype: torch.dtype | None = None) -> VlmPredictor:
         """The network on ``device``. Raises CheckpointError.

@@ -26,8 +26,8 @@ from rfm_client.contract import InvalidSampleError, ProgressSample, Sample, Simi
 from rfm_client.contract.samples import UInt8Array
 
 TEXT, IMAGE, VIDEO = 0, 1, 2  # values of mm_token_type_ids
-SECONDS_PER_GROUP = 1.0  # what the original tells Qwen2.5-VL of its videos
-VIDEO_FPS = 1  # what it tells Qwen3-VL, which writes each group's time into the prompt
+SECONDS_PER_GROUP = 1.0  # the original gives it to Qwen2.5-VL with its videos
+VIDEO_FPS = 1  # the original gives it to Qwen3-VL, which writes each group's time into the prompt
 QWEN3 = "qwen3_vl"
 VISION_START, VISION_END = "<|vision_start|>", "<|vision_end|>"
 IMAGE_PAD, VIDEO_PAD = "<|image_pad|>", "<|video_pad|>"
@@ -225,7 +225,7 @@ class QwenCollator(VlmCollator):
             pixels = [self.images.video(video) for video in videos]
         patches = torch.cat([each.patches for each in pixels])
         grids = torch.tensor([astuple(each.grid) for each in pixels])
-        inputs = {"mm_token_type_ids": types}  # transformers 5 tells positions by it
+        inputs = {"mm_token_type_ids": types}  # transformers 5 computes positions from it
         if self.config.multi_image:
             return inputs | {"pixel_values": patches, "image_grid_thw": grids}
         seconds = torch.full((len(pixels),), SECONDS_PER_GROUP)

@@ -31,13 +31,13 @@ MAX_VIDEO_SIDE_PX = 480  # longer frames are scaled down before anything else, i
 
 @dataclass(frozen=True)
 class Normalisation:
-    """Per channel (value - 255 mean) / (255 std)."""
+    """Normalisation of pixels per channel: (value - 255 mean) / (255 std)."""
 
     mean: tuple[float, ...]
     std: tuple[float, ...]
 
     def to_config(self) -> dict[str, Any]:
-        """The fields of preprocessor_config.json that tell this."""
+        """The fields of preprocessor_config.json that describe this."""
         return {"image_mean": self.mean, "image_std": self.std, "rescale_factor": 1 / MAX_UINT8}
 
     def __call__(self, images: Tensor) -> Tensor:
@@ -111,7 +111,7 @@ class QwenImages:
     size_px: tuple[int, int] | None = None
 
     def to_config(self) -> dict[str, Any]:
-        """The fields of preprocessor_config.json that tell this."""
+        """The fields of preprocessor_config.json that describe this."""
         return {"patch_size": self.patch_px, **self.normalisation.to_config()}
 
     def image_grid(self, frames: UInt8Array) -> Grid:
@@ -199,7 +199,7 @@ class SmolImages:
     normalisation: Normalisation
 
     def to_config(self) -> dict[str, Any]:
-        """The fields of preprocessor_config.json that tell this."""
+        """The fields of preprocessor_config.json that describe this."""
         return {"resample": self.resample, **self.normalisation.to_config()}
 
     def images(self, frames: UInt8Array) -> Tensor:

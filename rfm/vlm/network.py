@@ -26,7 +26,7 @@ SMOL = "smolvlm"
 
 @dataclass(frozen=True)
 class VlmConfig:
-    """What a checkpoint's network looks like and how it was trained to be asked.
+    """What a checkpoint's network looks like, and which prompts it was trained with.
 
     backbone: transformers' configuration of it (config.json)
     dtype: of all parameters, heads included
@@ -61,7 +61,7 @@ class VlmConfig:
 
     @property
     def pads_left(self) -> bool:
-        """On which side the checkpoint was trained to be padded."""
+        """Whether padding stands before the tokens, as in the checkpoint's training."""
         return self.family == SMOL
 
     @property
@@ -71,7 +71,7 @@ class VlmConfig:
 
     @property
     def torch_dtype(self) -> torch.dtype:
-        """``dtype`` as torch has it."""
+        """The torch type that ``dtype`` names."""
         return {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}[self.dtype]
 
 

@@ -47,7 +47,7 @@ class VlmPredictor:
         return self.collator.collate(rows)
 
     def occupancy(self, batch: VlmBatch) -> tuple[int, int]:
-        """Of conversations, padded to the longest."""
+        """Number of tokens of the conversations, and of slots with the padding to the longest."""
         mask = batch.inputs["attention_mask"]
         return int(mask.sum()), mask.numel()
 
@@ -72,7 +72,7 @@ class VlmPredictor:
         return checked(of_rows)
 
     def _per_frame(self, scores: FrameScores, num_frames: int) -> FrameScores:
-        """In video mode both frames of a temporal group carry its value."""
+        """The scores of each frame: in video mode both frames of a temporal group carry its value."""
         if self.network.config.multi_image:
             return scores
         return part_of(scores, np.arange(num_frames) // FRAMES_PER_GROUP)

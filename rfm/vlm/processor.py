@@ -19,7 +19,7 @@ SMOL_SIZE_PX = 512  # what upstream sets, whatever the base model says; so no im
 
 
 def frame_size(config: VlmConfig) -> FrameSize | None:
-    """To what a checkpoint brings each frame first; None: that depends on the frame."""
+    """The size to which a checkpoint brings each frame first; None: it depends on the frame."""
     if config.family == SMOL:
         return FrameSize("longest", (SMOL_SIZE_PX,))
     if config.size_px is None:

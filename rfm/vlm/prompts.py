@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a vision-language checkpoint is asked, to the letter: its wording is part of the checkpoint.
+"""The prompts of vision-language checkpoints, to the letter: the wording is part of the checkpoint.
 
 A question is a list of parts in the order in which the model reads them: text, and whole trajectories.
 Source: the collators of ``reward_fm`` and ``robometer``.
@@ -50,7 +50,10 @@ Part: TypeAlias = str | TrajectoryPart
 
 
 def question(sample: Sample, *, progress_in_preference: bool) -> list[Part]:
-    """The parts of the question about a sample; progress_in_preference: the checkpoint was trained to be asked that."""
+    """The parts of the prompt for a sample.
+
+    progress_in_preference: the checkpoint was trained with preference prompts that request progress, too
+    """
     task = sample.trajectories[0].task
     if isinstance(sample, ProgressSample):
         return [PROGRESS_PROMPT.replace("{task}", task), TrajectoryPart(0)]

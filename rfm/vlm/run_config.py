@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""config.yaml of a vision-language training run: the settings that weights do not tell.
+"""config.yaml of a vision-language training run: the settings that weights do not hold.
 
 docs/checkpoints.md lists every setting, and what decides it where the file lacks its key.
 """
@@ -36,7 +36,9 @@ class RunConfig:
 
     @classmethod
     def of(cls, folder: Path) -> RunConfig:
-        """That of the checkpoint in ``folder``. Raises CheckpointError if there is none, or none of upstream's."""
+        """The run configuration of the checkpoint in ``folder``. Raises CheckpointError if there is none, or none of
+        upstream's.
+        """
         file = find_run_config(folder)
         if file is None:
             raise CheckpointError(

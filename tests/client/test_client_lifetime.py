@@ -305,7 +305,7 @@ def test_progress_becomes_a_reward() -> None:
 def test_what_a_checkpoint_does_not_tell_becomes_no_number(name: str) -> None:
     nothing = np.full(2, np.nan, np.float32)
     scores = FrameScores(progress=nothing, success=nothing)
-    with pytest.raises(ValueError, match="got NaN: this checkpoint does not tell it"):
+    with pytest.raises(ValueError, match="got NaN: this checkpoint does not predict it"):
         getattr(scores, name)() if name == "succeeded" else getattr(scores, name)
 
 

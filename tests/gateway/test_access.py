@@ -104,7 +104,7 @@ def test_browsers_may_ask_from_the_named_origin_alone(keyed: Gateway, tiny: Gate
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "127.0.0.1"])
 def test_an_open_address_without_a_key_is_warned_of(triton: Triton, tmp_path: Path, host: str) -> None:
-    warning = "WARNING rfm_gateway: 0.0.0.0 is no loopback address, and no key is asked for"
+    warning = "WARNING rfm_gateway: 0.0.0.0 is no loopback address, and no key is required"
     with running(triton.endpoints, tmp_path, TINY, "--host", host) as gateway:
         assert (warning in gateway.log) is (host == "0.0.0.0")
     with running(triton.endpoints, tmp_path, TINY, "--host", host, RFM_GATEWAY_API_KEY=KEY) as gateway:

@@ -136,7 +136,7 @@ def test_readiness_follows_the_probe(bench: Bench) -> None:
         assert bench.look(event) is None
         said.append((bench.model.reason, bench.is_probe_ok))
     assert said == [
-        ("it was not asked yet", False),
+        ("it was not probed yet", False),
         ("it gives no answer in time", False),
         (NO_REASON, True),
         (NO_REASON, False),

@@ -442,4 +442,4 @@ def test_a_model_without_its_metrics_serves_all_the_same_and_says_so_once(tmp_pa
     ):
         for _ in range(3):
             assert len(client.evaluate(mixed(3, PLAIN_WIDTHS))) == 3
-    assert log.read_text().count("metrics cannot be told") == 1
+    assert log.read_text().count("metrics cannot be reported") == 1

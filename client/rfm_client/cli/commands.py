@@ -25,7 +25,7 @@ FILE_WIDTH = 200
 
 app = typer.Typer(
     name="rfm-client",
-    help="Asks a served reward model about videos, and its server how it is.",
+    help="Scores videos with a served reward model, and shows the state of its server.",
     epilog=EXIT_CODES,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -55,11 +55,11 @@ def main(
     client_key: options.ClientKey = None,
     api_key_file: options.ApiKeyFile = None,
     version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Tell the version and end.")
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Asks a served reward model about videos, and its server how it is."""
-    logging.basicConfig(format="rfm-client: %(message)s", level=logging.WARNING)  # the client tells of retries
+    """Scores videos with a served reward model, and shows the state of its server."""
+    logging.basicConfig(format="rfm-client: %(message)s", level=logging.WARNING)  # the client logs retries
     context.obj = options.read_access(ca_file, client_certificate, client_key, api_key_file)
 
 
@@ -190,7 +190,7 @@ def wait(
     model: options.Model = DEFAULT_MODEL,
     timeout: Annotated[float, typer.Option(min=options.MIN_TIMEOUT_S, help="Seconds to wait at most.")] = 120.0,
 ) -> None:
-    """Return as soon as the model is ready to be asked (of several servers: on one of them)."""
+    """Return as soon as the model is ready (of several servers: on one of them)."""
     from rfm_client.client import RewardClient
 
     with options.usage_errors("--url"):
@@ -212,7 +212,7 @@ def sample(
     json: options.Json = None,
     timeout: options.TimeoutS = DEFAULT_TIMEOUT_S,
 ) -> None:
-    """Ask about made-up samples, to see that the server answers. Their scores mean nothing."""
+    """Score made-up samples, to see that the server answers. Their scores mean nothing."""
     from rfm_client.cli.show import scores_table
 
     options.check_outputs(json, None)
@@ -288,7 +288,7 @@ def _note(name: str, num_scored: int, num_frames: int) -> None:
 
 
 def _print(*tables: object) -> None:
-    """As wide as the terminal; in a file or a pipe, as wide as it takes."""
+    """Prints as wide as the terminal; into a file or a pipe, as wide as the content."""
     from rich.console import Console
 
     console = Console()

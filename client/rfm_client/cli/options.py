@@ -39,7 +39,7 @@ class ExitCode(IntEnum):
 
 EXIT_CODES = (
     "Exit codes: 0 done; 1 a sample (or anything not named here) failed; 2 wrong usage; 3 server unavailable; "
-    "4 out of time; 5 model not served; 130 interrupted. Errors are told on standard error, one a line."
+    "4 out of time; 5 model not served; 130 interrupted. Errors are written to standard error, one a line."
 )
 
 _ERROR_CODES: dict[type[BaseException], ExitCode] = {
@@ -110,7 +110,7 @@ class OneLineCommand(TyperCommand):
 
 @dataclass(frozen=True)
 class Server:
-    """What is asked, and how long."""
+    """The servers and model of a command, and how long a request may take."""
 
     urls: list[str]
     model: str = DEFAULT_MODEL
@@ -119,7 +119,7 @@ class Server:
 
     @contextmanager
     def connected(self) -> Iterator[RewardClient]:
-        """A client of a server that answers and serves the model; one that does not is told at once, not waited for."""
+        """A client, once one of the servers answers and serves the model. If none does, it fails without a wait."""
         with usage_errors("--url"):
             client = RewardClient(self.urls, model=self.model, timeout_s=self.timeout_s, **self.access.options)
         with client:
@@ -204,7 +204,7 @@ def missing_package(error: ImportError) -> str:
 
 
 def check_outputs(json: str | None, plot: Path | None) -> None:
-    """Sees to it, before anything is asked, that results can be written. Raises typer.BadParameter."""
+    """Checks, before the first request, that results can be written. Raises typer.BadParameter."""
     if json is not None and json != STANDARD_OUTPUT and Path(json).suffix != ".json":
         raise typer.BadParameter(f"expected a .json file or -, got {json}", param_hint="--json")
     if plot is not None and plot.suffix not in PICTURES:

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""What the commands write: JSON documents and arrays. A score that is not told is null, never a number."""
+"""What the commands write: JSON documents and arrays.
+
+A score that a checkpoint does not predict is null in JSON, never a number.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ from rfm_client.status import ServerStatus
 
 
 def write_json(target: str, document: Mapping[str, Any]) -> None:
-    """To a file or standard output."""
+    """Writes the document to a file, or to standard output."""
     text = json.dumps(document, indent=2, allow_nan=False)
     if target == STANDARD_OUTPUT:
         typer.echo(text)
@@ -100,7 +103,10 @@ def status_document(statuses: Sequence[ServerStatus]) -> dict[str, Any]:
 
 
 def write_arrays(target: Path, outcomes: Sequence[Outcome]) -> None:
-    """float32 [T, 2], progress and success (NaN: not told): into the one .npy file, or one a source in a folder."""
+    """Writes float32 [T, 2], progress and success (NaN: not predicted).
+
+    ``target`` is one .npy file, or a folder that gets one file for each source.
+    """
     if target.suffix == ".npy":
         files = [target] * len(outcomes)
     else:
@@ -123,5 +129,5 @@ def _error(error: Exception, message: str) -> dict[str, Any]:
 
 
 def _or_null(scores: npt.NDArray[np.float32]) -> list[float] | None:
-    """Each as the float64 that is equal to it; None if the checkpoint does not tell them."""
+    """The scores [T] as float64 of the same value; None if the checkpoint does not predict them."""
     return None if np.isnan(scores).all() else scores.tolist()

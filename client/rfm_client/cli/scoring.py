@@ -34,7 +34,7 @@ Times = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked of each source.
+    """The settings with which each source is scored.
 
     max_frames: frames that are sent at most, besides the checkpoint's own limit, which ``subsample`` applies
     """
@@ -57,7 +57,7 @@ class Source:
 
     @classmethod
     def read(cls, name: str, question: Question) -> Source:
-        """From a file or URL. Raises InvalidSampleError."""
+        """The source that a file or URL holds. Raises InvalidSampleError."""
         from rfm_client.data.inputs import ARRAY_SUFFIXES, load_trajectory
         from rfm_client.data.video import frame_times_s, is_url
 
@@ -139,7 +139,7 @@ class Comparison:
 
 
 def score_all(server: Server, names: Sequence[str], question: Question) -> list[Outcome]:
-    """The outcome of each source, in order. Raises RewardError if the server cannot be asked at all."""
+    """The outcome of each source, in order. Raises RewardError if the server gives no answer at all."""
     with ThreadPoolExecutor(WORKERS) as pool, server.connected() as client, _progress_bar(len(names)) as advance:
         futures: list[Future[Outcome]] = []
         try:
@@ -197,7 +197,7 @@ def _score(client: RewardClient, name: str, question: Question) -> Outcome:
     except ImportError as error:
         return Failed(name, error, missing_package(error))
     except (RewardError, OSError) as error:
-        return Failed(name, error, str(error).removesuffix(f" ({name})"))  # it is told with the name in any case
+        return Failed(name, error, str(error).removesuffix(f" ({name})"))  # the report names the source in any case
     return Scored(
         name=name,
         result=result,
@@ -209,7 +209,10 @@ def _score(client: RewardClient, name: str, question: Question) -> Outcome:
 
 
 def _evaluate(client: RewardClient, sample: Sample, question: Question) -> Result:
-    """Its frames are left out here rather than by the client, which knows of no other limit than the checkpoint's."""
+    """The result of one sample, with frames left out as the question and the checkpoint require.
+
+    The frames are left out here: the client knows of no other limit than the checkpoint's.
+    """
     info = client.model_info(frames=sample.trajectories[0].frames is not None)
     dense = question.frame_steps > 0  # then the server samples each prefix
     limits = (question.max_frames, info.max_frames if question.subsample and not dense else None)
@@ -223,7 +226,7 @@ def _evaluate(client: RewardClient, sample: Sample, question: Question) -> Resul
 
 @contextmanager
 def _progress_bar(total: int) -> Iterator[Callable[[], None]]:
-    """On standard error, and only on a terminal. What it gives is called for each that is done."""
+    """A progress bar on standard error, shown only on a terminal. It gives a function to call after each source."""
     from rich.console import Console
     from rich.progress import MofNCompleteColumn, Progress
 

@@ -33,7 +33,7 @@ _CURVES = (("progress", "tab:blue", "-", "o"), ("success", "tab:green", "--", "s
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """The number, or ``-`` for one that is not told (None, NaN)."""
+    """The number, or ``-`` for one that is not predicted (None, NaN)."""
     return "-" if value is None or math.isnan(value) else f"{value:.{digits}f}"
 
 
@@ -74,7 +74,7 @@ def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> Table:
 
 
 def status_tables(status: ServerStatus) -> list[Table]:
-    """The server's models, and the machine if its metrics tell of it."""
+    """The server's models, and the machine if its metrics describe it."""
     version = f" {status.version}" if status.version else ""
     title = f"{status.url}: Triton{version}, {'ready' if status.ready else 'not ready'}"
     columns = (
@@ -118,7 +118,7 @@ class Panel:
         frames: UInt8Array | None = None,
         times_s: npt.NDArray[np.float64] | None = None,
     ) -> Panel:
-        """From the scores of a trajectory, all its frames and their times [T], as far as they are known.
+        """The panel of a trajectory's scores, with all its frames and their times [T], as far as they are known.
 
         Of the frames it keeps only copies of those that it shows.
         """
@@ -171,7 +171,7 @@ def _draw(part: SubFigure, panel: Panel) -> None:
     for name, colour, line, marker in _CURVES:
         scores: Float32Array = getattr(panel.scores, name)
         if np.isnan(scores).all():
-            axes.plot([], [], color=colour, label=f"{name}: not told")
+            axes.plot([], [], color=colour, label=f"{name}: not predicted")
         else:
             axes.plot(panel.positions, scores, color=colour, linestyle=line, marker=marker, markersize=4, label=name)
     axes.set(xlabel="time (s)" if panel.unit == "s" else "frame", ylabel="score", ylim=(-0.02, 1.02))

@@ -31,7 +31,10 @@ class SampleKind(str, Enum):
 
 @dataclass(frozen=True)
 class Toy:
-    """lengths: those of the trajectories, in turn, in an order that the seed gives."""
+    """A recipe for made-up samples.
+
+    lengths: frames of the trajectories, taken in turn, in an order that the seed gives
+    """
 
     kind: SampleKind
     num_samples: int
@@ -55,7 +58,7 @@ class Toy:
 
 
 def parse_lengths(text: str) -> list[int]:
-    """From ``8``, ``4,8,16`` or ``4-16``. Raises ValueError."""
+    """The lengths that ``8``, ``4,8,16`` or ``4-16`` names. Raises ValueError."""
     lengths: list[int] = []
     for part in text.split(","):
         match = _LENGTHS.fullmatch(part.strip())

@@ -14,7 +14,7 @@ _URL = re.compile(r"((?P<scheme>grpcs?|https?)://|dns:///)(?P<address>[^/]+:(?P<
 
 
 def split_url(url: str) -> tuple[str, str]:
-    """``grpc``, ``http``, ``grpcs`` or ``https``, and ``host:port``. Raises ValueError.
+    """The parts of a URL: ``grpc``, ``http``, ``grpcs`` or ``https``, and ``host:port``. Raises ValueError.
 
     ``dns:///host:port``, as gRPC writes it, is ``grpc://host:port``.
     """
@@ -33,12 +33,12 @@ def is_loopback(host: str) -> bool:
 
 
 def check_certificate(certificate: str | Path, key: str | Path, where: str) -> None:
-    """Raises ValueError, told as ``where: ...``, unless a server could serve with these files."""
+    """Raises ValueError (``where: ...``) unless a server could serve with these files."""
     load_certificate(ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), certificate, key, where)
 
 
 def check_authorities(file: str | Path, where: str) -> None:
-    """Raises ValueError, told as ``where: ...``, unless certificates can be judged by those in the file."""
+    """Raises ValueError (``where: ...``) unless certificates can be judged by those in the file."""
     try:
         ssl.create_default_context(cafile=file)
     except OSError as error:
@@ -46,9 +46,9 @@ def check_authorities(file: str | Path, where: str) -> None:
 
 
 def load_certificate(context: ssl.SSLContext, certificate: str | Path, key: str | Path, where: str) -> None:
-    """Raises ValueError, told as ``where: ...``, unless the context can use these files."""
+    """Raises ValueError (``where: ...``) unless the context can use these files."""
     try:
-        context.load_cert_chain(certificate, key, password="")  # no password: nobody is asked for one
+        context.load_cert_chain(certificate, key, password="")  # no password: OpenSSL must not prompt for one
     except OSError as error:
         expected = f"a certificate and its key (PEM, unencrypted) at {certificate} and {key}"
         raise ValueError(f"{where}: expected {expected}, got: {_reason(error)}") from None

@@ -22,7 +22,7 @@ DEADLY = "request: expected one that the model survives"  # how a server begins 
 class RewardError(Exception):
     """Base of every error that this library raises.
 
-    request_id: by which the server's log knows the request that failed, told behind the message; None: none was sent
+    request_id: the id of the failed request in the server's log, at the end of the message; None: none was sent
     """
 
     request_id: str | None = None
@@ -37,7 +37,7 @@ class RewardError(Exception):
 
 
 class InvalidSampleError(RewardError, ValueError):
-    """A sample that cannot be scored, told as ``where: expected X, got Y``."""
+    """A sample that cannot be scored, reported as ``where: expected X, got Y``."""
 
     @property
     def is_deadly(self) -> bool:
@@ -73,7 +73,7 @@ class DeadlineExceededError(ServerError, TimeoutError):
 
 
 class ModelNotFoundError(ServerError):
-    """The server does not serve the model that was asked for."""
+    """The server does not serve the requested model."""
 
 
 class AccessDeniedError(ServerError):

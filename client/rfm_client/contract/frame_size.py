@@ -15,7 +15,7 @@ _TEXT = re.compile(r"(?:(shortest|longest) ([1-9][0-9]*))|(?:(exact) ([1-9][0-9]
 
 @dataclass(frozen=True)
 class FrameSize:
-    """To what size a served checkpoint brings every frame before it reads it.
+    """The size to which a served checkpoint brings every frame before it reads it.
 
     rule: ``shortest``, as ReWiND's encoders: that edge to so many pixels, the other in proportion, rounded down;
         ``longest``, as SmolVLM: that edge, the other in proportion and even;
@@ -28,7 +28,9 @@ class FrameSize:
 
     @classmethod
     def parse(cls, text: str) -> FrameSize:
-        """From ``shortest 256``, ``longest 512`` or ``exact 224x320``; ``str`` gives it back. Raises ValueError."""
+        """The size that ``shortest 256``, ``longest 512`` or ``exact 224x320`` names, as ``str`` writes it. Raises
+        ValueError.
+        """
         match = _TEXT.fullmatch(text)
         if match is None:
             raise ValueError(f"frame_size: expected {_FORMS}, got {text!r}")

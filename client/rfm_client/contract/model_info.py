@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a server tells of a model before anything is asked: its limits, and the widths that it reads."""
+"""What a server says of a model before the first sample: its limits, and the widths that it reads."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class ModelInfo:
     frames_per_value: frames that share their scores; 2 where a vision-language model sees a trajectory as a video
     source: which checkpoint was exported: its Hub id, or the end of its path; None: it does not say
     revision: the commit of the Hub that was exported; None: it was a folder
-    weights_digest: 16 hex digits that tell the exported weights from others; None: it does not say
+    weights_digest: 16 hex digits, a digest of the exported weights; None: the server does not say
     network: its class, its configuration (config), and how many numbers each part of it has (parameters)
     run_config: config.yaml of the training run, without secrets; empty: the checkpoint had none
     """
@@ -61,7 +61,7 @@ class ModelInfo:
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> ModelInfo:
-        """From Triton's model configuration, as its HTTP API writes it.
+        """What Triton's model configuration, as its HTTP API writes it, says of the model.
 
         Raises ValueError, LookupError or TypeError for what is none.
         """

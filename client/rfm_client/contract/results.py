@@ -39,14 +39,14 @@ class FrameScores:
 
     @property
     def last_progress(self) -> float:
-        """Progress at the last frame. Raises ValueError if the checkpoint does not tell it."""
+        """Progress at the last frame. Raises ValueError if the checkpoint does not predict it."""
         return float(_known("progress", self.progress)[-1])
 
     @property
     def progress_deltas(self) -> Float32Array:
         """float32 [T], how far each scored frame has come since the one before; 0 for the first.
 
-        Raises ValueError if the checkpoint does not tell progress.
+        Raises ValueError if the checkpoint does not predict progress.
         """
         progress = _known("progress", self.progress)
         return np.diff(progress, prepend=progress[:1])
@@ -54,7 +54,7 @@ class FrameScores:
     def succeeded(self, *, last: int = 1, threshold: float = SUCCESS_THRESHOLD) -> bool:
         """Whether more than half of the ``last`` frames (all, if there are fewer) reach the probability ``threshold``.
 
-        Raises ValueError if the checkpoint does not tell success.
+        Raises ValueError if the checkpoint does not predict success.
         """
         if last < 1:
             raise ValueError(f"last: expected at least one frame, got {last}")
@@ -100,5 +100,5 @@ Result: TypeAlias = ProgressResult | PreferenceResult | SimilarityResult
 
 def _known(name: str, scores: Float32Array) -> Float32Array:
     if np.isnan(scores).any():
-        raise ValueError(f"{name}: expected a score of each frame, got NaN: this checkpoint does not tell it")
+        raise ValueError(f"{name}: expected a score of each frame, got NaN: this checkpoint does not predict it")
     return scores

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Samples: what a reward model is asked.
+"""Samples: what a reward model scores.
 
 Shapes: T frames, H x W pixels, D width of a frame embedding, Dt width of a text embedding.
 Arrays are checked once, here; everything behind trusts them.
@@ -61,7 +61,7 @@ class Trajectory:
             object.__setattr__(self, "text_embedding", text)
 
     def __repr__(self) -> str:
-        """With shapes in place of values, which would fill pages."""
+        """The trajectory with shapes in place of values, which would fill pages."""
         arrays = {"frames": self.frames, "video_embeddings": self.video_embeddings, "text": self.text_embedding}
         shapes = [f"{name}={array.dtype} {list(array.shape)}" for name, array in arrays.items() if array is not None]
         return f"Trajectory({', '.join([*shapes, f'task={self.task!r}'])})"
@@ -143,7 +143,7 @@ Sample: TypeAlias = ProgressSample | PreferenceSample | SimilaritySample
 
 @dataclass(frozen=True, eq=False)
 class Footage:
-    """What an encoder is asked about: the trajectories of raw frames of one sample, and the task of the first.
+    """What an encoder reads: the trajectories of raw frames of one sample, and the task of the first.
 
     Those of one size may already be joined.
     """
@@ -183,7 +183,7 @@ def as_array(values: Any) -> npt.NDArray[Any]:
     """
     if isinstance(values, (list, tuple)) and values and hasattr(values[0], "detach"):
         values = [as_array(tensor) for tensor in values]
-    if hasattr(values, "detach"):  # a tensor, told without importing torch
+    if hasattr(values, "detach"):  # a tensor, recognised without importing torch
         tensor = values.detach().cpu()
         values = (tensor.float() if str(tensor.dtype) == "torch.bfloat16" else tensor).numpy()
     return np.asarray(values)

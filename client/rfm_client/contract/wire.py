@@ -223,7 +223,7 @@ def encode_results(results: Sequence[Result], num_positions: int, outputs: Colle
 def decode_results(
     tensors: Mapping[str, npt.NDArray[Any]], samples: Sequence[Sample], model_version: str | None = None
 ) -> list[Result]:
-    """The results of the samples that a request asked about, and that ``model_version`` answered.
+    """The results of the samples of one request, which ``model_version`` answered.
 
     Raises InferenceFailedError for an answer that lacks a score: a missing reward is no reward of 0 or NaN.
     """
@@ -248,7 +248,7 @@ def _num_frames(sample: Sample) -> tuple[int, int]:
 
 
 def _encode_frames(field: str) -> Callable[[Sequence[Result], int], Float32Array]:
-    """Of one score a frame: [B, P, ...]."""
+    """An encoder of one score a frame: it gives [B, P, ...]."""
 
     def encode(results: Sequence[Result], num_positions: int) -> Float32Array:
         rows = [[getattr(scores, field) for scores in _frame_scores(result)] for result in results]
@@ -259,7 +259,7 @@ def _encode_frames(field: str) -> Callable[[Sequence[Result], int], Float32Array
 
 
 def _encode_question(field: str) -> Callable[[Sequence[Result], int], Float32Array]:
-    """Of one score a sample of one type: [B, 1]."""
+    """An encoder of one score a sample of one type: it gives [B, 1]."""
 
     def encode(results: Sequence[Result], _num_positions: int) -> Float32Array:
         return np.array([[getattr(result, field, np.nan)] for result in results], np.float32)
@@ -321,7 +321,10 @@ def _trajectory(tensors: Mapping[str, npt.NDArray[Any]], row: int, positions: np
 
 
 def _positions(tensors: Mapping[str, npt.NDArray[Any]], row: int, lengths: Sequence[int]) -> list[npt.NDArray[Any]]:
-    """Of one sample what is no padding: those of both trajectories in one array, or each trajectory's in its own."""
+    """The frame positions of one sample without padding.
+
+    Both trajectories are in one array or, if there are second frames, each is in its own.
+    """
     if SECOND_FRAMES in tensors:
         arrays = zip((FRAMES, SECOND_FRAMES), lengths, strict=True)
         return [_unpadded(tensors, name, row, length) for name, length in arrays]

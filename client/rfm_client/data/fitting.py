@@ -35,7 +35,7 @@ def whole(sample: Sample) -> FittedSample:
 
 
 def snapshot(sample: Sample) -> Sample:
-    """The sample with arrays of its own, so that what becomes of the caller's does not change what is asked."""
+    """The sample with arrays of its own, so that changes of the caller's arrays do not change what is sent."""
 
     def copied(trajectory: Trajectory) -> Trajectory:
         names = ("frames", "video_embeddings", "text_embedding")
@@ -48,7 +48,7 @@ def snapshot(sample: Sample) -> Sample:
 
 
 def fitted(sample: Sample, info: ModelInfo, *, subsample: bool, resize: bool) -> FittedSample:
-    """The sample with at most ``info.max_frames`` frames a trajectory, of at most ``info.frame_size``, as asked.
+    """The sample with at most ``info.max_frames`` frames a trajectory, of at most ``info.frame_size``, as requested.
 
     In dense mode each prefix is sampled by the server, so no frame is taken away here.
     """
@@ -77,7 +77,7 @@ def evenly_spaced(num_frames: int, limit: int | None) -> FrameIndices | None:
 
 
 def with_frame_indices(result: Result, indices: Sequence[FrameIndices | None]) -> Result:
-    """The result, telling which frames of its trajectories were scored."""
+    """The result, with the indices of its trajectories' frames that were scored."""
     if all(kept is None for kept in indices):
         return result
     if isinstance(result, ProgressResult):

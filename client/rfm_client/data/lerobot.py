@@ -2,7 +2,7 @@
 """Which video files of LeRobot datasets are no film of one episode.
 
 Up to v2.1 a dataset has one film for each episode and camera. Since v3.0 one file holds many episodes, one behind the
-other, and only tables in Parquet tell where each begins. Read as one film, such a file would be scored as one long
+other, and only tables in Parquet say where each begins. Read as one film, such a file would be scored as one long
 episode. So it is refused unless the dataset has one episode in all. No table is read: that would need pyarrow.
 """
 
@@ -46,7 +46,7 @@ def check_film_behind(url: str) -> None:
 
 
 def _info(file: Path) -> dict[str, object] | None:
-    """What a LeRobot dataset tells of itself; None: this is none."""
+    """The metadata of a LeRobot dataset; None: the folder is none."""
     try:
         info = json.loads(file.read_bytes())
     except (FileNotFoundError, NotADirectoryError):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""An episode as a reward model sees it: its frames, what is known of it, what is asked. ``gym.py`` tells the rules."""
+"""An episode as a reward model sees it: its frames, known scores and requests. ``gym.py`` states the rules."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class RewardOptions:
 
 
 class Scorer:
-    """Asks the reward model about episodes. Connects when it is first asked to."""
+    """Sends episodes to the reward model. Connects at the first request."""
 
     def __init__(self, client: ClientSource, options: RewardOptions) -> None:
         if not (isinstance(client, RewardClient) or callable(client)):
@@ -137,7 +137,7 @@ class Scorer:
 
 
 class Episode:
-    """The frames of one episode, what is known of it, and what is still asked about it.
+    """The frames of one episode, what is known of it, and the requests that have no answer yet.
 
     where: names its environment in messages; empty if there is only one
     """
@@ -229,7 +229,7 @@ class Episode:
         return reward + env_reward if self._options.add_to_env_reward else reward
 
     def info(self) -> Info:
-        """What is known, and how late."""
+        """The newest known scores, and by how many steps they lag."""
         known = {"progress": self._progress, "success": self._success, "step": self._known_step}
         known |= {"lag": self.step - self._known_step, "skipped": self.num_skipped}
         return known if self._options.terminate_on_success is None else known | {"succeeded": self.succeeded}

@@ -13,7 +13,7 @@ than the one in use is ignored; with ``max_pending`` questions open nothing is s
 Even then the frame of the reset is waited for, so that there is a score from the start, and the last step is, unless
 ``await_last=False``; older questions are needless then, and cancelled.
 
-``info["reward_model"]``: ``progress`` and ``success`` (NaN: the checkpoint does not tell it) of the newest known
+``info["reward_model"]``: ``progress`` and ``success`` (NaN: the checkpoint does not predict it) of the newest known
 answer; the ``step`` of the episode that it is about, and its ``lag`` in steps; the steps ``skipped`` in this episode;
 after a step the ``env_reward``; with ``terminate_on_success`` whether the episode has ``succeeded``.
 
@@ -48,11 +48,11 @@ _DEFAULTS = RewardOptions()
 
 
 class RewardModelWrapper(gymnasium.Wrapper):
-    """An environment paid by a reward model; the module's text tells how.
+    """An environment paid by a reward model; the module's docstring says how.
 
     client: a RewardClient, which stays open; or what makes one, at the first reset, which ``close()`` closes. For
         environments that are made in another process than they work in (AsyncVectorEnv) only the latter is right.
-    task: the task sentence, or what tells it from the info of each reset
+    task: the task sentence, or a function that reads it from the info of each reset
 
     Raises ValueError if frames cannot come from where ``options`` says.
     """
@@ -72,7 +72,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
         self._episode: Episode | None = None
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """As the environment's, and scores its frame. What was open is cancelled. Raises RewardError."""
+        """Resets the environment and scores its first frame. Open requests are cancelled. Raises RewardError."""
         observation, info = self.env.reset(seed=seed, options=options)
         if self._episode is not None:
             self._episode.cancel()
@@ -83,7 +83,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
         return observation, {**info, INFO: self._episode.info()}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
-        """As the environment's, with the reward model's reward. Raises RewardError."""
+        """Steps the environment, with the reward model's reward. Raises RewardError."""
         observation, env_reward, terminated, truncated, info = self.env.step(action)
         if self._episode is None:
             raise ResetNeeded("step: expected a reset before it")
@@ -142,7 +142,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         self._ended: npt.NDArray[np.bool_] = np.zeros(env.num_envs, np.bool_)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """As the environment's, ``reset_mask`` included, and scores the frames of the resets. Raises RewardError."""
+        """Resets the environments (those of ``reset_mask``), and scores their first frames. Raises RewardError."""
         everyone = np.ones(self.num_envs, np.bool_)
         reset_mask = (options or {}).get("reset_mask", everyone)  # before env.reset, which takes it out of the options
         observations, infos = self.env.reset(seed=seed, options=options)
@@ -156,7 +156,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         return observations, self._with_scores(infos, fresh)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, Info]:
-        """As the environment's, with the reward model's rewards, float64 [num_envs]. Raises RewardError."""
+        """Steps the environments, with the reward model's rewards, float64 [num_envs]. Raises RewardError."""
         observations, env_rewards, terminations, truncations, infos = self.env.step(actions)
         if len(self._episodes) != self.num_envs:
             raise ResetNeeded("step: expected a reset of every environment before it")

@@ -32,7 +32,7 @@ class AccessOptions(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Access:
-    """What a connection takes beyond a URL. Raises ValueError for what cannot be used, without telling a key.
+    """What a connection takes beyond a URL. Raises ValueError for what cannot be used, without showing a key.
 
     ca_file: certificates (PEM) of the authorities that may vouch for the server; None: those of the system
     client_certificate, client_key: files (PEM) by which a server knows this client (mutual TLS); both or none
@@ -55,7 +55,7 @@ class Access:
             if not _VALUE.fullmatch(value):
                 raise ValueError(f"{name}: expected visible ASCII characters, got others or none")
         if self.uses_tls:
-            self.ssl_context  # noqa: B018  # what cannot be read is told now, not when it is first needed
+            self.ssl_context  # noqa: B018  # a file that cannot be read is an error now, not at first use
 
     @property
     def uses_tls(self) -> bool:
@@ -64,7 +64,7 @@ class Access:
 
     @classmethod
     def of(cls, options: AccessOptions) -> Access:
-        """From what is of it among a client's options."""
+        """The access that a client's options describe; options of other kinds are left out."""
         given = cast("dict[str, Any]", options)
         return cls(**{name: given[name] for name in AccessOptions.__annotations__ if name in given})
 

@@ -53,7 +53,7 @@ class Transport(Protocol):
         """The named ``outputs`` of ``model`` for ``inputs``. request_id: what the server calls the request"""
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
-        """What the server tells of ``model``. ModelNotFoundError when it is not served."""
+        """What the server says of ``model``. ModelNotFoundError when it is not served."""
 
     async def is_ready(self, model: str, timeout_s: float) -> bool:
         """Whether the server answers and ``model`` is ready."""
@@ -174,7 +174,10 @@ class _TritonTransport:
         *,
         bad_request: type[errors.RewardError] = errors.InvalidSampleError,
     ) -> Answered:
-        """``bad_request``: what a 400 means; Triton answers it for an unknown model too."""
+        """What the server answers to ``request``, within ``timeout_s``.
+
+        bad_request: the error for a 400, with which Triton answers for an unknown model, too
+        """
         try:
             # Not by a deadline of gRPC: Triton 2.51 overlooks that one has passed, but not that a call is cancelled.
             async with timeout(timeout_s):

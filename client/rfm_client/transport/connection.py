@@ -49,7 +49,7 @@ class Connection:
 
     @contextmanager
     def used(self) -> Iterator[Any]:
-        """Within it, a call may use the client."""
+        """A context in which a call may use the client."""
         self._num_calls += 1
         if self._silent_since_s is None:
             self._silent_since_s = time.monotonic()

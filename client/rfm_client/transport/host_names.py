@@ -39,7 +39,7 @@ class Name:
 
     @property
     def transports(self) -> Mapping[str, Transport]:
-        """By address, as it was last looked up."""
+        """The transports by address, as the name was last looked up."""
         return self._transports
 
     async def look_up(self) -> None:
@@ -74,7 +74,10 @@ def of_urls(urls: Iterable[str], connect: Connect) -> tuple[list[Transport], lis
 
 
 async def _addresses(host: str, port: int) -> list[str]:
-    """``address:port`` of each; of one family, so that a server that has an address of each kind is one server."""
+    """The addresses of a host, ``address:port`` each.
+
+    All are of one family, so that a server with an IPv4 and an IPv6 address is one server.
+    """
     found = await asyncio.get_running_loop().getaddrinfo(host, port, type=socket.SOCK_STREAM)
     family = found[0][0]
     hosts = sorted({str(place[0]) for kind, _, _, _, place in found if kind is family})

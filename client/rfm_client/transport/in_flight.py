@@ -25,7 +25,7 @@ class InFlight:
 
     @asynccontextmanager
     async def room(self, num_bytes: int, deadline: Deadline) -> AsyncIterator[None]:
-        """Within it, a request of so many bytes is under way; one of more than MAX_BYTES is so alone.
+        """A context in which a request of ``num_bytes`` is under way. One of more than MAX_BYTES is under way alone.
 
         Raises DeadlineExceededError if there is no room in time.
         """

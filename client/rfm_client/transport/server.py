@@ -21,7 +21,11 @@ _HEAL_POLL_S = 0.2  # while it loads its model anew, which takes seconds, it is 
 
 
 class Server:
-    """failures: one after the other, up to now; is_gone: it is asked no more, and closed as soon as nobody uses it"""
+    """One server of several: its transport, its load and its failures.
+
+    failures: number of requests that failed since the last success
+    is_gone: it gets no more requests, and is closed as soon as nobody uses it
+    """
 
     _moments = itertools.count(1)
 
@@ -37,7 +41,7 @@ class Server:
 
     @property
     def is_left_out(self) -> bool:
-        """Until it says that it is ready."""
+        """Whether the server gets no requests until it says that it is ready."""
         return self.comeback is not None and not self.comeback.done()
 
     @property
@@ -57,13 +61,16 @@ class Server:
             self._close_if_unused()
 
     def leave_out(self, model: str) -> None:
-        """Until it says that it is ready; the more often it has failed, the later it is asked."""
+        """Leaves the server out until it says that it is ready. The more often it failed, the later it is probed."""
         if not self.is_left_out and not self.is_gone:
             self._has_ended_process = False
             self.comeback = asyncio.create_task(self._rest(model))
 
     def leave_out_dead(self, model: str) -> None:
-        """Until it is healed. Triton 2.51 says that a dead model is ready, so it must have said the opposite before."""
+        """Leaves the server out until it is healed.
+
+        Triton 2.51 says that a dead model is ready, so it must have said the opposite before.
+        """
         if not self.is_dead and not self.is_gone:
             if self.comeback is not None:
                 self.comeback.cancel()
@@ -112,7 +119,10 @@ class Server:
         return False
 
     async def _heal(self, model: str) -> bool:
-        """It may be that nobody heals it, or that its load was too short to be seen: then it is tried again."""
+        """Whether the server was seen to be healed.
+
+        It may never heal, or load too quickly to be seen; then it is tried again after LONGEST_REST_S.
+        """
         was_unready = False
         tried_at_s = time.monotonic() + LONGEST_REST_S
         while True:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Several servers of one checkpoint as one: the least busy is asked, and one that fails is left out for a while.
+"""Several servers of one checkpoint as one: the least busy gets the request, one that fails is left out for a while.
 
 A request may end the process that works on it. Sent from server to server it would end one process after the other.
-So a request that was with server S when a process of S ended waits for S, since S alone can tell whose fault it was:
+So a request that was with server S when a process of S ended waits for S, since S alone knows which request caused it:
 its journal lets the others through and refuses a request that has ended its process twice. Once S is loaded anew, the
 request stays with S. If nobody heals S within half of the time that is left, and HEALED_WITHIN_S at most, the request
 goes to a server that is not known to be dead. If a process ends there too, the request fails. Either way it ends two
@@ -46,11 +46,12 @@ logger = logging.getLogger("rfm_client")
 
 
 class Servers:
-    """Asks one of several servers, for one event loop.
+    """Sends each request to one of several servers, for one event loop.
 
-    retry: what fails because a server is down, restarting or full is asked again, elsewhere at once or, when there is
-        no other, after pauses that grow, until the deadline; what a server lacks, denies or fails at is asked once of
-        each other one. A score depends on the request alone, so asking twice is safe.
+    retry: a request that fails because a server is down, restarting or full is sent again until the deadline: at once
+        to another server or, when there is none, after pauses that grow. A request that a server denies or fails
+        at, or whose model it lacks, is sent once to each other one. A score depends on the request alone, so
+        sending it twice is safe.
     names: whose addresses are servers, too
     """
 
@@ -83,7 +84,7 @@ class Servers:
             raise
 
     async def model_info(self, model: str, deadline: Deadline) -> ModelInfo:
-        """What a server tells of ``model``. Raises RewardError."""
+        """What a server says of ``model``. Raises RewardError."""
         return await self._request(model, lambda server, left_s: server.model_info(model, left_s), deadline)
 
     async def is_ready(self, models: Sequence[str], timeout_s: float) -> bool:
@@ -111,7 +112,7 @@ class Servers:
         await asyncio.gather(*(server.close() for server in (*self._servers, *self._gone)))
 
     async def _request(self, model: str, request: Request[Answered], deadline: Deadline) -> Answered:
-        """As the module's text has it."""
+        """The answer to a request, retried as the module's docstring says."""
         self._keep_up()
         try:
             return await self._request_among(None, model, request, deadline)
@@ -131,7 +132,10 @@ class Servers:
     async def _request_among(
         self, only: Server | None, model: str, request: Request[Answered], deadline: Deadline
     ) -> Answered:
-        """only: no other is asked; None: any, and of several _EndedAtError is raised where a process has ended."""
+        """The answer of the server ``only`` or, if that is None, of any.
+
+        With several servers it raises _EndedAtError where a process of the model has ended.
+        """
         refusals: dict[Server, RewardError] = {}
         for attempt in itertools.count():
             server = only or await self._living(refusals, deadline)
@@ -190,13 +194,13 @@ class Servers:
         return min(self._servers, key=rank)
 
     def _note(self, server: Server, model: str, error: ServerUnavailableError) -> None:
-        """That a server is not to be had."""
+        """Records that a server does not answer, and leaves it out."""
         if not server.failures and self._retry:
             logger.warning("%s: trying again: %s", server.transport.url, error)
         self._leave_out(server, model, is_dead=isinstance(error, ProcessEndedError))
 
     def _leave_out(self, server: Server, model: str, *, is_dead: bool = False) -> None:
-        """Until it is ready, or healed. The only server there is stays in."""
+        """Leaves a server out until it is ready, or healed. The only server stays in."""
         server.failures += 1
         if len(self._servers) > 1:
             (server.leave_out_dead if is_dead else server.leave_out)(model)

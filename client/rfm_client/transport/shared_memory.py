@@ -36,7 +36,7 @@ from rfm_client.transport.off_loop import off_loop
 FOLDER = Path("/dev/shm")
 MIN_SHARED_BYTES = 64 * 2**10  # smaller inputs are quicker in the request itself
 MIN_REGION_BYTES = 2**20
-ANSWER_TIMEOUT_S = 2.0  # of a server that is to unmap a region, or to tell which it maps
+ANSWER_TIMEOUT_S = 2.0  # of a server that is to unmap a region, or to list those that it maps
 _PREFIX = "rfm-client-"
 _LOCK_SUFFIX = ".lock"
 _REGION_NAME = re.compile(rf"{_PREFIX}(?P<owner>[0-9a-f]{{32}})-\d+")
@@ -195,17 +195,22 @@ class SharedMemory:
             self._free.append(region)
 
     async def _give_up(self, region: Region) -> None:
-        """It is free again if the server keeps it."""
+        """Unregisters a region. It is free again if the server keeps it."""
         await self._unregister(region)
         self._release(region)
 
     async def _drop(self, region: Region) -> None:
-        """Of one that nobody has used: a server that does not answer does not map it, as its name is gone."""
+        """Drops a region that no request has used.
+
+        A server that does not answer cannot map it later: its name is gone.
+        """
         await self._unregister(region)
         self._known.discard(region)
 
     async def _unregister(self, region: Region) -> None:
-        """It stays known if a cancelled request still uses it, or nobody is there to be told."""
+        """Has the server unmap a region. It stays known if a cancelled request still uses it, or the server does not
+        answer.
+        """
         with self._unanswered():
             async with timeout(ANSWER_TIMEOUT_S):
                 await self._server.unregister_region(region.name)
