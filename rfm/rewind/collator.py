@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from rfm.dense_mode import prefix_indices
 from rfm.layers.tensors import as_tensor
-from rfm.prefixes import prefix_indices
 from rfm.rewind.network import RewindBatch, RewindConfig
 from rfm.rewind.packing import rounded_up
 from rfm_client.contract import InvalidSampleError, ProgressSample, Sample, SimilaritySample, Trajectory

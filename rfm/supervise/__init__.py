@@ -3,10 +3,10 @@
 
 - Start: ``process`` is one tritonserver, from an ``installation``, with ``triton_options``, on a ``listen_address``,
   with ``tls`` and an ``admin_key``; ``cleanup`` removes what it leaves; ``temporary`` has one for a while.
-- Watch: ``triton_watch`` (does Triton answer, what does it serve?), ``stubs`` (do its model processes live, and get
-  on?), ``model_probe`` (does a model answer?).
-- Heal: ``lifecycle`` is the table of states, events and actions of a model; ``served_model`` feeds it and acts;
-  ``reload`` unloads and loads through the ``repository_api``; ``back_off`` chooses the pauses between starts.
+- Watch: ``triton_watch`` (does Triton answer, what does it serve?), ``model_processes`` (do they live, and get on?),
+  ``model_probe`` (does a model answer?).
+- Heal: ``model_states`` is the table of states, events and actions of a model; ``model_watch`` feeds it and acts;
+  ``model_reload`` unloads and loads through the ``repository_api``; ``back_off`` chooses the pauses between starts.
 - Together: ``served`` holds all models of one Triton, ``supervisor`` Triton itself and the ``gateway_process``;
   ``status`` is what others see of it. They are one thread; what may wait runs ``background`` calls over ``http``.
 """

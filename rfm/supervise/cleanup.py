@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from rfm.supervise.stubs import SHARED_MEMORY
+from rfm.supervise.model_processes import SHARED_MEMORY
 
 BACKENDS_PREFIX = "rfm-backends-"
 # Newer Tritons let no client map a region of this name, which is that of the Python backend's own.

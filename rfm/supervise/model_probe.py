@@ -22,7 +22,7 @@ from tritonclient.utils import np_to_triton_dtype
 from rfm.probe import blank_question
 from rfm.supervise.background import in_background
 from rfm.supervise.http import NO_ANSWER, Http
-from rfm.supervise.lifecycle import Event
+from rfm.supervise.model_states import Event
 from rfm_client.contract import triton, wire
 from rfm_client.contract.names import PROBE_PREFIX
 

@@ -25,13 +25,13 @@ import time
 from collections.abc import Callable, Mapping
 
 from rfm.supervise.http import Http
-from rfm.supervise.lifecycle import State
 from rfm.supervise.model_probe import ModelProbe, can_be_probed
+from rfm.supervise.model_processes import StubWatch
+from rfm.supervise.model_states import State
+from rfm.supervise.model_watch import ServedModel
 from rfm.supervise.process import TritonServer
 from rfm.supervise.repository_api import LOADING, READY, UNLOADING
-from rfm.supervise.served_model import ServedModel
 from rfm.supervise.status import NO_REASON, Status
-from rfm.supervise.stubs import StubWatch
 from rfm.supervise.triton_watch import Config, Snapshot, TritonWatch
 
 LOOK_INTERVAL_S = 0.3

@@ -15,11 +15,11 @@ from rfm.journal import NO_DIGEST
 from rfm.parameters import THREADS_PARAMETER
 from rfm.probe import blank_question
 from rfm.triton_model.cancellation import Cancellation
-from rfm.triton_model.digest import digest
 from rfm.triton_model.exit import exit_with_triton
 from rfm.triton_model.metrics import Counted, Metrics
 from rfm.triton_model.quarantine import Quarantine
 from rfm.triton_model.request import SAMPLE_TYPES, CancelledError, Origins, Request
+from rfm.triton_model.request_digest import digest
 from rfm.triton_model.request_log import RequestLog
 from rfm.triton_model.self_check import SelfCheck
 from rfm.triton_model.weights import check_digest

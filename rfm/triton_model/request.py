@@ -10,7 +10,7 @@ from enum import Enum
 from typing import Any, Generic, TypeVar
 
 from rfm.journal import NO_DIGEST
-from rfm.triton_model.digest import digest
+from rfm.triton_model.request_digest import digest
 from rfm_client.contract import (
     InvalidSampleError,
     PreferenceSample,

@@ -18,7 +18,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from rfm.prefixes import prefix_indices
+from rfm.dense_mode import prefix_indices
 from rfm.vlm.images import FRAMES_PER_GROUP, Grid, QwenImages, SmolImages
 from rfm.vlm.network import VlmBatch, VlmConfig
 from rfm.vlm.prompts import PREFERENCE_TOKEN, PROGRESS_TOKEN, SIMILARITY_TOKEN, TrajectoryPart, question

@@ -17,8 +17,8 @@ import pytest
 
 from one_model import OneModelServer, answered
 from patients import DEADLY, MARK, Callers, make_repository, references, trajectory
+from rfm.supervise.model_processes import Stub, StubWatch
 from rfm.supervise.process import Endpoints
-from rfm.supervise.stubs import Stub, StubWatch
 from rfm_client import (
     AsyncRewardClient,
     InvalidSampleError,

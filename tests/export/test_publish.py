@@ -18,9 +18,9 @@ import goldens
 import rfm_export
 from engines import serve_config
 from rfm.supervise.installation import find_installation
+from rfm.supervise.model_processes import StubWatch
 from rfm.supervise.process import Endpoints, TritonServer
 from rfm.supervise.repository_api import RepositoryApi
-from rfm.supervise.stubs import StubWatch
 from rfm_client import RewardClient
 from rfm_commands.rollout import Rollout, previous_version
 from rfm_export.publish import staging

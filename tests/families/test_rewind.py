@@ -14,9 +14,9 @@ from torch import Tensor, nn
 
 import goldens
 from rfm.config import DEFAULT_TOKEN_BUDGET
+from rfm.dense_mode import prefix_indices
 from rfm.engine import Engine, Outcome
 from rfm.layers.heads import PredictionHead, progress_from_logits
-from rfm.prefixes import prefix_indices
 from rfm.rewind.collator import MAX_EMBEDDING, RewindCollator
 from rfm.rewind.network import RewindBatch, RewindConfig, RewindTransformer
 from rfm.rewind.packing import Packing, rounded_up

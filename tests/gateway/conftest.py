@@ -28,8 +28,8 @@ from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer
 from rfm.supervise.cleanup import REGION_PREFIX
 from rfm.supervise.installation import find_installation
+from rfm.supervise.model_processes import SHARED_MEMORY
 from rfm.supervise.process import Endpoints, TritonServer
-from rfm.supervise.stubs import SHARED_MEMORY
 
 
 @pytest.fixture(scope="package")

@@ -44,8 +44,8 @@ from gateway_requests import (
 from gateways import WITHIN_S, Gateway, answers, free_port, poll, running
 from rfm.checkpoint.content import read_run_config
 from rfm.rewind.network import RewindTransformer
+from rfm.supervise.model_processes import SHARED_MEMORY
 from rfm.supervise.process import Endpoints
-from rfm.supervise.stubs import SHARED_MEMORY
 from rfm_client import (
     InvalidSampleError,
     ModelNotFoundError,

@@ -20,7 +20,7 @@ SHARED = {  # what a family may import beside itself
     "rfm.family",
     "rfm.layers",
     "rfm.predictor",
-    "rfm.prefixes",
+    "rfm.dense_mode",
     "rfm.version_folder",
     "rfm_client.contract",
 }

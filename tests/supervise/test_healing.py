@@ -26,10 +26,10 @@ from rfm.journal import SUFFIX, is_alive
 from rfm.supervise import back_off, cleanup
 from rfm.supervise.back_off import BackOff, CrashLoopError
 from rfm.supervise.installation import find_installation
+from rfm.supervise.model_processes import SHARED_MEMORY
 from rfm.supervise.process import Endpoints, TritonServer
-from rfm.supervise.stubs import SHARED_MEMORY
-from rfm.triton_model.digest import digest
 from rfm.triton_model.quarantine import Quarantine
+from rfm.triton_model.request_digest import digest
 from rfm.triton_model.self_check import FAILED_BATCHES
 from rfm_client import (
     InferenceFailedError,

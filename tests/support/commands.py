@@ -15,8 +15,8 @@ from typing import Any
 from paths import ROOT
 from rfm.journal import is_alive
 from rfm.supervise.cleanup import REGION_PREFIX
+from rfm.supervise.model_processes import SHARED_MEMORY
 from rfm.supervise.process import Endpoints
-from rfm.supervise.stubs import SHARED_MEMORY
 from rfm_client import RewardClient
 
 REPOSITORY = ROOT / "model_repository"

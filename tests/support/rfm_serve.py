@@ -16,8 +16,8 @@ from typing import Any
 import httpx
 from prometheus_client.parser import text_string_to_metric_families
 
+from rfm.supervise.model_processes import SHARED_MEMORY, Stub, StubWatch
 from rfm.supervise.process import Endpoints
-from rfm.supervise.stubs import SHARED_MEMORY, Stub, StubWatch
 from rfm_client import RewardClient
 
 RFM = Path(sys.executable).parent / "rfm"

@@ -17,10 +17,10 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from rfm.checkpoint.files import NETWORK_CONFIG, WEIGHTS
+from rfm.dense_mode import prefix_indices
 from rfm.execution import Execution
 from rfm.family import NETWORK, Description, EncodersDescription, Family, Options
 from rfm.predictor import RowScores, frame_scores
-from rfm.prefixes import prefix_indices
 from rfm_client.contract import InvalidSampleError, ProgressSample, RewardError, Sample, SimilaritySample, Trajectory
 from rfm_client.contract.samples import Footage
 

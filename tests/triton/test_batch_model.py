@@ -20,11 +20,11 @@ from rfm.probe import blank_question
 from rfm.triton_model import batch_model, cancellation
 from rfm.triton_model.batch_model import BatchModel
 from rfm.triton_model.cancellation import Cancellation
-from rfm.triton_model.digest import digest
 from rfm.triton_model.metrics import Counted
 from rfm.triton_model.quarantine import Quarantine
 from rfm.triton_model.request import Origins
 from rfm.triton_model.request import Request as ModelRequest
+from rfm.triton_model.request_digest import digest
 from rfm.triton_model.self_check import SelfCheck
 from rfm_client import (
     FrameScores,

@@ -27,10 +27,10 @@ from rfm.probe import blank_question
 from rfm.supervise.status import NO_REASON
 from rfm.triton_model.batch_model import BatchModel
 from rfm.triton_model.cancellation import Cancellation
-from rfm.triton_model.digest import digest
 from rfm.triton_model.metrics import Counted
 from rfm.triton_model.quarantine import Quarantine, journals
 from rfm.triton_model.request import Origins
+from rfm.triton_model.request_digest import digest
 from rfm.triton_model.self_check import SelfCheck
 from rfm_client import InferenceFailedError, ProgressResult, ProgressSample, Result, Sample
 from rfm_client.contract import wire

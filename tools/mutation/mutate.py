@@ -36,7 +36,7 @@ BASELINE_S = 1800.0  # for the tests of the code as it is
 PATIENCE_S = 60.0  # beyond three times what they took
 # Files whose mutants are tried, and the tests of each: the first that fails is enough.
 TESTS: dict[str, tuple[str, ...]] = {
-    "rfm/prefixes.py": ("test_rewind",),
+    "rfm/dense_mode.py": ("test_rewind",),
     "rfm/layers/linear.py": ("test_linear",),
     "rfm/layers/*.py": ("test_rewind",),
     "rfm/rewind/collator.py": ("test_rewind", "test_properties"),
@@ -64,10 +64,10 @@ TESTS: dict[str, tuple[str, ...]] = {
     "rfm/triton_model/batch_model.py": ("test_batch_model", "test_poison", "test_logs"),
     "rfm/triton_model/cancellation.py": ("test_batch_model",),
     "rfm/triton_model/request.py": ("test_batch_model", "test_poison"),
-    "rfm/supervise/lifecycle.py": ("test_lifecycle",),
-    "rfm/supervise/served_model.py": ("test_served_model",),
-    "rfm/supervise/reload.py": ("test_served_model",),
-    "rfm/supervise/model_probe.py": ("test_served_model",),
+    "rfm/supervise/model_states.py": ("test_model_states",),
+    "rfm/supervise/model_watch.py": ("test_model_watch",),
+    "rfm/supervise/model_reload.py": ("test_model_watch",),
+    "rfm/supervise/model_probe.py": ("test_model_watch",),
 }
 
 

@@ -6,9 +6,9 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
+from rfm.supervise.model_processes import Stub
 from rfm.supervise.process import TritonServer
 from rfm.supervise.repository_api import RepositoryApi
-from rfm.supervise.stubs import Stub
 from rfm.supervise.triton_watch import Config, serving_just
 
 DRAIN_S = 2.0  # for what the model's other processes are working on

@@ -10,12 +10,12 @@ from functools import partial
 
 from rfm.supervise.back_off import BackOff, CrashLoopError
 from rfm.supervise.background import in_background
-from rfm.supervise.lifecycle import CRASH_LOOPING, FAULTS, HEALING, Action, Event, Lifecycle, State
 from rfm.supervise.model_probe import ModelProbe
+from rfm.supervise.model_processes import StubWatch
+from rfm.supervise.model_reload import Reload
+from rfm.supervise.model_states import CRASH_LOOPING, FAULTS, HEALING, Action, Event, Lifecycle, State
 from rfm.supervise.process import TritonServer
-from rfm.supervise.reload import Reload
 from rfm.supervise.status import NO_REASON, Status
-from rfm.supervise.stubs import StubWatch
 from rfm.supervise.triton_watch import Config
 
 RETRY_S = 300.0  # after so many failures in a row that they are a crash loop

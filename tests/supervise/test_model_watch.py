@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 
 from clock import Clock
-from rfm.supervise import back_off, model_probe, reload, served_model
+from rfm.supervise import back_off, model_probe, model_reload, model_watch
 from rfm.supervise.http import Http
-from rfm.supervise.lifecycle import Event, State
 from rfm.supervise.model_probe import ModelProbe, can_be_probed
+from rfm.supervise.model_states import Event, State
+from rfm.supervise.model_watch import RETRY_S, ServedModel
 from rfm.supervise.process import Endpoints
 from rfm.supervise.repository_api import ModelVersion, RepositoryApiError
-from rfm.supervise.served_model import RETRY_S, ServedModel
 from rfm.supervise.status import NO_REASON, Status
 from rfm_serve import MODEL, wait_for
 
@@ -81,10 +81,10 @@ class Bench:
         self.probed: Event | None = None
         self.is_getting_on = False
         self.renewed = 0
-        for module in (back_off, served_model, reload):
+        for module in (back_off, model_watch, model_reload):
             monkeypatch.setattr(module, "time", self.clock)
-        monkeypatch.setattr(reload, "RepositoryApi", lambda *_: self.triton)
-        monkeypatch.setattr(served_model, "in_background", at_once)
+        monkeypatch.setattr(model_reload, "RepositoryApi", lambda *_: self.triton)
+        monkeypatch.setattr(model_watch, "in_background", at_once)
         probe = SimpleNamespace(look=lambda: self.probed, renew=self.renew)
         watch = SimpleNamespace(
             of_model=lambda _: list(self.stubs), bury=self.buried.extend, is_getting_on=lambda _: self.is_getting_on

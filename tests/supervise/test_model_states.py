@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from rfm.supervise.lifecycle import FAULTS, HEALING, TABLE, UP, Action, Event, Lifecycle, State
+from rfm.supervise.model_states import FAULTS, HEALING, TABLE, UP, Action, Event, Lifecycle, State
 
 # Each line: what happens, what is done about it, and where the model is then.
 STORIES: dict[str, list[tuple[Event, Action | None, State]]] = {

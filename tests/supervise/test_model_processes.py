@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from rfm.journal import SUFFIX, Journal
-from rfm.supervise import stubs
-from rfm.supervise.stubs import Stub, StubWatch
+from rfm.supervise import model_processes
+from rfm.supervise.model_processes import Stub, StubWatch
 
 TRITON = 10
 MODEL = "rfm"
@@ -55,9 +55,9 @@ class Machine:
 @pytest.fixture
 def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
     machine = Machine(tmp_path)
-    monkeypatch.setattr(stubs, "_PROC", machine.proc)
-    monkeypatch.setattr(stubs, "SHARED_MEMORY", machine.memory)
-    monkeypatch.setattr(stubs, "CONFIRM_S", 0.0)
+    monkeypatch.setattr(model_processes, "_PROC", machine.proc)
+    monkeypatch.setattr(model_processes, "SHARED_MEMORY", machine.memory)
+    monkeypatch.setattr(model_processes, "CONFIRM_S", 0.0)
     return machine
 
 
