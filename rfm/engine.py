@@ -141,7 +141,7 @@ class Engine:
         return samples if self.encoders is None else embedded(samples, self.encoders, execution)
 
     def _rows(self, sample: Sample | RewardError) -> list[Any]:
-        """The sample's rows. Raises the error that it is, and InvalidSampleError."""
+        """The sample's rows. Raises InvalidSampleError, and a sample that is an error already."""
         if isinstance(sample, RewardError):
             raise sample
         rows = self.predictor.rows(sample)

@@ -49,7 +49,7 @@ class Journal:
 
     @property
     def is_alive(self) -> bool:
-        """Whether the process that wrote it has not ended."""
+        """Whether the process that wrote the journal still lives."""
         return is_alive(self.pid)
 
     @property
@@ -82,7 +82,7 @@ class Journal:
             self._write(0.0, 0)
 
     def renew(self) -> None:
-        """The batch has got on."""
+        """Records that the batch has made progress."""
         self._write(time.monotonic(), self._header[3])
 
     def count_refused(self) -> None:
@@ -90,7 +90,7 @@ class Journal:
         _HEADER.pack_into(self._memory, 0, self.pid, self.num_refused + 1, *self._header[2:])
 
     def forget(self, unsuspected: bytes) -> None:
-        """Takes a request out of the batch."""
+        """Takes a request out of the batch, by its digest."""
         for number, known in enumerate(self.digests):
             if known == unsuspected:
                 place = _HEADER.size + DIGEST_BYTES * number

@@ -325,7 +325,7 @@ class AsyncRewardClient:
 
 
 async def _together(calls: Sequence[Coroutine[None, None, None]]) -> None:
-    """All of them; one alone, as most are, without a task of its own."""
+    """Awaits all coroutines. A single one, as in most calls, needs no task of its own."""
     if len(calls) == 1:
         await calls[0]
     else:
@@ -343,7 +343,7 @@ def _for_each(error: RewardError, count: int) -> list[Result | RewardError]:
 
 
 def _check_known(options: Mapping[str, object], known: type[ClientOptions] | type[CallOptions]) -> None:
-    """A misspelt option would silently be none at all."""
+    """Raises TypeError for an unknown option, which would otherwise be ignored in silence."""
     unknown = sorted(options.keys() - known.__annotations__)
     if unknown:
         raise TypeError(f"options: expected some of {', '.join(known.__annotations__)}, got {', '.join(unknown)}")

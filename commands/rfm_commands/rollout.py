@@ -121,7 +121,7 @@ class Rollout:
                 probe(self.server, new[model], version)
 
     def _go_back(self, old: Configs, served: Mapping[str, Sequence[int]]) -> str:
-        """What became of it, in words."""
+        """Serves what was served before. Gives what became of it, in words."""
         self.report("going back")
         ends_s = time.monotonic() + RETURN_S
         failed: dict[str, str | None] = dict.fromkeys(reversed(list(served)))  # the ensemble before what it names
@@ -136,7 +136,9 @@ class Rollout:
         return f"served as before: {'; '.join(f'{model}: {_words(versions)}' for model, versions in served.items())}"
 
     def _put_back(self, config: pb.ModelConfig, versions: Sequence[int]) -> str | None:
-        """A model's file and what is served of it. Why that failed: the server is gone, or other models come first."""
+        """Restores a model's file and its served versions. Gives the reason if that fails: no server, or other models
+        come first.
+        """
         try:
             self._write(serving_versions(config, versions) if versions else config)
             if versions:
@@ -178,7 +180,7 @@ def probe(server: RepositoryApi, config: pb.ModelConfig, version: int) -> None:
 
 
 def _noise(config: pb.ModelConfig) -> Trajectory:
-    """What the model takes: embeddings, or frames."""
+    """A random trajectory that the model takes: of embeddings, or of frames."""
     random = np.random.default_rng(PROBE_SEED)
     widths = _widths(config.input)
     if wire.FRAMES in widths:

@@ -171,9 +171,9 @@ def _read_config(repository: Path, name: str) -> Any:
 
 
 def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], serve: ServeConfig) -> None:
-    """A model keeps its inputs and outputs from version to version; its clients rely on them.
+    """Raises ExportError for a model that would lose inputs or outputs, on which its clients rely.
 
-    What those need not know, an optional input, it may gain.
+    A model may gain an optional input, which clients need not know.
     """
     names = {model.name for model in models}
     for name in (serve.name, encoder_name(serve.name), frames_name(serve.name)):

@@ -38,8 +38,9 @@ _log = logging.getLogger(__name__)
 
 @contextmanager
 def alone(repository: Path) -> Iterator[None]:
-    """Nobody else changes the repository meanwhile, where its file system has locks; what those left that were killed
-    is gone. Raises ExportError if somebody does.
+    """A context in which no other export or rollout changes the repository, if its file system has locks.
+
+    It removes what killed ones left. Raises ExportError while another one runs.
     """
     repository.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(repository, os.O_RDONLY)
@@ -104,7 +105,10 @@ def config_of(repository: Path, name: str, version: int) -> pb.ModelConfig:
 
 
 def replace_config(repository: Path, config: pb.ModelConfig, scratch: Path) -> None:
-    """Readers see the old configuration or the new, never a part; ``scratch`` is on the same file system."""
+    """Replaces a configuration: readers see the old or the new one, never a part.
+
+    scratch: a folder on the same file system
+    """
     (scratch / CONFIG_FILE).write_text(render(config))
     (scratch / CONFIG_FILE).replace(repository / config.name / CONFIG_FILE)
 

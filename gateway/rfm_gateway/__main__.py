@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``python -m rfm_gateway``, for whoever has neither command."""
+"""``python -m rfm_gateway``: the gateway for installations without the ``rfm`` and ``rfm-client`` commands."""
 
 from __future__ import annotations
 

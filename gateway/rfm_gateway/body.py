@@ -55,7 +55,10 @@ _EXPECTED = {  # pydantic's kind of error, and what a field of it is
 
 @dataclass(frozen=True)
 class Batch:
-    """samples: at least one; use_frame_steps: whether progress samples are scored frame by frame"""
+    """The samples of one request, at least one.
+
+    use_frame_steps: whether progress samples are scored frame by frame
+    """
 
     samples: list[schema.Sample]
     use_frame_steps: bool

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``rfm-client gateway`` and ``rfm gateway``."""
+"""The commands ``rfm-client gateway`` and ``rfm gateway``."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Callers who hang up: nobody works for them any longer."""
+"""Callers who hang up: their requests are cancelled."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ class Memory:
 
     @contextmanager
     def share(self) -> Iterator[Share]:
-        """One request's, which is free again when the context ends."""
+        """A context with the share of one request, which is free again when the context ends."""
         share = Share(self)
         try:
             yield share
@@ -91,5 +91,7 @@ class Share:
         await self._memory.reserve(self, num_bytes, deadline)
 
     def take(self, num_bytes: int) -> None:
-        """So many more. Raises HTTPException: 413 if it is too much for one request, 503 if others hold too much."""
+        """Takes ``num_bytes`` more. Raises HTTPException: 413 if that is too much for one request, 503 if others hold
+        too much.
+        """
         self._memory.take(self, num_bytes)

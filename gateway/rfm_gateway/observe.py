@@ -80,7 +80,7 @@ class Observed:
         self._waiting = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """The request, and its answer."""
+        """Serves a request, and counts it with its answer."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -138,7 +138,10 @@ class Observed:
 
 
 def _request_id(scope: Scope) -> str:
-    """The caller's, unless it is none that a log could hold, or hides the request from metrics; else a new one."""
+    """The caller's request id, or a new one.
+
+    A new one replaces an id that no log could hold, or that would hide the request from metrics.
+    """
     given = Headers(scope=scope).get(REQUEST_ID_HEADER, "")
     if REQUEST_ID.fullmatch(given) and not given.startswith(PROBE_PREFIX):
         return given

@@ -63,7 +63,7 @@ def _array(value: Any, info: ValidationInfo) -> Any:
 
 
 def _check_leaves(array: list[Any]) -> None:
-    """Before numpy sees them: from words it would make an array whose every element is as wide as the longest."""
+    """Checks the leaves before numpy sees them: with words, numpy would make every element as wide as the longest."""
     for axis in range(MAX_AXES):
         values: Iterable[Any] = array
         for _ in range(axis):

@@ -29,7 +29,7 @@ _TEXT_FRAME_PX = 32  # of the blank frame that goes with a task, where only the 
 
 
 class Scorer:
-    """Asks the server behind ``client``."""
+    """Scores batches with the server behind ``client``."""
 
     def __init__(self, client: AsyncRewardClient, folder: AllowedFolder, timeout_s: float) -> None:
         self._client = client
@@ -127,7 +127,10 @@ class Scorer:
 
 
 def _answer(samples: Sequence[schema.Sample], results: Sequence[Result], group: int) -> schema.EvaluateBatchAnswer:
-    """group: frames that share a value; the evaluation server gave one value a group."""
+    """The evaluation server's answer for these results.
+
+    group: number of frames that share a value; the evaluation server gave one value a group
+    """
     progress = [result for result in results if isinstance(result, ProgressResult)]
     preferences = [result.preference for result in results if isinstance(result, PreferenceResult)]
     similar = [(s, r) for s, r in zip(samples, results, strict=True) if isinstance(r, SimilarityResult)]

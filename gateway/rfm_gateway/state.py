@@ -33,7 +33,7 @@ MS_PER_S = 1e3
 
 
 class State:
-    """Asks the server at ``url``, whose metrics are at ``metrics_url``, about ``model``."""
+    """The state of ``model`` on the server at ``url``, whose metrics are at ``metrics_url``."""
 
     def __init__(
         self, client: AsyncRewardClient, url: str, metrics_url: str | None, model: str, access: Access | None = None
@@ -123,7 +123,7 @@ class State:
         return infos
 
     async def _probe_all(self, deadline: Deadline) -> str | None:
-        """Asks every model for a score of next to nothing; the reason of the first that neither has one nor works."""
+        """Probes every model with a blank sample. Gives the reason of the first that neither answers nor works."""
         try:
             infos = await self._infos(deadline)
             late = [name for name in await asyncio.gather(*map(self._late, infos)) if name is not None]

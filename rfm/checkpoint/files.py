@@ -132,7 +132,7 @@ def _fetch(repo_id: str, tag: str | None) -> Path:
 
 
 def _fetch_run_config_of_main(repo_id: str) -> None:
-    """Puts it into the Hub's cache, where ``find_run_config`` looks; main may have none either."""
+    """Fetches main's config.yaml into the Hub's cache, where ``find_run_config`` looks. Even main may have none."""
     from huggingface_hub import hf_hub_download
     from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
 

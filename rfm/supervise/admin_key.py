@@ -62,7 +62,7 @@ def grpc_metadata(key: str | None) -> Mapping[str, str]:
 
 
 def _read(file: Path) -> str:
-    """Who may read the file is judged as PostgreSQL judges a private key.
+    """The key in a file whose permissions are as strict as PostgreSQL's of a private key.
 
     The owner alone; a file of root's may be read by its group too, which is how containers are handed a secret.
     """

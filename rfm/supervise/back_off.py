@@ -14,7 +14,7 @@ _FIRST_PAUSE_S = 0.5
 
 
 class CrashLoopError(ServerStartError):
-    """Something ends again and again."""
+    """A process ended so often that it is not started again."""
 
 
 class BackOff:
@@ -26,11 +26,11 @@ class BackOff:
         self._running_since_s: float | None = None  # None: it has ended
 
     def started(self) -> None:
-        """Notes that it runs now."""
+        """Records a start, from which the next pause is computed."""
         self._running_since_s = time.monotonic()
 
     def pause_s(self, reason: str) -> float:
-        """How long to wait before the next start, now that it has ended, or could not be started.
+        """Seconds to wait before the next start, after an exit or a failed start.
 
         Raises CrashLoopError when it is one.
         """

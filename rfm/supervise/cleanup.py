@@ -57,7 +57,7 @@ class Claim:
         new_folder.rename(self.backends)
 
     def release(self) -> None:
-        """Removes the lock files and closes them."""
+        """Removes the regions, the folder and their locks."""
         _remove(self._lock)
         _remove(self.backends / _LOCK)
         for file in self.lock_files:
@@ -90,7 +90,7 @@ def _is_free(lock: Path) -> bool:
 
 
 def _remove(lock: Path) -> list[Path]:
-    """What it stood for; the lock itself last, so that what cannot be removed now can be later."""
+    """Removes what a lock protects, and gives its paths. The lock goes last, so that a later attempt can finish."""
     try:
         if lock.parent == SHARED_MEMORY:
             removed = [path for path in SHARED_MEMORY.glob(f"{lock.name.removesuffix(_LOCK)}*") if path != lock]

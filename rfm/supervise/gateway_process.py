@@ -29,7 +29,7 @@ class GatewayProcess:
         self._back_off.started()
 
     def look(self) -> str | None:
-        """Why it was started again; None: it was not. Raises CrashLoopError."""
+        """Starts the gateway again if it has ended, and gives why; None: it was not started. Raises CrashLoopError."""
         if self._process is None or self._process.poll() is None:
             return None
         why = f"exit status {self._process.returncode}"
@@ -42,7 +42,7 @@ class GatewayProcess:
         return why
 
     def stop(self) -> None:
-        """Has it answer what it has begun, and end; by force after KILL_AFTER_S."""
+        """Lets the gateway answer the requests in flight, and ends it; by force after KILL_AFTER_S."""
         if self._process is None:
             return
         if self._process.poll() is None:

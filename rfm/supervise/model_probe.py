@@ -37,7 +37,7 @@ _OUTPUTS = (wire.PROGRESS, wire.VIDEO_EMBEDDINGS)
 
 @dataclass(frozen=True)
 class Reply:
-    """What a probe was answered. body: of the probe"""
+    """The answer to a probe: status, text, seconds. body: the probe that was sent"""
 
     status: int
     text: str
@@ -126,7 +126,7 @@ class ModelProbe:
         return Reply(status, text, time.monotonic() - started_s, body)
 
     def _take(self, probe: Future[Reply]) -> None:
-        """Takes in a reply. Where there is none, or it is not the model's, it waits on."""
+        """Records a reply. Without one, or with one that is not the model's, the probe stays open."""
         try:
             reply = probe.result()
         except NO_ANSWER:

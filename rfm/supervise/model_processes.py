@@ -66,7 +66,7 @@ class Stub:
         return Journal.open(SHARED_MEMORY / f"{self.region}_{self.model}{SUFFIX}")
 
     def kill(self) -> None:
-        """Ends it at once, whatever it does."""
+        """Ends the process at once, whatever it does."""
         if self.is_alive:
             with suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGKILL)
@@ -159,7 +159,7 @@ class StubWatch:
 
 
 def _stat(pid: int) -> list[str]:
-    """State, parent and so on: what stands behind the name, which may hold anything."""
+    """The fields of /proc/<pid>/stat behind the process' name, which may hold anything: state, parent and so on."""
     try:
         return (_PROC / str(pid) / "stat").read_text().rpartition(")")[2].split()
     except (FileNotFoundError, ProcessLookupError):

@@ -34,7 +34,7 @@ class Reload:
         self.ended: list[Stub] = []  # its processes that have ended since
 
     def close(self) -> None:
-        """Lets an attempt that runs change nothing more."""
+        """Keeps a running attempt from changing anything more."""
         self._is_closed = True
 
     def load(self, stubs: Sequence[Stub]) -> None:
@@ -80,7 +80,7 @@ class Reload:
         return serving_just(api.config(self._model, max(ready)), ready)
 
     def _end(self, stubs: Sequence[Stub]) -> None:
-        """Returns when none of them lives: not even those that Triton keeps, with their share of a GPU's memory."""
+        """Returns when none of the processes lives, not even one that Triton keeps with its share of a GPU's memory."""
         deadline_s = time.monotonic() + DRAIN_S
         while any(stub.is_alive for stub in stubs) and time.monotonic() < deadline_s:
             time.sleep(POLL_S)

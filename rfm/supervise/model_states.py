@@ -62,7 +62,7 @@ Row = tuple[State, Action | None]
 
 
 def _while_up() -> Iterator[tuple[tuple[State, Event], Row]]:
-    """Rows of a model that is loaded, as far as is known. Who is late stays ready: it may be busy."""
+    """Rows of the table for a model that is loaded, as far as is known. A late model stays ready: it may be busy."""
     for state in UP:
         yield (state, Event.ANSWERED), (State.READY, None)
         yield (state, Event.BUSY), (State.READY, None)
@@ -99,6 +99,6 @@ class Lifecycle:
         self.state = state
 
     def feed(self, event: Event) -> Action | None:
-        """What is to be done about the event."""
+        """Changes the state by the event, and gives the action to do."""
         self.state, action = TABLE.get((self.state, event), (self.state, None))
         return action

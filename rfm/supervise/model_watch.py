@@ -79,16 +79,18 @@ class ServedModel:
         return NO_REASON if self.state is State.READY else self.state.value
 
     def close(self) -> None:
-        """Leaves it as it is."""
+        """Ends the care for the model, which stays as it is."""
         if self._reload is not None:
             self._reload.close()
 
     def restore(self, config: Config) -> None:
-        """Loads it into a Triton that was started again."""
+        """Loads the model into a Triton that was started again."""
         self._heal(Event.LOST, "tritonserver was started again", config)
 
     def note_ready(self, requested_s: float) -> None:
-        """Takes in that Triton called it ready at ``requested_s``: if it is unloaded, somebody may have loaded it."""
+        """Records that Triton called the model ready at ``requested_s``. If it was unloaded, somebody may have loaded
+        it.
+        """
         if self.is_ensemble:
             self._feed(Event.ANSWERED)
         out_since_s = None if self._reload is None else self._reload.out_since_s
@@ -115,7 +117,7 @@ class ServedModel:
         return None
 
     def _probed(self) -> Event | None:
-        """What its probe says; None: nothing yet. Who is late behind a batch that gets on is busy."""
+        """What the model's probe says; None: nothing yet. A model that is late behind a batch in progress is busy."""
         if self._probe is None:
             return None
         event = self._probe.look()
@@ -132,7 +134,7 @@ class ServedModel:
         self._go_on()
 
     def _go_on(self) -> None:
-        """Takes in how an attempt has ended, or that the next is due."""
+        """Feeds the end of an attempt, or that the next one is due."""
         if self._attempt is None:
             if time.monotonic() >= self._due_s:
                 self._feed(Event.PAUSE_OVER)

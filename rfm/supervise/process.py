@@ -154,7 +154,7 @@ class TritonServer:
 
     @property
     def admin_key(self) -> str:
-        """What its restricted APIs ask for."""
+        """The key that requests to the restricted APIs must show."""
         return self._admin_key
 
     @property
@@ -173,7 +173,7 @@ class TritonServer:
             os.killpg(self.pid, signal.SIGKILL)
 
     def start(self, restored: Collection[str] | None = None) -> None:
-        """Starts the process. Raises ServerStartError for what can be seen to be wrong before.
+        """Starts the process. Raises ServerStartError for what is known to be wrong before.
 
         restored: models that it loads, and ``wait_ready`` does not insist on; None: all, and it does
         """

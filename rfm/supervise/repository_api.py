@@ -47,7 +47,7 @@ _UNAVAILABLE, _UNLOADED = "UNAVAILABLE", "unloaded"
 
 
 class RepositoryApiError(Exception):
-    """What the server did not do, and why."""
+    """A request that the server did not fulfil, and why."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class ModelVersion:
 
     @property
     def is_unloaded(self) -> bool:
-        """Whether it is not loaded because nobody wants it to be. One that failed has another reason."""
+        """Whether the version is not loaded because somebody unloaded it. A version that failed has another reason."""
         return self.state == _NOT_LOADED or (self.state, self.reason) == (_UNAVAILABLE, _UNLOADED)
 
 
@@ -180,7 +180,7 @@ def versions_of(index: Iterable[Mapping[str, str]]) -> list[ModelVersion]:
 
 
 def one_line(reason: str) -> str:
-    """What happened; the lines behind it are where."""
+    """The first line of an error, which says what happened; the lines behind it say where."""
     lines = reason.strip().splitlines()
     return lines[0].strip() if lines else ""
 

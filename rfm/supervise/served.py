@@ -108,12 +108,12 @@ class Served:
         return [(name, why) for name, why in looks if why is not None]
 
     def close(self) -> None:
-        """Looks after them no more."""
+        """Ends the care for all models, which stay as they are."""
         for model in self._models.values():
             model.close()
 
     def _died(self) -> dict[str, str]:
-        """How a process of each model has died. One that hangs is killed, and found dead by the next look."""
+        """How a process of each model has died. A hanging one is killed, and found dead by the next look."""
         died = {stub.model: self._killed.pop(stub.pid, "its process is dead") for stub in self._stubs.dead()}
         for stub, how in self._stubs.hung():
             if stub.model in self._models:
@@ -122,7 +122,7 @@ class Served:
         return died
 
     def _keep_up(self, snapshot: Snapshot) -> None:
-        """Takes in what was loaded, and leaves out what somebody unloaded, once that was seen twice in a row."""
+        """Adds models that were loaded, and drops those that two looks in a row saw unloaded."""
         for name, config in snapshot.configs.items():
             if snapshot.is_unloaded(name):
                 continue
@@ -145,7 +145,9 @@ class Served:
                 model.restore(config)
 
     def _is_unloaded(self, name: str, snapshot: Snapshot) -> bool:
-        """Whether somebody wanted that. Triton says the same of what is loaded anew, and of what that is a part of."""
+        """Whether somebody unloaded the model. Triton says the same of a model that is loaded anew, and of its
+        ensembles.
+        """
         model = self._models.get(name)
         if model is not None and (model.is_healing or (model.is_ensemble and model.state is not State.READY)):
             return False
@@ -165,7 +167,7 @@ class Served:
         self._status.record(reasons if self._triton.is_answered else dict.fromkeys(reasons, SILENT))
 
     def _reason(self, name: str, snapshot: Snapshot) -> str:
-        """Why a model is not ready. An ensemble has to be, and all its parts."""
+        """Why a model is not ready. An ensemble is ready when it and all its parts are."""
         model = self._models.get(name)
         if model is not None and (model.is_healing or not model.is_ensemble):
             return model.reason

@@ -25,7 +25,7 @@ _BUCKETS_S = tuple(digit * 10.0**power for power in range(-3, 2) for digit in (1
 
 
 class Status:
-    """What is known of the models. ``record`` and its kin are for the supervisor, the rest for the status port."""
+    """What is known of the models. The supervisor calls ``record`` and its kin, the status port the rest."""
 
     def __init__(self) -> None:
         self._reasons: Mapping[str, str] = {}
@@ -57,7 +57,7 @@ class Status:
         )
 
     def record(self, reasons: Mapping[str, str]) -> None:
-        """Takes in, by model, why it is not ready; NO_REASON for one that is. There are no other models."""
+        """Records by model why it is not ready; NO_REASON for one that is. There are no other models."""
         gone, before, self._reasons = self._reasons.keys() - reasons.keys(), self._reasons, dict(reasons)
         for model, reason in before.items():
             if reason not in (NO_REASON, reasons.get(model)):
@@ -73,13 +73,13 @@ class Status:
             self._probe_ok.remove(model)
 
     def record_down(self, reason: str) -> None:
-        """Takes in why no model is ready."""
+        """Records why no model is ready."""
         self.record(dict.fromkeys(self._reasons, reason))
         for model in self._probed:
             self.record_probe(model, is_ok=False)
 
     def record_probe(self, model: str, *, is_ok: bool) -> None:
-        """Takes in whether a model's last probe was answered."""
+        """Records whether a model's last probe was answered."""
         self._probed.add(model)
         self._probe_ok.labels(model).set(is_ok)
 
@@ -115,7 +115,7 @@ class StatusServer:
 
 
 class _BoundedServer(ThreadingHTTPServer):
-    """Whoever is slow loses the connection, and the thread that it holds: after REQUEST_S, or to somebody else."""
+    """An HTTP server that drops slow connections, after REQUEST_S or as soon as another caller needs the thread."""
 
     daemon_threads = True
     request_queue_size = 8 * MOST_CONNECTIONS  # what is beyond it has to try again after a second
@@ -143,7 +143,7 @@ class _BoundedServer(ThreadingHTTPServer):
                 self._open.pop(request, None)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Who leaves without an answer is no news."""
+        """Logs nothing: a caller that leaves without an answer is no fault."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(request, client_address)
 

@@ -129,7 +129,7 @@ class Supervisor:
         return list(self._configs) if is_so else []
 
     def _look(self) -> None:
-        """Starts again what has ended. Raises CrashLoopError."""
+        """Starts again whatever has ended. Raises CrashLoopError."""
         if self._served is not None and self._served.is_silent:
             self._server.kill()
             self._start_again(f"no answer for {self._triton_silent_s:g} s")

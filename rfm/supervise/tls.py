@@ -110,7 +110,7 @@ def _self_signed(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _read(file: Path) -> x509.Certificate:
-    """The first, which is the server's own; those that vouch for it follow."""
+    """The certificates of the file: the first is the server's own, those that vouch for it follow."""
     try:
         return x509.load_pem_x509_certificate(file.read_bytes())
     except (OSError, ValueError) as error:
@@ -118,7 +118,7 @@ def _read(file: Path) -> x509.Certificate:
 
 
 def _name_of(certificate: x509.Certificate, file: Path) -> str:
-    """A host that it names: gRPC compares names, also where the certificate itself is what is trusted."""
+    """A host that the certificate names. gRPC compares names even where the certificate itself is trusted."""
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:

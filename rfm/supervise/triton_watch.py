@@ -104,7 +104,7 @@ class TritonWatch:
         self.snapshot: Snapshot | None = None  # the latest
 
     def look(self) -> None:
-        """Takes in what came of a look, and begins the next when it is due."""
+        """Takes in the result of the last look, and begins the next one when it is due."""
         if self._look is not None and self._look.done():
             self._take(self._look.result())
             self._look = None
@@ -133,7 +133,7 @@ class TritonWatch:
             self._silent_since_s = self._silent_since_s or look.started_s
 
     def _looked(self) -> Look:
-        """Runs in a thread of its own, and changes nothing."""
+        """Makes one look. It runs in a thread of its own, and changes nothing."""
         started_s = time.monotonic()
         if not (self._answers(self._http, "/v2") or self._answers(self._metrics, "/metrics")):
             return Look(started_s, is_answered=False)

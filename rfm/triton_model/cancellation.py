@@ -18,7 +18,10 @@ Answer = TypeVar("Answer")
 
 
 class Cancellation:
-    """answer_s: what each answer of the last batch took."""
+    """Finds requests that their clients have cancelled.
+
+    answer_s: seconds that each answer of the last batch took
+    """
 
     def __init__(self) -> None:
         self.answer_s = math.inf
@@ -34,7 +37,7 @@ class Cancellation:
         questions: Sequence[Question],
         execution: Execution,
     ) -> Sequence[Answer]:
-        """What ``answer`` gives, whose time is taken."""
+        """What ``answer`` gives. Its time per answer is kept."""
         started_s = time.perf_counter()
         answers = answer(questions, execution)
         self.answer_s = (time.perf_counter() - started_s) / max(len(questions), 1)

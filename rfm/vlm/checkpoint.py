@@ -215,7 +215,7 @@ def _trained_config(
 
 
 def _check_transformers(config: VlmConfig) -> None:
-    """transformers 5 computes other image features for SmolVLM than those that checkpoints were trained on."""
+    """Raises CheckpointError for SmolVLM on transformers 5, which computes other image features than in training."""
     if config.family != SMOL:
         return
     version = importlib.metadata.version("transformers")

@@ -263,7 +263,7 @@ def _frames(trajectory: Trajectory) -> UInt8Array:
 
 
 def _replaced(text: str, placeholder: str, replacements: Sequence[str]) -> str:
-    """Each occurrence of ``placeholder`` replaced by its own."""
+    """The text with each occurrence of ``placeholder`` replaced by the next of ``replacements``."""
     pieces = text.split(placeholder)
     assert len(pieces) == len(replacements) + 1, "the chat template shows each image or video once"
     return pieces[0] + "".join(new + piece for new, piece in zip(replacements, pieces[1:], strict=True))

@@ -41,7 +41,7 @@ def check_local_film(source: str | Path) -> None:
 
 
 def check_film_behind(url: str) -> None:
-    """The same of a URL, by its path alone."""
+    """Raises InvalidSampleError for such a file behind a URL, judged by the URL's path alone."""
     _check_layout(unquote(urlsplit(url).path))
 
 

@@ -86,7 +86,7 @@ class Scorer:
         self._made: RewardClient | None = None
 
     def score(self, episodes: Mapping[Episode, bool]) -> None:
-        """Has episodes learn what has come, and asks about their newest frames where that is due.
+        """Collects the answers that have come, and sends requests about the newest frames where they are due.
 
         episodes: with whether their newest frame is their last
         """
@@ -169,7 +169,7 @@ class Episode:
         return len(self._pending)
 
     def add(self, frame: Any) -> None:
-        """Keeps a copy: an environment may draw into the same array again."""
+        """Adds a copy of the frame: an environment may draw into the same array again."""
         kept = np.array(frame)
         got = f"{kept.dtype} {list(kept.shape)}"
         if kept.dtype != np.uint8 or kept.ndim != 3 or kept.shape[2] != 3:
@@ -180,17 +180,17 @@ class Episode:
         self._frames.append(kept)
 
     def sample(self, max_frames: int | None) -> ProgressSample:
-        """The question about the newest frame."""
+        """The sample of the newest frame."""
         indices = evenly_spaced(len(self._frames), max_frames)
         frames = self._frames if indices is None else [self._frames[index] for index in indices]
         return ProgressSample(Trajectory(frames=np.stack(frames), task=self._task))
 
     def expect(self, answer: Future[ProgressResult]) -> None:
-        """An answer about the newest frame will come."""
+        """Records that an answer about the newest frame is to come."""
         self._pending[self.step] = answer
 
     def collect(self) -> None:
-        """Learns the answers that have come. Raises the RewardError of one that failed."""
+        """Takes over the answers that have come. Raises the RewardError of one that failed."""
         for step in [step for step, answer in self._pending.items() if answer.done()]:
             answer = self._pending.pop(step)
             error = answer.exception()
@@ -199,7 +199,7 @@ class Episode:
             self.learn(step, answer.result())
 
     def cancel(self) -> None:
-        """Takes back the questions that are open."""
+        """Cancels the requests that have no answer yet."""
         for answer in self._pending.values():
             answer.cancel()
         self._pending.clear()
@@ -223,7 +223,7 @@ class Episode:
             self.succeeded |= result.succeeded(last=rule.last, threshold=rule.threshold)
 
     def reward(self, env_reward: float) -> float:
-        """What the step is paid."""
+        """The reward of the step."""
         change, self._paid_progress = self._progress - self._paid_progress, self._progress
         reward = self._options.scale * (self._progress if self._options.mode == "absolute" else change)
         return reward + env_reward if self._options.add_to_env_reward else reward
