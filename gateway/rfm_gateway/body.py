@@ -134,7 +134,7 @@ class _Form(MultiPartParser):
         super().on_header_end()
 
     async def parse(self) -> FormData:
-        """The fields of the form. Raises HTTPException (400) for a body that is none."""
+        """The fields of the form. Raises HTTPException (400) for a malformed body."""
         try:
             return await super().parse()
         except MultiPartException as error:

@@ -105,7 +105,7 @@ class TritonServer:
     admin_key: what requests to the restricted APIs must show (``admin_key``); None: a new one, known to this alone
     ends_with_parent: it is killed when the thread that starts it ends, be it by kill -9
     accepts_known_vulnerabilities: it may be reached from elsewhere although its Triton has some
-    more_arguments: of tritonserver, such as ``--trace-config=...``; none that are set here
+    more_arguments: of tritonserver, such as ``--trace-config=...``; not those that this class sets
     """
 
     def __init__(

@@ -48,7 +48,7 @@ class Reload:
         """
         with self._api() as api:
             if self.out_since_s is not None and any(e.is_ready for e in api.index() if e.name == self._model):
-                return  # somebody has loaded it meanwhile
+                return  # another client has loaded it meanwhile
             self._take_out(api, stubs)
             if self._served is not None and not self._is_closed:  # else Triton may be another
                 # Triton 2.51 never finishes to unload a model of which a request met a dead process. A load goes on.

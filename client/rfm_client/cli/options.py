@@ -190,7 +190,7 @@ def errors_on_one_line() -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         fail("interrupted", ExitCode.INTERRUPTED)
-    except BrokenPipeError:  # whoever read the output has seen enough
+    except BrokenPipeError:  # the reader of the output has closed the pipe
         raise
     except ImportError as error:
         fail(missing_package(error), ExitCode.FAILED)

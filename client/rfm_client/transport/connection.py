@@ -79,7 +79,7 @@ class Connection:
         return self._closing is not None and self._closing.done()
 
     async def close(self) -> None:
-        """Closes it, whoever still uses it."""
+        """Closes the connection, even if calls still use it."""
         if self._closing is None:
             self._closing = asyncio.create_task(self.client.close())
         await self._closing
