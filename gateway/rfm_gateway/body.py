@@ -167,8 +167,10 @@ def _of_form(fields: Mapping[str, str], uploads: Mapping[str, Upload], share: Sh
 
 
 class BodyLimits:
-    """How much the requests may bring: ``max_bytes`` each, MAX_JSON_BYTES of JSON, and ``max_memory_bytes`` that are
-    held for all of them together, where JSON counts as what it becomes, and copies and files are added.
+    """How much the requests may bring.
+
+    max_bytes: of one request's body, of JSON at most MAX_JSON_BYTES; max_memory_bytes: held for all requests together,
+    where JSON counts as what it becomes, and copies and files are added
     """
 
     def __init__(self, max_bytes: int, max_memory_bytes: int) -> None:
@@ -177,9 +179,11 @@ class BodyLimits:
 
     @contextmanager
     def admitted(self, request: Request) -> Iterator[Admitted]:
-        """The request, whose body counts as held as long as the context lasts. Reading it raises HTTPException: 413 as
-        soon as too much is announced or has come, 503 if all requests together hold too much, 400 if a multipart body
-        does not end as it must: what was cut off may be a sample; 415 if it is to be multipart and is not.
+        """The request, whose body counts as held as long as the context lasts.
+
+        Reading it raises HTTPException: 413 as soon as too much is announced or has come, 503 if all requests together
+        hold too much, 400 if a multipart body does not end as it must (what was cut off may be a sample), 415 if a
+        multipart body is required and this is none.
         """
         with self._memory.share() as share:
             yield Admitted(self._limited(request, share), share)

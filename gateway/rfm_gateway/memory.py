@@ -76,7 +76,9 @@ class Memory:
 
 
 class Share:
-    """What one request holds. reserved_bytes: of these, still to be taken; is_over: it has ended, though a thread may
+    """The memory of one request.
+
+    reserved_bytes: of ``held_bytes``, those still to be taken; is_over: the request has ended, though a thread may
     still work for it
     """
 

@@ -55,7 +55,9 @@ class Reload:
                 api.load(self._model, self._served)
 
     def unload(self, stubs: Sequence[Stub]) -> None:
-        """Unloads the model, so that nobody waits for it, and a load by somebody is seen. Raises RepositoryApiError."""
+        """Unloads the model, so that callers get an error at once, and a load by others is seen. Raises
+        RepositoryApiError.
+        """
         with self._api() as api:
             self._take_out(api, stubs)
 
@@ -74,7 +76,7 @@ class Reload:
             self._end(stubs)
 
     def _serves(self, api: RepositoryApi) -> Config | None:
-        """The configuration of the versions that it serves, and of no others: a rollout may have changed its file."""
+        """The configuration of exactly the versions that the model serves: a rollout may have changed its file."""
         versions = [entry for entry in api.index() if entry.name == self._model]
         ready = [entry.version for entry in versions if entry.is_ready and entry.version is not None]
         if not ready:

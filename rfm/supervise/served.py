@@ -89,7 +89,7 @@ class Served:
         return dict(self._configs) if self._configs or self._snapshot is not None else None
 
     def look(self) -> list[tuple[str, str]]:
-        """Heals what needs to be. Gives the models that are healed from now on, and why."""
+        """Heals the models that need it. Gives those that are healed from now on, and why."""
         if time.monotonic() - self._looked_s < LOOK_INTERVAL_S:
             return []
         self._looked_s = time.monotonic()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The status port of ``rfm serve``: is it live, is it ready, and what has it had to do."""
+"""The status port of ``rfm serve``: whether it lives, whether it is ready, and what it had to heal."""
 
 from __future__ import annotations
 

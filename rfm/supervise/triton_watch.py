@@ -51,12 +51,12 @@ class Snapshot:
         return all(entry.is_unloaded for entry in self.versions if entry.name == model)
 
     def has(self, model: str, version: int) -> bool:
-        """Whether this version of it is ready; -1: any."""
+        """Whether this version of the model is ready; -1: any version."""
         ready = {number for name, number in self.in_state(READY) if name == model}
         return bool(ready) if version == -1 else version in ready
 
     def in_state(self, *states: str) -> set[tuple[str, int]]:
-        """Models and versions that are in one of these states."""
+        """Names and versions of the models that are in one of these states."""
         return {(entry.name, entry.version or 0) for entry in self.versions if entry.state in states}
 
 
@@ -76,7 +76,7 @@ def names_what_was_served(repository: Path, model: str, served: Config) -> bool:
 
 @dataclass(frozen=True)
 class Look:
-    """What came of one look. snapshot: None if the repository gave no answer"""
+    """The result of one look. snapshot: None if the repository gave no answer"""
 
     started_s: float
     is_answered: bool
