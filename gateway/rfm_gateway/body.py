@@ -143,7 +143,7 @@ class _Form(MultiPartParser):
 
 def parsed_bytes(json: bytes) -> int:
     """The most memory that JSON becomes, arrays included. Counting is quicker than reading, and safe."""
-    is_narrow = json.isascii() and b"\\u" not in json  # else one letter may make all of a text four bytes wide
+    is_narrow = json.isascii() and b"\\u" not in json  # else one letter may make a whole text four bytes wide
     return (
         len(json) * (1 if is_narrow else 4)
         + json.count(b",") * _NUMBER_BYTES
@@ -224,7 +224,7 @@ def _ending(request: Request) -> bytes:
             415, f"content-type: expected multipart/form-data with a boundary, got {kind.decode() or 'none'}"
         )
     charset = options.get(b"charset", b"utf-8").decode("latin-1")
-    if charset.lower().replace("_", "-") not in CHARSETS:  # Python knows others, some of which are none of text
+    if charset.lower().replace("_", "-") not in CHARSETS:  # Python has others, some of which do not decode text
         raise HTTPException(
             415, f"content-type: expected a charset of utf-8, us-ascii or iso-8859-1, got {reprlib.repr(charset)}"
         )

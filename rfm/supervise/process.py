@@ -259,7 +259,7 @@ class TritonServer:
             "--model-control-mode=explicit",
             *(f"--load-model={model}" for model in models),
             "--disable-auto-complete-config",
-            "--strict-readiness=false",  # else one version that cannot be loaded makes all not ready
+            "--strict-readiness=false",  # else one version that cannot be loaded keeps all models from being ready
             "--exit-on-error=false",  # so that the reason of each model that fails can be read
             f"--exit-timeout-secs={EXIT_TIMEOUT_S}",
             f"--http-address={endpoints.http_host}",

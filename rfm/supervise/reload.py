@@ -51,7 +51,7 @@ class Reload:
                 return  # another client has loaded it meanwhile
             self._take_out(api, stubs)
             if self._served is not None and not self._is_closed:  # else Triton may be another
-                # Triton 2.51 never finishes to unload a model of which a request met a dead process. A load goes on.
+                # Triton 2.51 never finishes an unload after a request met a dead process of the model. A load goes on.
                 api.load(self._model, self._served)
 
     def unload(self, stubs: Sequence[Stub]) -> None:

@@ -118,7 +118,7 @@ class _BoundedServer(ThreadingHTTPServer):
     """An HTTP server that drops slow connections, after REQUEST_S or as soon as another caller needs the thread."""
 
     daemon_threads = True
-    request_queue_size = 8 * MOST_CONNECTIONS  # what is beyond it has to try again after a second
+    request_queue_size = 8 * MOST_CONNECTIONS  # connections beyond this number have to try again after a second
 
     def __init__(self, *arguments: Any) -> None:
         self._open: dict[socket.socket, None] = {}  # the oldest first

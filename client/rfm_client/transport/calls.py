@@ -222,7 +222,7 @@ class _TritonTransport:
             raise errors.ServerUnavailableError(
                 f"{self.url}: no connection: {error or type(error).__name__}"
             ) from error
-        except (ValueError, LookupError, TypeError) as error:  # while reading what is no answer of a KServe server
+        except (ValueError, LookupError, TypeError) as error:  # the answer is not that of a KServe server
             raise errors.InferenceFailedError(f"{self.url}: the answer cannot be read: {error!r}") from error
 
     async def _answer(self, request: Callable[[Any], Awaitable[Answered]]) -> Answered:

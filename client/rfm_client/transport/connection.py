@@ -33,7 +33,7 @@ GRPC_OPTIONS: dict[str, int] = {
     "grpc.max_reconnect_backoff_ms": 2000,  # two minutes otherwise, when the server may long be back
     "grpc.keepalive_time_ms": PING_MS,
     "grpc.keepalive_timeout_ms": UNACKNOWLEDGED_MS,
-    "grpc.use_local_subchannel_pool": 1,  # else a new channel would go on with the connection of the old one
+    "grpc.use_local_subchannel_pool": 1,  # else a new channel would use the old one's connection
 }
 
 

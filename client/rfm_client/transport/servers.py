@@ -146,7 +146,7 @@ class Servers:
                 with server.request_under_way():
                     answer = await request(server.transport, left_s)
                 server.failures = 0
-                for other in refusals:  # not before: what all refuse is no fault of one
+                for other in refusals:  # not before: a request that all refuse is not one server's fault
                     self._leave_out(other, model)
                 return answer
             except DeadlineExceededError as error:  # perhaps it hangs
