@@ -160,7 +160,7 @@ class ServeConfig:
     @property
     def torch_dtype(self) -> torch.dtype | None:
         """The torch type that ``dtype`` names; None: ``dtype`` is not set."""
-        import torch  # here, since only few of those who read a configuration need it
+        import torch  # imported here: few readers of a configuration need torch
 
         return getattr(torch, self.dtype) if self.dtype else None
 

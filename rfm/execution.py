@@ -21,7 +21,7 @@ Output = TypeVar("Output")
 
 _log = logging.getLogger(__name__)
 
-_CPU_OUT_OF_MEMORY = re.compile(  # plain RuntimeErrors: of PyTorch's allocator, and of oneDNN, which gives no reason
+_CPU_OUT_OF_MEMORY = re.compile(  # PyTorch's allocator and oneDNN, which gives no reason, raise plain RuntimeErrors
     r"DefaultCPUAllocator: can't allocate memory|could not (create|execute) a (primitive|memory object)"
 )
 

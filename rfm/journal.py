@@ -59,7 +59,7 @@ class Journal:
 
     @property
     def busy_s(self) -> float:
-        """How long ago the batch was begun or last got on, be the process dead or alive; 0: there is none."""
+        """Seconds since the batch began or last made progress, whether the process lives or not; 0: no batch."""
         since_s = self._header[2]
         return max(time.monotonic() - since_s, 0.0) if since_s else 0.0  # the clock is the same in all processes
 

@@ -52,7 +52,7 @@ def padded_bytes(samples: Sequence[Sample]) -> int:
 
 
 def num_positions(sample: Sample) -> int:
-    """Frames of all its trajectories."""
+    """Number of frames of all trajectories of the sample."""
     return sum(trajectory.num_frames for trajectory in sample.trajectories)
 
 

@@ -86,7 +86,7 @@ class RewardClient:
         sent at a time; the copies of the others stay in memory.
         """
         future = self._loop.start(self._client.score(snapshot(sample), **options))
-        future.add_done_callback(lambda _done: self)  # until then the client stays, whoever else has forgotten it
+        future.add_done_callback(lambda _done: self)  # until then the client lives, even without another reference
         return future
 
     def encode(

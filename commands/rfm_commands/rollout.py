@@ -95,7 +95,7 @@ class Rollout:
         served = {model: self.server.ready_versions(model) for model in models}
         try:
             new = self._configs(models, dict.fromkeys(models, version))
-            # Of what is not served the configuration that stands there.
+            # A model that is not served keeps the configuration in the repository.
             old = {model: read_config(self.repository, model) for model in models if not served[model]}
             old |= self._configs(models, {model: max(served[model]) for model in models if served[model]})
         except (OSError, ParseError) as error:

@@ -26,7 +26,7 @@ from rfm_client.contract.model_info import (
     SOURCE_PARAMETER,
 )
 
-_NAMED_PARTS = 2  # of a path; all of it is nobody else's business
+_NAMED_PARTS = 2  # of a path; the whole path may be private
 _SECRET = re.compile(r"(^|_)(token|secret|password|key)$", re.IGNORECASE)  # such as hub_token, wandb_api_key
 
 

@@ -77,7 +77,7 @@ class GatewaySettings:
 
 
 def create_app(settings: GatewaySettings) -> FastAPI:
-    """The application. Raises OSError for a folder that is not there, ValueError for a URL that is none."""
+    """The application. Raises OSError for a folder that is not there, ValueError for a malformed URL."""
     folder = AllowedFolder(settings.folder, settings.limits.max_body_mib * MIB)
     metrics = Metrics()
     client = AsyncRewardClient(

@@ -134,7 +134,7 @@ class _Form(MultiPartParser):
         super().on_header_end()
 
     async def parse(self) -> FormData:
-        """The fields of the form. Raises HTTPException (400) for a body that is none."""
+        """The fields of the form. Raises HTTPException (400) for a malformed body."""
         try:
             return await super().parse()
         except MultiPartException as error:
@@ -143,7 +143,7 @@ class _Form(MultiPartParser):
 
 def parsed_bytes(json: bytes) -> int:
     """The most memory that JSON becomes, arrays included. Counting is quicker than reading, and safe."""
-    is_narrow = json.isascii() and b"\\u" not in json  # else one letter may make all of a text four bytes wide
+    is_narrow = json.isascii() and b"\\u" not in json  # else one letter may make a whole text four bytes wide
     return (
         len(json) * (1 if is_narrow else 4)
         + json.count(b",") * _NUMBER_BYTES
@@ -167,8 +167,10 @@ def _of_form(fields: Mapping[str, str], uploads: Mapping[str, Upload], share: Sh
 
 
 class BodyLimits:
-    """How much the requests may bring: ``max_bytes`` each, MAX_JSON_BYTES of JSON, and ``max_memory_bytes`` that are
-    held for all of them together, where JSON counts as what it becomes, and copies and files are added.
+    """How much the requests may bring.
+
+    max_bytes: of one request's body, of JSON at most MAX_JSON_BYTES; max_memory_bytes: held for all requests together,
+    where JSON counts as what it becomes, and copies and files are added
     """
 
     def __init__(self, max_bytes: int, max_memory_bytes: int) -> None:
@@ -177,9 +179,11 @@ class BodyLimits:
 
     @contextmanager
     def admitted(self, request: Request) -> Iterator[Admitted]:
-        """The request, whose body counts as held as long as the context lasts. Reading it raises HTTPException: 413 as
-        soon as too much is announced or has come, 503 if all requests together hold too much, 400 if a multipart body
-        does not end as it must: what was cut off may be a sample; 415 if it is to be multipart and is not.
+        """The request, whose body counts as held as long as the context lasts.
+
+        Reading it raises HTTPException: 413 as soon as too much is announced or has come, 503 if all requests together
+        hold too much, 400 if a multipart body does not end as it must (what was cut off may be a sample), 415 if a
+        multipart body is required and this is none.
         """
         with self._memory.share() as share:
             yield Admitted(self._limited(request, share), share)
@@ -220,7 +224,7 @@ def _ending(request: Request) -> bytes:
             415, f"content-type: expected multipart/form-data with a boundary, got {kind.decode() or 'none'}"
         )
     charset = options.get(b"charset", b"utf-8").decode("latin-1")
-    if charset.lower().replace("_", "-") not in CHARSETS:  # Python knows others, some of which are none of text
+    if charset.lower().replace("_", "-") not in CHARSETS:  # Python has others, some of which do not decode text
         raise HTTPException(
             415, f"content-type: expected a charset of utf-8, us-ascii or iso-8859-1, got {reprlib.repr(charset)}"
         )

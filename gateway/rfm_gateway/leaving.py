@@ -17,7 +17,7 @@ class CallerLeftError(Exception):
 
 
 async def while_connected(request: Request, work: Coroutine[Any, Any, Returned]) -> Returned:
-    """What ``work`` gives. It is cancelled, with all that it asks of Triton, if the caller hangs up: CallerLeftError.
+    """What ``work`` gives. If the caller hangs up, it is cancelled with its requests to Triton: CallerLeftError.
 
     The body of the request must have been read.
     """

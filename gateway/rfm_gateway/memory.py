@@ -40,7 +40,7 @@ class Memory:
 
     async def reserve(self, share: Share, num_bytes: int, deadline: Deadline) -> None:
         """Waits until ``num_bytes`` are free for ``share``, as Share.reserve describes it."""
-        num_bytes = min(num_bytes, self._most_bytes)  # what is too much for one is refused when it is taken
+        num_bytes = min(num_bytes, self._most_bytes)  # take() refuses what is too much for one request
         try:
             async with timeout(deadline.remaining_s()), self._turn:  # first come, first served
                 while not self._reserved(share, num_bytes):
@@ -76,7 +76,9 @@ class Memory:
 
 
 class Share:
-    """What one request holds. reserved_bytes: of these, still to be taken; is_over: it has ended, though a thread may
+    """The memory of one request.
+
+    reserved_bytes: of ``held_bytes``, those still to be taken; is_over: the request has ended, though a thread may
     still work for it
     """
 

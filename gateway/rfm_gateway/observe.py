@@ -107,7 +107,7 @@ class Observed:
             else:
                 await self._evaluated(scope, receive, send_counted)
         finally:
-            endpoint = scope["path"] if scope["path"] in ENDPOINTS else "other"  # not whatever somebody asks for
+            endpoint = scope["path"] if scope["path"] in ENDPOINTS else "other"  # not any path that a caller makes up
             self._metrics.requests.labels(endpoint, str(code)).inc()
             self._metrics.durations.labels(endpoint).observe(time.perf_counter() - started_s)
             if is_evaluation and code >= 400:

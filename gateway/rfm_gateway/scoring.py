@@ -45,7 +45,7 @@ class Scorer:
         deadline = Deadline(self._timeout_s)
         try:
             return await self._evaluate(batch, share, deadline, request_id)
-        except DeadlineExceededError as error:  # which names what was left for one of several calls
+        except DeadlineExceededError as error:  # its message names the time of one of several calls
             raise deadline.exceeded("Triton") from error
 
     async def _evaluate(

@@ -165,7 +165,10 @@ class State:
 
 @dataclass(frozen=True)
 class _Stalled:
-    """A model that is late. num_finished: requests that it has answered; since_s: when it was first seen at that"""
+    """A model that is late.
+
+    num_finished: requests that it has answered; since_s: when that number was first seen
+    """
 
     num_finished: int
     since_s: float
@@ -205,7 +208,7 @@ def _gpu_status(status: ServerStatus, model: str) -> schema.GpuStatus:
 
 
 def _busy_s(status: ServerStatus, device: Device, model: str) -> float:
-    """Seconds of a model's batches on one device: of all that Triton reports, the share that its requests had there."""
+    """Seconds that a model's batches took on one device: the share of Triton's total that its requests had there."""
     on_all = sum(each.work[model].compute_s for each in status.devices if model in each.work)
     if model not in device.work or not on_all:
         return 0.0

@@ -188,7 +188,9 @@ class Encoders:
                     yield torch.cat(waiting)
                     waiting = []
                 with execution.collating():
-                    waiting.append(self.preprocessor(images))  # on the CPU: nowhere else is uint8 resized antialiased
+                    waiting.append(
+                        self.preprocessor(images)
+                    )  # on the CPU: torch resizes uint8 with antialiasing only there
         yield torch.cat(waiting)
 
     def _check_task(self, task: str) -> None:

@@ -18,7 +18,7 @@ def in_background(name: str, call: Callable[[], Result]) -> Future[Result]:
     def run() -> None:
         try:
             future.set_result(call())
-        except Exception as error:  # noqa: BLE001  it is raised to whoever asks for the result
+        except Exception as error:  # noqa: BLE001  it is raised where the result is read
             future.set_exception(error)
 
     threading.Thread(target=run, name=name, daemon=True).start()

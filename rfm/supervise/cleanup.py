@@ -16,7 +16,7 @@ from pathlib import Path
 from rfm.supervise.model_processes import SHARED_MEMORY
 
 BACKENDS_PREFIX = "rfm-backends-"
-# Newer Tritons let no client map a region of this name, which is that of the Python backend's own.
+# The Python backend's regions have this name. Newer Tritons let no client map a region with it.
 REGION_PREFIX = "triton_python_backend_shm_region_rfm"
 
 _PR_SET_PDEATHSIG = 1

@@ -85,7 +85,7 @@ class StubWatch:
         self._stubs: set[Stub] = set()
         self._loaded: set[Stub] = set()
         self._watched: set[Stub] = set()
-        self._buried: set[Stub] = set()
+        self._forgotten: set[Stub] = set()
         self._since: dict[tuple[Stub, str], float] = {}  # stub and state: when it was first seen so
 
     def update(
@@ -104,7 +104,7 @@ class StubWatch:
         self._watched = {stub for stub in self._loaded if stub.serves not in going}
 
     def dead(self) -> list[Stub]:
-        """The stubs that have died and were not buried."""
+        """The stubs that have died and were not forgotten."""
         self._look()
         return [stub for stub in self._watched if self._has_been(stub, _ZOMBIE, CONFIRM_S)]
 
@@ -134,12 +134,12 @@ class StubWatch:
         """All processes of models that are known now."""
         return list(self._stubs)
 
-    def bury(self, stubs: Iterable[Stub]) -> None:
-        """Forgets stubs, which are of no more interest."""
-        self._buried.update(stubs)
-        self._stubs -= self._buried
-        self._loaded -= self._buried
-        self._watched -= self._buried
+    def forget(self, stubs: Iterable[Stub]) -> None:
+        """Forgets stubs that were replaced: they are found no more."""
+        self._forgotten.update(stubs)
+        self._stubs -= self._forgotten
+        self._loaded -= self._forgotten
+        self._watched -= self._forgotten
 
     def _look(self) -> None:
         now_s = time.monotonic()
@@ -154,8 +154,8 @@ class StubWatch:
     def _scan(self) -> None:
         known = {stub for stub in self._stubs if stub.state is not None}  # of a zombie nothing can be read
         found = (_stub(folder, self._triton_pid) for folder in _PROC.glob("[0-9]*"))
-        self._buried = {stub for stub in self._buried if stub.state is not None}
-        self._stubs = known | {stub for stub in found if stub is not None} - self._buried
+        self._forgotten = {stub for stub in self._forgotten if stub.state is not None}
+        self._stubs = known | {stub for stub in found if stub is not None} - self._forgotten
 
 
 def _stat(pid: int) -> list[str]:

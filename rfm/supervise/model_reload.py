@@ -46,14 +46,16 @@ class Reload:
         """
         with self._api() as api:
             if self.out_since_s is not None and any(e.is_ready for e in api.index() if e.name == self._model):
-                return  # somebody has loaded it meanwhile
+                return  # another client has loaded it meanwhile
             self._take_out(api, stubs)
             if self._served is not None and not self._is_closed:  # else Triton may be another
-                # Triton 2.51 never finishes to unload a model of which a request met a dead process. A load goes on.
+                # Triton 2.51 never finishes an unload after a request met a dead process of the model. A load goes on.
                 api.load(self._model, self._served)
 
     def unload(self, stubs: Sequence[Stub]) -> None:
-        """Unloads the model, so that nobody waits for it, and a load by somebody is seen. Raises RepositoryApiError."""
+        """Unloads the model, so that callers get an error at once, and a load by others is seen. Raises
+        RepositoryApiError.
+        """
         with self._api() as api:
             self._take_out(api, stubs)
 
@@ -72,7 +74,7 @@ class Reload:
             self._end(stubs)
 
     def _serves(self, api: RepositoryApi) -> Config | None:
-        """The configuration of the versions that it serves, and of no others: a rollout may have changed its file."""
+        """The configuration of exactly the versions that the model serves: a rollout may have changed its file."""
         versions = [entry for entry in api.index() if entry.name == self._model]
         ready = [entry.version for entry in versions if entry.is_ready and entry.version is not None]
         if not ready:

@@ -87,7 +87,7 @@ class ServedModel:
         """Loads the model into a Triton that was started again."""
         self._heal(Event.LOST, "tritonserver was started again", config)
 
-    def note_ready(self, requested_s: float) -> None:
+    def record_ready(self, requested_s: float) -> None:
         """Records that Triton called the model ready at ``requested_s``. If it was unloaded, somebody may have loaded
         it.
         """
@@ -141,7 +141,7 @@ class ServedModel:
         elif self._attempt.done():
             error, self._attempt = self._attempt.exception(), None
             assert self._reload is not None  # it made the attempt
-            self._watch.bury(self._reload.ended)
+            self._watch.forget(self._reload.ended)
             if error is not None:
                 self._trouble = str(error)
             self._feed(Event.DONE if error is None else Event.FAILED)

@@ -105,7 +105,7 @@ class TritonServer:
     admin_key: what requests to the restricted APIs must show (``admin_key``); None: a new one, known to this alone
     ends_with_parent: it is killed when the thread that starts it ends, be it by kill -9
     accepts_known_vulnerabilities: it may be reached from elsewhere although its Triton has some
-    more_arguments: of tritonserver, such as ``--trace-config=...``; none that are set here
+    more_arguments: of tritonserver, such as ``--trace-config=...``; not those that this class sets
     """
 
     def __init__(
@@ -259,7 +259,7 @@ class TritonServer:
             "--model-control-mode=explicit",
             *(f"--load-model={model}" for model in models),
             "--disable-auto-complete-config",
-            "--strict-readiness=false",  # else one version that cannot be loaded makes all not ready
+            "--strict-readiness=false",  # else one version that cannot be loaded keeps all models from being ready
             "--exit-on-error=false",  # so that the reason of each model that fails can be read
             f"--exit-timeout-secs={EXIT_TIMEOUT_S}",
             f"--http-address={endpoints.http_host}",

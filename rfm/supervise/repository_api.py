@@ -74,7 +74,7 @@ class RepositoryApi:
     """The server at ``url`` (grpc://host:port, or grpcs:// with TLS). A context manager.
 
     options: of tritonclient's gRPC client, as Access and OwnTls have them
-    Its methods raise RepositoryApiError, as it does itself for a url that is none of these.
+    Its methods raise RepositoryApiError, and so does the constructor for another kind of URL.
     """
 
     def __init__(self, url: str, admin_key: str | None, options: Mapping[str, Any] | None = None) -> None:

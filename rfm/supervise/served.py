@@ -6,7 +6,7 @@ What is watched, and the fault that no other watch sees:
 | watch | the fault that it alone sees |
 |---|---|
 | Triton's exit status (``supervisor``) | Triton has ended |
-| Triton's doors ``/v2`` and ``/metrics`` (``TritonWatch``) | Triton lives and does nothing |
+| Triton's endpoints ``/v2`` and ``/metrics`` (``TritonWatch``) | Triton lives and does nothing |
 | Triton's repository index (``TritonWatch``) | somebody has loaded or unloaded a model; an ensemble is not ready |
 | zombies among Triton's children (``StubWatch``) | one of several processes is dead: probes go to the others |
 | stopped children (``StubWatch``) | one of several processes is stopped (SIGSTOP) while it is idle |
@@ -89,7 +89,7 @@ class Served:
         return dict(self._configs) if self._configs or self._snapshot is not None else None
 
     def look(self) -> list[tuple[str, str]]:
-        """Heals what needs to be. Gives the models that are healed from now on, and why."""
+        """Heals the models that need it. Gives those that are healed from now on, and why."""
         if time.monotonic() - self._looked_s < LOOK_INTERVAL_S:
             return []
         self._looked_s = time.monotonic()
@@ -132,7 +132,7 @@ class Served:
             if name not in self._models and can_be_probed(config):
                 self._models[name] = self._new_model(name, config)
             if name in self._models and name in snapshot.ready:
-                self._models[name].note_ready(snapshot.requested_s)
+                self._models[name].record_ready(snapshot.requested_s)
         leaving = {name for name in self._configs if self._is_unloaded(name, snapshot)}
         for name in leaving & self._leaving:
             del self._configs[name]

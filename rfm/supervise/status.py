@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The status port of ``rfm serve``: is it live, is it ready, and what has it had to do."""
+"""The status port of ``rfm serve``: whether it lives, whether it is ready, and what it had to heal."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ class _BoundedServer(ThreadingHTTPServer):
     """An HTTP server that drops slow connections, after REQUEST_S or as soon as another caller needs the thread."""
 
     daemon_threads = True
-    request_queue_size = 8 * MOST_CONNECTIONS  # what is beyond it has to try again after a second
+    request_queue_size = 8 * MOST_CONNECTIONS  # connections beyond this number have to try again after a second
 
     def __init__(self, *arguments: Any) -> None:
         self._open: dict[socket.socket, None] = {}  # the oldest first

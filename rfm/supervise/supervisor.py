@@ -52,7 +52,7 @@ class Supervisor:
         self._is_to_stop = threading.Event()
         self._back_off = BackOff("tritonserver")
         self._served: Served | None = None  # None: it is started, or has ended
-        self._configs: dict[str, Config] | None = None  # of what was served last; None: what the files say
+        self._configs: dict[str, Config] | None = None  # the configurations served last; None: those in the files
 
     def run(self) -> int:
         """Gives Triton's exit status. Raises ServerStartError for what does not start, or ends again and again."""
@@ -87,7 +87,7 @@ class Supervisor:
                 raise
         finally:
             self._status.record_down("it is stopping")
-            if self._gateway is not None:  # it answers what it has begun, and then the server is stopped
+            if self._gateway is not None:  # the gateway answers its requests in flight before the server stops
                 self._gateway.stop()
             self._close_served()
             status = self._server.stop()

@@ -12,7 +12,7 @@ from rfm.supervise.installation import Installation, ServerStartError
 
 MAX_HTTP_BYTES = 256 * 2**20  # of a request's body, as in the gateway; over gRPC Triton takes 2 GiB
 
-# Beside those that are set: other names of them, and what would take away what a start waits for.
+# Refused besides the options that are set here: their other names, and options that take away what a start waits for.
 _KEPT = {
     "--model-store",
     "--backend-directory",

@@ -25,7 +25,7 @@ from rfm.supervise.repository_api import INDEX_PATH, READY, ModelVersion, versio
 INTERVAL_S = 1.0
 LOOKS = 3  # without any answer, at least, before it has to be started again
 
-_DOOR_TIMEOUT_S = 1.5  # at most; a look tries both doors
+_ENDPOINT_TIMEOUT_S = 1.5  # at most; a look tries both endpoints
 _INDEX_TIMEOUT_S = 5.0
 
 Config = Mapping[str, Any]
@@ -51,12 +51,12 @@ class Snapshot:
         return all(entry.is_unloaded for entry in self.versions if entry.name == model)
 
     def has(self, model: str, version: int) -> bool:
-        """Whether this version of it is ready; -1: any."""
+        """Whether this version of the model is ready; -1: any version."""
         ready = {number for name, number in self.in_state(READY) if name == model}
         return bool(ready) if version == -1 else version in ready
 
     def in_state(self, *states: str) -> set[tuple[str, int]]:
-        """Models and versions that are in one of these states."""
+        """Names and versions of the models that are in one of these states."""
         return {(entry.name, entry.version or 0) for entry in self.versions if entry.state in states}
 
 
@@ -76,7 +76,7 @@ def names_what_was_served(repository: Path, model: str, served: Config) -> bool:
 
 @dataclass(frozen=True)
 class Look:
-    """What came of one look. snapshot: None if the repository gave no answer"""
+    """The result of one look. snapshot: None if the repository gave no answer"""
 
     started_s: float
     is_answered: bool
@@ -96,7 +96,7 @@ class TritonWatch:
         self._metrics = Http(endpoints.host, endpoints.metrics_port)
         self._headers = http_headers(server.admin_key)
         self._silent_s = silent_s
-        self._door_timeout_s = min(silent_s / LOOKS / 2, _DOOR_TIMEOUT_S)
+        self._endpoint_timeout_s = min(silent_s / LOOKS / 2, _ENDPOINT_TIMEOUT_S)
         self._silent_since_s: float | None = None
         self._failed_looks = 0
         self._look: Future[Look] | None = None
@@ -142,9 +142,9 @@ class TritonWatch:
         except NO_ANSWER:
             return Look(started_s, is_answered=True)
 
-    def _answers(self, door: Http, path: str) -> bool:
+    def _answers(self, endpoint: Http, path: str) -> bool:
         try:
-            door.request("GET", path, self._door_timeout_s)
+            endpoint.request("GET", path, self._endpoint_timeout_s)
         except NO_ANSWER:
             return False
         return True
@@ -169,5 +169,5 @@ class TritonWatch:
         if "ensemble_scheduling" not in config:
             return True
         path = f"/v2/models/{quote(config['name'], safe='')}/ready"
-        status, _ = self._http.request("GET", path, self._door_timeout_s)
+        status, _ = self._http.request("GET", path, self._endpoint_timeout_s)
         return status == HTTPStatus.OK

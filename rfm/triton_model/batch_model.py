@@ -144,7 +144,7 @@ class BatchModel(Generic[Question, Answer]):
     def _score_blank(self) -> None:
         """Raises the error of an instance that cannot score the blank sample."""
         questions = self.decode(self._blank_tensors)
-        with self._quarantine.at_work_on([NO_DIGEST]):  # a hang is noticed, and blames nobody
+        with self._quarantine.at_work_on([NO_DIGEST]):  # a hang is noticed, and no request is a suspect
             error = _first_error(self.answer(questions, Execution(on_forward=self._quarantine.renew)))
         if error is not None and not isinstance(error, InvalidSampleError):
             raise error

@@ -1,11 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Requests that kill the model process: known by what it was working on when it died, and refused for a while.
+"""Requests that end the model process: their digests are known from its journal, and they are refused for a while.
+
+Each model process keeps a journal, a small file in shared memory. It names the requests that the process works on, and
+when their batch last made progress, by which a hung process is known. The journal outlives the process.
+
+The next process of the model reads the journals of dead ones. A request in one of them is a suspect. It is worked on
+alone from then on, so that no other request is blamed for it. A suspect that the process survives is cleared. One that
+was there twice when a process died is refused for QUARANTINE_S.
 
 Each model process keeps a journal, a small file in shared memory, of the batch that it is working on, and of when that
 batch last got on, by which a process that hangs is known. The journal outlives the process. The next process of the
 model reads the journals of the dead: what stands in one is a suspect, which is worked on alone from then on, so that no
-neighbour is blamed for it. A suspect that is survived is none any more; one that was there twice when a process died is
-refused for QUARANTINE_S.
+neighbour is blamed for it. A suspect that the process survives is cleared. One that was there twice when a
+process died is refused for QUARANTINE_S.
 """
 
 from __future__ import annotations

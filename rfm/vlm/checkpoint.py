@@ -155,7 +155,7 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
     with expecting("a vision-language checkpoint", folder):
         is_adapter = is_there(folder / ADAPTER_CONFIG)
         backbone = {} if is_adapter else read_json(folder / NETWORK_CONFIG)
-        if SETTINGS in backbone:  # written by VlmCheckpoint.save, which says all
+        if SETTINGS in backbone:  # written by VlmCheckpoint.save, with every setting
             config = _saved_config(backbone)
             weights = _renamed(read_weights(folder), _renames(config.family))
         else:

@@ -70,7 +70,7 @@ def later_s() -> float:
     return time.monotonic() + 1.0
 
 
-def test_the_dead_of_a_version_that_is_ready_are_told_until_they_are_buried(machine: Machine) -> None:
+def test_the_dead_of_a_version_that_is_ready_are_reported_until_they_are_forgotten(machine: Machine) -> None:
     watch = StubWatch(TRITON, 30.0)
     machine.start(21, 1)
     machine.start(22, 1)
@@ -79,7 +79,7 @@ def test_the_dead_of_a_version_that_is_ready_are_told_until_they_are_buried(mach
     machine.die(22)
     assert pids(watch.dead()) == [22]
     assert pids(watch.of_model(MODEL)) == [21, 22]
-    watch.bury(watch.dead())
+    watch.forget(watch.dead())
     assert watch.dead() == []
     assert pids(watch.of_model(MODEL)) == [21]
 
@@ -129,5 +129,5 @@ def test_another_process_of_the_same_id_is_another(machine: Machine) -> None:
     (old,) = watch.all
     machine.start(21, 1, started_s=2.0)
     assert not old.is_alive
-    watch.bury([old])
+    watch.forget([old])
     assert pids(watch.of_model(MODEL)) == [21]

@@ -77,7 +77,7 @@ class Bench:
         self.clock, self.triton, self.status = Clock(), Triton(), Status()
         self.said: list[str] = []
         self.stubs: list[Stub] = []
-        self.buried: list[Stub] = []
+        self.forgotten: list[Stub] = []
         self.probed: Event | None = None
         self.is_getting_on = False
         self.renewed = 0
@@ -87,7 +87,9 @@ class Bench:
         monkeypatch.setattr(model_watch, "in_background", at_once)
         probe = SimpleNamespace(look=lambda: self.probed, renew=self.renew)
         watch = SimpleNamespace(
-            of_model=lambda _: list(self.stubs), bury=self.buried.extend, is_getting_on=lambda _: self.is_getting_on
+            of_model=lambda _: list(self.stubs),
+            forget=self.forgotten.extend,
+            is_getting_on=lambda _: self.is_getting_on,
         )
         server = SimpleNamespace(endpoints=Endpoints.free(), admin_key="", grpc_options={})
         given = None if is_ensemble else probe
@@ -160,7 +162,7 @@ def test_a_fault_is_healed_at_once(bench: Bench, fault: Event) -> None:
     assert (bench.model.is_healing, bench.model.reason, bench.is_probe_ok) == (True, "it is loaded anew", False)
     assert bench.triton.asked == ["unload", "load 1"]
     assert bench.look(fault) is None  # of the old processes
-    assert (bench.model.state, bench.buried, bench.renewed) == (State.NEW, bench.stubs, 1)
+    assert (bench.model.state, bench.forgotten, bench.renewed) == (State.NEW, bench.stubs, 1)
     assert [stub.is_alive for stub in bench.stubs] == [False]
     assert bench.clock.now_s == pytest.approx(2.0)  # they had this time
     # What a process worked on is to blame if it hung, and not if it was killed for another's fault.
@@ -217,10 +219,10 @@ def test_what_dies_again_and_again_is_taken_out_and_loaded_by_somebody(bench: Be
     assert bench.triton.asked[-1] == "unload"  # so that nobody waits for it
     out_s = bench.clock.now_s
     bench.triton.be("READY", version=2)
-    bench.model.note_ready(out_s)  # Triton was asked before, or at once
+    bench.model.record_ready(out_s)  # the request is older, or as old
     bench.look()
     assert bench.model.state is State.GIVEN_UP
-    bench.model.note_ready(out_s + 1.0)
+    bench.model.record_ready(out_s + 1.0)
     bench.look()
     assert bench.model.state is State.NEW
     assert bench.triton.asked[-1] == "unload"
@@ -279,7 +281,7 @@ def test_an_ensemble_is_restored_once_and_ready_when_triton_says_so(monkeypatch:
     bench.model.restore(CONFIG)
     bench.wait(0.0)
     assert (bench.triton.asked, bench.model.state) == (["load 1"], State.NEW)
-    bench.model.note_ready(bench.clock.now_s)
+    bench.model.record_ready(bench.clock.now_s)
     assert bench.model.state is State.READY
 
 

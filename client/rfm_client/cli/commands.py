@@ -113,7 +113,7 @@ def score(
         if isinstance(outcome, Failed):
             options.report(f"{outcome.name}: {outcome.message}")
         else:
-            _note(outcome.name, len(outcome.result.progress), outcome.num_frames)
+            _report_subsampled(outcome.name, len(outcome.result.progress), outcome.num_frames)
     if json != STANDARD_OUTPUT and scored:
         _print(scoring.scored_table(scored))
     if json is not None:
@@ -149,7 +149,7 @@ def compare(
     question = Question(task, fps, max_frames, subsample=subsample, resize=resize)
     comparison = scoring.compare(server, (first, second), question)
     for source, scores, _ in comparison.sides:
-        _note(source.name, len(scores.progress), source.trajectory.num_frames)
+        _report_subsampled(source.name, len(scores.progress), source.trajectory.num_frames)
     if json != STANDARD_OUTPUT:
         _print(comparison.table())
     if json is not None:
@@ -282,7 +282,7 @@ def _check_arrays(npy: Path | None, videos: list[str]) -> None:
         raise typer.BadParameter(f"expected a folder for {len(videos)} videos, got {npy}", param_hint="--npy")
 
 
-def _note(name: str, num_scored: int, num_frames: int) -> None:
+def _report_subsampled(name: str, num_scored: int, num_frames: int) -> None:
     if num_scored < num_frames:
         options.report(f"note: {name}: {num_scored} of {num_frames} frames were scored, evenly spaced")
 

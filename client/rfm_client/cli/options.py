@@ -151,12 +151,12 @@ def read_access(ca_file: Path | None, certificate: Path | None, key: Path | None
 
 
 def exit_code(error: BaseException) -> ExitCode:
-    """How a command ends that fails with this error."""
+    """The exit code of a command that fails with this error."""
     return next((code for kind, code in _ERROR_CODES.items() if isinstance(error, kind)), ExitCode.FAILED)
 
 
 def exit_code_of(failures: Sequence[Exception], *, some_succeeded: bool) -> ExitCode:
-    """How a command ends of whose samples some failed: a code of its own only if all failed for that one reason."""
+    """The exit code of a command of whose samples some failed: a special one only if all failed for that one reason."""
     codes = {exit_code(error) for error in failures}
     if not codes:
         return ExitCode.OK
@@ -190,7 +190,7 @@ def errors_on_one_line() -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         fail("interrupted", ExitCode.INTERRUPTED)
-    except BrokenPipeError:  # whoever read the output has seen enough
+    except BrokenPipeError:  # the reader of the output has closed the pipe
         raise
     except ImportError as error:
         fail(missing_package(error), ExitCode.FAILED)

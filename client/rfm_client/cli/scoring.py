@@ -153,7 +153,7 @@ def score_all(server: Server, names: Sequence[str], question: Question) -> list[
 
 
 def exit_code_of(outcomes: Sequence[Outcome]) -> ExitCode:
-    """How a command ends with these outcomes."""
+    """The exit code of a command with these outcomes."""
     failures = [outcome.error for outcome in outcomes if isinstance(outcome, Failed)]
     return options.exit_code_of(failures, some_succeeded=len(failures) < len(outcomes))
 

@@ -48,7 +48,7 @@ class FrameSize:
         edge = min(height, width) if self.rule == "shortest" else max(height, width)
         if edge <= px:
             return height, width
-        # The very expressions of the server: one that rounds otherwise would have it resize once more.
+        # The same expressions as the server's: with other rounding the server would resize once more.
         if self.rule == "shortest":
             other = int(px * max(height, width) / edge)
             return (px, other) if height <= width else (other, px)

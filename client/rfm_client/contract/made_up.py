@@ -16,7 +16,7 @@ Widths: TypeAlias = tuple[int, int] | None
 
 BLANK_FRAMES = 2
 SIDE_PX = 64
-PROBE_TASK = "canary"  # of a blank trajectory: every probe asks the same question, by which a model knows it
+PROBE_TASK = "canary"  # of a blank trajectory: every probe has the same inputs, by which a model recognises it
 
 
 def blank_trajectory(widths: Widths, task: str = PROBE_TASK) -> Trajectory:

@@ -63,7 +63,7 @@ class ModelInfo:
     def from_config(cls, config: Mapping[str, Any]) -> ModelInfo:
         """What Triton's model configuration, as its HTTP API writes it, says of the model.
 
-        Raises ValueError, LookupError or TypeError for what is none.
+        Raises ValueError, LookupError or TypeError for a configuration that is not one of ours.
         """
         last_dims = {tensor["name"]: int(tensor["dims"][-1]) for tensor in (*config["input"], *config["output"])}
         parameters = {name: value.get("string_value", "") for name, value in config.get("parameters", {}).items()}

@@ -215,7 +215,7 @@ def _checked_floats(where: str, values: Any, axes: tuple[str, ...]) -> Float32Ar
     if 0 in array.shape:
         raise InvalidSampleError.at(where, f"{expected} without an empty axis", f"{array.dtype} {list(array.shape)}")
     if array.dtype != np.float32:
-        with np.errstate(over="ignore"):  # what does not fit becomes Inf and is refused below
+        with np.errstate(over="ignore"):  # a value too large for float32 becomes Inf and is refused below
             array = array.astype(np.float32)
     finite = np.isfinite(array)
     if not finite.all():

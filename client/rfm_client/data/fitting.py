@@ -27,7 +27,7 @@ class FittedSample:
 
 
 def whole(sample: Sample) -> FittedSample:
-    """The sample as it is. Raises InvalidSampleError for what is none."""
+    """The sample as it is. Raises InvalidSampleError for any other value."""
     if not isinstance(sample, Sample):
         expected = "ProgressSample, PreferenceSample or SimilaritySample"
         raise InvalidSampleError.at("sample", expected, type(sample).__name__)

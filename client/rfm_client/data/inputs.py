@@ -21,7 +21,7 @@ from rfm_client.contract.samples import Trajectory, UInt8Array, as_array
 from rfm_client.data.video import is_url, read_video
 
 MAX_UINT8 = 255
-BROKEN_NPY = (  # what numpy raises of a .npy header that is none
+BROKEN_NPY = (  # what numpy raises of a broken .npy header
     *(ValueError, TypeError, LookupError, SyntaxError),
     *(tokenize.TokenError, MemoryError, RecursionError),
 )

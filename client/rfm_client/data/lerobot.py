@@ -46,7 +46,7 @@ def check_film_behind(url: str) -> None:
 
 
 def _info(file: Path) -> dict[str, object] | None:
-    """The metadata of a LeRobot dataset; None: the folder is none."""
+    """The metadata of a LeRobot dataset; None: the folder holds no such dataset."""
     try:
         info = json.loads(file.read_bytes())
     except (FileNotFoundError, NotADirectoryError):

@@ -39,7 +39,7 @@ class SuccessRule:
 
 @dataclass(frozen=True, kw_only=True)
 class RewardOptions:
-    """How an episode is scored, and how progress becomes reward. Raises ValueError for what cannot be.
+    """How an episode is scored, and how progress becomes reward. Raises ValueError for contradictory options.
 
     mode: a step is paid the newest known progress (absolute), or how far that has come since the step before (delta):
         then an episode's rewards add up to its last known progress less its first, however late answers come

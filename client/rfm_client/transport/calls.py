@@ -138,7 +138,7 @@ class _TritonTransport:
             through_socket = 0 if regions else inputs[largest].nbytes
             tensors = await off_loop(through_socket, self._inputs, inputs, regions)
             requested = [self._requested(name) for name in outputs]
-            # Whoever waits in Triton's queue for longer is dropped there, over HTTP too: nobody waits for the answer.
+            # Triton drops a request that waits in its queue for longer, over HTTP too: no client waits for the answer.
             waits_us = max(int(timeout_s * _US_PER_S), 1)
             answer = await client.infer(model, tensors, outputs=requested, request_id=request_id, timeout=waits_us)
         return Answer(_outputs(answer, outputs), self._model_version(answer))
@@ -198,7 +198,7 @@ class _TritonTransport:
             raise errors.ServerUnavailableError(
                 f"{self.url}: no connection: {error or type(error).__name__}"
             ) from error
-        except (ValueError, LookupError, TypeError) as error:  # while reading what is no answer of a KServe server
+        except (ValueError, LookupError, TypeError) as error:  # the answer is not that of a KServe server
             raise errors.InferenceFailedError(f"{self.url}: the answer cannot be read: {error!r}") from error
 
     async def _answer(self, request: Callable[[Any], Awaitable[Answered]]) -> Answered:

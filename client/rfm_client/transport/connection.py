@@ -33,7 +33,7 @@ GRPC_OPTIONS: dict[str, int] = {
     "grpc.max_reconnect_backoff_ms": 2000,  # two minutes otherwise, when the server may long be back
     "grpc.keepalive_time_ms": PING_MS,
     "grpc.keepalive_timeout_ms": UNACKNOWLEDGED_MS,
-    "grpc.use_local_subchannel_pool": 1,  # else a new channel would go on with the connection of the old one
+    "grpc.use_local_subchannel_pool": 1,  # else a new channel would use the old one's connection
 }
 
 
@@ -79,7 +79,7 @@ class Connection:
         return self._closing is not None and self._closing.done()
 
     async def close(self) -> None:
-        """Closes it, whoever still uses it."""
+        """Closes the connection, even if calls still use it."""
         if self._closing is None:
             self._closing = asyncio.create_task(self.client.close())
         await self._closing

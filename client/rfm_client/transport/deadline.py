@@ -17,7 +17,7 @@ MAX_TIMEOUT_S = 1e9  # more than thirty years; Triton counts nanoseconds, and co
 
 
 def check_timeout(timeout_s: float) -> None:
-    """Raises ValueError for what is no time that a call may take. An endless wait is none: servers can hang."""
+    """Raises ValueError for a time limit that a call may not have. It may not wait for ever: servers can hang."""
     if not 0 < timeout_s <= MAX_TIMEOUT_S:  # nor NaN
         expected = f"a number of seconds above 0 and at most {MAX_TIMEOUT_S:g}"
         raise ValueError(f"timeout_s: expected {expected}, got {timeout_s}")

@@ -2,7 +2,7 @@
 """A host name that several gRPC servers share, as a headless Service of Kubernetes: each address is a server.
 
 gRPC by itself keeps to one address of a name, or with round_robin looks the name up again only when a connection ends,
-so that servers which are added later would stay idle. And whoever retries must know which server has been tried.
+so that servers which are added later would stay idle. And a retry must know which server has been tried.
 """
 
 from __future__ import annotations

@@ -98,7 +98,7 @@ class Server:
         return self._closing is not None and self._closing.done()
 
     async def close(self) -> None:
-        """Closes the connection, whoever still uses it."""
+        """Closes the connection, even if calls still use it."""
         self.is_gone = True
         if self.comeback is not None:
             self.comeback.cancel()

@@ -146,7 +146,7 @@ class Servers:
                 with server.request_under_way():
                     answer = await request(server.transport, left_s)
                 server.failures = 0
-                for other in refusals:  # not before: what all refuse is no fault of one
+                for other in refusals:  # not before: a request that all refuse is not one server's fault
                     self._leave_out(other, model)
                 return answer
             except DeadlineExceededError as error:  # perhaps it hangs
@@ -160,7 +160,7 @@ class Servers:
                 if only or refusals.keys() >= set(self._servers):
                     break
             except ServerUnavailableError as error:
-                self._note(server, model, error)
+                self._record_failure(server, model, error)
                 if isinstance(error, ProcessEndedError) and only is None and len(self._servers) > 1:
                     raise _EndedAtError(server, error) from error
                 busy = {server, *refusals}
@@ -193,7 +193,7 @@ class Servers:
 
         return min(self._servers, key=rank)
 
-    def _note(self, server: Server, model: str, error: ServerUnavailableError) -> None:
+    def _record_failure(self, server: Server, model: str, error: ServerUnavailableError) -> None:
         """Records that a server does not answer, and leaves it out."""
         if not server.failures and self._retry:
             logger.warning("%s: trying again: %s", server.transport.url, error)

@@ -60,7 +60,7 @@ class RegionServer(Protocol):
         """The server unmaps the memory ``name``, if no request uses it."""
 
     async def registered_regions(self) -> list[str]:
-        """Names of the regions that the server maps, whoever made them."""
+        """Names of the regions that the server maps, of all clients."""
 
 
 class Region:
