@@ -63,7 +63,7 @@ class BatchModel(Generic[Question, Answer]):
         self._self_check = SelfCheck(self._score_blank, self._log.report_end)
         self._blank_tensors = blank_question(config)
         warmups = config.get("model_warmup", [])
-        num_warmups = sum(max(warmup.get("count", 1), 1) for warmup in warmups)
+        num_warmups = sum(max(warmup.get("count", 0), 1) for warmup in warmups)
         self._origins = Origins(num_warmups, digest(self._blank_tensors))
 
     def finalize(self) -> None:

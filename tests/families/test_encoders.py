@@ -246,6 +246,16 @@ def test_saving_and_loading_changes_nothing(encoders: Encoders, tmp_path: Path) 
     np.testing.assert_array_equal(copy.encode_tasks(["lift the cup"]), encoders.encode_tasks(["lift the cup"]))
 
 
+def test_what_an_export_saves_is_loaded_from_its_folder(encoders: Encoders, tmp_path: Path) -> None:
+    encoders.save(tmp_path)
+    film = Footage([Trajectory(frames=np.full((2, 40, 48, 3), 7, np.uint8), task="lift")])
+    (before,), (after,) = (made.encode([film], Execution()) for made in (encoders, Encoders.load(tmp_path)))
+    assert isinstance(before, Trajectory)
+    assert isinstance(after, Trajectory)
+    np.testing.assert_array_equal(before.positions, after.positions)
+    assert Encoders.describe(tmp_path) == encoders.description
+
+
 def test_a_checkpoints_own_encoder_weights_win(encoders: Encoders) -> None:
     config = goldens.config(NAME)
     assert config.image_encoder is not None

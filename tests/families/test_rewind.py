@@ -401,3 +401,12 @@ def test_only_discrete_progress_has_logits_and_they_are_those_of_the_progress(
         assert result.progress_logits.shape == (3, 10)
         expected = progress_from_logits(torch.from_numpy(result.progress_logits))
         np.testing.assert_allclose(result.progress, expected.numpy(), rtol=0, atol=TOLERANCE)
+
+
+def test_the_network_scores_each_frame_and_no_padding_behind_the_last() -> None:
+    network = RewindTransformer(BASE).eval()
+    collator = RewindCollator(BASE)
+    rows = collator.rows(ProgressSample(random_trajectory(0, 3, BASE.video_feature_dim, BASE.text_feature_dim)))
+    with torch.inference_mode():
+        output = network(collator.collate(rows))
+    assert (len(output.progress), len(output.success), len(output.query)) == (3, 3, 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import re
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -156,6 +157,14 @@ def test_a_spoiled_checkpoint_is_refused(
     spoil(folder)
     with pytest.raises(CheckpointError, match=message):
         load(name, folder).build()
+
+
+def test_an_adapter_s_base_model_is_the_one_of_its_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = goldens.config(ADAPTER)
+    run = yaml.safe_load((config.checkpoint / "config.yaml").read_text())
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    with pytest.raises(CheckpointError, match=re.escape(f"base model {run['model']['base_model_id']}: ")):
+        families.load(config.checkpoint)
 
 
 def test_an_adapter_whose_base_model_is_missing_is_refused(copied: Callable[[str], Path]) -> None:

@@ -268,3 +268,20 @@ def test_pairs_are_counted_with_all_their_frames(tmp_path: Path) -> None:
     (counted,) = model.counted
     assert counted.samples == {("preference", "scored"): 1}
     assert counted.num_frames == 12
+
+
+@pytest.mark.parametrize("kind", [None, InvalidSampleError, InferenceFailedError])
+def test_only_a_refusal_of_the_blank_sample_is_no_failure(tmp_path: Path, kind: type[RewardError] | None) -> None:
+    """A checkpoint may refuse blank frames; an instance that fails at them is broken."""
+
+    class Blank(Model):
+        def answer(self, questions: Sequence[Sample], execution: Execution) -> list[Result | RewardError]:
+            score = np.zeros(questions[0].trajectories[0].num_frames, np.float32)
+            return [ProgressResult(progress=score, success=score) if kind is None else kind("made up")]
+
+    model = Blank(tmp_path)
+    if kind is InferenceFailedError:
+        with pytest.raises(InferenceFailedError, match="made up"):
+            model._score_blank()
+    else:
+        model._score_blank()
