@@ -41,7 +41,7 @@ app = typer.Typer(
 
 Config = Annotated[Path | None, typer.Option(help="YAML file of a ServeConfig; options given here win over it.")]
 BaseModel = Annotated[
-    str | None, typer.Option(help="Folder or id of a vision-language checkpoint's base model; else as it says itself.")
+    str | None, typer.Option(help="Folder or id of a vision-language checkpoint's base model; else the one that it names.")
 ]
 Repository = Annotated[Path, typer.Option(help="Triton model repository.")]
 TritonPath = Annotated[
@@ -87,7 +87,7 @@ def export(
             differences = rfm_export.check(repository, serve)
             if differences:
                 _fail("\n".join(differences))
-            typer.echo(f"{repository}: as generated")
+            typer.echo(f"{repository}: every generated file is as an export would write it")
             return
         if serve.model_path is None:
             _fail("--checkpoint: expected a checkpoint, here or as model_path in --config, got none")
@@ -107,7 +107,7 @@ def serve(
     grpc_port: Annotated[int | None, typer.Option(help="gRPC port (8001).")] = None,
     metrics_port: Annotated[int | None, typer.Option(help="Port of the Prometheus metrics (8002).")] = None,
     gateway_port: Annotated[
-        int | None, typer.Option(help="Port of the FastAPI evaluation server's endpoints, too (see rfm gateway).")
+        int | None, typer.Option(help="Serve the FastAPI evaluation server's endpoints, too, on this port (see rfm gateway).")
     ] = None,
     status_port: Annotated[
         int | None, typer.Option(help="Port of rfm serve's own state: /live, /ready and /metrics.")
@@ -125,7 +125,7 @@ def serve(
     ] = None,
     accept_known_vulnerabilities: Annotated[
         bool,
-        typer.Option("--accept-known-vulnerabilities", help="Let others reach a Triton that is known to have some."),
+        typer.Option("--accept-known-vulnerabilities", help="Let other machines reach a Triton with known vulnerabilities."),
     ] = False,
     tritonserver: TritonPath = None,
     more_arguments: Annotated[
@@ -197,9 +197,9 @@ def tune(
     repository: Repository,
     output: Annotated[Path, typer.Option(help="YAML file for the best settings, for rfm export --config.")],
     config: Config = None,
-    callers: Annotated[int, typer.Option(min=1, help="At a time, with one sample each.")] = 32,
+    callers: Annotated[int, typer.Option(min=1, help="Callers at a time, each with one sample.")] = 32,
     frames: Annotated[bool, typer.Option("--frames", help="Send raw frames instead of embeddings.")] = False,
-    seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement.")] = 3.0,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Seconds that each measurement takes.")] = 3.0,
     rounds: Annotated[int, typer.Option(min=1, help="How often each setting is measured.")] = 3,
     tritonserver: TritonPath = None,
 ) -> None:

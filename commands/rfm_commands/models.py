@@ -89,7 +89,7 @@ def unload(
     url: Url = DEFAULT_URL,
     admin_key_file: AdminKeyFile = None,
 ) -> None:
-    """Serve NAME no more, once the requests in flight are answered. Its files stay."""
+    """Stop serving NAME when the requests in flight are answered. Its files stay."""
     with _server(context, url, admin_key_file) as server:
         for model in reversed(models_of(repository, name)):
             server.unload(model)

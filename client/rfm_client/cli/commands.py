@@ -38,7 +38,7 @@ NumFrames = Annotated[
     str, typer.Option(metavar="N|N,M,...|N-M", help="Frames of a trajectory: one length, several or a range, in turn.")
 ]
 UseFrames = Annotated[bool, typer.Option("--use-frames", help="Random frames instead of embeddings.")]
-Seed = Annotated[int, typer.Option(min=0, help="Of the random numbers.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")]
 
 
 def _print_version(is_wanted: bool) -> None:

@@ -63,7 +63,7 @@ CaFile = Annotated[
     Path | None, typer.Option(envvar="RFM_CA_FILE", help="Authorities (PEM) to trust; else the system's.")
 ]
 ClientCertificate = Annotated[
-    Path | None, typer.Option(envvar="RFM_CLIENT_CERTIFICATE", help="By which a server knows this client (PEM).")
+    Path | None, typer.Option(envvar="RFM_CLIENT_CERTIFICATE", help="Certificate that this client shows to the server (PEM).")
 ]
 ClientKey = Annotated[Path | None, typer.Option(envvar="RFM_CLIENT_KEY", help="The certificate's key (PEM).")]
 ApiKeyFile = Annotated[
@@ -83,7 +83,7 @@ Plot = Annotated[
 Task = Annotated[str, typer.Option("--task", help="What is to be done, as a sentence.")]
 Fps = Annotated[float, typer.Option("--fps", min=0.001, help="Frames a second that are taken from a video.")]
 Subsample = Annotated[
-    bool, typer.Option(help="Score at most as many frames, evenly, as the checkpoint was trained on; or all.")
+    bool, typer.Option(help="Score no more frames than the checkpoint was trained on, evenly spaced; else all.")
 ]
 MaxFrames = Annotated[int | None, typer.Option(min=1, help="Score at most so many frames, evenly.")]
 Resize = Annotated[bool, typer.Option("--resize", help="Make frames as small as the checkpoint reads them, then send.")]
