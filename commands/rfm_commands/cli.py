@@ -41,7 +41,8 @@ app = typer.Typer(
 
 Config = Annotated[Path | None, typer.Option(help="YAML file of a ServeConfig; options given here win over it.")]
 BaseModel = Annotated[
-    str | None, typer.Option(help="Folder or id of a vision-language checkpoint's base model; else the one that it names.")
+    str | None,
+    typer.Option(help="Folder or id of a vision-language checkpoint's base model; else the one that it names."),
 ]
 Repository = Annotated[Path, typer.Option(help="Triton model repository.")]
 TritonPath = Annotated[
@@ -107,7 +108,8 @@ def serve(
     grpc_port: Annotated[int | None, typer.Option(help="gRPC port (8001).")] = None,
     metrics_port: Annotated[int | None, typer.Option(help="Port of the Prometheus metrics (8002).")] = None,
     gateway_port: Annotated[
-        int | None, typer.Option(help="Serve the FastAPI evaluation server's endpoints, too, on this port (see rfm gateway).")
+        int | None,
+        typer.Option(help="Serve the FastAPI evaluation server's endpoints, too, on this port (see rfm gateway)."),
     ] = None,
     status_port: Annotated[
         int | None, typer.Option(help="Port of rfm serve's own state: /live, /ready and /metrics.")
@@ -125,7 +127,9 @@ def serve(
     ] = None,
     accept_known_vulnerabilities: Annotated[
         bool,
-        typer.Option("--accept-known-vulnerabilities", help="Let other machines reach a Triton with known vulnerabilities."),
+        typer.Option(
+            "--accept-known-vulnerabilities", help="Let other machines reach a Triton with known vulnerabilities."
+        ),
     ] = False,
     tritonserver: TritonPath = None,
     more_arguments: Annotated[

@@ -63,7 +63,8 @@ CaFile = Annotated[
     Path | None, typer.Option(envvar="RFM_CA_FILE", help="Authorities (PEM) to trust; else the system's.")
 ]
 ClientCertificate = Annotated[
-    Path | None, typer.Option(envvar="RFM_CLIENT_CERTIFICATE", help="Certificate that this client shows to the server (PEM).")
+    Path | None,
+    typer.Option(envvar="RFM_CLIENT_CERTIFICATE", help="Certificate that this client shows to the server (PEM)."),
 ]
 ClientKey = Annotated[Path | None, typer.Option(envvar="RFM_CLIENT_KEY", help="The certificate's key (PEM).")]
 ApiKeyFile = Annotated[
