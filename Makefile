@@ -141,4 +141,4 @@ $(INSTALLED): pyproject.toml client/pyproject.toml gateway/pyproject.toml constr
 
 # Remove what make has made.
 clean:
-	rm -rf $(VENV) build client/build demo_output
+	rm -rf $(VENV) build client/build gateway/build demo_output

@@ -1,11 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Upstream's checkpoint layouts -> configuration and weights.
-
-A checkpoint is a local folder or a Hugging Face id ``org/name[@tag]``. In it: ``model.safetensors`` (or shards
-with an index, or an adapter), ``config.json`` (the network) and, in the folder, its parent or on main of the Hub's
-repository, ``config.yaml`` (the training run). Nothing in a checkpoint is executed: safetensors only, and YAML tags
-construct nothing.
-"""
+"""Which family a checkpoint is of: found by its name, or by its files; loaded and checked."""
 
 from __future__ import annotations
 
@@ -42,6 +36,8 @@ def named(package: str) -> Family:
         raise CheckpointError(f"family: expected a package that can be imported, got {package}: {error}") from error
     if not isinstance(family, Family):
         raise CheckpointError(f"family: expected a package with a FAMILY, got {package}")
+    if family.name != package:
+        raise CheckpointError(f"family: expected the name of its package, {package}, got {family.name}")
     return family
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Names of the parameters in config.pbtxt that a model process reads."""
+"""Names of the parameters in config.pbtxt that rfm_export writes and a model process reads."""
 
-THREADS_PARAMETER = "torch_threads"  # parameters of config.pbtxt; rfm_export writes them
+THREADS_PARAMETER = "torch_threads"
 BUDGET_PARAMETER = "token_budget"
 SAMPLE_TOKENS_PARAMETER = "max_sample_tokens"
 FAMILY_PARAMETER = "family"  # the package of its checkpoint's family

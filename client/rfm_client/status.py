@@ -153,8 +153,8 @@ def read_status(
     except InferenceServerException as error:
         if triton.is_denied(str(error.status()), error.message() or ""):
             raise AccessDeniedError(f"{url}: access denied: {error.message()}") from error
-        in_time = "DEADLINE_EXCEEDED" not in str(error.status())
-        kind = ServerUnavailableError if in_time else DeadlineExceededError
+        is_late = str(error.status()) in triton.OUT_OF_TIME
+        kind = DeadlineExceededError if is_late else ServerUnavailableError
         raise kind(f"{url}: {error.message()}") from error
     except TimeoutError as error:
         raise DeadlineExceededError(f"{url}: no answer within {timeout_s:g} s") from error

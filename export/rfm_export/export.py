@@ -111,9 +111,13 @@ def _verify(source: _Source, version: Version, staged: Path) -> None:
         engine = partial(Engine.of, device="cuda" if on_gpu else "cpu", dtype=serve.torch_dtype)
 
     def exported() -> Engine:
-        checkpoint = source.family.load(_checkpoint_folder(description, version, staged), Options())
-        encoders = None if source.encoders is None else type(source.encoders).load(_encoders_folder(version, staged))
-        return engine(checkpoint, encoders=encoders)
+        checkpoint = families.named(source.family.name).load(
+            _checkpoint_folder(description, version, staged), Options()
+        )
+        if source.encoders is None:
+            return engine(checkpoint)
+        served_by = families.encoders_of(source.family.name)
+        return engine(checkpoint, encoders=served_by.load(_encoders_folder(version, staged)))
 
     samples = probes(description, with_encoders=source.encoders is not None)
     verify(lambda: engine(source.checkpoint, encoders=source.encoders), exported, samples)

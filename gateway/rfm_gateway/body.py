@@ -31,8 +31,7 @@ NPY_ENDPOINT = "/evaluate_batch_npy"
 MAX_PARTS = 10_000  # files, and fields, of one multipart request
 MAX_SAMPLES = 10_000  # of one request
 MAX_JSON_BYTES = 32 * 2**20  # arrays have a better way
-JSON_GROWTH = 32  # times as large is JSON of numbers, at the most, when it is read: see parsed_bytes
-READ_JSON_GROWTH = 5  # times as large it is usually: what waits for room before it is read
+READ_JSON_GROWTH = 5  # times as large as its text is JSON usually when it is read: what waits for room before that
 CHARSETS = ("utf-8", "utf8", "us-ascii", "ascii", "iso-8859-1", "iso8859-1", "latin-1", "latin1")
 
 _NUMBER_BYTES, _LIST_BYTES, _TEXT_BYTES, _OBJECT_BYTES = 48, 88, 96, 208  # what Python takes for one, at the most

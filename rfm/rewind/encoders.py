@@ -187,10 +187,8 @@ class Encoders:
                 if sum(map(len, waiting)) + len(images) > IMAGES_PER_FORWARD:
                     yield torch.cat(waiting)
                     waiting = []
-                with execution.collating():
-                    waiting.append(
-                        self.preprocessor(images)
-                    )  # on the CPU: torch resizes uint8 with antialiasing only there
+                with execution.collating():  # on the CPU: torch resizes uint8 with antialiasing only there
+                    waiting.append(self.preprocessor(images))
         yield torch.cat(waiting)
 
     def _check_task(self, task: str) -> None:

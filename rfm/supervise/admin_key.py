@@ -14,7 +14,9 @@ import stat
 from collections.abc import Mapping, MutableMapping
 from pathlib import Path
 
-VARIABLE = "RFM_ADMIN_KEY"
+from rfm_client.contract.names import ADMIN_KEY_VARIABLE
+
+VARIABLE = ADMIN_KEY_VARIABLE
 HEADER = "rfm-admin-key"
 MIN_CHARACTERS = 16
 

@@ -12,7 +12,10 @@ Result = TypeVar("Result")
 
 
 def in_background(name: str, call: Callable[[], Result]) -> Future[Result]:
-    """The future of a call that begins now. Nobody waits for it when the process ends, as a pool would."""
+    """The future of a call that begins now. Nobody waits for it when the process ends, as a pool would.
+
+    The future raises what the call raises, and OSError if no thread can be started.
+    """
     future: Future[Result] = Future()
 
     def run() -> None:
@@ -21,5 +24,8 @@ def in_background(name: str, call: Callable[[], Result]) -> Future[Result]:
         except Exception as error:  # noqa: BLE001  it is raised where the result is read
             future.set_exception(error)
 
-    threading.Thread(target=run, name=name, daemon=True).start()
+    try:
+        threading.Thread(target=run, name=name, daemon=True).start()
+    except RuntimeError as error:  # this machine has no room for a thread now
+        future.set_exception(OSError(str(error)))
     return future

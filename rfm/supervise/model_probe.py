@@ -21,7 +21,7 @@ from tritonclient.utils import np_to_triton_dtype
 
 from rfm.probe import blank_question
 from rfm.supervise.background import in_background
-from rfm.supervise.http import NO_ANSWER, Http
+from rfm.supervise.http import Http
 from rfm.supervise.model_states import Event
 from rfm_client.contract import triton, wire
 from rfm_client.contract.names import PROBE_PREFIX
@@ -101,11 +101,10 @@ class ModelProbe:
     def _look_at_stats(self) -> None:
         """Reads Triton's counts of answered requests: a model that answers others is not hung."""
         if self._stats is not None and self._stats.done():
-            try:
-                successes = self._stats.result()
-            except NO_ANSWER:
+            if self._stats.exception() is not None:
                 self._has_stats = False
             else:
+                successes = self._stats.result()
                 if self._successes is not None and successes != self._successes:
                     self._last_success_s = time.monotonic()
                 self._successes, self._has_stats = successes, True
@@ -127,10 +126,9 @@ class ModelProbe:
 
     def _take(self, probe: Future[Reply]) -> None:
         """Records a reply. Without one, or with one that is not the model's, the probe stays open."""
-        try:
-            reply = probe.result()
-        except NO_ANSWER:
+        if probe.exception() is not None:
             return
+        reply = probe.result()
         self._body = reply.body
         known = self._event_of(reply)
         if known is not None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What becomes of a served model: its states, what can happen to it, and what is done then. The table is all of it.
 
-Nothing here waits, asks or starts anything. ``served_model`` feeds the events and does the actions.
+Nothing here waits, requests or starts anything. ``model_watch`` feeds the events and does the actions.
 """
 
 from __future__ import annotations

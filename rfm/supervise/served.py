@@ -26,7 +26,7 @@ from collections.abc import Callable, Mapping
 
 from rfm.supervise.http import Http
 from rfm.supervise.model_probe import ModelProbe, can_be_probed
-from rfm.supervise.model_processes import StubWatch
+from rfm.supervise.model_processes import Stub, StubWatch
 from rfm.supervise.model_states import State
 from rfm.supervise.model_watch import ServedModel
 from rfm.supervise.process import TritonServer
@@ -71,7 +71,7 @@ class Served:
         self._models: dict[str, ServedModel] = {}  # those that have processes of ours, and ensembles that were restored
         self._leaving: set[str] = set()
         self._looked_s = 0.0
-        self._num_refused: dict[int, int] = {}  # by process
+        self._num_refused: dict[Stub, int] = {}
         self._killed: dict[int, str] = {}  # processes that hung, and how
         for name, config in restored.items():
             self._models[name] = self._new_model(name, config)
@@ -183,8 +183,8 @@ class Served:
         for stub in self._stubs.all:
             journal = stub.journal
             if journal is not None:
-                self._status.poison_refused.inc(journal.num_refused - self._num_refused.get(stub.pid, 0))
-                self._num_refused[stub.pid] = journal.num_refused
+                self._status.poison_refused.inc(journal.num_refused - self._num_refused.get(stub, 0))
+                self._num_refused[stub] = journal.num_refused
 
 
 def _parts(config: Config) -> list[tuple[str, int]]:

@@ -100,16 +100,19 @@ class TritonWatch:
         self._silent_since_s: float | None = None
         self._failed_looks = 0
         self._look: Future[Look] | None = None
+        self._looked_s = 0.0
         self._due_s = 0.0
         self.snapshot: Snapshot | None = None  # the latest
 
     def look(self) -> None:
         """Takes in the result of the last look, and begins the next one when it is due."""
         if self._look is not None and self._look.done():
-            self._take(self._look.result())
+            failed = self._look.exception() is not None  # no thread, or no memory: it was no look
+            self._take(Look(self._looked_s, is_answered=False) if failed else self._look.result())
             self._look = None
         if self._look is None and time.monotonic() >= self._due_s:
-            self._due_s = time.monotonic() + INTERVAL_S
+            self._looked_s = time.monotonic()
+            self._due_s = self._looked_s + INTERVAL_S
             self._look = in_background("rfm-triton-watch", self._looked)
 
     @property

@@ -7,12 +7,6 @@ when their batch last made progress, by which a hung process is known. The journ
 The next process of the model reads the journals of dead ones. A request in one of them is a suspect. It is worked on
 alone from then on, so that no other request is blamed for it. A suspect that the process survives is cleared. One that
 was there twice when a process died is refused for QUARANTINE_S.
-
-Each model process keeps a journal, a small file in shared memory, of the batch that it is working on, and of when that
-batch last got on, by which a process that hangs is known. The journal outlives the process. The next process of the
-model reads the journals of the dead: what stands in one is a suspect, which is worked on alone from then on, so that no
-neighbour is blamed for it. A suspect that the process survives is cleared. One that was there twice when a
-process died is refused for QUARANTINE_S.
 """
 
 from __future__ import annotations

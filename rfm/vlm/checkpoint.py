@@ -110,17 +110,19 @@ class VlmCheckpoint:
         """
         if dtype is None and device.type == "cpu":
             dtype = torch.float32
-        return VlmPredictor(self.build(dtype), self.collator, device)
+        collator = self.collator  # first: what is missing is reported before the weights are read
+        return VlmPredictor(self.build(dtype), collator, device)
 
     def save(self, folder: Path) -> None:
         """Writes merged weights, one config.json that says all, and the processor."""
+        collator = self.collator  # first: what is missing is reported before the weights are written
         folder.mkdir(parents=True)
         settings = {name: value for name, value in asdict(self.config).items() if name != "backbone"}
         config = {**self.config.backbone, SETTINGS: settings}
         (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
         tensors = {name: tensor.contiguous() for name, tensor in self.weights.items()}
         save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
-        save_processor(self.collator, folder / PROCESSOR_FOLDER)
+        save_processor(collator, folder / PROCESSOR_FOLDER)
 
     def build(self, dtype: torch.dtype | None = None, attention: str | None = None) -> VlmRewardModel:
         """The network with these weights, on the CPU, ready to score, in ``dtype`` (None: its own)."""

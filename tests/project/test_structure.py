@@ -165,7 +165,7 @@ def test_a_package_exports_all_that_it_imports_for_its_users(package: str) -> No
 def test_files_say_their_licence() -> None:
     files = [
         file
-        for part in ("client", "gateway", "rfm", "export", "commands", "examples", "tests")
+        for part in ("client", "gateway", "rfm", "export", "commands", "examples", "benchmarks", "tests", "tools")
         for file in (ROOT / part).rglob("*.py")
     ]
     assert files

@@ -296,5 +296,13 @@ def _print(*tables: object) -> None:
     console.print(*tables, sep="\n")
 
 
-for _command in entry_points(group="rfm_client.commands"):  # of other distributions: rfm-gateway
-    app.command(_command.name, cls=OneLineCommand)(_command.load())
+def _add_gateway() -> None:
+    """Adds the command of the distribution rfm-gateway, if it is installed. Its fault is no other command's."""
+    for found in entry_points(group="rfm_client.commands", name="gateway"):
+        try:
+            app.command(found.name, cls=OneLineCommand)(found.load())
+        except ImportError as error:
+            options.report(f"note: the gateway cannot be used: {error}")
+
+
+_add_gateway()
