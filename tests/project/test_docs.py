@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
 import re
 import shlex
@@ -237,6 +238,32 @@ def test_every_tensor_of_the_contract_is_documented() -> None:
     specs = (*wire.embedding_inputs(1, 1), *wire.frame_inputs(), *wire.score_outputs(10))
     for spec in specs:
         assert f"| `{spec.name}` |" in contract
+
+
+def shown_request() -> dict[str, Any]:
+    (text,) = re.findall(r"^```json\n(.*?)^```", CONTRACT.read_text(), re.MULTILINE | re.DOTALL)
+    request: dict[str, Any] = json.loads(text)
+    return request
+
+
+def test_the_request_of_the_contract_is_one_of_two_samples() -> None:
+    types = {"UINT8": np.uint8, "INT32": np.int32, "BYTES": np.object_}
+    tensors = {
+        tensor["name"]: np.array(tensor["data"], types[tensor["datatype"]]).reshape(tensor["shape"])
+        for tensor in shown_request()["inputs"]
+    }
+    assert {spec.name for spec in wire.frame_inputs() if not spec.optional} == set(tensors)
+    first, second = wire.decode_samples(tensors)
+    assert isinstance(first, ProgressSample)
+    assert isinstance(second, PreferenceSample)
+    assert [trajectory.num_frames for trajectory in (*first.trajectories, *second.trajectories)] == [3, 1, 1]
+
+
+def test_the_request_of_the_contract_runs(demo_server: Endpoints) -> None:
+    answer = httpx.post(f"{demo_server.http_url}/v2/models/rfm_frames/infer", json=shown_request(), timeout=60)
+    assert answer.status_code == 200, answer.text
+    outputs = {output["name"]: output for output in answer.json()["outputs"]}
+    assert outputs["progress"]["shape"] == [2, 3]
 
 
 def test_every_key_of_the_configuration_is_documented() -> None:
