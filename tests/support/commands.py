@@ -62,7 +62,7 @@ def is_ours(pid: int) -> bool:
     """Whether the process inherited what conftest.py wrote into the environment."""
     try:
         return f"{RUN}={os.environ[RUN]}" in Path("/proc", str(pid), "environ").read_text().split("\0")
-    except (FileNotFoundError, ProcessLookupError):
+    except (FileNotFoundError, PermissionError, ProcessLookupError):  # it has ended, or is another user's
         return False
 
 
