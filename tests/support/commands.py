@@ -59,7 +59,9 @@ def tritons() -> set[int]:
 
 
 def is_ours(pid: int) -> bool:
-    """Whether the process inherited what conftest.py wrote into the environment."""
+    """Whether it is this process, or inherited what conftest.py wrote into the environment."""
+    if pid == os.getpid():
+        return True
     try:
         return f"{RUN}={os.environ[RUN]}" in Path("/proc", str(pid), "environ").read_text().split("\0")
     except (FileNotFoundError, PermissionError, ProcessLookupError):  # it has ended, or is another user's
