@@ -406,7 +406,8 @@ def test_only_discrete_progress_has_logits_and_they_are_those_of_the_progress(
 def test_the_network_scores_each_frame_and_no_padding_behind_the_last() -> None:
     network = RewindTransformer(BASE).eval()
     collator = RewindCollator(BASE)
-    rows = collator.rows(ProgressSample(random_trajectory(0, 3, BASE.video_feature_dim, BASE.text_feature_dim)))
+    trajectory = random_trajectory(0, 11, BASE.video_feature_dim, BASE.text_feature_dim)
+    rows = collator.rows(ProgressSample(trajectory, frame_steps=3))
     with torch.inference_mode():
         output = network(collator.collate(rows))
-    assert (len(output.progress), len(output.success), len(output.query)) == (3, 3, 0)
+    assert (len(output.progress), len(output.success), len(output.query)) == (33, 33, 0)
