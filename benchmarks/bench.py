@@ -29,9 +29,10 @@ from load import SHARED_MEMORY, Load
 from rich.console import Console
 
 import rfm_export
-from rfm.config import ServeConfig
+from rfm.config import ExportConfig
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindConfig, RewindTransformer
+from rfm_commands.config import Config
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -152,15 +153,15 @@ def checkpoint(size: str, folder: Path, threads: int) -> Checkpoint:
         versions = DEMO / "rfm" / "1", DEMO / "rfm_encoder" / "1"
         source, encoders = versions[0] / "checkpoint", (versions[1] / "image_encoder", versions[1] / "text_encoder")
         images, texts = map(str, encoders)
-        serve = replace(ServeConfig.from_yaml(DEMO / "serve.yaml"), image_encoder=images, text_encoder=texts)
-        serve = replace(serve, torch_threads=max(1, threads // serve.instances))
+        settings = replace(Config.from_yaml(DEMO / "serve.yaml").export, image_encoder=images, text_encoder=texts)
+        settings = replace(settings, torch_threads=max(1, threads // settings.instances))
     else:
         torch.manual_seed(0)
         source, encoders = folder / size, None
         RewindCheckpoint(DEFAULT_SIZE, RewindTransformer(DEFAULT_SIZE).state_dict()).save(source)
-        serve = ServeConfig(num_gpus=0, torch_threads=threads)
-    rfm_export.export(source, repository, serve)
-    return Checkpoint(size, source, repository, serve.instances, serve.torch_threads, encoders)
+        settings = ExportConfig(num_gpus=0, torch_threads=threads)
+    rfm_export.export(source, repository, settings)
+    return Checkpoint(size, source, repository, settings.instances, settings.torch_threads, encoders)
 
 
 def machine() -> dict[str, object]:

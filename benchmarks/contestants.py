@@ -17,10 +17,11 @@ from pathlib import Path
 from load import SHARED_MEMORY, Load, Measured, samples
 
 from rfm.engine import Engine
+from rfm.launch.process import Endpoints
+from rfm.launch.temporary import temporary_server
 from rfm.rewind.encoders import Encoders
-from rfm.supervise.process import Endpoints
-from rfm.supervise.temporary import served
 from rfm_gateway.command import gateway_command
+from rfm_gateway.config import GatewayConfig
 
 PEER_SCRIPTS = {"FastAPI": "fastapi_server.py", "LitServe": "litserve_server.py", "mosec": "mosec_server.py"}
 START_S = 120
@@ -49,6 +50,11 @@ class Callers:
     def __init__(self, way: str, url: str, widths: tuple[int, int]) -> None:
         words = [sys.executable, str(HERE / "load.py"), way, url, *map(str, widths)]
         self._process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    @property
+    def pid(self) -> int:
+        """Id of the process."""
+        return self._process.pid
 
     def measure(self, load: Load) -> Measured:
         """Raises RuntimeError if the process ends."""
@@ -87,10 +93,11 @@ class BareEngine:
             before_s = time.perf_counter()
             self.engine.evaluate(batch)
             latencies_s.append(time.perf_counter() - before_s)
-        rate = len(latencies_s) * batch_size / (time.perf_counter() - started_s)
+        took_s = time.perf_counter() - started_s
+        rate = len(latencies_s) * batch_size / took_s
         in_order = sorted(latencies_s)
         p50_s, p99_s = in_order[len(in_order) // 2], in_order[int(len(in_order) * 0.99)]
-        return Measured(rate, 0, p50_s * 1e3, p99_s * 1e3)
+        return Measured(rate, 0, p50_s * 1e3, p99_s * 1e3, took_s)
 
 
 @contextmanager
@@ -100,9 +107,12 @@ def contestants(
     """Callers by name, of this server over each of its ways and of the peers, all of the same checkpoint."""
     log_folder.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
-        endpoints = stack.enter_context(served(checkpoint.repository, log_folder / f"triton_{checkpoint.name}.log"))
-        gateway_port, *peer_ports = _ports(1 + len(peers))
-        gateway = gateway_command(endpoints.grpc_url, endpoints.metrics_url, "rfm", "127.0.0.1", gateway_port)
+        endpoints = stack.enter_context(
+            temporary_server(checkpoint.repository, log_folder / f"triton_{checkpoint.name}.log")
+        )
+        gateway_port = Endpoints.free().http_port
+        config = GatewayConfig(gateway_port, triton=endpoints.grpc_url, metrics_url=endpoints.metrics_url)
+        gateway = gateway_command(config)
         stack.enter_context(_running(gateway, gateway_port, log_folder / f"gateway_{checkpoint.name}.log"))
         urls = {
             "gRPC": endpoints.grpc_url,
@@ -110,11 +120,10 @@ def contestants(
             SHARED_MEMORY: endpoints.grpc_url,
             "gateway": f"http://127.0.0.1:{gateway_port}",
         }
-        for peer, port in zip(peers, peer_ports, strict=True):
-            options = {"checkpoint": checkpoint.folder, "port": port, **_processes(peer, checkpoint)}
-            words = [f"--{name}={value}" for name, value in options.items()]
-            command = [sys.executable, str(HERE / "peers" / PEER_SCRIPTS[peer]), *words]
-            stack.enter_context(_running(command, port, log_folder / f"{peer}_{checkpoint.name}.log"))
+        for peer in peers:
+            options = {"checkpoint": checkpoint.folder, **_processes(peer, checkpoint)}
+            log = log_folder / f"{peer}_{checkpoint.name}.log"
+            port = stack.enter_context(running_peer(PEER_SCRIPTS[peer], options, log))
             ways = ["FastAPI, JSON", "FastAPI, npy"] if peer == "FastAPI" else [peer]
             urls |= dict.fromkeys(ways, f"http://127.0.0.1:{port}")
         callers = {}
@@ -131,12 +140,13 @@ def _processes(peer: str, checkpoint: Checkpoint) -> Mapping[str, int]:
     return {"threads": checkpoint.threads, "workers": checkpoint.instances}
 
 
-def _ports(count: int) -> list[int]:
-    """Free ones, which differ."""
-    ports: set[int] = set()
-    while len(ports) < count:
-        ports.add(Endpoints.free().http_port)
-    return list(ports)
+@contextmanager
+def running_peer(script: str, options: Mapping[str, object], log: Path) -> Iterator[int]:
+    """A peer with these options, from when it answers, and its port."""
+    port = Endpoints.free().http_port
+    words = [f"--{name}={value}" for name, value in {**options, "port": port}.items()]
+    with _running([sys.executable, str(HERE / "peers" / script), *words], port, log):
+        yield port
 
 
 @contextmanager

@@ -27,8 +27,8 @@ from contestants import BareEngine, Callers
 from load import Load, samples
 from rich.console import Console
 
-from rfm.supervise.installation import find_installation
-from rfm.supervise.temporary import served
+from rfm.launch.installation import find_installation
+from rfm.launch.temporary import temporary_server
 from rfm_client.cli.perf_input import write_perf_analyzer_input
 from rfm_client.cli.show import table
 
@@ -61,7 +61,7 @@ def main() -> None:
         measured = checkpoint(arguments.size, Path(folder), threads=0)
         bare = BareEngine(measured)
         rows = []
-        with served(measured.repository, Path(folder) / "triton.log") as endpoints, ExitStack() as stack:
+        with temporary_server(measured.repository, Path(folder) / "triton.log") as endpoints, ExitStack() as stack:
             callers = Callers("gRPC", endpoints.grpc_url, bare.widths)
             stack.callback(callers.close)
             for kind, load in KINDS.items():

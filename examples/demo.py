@@ -13,7 +13,7 @@ from typing import Annotated, NamedTuple
 import typer
 from rich.console import Console
 
-from rfm.supervise.temporary import served, stopped_by_signals
+from rfm.launch.temporary import stopped_by_signals, temporary_server
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Sample, SimilaritySample, Trajectory
 from rfm_client.cli.show import Panel, plot, scores_table
 from rfm_commands.demo import show_metrics
@@ -56,7 +56,7 @@ def demo(
     if url is not None:
         show_clips(url, Clips.of(seed), output / "rewards.png", console)
         return
-    with stopped_by_signals(), served(repository, output / "tritonserver.log") as endpoints:
+    with stopped_by_signals(), temporary_server(repository, output / "tritonserver.log") as endpoints:
         show_clips(endpoints.grpc_url, Clips.of(seed), output / "rewards.png", console)
         show_metrics(endpoints, console)
 

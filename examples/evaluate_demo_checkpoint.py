@@ -74,11 +74,11 @@ def _evaluator(
         with RewardClient(url) as client:
             yield client.evaluate
     else:
-        from rfm.supervise.temporary import served
+        from rfm.launch.temporary import temporary_server
 
         assert repository is not None  # one of the three is given
         with (
-            served(repository, log_folder / "tritonserver.log") as endpoints,
+            temporary_server(repository, log_folder / "tritonserver.log") as endpoints,
             RewardClient(endpoints.grpc_url) as client,
         ):
             yield client.evaluate

@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""ServeConfig: one YAML file -> one frozen dataclass -> config.pbtxt and the arguments of tritonserver."""
+"""What an export and a server are told: the sections ``export`` and ``serve`` of one YAML file.
+
+``rfm_commands.config`` reads that file.
+"""
 
 from __future__ import annotations
 
 import re
-import types
-import typing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from rfm.plain_yaml import read_yaml
-from rfm_client.contract.addresses import is_loopback
+from rfm_client.contract.addresses import MAX_PORT, is_loopback
+from rfm_client.contract.names import DEFAULT_MODEL
+from rfm_client.contract.settings import ConfigError, Settings, setting
 
 if TYPE_CHECKING:
     import torch
@@ -19,143 +21,63 @@ if TYPE_CHECKING:
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_TOKEN_BUDGET = 16_384
 DEFAULT_SAMPLE_TOKENS = 131_072
-MAX_PORT = 65_535
+DEFAULT_QUEUE_SIZE = 1024  # as many as a gateway lets wait
 MAX_OF_A_MACHINE = 4096  # GPUs, instances, threads
 MAX_INT32 = 2**31 - 1
 MAX_NAME = 100  # characters; it becomes the name of a folder
-_PORTS = ("server_port", "grpc_port", "metrics_port", "gateway_port", "status_port")
 _DTYPES = ("float32", "bfloat16", "float16")
-
-
-class ConfigError(Exception):
-    """A configuration that cannot be used: which file, which key, what was expected."""
+_COUNT = {"least": 1, "most": MAX_INT32}
+_PORT = {"least": 1, "most": MAX_PORT}
+_OF_A_MACHINE = {"most": MAX_OF_A_MACHINE}
 
 
 @dataclass(frozen=True)
-class ServeConfig:
-    """How a checkpoint is exported and served.
+class ExportConfig(Settings):
+    """What ``rfm export`` writes into a repository. To change it, export again."""
 
-    Keys of the FastAPI evaluation server:
-
-    model_path: the checkpoint; ``--checkpoint`` of ``rfm export``
-    num_gpus: GPUs to use, one instance of the model on each; null: all there are, the CPU if there are none; 0: the CPU
-    batch_size: of no effect, as in the original server, which never reads it; ``max_batch_size`` bounds a batch
-    max_workers: threads that read HTTP requests; null: Triton's choice. Batches need no workers here
-    server_url: address to listen on, with or without ``http://``
-    server_port: HTTP port
-
-    Keys of this server:
-
-    name: of the model in the repository; raw frames are scored by ``<name>_frames``
-    image_encoder, text_encoder: folders or Hugging Face ids of a ReWiND checkpoint's encoders
-    base_model: folder or id of a vision-language checkpoint's base model; else the one that the checkpoint names
-    resize_images: of a vision-language checkpoint that reads frames as images and whose run set
-        ``data.resized_height`` and ``data.resized_width``: whether it was trained with that size, as upstream's runs
-        were before 2026-01-21; null: such a checkpoint is refused
-    max_batch_size: the most samples of one batch, whoever sent them
-    dtype: float32, bfloat16 or float16 of the network (not of ReWiND's encoders); null: float32, and a vision-language
-        checkpoint's own on a GPU
-    token_budget: the most tokens, padding included, of one forward pass of several samples; a larger one runs alone
-    max_sample_tokens: the most tokens of one sample, in dense mode of one frame's; more are refused. It bounds memory
-    instances: of each model, on each GPU or on the CPU; ``rfm tune`` measures what serves fastest
-    torch_threads: CPU threads of each model instance; 0: on the CPU all instances of a model share its cores
-    grpc_port, metrics_port: Triton's other two ports
-    gateway_port: port of the gateway with the FastAPI evaluation server's endpoints; null: no gateway
-    status_port: port on which ``rfm serve`` reports its own state; null: it opens none
-    max_queue_size: requests that may wait for a model; more are refused at once; null: any number
-    queue_timeout_ms: the longest that a request may wait; then it is refused. A request may ask for less; null: any
-        time. With either, Triton 2.51 misses requests for half a second at a time where a model has one instance
-    grpc_certificate, grpc_key: files (PEM) to serve gRPC with TLS; HTTP, which Triton cannot encrypt, is then open on
-        127.0.0.1 alone
-    grpc_client_ca: file (PEM) of who may vouch for gRPC's clients, which then need a certificate
-    canary_s: seconds between two probes that ``rfm serve`` sends to a model
-    hang_s: how long a model may take to get one forward pass further, or answer nobody, before ``rfm serve`` loads it
-        anew
-    triton_silent_s: how long Triton may give no answer, to three looks in a row, before ``rfm serve`` restarts it
-    """
-
-    model_path: str | None = None
-    num_gpus: int | None = None
-    batch_size: int | None = None
-    max_workers: int | None = None
-    server_url: str = DEFAULT_HOST
-    server_port: int = 8000
-    name: str = "rfm"
-    image_encoder: str | None = None
-    text_encoder: str | None = None
-    base_model: str | None = None
-    resize_images: bool | None = None
-    max_batch_size: int = 64
-    dtype: str | None = None
-    token_budget: int = DEFAULT_TOKEN_BUDGET
-    max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS
-    instances: int = 1
-    torch_threads: int = 0
-    grpc_port: int = 8001
-    metrics_port: int = 8002
-    gateway_port: int | None = None
-    status_port: int | None = None
-    max_queue_size: int | None = None
-    queue_timeout_ms: int | None = None
-    grpc_certificate: str | None = None
-    grpc_key: str | None = None
-    grpc_client_ca: str | None = None
-    canary_s: int = 2
-    hang_s: int = 30
-    triton_silent_s: int = 10
+    checkpoint: str | None = setting(None, "Folder, or Hugging Face id org/name[@tag].")
+    name: str = setting(DEFAULT_MODEL, "Model name in the repository; raw frames are scored by NAME_frames.")
+    num_gpus: int | None = setting(
+        None, "GPUs, with as many instances on each; else all, or the CPU. 0: the CPU.", least=0, **_OF_A_MACHINE
+    )
+    instances: int = setting(1, "Of each model, on each GPU or on the CPU (see rfm tune).", least=1, **_OF_A_MACHINE)
+    torch_threads: int = setting(
+        0, "CPU threads of each instance. 0: the instances of a model share the cores.", least=0, **_OF_A_MACHINE
+    )
+    max_batch_size: int = setting(64, "Most samples of one batch, over all callers.", **_COUNT)
+    token_budget: int = setting(
+        DEFAULT_TOKEN_BUDGET, "Most tokens, with padding, of one forward pass of several samples.", **_COUNT
+    )
+    max_sample_tokens: int = setting(
+        DEFAULT_SAMPLE_TOKENS, "Most tokens of one sample, in dense mode of one frame's; it bounds memory.", **_COUNT
+    )
+    dtype: str | None = setting(
+        None, "float32, bfloat16 or float16 of the network; else as checkpoint and device decide.", one_of=_DTYPES
+    )
+    image_encoder: str | None = setting(None, "Folder or id of ReWiND's image encoder.")
+    text_encoder: str | None = setting(None, "Folder or id of ReWiND's text encoder.")
+    base_model: str | None = setting(
+        None, "Folder or id of a vision-language checkpoint's base model; else the one that it names."
+    )
+    resize_images: bool | None = setting(
+        None, "Whether a multi-image checkpoint was trained at its run's data.resized_height and _width."
+    )
+    max_queue_size: int | None = setting(
+        DEFAULT_QUEUE_SIZE, "Requests that may wait for a model; more are rejected at once. null: any number.", **_COUNT
+    )
+    queue_timeout_ms: int | None = setting(
+        None, "Longest that a request waits before it is rejected, if it asks for no less; else any time.", **_COUNT
+    )
+    batch_size: int | None = setting(
+        None, "Of no effect, as in the FastAPI server; max_batch_size bounds a batch.", least=1, has_option=False
+    )
 
     def __post_init__(self) -> None:
-        _at_least(1, self, "batch_size", "max_batch_size", "max_workers", "instances", *_PORTS)
-        _at_least(1, self, "token_budget", "max_sample_tokens")
-        _at_least(1, self, "max_queue_size", "queue_timeout_ms", "canary_s", "hang_s", "triton_silent_s")
-        _at_least(0, self, "num_gpus", "torch_threads")
-        _at_most(MAX_OF_A_MACHINE, self, "num_gpus", "instances", "torch_threads", "max_workers")
-        _at_most(MAX_INT32, self, "max_batch_size", "token_budget", "max_sample_tokens")
-        _at_most(MAX_INT32, self, "max_queue_size", "queue_timeout_ms")
-        if self.dtype not in (None, *_DTYPES):
-            raise ConfigError(f"dtype: expected one of {', '.join(_DTYPES)} or null, got {self.dtype!r}")
-        ports = {name: getattr(self, name) for name in _PORTS if getattr(self, name) is not None}
-        if max(ports.values()) > MAX_PORT or len(set(ports.values())) < len(ports):
-            raise ConfigError(f"ports: expected different ones up to {MAX_PORT}, got {ports}")
-        if (self.grpc_certificate is None) != (self.grpc_key is None):
-            raise ConfigError("grpc_certificate, grpc_key: expected both or none, got one")
-        if self.grpc_client_ca is not None and self.grpc_certificate is None:
-            raise ConfigError("grpc_client_ca: expected with grpc_certificate and grpc_key, got it alone")
-        if ":" in self.host:
-            raise ConfigError(f"server_url: expected an address without port (server_port), got {self.server_url!r}")
+        super().__post_init__()
         if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_-]*", self.name):
-            raise ConfigError(f"name: expected letters, digits, _ and -, got {self.name!r:.200}")
+            raise ConfigError("name", f"expected letters, digits, _ and -, got {self.name!r:.200}")
         if len(self.name) > MAX_NAME:
-            raise ConfigError(f"name: expected at most {MAX_NAME} characters, got {len(self.name)}")
-
-    @classmethod
-    def from_yaml(cls, file: str | Path) -> ServeConfig:
-        """Reads the file. Raises ConfigError for what is not YAML, unknown keys and values of the wrong type."""
-        try:
-            content = read_yaml(Path(file))
-        except (OSError, ValueError) as error:
-            raise ConfigError(f"{file}: expected a YAML file, got {error}") from error
-        if content is None:
-            content = {}
-        if not isinstance(content, dict):
-            raise ConfigError(f"{file}: expected keys and values, got {type(content).__name__}")
-        types_of = typing.get_type_hints(cls)
-        for key, value in content.items():
-            if key not in types_of:
-                raise ConfigError(f"{file}: {key}: expected one of {', '.join(types_of)}, got an unknown key")
-            if not _fits(value, types_of[key]):
-                raise ConfigError(f"{file}: {key}: expected {_name(types_of[key])}, got {value!r:.200}")
-        try:
-            return cls(**content)
-        except ConfigError as error:
-            raise ConfigError(f"{file}: {error}") from None
-
-    @property
-    def host(self) -> str:
-        """The listen address that ``server_url`` names."""
-        host = self.server_url.partition("://")[2] or self.server_url
-        host = host.rstrip("/")
-        return DEFAULT_HOST if host == "localhost" else host
+            raise ConfigError("name", f"expected at most {MAX_NAME} characters, got {len(self.name)}")
 
     @property
     def torch_dtype(self) -> torch.dtype | None:
@@ -164,33 +86,50 @@ class ServeConfig:
 
         return getattr(torch, self.dtype) if self.dtype else None
 
+
+@dataclass(frozen=True)
+class ServeConfig(Settings):
+    """What ``rfm serve`` itself reads. To change it, start it again.
+
+    ``host`` may be written as a URL, as in the FastAPI server's file; it is the address alone here.
+    """
+
+    host: str = setting(DEFAULT_HOST, "Address to listen on.")
+    http_port: int = setting(8000, "Triton's HTTP port.", **_PORT)
+    grpc_port: int = setting(8001, "Triton's gRPC port.", **_PORT)
+    metrics_port: int = setting(8002, "Port of Triton's metrics.", **_PORT)
+    status_port: int | None = setting(None, "Port of rfm serve's own state: /live, /ready and /metrics.", **_PORT)
+    http_threads: int | None = setting(
+        None, "Threads that read HTTP requests; else Triton's choice.", least=1, **_OF_A_MACHINE
+    )
+    grpc_certificate: Path | None = setting(
+        None, "Serve gRPC with TLS, by this certificate (PEM); HTTP then only on 127.0.0.1."
+    )
+    grpc_key: Path | None = setting(None, "The certificate's key (PEM).")
+    grpc_client_ca: Path | None = setting(None, "Authorities (PEM) of gRPC's clients, which then need a certificate.")
+    canary_s: int = setting(2, "Seconds from one health probe of a model to the next.", least=1)
+    hang_s: int = setting(30, "Seconds without progress after which a model is loaded again.", least=1)
+    triton_silent_s: int = setting(
+        10, "Seconds that Triton may give no answer before it is killed and restarted.", least=1
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "host", _address(self.host))
+        if ":" in self.host:
+            raise ConfigError("host", f"expected an address without port (http_port), got {self.host!r}")
+        if (self.grpc_certificate is None) != (self.grpc_key is None):
+            raise ConfigError("grpc_certificate, grpc_key", "expected both or none, got one")
+        if self.grpc_client_ca is not None and self.grpc_certificate is None:
+            raise ConfigError("grpc_client_ca", "expected with grpc_certificate and grpc_key, got it alone")
+
     @property
     def is_loopback(self) -> bool:
         """Whether only this machine can reach it."""
         return is_loopback(self.host)
 
 
-def _at_least(least: int, config: ServeConfig, *keys: str) -> None:
-    for key in keys:
-        value = getattr(config, key)
-        if value is not None and value < least:
-            raise ConfigError(f"{key}: expected at least {least}, got {value}")
-
-
-def _at_most(most: int, config: ServeConfig, *keys: str) -> None:
-    for key in keys:
-        value = getattr(config, key)
-        if value is not None and value > most:
-            raise ConfigError(f"{key}: expected at most {most}, got {value}")
-
-
-def _fits(value: Any, expected: Any) -> bool:
-    if isinstance(expected, types.UnionType):
-        return any(_fits(value, kind) for kind in typing.get_args(expected))
-    return type(value) is expected  # not isinstance: True is no number of GPUs
-
-
-def _name(expected: Any) -> str:
-    if isinstance(expected, types.UnionType):
-        return " or ".join(_name(kind) for kind in typing.get_args(expected))
-    return "null" if expected is type(None) else str(expected.__name__)
+def _address(host: str) -> str:
+    """The address in a host that may be written as a URL."""
+    address = (host.partition("://")[2] or host).rstrip("/")
+    return DEFAULT_HOST if address == "localhost" else address

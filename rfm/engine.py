@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -18,6 +18,7 @@ from rfm.config import DEFAULT_SAMPLE_TOKENS, DEFAULT_TOKEN_BUDGET
 from rfm.embedding import embedded
 from rfm.execution import Execution, memory_errors
 from rfm.family import Checkpoint, FrameEncoders
+from rfm.layers.precision import keep_float32
 from rfm.predictor import Predictor, RowScores
 from rfm_client.contract import (
     BatchTiming,
@@ -34,6 +35,19 @@ from rfm_client.contract import (
 )
 
 Outcome: TypeAlias = Result | RewardError
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A sample that is ready for its forward pass.
+
+    rows: what the network scores of it; an error: why it cannot
+    num_tokens: of all rows
+    """
+
+    sample: Sample
+    rows: Sequence[Any] | RewardError
+    num_tokens: int = 0
 
 
 class Engine:
@@ -103,6 +117,8 @@ class Engine:
         dtype: of the network; None: float32, and a vision-language checkpoint's own on a GPU
         """
         on = torch.device(device)
+        if on.type == "cuda":
+            keep_float32()
         predictor = checkpoint.predictor(on, dtype)
         encoders = None if encoders is None else encoders.to(on)
         return cls(predictor, encoders=encoders, token_budget=token_budget, max_sample_tokens=max_sample_tokens)
@@ -114,42 +130,69 @@ class Engine:
         InvalidSampleError: this checkpoint cannot score the sample.
         InferenceFailedError: the network gave something that is no number, or the sample does not fit in memory.
         """
-        started_s = time.perf_counter()
         execution = execution or Execution()
         before = replace(execution)
-        outcomes: dict[int, Outcome] = {}
-        rows: list[Any] = []
-        rows_of: dict[int, slice] = {}
-        for index, sample in enumerate(self._embedded(samples, execution)):
-            try:
-                sample_rows = self._rows(sample)
-            except RewardError as error:
-                outcomes[index] = error
-                continue
-            rows_of[index] = slice(len(rows), len(rows) + len(sample_rows))
-            rows += sample_rows
-        scores = self._scores(rows, execution)
-        forward_s = execution.forward_s - before.forward_s  # of encoders, too
-        collate_s = time.perf_counter() - started_s - forward_s
-        execution.collate_s = before.collate_s + collate_s
-        timing = BatchTiming(collate_s * 1e3, forward_s * 1e3)
-        for index, of_sample in rows_of.items():
-            outcomes[index] = _outcome(samples[index], scores[of_sample], timing)
-        return [outcomes[index] for index in range(len(samples))]
+        embedded_samples = self._embedded(samples, execution)
+        with execution.collating():
+            prepared = [self._prepared(sample, of) for sample, of in zip(samples, embedded_samples, strict=True)]
+        return self._results(prepared, execution, before)
+
+    def prepare(self, sample: Sample) -> Prepared:
+        """The first half of ``evaluate``. Takes no forward pass, and may run in one thread while another scores.
+
+        sample: of what the network reads; no encoders are asked
+        """
+        return self._prepared(sample, sample)
+
+    @property
+    def works_ahead(self) -> bool:
+        """Whether ``work_ahead`` is worth a thread."""
+        return self.predictor.works_ahead
+
+    def work_ahead(self, prepared: Prepared) -> None:
+        """What takes long between the halves of ``evaluate``, in any thread; where nobody calls it, the second half
+        does it.
+        """
+        if not isinstance(prepared.rows, RewardError):
+            self.predictor.work_ahead(prepared.rows)
+
+    def score(self, prepared: Sequence[Prepared], execution: Execution) -> list[Outcome]:
+        """The second half of ``evaluate``."""
+        return self._results(prepared, execution, replace(execution))
 
     def _embedded(self, samples: Sequence[Sample], execution: Execution) -> Sequence[Sample | RewardError]:
         return samples if self.encoders is None else embedded(samples, self.encoders, execution)
 
-    def _rows(self, sample: Sample | RewardError) -> list[Any]:
-        """The sample's rows. Raises InvalidSampleError, and a sample that is an error already."""
-        if isinstance(sample, RewardError):
-            raise sample
-        rows = self.predictor.rows(sample)
-        longest = max(self.predictor.num_tokens(row) for row in rows)
-        if longest > self.max_sample_tokens:
+    def _prepared(self, sample: Sample, embedded_sample: Sample | RewardError) -> Prepared:
+        if isinstance(embedded_sample, RewardError):
+            return Prepared(sample, embedded_sample)
+        try:
+            rows = self.predictor.rows(embedded_sample)
+        except RewardError as error:
+            return Prepared(sample, error)
+        num_tokens = [self.predictor.num_tokens(row) for row in rows]
+        if max(num_tokens) > self.max_sample_tokens:
             expected = f"at most {self.max_sample_tokens} tokens (max_sample_tokens of this server)"
-            raise InvalidSampleError.at("num_frames", expected, f"{longest} tokens")
-        return rows
+            return Prepared(sample, InvalidSampleError.at("num_frames", expected, f"{max(num_tokens)} tokens"))
+        return Prepared(sample, rows, sum(num_tokens))
+
+    def _results(self, prepared: Sequence[Prepared], execution: Execution, before: Execution) -> list[Outcome]:
+        """The result or the error of each sample. ``before``: ``execution`` when this batch had cost nothing."""
+        collated_s, started_s, forwarded_s = execution.collate_s, time.perf_counter(), execution.forward_s
+        rows: list[Any] = []
+        rows_of: list[slice] = []
+        for sample in prepared:
+            of_sample = () if isinstance(sample.rows, RewardError) else sample.rows
+            rows_of.append(slice(len(rows), len(rows) + len(of_sample)))
+            rows += of_sample
+        scores = self._scores(rows, execution)
+        execution.collate_s = collated_s + time.perf_counter() - started_s - (execution.forward_s - forwarded_s)
+        collate_s, forward_s = execution.collate_s - before.collate_s, execution.forward_s - before.forward_s
+        timing = BatchTiming(collate_s * 1e3, forward_s * 1e3)
+        return [
+            sample.rows if isinstance(sample.rows, RewardError) else _outcome(sample.sample, scores[of_sample], timing)
+            for sample, of_sample in zip(prepared, rows_of, strict=True)
+        ]
 
     def _scores(self, rows: Sequence[Any], execution: Execution) -> list[RowScores | RewardError]:
         """Each row's scores. While a batch is in its forward pass the next is collated."""

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from rfm.execution import Execution
 from rfm.predictor import Predictor
-from rfm_client.contract import FrameSize, RewardError, Trajectory
+from rfm_client.contract import FrameSize, RewardError
 from rfm_client.contract.samples import Footage
 
 NETWORK = "network"  # in Checkpoint.parts: the weights of the network that scores
@@ -96,8 +96,8 @@ class FrameEncoders(Protocol):
     def to(self, device: torch.device) -> FrameEncoders:
         """Moves the encoders to ``device``, and returns them."""
 
-    def encode(self, samples: Sequence[Footage], execution: Execution) -> list[Trajectory | RewardError]:
-        """The embeddings of each sample's frames, one trajectory after the other, and task, or why there are none.
+    def encode(self, samples: Sequence[Footage], execution: Execution) -> list[Footage | RewardError]:
+        """Each sample with embeddings of its trajectories' frames and of its task, or why it has none.
 
         execution: what it took is added to it
         """

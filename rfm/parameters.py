@@ -6,3 +6,5 @@ BUDGET_PARAMETER = "token_budget"
 SAMPLE_TOKENS_PARAMETER = "max_sample_tokens"
 FAMILY_PARAMETER = "family"  # the package of its checkpoint's family
 DTYPE_PARAMETER = "dtype"  # empty: as the checkpoint and the device decide
+QUEUE_SIZE_PARAMETER = "max_queue_size"  # empty: any number
+QUEUE_TIMEOUT_PARAMETER = "queue_timeout_ms"  # empty: any time

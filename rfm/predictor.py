@@ -21,6 +21,10 @@ Batch = TypeVar("Batch")
 class Predictor(Protocol[Row, Batch]):
     """A network on a device, and how samples become its batches. A row is one token sequence of a forward."""
 
+    @property
+    def works_ahead(self) -> bool:
+        """Whether ``work_ahead`` is worth a thread."""
+
     def rows(self, sample: Sample) -> list[Row]:
         """The sample's rows, in dense mode one a frame; takes no forward pass.
 
@@ -29,6 +33,9 @@ class Predictor(Protocol[Row, Batch]):
 
     def num_tokens(self, row: Row) -> int:
         """Tokens of the row. Rows of similar numbers share a batch."""
+
+    def work_ahead(self, rows: Sequence[Row]) -> None:
+        """What takes long of collation and can be done rows alone, in any thread; ``collate`` does what is left."""
 
     def collate(self, rows: Sequence[Row]) -> Batch:
         """One batch, on the CPU; may run while the device computes."""

@@ -15,8 +15,8 @@ from engines import load_engine, serve_config
 from patients import references  # noqa: F401  a fixture
 from reference_server import Served
 from rfm.engine import Engine
-from rfm.supervise.installation import find_installation
-from rfm.supervise.process import Endpoints, TritonServer
+from rfm.launch.installation import find_installation
+from rfm.launch.process import Endpoints, TritonServer
 
 torch.set_num_threads(1)
 os.environ[RUN] = uuid.uuid4().hex  # by which tests know what this run has started

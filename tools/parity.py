@@ -13,8 +13,8 @@ from rich.table import Table
 import goldens
 import rfm_export
 from engines import serve_config
-from rfm.supervise.installation import find_installation
-from rfm.supervise.process import Endpoints, TritonServer
+from rfm.launch.installation import find_installation
+from rfm.launch.process import Endpoints, TritonServer
 from rfm_client import RewardClient
 
 

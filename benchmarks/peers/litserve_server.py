@@ -16,8 +16,9 @@ import msgpack
 import torch
 from fastapi import Body, Response
 from message import answer_of, sample_of
+from simulated import engine_of
 
-from rfm.engine import Engine, Outcome
+from rfm.engine import Outcome
 from rfm_client import Sample
 
 MAX_BATCH_SIZE = 64
@@ -38,7 +39,7 @@ class RewardAPI(litserve.LitAPI):
         """Loads the engine, in the inference process."""
         torch.set_num_threads(self.threads)
         torch.set_num_interop_threads(1)
-        self.engine = Engine.from_checkpoint(self.checkpoint, device=device)
+        self.engine = engine_of(self.checkpoint, device)
 
     def decode_request(self, request: Annotated[bytes, Body(media_type=MIME_TYPE)]) -> Sample:
         """The sample in the body of a request."""

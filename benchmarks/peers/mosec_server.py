@@ -18,8 +18,7 @@ import mosec
 import torch
 from message import answer_of, sample_of
 from mosec.mixin import MsgpackMixin
-
-from rfm.engine import Engine
+from simulated import engine_of
 
 MAX_BATCH_SIZE = 64
 MAX_WAIT_MS = 1  # the least that it takes
@@ -34,7 +33,7 @@ class RewardWorker(MsgpackMixin, mosec.Worker):
         warnings.filterwarnings("ignore", "IPC data", RuntimeWarning)  # told of every large batch
         torch.set_num_threads(int(os.environ["PEER_THREADS"]))
         torch.set_num_interop_threads(1)
-        self.engine = Engine.from_checkpoint(os.environ["PEER_CHECKPOINT"])
+        self.engine = engine_of(os.environ["PEER_CHECKPOINT"])
 
     def forward(self, data: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """The answer to each request of a batch."""

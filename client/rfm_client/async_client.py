@@ -4,35 +4,23 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
-import secrets
-from collections.abc import Coroutine, Iterable, Iterator, Mapping, Sequence
-from copy import copy
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 from functools import partial
 from types import TracebackType
-from typing import TYPE_CHECKING, Literal, TypedDict, cast, overload
+from typing import TYPE_CHECKING, Literal, cast, overload
 
-from rfm_client.batching import groups, model_of, padded_bytes, parts
-from rfm_client.contract import wire
-from rfm_client.contract.errors import (
-    DeadlineExceededError,
-    InferenceFailedError,
-    InvalidSampleError,
-    ModelNotFoundError,
-    RewardError,
-)
+from rfm_client.call import Call, CallOptions, check_known
+from rfm_client.contract.errors import DeadlineExceededError, InvalidSampleError, RewardError
 from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.names import DEFAULT_MODEL, encoder_name, frames_name
+from rfm_client.contract.names import DEFAULT_MODEL, frames_name
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
-from rfm_client.data.fitting import FittedSample, fitted, whole, with_frame_indices
+from rfm_client.scorer import Scorer
 from rfm_client.transport.access import Access, AccessOptions
-from rfm_client.transport.calls import Answer, Transport, connect
+from rfm_client.transport.calls import Transport, connect
 from rfm_client.transport.deadline import Deadline, check_timeout
 from rfm_client.transport.host_names import of_urls
 from rfm_client.transport.in_flight import InFlight
-from rfm_client.transport.off_loop import off_loop
 from rfm_client.transport.server import PROBE_TIMEOUT_S
 from rfm_client.transport.servers import Servers
 
@@ -42,9 +30,6 @@ if TYPE_CHECKING:
 DEFAULT_TIMEOUT_S = 60.0
 DEFAULT_IN_FLIGHT = 128  # twice the usual batch: while one is scored, the next one gathers
 READY_POLL_S = 0.2
-_ID_BYTES = 8  # of chance in the ids of a call's requests
-
-_SCORES = (wire.PROGRESS, wire.SUCCESS, wire.PREFERENCE, wire.SIMILARITY)
 
 
 class ClientOptions(AccessOptions, total=False):
@@ -54,6 +39,8 @@ class ClientOptions(AccessOptions, total=False):
     timeout_s: the longest that a call may take, retries included, at most 1e9; there is no endless wait (60)
     retry: send again what failed because a server was down, restarting or full, until the time is up (True)
     max_in_flight: requests under way at a time (128); more wait their turn
+    join: concurrent calls about one sample with embeddings share requests while the servers are busy (False: a sample
+        that ends its process may end one more when it was joined, and a caller who asks alone gains nothing)
     shared_memory: large inputs go through memory that client and server map, if both are on one host (False)
     ca_file, client_certificate, client_key, headers, api_key: as Access has them
     """
@@ -62,37 +49,8 @@ class ClientOptions(AccessOptions, total=False):
     timeout_s: float
     retry: bool
     max_in_flight: int
+    join: bool
     shared_memory: bool
-
-
-class CallOptions(TypedDict, total=False):
-    """How one call is made.
-
-    timeout_s: the longest that it may take, instead of the client's
-    logits: with the raw scores of the progress bins, which only discrete checkpoints have
-    timing: with the server's time for the batch
-    subsample: of a trajectory longer than the checkpoint was trained on (``ModelInfo.max_frames``) so many frames are
-        scored, evenly from the first to the last; the result's ``frame_indices`` names them (None: all)
-    resize: frames are made as small as the checkpoint reads them before they are sent (needs Pillow); ReWiND's scores
-        differ slightly from those of the frames as they are
-    request_id: with which the ids of the call's requests begin, in errors and in the server's log (None: a random one)
-    """
-
-    timeout_s: float | None
-    logits: bool
-    timing: bool
-    subsample: bool
-    resize: bool
-    request_id: str | None
-
-
-@dataclass(frozen=True)
-class _Call:
-    """What the requests of one call share. request_ids: one for each"""
-
-    deadline: Deadline
-    outputs: Sequence[str]
-    request_ids: Iterator[str]
 
 
 class AsyncRewardClient:
@@ -113,7 +71,7 @@ class AsyncRewardClient:
         transports: Sequence[Transport] | None = None,
         **options: Unpack[ClientOptions],
     ) -> None:
-        _check_known(options, ClientOptions)
+        check_known(options, ClientOptions)
         urls = [urls] if isinstance(urls, str) else urls
         shared_memory = options.get("shared_memory", False)
         access = Access.of(options)
@@ -122,8 +80,8 @@ class AsyncRewardClient:
         self._timeout_s = options.get("timeout_s", DEFAULT_TIMEOUT_S)
         check_timeout(self._timeout_s)
         self._servers = Servers(transports or fixed, retry=options.get("retry", True), names=names)
-        self._in_flight = InFlight(options.get("max_in_flight", DEFAULT_IN_FLIGHT))
-        self._model_infos: dict[str, ModelInfo] = {}
+        in_flight = InFlight(options.get("max_in_flight", DEFAULT_IN_FLIGHT))
+        self._scorer = Scorer(self._model, self._servers, in_flight, join=options.get("join", False))
         self._is_closed = False
 
     async def progress(
@@ -146,7 +104,7 @@ class AsyncRewardClient:
 
     async def score(self, sample: Sample, **options: Unpack[CallOptions]) -> Result:
         """The result of one sample of any type. Raises RewardError."""
-        return (await self.evaluate([sample], **options))[0]
+        return await self._scorer.result(sample, self._call(options))
 
     @overload
     async def evaluate(
@@ -165,7 +123,7 @@ class AsyncRewardClient:
             first error is raised, as ``samples[3].num_frames: expected X, got Y``
         """
         samples = list(samples)
-        outcomes = await self._outcomes(samples, options)
+        outcomes = await self._scorer.outcomes(samples, self._call(options))
         if return_errors:
             return outcomes
         for index, outcome in enumerate(outcomes):
@@ -181,14 +139,7 @@ class AsyncRewardClient:
         """The trajectory with embeddings of its frames and its task in place of the frames, for a checkpoint that is
         served with encoders. A trajectory that is scored often is then encoded once. Raises RewardError.
         """
-        if trajectory.frames is None:
-            raise InvalidSampleError.at("trajectory", "frames", "video_embeddings")
-        tensors = await off_loop(trajectory.frames.nbytes, wire.encode_frames, trajectory)
-        outputs = (wire.VIDEO_EMBEDDINGS, wire.TEXT_EMBEDDING)
-        deadline, name = self._deadline(timeout_s), next(_request_ids(request_id))
-        async with self._in_flight.room(trajectory.frames.nbytes, deadline):
-            answer = await self._servers.infer(encoder_name(self._model), tensors, outputs, deadline, request_id=name)
-        return wire.decode_embeddings(answer.tensors, trajectory)
+        return await self._scorer.embeddings(trajectory, self._deadline(timeout_s), request_id)
 
     async def is_ready(self, *, timeout_s: float | None = None) -> bool:
         """Whether a server answers and has the model ready, for embeddings or for raw frames."""
@@ -214,11 +165,12 @@ class AsyncRewardClient:
         Raises ModelNotFoundError if it is not served.
         """
         name = frames_name(self._model) if frames else self._model
-        return await self._model_info(name, self._deadline(timeout_s), refresh=refresh)
+        return await self._scorer.model_infos.get(name, self._deadline(timeout_s), refresh=refresh)
 
     async def close(self) -> None:
         """Closes the connections and gives shared memory back."""
         self._is_closed = True
+        self._scorer.model_infos.close()
         await self._servers.close()
 
     async def __aenter__(self) -> AsyncRewardClient:
@@ -229,134 +181,12 @@ class AsyncRewardClient:
     ) -> None:
         await self.close()
 
-    async def _outcomes(self, samples: Sequence[Sample], options: CallOptions) -> list[Result | RewardError]:
-        _check_known(options, CallOptions)
-        call = _Call(
-            self._deadline(options.get("timeout_s")), _outputs(options), _request_ids(options.get("request_id"))
-        )
-        deadline = call.deadline
-        fits, outcomes = await self._fitted(samples, options, deadline)
-        sent = {index: fit.sample for index, fit in fits.items()}
-
-        async def request_group(model: str, group: Sequence[int]) -> None:
-            try:
-                limit = (await self._model_info(model, deadline)).max_batch_size if len(group) > 1 else 1
-            except RewardError as error:
-                outcomes.update(zip(group, _for_each(error, len(group)), strict=True))
-                return
-            await _together([request_part(model, part) for part in parts(sent, group, limit)])
-
-        async def request_part(model: str, part: Sequence[int]) -> None:
-            answers = await self._request(model, [sent[index] for index in part], call)
-            for index, answer in zip(part, answers, strict=True):
-                outcomes[index] = (
-                    answer if isinstance(answer, RewardError) else with_frame_indices(answer, fits[index].frame_indices)
-                )
-
-        await _together([request_group(model, group) for model, group in groups(sent, self._model)])
-        return [outcomes[index] for index in range(len(samples))]
-
-    async def _fitted(
-        self, samples: Sequence[Sample], options: CallOptions, deadline: Deadline
-    ) -> tuple[dict[int, FittedSample], dict[int, Result | RewardError]]:
-        """The samples as they are sent, and the errors of those that cannot be sent, by index."""
-        subsample, resize = options.get("subsample", False), options.get("resize", False)
-        fits: dict[int, FittedSample] = {}
-        failed: dict[int, Result | RewardError] = {}
-        for index, sample in enumerate(samples):
-            try:
-                fits[index] = whole(sample)
-                if subsample or resize:
-                    deadline.remaining_s()
-                    info = await self._model_info(model_of(sample, self._model), deadline)
-                    # in a thread: resizing takes a while, and other calls wait for this event loop
-                    fits[index] = await asyncio.to_thread(fitted, sample, info, subsample=subsample, resize=resize)
-            except RewardError as error:
-                fits.pop(index, None)
-                failed[index] = error
-        return fits, failed
-
-    async def _request(self, model: str, samples: Sequence[Sample], call: _Call) -> Sequence[Result | RewardError]:
-        """One request. It fails whole if one sample cannot be scored; then each sample is sent alone.
-
-        A request that is refused because it has ended its process is not taken apart: all its samples fail.
-        """
-        request_id = next(call.request_ids)
-        try:
-            answer = await self._infer(model, samples, call, request_id)
-            return wire.decode_results(answer.tensors, samples, answer.model_version)
-        except (InvalidSampleError, InferenceFailedError) as error:
-            error.request_id = request_id
-            if len(samples) == 1:
-                return [error]
-            if isinstance(error, InvalidSampleError) and error.is_deadly:
-                return _for_each(error, len(samples))  # alone, the one that is would end two more processes
-        except RewardError as error:
-            return _for_each(error, len(samples))
-        alone = await asyncio.gather(*(self._request(model, [sample], call) for sample in samples))
-        return [outcome for (outcome,) in alone]
-
-    async def _infer(self, model: str, samples: Sequence[Sample], call: _Call, request_id: str) -> Answer:
-        num_bytes = padded_bytes(samples)
-        async with self._in_flight.room(
-            num_bytes, call.deadline
-        ):  # arrays are made in turn, so that they do not pile up
-            tensors = await off_loop(num_bytes, wire.encode_samples, samples)
-            answer = await self._servers.infer(model, tensors, call.outputs, call.deadline, request_id=request_id)
-        known = self._model_infos.get(model)
-        if known is not None and known.versions and answer.model_version not in known.versions:
-            del self._model_infos[model]
-        return answer
+    def _call(self, options: CallOptions) -> Call:
+        """The call that begins now, with these options."""
+        return Call.of(options, self._deadline(options.get("timeout_s")))
 
     def _deadline(self, timeout_s: float | None) -> Deadline:
         """Deadline of a call which begins now; timeout_s: None: the client's."""
         if self._is_closed:
             raise RuntimeError("this AsyncRewardClient is closed")
         return Deadline(self._timeout_s if timeout_s is None else timeout_s)
-
-    async def _model_info(self, model: str, deadline: Deadline, *, refresh: bool = False) -> ModelInfo:
-        if refresh or model not in self._model_infos:
-            try:
-                self._model_infos[model] = await self._servers.model_info(model, deadline)
-            except ModelNotFoundError:
-                self._model_infos.pop(model, None)
-                raise
-        return self._model_infos[model]
-
-
-async def _together(calls: Sequence[Coroutine[None, None, None]]) -> None:
-    """Awaits all coroutines. A single one, as in most calls, needs no task of its own."""
-    if len(calls) == 1:
-        await calls[0]
-    else:
-        await asyncio.gather(*calls)
-
-
-def _for_each(error: RewardError, count: int) -> list[Result | RewardError]:
-    """One error of its own for each sample that shares the failure; they may be raised apart."""
-    copies: list[Result | RewardError] = []
-    for _ in range(count):
-        one = copy(error)
-        one.__cause__ = error
-        copies.append(one)
-    return copies
-
-
-def _check_known(options: Mapping[str, object], known: type[ClientOptions] | type[CallOptions]) -> None:
-    """Raises TypeError for an unknown option, which would otherwise be ignored in silence."""
-    unknown = sorted(options.keys() - known.__annotations__)
-    if unknown:
-        raise TypeError(f"options: expected some of {', '.join(known.__annotations__)}, got {', '.join(unknown)}")
-
-
-def _request_ids(prefix: str | None) -> Iterator[str]:
-    """Request ids of one call, which begin alike. Raises ValueError for a prefix that is not allowed."""
-    if prefix is not None and not wire.REQUEST_ID.fullmatch(prefix):
-        raise ValueError(f"request_id: expected 1 to 64 letters, digits or any of ._:/+=@-, got {prefix!r}")
-    prefix = prefix or secrets.token_hex(_ID_BYTES)
-    return (f"{prefix}-{number}" for number in itertools.count(1))
-
-
-def _outputs(options: CallOptions) -> tuple[str, ...]:
-    optional = {wire.PROGRESS_LOGITS: options.get("logits", False), wire.TIMING_MS: options.get("timing", False)}
-    return (*_SCORES, *(name for name, wanted in optional.items() if wanted))

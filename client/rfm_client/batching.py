@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.samples import Sample, stackable
 
 MAX_REQUEST_BYTES = 8 * 2**20  # more gains nothing: Triton puts requests together
+_FEW_BYTES = 2**18  # of padding in a joint request, which cost nothing
 
 
 def model_of(sample: Sample, model: str) -> str:
@@ -36,7 +37,7 @@ def parts(samples: Mapping[int, Sample], group: Sequence[int], max_batch_size: i
     part: list[int] = []
     longest: list[int] = []
     for index in group:
-        sizes = _array_bytes(samples[index])
+        sizes = array_bytes(samples[index])
         longest = list(map(max, longest, sizes)) if part else sizes
         if part and ((len(part) + 1) * sum(longest) > MAX_REQUEST_BYTES or len(part) == max_batch_size):
             yield part
@@ -45,9 +46,25 @@ def parts(samples: Mapping[int, Sample], group: Sequence[int], max_batch_size: i
     yield part
 
 
+def num_together(sizes: Iterable[int], most: int) -> int:
+    """How many of the first samples one request takes, in the order in which they came: ``most`` at most, as many
+    bytes as MAX_REQUEST_BYTES, and no more of padding than of samples if that is much. At least one.
+
+    sizes: bytes of each sample's frame positions
+    """
+    longest = total = count = 0
+    for size in sizes:
+        longest, total = max(longest, size), total + size
+        padded = (count + 1) * longest
+        if count and (count == most or padded > min(MAX_REQUEST_BYTES, max(_FEW_BYTES, 2 * total))):
+            break
+        count += 1
+    return count
+
+
 def padded_bytes(samples: Sequence[Sample]) -> int:
     """Bytes of the frame positions of one request of these samples, which fit the same arrays."""
-    longest: list[int] = [max(sizes) for sizes in zip(*map(_array_bytes, samples), strict=True)]
+    longest: list[int] = [max(sizes) for sizes in zip(*map(array_bytes, samples), strict=True)]
     return len(samples) * sum(longest)
 
 
@@ -56,6 +73,8 @@ def num_positions(sample: Sample) -> int:
     return sum(trajectory.num_frames for trajectory in sample.trajectories)
 
 
-def _array_bytes(sample: Sample) -> list[int]:
+def array_bytes(sample: Sample) -> list[int]:
     """Bytes of the sample's frame positions in each of the arrays that hold them."""
+    if len(sample.trajectories) == 1:
+        return [sample.trajectories[0].positions.nbytes]
     return [sum(t.positions.nbytes for t in together) for together in stackable(sample.trajectories)]

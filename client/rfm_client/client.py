@@ -9,7 +9,8 @@ from concurrent.futures import Future
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, overload
 
-from rfm_client.async_client import AsyncRewardClient, CallOptions, ClientOptions
+from rfm_client.async_client import AsyncRewardClient, ClientOptions
+from rfm_client.call import CallOptions
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from http.client import HTTPException
-from typing import Any
+from typing import Any, TypeAlias
 
 from tritonclient.utils import InferenceServerException
 
@@ -32,11 +32,13 @@ from rfm_client.transport.access import Access
 METRICS_PORT = 8002
 DEVICE_METRICS = "nv_cpu_utilization, nv_gpu_utilization, nv_*_memory_*_bytes"
 _PROCESSOR = "CPU"
-PENDING_METRIC = "nv_inference_pending_request_count"
+WAITING_METRICS = ("nv_inference_pending_request_count", "rfm_waiting_requests")  # in Triton, in the model
 
 _DEVICE_METRIC = re.compile("nv_(cpu|gpu)_(utilization|memory_used_bytes|memory_total_bytes)")
 _REQUESTS_METRIC = "nv_inference_request_success_total"
 _COMPUTE_METRIC = "nv_inference_compute_infer_duration_us_total"
+_BATCH_SAMPLES_METRIC, _WAIT_METRIC = "rfm_batch_samples", "rfm_wait_seconds"  # histograms
+_SCORING_METRICS = ("rfm_collate_seconds", "rfm_forward_seconds")
 _SAMPLED_METRIC = "nv_cpu_memory_used_bytes"
 _SAMPLING_S = 2.5  # Triton looks at the machine every two seconds; until the first time it reports zeros
 _POLL_S = 0.2
@@ -45,15 +47,36 @@ _NS_PER_MS = 1e6
 _MS_PER_S = 1e3
 _US_PER_S = 1e6
 
+_Version: TypeAlias = tuple[str, str]  # name and version of a model
+
+
+@dataclass(frozen=True)
+class Batches:
+    """The batches in which a model has scored callers' requests, as it tells itself; all its instances together.
+
+    count, samples: of batches, and of the samples in them
+    wait_ms: of each batch the longest time that one of its requests had waited in the model, added up
+    scoring_ms: of all batches, in which they were collated and forward passes ran
+    """
+
+    count: int
+    samples: int
+    wait_ms: float
+    scoring_ms: float
+
 
 @dataclass(frozen=True)
 class ModelStatus:
     """One version of a model.
 
-    requests_pending: requests that wait for their turn now; None: the metrics do not say
-    samples, executions: of all requests together; a batch is executed once
-    queue_ms, compute_ms: of all requests in the queue, of all executions in the model
+    Triton hands requests to a model, which may keep them waiting and put them into other batches. Only the model knows
+    of that, and tells it as ``batches``.
+
+    requests_pending: requests that wait for their turn now, in Triton or in the model; None: the metrics do not say
+    samples, executions: of all requests together, as Triton has handed them over
+    queue_ms, compute_ms: of all requests in Triton's queue, of all that Triton has handed over until it could go on
     last_used_s: Unix time of the last request; None: there was none
+    batches: None: the metrics do not say
     """
 
     name: str
@@ -68,21 +91,38 @@ class ModelStatus:
     queue_ms: float
     compute_ms: float
     last_used_s: float | None = None
+    batches: Batches | None = None
 
     @property
-    def samples_per_execution(self) -> float | None:
+    def batch_count(self) -> int:
+        """How many batches there were: callers', or before the first of these whatever Triton has handed over."""
+        return self.batches.count if self.batches and self.batches.count else self.executions
+
+    @property
+    def samples_per_batch(self) -> float | None:
         """How well requests share batches; None before the first."""
-        return self.samples / self.executions if self.executions else None
+        samples = self.batches.samples if self.batches and self.batches.count else self.samples
+        return samples / self.batch_count if self.batch_count else None
 
     @property
     def queue_ms_per_request(self) -> float | None:
-        """How long a request waits for its turn; None before the first."""
-        return self.queue_ms / self.requests_succeeded if self.requests_succeeded else None
+        """How long a request waits for its turn: in Triton's queue, then in the model. None before the first.
+
+        In the model it is the wait of a batch's first request, so others wait for less.
+        """
+        in_model_ms = self.batches.wait_ms / self.batches.count if self.batches and self.batches.count else 0.0
+        return self.queue_ms / self.requests_succeeded + in_model_ms if self.requests_succeeded else None
 
     @property
-    def compute_ms_per_execution(self) -> float | None:
+    def compute_ms_per_batch(self) -> float | None:
         """How long a batch takes; None before the first."""
-        return self.compute_ms / self.executions if self.executions else None
+        total_ms = self.batches.scoring_ms if self.batches and self.batches.count else self.compute_ms
+        return total_ms / self.batch_count if self.batch_count else None
+
+    @property
+    def busy_ms(self) -> float:
+        """How long the model was at work, on all devices. Triton does not know of work that it did not wait for."""
+        return max(self.compute_ms, self.batches.scoring_ms if self.batches else 0.0)
 
 
 @dataclass(frozen=True)
@@ -127,7 +167,8 @@ class ServerStatus:
 @dataclass(frozen=True)
 class _Metrics:
     devices: tuple[Device, ...] = ()
-    pending: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    pending: Mapping[_Version, int] = field(default_factory=dict)
+    batches: Mapping[_Version, Batches] = field(default_factory=dict)
     error: str | None = None
 
 
@@ -250,6 +291,7 @@ def _models(server: _Server, metrics: _Metrics) -> list[ModelStatus]:
                 compute_ms=sum(_whole(batch, "compute_infer", "ns") for batch in done.get("batch_stats", []))
                 / _NS_PER_MS,
                 last_used_s=int(done.get("last_inference", 0)) / _MS_PER_S or None,
+                batches=metrics.batches.get(key),
             )
         )
     return models
@@ -285,12 +327,33 @@ def _read_metrics(url: str, timeout_s: float) -> _Metrics:
             )
             for name, values in devices.items()
         ),
-        pending={
-            (sample.labels["model"], sample.labels["version"]): int(sample.value)
-            for sample in samples
-            if sample.name == PENDING_METRIC
-        },
+        pending={version: int(count) for version, count in _totals(samples, *WAITING_METRICS).items()},
+        batches=_batches(samples),
     )
+
+
+def _totals(samples: list[Any], *names: str) -> dict[_Version, float]:
+    """The sum of these metrics for each version of a model, over its instances."""
+    totals: dict[_Version, float] = {}
+    for sample in samples:
+        if sample.name in names:
+            version = sample.labels["model"], sample.labels["version"]
+            totals[version] = totals.get(version, 0.0) + sample.value
+    return totals
+
+
+def _batches(samples: list[Any]) -> dict[_Version, Batches]:
+    """What each version tells of its batches; nothing of models that are not ours, or older."""
+    num_samples = _totals(samples, f"{_BATCH_SAMPLES_METRIC}_sum")
+    waits_s = _totals(samples, f"{_WAIT_METRIC}_sum")
+    scoring_s = _totals(samples, *(f"{name}_sum" for name in _SCORING_METRICS))
+    return {
+        version: Batches(
+            int(count), int(num_samples[version]), waits_s[version] * _MS_PER_S, scoring_s[version] * _MS_PER_S
+        )
+        for version, count in _totals(samples, f"{_BATCH_SAMPLES_METRIC}_count").items()
+        if version in waits_s
+    }
 
 
 def _work(samples: list[Any], device: str) -> dict[str, DeviceWork]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from rfm.supervise.process import Endpoints
+from rfm.launch.process import Endpoints
 from rfm_client import RewardClient, Trajectory
 from rfm_client.cli.show import Panel, plot, scores_table, status_tables
 from rfm_client.data.video import frame_times_s, read_video

@@ -15,8 +15,8 @@ from typing import Annotated
 
 import typer
 
-from rfm.supervise.admin_key import AdminKeyError, take_key
-from rfm.supervise.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
+from rfm.launch.admin_key import AdminKeyError, take_key
+from rfm.launch.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
 from rfm_client.transport.access import Access
 from rfm_commands.rollout import Rollout, models_of, previous_version
 from rfm_export.errors import ExportError

@@ -30,9 +30,10 @@ import numpy as np
 from google.protobuf.text_format import ParseError
 from tritonclient.grpc import model_config_pb2 as pb
 
-from rfm.supervise.repository_api import RepositoryApi, RepositoryApiError
-from rfm_client import PreferenceSample, ProgressSample, RewardError, Trajectory
+from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
+from rfm_client import PreferenceSample, ProgressSample, RewardError
 from rfm_client.contract import wire
+from rfm_client.contract.made_up import random_trajectory
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_export.errors import ExportError
 from rfm_export.layout import CONFIG_FILE
@@ -42,8 +43,8 @@ from rfm_export.publish import alone, config_of, read_config, replace_config, st
 RETURN_S = 120.0
 POLL_S = 1.0
 PROBE_FRAMES = 2
-PROBE_SIZE_PX = 64
 PROBE_SEED = 0
+PROBE_TASK = "pick up the red cup"
 SCORES = (wire.PROGRESS, wire.SUCCESS, wire.PREFERENCE)
 EMBEDDINGS = (wire.VIDEO_EMBEDDINGS, wire.TEXT_EMBEDDING)
 
@@ -163,14 +164,11 @@ class Rollout:
 
 
 def probe(server: RepositoryApi, config: pb.ModelConfig, version: int) -> None:
-    """Raises RepositoryApiError or RewardError unless the version answers with numbers.
-
-    A model without warm-up generates text: what it answers to noise need not be valid, so it gets no probe.
-    """
-    if not (config.model_warmup or _is_ensemble(config)):
-        return
-    trajectory = _noise(config)
-    if wire.VIDEO_EMBEDDINGS in _widths(config.output):
+    """Raises RepositoryApiError or RewardError unless the version answers with numbers."""
+    reads = _dims(config.input)
+    widths = None if wire.FRAMES in reads else (reads[wire.VIDEO_EMBEDDINGS], reads[wire.TEXT_EMBEDDING])
+    trajectory = random_trajectory(np.random.default_rng(PROBE_SEED), PROBE_FRAMES, widths, task=PROBE_TASK)
+    if wire.VIDEO_EMBEDDINGS in _dims(config.output):
         embeddings = server.infer(config.name, version, wire.encode_frames(trajectory), EMBEDDINGS)
         wire.decode_embeddings(embeddings, trajectory)
         return
@@ -179,20 +177,7 @@ def probe(server: RepositoryApi, config: pb.ModelConfig, version: int) -> None:
         wire.decode_results(scores, [sample])
 
 
-def _noise(config: pb.ModelConfig) -> Trajectory:
-    """A random trajectory that the model takes: of embeddings, or of frames."""
-    random = np.random.default_rng(PROBE_SEED)
-    widths = _widths(config.input)
-    if wire.FRAMES in widths:
-        frames = random.integers(0, 256, (PROBE_FRAMES, PROBE_SIZE_PX, PROBE_SIZE_PX, 3), np.uint8)
-        return Trajectory(frames=frames, task="pick up the red cup")
-    return Trajectory(
-        video_embeddings=random.standard_normal((PROBE_FRAMES, widths[wire.VIDEO_EMBEDDINGS]), np.float32),
-        text_embedding=random.standard_normal(widths[wire.TEXT_EMBEDDING], np.float32),
-    )
-
-
-def _widths(tensors: Iterable[Any]) -> dict[str, int]:
+def _dims(tensors: Iterable[Any]) -> dict[str, int]:
     """The last dimension of each, by name."""
     return {tensor.name: tensor.dims[-1] for tensor in tensors}
 

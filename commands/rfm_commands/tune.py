@@ -17,10 +17,11 @@ from tempfile import TemporaryDirectory
 import yaml
 from tritonclient.grpc import model_config_pb2 as pb
 
+from rfm.launch.temporary import temporary_server
 from rfm.parameters import THREADS_PARAMETER
-from rfm.supervise.temporary import served
 from rfm_client import AsyncRewardClient, RewardClient, Sample
 from rfm_client.cli.toy import SampleKind, Toy
+from rfm_commands.config import File
 from rfm_export.errors import ExportError
 from rfm_export.layout import CONFIG_FILE
 from rfm_export.pbtxt import parse, render
@@ -34,7 +35,7 @@ NUM_FRAMES = 16  # of a sample, where the checkpoint does not say on how many it
 
 @dataclass(frozen=True)
 class Setting:
-    """Values of the ServeConfig keys of these names."""
+    """Values of the keys of these names in the section ``export``."""
 
     instances: int
     torch_threads: int
@@ -109,7 +110,7 @@ class Sweep:
             repository = Path(folder) / "repository"
             shutil.copytree(self.repository.resolve(), repository, copy_function=os.symlink)
             _apply(setting, repository)
-            with served(repository, Path(folder) / "triton.log", self.tritonserver) as endpoints:
+            with temporary_server(repository, Path(folder) / "triton.log", self.tritonserver) as endpoints:
                 url = endpoints.grpc_url
                 with RewardClient(url, model=self.name) as client:
                     frames = client.model_info(frames=self.use_frames).max_frames or NUM_FRAMES
@@ -132,10 +133,11 @@ def quickest(trials: Sequence[Trial]) -> Trial:
     return min((t for t in trials if t.samples_per_s >= AS_FAST * fastest), key=lambda trial: trial.p50_ms)
 
 
-def write_setting(setting: Setting, file: Path, config: Path | None) -> None:
-    """Writes the keys of ``config`` (none: no others) with those of the setting. Raises OSError."""
-    keys = {} if config is None else yaml.safe_load(config.read_text()) or {}
-    file.write_text("# Measured by `rfm tune`.\n" + yaml.safe_dump(keys | asdict(setting), sort_keys=False))
+def write_setting(setting: Setting, output: Path, given: File) -> None:
+    """Writes the keys of a file with those of the setting, in sections. Raises OSError."""
+    values = {**given.values, "export": given.values["export"] | asdict(setting)}
+    sections = {section: keys for section, keys in values.items() if keys}
+    output.write_text("# Measured by `rfm tune`.\n" + yaml.safe_dump(sections, sort_keys=False))
 
 
 async def _measure_latencies(
@@ -143,7 +145,7 @@ async def _measure_latencies(
 ) -> list[float]:
     """Latencies in seconds of what is answered within ``seconds``, once the client is connected.
 
-    ``callers`` each ask about one sample after the other.
+    ``callers`` each ask about one sample after the other, as callers in processes of their own would.
     """
     latencies_s: list[float] = []
 
@@ -156,7 +158,7 @@ async def _measure_latencies(
                 latencies_s.append(answered_s - sent_s)
             index += callers
 
-    async with AsyncRewardClient(url, model=model, max_in_flight=2 * callers) as client:
+    async with AsyncRewardClient(url, model=model, max_in_flight=2 * callers, join=False) as client:
         await client.score(samples[0])
         end_s = time.perf_counter() + seconds
         await asyncio.gather(*(call(first, end_s) for first in range(callers)))

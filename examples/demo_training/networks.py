@@ -88,7 +88,7 @@ def _waves(length: int, width: int) -> Tensor:
 def write_checkpoint(learner: Learner, folder: Path) -> None:
     """Writes ``checkpoint`` in upstream's layout, and ``image_encoder`` and ``text_encoder``, its base models."""
     encoders = learner.encoders
-    encoders.save_pretrained(folder / "image_encoder", folder / "text_encoder")
+    encoders.save(folder)
     RewindCheckpoint(CONFIG, learner.network.state_dict()).save(folder / "checkpoint")
     weights = load_file(folder / "checkpoint" / WEIGHTS)
     parts = ((IMAGE_ENCODER_PREFIX, encoders.image_model), (TEXT_ENCODER_PREFIX, encoders.text_model))

@@ -49,12 +49,9 @@ class Origin:
 
         source: as the user named it; folder: where its files lie, of the Hub's a snapshot named by its commit
         """
-        named = Path(source).expanduser()
         file = find_run_config(folder)
         run_config = "" if file is None else json.dumps(_public(read_run_config(file)))
-        if str(source) and named.is_dir():
-            return cls("/".join(named.resolve().parts[-_NAMED_PARTS:]), "", run_config)
-        return cls(str(source), folder.name, run_config)
+        return cls(source_name(source), "" if _is_folder(source) else folder.name, run_config)
 
     @classmethod
     def from_config(cls, config: pb.ModelConfig) -> Origin:
@@ -67,6 +64,11 @@ class Origin:
         """Where the checkpoint is from, as parameters of config.pbtxt by name."""
         of_run = {RUN_CONFIG_PARAMETER: self.run_config} if self.run_config else {}
         return {SOURCE_PARAMETER: self.source, REVISION_PARAMETER: self.revision, **of_run}
+
+
+def source_name(source: str | Path) -> str:
+    """How models name the source of a checkpoint: by the end of a folder's path, or the Hub id."""
+    return "/".join(Path(source).expanduser().resolve().parts[-_NAMED_PARTS:]) if _is_folder(source) else str(source)
 
 
 def about(checkpoint: Checkpoint, origin: Origin) -> dict[str, str]:
@@ -87,6 +89,10 @@ def record_weights(config: pb.ModelConfig, version: int, repository: Path) -> No
     parts = [step.model_name for step in config.ensemble_scheduling.step] or [config.name]
     digest = weights_digest(repository / part / str(version) for part in parts)
     config.parameters[DIGEST_PARAMETER].string_value = digest
+
+
+def _is_folder(source: str | Path) -> bool:
+    return bool(str(source)) and Path(source).expanduser().is_dir()
 
 
 def _public(value: Any) -> Any:

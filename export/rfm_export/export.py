@@ -14,7 +14,7 @@ from google.protobuf.text_format import ParseError
 from safetensors import SafetensorError
 
 from rfm import families
-from rfm.config import ServeConfig
+from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.family import Checkpoint, Description, Family, FrameEncoders, Options
 from rfm.parameters import FAMILY_PARAMETER
@@ -43,7 +43,7 @@ class _Source:
 def export(
     source: str | Path,
     repository: Path,
-    serve: ServeConfig,
+    settings: ExportConfig,
     *,
     other_machine: bool = False,
     family: str | None = None,
@@ -56,25 +56,25 @@ def export(
     Raises CheckpointError, ExportError.
     """
     if not other_machine:
-        _check_gpus(serve.num_gpus)
-    loaded = _load(source, serve, family)
+        _check_gpus(settings.num_gpus)
+    loaded = _load(source, settings, family)
     described = loaded.encoders.description if loaded.encoders is not None else None
-    names = [serve.name, encoder_name(serve.name), frames_name(serve.name)]
+    names = [settings.name, encoder_name(settings.name), frames_name(settings.name)]
     with alone(repository), staging(repository, names) as staged:
-        version = _version(loaded, serve, next_version(repository, names))
+        version = _version(loaded, settings, next_version(repository, names))
         models = generated_models(loaded.checkpoint.description, described, version)
-        _check_replaceable(repository, models, serve)
+        _check_replaceable(repository, models, settings)
         _stage(loaded, models, version, staged)
         _verify(loaded, version, staged)
         publish(repository, staged, models)
     return version.number
 
 
-def _load(source: str | Path, serve: ServeConfig, family: str | None) -> _Source:
+def _load(source: str | Path, settings: ExportConfig, family: str | None) -> _Source:
     """What is at ``source``, checked."""
     folder = families.find(source)
     kind = families.choose(folder, family)
-    options = Options(serve.base_model, serve.resize_images, serve.image_encoder, serve.text_encoder)
+    options = Options(settings.base_model, settings.resize_images, settings.image_encoder, settings.text_encoder)
     checkpoint = kind.load(folder, options)
     families.check(folder, checkpoint)
     return _Source(kind, checkpoint, checkpoint.encoders(), Origin.of(source, folder))
@@ -104,11 +104,11 @@ def _stage(source: _Source, models: Sequence[GeneratedModel], version: Version, 
 
 def _verify(source: _Source, version: Version, staged: Path) -> None:
     """Raises ExportDiffersError unless what was staged gives the checkpoint's numbers."""
-    description, serve = source.checkpoint.description, version.serve
+    description, settings = source.checkpoint.description, version.settings
     engine = partial(Engine.of, device="cpu", dtype=None)
     if description.is_large:
-        on_gpu = torch.cuda.is_available() and serve.num_gpus != 0
-        engine = partial(Engine.of, device="cuda" if on_gpu else "cpu", dtype=serve.torch_dtype)
+        on_gpu = torch.cuda.is_available() and settings.num_gpus != 0
+        engine = partial(Engine.of, device="cuda" if on_gpu else "cpu", dtype=settings.torch_dtype)
 
     def exported() -> Engine:
         checkpoint = families.named(source.family.name).load(
@@ -124,16 +124,16 @@ def _verify(source: _Source, version: Version, staged: Path) -> None:
 
 
 def _checkpoint_folder(description: Description, version: Version, repository: Path) -> Path:
-    return repository / scorer_name(description, version.serve.name) / str(version.number) / CHECKPOINT_FOLDER
+    return repository / scorer_name(description, version.settings.name) / str(version.number) / CHECKPOINT_FOLDER
 
 
 def _encoders_folder(version: Version, repository: Path) -> Path:
-    return repository / encoder_name(version.serve.name) / str(version.number)
+    return repository / encoder_name(version.settings.name) / str(version.number)
 
 
-def check(repository: Path, serve: ServeConfig) -> list[str]:
+def check(repository: Path, settings: ExportConfig) -> list[str]:
     """How the repository's generated files differ from what an export would write now; empty if they do not."""
-    scorer = serve.name if (repository / serve.name).exists() else frames_name(serve.name)
+    scorer = settings.name if (repository / settings.name).exists() else frames_name(settings.name)
     config = _read_config(repository, scorer)
     versions = config.version_policy.specific.versions
     if not versions:
@@ -142,9 +142,9 @@ def check(repository: Path, serve: ServeConfig) -> list[str]:
     folder = repository / scorer / str(number) / CHECKPOINT_FOLDER
     family = families.choose(folder, config.parameters[FAMILY_PARAMETER].string_value or None)
     checkpoint = family.load(folder, Options())
-    encoders = repository / encoder_name(serve.name) / str(number)
+    encoders = repository / encoder_name(settings.name) / str(number)
     described = family.encoders.describe(encoders) if family.encoders is not None and encoders.exists() else None
-    version = _version(_Source(family, checkpoint, None, Origin.from_config(config)), serve, number)
+    version = _version(_Source(family, checkpoint, None, Origin.from_config(config)), settings, number)
     models = generated_models(checkpoint.description, described, version)
     differences = []
     for path, content in _generated(models, repository).items():
@@ -162,9 +162,9 @@ def _generated(models: Sequence[GeneratedModel], repository: Path) -> dict[str, 
     return {path: content for model in models for path, content in model.files().items()}
 
 
-def _version(source: _Source, serve: ServeConfig, number: int) -> Version:
-    num_gpus = torch.cuda.device_count() if serve.num_gpus is None else serve.num_gpus
-    return Version(number, serve, num_gpus, source.family.name, about(source.checkpoint, source.origin))
+def _version(source: _Source, settings: ExportConfig, number: int) -> Version:
+    num_gpus = torch.cuda.device_count() if settings.num_gpus is None else settings.num_gpus
+    return Version(number, settings, num_gpus, source.family.name, about(source.checkpoint, source.origin))
 
 
 def _read_config(repository: Path, name: str) -> Any:
@@ -174,13 +174,13 @@ def _read_config(repository: Path, name: str) -> Any:
         raise ExportError(f"{repository / name}: expected an exported model, got {error}") from error
 
 
-def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], serve: ServeConfig) -> None:
+def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], settings: ExportConfig) -> None:
     """Raises ExportError for a model that would lose inputs or outputs, on which its clients rely.
 
     A model may gain an optional input, which clients need not know.
     """
     names = {model.name for model in models}
-    for name in (serve.name, encoder_name(serve.name), frames_name(serve.name)):
+    for name in (settings.name, encoder_name(settings.name), frames_name(settings.name)):
         if name not in names and (repository / name).exists():
             raise ExportError(
                 f"{repository / name}: expected a checkpoint that this model can serve too, got one that it cannot; "

@@ -14,7 +14,7 @@ from importlib import resources
 
 from tritonclient.grpc import model_config_pb2 as pb
 
-from rfm.config import ServeConfig
+from rfm.config import ExportConfig
 from rfm.family import Description, EncodersDescription
 from rfm.parameters import FAMILY_PARAMETER
 from rfm_client.contract import FrameSize, PreferenceSample, ProgressSample, Sample, SimilaritySample, wire
@@ -73,7 +73,7 @@ class Version:
     """
 
     number: int
-    serve: ServeConfig
+    settings: ExportConfig
     num_gpus: int
     family: str
     about: Mapping[str, str]
@@ -88,7 +88,7 @@ def generated_models(
     description: Description, encoders: EncodersDescription | None, version: Version
 ) -> list[GeneratedModel]:
     """The models of a checkpoint and its encoders, if it has some; an ensemble stands behind what it is made of."""
-    name, widths = version.serve.name, description.widths
+    name, widths = version.settings.name, description.widths
     outputs = wire.score_outputs(description.progress_bins if description.progress_bins > 1 else None)
     inputs = wire.frame_inputs() if widths is None else wire.embedding_inputs(*widths)
     about = {**_limits(description, description.frame_size), **version.about}
@@ -102,7 +102,7 @@ def generated_models(
     frames = Interface(frames_name(name), wire.frame_inputs(), outputs, about)
     models.append(_python_model(encoder, "rfm_encoder", version, [_encoder_warmup()]))
     models.append(
-        GeneratedModel(ensemble_config(frames, version.serve, version.number, encoder, scorer), version.number)
+        GeneratedModel(ensemble_config(frames, version.settings, version.number, encoder, scorer), version.number)
     )
     return models
 
@@ -120,7 +120,7 @@ def _limits(description: Description, frame_size: FrameSize | None) -> dict[str,
 def _python_model(interface: Interface, template: str, version: Version, warmups: list[Warmup]) -> GeneratedModel:
     model_file = resources.files("rfm_export") / "templates" / template / MODEL_FILE
     files = {name: content for warmup in warmups for name, content in warmup.files().items()}
-    config = python_config(interface, version.serve, version.num_gpus, version.number, warmups)
+    config = python_config(interface, version.settings, version.num_gpus, version.number, warmups)
     config.parameters[FAMILY_PARAMETER].string_value = version.family
     return GeneratedModel(config, version.number, model_file.read_bytes(), files)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""config.pbtxt of each model of a repository, from the wire contract and the ServeConfig."""
+"""config.pbtxt of each model of a repository, from the wire contract and the ExportConfig."""
 
 from __future__ import annotations
 
@@ -12,9 +12,17 @@ import numpy.typing as npt
 from google.protobuf import text_format
 from tritonclient.grpc import model_config_pb2 as pb
 
-from rfm.config import ServeConfig
-from rfm.parameters import BUDGET_PARAMETER, DTYPE_PARAMETER, SAMPLE_TOKENS_PARAMETER, THREADS_PARAMETER
+from rfm.config import ExportConfig
+from rfm.parameters import (
+    BUDGET_PARAMETER,
+    DTYPE_PARAMETER,
+    QUEUE_SIZE_PARAMETER,
+    QUEUE_TIMEOUT_PARAMETER,
+    SAMPLE_TOKENS_PARAMETER,
+    THREADS_PARAMETER,
+)
 from rfm_client.contract import wire
+from rfm_client.contract.model_info import SOURCE_PARAMETER
 from rfm_client.contract.wire import TensorSpec
 
 US_PER_MS = 1000
@@ -44,47 +52,66 @@ class Warmup:
 
 
 def python_config(
-    interface: Interface, serve: ServeConfig, num_gpus: int, version: int, warmups: Sequence[Warmup]
+    interface: Interface, settings: ExportConfig, num_gpus: int, version: int, warmups: Sequence[Warmup]
 ) -> pb.ModelConfig:
-    """A Python-backend model that batches dynamically, with ``serve.instances`` on each GPU, or on the CPU."""
-    config = _config(interface, serve, version)
+    """A Python-backend model that batches dynamically, with ``settings.instances`` on each GPU, or on the CPU."""
+    config = _config(interface, settings, version)
     config.backend = "python"
     for spec, tensor in zip(interface.inputs, config.input, strict=True):
         tensor.allow_ragged_batch = spec.ragged
     config.dynamic_batching.SetInParent()
-    queue = config.dynamic_batching.default_queue_policy  # and no delay: Triton before 26.08 decays with both
-    if serve.max_queue_size is not None:
-        queue.max_queue_size = serve.max_queue_size
-    if serve.queue_timeout_ms is not None:
-        queue.timeout_action = pb.ModelQueuePolicy.REJECT
-        queue.default_timeout_microseconds = serve.queue_timeout_ms * US_PER_MS
-        queue.allow_timeout_override = True  # by shorter ones
-    group = config.instance_group.add(count=serve.instances, kind=pb.ModelInstanceGroup.KIND_CPU)
-    if num_gpus:
-        group.kind = pb.ModelInstanceGroup.KIND_GPU
-        group.gpus.extend(range(num_gpus))
-    config.parameters[BUDGET_PARAMETER].string_value = str(serve.token_budget)
-    config.parameters[SAMPLE_TOKENS_PARAMETER].string_value = str(serve.max_sample_tokens)
-    config.parameters[THREADS_PARAMETER].string_value = str(serve.torch_threads)
-    config.parameters[DTYPE_PARAMETER].string_value = serve.dtype or ""
+    if settings.instances * max(num_gpus, 1) > 1:
+        _bound_queue(config.dynamic_batching.default_queue_policy, settings)
+    kind = pb.ModelInstanceGroup.KIND_GPU if num_gpus else pb.ModelInstanceGroup.KIND_CPU
+    config.instance_group.add(count=settings.instances, kind=kind, gpus=range(num_gpus))
+    config.parameters[BUDGET_PARAMETER].string_value = str(settings.token_budget)
+    config.parameters[SAMPLE_TOKENS_PARAMETER].string_value = str(settings.max_sample_tokens)
+    config.parameters[THREADS_PARAMETER].string_value = str(settings.torch_threads)
+    config.parameters[DTYPE_PARAMETER].string_value = settings.dtype or ""
+    config.parameters[QUEUE_SIZE_PARAMETER].string_value = str(settings.max_queue_size or "")
+    config.parameters[QUEUE_TIMEOUT_PARAMETER].string_value = str(settings.queue_timeout_ms or "")
     for warmup in warmups:
-        sample = config.model_warmup.add(name=warmup.name, batch_size=1)
-        for spec in [spec for spec in interface.inputs if spec.name in warmup.tensors]:
-            tensor = sample.inputs[spec.name]
-            tensor.data_type = _datatype(spec)
-            tensor.dims.extend(warmup.tensors[spec.name].shape[1:])
-            if _is_zero(warmup.tensors[spec.name]):
-                tensor.zero_data = True
-            else:
-                tensor.input_data_file = f"{warmup.name}.{spec.name}"
+        _add_warmup(config, interface, warmup)
     return config
 
 
+def _bound_queue(policy: pb.ModelQueuePolicy, settings: ExportConfig) -> None:
+    """Bounds Triton's queue, in which most requests wait where a model has several instances.
+
+    One instance takes all requests, and bounds what waits itself: Triton 2.51 with a bounded queue and one instance
+    misses requests for half a second at a time.
+    """
+    if settings.max_queue_size is not None:
+        policy.max_queue_size = settings.max_queue_size
+    if settings.queue_timeout_ms is not None:
+        policy.timeout_action = pb.ModelQueuePolicy.REJECT
+        policy.default_timeout_microseconds = settings.queue_timeout_ms * US_PER_MS
+        policy.allow_timeout_override = True  # by shorter ones
+
+
+def exported_settings(config: pb.ModelConfig) -> dict[str, Any]:
+    """What a configuration of ``python_config`` tells of the ExportConfig that it was made from, by key.
+
+    ``num_gpus`` is that of the machine for which it was made, ``checkpoint`` its ``source_name``. An older export tells
+    less.
+    """
+    texts = {name: parameter.string_value for name, parameter in config.parameters.items()}
+    numbers = (THREADS_PARAMETER, BUDGET_PARAMETER, SAMPLE_TOKENS_PARAMETER)
+    told: dict[str, Any] = {key: int(texts[key]) for key in numbers if key in texts}
+    optional = (QUEUE_SIZE_PARAMETER, QUEUE_TIMEOUT_PARAMETER)
+    told |= {key: int(texts[key]) if texts[key] else None for key in optional if key in texts}
+    if SOURCE_PARAMETER in texts:
+        told["checkpoint"] = texts[SOURCE_PARAMETER]
+    for group in config.instance_group:
+        told |= {"num_gpus": len(group.gpus), "instances": group.count}
+    return told | {"max_batch_size": config.max_batch_size, "dtype": texts.get(DTYPE_PARAMETER) or None}
+
+
 def ensemble_config(
-    interface: Interface, serve: ServeConfig, version: int, encoder: Interface, scorer: Interface
+    interface: Interface, settings: ExportConfig, version: int, encoder: Interface, scorer: Interface
 ) -> pb.ModelConfig:
     """Frames through the encoder into the scorer; both at the version with which they were exported."""
-    config = _config(interface, serve, version)
+    config = _config(interface, settings, version)
     config.platform = "ensemble"
     own = {spec.name for spec in (*interface.inputs, *interface.outputs)}
     for step_of in (encoder, scorer):
@@ -116,8 +143,8 @@ def parse(text: str) -> pb.ModelConfig:
     return text_format.Parse(text, pb.ModelConfig())
 
 
-def _config(interface: Interface, serve: ServeConfig, version: int) -> pb.ModelConfig:
-    config = pb.ModelConfig(name=interface.name, max_batch_size=serve.max_batch_size)
+def _config(interface: Interface, settings: ExportConfig, version: int) -> pb.ModelConfig:
+    config = pb.ModelConfig(name=interface.name, max_batch_size=settings.max_batch_size)
     config.version_policy.specific.versions.append(version)
     for spec in interface.inputs:
         config.input.add(name=spec.name, data_type=_datatype(spec), dims=spec.dims, optional=spec.optional)
@@ -126,6 +153,18 @@ def _config(interface: Interface, serve: ServeConfig, version: int) -> pb.ModelC
     for name, value in interface.parameters.items():
         config.parameters[name].string_value = value
     return config
+
+
+def _add_warmup(config: pb.ModelConfig, interface: Interface, warmup: Warmup) -> None:
+    sample = config.model_warmup.add(name=warmup.name, batch_size=1)
+    for spec in [spec for spec in interface.inputs if spec.name in warmup.tensors]:
+        tensor = sample.inputs[spec.name]
+        tensor.data_type = _datatype(spec)
+        tensor.dims.extend(warmup.tensors[spec.name].shape[1:])
+        if _is_zero(warmup.tensors[spec.name]):
+            tensor.zero_data = True
+        else:
+            tensor.input_data_file = f"{warmup.name}.{spec.name}"
 
 
 def _datatype(spec: TensorSpec) -> int:

@@ -5,10 +5,8 @@ from __future__ import annotations
 
 import logging
 import secrets
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated, Any
 
 import anyio
@@ -25,12 +23,11 @@ from starlette.requests import ClientDisconnect
 from rfm_client.async_client import AsyncRewardClient
 from rfm_client.contract import errors
 from rfm_client.contract.names import DEFAULT_MODEL
-from rfm_client.transport.access import Access
 from rfm_gateway import schema
 from rfm_gateway.body import Admitted, Batch, BodyLimits, read_json, read_multipart
+from rfm_gateway.config import MIB, GatewayConfig
 from rfm_gateway.folder import AllowedFolder
 from rfm_gateway.leaving import CallerLeftError, while_connected
-from rfm_gateway.limits import MIB, Limits
 from rfm_gateway.memory import RETRY_AFTER
 from rfm_gateway.observe import CALLER_LEFT, REQUEST_ID_HEADER, Metrics, Observed
 from rfm_gateway.scoring import Scorer
@@ -52,41 +49,21 @@ _STATUS_OF = {  # of an answer, by what went wrong behind it
 logger = logging.getLogger("rfm_gateway")
 
 
-@dataclass(frozen=True)
-class GatewaySettings:
-    """How a gateway works.
+def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
+    """The application.
 
-    triton_url: ``grpc://host:port`` or ``http://host:port``, or with TLS ``grpcs://`` or ``https://``
-    access: certificates, and what Triton is shown
-    metrics_url: of Triton's metrics; None: port 8002 of the same host
-    model: name under which the checkpoint was exported
-    limits: what it takes on
-    api_key: which requests must show, but for those of health and documentation; None: none
-    cors_origins: from which browsers may ask
-    folder: whose files requests may name; None: none
+    api_key: what requests must show, but for those of health and documentation; None: nothing
+    Raises OSError for a folder that is not there, ValueError for a malformed URL or files that cannot be used.
     """
-
-    triton_url: str
-    access: Access = field(default_factory=Access)
-    metrics_url: str | None = None
-    model: str = DEFAULT_MODEL
-    limits: Limits = field(default_factory=Limits)
-    api_key: str | None = None
-    cors_origins: tuple[str, ...] = ()
-    folder: Path | None = None
-
-
-def create_app(settings: GatewaySettings) -> FastAPI:
-    """The application. Raises OSError for a folder that is not there, ValueError for a malformed URL."""
-    folder = AllowedFolder(settings.folder, settings.limits.max_body_mib * MIB)
-    metrics = Metrics()
+    folder = AllowedFolder(config.allow_folder, config.max_body_mib * MIB)
+    model, access, metrics = config.model or DEFAULT_MODEL, config.access, Metrics()
     client = AsyncRewardClient(
-        settings.triton_url,
-        model=settings.model,
-        timeout_s=settings.limits.timeout,
+        config.triton_url,
+        model=model,
+        timeout_s=config.timeout,
         retry=False,  # the caller gets the error at once, and decides
-        max_in_flight=settings.limits.max_in_flight,
-        **settings.access.options,
+        max_in_flight=config.max_in_flight,
+        **access.options,
     )
 
     @asynccontextmanager
@@ -95,39 +72,62 @@ def create_app(settings: GatewaySettings) -> FastAPI:
             yield
 
     app = FastAPI(title="RFM evaluation gateway", summary="Rewards for robot trajectories.", lifespan=lifespan)
-    app.add_middleware(Observed, metrics=metrics, limits=settings.limits)
-    if settings.cors_origins:
-        app.add_middleware(
-            CORSMiddleware,
-            allow_origins=settings.cors_origins,
-            allow_methods=["GET", "POST"],
-            allow_headers=["*"],
-            expose_headers=[REQUEST_ID_HEADER],
-        )
-    state = State(client, settings.triton_url, settings.metrics_url, settings.model, settings.access)
-    for router in (_health(state), _guarded(settings, Scorer(client, folder, settings.limits.timeout), state, metrics)):
+    app.add_middleware(Observed, metrics=metrics, config=config)
+    _allow_origins(app, config.cors_origin)
+    state = State(client, config.triton_url, config.metrics_url, model, access)
+    evaluations = _Evaluations(config, Scorer(client, folder, config.timeout), metrics)
+    for router in (_health(state), _guarded(api_key, evaluations, state, metrics)):
         app.include_router(router)
     _answer_errors(app)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]  # FastAPI's way to extend it
     return app
 
 
-def _guarded(settings: GatewaySettings, scorer: Scorer, state: State, metrics: Metrics) -> APIRouter:
-    """Everything that the key guards."""
-    guards = [] if settings.api_key is None else [Depends(_key_check(settings.api_key))]
-    router = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
-    limits = BodyLimits(settings.limits.max_body_mib * MIB, settings.limits.max_memory_mib * MIB)
+def _allow_origins(app: FastAPI, origins: Sequence[str]) -> None:
+    """Lets browsers ask from ``origins``."""
+    if origins:
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=origins,
+            allow_methods=["GET", "POST"],
+            allow_headers=["*"],
+            expose_headers=[REQUEST_ID_HEADER],
+        )
 
-    async def evaluated(request: Request, read: Callable[[Admitted], Awaitable[Batch]]) -> Response:
-        with limits.admitted(request) as admitted:
+
+class _Evaluations:
+    """Reads requests within the limits, has them scored, and counts their samples."""
+
+    def __init__(self, config: GatewayConfig, scorer: Scorer, metrics: Metrics) -> None:
+        self._limits = BodyLimits(config.max_body_mib * MIB, config.max_memory_mib * MIB)
+        self._timeout_s = config.timeout
+        self._scorer = scorer
+        self._metrics = metrics
+
+    async def answer(self, request: Request, read: Callable[[Admitted], Awaitable[Batch]]) -> Response:
+        """The answer to a request whose body ``read`` reads."""
+        with self._limits.admitted(request) as admitted:
             await admitted.wait_for_room(request.state.begin_by)
-            with anyio.fail_after(settings.limits.timeout):
+            with anyio.fail_after(self._timeout_s):
                 batch = await read(admitted)
-            scoring = scorer.evaluate(batch, admitted.share, request.state.request_id)
+            scoring = self._scorer.evaluate(batch, admitted.share, request.state.request_id)
             answer = await while_connected(request, scoring)
         for sample in batch.samples:
-            metrics.samples.labels(sample.sample_type).inc()
+            self._metrics.samples.labels(sample.sample_type).inc()
         return Response(answer.model_dump_json(), media_type="application/json")
+
+
+def _guarded(api_key: str | None, evaluations: _Evaluations, state: State, metrics: Metrics) -> APIRouter:
+    """Everything that the key guards."""
+    guards = [] if api_key is None else [Depends(_key_check(api_key))]
+    router = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
+    _add_evaluations(router, evaluations)
+    _add_reports(router, state, metrics)
+    return router
+
+
+def _add_evaluations(router: APIRouter, evaluations: _Evaluations) -> None:
+    """The endpoints that score samples."""
 
     @router.post(
         "/evaluate_batch",
@@ -137,7 +137,7 @@ def _guarded(settings: GatewaySettings, scorer: Scorer, state: State, metrics: M
     )
     async def evaluate_batch(request: Request) -> Response:
         """Score samples that come as JSON."""
-        return await evaluated(request, read_json)
+        return await evaluations.answer(request, read_json)
 
     @router.post(
         "/evaluate_batch_npy",
@@ -149,7 +149,11 @@ def _guarded(settings: GatewaySettings, scorer: Scorer, state: State, metrics: M
         """Score samples whose arrays come as .npy files: fields `sample_0`, `sample_1`, ... hold each sample as JSON,
         in which `{"__numpy_file__": name}` stands for the array in the part of that name.
         """
-        return await evaluated(request, read_multipart)
+        return await evaluations.answer(request, read_multipart)
+
+
+def _add_reports(router: APIRouter, state: State, metrics: Metrics) -> None:
+    """The endpoints that tell what is served, and how."""
 
     @router.get("/gpu_status", responses=_failures(502, 503, 504))
     async def gpu_status() -> schema.GpuStatus:
@@ -165,8 +169,6 @@ def _guarded(settings: GatewaySettings, scorer: Scorer, state: State, metrics: M
     async def metrics_text() -> Response:
         """The gateway's own metrics, for Prometheus."""
         return Response(metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
-
-    return router
 
 
 def _health(state: State) -> APIRouter:

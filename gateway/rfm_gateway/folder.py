@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 class AllowedFolder:
     """The folder whose files requests may name. Without a folder, they may name none.
 
-    max_bytes: of the decoded files that one request names, all together
-
     max_bytes: of the files that one request names, all together, when they are decoded
     """
 

@@ -17,7 +17,7 @@ from rfm_client.contract.names import PROBE_PREFIX
 from rfm_client.contract.wire import REQUEST_ID
 from rfm_client.transport.deadline import Deadline, timeout
 from rfm_gateway.body import NPY_ENDPOINT
-from rfm_gateway.limits import Limits
+from rfm_gateway.config import GatewayConfig
 from rfm_gateway.memory import RETRY_AFTER
 
 EVALUATIONS = ("/evaluate_batch", NPY_ENDPOINT)
@@ -64,19 +64,27 @@ class Metrics:
         self.in_flight = Gauge("rfm_gateway_requests_in_flight", "Evaluations under way.", registry=self._registry)
         self.waiting = Gauge("rfm_gateway_requests_waiting", "Evaluations not begun.", registry=self._registry)
 
+    def count(self, path: str, code: int, duration_s: float) -> None:
+        """Counts a request that was answered with the status ``code``."""
+        endpoint = path if path in ENDPOINTS else "other"  # not any path that a caller makes up
+        self.requests.labels(endpoint, str(code)).inc()
+        self.durations.labels(endpoint).observe(duration_s)
+        if path in EVALUATIONS and code >= 400:
+            self.rejections.labels(REJECTIONS.get(code, "other")).inc()
+
     def text(self) -> bytes:
         """The metrics in the text format of Prometheus."""
         return generate_latest(self._registry)
 
 
 class Observed:
-    """ASGI middleware: names, times and counts every request, and lets in as many evaluations as ``limits`` say."""
+    """ASGI middleware: names, times and counts every request, and lets in as many evaluations as ``config`` says."""
 
-    def __init__(self, app: ASGIApp, metrics: Metrics, limits: Limits) -> None:
+    def __init__(self, app: ASGIApp, metrics: Metrics, config: GatewayConfig) -> None:
         self._app = app
         self._metrics = metrics
-        self._limits = limits
-        self._room = asyncio.Semaphore(limits.max_in_flight)
+        self._config = config
+        self._room = asyncio.Semaphore(config.max_in_flight)
         self._waiting = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -87,7 +95,7 @@ class Observed:
         started_s = time.perf_counter()
         request_id = _request_id(scope)
         state = scope.setdefault("state", {})
-        state["request_id"], state["begin_by"] = request_id, Deadline(self._limits.timeout)
+        state["request_id"], state["begin_by"] = request_id, Deadline(self._config.timeout)
         code = 500  # if nothing is answered
 
         async def send_counted(message: Message) -> None:
@@ -97,25 +105,20 @@ class Observed:
                 MutableHeaders(scope=message)[REQUEST_ID_HEADER] = request_id
             await send(message)
 
-        is_evaluation = scope["path"] in EVALUATIONS
         try:
-            if not is_evaluation:
+            if scope["path"] not in EVALUATIONS:
                 await self._app(scope, receive, send_counted)
             elif not await self._has_entered(state["begin_by"]):
-                refused = {"detail": f"expected at most {self._limits.max_in_flight} evaluations at a time, got more"}
+                refused = {"detail": f"expected at most {self._config.max_in_flight} evaluations at a time, got more"}
                 await JSONResponse(refused, 503, RETRY_AFTER)(scope, receive, send_counted)
             else:
                 await self._evaluated(scope, receive, send_counted)
         finally:
-            endpoint = scope["path"] if scope["path"] in ENDPOINTS else "other"  # not any path that a caller makes up
-            self._metrics.requests.labels(endpoint, str(code)).inc()
-            self._metrics.durations.labels(endpoint).observe(time.perf_counter() - started_s)
-            if is_evaluation and code >= 400:
-                self._metrics.rejections.labels(REJECTIONS.get(code, "other")).inc()
+            self._metrics.count(scope["path"], code, time.perf_counter() - started_s)
 
     async def _has_entered(self, deadline: Deadline) -> bool:
         """Whether there is room in time, first come, first served."""
-        if self._room.locked() and self._waiting >= self._limits.max_waiting:
+        if self._room.locked() and self._waiting >= self._config.max_waiting:
             return False
         self._waiting += 1
         self._metrics.waiting.set(self._waiting)

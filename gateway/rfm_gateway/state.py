@@ -212,5 +212,5 @@ def _busy_s(status: ServerStatus, device: Device, model: str) -> float:
     on_all = sum(each.work[model].compute_s for each in status.devices if model in each.work)
     if model not in device.work or not on_all:
         return 0.0
-    batches_s = sum(entry.compute_ms for entry in status.models if entry.name == model) / MS_PER_S
+    batches_s = sum(entry.busy_ms for entry in status.models if entry.name == model) / MS_PER_S
     return batches_s * device.work[model].compute_s / on_all

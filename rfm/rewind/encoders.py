@@ -28,7 +28,7 @@ from rfm.rewind.preprocessing import ImagePreprocessor
 from rfm.rewind.pretrained import load_model, load_preprocessor, load_tokenizer
 from rfm.version_folder import IMAGE_ENCODER_FOLDER, TEXT_ENCODER_FOLDER
 from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError, Trajectory
-from rfm_client.contract.samples import Float32Array, Footage, UInt8Array, joined, stackable
+from rfm_client.contract.samples import Float32Array, Footage, UInt8Array
 
 IMAGES_PER_FORWARD = 64
 MAX_ENCODER_ASPECT_RATIO = 50
@@ -72,22 +72,19 @@ class Encoders:
             load_tokenizer(text_source),
         )
 
-    def save_pretrained(self, image_folder: Path, text_folder: Path) -> None:
-        """Writes both so that ``from_pretrained`` needs no network."""
-        self.image_model.save_pretrained(image_folder)
-        content = json.dumps(self.preprocessor.to_config(), indent=2)
-        (image_folder / PREPROCESSOR_CONFIG).write_text(content + "\n")
-        self.text_model.save_pretrained(text_folder)
-        self.tokenizer.save_pretrained(text_folder)
-
     @classmethod
     def load(cls, folder: Path) -> Encoders:
         """The encoders that ``save`` wrote into ``folder``."""
         return cls.from_pretrained(folder / IMAGE_ENCODER_FOLDER, folder / TEXT_ENCODER_FOLDER)
 
     def save(self, folder: Path) -> None:
-        """Writes the image and the text encoder into ``folder``."""
-        self.save_pretrained(folder / IMAGE_ENCODER_FOLDER, folder / TEXT_ENCODER_FOLDER)
+        """Writes the image and the text encoder into ``folder``, from which ``load`` needs no network."""
+        image_folder, text_folder = folder / IMAGE_ENCODER_FOLDER, folder / TEXT_ENCODER_FOLDER
+        self.image_model.save_pretrained(image_folder)
+        content = json.dumps(self.preprocessor.to_config(), indent=2)
+        (image_folder / PREPROCESSOR_CONFIG).write_text(content + "\n")
+        self.text_model.save_pretrained(text_folder)
+        self.tokenizer.save_pretrained(text_folder)
 
     @classmethod
     def describe(cls, folder: Path) -> EncodersDescription:
@@ -117,8 +114,8 @@ class Encoders:
         """Dt, the width of a task's embedding."""
         return int(self.text_model.config.hidden_size)
 
-    def encode(self, samples: Sequence[Footage], execution: Execution | None = None) -> list[Trajectory | RewardError]:
-        """The embeddings of each sample's frames, one trajectory after the other, and task, or why there are none.
+    def encode(self, samples: Sequence[Footage], execution: Execution | None = None) -> list[Footage | RewardError]:
+        """Each sample with embeddings of its trajectories' frames and of its task, or why it has none.
 
         execution: what it took is added to it; its tokens are those of images, which have no padding, and of tasks
         """
@@ -126,8 +123,8 @@ class Encoders:
         with execution.forwarding():
             return self._encoded(samples, execution)
 
-    def _encoded(self, samples: Sequence[Footage], execution: Execution) -> list[Trajectory | RewardError]:
-        outcomes: dict[int, Trajectory | RewardError] = {}
+    def _encoded(self, samples: Sequence[Footage], execution: Execution) -> list[Footage | RewardError]:
+        outcomes: dict[int, Footage | RewardError] = {}
         for index, footage in enumerate(samples):
             try:
                 self._check_task(footage.trajectories[0].task)
@@ -137,12 +134,11 @@ class Encoders:
                 outcomes[index] = error
         good = [index for index in range(len(samples)) if index not in outcomes]
         if good:
-            parts = {index: stackable(samples[index].trajectories) for index in good}
-            videos = self.encode_frames([joined(part) for of_sample in parts.values() for part in of_sample], execution)
+            trajectories = [trajectory for index in good for trajectory in samples[index].trajectories]
+            videos = iter(self.encode_frames([trajectory.positions for trajectory in trajectories], execution))
             texts = self.encode_tasks([samples[index].trajectories[0].task for index in good], execution)
-            encoded = iter(videos)
-            for (index, of_sample), text in zip(parts.items(), texts, strict=True):
-                outcomes[index] = _embedded(list(islice(encoded, len(of_sample))), text)
+            for index, text in zip(good, texts, strict=True):
+                outcomes[index] = _embedded([next(videos) for _ in samples[index].trajectories], text)
         return [outcomes[index] for index in range(len(samples))]
 
     @torch.inference_mode()
@@ -179,17 +175,21 @@ class Encoders:
         return execution.run(forward, list(tasks))
 
     def _crop_batches(self, videos: Sequence[UInt8Array], execution: Execution) -> Iterator[Tensor]:
-        """The crops of all videos' frames, in order, at most IMAGES_PER_FORWARD of them in memory."""
+        """The crops of all videos' frames, in order, IMAGES_PER_FORWARD of them at a time, whosever they are."""
         waiting: list[Tensor] = []
+        room = IMAGES_PER_FORWARD
         for video in videos:
-            for start in range(0, len(video), IMAGES_PER_FORWARD):
-                images = as_tensor(video[start : start + IMAGES_PER_FORWARD])
-                if sum(map(len, waiting)) + len(images) > IMAGES_PER_FORWARD:
-                    yield torch.cat(waiting)
-                    waiting = []
+            start = 0
+            while start < len(video):
+                images = as_tensor(video[start : start + room])
                 with execution.collating():  # on the CPU: torch resizes uint8 with antialiasing only there
                     waiting.append(self.preprocessor(images))
-        yield torch.cat(waiting)
+                start, room = start + len(images), room - len(images)
+                if not room:
+                    yield torch.cat(waiting)
+                    waiting, room = [], IMAGES_PER_FORWARD
+        if waiting:
+            yield torch.cat(waiting)
 
     def _check_task(self, task: str) -> None:
         """Raises InvalidSampleError for a task longer than the text encoder reads; it is never cut silently."""
@@ -215,7 +215,7 @@ def _of_video(images: Sequence[Tensor | InferenceFailedError]) -> Float32Array |
 
 def _embedded(
     videos: Sequence[Float32Array | InferenceFailedError], text: Float32Array | InferenceFailedError
-) -> Trajectory | RewardError:
+) -> Footage | RewardError:
     embeddings = []
     for outcome in (*videos, text):
         if isinstance(outcome, InferenceFailedError):
@@ -223,7 +223,8 @@ def _embedded(
         if not np.isfinite(outcome).all():
             return InferenceFailedError("an encoder gave an embedding that is not finite")
         embeddings.append(outcome)
-    return Trajectory(video_embeddings=np.concatenate(embeddings[:-1]), text_embedding=embeddings[-1])
+    *of_videos, of_text = embeddings
+    return Footage(tuple(Trajectory(video_embeddings=video, text_embedding=of_text) for video in of_videos))
 
 
 def _check_shape(trajectory: Trajectory) -> None:

@@ -19,6 +19,8 @@ class RewindPredictor:
     dtype: of the network. Others than float32 move scores by more than 1e-5
     """
 
+    works_ahead = False
+
     def __init__(self, network: RewindTransformer, device: torch.device, dtype: torch.dtype = torch.float32) -> None:
         self.network = network.to(device, dtype).eval()
         self.device = device
@@ -32,6 +34,9 @@ class RewindPredictor:
     def num_tokens(self, row: Row) -> int:
         """Number of tokens that the row takes in the transformer."""
         return self.network.config.num_tokens(row.num_first, row.num_second)
+
+    def work_ahead(self, rows: Sequence[Row]) -> None:
+        """Nothing: collation is cheap."""
 
     def collate(self, rows: Sequence[Row]) -> RewindBatch:
         """One batch of rows, which may be of different kinds."""

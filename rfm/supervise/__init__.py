@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""What runs beside Triton: starts it, watches it, and heals what it does not.
+"""What runs beside Triton, which ``rfm.launch`` has started: watches it, and heals what it does not heal itself.
 
-- Start: ``process`` is one tritonserver, from an ``installation``, with ``triton_options``, on a ``listen_address``,
-  with ``tls`` and an ``admin_key``; ``cleanup`` removes what it leaves; ``temporary`` has one for a while.
 - Watch: ``triton_watch`` (does Triton answer, what does it serve?), ``model_processes`` (do they live, and get on?),
   ``model_probe`` (does a model answer?).
 - Heal: ``model_states`` is the table of states, events and actions of a model; ``model_watch`` feeds it and acts;
-  ``model_reload`` unloads and loads through the ``repository_api``; ``back_off`` chooses the pauses between starts.
-- Together: ``served`` holds all models of one Triton, ``supervisor`` Triton itself and the ``gateway_process``;
-  ``status`` is what others see of it. They are one thread; what may wait runs ``background`` calls over ``http``.
+  ``model_reload`` unloads and loads; ``back_off`` chooses the pauses between starts.
+- Together: ``served_models`` holds all models of one Triton, ``supervisor`` Triton itself and the ``gateway_process``;
+  ``status`` is what others see of it. They are one thread; what may wait runs ``background`` calls.
 """

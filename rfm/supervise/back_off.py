@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 
-from rfm.supervise.installation import ServerStartError
+from rfm.launch.installation import ServerStartError
 
 STEADY_S = 60.0  # whatever has run for so long is no part of a crash loop
 MOST = 5  # restarts in a row

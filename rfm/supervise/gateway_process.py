@@ -7,9 +7,8 @@ import subprocess
 import time
 from collections.abc import Sequence
 
+from rfm.launch.ending import end, ending_with_parent
 from rfm.supervise.back_off import BackOff
-from rfm.supervise.cleanup import ending_with_parent
-from rfm.supervise.process import KILL_AFTER_S
 
 
 class GatewayProcess:
@@ -43,12 +42,5 @@ class GatewayProcess:
 
     def stop(self) -> None:
         """Lets the gateway answer the requests in flight, and ends it; by force after KILL_AFTER_S."""
-        if self._process is None:
-            return
-        if self._process.poll() is None:
-            self._process.terminate()
-        try:
-            self._process.wait(KILL_AFTER_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        if self._process is not None:
+            end(self._process)

@@ -19,9 +19,9 @@ from typing import Any
 
 from tritonclient.utils import np_to_triton_dtype
 
+from rfm.launch.http import NO_ANSWER, Http
 from rfm.probe import blank_question
-from rfm.supervise.background import in_background
-from rfm.supervise.http import Http
+from rfm.supervise.background import Calls
 from rfm.supervise.model_states import Event
 from rfm_client.contract import triton, wire
 from rfm_client.contract.names import PROBE_PREFIX
@@ -65,11 +65,11 @@ class ModelProbe:
     def renew(self) -> None:
         """Forgets what it knows: the model's processes are others, and their probe is sent at once."""
         self._known: Event | None = None
-        self._probe: Future[Reply] | None = None
+        self._probes: Calls[Reply] = Calls(f"rfm-probe-{self._model}", NO_ANSWER)
         self._body: bytes | None = None
         self._due_s = time.monotonic()
         self._waiting_since_s: float | None = None
-        self._stats: Future[list[int]] | None = None
+        self._stats: Calls[list[int]] = Calls(f"rfm-stats-{self._model}", NO_ANSWER)
         self._successes: list[int] | None = None  # requests that each version has answered
         self._last_success_s = -math.inf  # when they were last seen to grow
         self._has_stats = False  # else Triton gives no answer; the model may
@@ -78,13 +78,12 @@ class ModelProbe:
 
     def look(self) -> Event | None:
         """What is known of the model now; None: nothing yet. Sends the next probe when it is due."""
-        if self._probe is not None and self._probe.done():
-            self._take(self._probe)
-            self._probe = None
+        if (probe := self._probes.ended()) is not None:
+            self._take(probe)
             self._due_s = time.monotonic() + max(self._interval_s, min(self._took_s, default=0.0) / SHARE)
-        if self._probe is None and time.monotonic() >= self._due_s:
+        if not self._probes.is_under_way and time.monotonic() >= self._due_s:
             self._waiting_since_s = self._waiting_since_s or time.monotonic()
-            self._probe = in_background(f"rfm-probe-{self._model}", self._send_probe)
+            self._probes.begin(self._send_probe)
         if self._waiting_since_s is not None and time.monotonic() - self._waiting_since_s > LATE_S / 2:
             self._look_at_stats()
         return self._judged()
@@ -100,17 +99,15 @@ class ModelProbe:
 
     def _look_at_stats(self) -> None:
         """Reads Triton's counts of answered requests: a model that answers others is not hung."""
-        if self._stats is not None and self._stats.done():
-            if self._stats.exception() is not None:
-                self._has_stats = False
-            else:
-                successes = self._stats.result()
-                if self._successes is not None and successes != self._successes:
+        if (stats := self._stats.ended()) is not None:
+            self._has_stats = stats.exception() is None
+            if self._has_stats:
+                successes = stats.result()
+                if self._successes not in (None, successes):
                     self._last_success_s = time.monotonic()
-                self._successes, self._has_stats = successes, True
-            self._stats = None
-        if self._stats is None:
-            self._stats = in_background(f"rfm-stats-{self._model}", self._read_stats)
+                self._successes = successes
+        if not self._stats.is_under_way:
+            self._stats.begin(self._read_stats)
 
     def _read_stats(self) -> list[int]:
         """Answered requests of each version, as Triton counts them. Runs in a thread of its own."""

@@ -6,9 +6,9 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
-from rfm.supervise.model_processes import Stub
-from rfm.supervise.process import TritonServer
-from rfm.supervise.repository_api import RepositoryApi
+from rfm.launch.process import TritonServer
+from rfm.launch.repository_api import RepositoryApi
+from rfm.supervise.model_processes import ModelProcess
 from rfm.supervise.triton_watch import Config, serving_just
 
 DRAIN_S = 2.0  # for what the model's other processes are working on
@@ -28,50 +28,46 @@ class Reload:
         self._server = server
         self._config = config
         self._was_hung = was_hung
-        self._served: Config | None = config if is_out else None
+        self._to_load: Config | None = config if is_out else None  # None: it is not known yet, or nothing
         self._is_closed = False
         self.out_since_s: float | None = time.monotonic() if is_out else None  # it was unloaded then
-        self.ended: list[Stub] = []  # its processes that have ended since
+        self.ended: list[ModelProcess] = []  # its processes that have ended since
 
     def close(self) -> None:
         """Keeps a running attempt from changing anything more."""
         self._is_closed = True
 
-    def load(self, stubs: Sequence[Stub]) -> None:
+    def load(self, processes: Sequence[ModelProcess]) -> None:
         """Loads the model anew, unless somebody has loaded or unloaded it. Raises RepositoryApiError.
 
         Ensembles that the model is a part of are unloaded and loaded with it, as they were.
 
-        stubs: its processes, dead or alive
+        processes: its processes, dead or alive
         """
-        with self._api() as api:
+        with self._server.repository_api() as api:
             if self.out_since_s is not None and any(e.is_ready for e in api.index() if e.name == self._model):
                 return  # another client has loaded it meanwhile
-            self._take_out(api, stubs)
-            if self._served is not None and not self._is_closed:  # else Triton may be another
+            self._take_out(api, processes)
+            if self._to_load is not None and not self._is_closed:  # else Triton may be another
                 # Triton 2.51 never finishes an unload after a request met a dead process of the model. A load goes on.
-                api.load(self._model, self._served)
+                api.load(self._model, self._to_load)
 
-    def unload(self, stubs: Sequence[Stub]) -> None:
+    def unload(self, processes: Sequence[ModelProcess]) -> None:
         """Unloads the model, so that callers get an error at once, and a load by others is seen. Raises
         RepositoryApiError.
         """
-        with self._api() as api:
-            self._take_out(api, stubs)
+        with self._server.repository_api() as api:
+            self._take_out(api, processes)
 
-    def _api(self) -> RepositoryApi:
-        server = self._server
-        return RepositoryApi(server.endpoints.grpc_url, server.admin_key, server.grpc_options)
-
-    def _take_out(self, api: RepositoryApi, stubs: Sequence[Stub]) -> None:
+    def _take_out(self, api: RepositoryApi, processes: Sequence[ModelProcess]) -> None:
         """Unloads the model, unless somebody has done so: then it is to stay unloaded."""
         if self.out_since_s is not None:
             return
-        self._served = self._served or self._serves(api)
-        if self._served is not None:
+        self._to_load = self._to_load or self._serves(api)
+        if self._to_load is not None:
             api.unload(self._model)
             self.out_since_s = time.monotonic()
-            self._end(stubs)
+            self._end(processes)
 
     def _serves(self, api: RepositoryApi) -> Config | None:
         """The configuration of exactly the versions that the model serves: a rollout may have changed its file."""
@@ -81,14 +77,14 @@ class Reload:
             return None if all(entry.is_unloaded for entry in versions) else self._config
         return serving_just(api.config(self._model, max(ready)), ready)
 
-    def _end(self, stubs: Sequence[Stub]) -> None:
+    def _end(self, processes: Sequence[ModelProcess]) -> None:
         """Returns when none of the processes lives, not even one that Triton keeps with its share of a GPU's memory."""
         deadline_s = time.monotonic() + DRAIN_S
-        while any(stub.is_alive for stub in stubs) and time.monotonic() < deadline_s:
+        while any(process.is_alive for process in processes) and time.monotonic() < deadline_s:
             time.sleep(POLL_S)
-        for stub in stubs:
-            if stub.is_alive:
-                stub.kill()
-                if not self._was_hung and stub.journal is not None:
-                    stub.journal.close()  # what it was working on is not why it ends
-        self.ended = [*self.ended, *stubs]
+        for process in processes:
+            if process.is_alive:
+                process.kill()
+                if not self._was_hung and process.journal is not None:
+                    process.journal.close()  # what it was working on is not why it ends
+        self.ended = [*self.ended, *processes]

@@ -5,27 +5,28 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from concurrent.futures import Future
 from functools import partial
 
+from rfm.launch.process import TritonServer
+from rfm.launch.repository_api import RepositoryApiError
 from rfm.supervise.back_off import BackOff, CrashLoopError
-from rfm.supervise.background import in_background
+from rfm.supervise.background import Calls
 from rfm.supervise.model_probe import ModelProbe
-from rfm.supervise.model_processes import StubWatch
+from rfm.supervise.model_processes import ProcessWatch
 from rfm.supervise.model_reload import Reload
 from rfm.supervise.model_states import CRASH_LOOPING, FAULTS, HEALING, Action, Event, Lifecycle, State
-from rfm.supervise.process import TritonServer
 from rfm.supervise.status import NO_REASON, Status
 from rfm.supervise.triton_watch import Config
 
 RETRY_S = 300.0  # after so many failures in a row that they are a crash loop
 
 
-class ServedModel:
+class ModelWatch:
     """Keeps one model answering. Whether Triton runs is another's business. All but its attempts is in one thread.
 
-    probe: None for an ensemble, which is loaded when its parts are ready, and whose parts are probed
-    watch: the server's model processes
+    probe: None for a model that cannot be probed, such as an ensemble: it is loaded when its parts are ready, which are
+        probed, and Triton says whether it is ready
+    processes: those of all the server's models
     say: takes a line about what fails again and again
     """
 
@@ -34,21 +35,21 @@ class ServedModel:
         name: str,
         probe: ModelProbe | None,
         server: TritonServer,
-        watch: StubWatch,
+        processes: ProcessWatch,
         status: Status,
         say: Callable[[str], None],
     ) -> None:
         self.name = name
         self._probe = probe
         self._server = server
-        self._watch = watch
+        self._processes = processes
         self._status = status
         self._say = say
         self._lifecycle = Lifecycle(State.WAITING if probe is None else State.NEW)
         self._back_off = BackOff(f"model {name}")
         self._back_off.started()
         self._reload: Reload | None = None
-        self._attempt: Future[None] | None = None
+        self._attempts: Calls[None] = Calls(f"rfm-heal-{name}", (RepositoryApiError, OSError))
         self._due_s = 0.0  # the next attempt
         self._why = ""  # it is healed
         self._trouble = ""  # why its last load failed
@@ -64,9 +65,9 @@ class ServedModel:
         return self.state in HEALING
 
     @property
-    def is_ensemble(self) -> bool:
-        """Whether it has no processes of its own."""
-        return self._probe is None
+    def is_probed(self) -> bool:
+        """Whether it is asked itself whether it answers; else Triton is asked whether it is ready."""
+        return self._probe is not None
 
     @property
     def reason(self) -> str:
@@ -91,7 +92,7 @@ class ServedModel:
         """Records that Triton called the model ready at ``requested_s``. If it was unloaded, somebody may have loaded
         it.
         """
-        if self.is_ensemble:
+        if not self.is_probed:
             self._feed(Event.ANSWERED)
         out_since_s = None if self._reload is None else self._reload.out_since_s
         if out_since_s is not None and requested_s > out_since_s:
@@ -121,7 +122,7 @@ class ServedModel:
         if self._probe is None:
             return None
         event = self._probe.look()
-        if event in (Event.LATE, Event.HUNG) and self._watch.is_getting_on(self.name):
+        if event in (Event.LATE, Event.HUNG) and self._processes.is_getting_on(self.name):
             event = Event.BUSY
         self._status.record_probe(self.name, is_ok=event is Event.ANSWERED)
         return event
@@ -135,13 +136,13 @@ class ServedModel:
 
     def _go_on(self) -> None:
         """Feeds the end of an attempt, or that the next one is due."""
-        if self._attempt is None:
+        if not self._attempts.is_under_way:
             if time.monotonic() >= self._due_s:
                 self._feed(Event.PAUSE_OVER)
-        elif self._attempt.done():
-            error, self._attempt = self._attempt.exception(), None
+        elif (attempt := self._attempts.ended()) is not None:
+            error = attempt.exception()
             assert self._reload is not None  # it made the attempt
-            self._watch.forget(self._reload.ended)
+            self._processes.forget(self._reload.ended)
             if error is not None:
                 self._trouble = str(error)
             self._feed(Event.DONE if error is None else Event.FAILED)
@@ -168,7 +169,7 @@ class ServedModel:
     def _begin(self, action: Action) -> None:
         assert self._reload is not None  # made when the healing began
         attempt = self._reload.load if action is Action.LOAD else self._reload.unload
-        self._attempt = in_background(f"rfm-heal-{self.name}", partial(attempt, self._watch.of_model(self.name)))
+        self._attempts.begin(partial(attempt, self._processes.of_model(self.name)))
 
     def _renew(self) -> None:
         self._back_off.started()

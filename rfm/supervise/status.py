@@ -15,7 +15,7 @@ from typing import Any
 
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
-from rfm.supervise.installation import ServerStartError
+from rfm.launch.installation import ServerStartError
 
 NO_REASON = ""  # the reason why a model is not ready, of one that is
 REQUEST_S = 5.0  # from its connection to its answer

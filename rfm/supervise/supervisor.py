@@ -7,20 +7,22 @@ import signal
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext
+from functools import partial
 from types import FrameType
 
-from rfm.supervise import cleanup
+from rfm.launch import cleanup
+from rfm.launch.ending import stop_signals_to
+from rfm.launch.installation import ServerStartError
+from rfm.launch.process import POLL_S, TritonServer
 from rfm.supervise.back_off import BackOff
 from rfm.supervise.gateway_process import GatewayProcess
-from rfm.supervise.installation import ServerStartError
-from rfm.supervise.process import POLL_S, STOP_SIGNALS, TritonServer
-from rfm.supervise.served import Served
+from rfm.supervise.served_models import ServedModels
 from rfm.supervise.status import Status, StatusServer
-from rfm.supervise.triton_watch import Config, names_what_was_served
+from rfm.supervise.triton_watch import Config, names_the_same_versions
 
 
 class Supervisor:
-    """Serves until one of STOP_SIGNALS comes. Run it in the main thread.
+    """Serves until a signal to stop comes. Run it in the main thread.
 
     gateway: command line of a gateway that runs beside the server; None: there is none
     status_port: of the status (``status``), on the server's host; None: there is none
@@ -44,14 +46,15 @@ class Supervisor:
         self._server = server
         self._gateway = None if gateway is None else GatewayProcess(gateway)
         self._status_port = status_port
-        self._canary_s = canary_s
-        self._hang_s = hang_s
         self._triton_silent_s = triton_silent_s
         self._say = say
         self._status = Status()
+        self._new_models = partial(
+            ServedModels, server, self._status, say, canary_s=canary_s, hang_s=hang_s, triton_silent_s=triton_silent_s
+        )
         self._is_to_stop = threading.Event()
         self._back_off = BackOff("tritonserver")
-        self._served: Served | None = None  # None: it is started, or has ended
+        self._models: ServedModels | None = None  # None: it is started, or has ended
         self._configs: dict[str, Config] | None = None  # the configurations served last; None: those in the files
 
     def run(self) -> int:
@@ -61,24 +64,22 @@ class Supervisor:
         self._status.record(dict.fromkeys(self._server.models, "it is loaded"))
         for what in ("triton", *self._server.models, *(() if self._gateway is None else ("gateway",))):
             self._status.restarts.labels(what)  # 0, so that already the first is an increase
-        previous = {number: signal.signal(number, self._stop) for number in STOP_SIGNALS}
         port, host = self._status_port, self._server.endpoints.host
-        try:
-            with nullcontext() if port is None else closing(StatusServer(host, port, self._status)):
-                return self._serve()
-        finally:
-            for number, handler in previous.items():
-                signal.signal(number, handler)
+        with (
+            stop_signals_to(self._stop),
+            nullcontext() if port is None else closing(StatusServer(host, port, self._status)),
+        ):
+            return self._serve()
 
     def _stop(self, number: int, _frame: FrameType | None) -> None:
         self._is_to_stop.set()
-        if self._served is None:  # it loads, and would not look
+        if self._models is None:  # it loads, and would not look
             self._server.signal(signal.SIGTERM if number == signal.SIGHUP else number)
 
     def _serve(self) -> int:
         try:
             self._start()
-            if self._gateway is not None and self._served is not None:
+            if self._gateway is not None and self._models is not None:
                 self._gateway.start()
             while not self._is_to_stop.wait(POLL_S):
                 self._look()
@@ -89,7 +90,7 @@ class Supervisor:
             self._status.record_down("it is stopping")
             if self._gateway is not None:  # the gateway answers its requests in flight before the server stops
                 self._gateway.stop()
-            self._close_served()
+            self._close_models()
             status = self._server.stop()
         return status
 
@@ -108,15 +109,7 @@ class Supervisor:
         if self._configs is None:
             self._say(f"ready: {', '.join(self._server.models)} at {urls}")
         self._back_off.started()
-        self._served = Served(
-            self._server,
-            self._status,
-            canary_s=self._canary_s,
-            hang_s=self._hang_s,
-            triton_silent_s=self._triton_silent_s,
-            say=self._say,
-            restored=self._configs or {},
-        )
+        self._models = self._new_models(restored=self._configs or {})
 
     def _restored(self) -> list[str] | None:
         """The models that Triton loads by itself, before it answers anybody; None: all, for it never served any.
@@ -125,27 +118,31 @@ class Supervisor:
         """
         if self._configs is None:
             return None
-        is_so = all(names_what_was_served(self._server.repository, *served) for served in self._configs.items())
+        is_so = all(names_the_same_versions(self._server.repository, *each) for each in self._configs.items())
         return list(self._configs) if is_so else []
 
     def _look(self) -> None:
         """Starts again whatever has ended. Raises CrashLoopError."""
-        if self._served is not None and self._served.is_silent:
+        if self._models is not None and self._models.is_silent:
             self._server.kill()
             self._start_again(f"no answer for {self._triton_silent_s:g} s")
+        elif self._models is not None and (why := self._models.owing) is not None:
+            self._server.remember_the_dead()
+            self._server.kill()
+            self._start_again(why)
         elif self._server.exit_status is not None:
             self._start_again(f"exit status {self._server.exit_status}")
         if self._gateway is not None and (why := self._gateway.look()):
             self._count("gateway", why)
-        if self._served is not None:
-            for model, why in self._served.look():
+        if self._models is not None:
+            for model, why in self._models.look():
                 self._count(model, why)
 
     def _start_again(self, why: str) -> None:
         """Returns when Triton is ready, or a signal has come. Raises CrashLoopError."""
         while not self._is_to_stop.is_set():
             self._count("triton", why)
-            self._close_served()
+            self._close_models()
             self._status.record_down(f"tritonserver is started again, after {why}")
             self._server.stop()  # what is left of it
             if self._is_to_stop.wait(self._back_off.pause_s(why)):
@@ -160,9 +157,9 @@ class Supervisor:
         self._status.restarts.labels(what).inc()
         self._say(f"{what} is started again: {why}")
 
-    def _close_served(self) -> None:
-        if self._served is not None:
-            if self._served.configs is not None:
-                self._configs = self._served.configs
-            self._served.close()
-            self._served = None
+    def _close_models(self) -> None:
+        if self._models is not None:
+            if self._models.configs is not None:
+                self._configs = self._models.configs
+            self._models.close()
+            self._models = None

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Mapping, Sequence
-from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
@@ -16,11 +15,11 @@ from urllib.parse import quote
 from google.protobuf import text_format
 from tritonclient.grpc.model_config_pb2 import ModelConfig
 
-from rfm.supervise.admin_key import http_headers
-from rfm.supervise.background import in_background
-from rfm.supervise.http import NO_ANSWER, Http
-from rfm.supervise.process import TritonServer
-from rfm.supervise.repository_api import INDEX_PATH, READY, ModelVersion, versions_of
+from rfm.launch.admin_key import http_headers
+from rfm.launch.http import NO_ANSWER, Http
+from rfm.launch.process import TritonServer
+from rfm.launch.repository_api import INDEX_PATH, READY, ModelVersion, versions_of
+from rfm.supervise.background import Calls
 
 INTERVAL_S = 1.0
 LOOKS = 3  # without any answer, at least, before it has to be started again
@@ -65,22 +64,13 @@ def serving_just(config: Config, versions: Sequence[int]) -> Config:
     return {**config, "version_policy": {"specific": {"versions": list(versions)}}}
 
 
-def names_what_was_served(repository: Path, model: str, served: Config) -> bool:
-    """Whether the model's file names the versions of ``served``, which is as ``serving_just`` gives it."""
+def names_the_same_versions(repository: Path, model: str, config: Config) -> bool:
+    """Whether the model's file names the versions of ``config``, which is as ``serving_just`` gives it."""
     try:
-        config = text_format.Parse((repository / model / "config.pbtxt").read_text(), ModelConfig())
+        file = text_format.Parse((repository / model / "config.pbtxt").read_text(), ModelConfig())
     except (OSError, UnicodeDecodeError, text_format.ParseError):
         return False
-    return bool(list(config.version_policy.specific.versions) == served["version_policy"]["specific"]["versions"])
-
-
-@dataclass(frozen=True)
-class Look:
-    """The result of one look. snapshot: None if the repository gave no answer"""
-
-    started_s: float
-    is_answered: bool
-    snapshot: Snapshot | None = None
+    return bool(list(file.version_policy.specific.versions) == config["version_policy"]["specific"]["versions"])
 
 
 class TritonWatch:
@@ -92,65 +82,54 @@ class TritonWatch:
     def __init__(self, server: TritonServer, silent_s: float) -> None:
         endpoints = server.endpoints
         self._http = Http(endpoints.http_host, endpoints.http_port)
-        # While the threads of HTTP wait for models that are loaded, this one answers still.
         self._metrics = Http(endpoints.host, endpoints.metrics_port)
         self._headers = http_headers(server.admin_key)
         self._silent_s = silent_s
         self._endpoint_timeout_s = min(silent_s / LOOKS / 2, _ENDPOINT_TIMEOUT_S)
-        self._silent_since_s: float | None = None
-        self._failed_looks = 0
-        self._look: Future[Look] | None = None
+        self._failed_looks = 0  # in a row
+        self._silent_since_s = 0.0  # when the first of them began
+        self._looks: Calls[Snapshot | None] = Calls("rfm-triton-watch", NO_ANSWER)
         self._looked_s = 0.0
         self._due_s = 0.0
         self.snapshot: Snapshot | None = None  # the latest
 
     def look(self) -> None:
         """Takes in the result of the last look, and begins the next one when it is due."""
-        if self._look is not None and self._look.done():
-            failed = self._look.exception() is not None  # no thread, or no memory: it was no look
-            self._take(Look(self._looked_s, is_answered=False) if failed else self._look.result())
-            self._look = None
-        if self._look is None and time.monotonic() >= self._due_s:
+        look = self._looks.ended()
+        if look is not None and look.exception() is None:
+            self._failed_looks = 0
+            self.snapshot = look.result() or self.snapshot  # if there is none, the next look requests it again
+        elif look is not None:
+            self._silent_since_s = self._silent_since_s if self._failed_looks else self._looked_s
+            self._failed_looks += 1
+        if not self._looks.is_under_way and time.monotonic() >= self._due_s:
             self._looked_s = time.monotonic()
             self._due_s = self._looked_s + INTERVAL_S
-            self._look = in_background("rfm-triton-watch", self._looked)
+            self._looks.begin(self._looked)
 
     @property
     def is_silent(self) -> bool:
         """Whether it has not answered for ``silent_s``, and has to be started again."""
-        if self._silent_since_s is None or self._failed_looks < LOOKS:
-            return False
-        return time.monotonic() - self._silent_since_s >= self._silent_s
+        return self._failed_looks >= LOOKS and time.monotonic() - self._silent_since_s >= self._silent_s
 
     @property
     def is_answered(self) -> bool:
         """Whether it has answered the last look."""
-        return self._silent_since_s is None
+        return not self._failed_looks
 
-    def _take(self, look: Look) -> None:
-        if look.is_answered:
-            self._silent_since_s, self._failed_looks = None, 0
-            self.snapshot = look.snapshot or self.snapshot  # if there is none, the next look requests it again
-        else:
-            self._failed_looks += 1
-            self._silent_since_s = self._silent_since_s or look.started_s
+    def _looked(self) -> Snapshot | None:
+        """What Triton serves; None: it answers, but not that. It runs in a thread of its own, and changes nothing.
 
-    def _looked(self) -> Look:
-        """Makes one look. It runs in a thread of its own, and changes nothing."""
-        started_s = time.monotonic()
-        if not (self._answers(self._http, "/v2") or self._answers(self._metrics, "/metrics")):
-            return Look(started_s, is_answered=False)
+        Raises one of NO_ANSWER.
+        """
         try:
-            return Look(started_s, is_answered=True, snapshot=self._new_snapshot())
-        except NO_ANSWER:
-            return Look(started_s, is_answered=True)
-
-    def _answers(self, endpoint: Http, path: str) -> bool:
+            self._http.request("GET", "/v2", self._endpoint_timeout_s)
+        except NO_ANSWER:  # while the threads of HTTP wait for models that are loaded, this one answers still
+            self._metrics.request("GET", "/metrics", self._endpoint_timeout_s)
         try:
-            endpoint.request("GET", path, self._endpoint_timeout_s)
+            return self._new_snapshot()
         except NO_ANSWER:
-            return False
-        return True
+            return None
 
     def _new_snapshot(self) -> Snapshot:
         requested_s = time.monotonic()

@@ -1,42 +1,56 @@
 # SPDX-License-Identifier: MIT
-"""What every model.py has in common: the requests of one ``execute`` are answered together, and fail apart."""
+"""What every model.py has in common: requests are read as they come, scored together, and answered one by one."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping, Sequence
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeAlias, TypeVar
 
 import torch
 
 from rfm.execution import Execution
 from rfm.journal import NO_DIGEST
-from rfm.parameters import THREADS_PARAMETER
+from rfm.parameters import BUDGET_PARAMETER, QUEUE_SIZE_PARAMETER, QUEUE_TIMEOUT_PARAMETER
 from rfm.probe import blank_question
 from rfm.triton_model.cancellation import Cancellation
 from rfm.triton_model.exit import exit_with_triton
 from rfm.triton_model.metrics import Counted, Metrics
+from rfm.triton_model.neighbours import Neighbours
+from rfm.triton_model.pipeline import Bounds, Pipeline, Stages
+from rfm.triton_model.placement import Placement, num_instances
 from rfm.triton_model.quarantine import Quarantine
-from rfm.triton_model.request import SAMPLE_TYPES, CancelledError, Origins, Request
+from rfm.triton_model.request import SAMPLE_TYPES, Origins, RejectedError, Request
 from rfm.triton_model.request_digest import digest
 from rfm.triton_model.request_log import RequestLog
 from rfm.triton_model.self_check import SelfCheck
 from rfm.triton_model.weights import check_digest
-from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError, wire
+from rfm_client.contract import InvalidSampleError, RewardError, wire
 from rfm_client.contract.model_info import DIGEST_PARAMETER, NETWORK_PARAMETER, REVISION_PARAMETER, SOURCE_PARAMETER
 from rfm_client.contract.samples import Footage
+from rfm_client.contract.triton import QUEUE_FULL
 from rfm_client.contract.wire import Tensors
+
+MS_PER_S = 1e3
+MAX_INT32 = 2**31 - 1
+LONE_ANSWER_S = 50e-3  # an answer that takes longer is worth another thread, so that meanwhile others can be rejected
+CHEAP_ANSWER_S = {"cpu": 2e-3, "cuda": 0.2e-3}  # one that takes less is not worth the time that sending it takes
 
 Question = TypeVar("Question")
 Answer = TypeVar("Answer")
+Scored: TypeAlias = list[tuple[Sequence[Request[Question]], Execution]]  # requests, and what was spent on them
 
 
 class BatchModel(Generic[Question, Answer]):
     """Triton <-> a function from questions to answers. A request holds one or more questions.
 
-    A subclass says how a request's tensors are read (``decode``), how questions are answered (``answer``) and
-    how the answers of one request are written (``encode``).
+    A subclass says how a request's tensors are read (``decode``), what is done with a question when it comes
+    (``prepare``), how questions are answered (``answer``) and how the answers of one request are written (``encode``).
+    One that ``works_ahead`` says, too, what can be done before a question's turn comes (``work_ahead``).
     """
 
     def initialize(self, args: Mapping[str, str]) -> None:
@@ -44,30 +58,64 @@ class BatchModel(Generic[Question, Answer]):
         exit_with_triton()
         config = json.loads(args["model_config"])
         settings = {name: value["string_value"] for name, value in config["parameters"].items()}
-        self.input_names = [spec["name"] for spec in config["input"]]
-        on_gpu = args["model_instance_kind"] == "GPU"
-        sharing = 1 if on_gpu else sum(group["count"] for group in config["instance_group"])
-        torch.set_num_threads(int(settings[THREADS_PARAMETER]) or max(torch.get_num_threads() // sharing, 1))
-        device = torch.device("cuda", int(args["model_instance_device_id"])) if on_gpu else torch.device("cpu")
-        if on_gpu:
-            torch.cuda.set_device(device)  # some kernels launch on the current device, whatever their tensors'
+        placement = Placement.of(args, config, settings)
+        placement.apply()
         version = Path(args["model_repository"], args["model_version"])
         check_digest(version, settings.get(DIGEST_PARAMETER, ""))
-        self.load(version, device, settings)
+        self.load(version, placement.device, settings)
         model = {"model": args["model_name"], "version": args["model_version"]}
-        labels = {**model, "device": str(device), "instance": args["model_instance_name"]}
+        labels = {**model, "device": str(placement.device), "instance": args["model_instance_name"]}
+        names = [spec["name"] for spec in config["input"]]
         self._log = RequestLog(model)
-        self._metrics = Metrics(labels, _checkpoint(settings), _sample_types(self.input_names))
-        self._quarantine = Quarantine.of_this_process(args["model_name"], max(config["max_batch_size"], 1))
+        self._metrics = Metrics(labels, _checkpoint(settings), _sample_types(names))
+        num_preparing = placement.num_preparing if self.works_ahead else 0
+        capacity = max(config["max_batch_size"], 1)
+        self._quarantine = Quarantine.of_this_process(args["model_name"], capacity, num_preparing)
+        neighbours = Neighbours.of_this_process(args["model_name"]) if num_instances(config) > 1 else None
+        cheap_answer_s = CHEAP_ANSWER_S[placement.device.type]
+        self.start(config, settings, neighbours, placement.apply, cheap_answer_s, num_preparing)
+
+    def start(
+        self,
+        config: Mapping[str, Any],
+        settings: Mapping[str, str],
+        neighbours: Neighbours | None = None,
+        begin: Callable[[], None] = lambda: None,
+        cheap_answer_s: float = CHEAP_ANSWER_S["cpu"],
+        num_preparing: int = 0,
+    ) -> None:
+        """Begins to take requests. Weights, log, metrics and quarantine are there.
+
+        begin: called in the thread that scores
+        cheap_answer_s: answers that take less are given together
+        num_preparing: threads that work ahead
+        """
+        self._cheap_answer_s = cheap_answer_s
+        self._request_s: float | None = None  # what each request of the last group took; None: there was none
+        self.input_names = [spec["name"] for spec in config["input"]]
+        bounds = _bounds(config, settings)
+        self._max_batch = bounds.batch_samples
+        self._patience_s = (int(settings.get(QUEUE_TIMEOUT_PARAMETER) or 0) / MS_PER_S) or None
         self._cancellation = Cancellation()
         self._self_check = SelfCheck(self._score_blank, self._log.report_end)
         self._blank_tensors = blank_question(config)
         warmups = config.get("model_warmup", [])
-        num_warmups = sum(max(warmup.get("count", 0), 1) for warmup in warmups)
-        self._origins = Origins(num_warmups, digest(self._blank_tensors))
+        self._origins = Origins(sum(max(warmup.get("count", 0), 1) for warmup in warmups), digest(self._blank_tensors))
+        self._neighbours = neighbours
+        stages = Stages(
+            self._score,
+            self._send,
+            self._self_check.end,
+            begin,
+            begin_preparing=partial(torch.set_num_threads, 1),  # there are as many threads as this instance has cores
+            prepare=self._work_ahead,
+            num_preparing=num_preparing,
+        )
+        self._pipeline = Pipeline(stages, bounds)
 
     def finalize(self) -> None:
         """Called once by Triton when the model is unloaded."""
+        self._pipeline.close()
         self._quarantine.close()
         self._metrics.close()
 
@@ -75,75 +123,189 @@ class BatchModel(Generic[Question, Answer]):
         """Loads the weights in the folder ``version`` onto ``device``."""
         raise NotImplementedError
 
+    @property
+    def works_ahead(self) -> bool:
+        """Whether ``work_ahead`` is worth a thread; asked when the weights are loaded."""
+        return False
+
     def decode(self, tensors: Tensors) -> list[Question]:
         """The questions of one request. Raises InvalidSampleError."""
         raise NotImplementedError
 
-    def answer(self, questions: Sequence[Question], execution: Execution) -> Sequence[Answer | RewardError]:
-        """One answer, or error, a question. ``execution`` records what they took."""
+    def prepare(self, question: Question) -> tuple[Any, int]:
+        """What ``answer`` wants of a question, and its tokens, of which a batch has at most ``token_budget``. Cheap.
+
+        Raises RewardError for a question that cannot be answered.
+        """
+        return question, 0
+
+    def work_ahead(self, prepared: Any) -> None:
+        """Does what takes long and can be done with a prepared question before its turn, in any thread, or never."""
+
+    def answer(self, questions: Sequence[Any], execution: Execution) -> Sequence[Answer | RewardError]:
+        """One answer, or error, for each of the prepared questions. ``execution`` records what they took."""
         raise NotImplementedError
 
     def encode(self, answers: Sequence[Answer], tensors: Tensors, outputs: Collection[str]) -> Tensors:
         """The requested outputs of one request whose inputs were ``tensors``."""
         raise NotImplementedError
 
-    def execute(self, requests: Sequence[Any]) -> list[Any]:
-        """Called by Triton with the requests of one batch; gives one response each."""
-        batch: list[Request[Question]] = [Request(request) for request in requests]
-        self._origins.mark(batch)
-        with self._metrics.at_work_on(batch), self._self_check.around(batch):
-            return self._respond(batch)
+    def execute(self, requests: Sequence[Any]) -> list[Any] | None:
+        """Called by Triton with requests. Gives their responses; None: they are sent as they come."""
+        self._self_check.wait_if_ending()
+        if self._pipeline.is_idle and self._is_better_at_once(requests):
+            return self._responses_of([self._read(inference, later=False) for inference in requests])
+        self._quarantine.owe(len(requests))
+        batch = [self._read(inference, later=True) for inference in requests]
+        failed = [request for request in batch if request.error is not None]
+        failed += self._put([request for request in batch if request.error is None])
+        if failed:
+            self._send(failed, [(failed, Execution())])
+        if self._neighbours is not None:
+            self._neighbours.wait_for_turn(self._pipeline, self._max_batch)
+        return None
 
-    def _respond(self, batch: Sequence[Request[Question]]) -> list[Any]:
-        """Serves the requests together or, if that fails, each alone: what breaks one costs no other its answer."""
+    def _is_better_at_once(self, requests: Sequence[Any]) -> bool:
+        """Whether requests are better scored here, while nothing else is, and answered together.
+
+        To send a response takes a tenth of a millisecond longer than to give it back, and a lone caller waits for the
+        change of threads. But what is scored here keeps Triton from handing over more. A full batch says that more
+        wait; some of them may have to be rejected.
+
+        Where the process dies, Triton 2.51 fails the requests of ``execute``, and never those that are to be answered
+        later. So all are answered at once while a suspect may kill the process.
+        """
+        if self._quarantine.has_suspects or self._request_s is None:
+            return True
+        if len(requests) >= self._max_batch:
+            return False
+        return self._request_s < (LONE_ANSWER_S if len(requests) == 1 else self._cheap_answer_s)
+
+    def _responses_of(self, batch: Sequence[Request[Question]]) -> list[Any]:
+        """Scores and encodes the requests here and now."""
+        scored: Scored[Question] = []
+        if failed := [request for request in batch if request.error is not None]:
+            scored.append((failed, Execution()))
+        if ready := [request for request in batch if request.error is None]:
+            scored += self._pipeline.run(ready)
+        responses = [self._response(request) for request in batch]
+        self._count(scored)
+        return responses
+
+    def _put(self, batch: Sequence[Request[Question]]) -> list[Request[Question]]:
+        """Has requests wait for their turn. Gives those for which there is no room, with the error that says so."""
+        rejected = self._pipeline.put(batch)
+        self._metrics.num_waiting = self._pipeline.num_waiting
+        for request in rejected:
+            request.error = RejectedError(f"{QUEUE_FULL}: {self._pipeline.num_waiting} requests wait already")
+        return rejected
+
+    def _read(self, inference: Any, *, later: bool) -> Request[Question]:
+        """The first stage: a request whose questions are prepared, or that has an error."""
+        request: Request[Question] = Request.of(inference, later=later)
+        try:
+            request.read(inference, self.input_names)
+            self._origins.find(request)
+            request.questions = self.decode(request.tensors)
+            self._quarantine.check(request.digest)
+            self._prepare(request)
+        except RewardError as error:
+            request.error = error
+        except Exception as error:  # noqa: BLE001  whatever went wrong with it costs no other its answer
+            request.fail(error)
+        return request
+
+    def _prepare(self, request: Request[Question]) -> None:
+        """Prepares the questions of a request, or notes the first error, located in it."""
+        prepared = []
+        for index, question in enumerate(request.questions):
+            try:
+                prepared.append(self.prepare(question))
+            except RewardError as error:
+                request.error = _located(error, index, len(request.questions))
+                return
+        request.prepared, num_tokens = zip(*prepared, strict=True)
+        request.num_tokens = sum(num_tokens)
+
+    def _work_ahead(self, request: Request[Question]) -> None:
+        """Beside the scoring of others: what takes long of a request. Not while a suspect may end the process, for
+        which others would be blamed. What is not done here is done in the request's turn.
+        """
+        if self._quarantine.has_suspects:
+            return
+        with self._quarantine.preparing(request.digest), suppress(Exception):  # its turn will show what is wrong
+            for prepared in request.prepared:
+                self.work_ahead(prepared)
+
+    def _score(self, batch: Sequence[Request[Question]]) -> Scored[Question]:
+        """The second stage: the answers, or the error, of each request."""
+        self._metrics.num_waiting = self._pipeline.num_waiting
+        if self._self_check.is_ending:  # those that wait are told while there is somebody to tell them
+            for request in batch:
+                request.error = RejectedError("the instance is broken, and ends")
+            return [(batch, Execution())]
+        for request in batch:
+            request.begin()
+        with self._metrics.at_work_on(batch), self._self_check.around(batch):
+            return self._scored(batch)
+
+    def _scored(self, batch: Sequence[Request[Question]]) -> Scored[Question]:
+        """Scores the requests together or, if that fails, each alone: what breaks one costs no other its answer."""
         execution = Execution(on_forward=self._quarantine.renew)
         try:
-            responses = self._serve(batch, execution)
+            self._answer_together(batch, execution)
         except Exception as error:  # noqa: BLE001  the request boundary: whatever happened, every request is answered
             if len(batch) > 1:
                 self._log.report_batch(batch, error)
-                return [response for request in batch for response in self._respond([request])]
-            batch[0].error = InferenceFailedError("scoring failed; the server's log has the reason")
-            batch[0].error.__cause__ = error
+                return [scored for request in batch for scored in self._scored([request])]
+            batch[0].fail(error)
             execution = Execution()
-            responses = [_failure(batch[0].error)]
-        for request in batch:
-            if request.error is not None:
-                self._log.report(request)
-        self._metrics.add(Counted.of(batch, execution))
-        return responses
+        return [(batch, execution)]
 
-    def _serve(self, batch: Sequence[Request[Question]], execution: Execution) -> list[Any]:
-        """Decodes, answers and encodes. A request that cannot be served has an error, and costs no other anything."""
+    def _answer_together(self, batch: Sequence[Request[Question]], execution: Execution) -> None:
         for request in batch:
-            request.read(self.input_names)
-            self._origins.verify(request)
-            try:
-                request.questions = self.decode(request.tensors)
-                self._cancellation.check(request)
-                self._quarantine.check(request.digest)
-            except (InvalidSampleError, CancelledError) as error:
-                request.error = error
+            request.error = self._cancellation.of(request) or request.out_of_patience(self._patience_s)
         for group in self._quarantine.groups([request for request in batch if request.error is None]):
-            questions = [question for request in group for question in request.questions]
+            questions = [question for request in group for question in request.prepared]
+            started_s = time.perf_counter()
             with self._quarantine.at_work_on([request.digest for request in group]):
-                answers = iter(self._cancellation.timed(self.answer, questions, execution))
+                answers = iter(self.answer(questions, execution))
+            took_s = time.perf_counter() - started_s
+            self._request_s, self._cancellation.answer_s = took_s / len(group), took_s / len(questions)
             for request in group:
-                request.answers = [next(answers) for _ in request.questions]
-        return [self._response(request) for request in batch]
+                request.answers = [next(answers) for _ in request.prepared]
+                request.error = _first_error(request.answers)
+
+    def _send(self, batch: Sequence[Request[Question]], scored: Scored[Question]) -> None:
+        """The third stage: encodes, sends and counts."""
+        for request in batch:
+            request.send(self._response(request))
+            self._quarantine.owe(-1)
+        self._count(scored)
 
     def _response(self, request: Request[Question]) -> Any:
-        import triton_python_backend_utils as pb_utils
+        """Triton's response of the answers or the error; of an error, too, if the answers cannot be written."""
+        if request.error is None:
+            try:
+                return request.response(self.encode(request.answers, request.tensors, request.outputs))
+            except Exception as error:  # noqa: BLE001  whatever went wrong with it costs no other its answer
+                request.fail(error)
+        return request.error_response()
 
-        request.error = request.error or _first_error(request.answers)
-        if request.error is not None:
-            return _failure(request.error)
-        outputs = self.encode(request.answers, request.tensors, request.inference.requested_output_names())
-        return pb_utils.InferenceResponse([pb_utils.Tensor(name, array) for name, array in outputs.items()])
+    def _count(self, scored: Scored[Question]) -> None:
+        """Logs what has failed, and counts all."""
+        for part, execution in scored:
+            for request in part:
+                if request.error is not None:
+                    self._log.report(request)
+            self._metrics.add(Counted.of(part, execution))
 
     def _score_blank(self) -> None:
         """Raises the error of an instance that cannot score the blank sample."""
-        questions = self.decode(self._blank_tensors)
+        try:
+            questions = [self.prepare(question)[0] for question in self.decode(self._blank_tensors)]
+        except InvalidSampleError:  # a checkpoint may refuse blank frames
+            return
         with self._quarantine.at_work_on([NO_DIGEST]):  # a hang is noticed, and no request is a suspect
             error = _first_error(self.answer(questions, Execution(on_forward=self._quarantine.renew)))
         if error is not None and not isinstance(error, InvalidSampleError):
@@ -152,23 +314,21 @@ class BatchModel(Generic[Question, Answer]):
 
 def _first_error(answers: Sequence[Any]) -> RewardError | None:
     """The first error of a request, located in it if it holds several questions."""
-    for index, answer in enumerate(answers):
-        if isinstance(answer, InvalidSampleError) and len(answers) > 1:
-            return answer.inside(f"samples[{index}]")
-        if isinstance(answer, RewardError):
-            return answer
-    return None
+    errors = ((answer, index) for index, answer in enumerate(answers) if isinstance(answer, RewardError))
+    return next((_located(*error, len(answers)) for error in errors), None)
 
 
-def _failure(error: Exception) -> Any:
-    import triton_python_backend_utils as pb_utils
+def _located(error: RewardError, index: int, count: int) -> RewardError:
+    """The error of the question ``index`` of a request of ``count`` questions."""
+    return error.inside(f"samples[{index}]") if isinstance(error, InvalidSampleError) and count > 1 else error
 
-    code = pb_utils.TritonError.INTERNAL
-    if isinstance(error, InvalidSampleError):
-        code = pb_utils.TritonError.INVALID_ARG
-    elif isinstance(error, CancelledError):
-        code = pb_utils.TritonError.CANCELLED
-    return pb_utils.InferenceResponse(error=pb_utils.TritonError(str(error), code))
+
+def _bounds(config: Mapping[str, Any], settings: Mapping[str, str]) -> Bounds:
+    """How much an instance takes at a time, as it was exported; what an older export does not say is unbounded."""
+    batch_samples = max(config["max_batch_size"], 1)
+    batch_tokens = int(settings.get(BUDGET_PARAMETER) or MAX_INT32)
+    waiting = int(settings.get(QUEUE_SIZE_PARAMETER) or 0) or None
+    return Bounds(batch_samples, batch_tokens, batch_samples, waiting)
 
 
 def _sample_types(input_names: Sequence[str]) -> list[str]:

@@ -25,7 +25,9 @@ IDLE_INTERVAL_S = 5.0  # while no request comes
 COUNTER, GAUGE, HISTOGRAM = "COUNTER", "GAUGE", "HISTOGRAM"  # as Triton names them
 FRAMES, RETRIES = "frames_total", "out_of_memory_retries_total"
 BATCH_SAMPLES, BATCH_PADDING = "batch_samples", "batch_padding_ratio"
-COLLATE_SECONDS, FORWARD_SECONDS = "collate_seconds", "forward_seconds"
+WAIT_SECONDS, COLLATE_SECONDS, FORWARD_SECONDS = "wait_seconds", "collate_seconds", "forward_seconds"
+
+BATCH_REQUESTS, WAITING_REQUESTS = "batch_requests", "waiting_requests"
 
 SAMPLES_BUCKETS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
 PADDING_BUCKETS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
@@ -35,9 +37,14 @@ _TOTALS = {
     FRAMES: "Frames scored.",
     RETRIES: "Forward passes that ran out of memory and were tried again in halves.",
 }
+_GAUGES = {
+    BATCH_REQUESTS: "Requests of the batch that is worked on now; 0: idle.",
+    WAITING_REQUESTS: "Requests that wait in the model for their turn.",
+}
 _HISTOGRAMS = {
     BATCH_SAMPLES: ("Samples of one execution.", SAMPLES_BUCKETS),
     BATCH_PADDING: ("Share of the token slots of an execution's forward passes that were padding.", PADDING_BUCKETS),
+    WAIT_SECONDS: ("The longest wait in the model of one execution's requests, for their turn.", BUCKETS_S),
     COLLATE_SECONDS: ("Of one execution, in which batches were made and no forward pass ran.", BUCKETS_S),
     FORWARD_SECONDS: ("Of one execution's forward passes.", BUCKETS_S),
 }
@@ -50,11 +57,13 @@ class Counted:
     samples: how many, by (sample type, outcome)
     num_frames: of the samples that were scored
     num_executed: samples that ``execution`` was about
+    wait_s: the longest that one of the requests had waited for its turn
     """
 
     samples: Counter[tuple[str, str]] = field(default_factory=Counter)
     num_frames: int = 0
     num_executed: int = 0
+    wait_s: float = 0.0
     execution: Execution = field(default_factory=Execution)
 
     @classmethod
@@ -69,6 +78,7 @@ class Counted:
             if request.outcome == SCORED:
                 counted.num_frames += request.num_frames
             counted.num_executed += len(request.answers)
+            counted.wait_s = max(counted.wait_s, request.waited_s)
         return counted
 
     def totals(self) -> dict[str, int]:
@@ -82,6 +92,7 @@ class Counted:
         return {
             BATCH_SAMPLES: self.num_executed,
             BATCH_PADDING: self.execution.padding_ratio,
+            WAIT_SECONDS: self.wait_s,
             COLLATE_SECONDS: self.execution.collate_s,
             FORWARD_SECONDS: self.execution.forward_s,
         }
@@ -93,9 +104,11 @@ class Metrics:
     labels: the labels that name the instance
     checkpoint: labels of rfm_checkpoint_info
     sample_types: the types of samples that the model scores
+    num_waiting: requests that wait for their turn; to be set when it changes
     """
 
     def __init__(self, labels: Mapping[str, str], checkpoint: Mapping[str, str], sample_types: Collection[str]) -> None:
+        self.num_waiting = 0
         self._at_work = 0
         self._queue: SimpleQueue[Counted | None] = SimpleQueue()  # None only wakes the thread
         self._closing = threading.Event()
@@ -148,7 +161,8 @@ class Metrics:
     def _flush(self, first: Counted | None = None, *, is_served: bool) -> None:
         try:
             batches = [batch for batch in (first, *_drained(self._queue)) if batch is not None]
-            self._series.add(batches, at_work=self._at_work, is_served=is_served)
+            self._series.add(batches)
+            self._series.show(at_work=self._at_work, waiting=self.num_waiting, is_served=is_served)
         except Exception:  # noqa: BLE001  requests are answered all the same
             self._log_once()
 
@@ -179,13 +193,15 @@ class _Series:
             name: self._family(name, HISTOGRAM, description).Metric(labels=dict(labels), buckets=list(buckets))
             for name, (description, buckets) in _HISTOGRAMS.items()
         }
-        at_work = self._family("batch_requests", GAUGE, "Requests of the batch that is worked on now; 0: idle.")
-        self._at_work = at_work.Metric(labels=dict(labels))
-        self._shown_at_work: int | None = None
+        self._gauges = {
+            name: self._family(name, GAUGE, description).Metric(labels=dict(labels))
+            for name, description in _GAUGES.items()
+        }
+        self._shown = dict.fromkeys(_GAUGES, -1)
         info = self._family("checkpoint_info", GAUGE, "1: the checkpoint is served.")
         model = {name: labels[name] for name in ("model", "version")}
         self._checkpoint = info.Metric(labels={**model, **checkpoint})
-        self.add([], at_work=0, is_served=True)
+        self.show(at_work=0, waiting=0, is_served=True)
 
     def _family(self, name: str, kind: str, description: str) -> Any:
         import triton_python_backend_utils as pb_utils
@@ -194,7 +210,7 @@ class _Series:
         self._families.append(pb_utils.MetricFamily(name=f"rfm_{name}", description=description, kind=kind))
         return self._families[-1]
 
-    def add(self, batches: Iterable[Counted], *, at_work: int, is_served: bool) -> None:
+    def add(self, batches: Iterable[Counted]) -> None:
         """Adds what came of ``batches``."""
         samples: Counter[tuple[str, str]] = Counter()
         totals: Counter[str] = Counter()
@@ -207,9 +223,13 @@ class _Series:
             self._samples[key].increment(count)
         for name, total in totals.items():
             self._totals[name].increment(total)
-        if at_work != self._shown_at_work:
-            self._at_work.set(at_work)
-            self._shown_at_work = at_work
+
+    def show(self, *, at_work: int, waiting: int, is_served: bool) -> None:
+        """Sets the gauges whose values have changed."""
+        for name, value in {BATCH_REQUESTS: at_work, WAITING_REQUESTS: waiting}.items():
+            if value != self._shown[name]:
+                self._gauges[name].set(value)
+                self._shown[name] = value
         # Every time: where a model is reloaded, the instance that goes says 0 when the one that comes has said 1.
         self._checkpoint.set(float(is_served))
 

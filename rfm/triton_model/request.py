@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""One request of a batch: who sent it, what it asks and what became of it."""
+"""One request: who sent it, what it asks and what became of it."""
 
 from __future__ import annotations
 
+import math
+import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Generic, TypeVar
@@ -12,6 +14,7 @@ from typing import Any, Generic, TypeVar
 from rfm.journal import NO_DIGEST
 from rfm.triton_model.request_digest import digest
 from rfm_client.contract import (
+    InferenceFailedError,
     InvalidSampleError,
     PreferenceSample,
     ProgressSample,
@@ -24,8 +27,9 @@ from rfm_client.contract.samples import Footage
 
 Question = TypeVar("Question")
 
-SCORED, REFUSED, FAILED, CANCELLED = "scored", "refused", "failed", "cancelled"  # what becomes of a request
-OUTCOMES = (SCORED, REFUSED, FAILED, CANCELLED)
+SCORED, REFUSED, FAILED = "scored", "refused", "failed"  # what becomes of a request
+CANCELLED, REJECTED = "cancelled", "rejected"  # by the client; by the server, which takes no more
+OUTCOMES = (SCORED, REFUSED, FAILED, CANCELLED, REJECTED)
 
 SAMPLE_TYPES = {
     ProgressSample: "progress",
@@ -33,6 +37,7 @@ SAMPLE_TYPES = {
     SimilaritySample: "similarity",
     Footage: "encode",
 }
+US_PER_S = 1e6
 UNKNOWN_TYPE = "unknown"  # of the samples of a request that could not be decoded
 
 
@@ -48,44 +53,119 @@ class CancelledError(RewardError):
     """The client has cancelled the request: nobody waits for its answer."""
 
 
+class RejectedError(RewardError):
+    """The model takes no more: it has no room for the request, no time before the request's ran out, or is ending."""
+
+
 @dataclass(eq=False)
 class Request(Generic[Question]):
-    """A request as Triton hands it over (``inference``), and what came of it so far.
+    """A request of Triton's, and what came of it so far.
 
+    request_id: the id that the client chose; empty if it chose none
+    outputs: names of the outputs that the client wants
+    sender: Triton's, which takes the response; None: ``execute`` gives it back
+    is_cancelled: asks Triton whether the client has cancelled
+    arrived_s: by time.monotonic, when the model got it
+    waited_s: seconds from then until its turn
+    patience_s: seconds that it may wait for its turn; None: any time
     num_samples: known when its tensors are read
+    num_tokens: of all its samples, known when they are prepared
     digest: names its inputs in the quarantine
     questions: none unless it could be decoded
+    prepared: one a question, once they are there
     answers: one a question, once they are there
     error: why it has no answer; None: it has one, or may get one
     """
 
-    inference: Any
+    request_id: str
+    outputs: Collection[str]
+    sender: Any
+    is_cancelled: Callable[[], bool]
+    arrived_s: float = field(default_factory=time.monotonic)
+    waited_s: float = 0.0
+    patience_s: float | None = None
     origin: Origin = Origin.CALLER
     tensors: wire.Tensors = field(default_factory=dict)
     num_samples: int = 1
+    num_tokens: int = 0
     digest: bytes = NO_DIGEST
     questions: Sequence[Question] = ()
+    prepared: Sequence[Any] = ()
     answers: Sequence[Any] = ()
     error: Exception | None = None
 
-    def read(self, input_names: Iterable[str]) -> None:
-        """Takes the tensors from Triton and forgets what came of an attempt before."""
+    @classmethod
+    def of(cls, inference: Any, *, later: bool) -> Request[Question]:
+        """What Triton hands over as ``inference``, without its tensors. ``later``: it is answered after ``execute``."""
+        sender = inference.get_response_sender() if later else None
+        asked = sender or inference
+        request = cls(inference.request_id(), inference.requested_output_names(), sender, asked.is_cancelled)
+        if timeout_us := inference.timeout():
+            request.patience_s = timeout_us / US_PER_S
+        return request
+
+    def read(self, inference: Any, input_names: Iterable[str]) -> None:
+        """Takes the tensors. A request that outlives ``execute`` needs copies: Triton's memory of them need not."""
         import triton_python_backend_utils as pb_utils
 
-        self.questions, self.answers, self.error = (), (), None
-        given = {name: pb_utils.get_input_tensor_by_name(self.inference, name) for name in input_names}
-        self.tensors = {name: tensor.as_numpy() for name, tensor in given.items() if tensor is not None}
+        given = {name: pb_utils.get_input_tensor_by_name(inference, name) for name in input_names}
+        arrays = {name: tensor.as_numpy() for name, tensor in given.items() if tensor is not None}
+        self.tensors = arrays if self.sender is None else {name: array.copy() for name, array in arrays.items()}
         self.num_samples = len(self.tensors[wire.NUM_FRAMES])
 
-    @property
-    def request_id(self) -> str:
-        """The id that the client chose; empty if it chose none."""
-        return str(self.inference.request_id())
+    def begin(self) -> None:
+        """Notes that its turn has come."""
+        self.waited_s = time.monotonic() - self.arrived_s
+
+    def out_of_patience(self, patience_s: float | None) -> RejectedError | None:
+        """The error of a request that had waited for longer than ``patience_s``, or than itself said; else None."""
+        if not self.may_be_rejected:
+            return None
+        own_s = math.inf if self.patience_s is None else self.patience_s
+        least_s = min(own_s, math.inf if patience_s is None else patience_s)
+        if self.waited_s <= least_s:
+            return None
+        of_whom = "queue_timeout_ms" if least_s == patience_s else "its own timeout"
+        return RejectedError(f"the request has waited for longer than {least_s:g} s ({of_whom})")
+
+    def fail(self, cause: Exception) -> None:
+        """Notes that something went wrong of which clients need not know more."""
+        self.error = InferenceFailedError("scoring failed; the server's log has the reason")
+        self.error.__cause__ = cause
+
+    def response(self, outputs: wire.Tensors) -> Any:
+        """Triton's response of these tensors."""
+        import triton_python_backend_utils as pb_utils
+
+        return pb_utils.InferenceResponse([pb_utils.Tensor(name, array) for name, array in outputs.items()])
+
+    def error_response(self) -> Any:
+        """Triton's response of the error, of which the log knows more than the client."""
+        import triton_python_backend_utils as pb_utils
+
+        codes = {
+            InvalidSampleError: pb_utils.TritonError.INVALID_ARG,
+            CancelledError: pb_utils.TritonError.CANCELLED,
+            RejectedError: pb_utils.TritonError.UNAVAILABLE,
+        }
+        code = next((codes[kind] for kind in codes if isinstance(self.error, kind)), pb_utils.TritonError.INTERNAL)
+        return pb_utils.InferenceResponse(error=pb_utils.TritonError(str(self.error), code))
+
+    def send(self, response: Any) -> None:
+        """Sends the response, which is the only one to this request."""
+        import triton_python_backend_utils as pb_utils
+
+        self.sender.send(response, flags=pb_utils.TRITONSERVER_RESPONSE_COMPLETE_FINAL)
 
     @property
     def is_counted(self) -> bool:
         """Whether the metrics count this request: a caller sent it."""
         return self.origin is Origin.CALLER
+
+    @property
+    def may_be_rejected(self) -> bool:
+        """Whether there may be no room for it. A probe always finds some: a busy model is a healthy one."""
+        return self.is_counted
 
     @property
     def sample_types(self) -> Counter[str]:
@@ -106,6 +186,8 @@ class Request(Generic[Question]):
             return SCORED
         if isinstance(self.error, CancelledError):
             return CANCELLED
+        if isinstance(self.error, RejectedError):
+            return REJECTED
         return REFUSED if isinstance(self.error, InvalidSampleError) else FAILED
 
 
@@ -120,20 +202,20 @@ class Origins:
         self._num_warmups = num_warmups
         self._blank = blank
 
-    def mark(self, batch: Iterable[Request[Any]]) -> None:
-        """Notes who the requests say that they are from; the first without an id are warm-ups."""
-        for request in batch:
-            if request.request_id.startswith(PROBE_PREFIX):
-                request.origin = Origin.PROBE
-            elif self._num_warmups and not request.request_id:
-                self._num_warmups -= 1
-                request.origin = Origin.WARM_UP
+    def find(self, request: Request[Any]) -> None:
+        """Notes who sent the request, and its digest if it is a caller's.
 
-    def verify(self, request: Request[Any]) -> None:
-        """Notes who sent a request whose tensors are read: anybody can say to be a probe, which asks the blank one."""
-        if request.origin is Origin.PROBE and digest(request.tensors) != self._blank:
-            request.origin = Origin.CALLER
-        request.digest = digest(request.tensors) if request.is_counted else NO_DIGEST
+        The first without an id are warm-ups. Anybody can say to be a probe, which asks the blank question.
+        """
+        if self._num_warmups and not request.request_id:
+            self._num_warmups -= 1
+            request.origin = Origin.WARM_UP
+            return
+        of_tensors = digest(request.tensors)
+        if request.request_id.startswith(PROBE_PREFIX) and of_tensors == self._blank:
+            request.origin = Origin.PROBE
+        else:
+            request.digest = of_tensors
 
 
 def _num_frames(question: Any) -> int:

@@ -36,8 +36,8 @@ class RequestLog:
         fields = {"request_ids": [request.request_id for request in batch], "error": repr(error)}
         self._write(FAILED, fields, error, event="batch_failed")
 
-    def report_end(self, error: Exception) -> None:
-        """Writes down that the process ends, since it cannot score a blank sample any more."""
+    def report_end(self, error: BaseException) -> None:
+        """Writes down that the process ends, since it cannot score any more."""
         self._write(FAILED, {"error": repr(error)}, error, event="instance_broken")
 
     def _write(

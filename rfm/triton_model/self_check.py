@@ -26,7 +26,7 @@ class SelfCheck:
     report: takes the error of an instance that ends
     """
 
-    def __init__(self, score_blank: Callable[[], None], report: Callable[[Exception], None]) -> None:
+    def __init__(self, score_blank: Callable[[], None], report: Callable[[BaseException], None]) -> None:
         self._score_blank = score_blank
         self._report = report
         self._num_failed = 0
@@ -35,14 +35,19 @@ class SelfCheck:
 
     @contextmanager
     def around(self, batch: Sequence[Request[Any]]) -> Iterator[None]:
-        """A context in which the batch is served. Afterwards it checks the instance, if the batch failed.
-
-        Nothing begins in a broken process, so that no request is a suspect when it ends.
-        """
-        if self._ending is not None:
-            self._ending.join()
+        """A context in which the batch is served. Afterwards it checks the instance, if the batch failed."""
         yield
         self._count(batch)
+
+    @property
+    def is_ending(self) -> bool:
+        """Whether the process is about to end. Nothing is scored then, so that no request is a suspect."""
+        return self._ending is not None
+
+    def wait_if_ending(self) -> None:
+        """Does not return if the process is about to end. Triton then tells those who ask that it has."""
+        if self._ending is not None:
+            self._ending.join()
 
     def _count(self, batch: Sequence[Request[Any]]) -> None:
         outcomes = {request.outcome for request in batch}
@@ -60,10 +65,14 @@ class SelfCheck:
         try:
             self._score_blank()
         except Exception as error:  # noqa: BLE001  whatever it is: the instance scored this before
-            self._report(error)
-            self._ending = threading.Timer(ANSWERED_S, _end)
-            self._ending.daemon = True
-            self._ending.start()
+            self.end(error)
+
+    def end(self, error: BaseException) -> None:
+        """Reports the error of a process that is broken, and ends it when Triton has passed on what it said."""
+        self._report(error)
+        self._ending = threading.Timer(ANSWERED_S, _end)
+        self._ending.daemon = True
+        self._ending.start()
 
 
 def _end() -> None:

@@ -124,11 +124,11 @@ class VlmCheckpoint:
         save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
         save_processor(collator, folder / PROCESSOR_FOLDER)
 
-    def build(self, dtype: torch.dtype | None = None, attention: str | None = None) -> VlmRewardModel:
+    def build(self, dtype: torch.dtype | None = None) -> VlmRewardModel:
         """The network with these weights, on the CPU, ready to score, in ``dtype`` (None: its own)."""
         wanted = dtype or self.config.torch_dtype
         _check_transformers(self.config)
-        network = self._network(wanted, attention)
+        network = self._network(wanted)
         # Parameters only: rotary frequencies stay float32, as in the original.
         network.load_state_dict({k: v.to(wanted) for k, v in self.weights.items()}, strict=True, assign=True)
         return network.eval().requires_grad_(False)
@@ -137,11 +137,11 @@ class VlmCheckpoint:
         """Raises CheckpointError unless the weights are those of the network; no memory is taken for it before."""
         _check_layers(self.config.backbone)
         with expecting("a backbone that transformers can make", NETWORK_CONFIG), torch.device("meta"):
-            network = self._network(self.config.torch_dtype, "sdpa")
+            network = self._network(self.config.torch_dtype)
         check_shapes(network.state_dict(), self.weights)
 
-    def _network(self, dtype: torch.dtype, attention: str | None) -> VlmRewardModel:
-        return VlmRewardModel(self.config, build_backbone(self.config, dtype, attention))
+    def _network(self, dtype: torch.dtype) -> VlmRewardModel:
+        return VlmRewardModel(self.config, build_backbone(self.config, dtype))
 
 
 def reads(folder: Path) -> bool:

@@ -3,13 +3,13 @@
 
 B rows, T frames, L tokens. A row is one conversation: its tokens, and where in them each frame's and the
 question's hidden states are read. Token ids are those of the original inference collator, sample for sample.
-Reading a row is cheap; its pixels are made when its batch is collated.
+Reading a row is cheap. Bringing its frames to size is not: that may be done before its batch is collated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, TypeAlias
 
@@ -19,14 +19,18 @@ import torch
 from torch import Tensor
 
 from rfm.dense_mode import prefix_indices
-from rfm.vlm.images import FRAMES_PER_GROUP, Grid, QwenImages, SmolImages
-from rfm.vlm.network import VlmBatch, VlmConfig
+from rfm.vlm.batch import FramesOfOneSize, QwenPixels, SmolPixels, VlmBatch
+from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, Grid, QwenImages, SmolImages
+from rfm.vlm.network import VlmConfig
+from rfm.vlm.positions import Box, positions
 from rfm.vlm.prompts import PREFERENCE_TOKEN, PROGRESS_TOKEN, SIMILARITY_TOKEN, TrajectoryPart, question
+from rfm.vlm.shots import Shots
+from rfm.vlm.vision import plan
 from rfm_client.contract import InvalidSampleError, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.contract.samples import UInt8Array
 
-TEXT, IMAGE, VIDEO = 0, 1, 2  # values of mm_token_type_ids
-SECONDS_PER_GROUP = 1.0  # the original gives it to Qwen2.5-VL with its videos
+SECONDS_PER_GROUP = 1  # the original gives it to Qwen2.5-VL with its videos
+TOKENS_PER_SECOND = 4  # transformers' default for Qwen2.5-VL
 VIDEO_FPS = 1  # the original gives it to Qwen3-VL, which writes each group's time into the prompt
 QWEN3 = "qwen3_vl"
 VISION_START, VISION_END = "<|vision_start|>", "<|vision_end|>"
@@ -34,6 +38,27 @@ IMAGE_PAD, VIDEO_PAD = "<|image_pad|>", "<|video_pad|>"
 SMOL_IMAGE, GLOBAL_IMAGE, FAKE = "<image>", "<global-img>", "<fake_token_around_image>"
 
 Spans: TypeAlias = list[tuple[int, int]]
+Indices: TypeAlias = npt.NDArray[np.int64]
+
+
+@dataclass(eq=False)
+class Film:
+    """A trajectory's frames, which all rows about it share.
+
+    frames: uint8 [T, H, W, 3]
+    num_shown: of them, in one conversation
+    pixels: uint8 [T, H', W', 3], brought to size, on the CPU or the device; None: not yet
+    """
+
+    frames: UInt8Array
+    num_shown: int
+    pixels: Tensor | None = None
+
+    @property
+    def sized(self) -> Tensor:
+        """The pixels of a film that has been brought to size."""
+        assert self.pixels is not None
+        return self.pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,27 +66,35 @@ class VlmRow:
     """One conversation.
 
     input_ids: int64 [L]
-    frames: uint8 [T, H, W, 3] of each trajectory
-    picked: in dense mode int64 [K], the frames that the conversation shows; None: all
+    films: of each trajectory
     spans: for each trajectory, the tokens (first, behind the last) over which each frame's state is read
     query: token whose state answers the question about two trajectories
+    picked: in dense mode int64 [K], the frames that the conversation shows; None: all
+    position_ids: of a Qwen backbone int64 [3, L]
     """
 
-    input_ids: npt.NDArray[np.int64]
-    frames: tuple[UInt8Array, ...]
+    input_ids: Indices
+    films: tuple[Film, ...]
     spans: tuple[Spans, ...]
     query: int | None
     is_similarity: bool
-    picked: npt.NDArray[np.int64] | None = None
+    picked: Indices | None = None
+    position_ids: Indices | None = None
+
+    @property
+    def frames(self) -> tuple[UInt8Array, ...]:
+        """uint8 [T, H, W, 3] of each trajectory, as they came."""
+        return tuple(film.frames for film in self.films)
 
     @property
     def num_frames(self) -> list[int]:
         """Frames of each trajectory that the conversation shows."""
-        return [len(video) for video in self.frames] if self.picked is None else [len(self.picked)]
+        return [film.num_shown for film in self.films]
 
-    def videos(self) -> tuple[UInt8Array, ...]:
-        """The frames that the conversation shows, of each trajectory; copied in dense mode, hence late."""
-        return self.frames if self.picked is None else (self.frames[0][self.picked],)
+    @property
+    def shown(self) -> Iterator[tuple[Film, Indices]]:
+        """Each trajectory, and which of its frames the conversation shows."""
+        return ((film, np.arange(film.num_shown) if self.picked is None else self.picked) for film in self.films)
 
     @property
     def num_tokens(self) -> int:
@@ -87,18 +120,21 @@ class VlmCollator:
         if isinstance(sample, SimilaritySample) and not self.config.has_similarity:
             supported = "progress or preference (this checkpoint has no similarity head)"
             raise InvalidSampleError.at("sample_type", supported, "similarity")
-        frames = tuple(_frames(trajectory) for trajectory in sample.trajectories)
+        frames = [_frames(trajectory) for trajectory in sample.trajectories]
         self._check_task(sample.trajectories[0].task)
         frame_steps = sample.frame_steps if isinstance(sample, ProgressSample) else 0
+        row = self._row(sample, tuple(Film(each, frame_steps or len(each)) for each in frames))
         if frame_steps:
             # Every prefix is as long and its frames are as large, so all conversations have the same tokens.
-            shown = np.broadcast_to(frames[0][:1], (frame_steps, *frames[0].shape[1:]))
-            row = self._row(sample, (shown,))
-            return [replace(row, frames=frames, picked=p) for p in prefix_indices(len(frames[0]), frame_steps)]
-        return [self._row(sample, frames)]
+            return [replace(row, picked=picked) for picked in prefix_indices(len(frames[0]), frame_steps)]
+        return [row]
+
+    def to_size(self, film: Film) -> Tensor:
+        """uint8 [T, H', W', 3]: a film's frames as large as the backbone reads them."""
+        raise NotImplementedError
 
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
-        """A batch of conversations of any kind and length."""
+        """A batch of conversations of any kind and length, whose films have been brought to size."""
         length = max(row.num_tokens for row in rows)
         pad = self.tokenizer.pad_token_id
         ids = torch.full((len(rows), length), pad, dtype=torch.int64)
@@ -114,24 +150,33 @@ class VlmCollator:
             for start, stop in of_trajectory
         ]
         queries = [(index, row.query + shifts[index]) for index, row in enumerate(rows) if row.query is not None]
-        query_index = torch.tensor(queries, dtype=torch.int64).reshape(-1, 2)
-        inputs = {"input_ids": ids, "attention_mask": mask, **self._pixel_inputs(rows, ids)}
-        return VlmBatch(inputs, torch.tensor(spans, dtype=torch.int64), query_index[:, 0], query_index[:, 1])
+        query_rows, query_tokens = torch.tensor(queries, dtype=torch.int64).reshape(-1, 2).T.contiguous()
+        batch = VlmBatch(
+            inputs={"input_ids": ids, "attention_mask": mask},
+            spans=torch.tensor(spans, dtype=torch.int64),
+            query_rows=query_rows,
+            query_tokens=query_tokens,
+            num_tokens=sum(row.num_tokens for row in rows),
+            num_span_tokens=sum(stop - start for _, start, stop in spans),
+        )
+        return self._with_pixels(batch, rows)
 
-    def _row(self, sample: Sample, frames: tuple[UInt8Array, ...]) -> VlmRow:
+    def _row(self, sample: Sample, films: tuple[Film, ...]) -> VlmRow:
         parts: list[str | dict[str, str]] = []
         for part in question(sample, progress_in_preference=self.config.progress_in_preference):
-            parts += self._frame_parts(len(frames[part.index])) if isinstance(part, TrajectoryPart) else [part]
+            parts += self._frame_parts(films[part.index].num_shown) if isinstance(part, TrajectoryPart) else [part]
         try:
-            text = self._expanded(self._rendered(parts), frames)
+            text, pad, lengths = self._placed(self._rendered(parts), films)
         except ValueError as error:  # an image of a shape that cannot be brought to size
             raise InvalidSampleError.at("frames", *str(error).split(", got ")) from error
         ids = np.asarray(self.tokenizer(text, add_special_tokens=False, verbose=False)["input_ids"], np.int64)
-        pair = len(frames) > 1
+        ids = _expanded(ids, self.tokenizer.convert_tokens_to_ids(pad), lengths)
         is_similarity = isinstance(sample, SimilaritySample)
         query_token = SIMILARITY_TOKEN if is_similarity else PREFERENCE_TOKEN
-        query = int(self._positions(ids, query_token)[-1]) if pair else None
-        return VlmRow(ids, frames, self._spans(ids, frames), query, is_similarity)
+        query = int(self._positions(ids, query_token)[-1]) if len(films) > 1 else None
+        return VlmRow(
+            ids, films, self._spans(ids, films), query, is_similarity, position_ids=self._position_ids(ids, films)
+        )
 
     def _frame_parts(self, num_frames: int) -> list[str | dict[str, str]]:
         """Placeholders of one trajectory in the conversation."""
@@ -148,21 +193,25 @@ class VlmCollator:
         conversation = [{"role": "user", "content": content}]
         return str(self.tokenizer.apply_chat_template(conversation, tokenize=False, add_vision_id=True))
 
-    def _expanded(self, text: str, frames: tuple[UInt8Array, ...]) -> str:
-        """The text with each placeholder of an image or video as long as its tokens."""
+    def _placed(self, text: str, films: tuple[Film, ...]) -> tuple[str, str, list[int]]:
+        """The text with one pad token for each image or video or group of it, which token, and of how many it stands
+        for.
+        """
         raise NotImplementedError
 
-    def _spans(self, ids: npt.NDArray[np.int64], frames: tuple[UInt8Array, ...]) -> tuple[Spans, ...]:
+    def _spans(self, ids: Indices, films: tuple[Film, ...]) -> tuple[Spans, ...]:
         """Where each frame's state is read."""
         raise NotImplementedError
 
-    def _pixel_inputs(self, rows: Sequence[VlmRow], ids: Tensor) -> dict[str, Tensor]:
-        """The backbone's arguments about images and videos."""
+    def _position_ids(self, ids: Indices, films: tuple[Film, ...]) -> Indices | None:
+        """int64 [3, L], if the backbone wants them."""
+        return None
+
+    def _with_pixels(self, batch: VlmBatch, rows: Sequence[VlmRow]) -> VlmBatch:
+        """The batch with what its backbone wants besides tokens."""
         raise NotImplementedError
 
-    def _image_spans(
-        self, ids: npt.NDArray[np.int64], frames: tuple[UInt8Array, ...], ends: Spans
-    ) -> tuple[Spans, ...]:
+    def _image_spans(self, ids: Indices, films: tuple[Film, ...], ends: Spans) -> tuple[Spans, ...]:
         """Spans of frames that are images of their own; ``ends``: the tokens around each one's."""
         if self.config.per_frame_progress_token:
             spans = [(int(token), int(token) + 1) for token in self._positions(ids, PROGRESS_TOKEN)]
@@ -170,10 +219,10 @@ class VlmCollator:
             spans = [(end - 1, end) for _, end in ends]
         else:
             spans = [(start + 1, end) for start, end in ends]
-        bounds = np.cumsum([0, *map(len, frames)])
-        return tuple(spans[bounds[i] : bounds[i + 1]] for i in range(len(frames)))
+        bounds = np.cumsum([0, *(film.num_shown for film in films)])
+        return tuple(spans[bounds[i] : bounds[i + 1]] for i in range(len(films)))
 
-    def _positions(self, ids: npt.NDArray[np.int64], token: str) -> npt.NDArray[np.int64]:
+    def _positions(self, ids: Indices, token: str) -> Indices:
         return np.flatnonzero(ids == self.tokenizer.convert_tokens_to_ids(token))
 
     def _check_task(self, task: str) -> None:
@@ -190,23 +239,40 @@ class QwenCollator(VlmCollator):
 
     images: QwenImages
 
-    def _expanded(self, text: str, frames: tuple[UInt8Array, ...]) -> str:
+    def to_size(self, film: Film) -> Tensor:
+        """uint8 [T, H', W', 3] of images, or of a video's frames."""
         if self.config.multi_image:
-            counts = [self.images.image_grid(video).tokens_per_group for video in frames for _ in video]
-            return _replaced(text, IMAGE_PAD, [IMAGE_PAD * count for count in counts])
-        grids = [self.images.video_grid(video) for video in frames]
-        if self.config.family != QWEN3:
-            return _replaced(text, VIDEO_PAD, [VIDEO_PAD * (grid.groups * grid.tokens_per_group) for grid in grids])
-        return _replaced(text, VISION_START + VIDEO_PAD + VISION_END, [_timed_groups(grid) for grid in grids])
+            return self.images.images_to_size(film.frames)
+        return self.images.video_to_size(film.frames, film.num_shown)
 
-    def _spans(self, ids: npt.NDArray[np.int64], frames: tuple[UInt8Array, ...]) -> tuple[Spans, ...]:
+    @property
+    def _pad(self) -> str:
+        return IMAGE_PAD if self.config.multi_image else VIDEO_PAD
+
+    def grid(self, film: Film) -> Grid:
+        """The grid of all that is shown of a film: images, or temporal groups."""
+        if self.config.multi_image:
+            return replace(self.images.image_grid(film.frames), groups=film.num_shown)
+        return self.images.video_grid(film.frames, film.num_shown)
+
+    def _placed(self, text: str, films: tuple[Film, ...]) -> tuple[str, str, list[int]]:
+        grids = [self.grid(film) for film in films]
+        of_shots = [grid.tokens_per_group for grid in grids for _ in range(grid.groups)]
+        if self.config.multi_image:
+            return text, IMAGE_PAD, of_shots
+        if self.config.family != QWEN3:
+            return text, VIDEO_PAD, [grid.groups * grid.tokens_per_group for grid in grids]
+        timed = [_timed_groups(grid) for grid in grids]
+        return _replaced(text, VISION_START + VIDEO_PAD + VISION_END, timed), VIDEO_PAD, of_shots
+
+    def _spans(self, ids: Indices, films: tuple[Film, ...]) -> tuple[Spans, ...]:
         starts = self._positions(ids, VISION_START)
         if self.config.multi_image:
             ends = list(zip(starts.tolist(), self._positions(ids, VISION_END).tolist(), strict=True))
-            return self._image_spans(ids, frames, ends)
+            return self._image_spans(ids, films, ends)
         # In strides from the n-th vision start of the row, for the n-th trajectory. Qwen3-VL writes times and a
         # start of its own before each group, which upstream does not heed, in training as in inference.
-        grids = [self.images.video_grid(video) for video in frames]
+        grids = map(self.grid, films)
         return tuple(self._video_spans(int(start), grid) for start, grid in zip(starts, grids, strict=False))
 
     def _video_spans(self, start: int, grid: Grid) -> Spans:
@@ -215,21 +281,41 @@ class QwenCollator(VlmCollator):
             return list(pairwise(bounds))
         return [(bound, bound + 1) for bound in bounds[1:]]
 
-    def _pixel_inputs(self, rows: Sequence[VlmRow], ids: Tensor) -> dict[str, Tensor]:
-        image_pad, video_pad = (self.tokenizer.convert_tokens_to_ids(pad) for pad in (IMAGE_PAD, VIDEO_PAD))
-        types = torch.where(ids == image_pad, IMAGE, torch.where(ids == video_pad, VIDEO, TEXT))
-        videos = [video for row in rows for video in row.videos()]
-        if self.config.multi_image:
-            pixels = [image for video in videos for image in self.images.images(video)]
-        else:
-            pixels = [self.images.video(video) for video in videos]
-        patches = torch.cat([each.patches for each in pixels])
-        grids = torch.tensor([astuple(each.grid) for each in pixels])
-        inputs = {"mm_token_type_ids": types}  # transformers 5 computes positions from it
-        if self.config.multi_image:
-            return inputs | {"pixel_values": patches, "image_grid_thw": grids}
-        seconds = torch.full((len(pixels),), SECONDS_PER_GROUP)
-        return inputs | {"pixel_values_videos": patches, "video_grid_thw": grids, "second_per_grid_ts": seconds}
+    def _position_ids(self, ids: Indices, films: tuple[Film, ...]) -> Indices:
+        """Of images, and of Qwen3-VL's groups, each is a box of its own; else a video is one."""
+        is_whole = not self.config.multi_image and self.config.family != QWEN3
+        step = SECONDS_PER_GROUP * self.config.backbone["vision_config"].get("tokens_per_second", TOKENS_PER_SECOND)
+        boxes, read, starts = [], 0, self._positions(ids, self._pad)
+        for grid in map(self.grid, films):
+            groups = grid.groups if is_whole else 1
+            for _ in range(grid.groups // groups):
+                boxes.append(Box(int(starts[read]), groups, grid.rows // MERGE, grid.columns // MERGE, step))
+                read += boxes[-1].num_tokens
+        return positions(len(ids), boxes)
+
+    def _with_pixels(self, batch: VlmBatch, rows: Sequence[VlmRow]) -> VlmBatch:
+        shots = Shots(are_images=self.config.multi_image)
+        read = [shots.add(film.sized, shown) for row in rows for film, shown in row.shown]
+        grids = [self.images.grid(len(each.numbers), *each.films[0].shape[1:3]) for each in shots.sizes]
+        firsts = np.cumsum([0, *(grid.groups * grid.tokens_per_group for grid in grids)])
+        features = []
+        for size, numbers in read:
+            per_shot = grids[size].tokens_per_group
+            features.append((firsts[size] + numbers[:, None] * per_shot + np.arange(per_shot)).ravel())
+        ids = batch.inputs["input_ids"]
+        position_ids = torch.zeros(3, *ids.shape, dtype=torch.int64)
+        for index, row in enumerate(rows):
+            assert row.position_ids is not None
+            position_ids[:, index, : row.num_tokens] = torch.from_numpy(row.position_ids)
+        inputs = {
+            "input_ids": ids,
+            "position_ids": position_ids,
+            "visual_tokens": (ids.flatten() == self.tokenizer.convert_tokens_to_ids(self._pad)).nonzero()[:, 0],
+            "visual_features": torch.from_numpy(np.concatenate(features)),
+        }
+        pixels = QwenPixels(self.images, [each.frames() for each in shots.sizes])
+        vision = plan(grids, self.config.backbone["vision_config"])
+        return replace(batch, inputs=inputs, pixels=pixels, plan=vision)
 
 
 class SmolCollator(VlmCollator):
@@ -237,23 +323,35 @@ class SmolCollator(VlmCollator):
 
     images: SmolImages
 
-    def _expanded(self, text: str, frames: tuple[UInt8Array, ...]) -> str:
-        image = FAKE + GLOBAL_IMAGE + SMOL_IMAGE * self.images.tokens + FAKE
-        return text.replace(SMOL_IMAGE, image)
+    def to_size(self, film: Film) -> Tensor:
+        """uint8 [T, side, side, 3]."""
+        return self.images.images_to_size(film.frames)
 
-    def _spans(self, ids: npt.NDArray[np.int64], frames: tuple[UInt8Array, ...]) -> tuple[Spans, ...]:
+    def _placed(self, text: str, films: tuple[Film, ...]) -> tuple[str, str, list[int]]:
+        text = text.replace(SMOL_IMAGE, FAKE + GLOBAL_IMAGE + SMOL_IMAGE + FAKE)
+        return text, SMOL_IMAGE, [self.images.tokens] * sum(film.num_shown for film in films)
+
+    def _spans(self, ids: Indices, films: tuple[Film, ...]) -> tuple[Spans, ...]:
         around = self._positions(ids, FAKE).tolist()
-        return self._image_spans(ids, frames, list(zip(around[::2], around[1::2], strict=True)))
+        return self._image_spans(ids, films, list(zip(around[::2], around[1::2], strict=True)))
 
-    def _pixel_inputs(self, rows: Sequence[VlmRow], ids: Tensor) -> dict[str, Tensor]:
-        images = [torch.cat([self.images.images(video) for video in row.videos()]) for row in rows]
-        most = max(len(each) for each in images)
-        pixels = torch.zeros(len(rows), most, *images[0].shape[1:])  # the backbone leaves out images of zeros
-        mask = torch.zeros(len(rows), most, *images[0].shape[2:], dtype=torch.bool)
-        for row, each in enumerate(images):
-            pixels[row, : len(each)] = each
-            mask[row, : len(each)] = True
-        return {"pixel_values": pixels, "pixel_attention_mask": mask}
+    def _with_pixels(self, batch: VlmBatch, rows: Sequence[VlmRow]) -> VlmBatch:
+        """Each conversation's squares side by side; a film that several show is there once."""
+        firsts: dict[Film, int] = {}
+        for film in (film for row in rows for film, _ in row.shown):
+            if film not in firsts:
+                firsts[film] = sum(len(each.frames) for each in firsts)
+        frames = [np.concatenate([firsts[film] + shown for film, shown in row.shown]) for row in rows]
+        counts = torch.tensor([len(each) for each in frames])
+        pixels = SmolPixels(
+            self.images,
+            FramesOfOneSize([film.sized for film in firsts], None),
+            rows=torch.arange(len(rows)).repeat_interleave(counts),
+            places=torch.cat([torch.arange(count) for count in counts.tolist()]),
+            frames=torch.from_numpy(np.concatenate(frames)),
+            shape=(len(rows), int(counts.max())),
+        )
+        return replace(batch, pixels=pixels)
 
 
 def _frames(trajectory: Trajectory) -> UInt8Array:
@@ -269,11 +367,20 @@ def _replaced(text: str, placeholder: str, replacements: Sequence[str]) -> str:
     return pieces[0] + "".join(new + piece for new, piece in zip(replacements, pieces[1:], strict=True))
 
 
+def _expanded(ids: Indices, pad: int, lengths: Sequence[int]) -> Indices:
+    """The tokens with each ``pad`` as often as ``lengths`` says; faster than to tokenise that many."""
+    times = np.ones(len(ids), np.int64)
+    at = np.flatnonzero(ids == pad)
+    assert len(at) == len(lengths), "the chat template shows each image or video once"
+    times[at] = lengths
+    return ids.repeat(times)
+
+
 def _timed_groups(grid: Grid) -> str:
     """A video as Qwen3-VL reads it: each temporal group behind the mean time of its frames."""
     groups = []
     for group in range(grid.groups):
         frame_times = [(group * FRAMES_PER_GROUP + frame) / VIDEO_FPS for frame in range(FRAMES_PER_GROUP)]
         time_s = sum(frame_times) / FRAMES_PER_GROUP
-        groups.append(f"<{time_s:.1f} seconds>{VISION_START}{VIDEO_PAD * grid.tokens_per_group}{VISION_END}")
+        groups.append(f"<{time_s:.1f} seconds>{VISION_START}{VIDEO_PAD}{VISION_END}")
     return "".join(groups)

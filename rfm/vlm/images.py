@@ -2,6 +2,7 @@
 """Raw frames -> the pixels that a vision-language backbone reads, value for value as the original collator's.
 
 T frames, H x W pixels, C = 3 channels; P pixels a side of a patch. A merged token stands for MERGE x MERGE patches.
+On the CPU each frame is brought to size once, as uint8 (``to_size``). All else, in float, is for the device.
 Sources: the resizing rules of ``qwen-vl-utils`` 0.0.14, the patch order of ``transformers``' Qwen2-VL image
 processor, and its SmolVLM image processor. Neither torchvision nor those processors are needed.
 """
@@ -9,7 +10,9 @@ processor, and its SmolVLM image processor. Neither torchvision nor those proces
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -40,10 +43,16 @@ class Normalisation:
         """The fields of preprocessor_config.json that describe this."""
         return {"image_mean": self.mean, "image_std": self.std, "rescale_factor": 1 / MAX_UINT8}
 
-    def __call__(self, images: Tensor) -> Tensor:
-        """[..., C, H, W] in 0..255 -> float32."""
-        mean, std = (torch.tensor(values).view(-1, 1, 1) * MAX_UINT8 for values in (self.mean, self.std))
-        return (images.float() - mean) / std
+    def __call__(self, frames: Tensor) -> Tensor:
+        """uint8 [..., H, W, C] -> float32 [..., C, H, W]."""
+        mean, std = (_channels(values, frames.device) for values in (self.mean, self.std))
+        return (frames.movedim(-1, -3).float() - mean) / std
+
+
+@lru_cache
+def _channels(values: tuple[float, ...], device: torch.device) -> Tensor:
+    """float32 [C, 1, 1]: fractions of white on the device, where they stay, in grey levels."""
+    return (torch.tensor(values).view(-1, 1, 1) * MAX_UINT8).to(device)
 
 
 @dataclass(frozen=True)
@@ -58,17 +67,6 @@ class Grid:
     def tokens_per_group(self) -> int:
         """Merged tokens of one temporal group."""
         return self.rows * self.columns // MERGE**2
-
-
-@dataclass(frozen=True)
-class Pixels:
-    """What the backbone reads of one image or video.
-
-    patches: float32 [N, C * FRAMES_PER_GROUP * P * P], N = all of the grid's
-    """
-
-    patches: Tensor
-    grid: Grid
 
 
 def fitted_size(height: int, width: int, factor: int, tokens: tuple[float, float] = IMAGE_TOKENS) -> tuple[int, int]:
@@ -91,6 +89,8 @@ def fitted_size(height: int, width: int, factor: int, tokens: tuple[float, float
 
 def resized(frame: UInt8Array, height: int, width: int, resample: int = PIL_BICUBIC) -> UInt8Array:
     """uint8 [H, W, 3] -> [height, width, 3], as Pillow resizes; ``resample``: its number of the filter."""
+    if frame.shape[:2] == (height, width):
+        return frame
     try:
         from PIL import Image
     except ImportError as error:
@@ -116,40 +116,55 @@ class QwenImages:
 
     def image_grid(self, frames: UInt8Array) -> Grid:
         """Grid of each of the frames [T, H, W, 3] as an image of its own."""
-        return self._grid(1, self._image_size(frames))
+        return self.grid(1, *self._image_size(frames))
 
-    def video_grid(self, frames: UInt8Array) -> Grid:
-        """Grid of all frames [T, H, W, 3] as one video."""
-        return self._grid(math.ceil(len(frames) / FRAMES_PER_GROUP), self._video_sizes(frames)[-1])
+    def video_grid(self, frames: UInt8Array, num_shown: int) -> Grid:
+        """Grid of a video that shows so many of the frames [T, H, W, 3]."""
+        groups = math.ceil(num_shown / FRAMES_PER_GROUP)
+        return self.grid(groups, *self._video_sizes(frames, num_shown)[-1])
 
-    def images(self, frames: UInt8Array) -> list[Pixels]:
-        """Each frame [T, H, W, 3] as an image of its own."""
-        size = self._image_size(frames)
-        return [
-            self._pixels(_channels_first(resized(frame, *size)).expand(FRAMES_PER_GROUP, -1, -1, -1))
-            for frame in frames
-        ]
+    def images_to_size(self, frames: UInt8Array) -> Tensor:
+        """uint8 [T, H, W, 3] -> [T, H', W', 3]: each frame as the image of its own that the network reads."""
+        return _to_sizes(frames, [self._image_size(frames)])
 
-    def video(self, frames: UInt8Array) -> Pixels:
-        """All frames [T, H, W, 3] as one video; an odd count is filled up with the last frame."""
-        *first_sizes, last_size = self._video_sizes(frames)
-        pictures = []
-        for frame in frames:
-            for size in first_sizes:
-                frame = resized(frame, *size)
-            pictures.append(_channels_first(frame))
-        stack = torch.cat(pictures + pictures[-1:] * (len(pictures) % FRAMES_PER_GROUP))
-        if stack.shape[-2:] != last_size:
+    def video_to_size(self, frames: UInt8Array, num_shown: int) -> Tensor:
+        """uint8 [T, H, W, 3] -> [T, H', W', 3]: each frame as the network reads it in a video of ``num_shown``."""
+        *first_sizes, last_size = self._video_sizes(frames, num_shown)
+        video = _to_sizes(frames, first_sizes)
+        if first_sizes[-1] == last_size:
+            return video
+        scaled = torch.empty(len(video), *last_size, video.shape[-1], dtype=torch.uint8)
+        for index, frame in enumerate(video):
             # in float and rounded, as torchvision resizes; torch's own uint8 path differs by up to one
-            stack = F.interpolate(stack.float(), last_size, mode="bicubic", antialias=True).clamp(0, MAX_UINT8).round()
-        return self._pixels(stack)
+            planes = frame.movedim(-1, 0)[None].float()
+            planes = F.interpolate(planes, last_size, mode="bicubic", antialias=True).clamp_(0, MAX_UINT8).round_()
+            scaled[index] = planes[0].movedim(0, -1)
+        return scaled
+
+    def patches(self, frames: Tensor, shots: Tensor | None, dtype: torch.dtype = torch.float32) -> Tensor:
+        """uint8 [T, H', W', 3] -> [N, C * FRAMES_PER_GROUP * P * P], those that are merged next to each other.
+
+        shots: int64 [S, 1], which frames are images, or [S, FRAMES_PER_GROUP], which are temporal groups of a video;
+            None: each frame is an image
+        """
+        planes = self.normalisation(frames).to(dtype)
+        groups = planes[:, None] if shots is None else planes[shots]
+        groups = groups.expand(-1, FRAMES_PER_GROUP, -1, -1, -1)  # an image is a group of the same frame twice
+        num_groups, _, channels, height, width = groups.shape
+        grid = self.grid(num_groups, height, width)
+        patches = groups.reshape(
+            num_groups, FRAMES_PER_GROUP, channels,
+            grid.rows // MERGE, MERGE, self.patch_px,
+            grid.columns // MERGE, MERGE, self.patch_px,
+        )  # fmt: skip
+        return patches.permute(0, 3, 6, 4, 7, 2, 1, 5, 8).flatten(0, 4).flatten(1)
 
     def _image_size(self, frames: UInt8Array) -> tuple[int, int]:
         height, width = self.size_px or frames.shape[1:3]
         return fitted_size(height, width, self.patch_px * MERGE)
 
-    def _video_sizes(self, frames: UInt8Array) -> list[tuple[int, int]]:
-        """Height and width to which a video's frames are brought one after the other."""
+    def _video_sizes(self, frames: UInt8Array, num_shown: int) -> list[tuple[int, int]]:
+        """Height and width to which the frames of a video of ``num_shown`` are brought one after the other."""
         factor = self.patch_px * MERGE
         sizes = []
         height, width = frames.shape[1:3]
@@ -162,27 +177,15 @@ class QwenImages:
         if self.size_px:
             return [*sizes, fitted_size(*self.size_px, factor)]
         least, most = VIDEO_TOKENS
-        count = math.ceil(len(frames) / FRAMES_PER_GROUP) * FRAMES_PER_GROUP
+        count = math.ceil(num_shown / FRAMES_PER_GROUP) * FRAMES_PER_GROUP
         most_px = max(
             min(most, VIDEO_TOTAL_TOKENS / count * FRAMES_PER_GROUP) * factor**2, int(least * factor**2 * 1.05)
         )
         return [*sizes, fitted_size(*sizes[-1], factor, (least, most_px / factor**2))]
 
-    def _grid(self, groups: int, size: tuple[int, int]) -> Grid:
-        return Grid(groups, size[0] // self.patch_px, size[1] // self.patch_px)
-
-    def _pixels(self, stack: Tensor) -> Pixels:
-        """uint8 [T, C, H, W] -> patches, those that are merged next to each other."""
-        stack = self.normalisation(stack)
-        frames, channels, height, width = stack.shape
-        grid = self._grid(frames // FRAMES_PER_GROUP, (height, width))
-        patches = stack.reshape(
-            grid.groups, FRAMES_PER_GROUP, channels,
-            grid.rows // MERGE, MERGE, self.patch_px,
-            grid.columns // MERGE, MERGE, self.patch_px,
-        )  # fmt: skip
-        patches = patches.permute(0, 3, 6, 4, 7, 2, 1, 5, 8)
-        return Pixels(patches.flatten(0, 4).flatten(1), grid)
+    def grid(self, groups: int, height: int, width: int) -> Grid:
+        """The grid of so many images or temporal groups of that size in pixels."""
+        return Grid(groups, height // self.patch_px, width // self.patch_px)
 
 
 @dataclass(frozen=True)
@@ -202,14 +205,10 @@ class SmolImages:
         """The fields of preprocessor_config.json that describe this."""
         return {"resample": self.resample, **self.normalisation.to_config()}
 
-    def images(self, frames: UInt8Array) -> Tensor:
-        """float32 [T, C, size_px, size_px] of frames [T, H, W, 3]."""
-        squares = []
-        for frame in frames:
-            size = _scaled_to_longest(frame.shape[0], frame.shape[1], self.size_px)
-            square = resized(resized(frame, *size, self.resample), self.size_px, self.size_px, self.resample)
-            squares.append(_channels_first(square))
-        return self.normalisation(torch.cat(squares))
+    def images_to_size(self, frames: UInt8Array) -> Tensor:
+        """uint8 [T, H, W, 3] -> [T, size_px, size_px, 3]."""
+        scaled = _scaled_to_longest(frames.shape[1], frames.shape[2], self.size_px)
+        return _to_sizes(frames, [scaled, (self.size_px, self.size_px)], self.resample)
 
 
 def _scaled_to_longest(height: int, width: int, longest: int) -> tuple[int, int]:
@@ -221,6 +220,16 @@ def _scaled_to_longest(height: int, width: int, longest: int) -> tuple[int, int]
     return longest, max(scaled + scaled % 2, 1)
 
 
-def _channels_first(picture: UInt8Array) -> Tensor:
-    """uint8 [H, W, C] -> [1, C, H, W]."""
-    return torch.from_numpy(np.array(picture)).permute(2, 0, 1).unsqueeze(0)
+def _to_sizes(frames: UInt8Array, sizes: Sequence[tuple[int, int]], resample: int = PIL_BICUBIC) -> Tensor:
+    """uint8 [T, H, W, 3] -> [T, *sizes[-1], 3]: each frame brought to one size after the other; no copy if it has all.
+
+    resample: Pillow's number of the filter
+    """
+    if frames.flags.writeable and all(size == frames.shape[1:3] for size in sizes):
+        return torch.from_numpy(frames)
+    sized = np.empty((len(frames), *sizes[-1], frames.shape[-1]), np.uint8)
+    for index, frame in enumerate(frames):
+        for size in sizes:
+            frame = resized(frame, *size, resample)
+        sized[index] = frame
+    return torch.from_numpy(sized)

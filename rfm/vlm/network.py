@@ -8,15 +8,16 @@ frame's state is pooled over a span of tokens, a question's is that of its token
 
 from __future__ import annotations
 
-import inspect
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 import torch
 from torch import Tensor, nn
 
 from rfm.layers.heads import PredictionHead
+from rfm.vlm.batch import VlmBatch
+from rfm.vlm.qwen import check_attention, last_hidden_state
 
 Pooling: TypeAlias = Literal["mean", "boundary", "attention"]
 
@@ -40,7 +41,7 @@ class VlmConfig:
     trained_frames: the most frames of a trajectory in training; None: the checkpoint does not say
     """
 
-    backbone: dict[str, Any] = field(hash=False)
+    backbone: dict[str, Any]
     dtype: Literal["float32", "bfloat16", "float16"]
     multi_image: bool
     per_frame_progress_token: bool
@@ -76,30 +77,6 @@ class VlmConfig:
 
 
 @dataclass(frozen=True)
-class VlmBatch:
-    """Conversations, padded to the longest.
-
-    inputs: the backbone's arguments
-    spans: int64 [F, 3], row and first and behind-the-last token of each frame's state
-    query_rows, query_tokens: int64 [Q], where the questions' tokens stand
-    """
-
-    inputs: dict[str, Tensor]
-    spans: Tensor
-    query_rows: Tensor
-    query_tokens: Tensor
-
-    def to(self, device: torch.device, dtype: torch.dtype) -> VlmBatch:
-        """The batch on ``device``, pixels in ``dtype``."""
-        inputs = {
-            name: tensor.to(device, dtype if tensor.is_floating_point() else None, non_blocking=True)
-            for name, tensor in self.inputs.items()
-        }
-        rest = (tensor.to(device) for tensor in (self.spans, self.query_rows, self.query_tokens))
-        return VlmBatch(inputs, *rest)
-
-
-@dataclass(frozen=True)
 class VlmOutput:
     """Raw scores: progress logits [F, K], success logits [F], preference and similarity logits [Q]."""
 
@@ -123,13 +100,14 @@ class VlmRewardModel(nn.Module):
         if config.has_similarity:
             self.similarity_head = PredictionHead(width, 1)
         self.frame_pool_attn = nn.Linear(width, 1, bias=False)
-        self._accepted = set(inspect.signature(backbone.forward).parameters)
 
     def forward(self, batch: VlmBatch) -> VlmOutput:
-        """Raw scores of every frame and question of the batch."""
-        inputs = {name: tensor for name, tensor in batch.inputs.items() if name in self._accepted}
-        hidden = self.model(**inputs, use_cache=False).last_hidden_state
-        frames = self._frame_states(hidden, batch.spans)
+        """Raw scores of every frame and question of the batch, which is on the network's device."""
+        if batch.plan is None:
+            hidden = self.model(**batch.inputs, use_cache=False).last_hidden_state
+        else:
+            hidden = last_hidden_state(self.model, batch.inputs, batch.plan)
+        frames = self._frame_states(hidden, batch.spans, batch.num_span_tokens)
         queries = hidden[batch.query_rows, batch.query_tokens]
         return VlmOutput(
             self.progress_head(frames),
@@ -138,52 +116,48 @@ class VlmRewardModel(nn.Module):
             self.similarity_head(queries).squeeze(-1) if self.config.has_similarity else None,
         )
 
-    def _frame_states(self, hidden: Tensor, spans: Tensor) -> Tensor:
+    def _frame_states(self, hidden: Tensor, spans: Tensor, num_tokens: int) -> Tensor:
         """[F, D]: each span's states, pooled; a span of one token is that token's state.
 
-        The spans' N tokens lie one span after the other, [N, D], so that a long span costs the others nothing.
+        The spans' N = num_tokens lie one span after the other, [N, D], so that a long span costs the others nothing.
         """
         rows, starts, stops = spans.unbind(dim=1)
         lengths = stops - starts
-        span = torch.arange(len(spans), device=spans.device).repeat_interleave(lengths)
-        offset = torch.arange(len(span), device=spans.device) - (lengths.cumsum(0) - lengths)[span]
+        span = torch.arange(len(spans), device=spans.device).repeat_interleave(lengths, output_size=num_tokens)
+        offset = torch.arange(num_tokens, device=spans.device) - (lengths.cumsum(0) - lengths)[span]
         states = hidden[rows[span], starts[span] + offset]
         if self.config.frame_pooling == "attention" and not self.config.per_frame_progress_token:
             scores = self.frame_pool_attn(states).squeeze(-1) / self.config.pooling_temperature
             states = states * _softmax_of_each(scores, lengths, span).unsqueeze(-1)
-            return _sum_of_each(states.float(), lengths).to(hidden.dtype)
-        return (_sum_of_each(states.float(), lengths) / lengths[:, None]).to(hidden.dtype)
+            return _of_each("sum", states.float(), lengths).to(hidden.dtype)
+        return (_of_each("sum", states.float(), lengths) / lengths[:, None]).to(hidden.dtype)
 
 
-def _sum_of_each(values: Tensor, lengths: Tensor) -> Tensor:
-    """[F, ...] of float32 [N, ...]: the sum of each segment."""
-    return torch.segment_reduce(values, "sum", lengths=lengths, axis=0)
+def _of_each(reduction: str, values: Tensor, lengths: Tensor) -> Tensor:
+    """[F, ...] of float32 [N, ...]: the sum, or the maximum, of each segment."""
+    # unsafe: the lengths are not checked, for which the host would wait
+    return torch.segment_reduce(values, reduction, lengths=lengths, axis=0, unsafe=True)
 
 
 def _softmax_of_each(scores: Tensor, lengths: Tensor, segment: Tensor) -> Tensor:
     """[N] of [N]: the softmax within each segment; ``segment``: each value's. In float32, given in the scores' type."""
-    largest = torch.segment_reduce(scores.float(), "max", lengths=lengths, axis=0)
+    largest = _of_each("max", scores.float(), lengths)
     weights = (scores.float() - largest[segment]).exp()
-    return (weights / _sum_of_each(weights, lengths)[segment]).to(scores.dtype)
+    return (weights / _of_each("sum", weights, lengths)[segment]).to(scores.dtype)
 
 
-def build_backbone(config: VlmConfig, dtype: torch.dtype, attention: str | None = None) -> nn.Module:
-    """The backbone with memory for its weights but no values in it; buffers keep the type that they need.
-
-    attention: implementation; None: flash attention where it is installed and can be used, else SDPA
-    """
+def build_backbone(config: VlmConfig, dtype: torch.dtype) -> nn.Module:
+    """The backbone with memory for its weights but no values in it; buffers keep the type that they need."""
     try:
         import transformers
-        from transformers.utils.import_utils import is_flash_attn_2_available
     except ImportError as error:
         raise ImportError('vision-language checkpoints need transformers: pip install ".[vlm]"') from error
     network = getattr(transformers, BACKBONES[config.family])
     settings = network.config_class.from_dict(config.backbone)
-    if attention is None:
-        usable = is_flash_attn_2_available() and dtype != torch.float32
-        attention = "flash_attention_2" if usable else "sdpa"
     with _no_init_weights():
-        backbone: nn.Module = network._from_config(settings, dtype=dtype, attn_implementation=attention)
+        backbone: nn.Module = network._from_config(settings, dtype=dtype, attn_implementation="sdpa")
+    if config.family != SMOL:
+        check_attention(backbone)
     return backbone
 
 

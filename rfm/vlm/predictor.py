@@ -9,22 +9,28 @@ from typing import Any
 import numpy as np
 import torch
 
+from rfm.layers.heads import progress_from_logits
 from rfm.layers.linear import speed_up
-from rfm.predictor import RowScores, checked, frame_scores, part_of
+from rfm.predictor import RowScores, checked, part_of
+from rfm.vlm.batch import VlmBatch
 from rfm.vlm.collator import VlmCollator, VlmRow
 from rfm.vlm.images import FRAMES_PER_GROUP
-from rfm.vlm.network import VlmBatch
+from rfm.vlm.network import VlmOutput
+from rfm.vlm.upload import Upload
 from rfm_client.contract import FrameScores, InvalidSampleError, RewardError, Sample
 
 
 class VlmPredictor:
     """A vision-language reward model on a device."""
 
+    works_ahead = True
+
     def __init__(self, network: Any, collator: VlmCollator, device: torch.device) -> None:
         self.network = network.to(device).eval()
         speed_up(self.network)
         self.collator = collator
         self.device = device
+        self._upload = Upload(device)
         self._dtype = next(network.parameters()).dtype
         self._max_tokens = int(network.model.config.get_text_config().max_position_embeddings)
 
@@ -42,22 +48,27 @@ class VlmPredictor:
         """Number of tokens of the row's conversation."""
         return row.num_tokens
 
+    def work_ahead(self, rows: Sequence[VlmRow]) -> None:
+        """Brings each frame to size once, and sends it on its way to the device."""
+        for film in (film for row in rows for film in row.films):
+            if film.pixels is None:
+                film.pixels = self._upload(self.collator.to_size(film))
+
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
-        """Conversations of any kind; here their pixels are made."""
-        return self.collator.collate(rows)
+        """Conversations of any kind."""
+        self.work_ahead(rows)
+        batch = self.collator.collate(rows)
+        return batch.pinned() if self.device.type == "cuda" else batch
 
     def occupancy(self, batch: VlmBatch) -> tuple[int, int]:
         """Number of tokens of the conversations, and of slots with the padding to the longest."""
-        mask = batch.inputs["attention_mask"]
-        return int(mask.sum()), mask.numel()
+        return batch.num_tokens, batch.inputs["input_ids"].numel()
 
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch) -> list[RowScores | RewardError]:
         """The scores of each row of the batch, or why it has none, from one forward pass."""
-        output = self.network(batch.to(self.device, self._dtype))
-        scores = frame_scores(output.progress, output.success)
-        preference = output.preference.sigmoid().float().tolist()
-        similarity = [] if output.similarity is None else output.similarity.float().tolist()
+        self._upload.wait_for([] if batch.pixels is None else batch.pixels.films)
+        scores, preference, similarity = _read(self.network(batch.to(self.device, self._dtype)))
         of_rows, read, num_queries = [], 0, 0
         for row in rows:
             frames = []
@@ -76,3 +87,15 @@ class VlmPredictor:
         if self.network.config.multi_image:
             return scores
         return part_of(scores, np.arange(num_frames) // FRAMES_PER_GROUP)
+
+
+def _read(output: VlmOutput) -> tuple[FrameScores, list[float], list[float]]:
+    """The scores of all frames, and preference and similarity of all questions, read from the device at once."""
+    made = [progress_from_logits(output.progress), output.success.sigmoid(), output.preference.sigmoid()]
+    made += [output.progress] if output.progress.shape[-1] > 1 else []
+    made += [] if output.similarity is None else [output.similarity]
+    read = torch.cat([each.float().flatten() for each in made]).cpu().split([each.numel() for each in made])
+    progress, success, preference, *rest = (each.view(of.shape) for each, of in zip(read, made, strict=True))
+    logits = rest.pop(0).numpy() if output.progress.shape[-1] > 1 else None
+    scores = FrameScores(progress=progress.numpy(), success=success.numpy(), progress_logits=logits)
+    return scores, preference.tolist(), rest[0].tolist() if rest else []

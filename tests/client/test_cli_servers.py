@@ -53,6 +53,7 @@ from rfm_client.cli.toy import SampleKind, Toy, parse_lengths
 from rfm_client.contract import wire
 from rfm_client.contract.wire import encode_samples
 from rfm_client.status import read_status
+from rfm_serve import wait_for
 from trajectories import random_trajectory
 
 COMMANDS = get_command(app).commands  # type: ignore[attr-defined]
@@ -76,6 +77,12 @@ def test_status_tells_what_triton_counts(served: Served, protocol: str, triton: 
     with served.client(protocol, MODEL) as client:
         client.progress(random_trajectory(0, 3, *WIDTHS))
     metrics = served.endpoints.metrics_url
+    wait_for(
+        lambda: any(
+            model.batches and model.batches.count
+            for model in read_status(served.url(protocol), metrics_url=metrics).models
+        )
+    )
     result = run("status", "--url", served.url(protocol), "--metrics-url", metrics, "--json")
     assert (result.returncode, result.stderr) == (0, "")
     (server,) = json.loads(result.stdout)["servers"]
@@ -89,12 +96,25 @@ def test_status_tells_what_triton_counts(served: Served, protocol: str, triton: 
     assert model["requests_failed"] == counted["inference_stats"]["fail"]["count"]
     assert model["samples"] == counted["inference_count"]
     assert model["executions"] == counted["execution_count"]
-    assert model["samples_per_execution"] == counted["inference_count"] / counted["execution_count"]
     assert model["queue_ms"] == pytest.approx(counted["inference_stats"]["queue"]["ns"] / 1e6)
-    assert model["compute_ms_per_execution"] > 0
+    batches = model["batches"]
+    assert model["samples_per_batch"] == batches["samples"] / batches["count"] >= 1
+    of_triton, in_model = model["queue_ms"] / model["requests_succeeded"], batches["wait_ms"] / batches["count"]
+    assert model["queue_ms_per_request"] == pytest.approx(of_triton + in_model)
+    assert model["compute_ms_per_batch"] == pytest.approx(batches["scoring_ms"] / batches["count"])
+    assert model["compute_ms_per_batch"] > 0
     assert model["requests_pending"] == 0
     (cpu,) = (device for device in server["devices"] if device["name"] == "CPU")
     assert 0 < cpu["memory_used_bytes"] < cpu["memory_total_bytes"]
+
+
+BATCHES = {  # of two instances: 40 batches, 120 samples; of each batch, the wait and the work
+    "batch_samples_count": (10, 30),
+    "batch_samples_sum": (30, 90),
+    "wait_seconds_sum": (5, 15),
+    "collate_seconds_sum": (0.5, 0.5),
+    "forward_seconds_sum": (3, 6),
+}
 
 
 def test_status_shows_the_gpus_and_what_waits(served: Served, tmp_path: Path) -> None:
@@ -106,11 +126,25 @@ def test_status_shows_the_gpus_and_what_waits(served: Served, tmp_path: Path) ->
         f'nv_gpu_memory_total_bytes{{gpu_uuid="GPU-a"}} {80 * gib}\n'
         'nv_gpu_utilization{gpu_uuid="GPU-b"} 0\n'
         f'nv_inference_pending_request_count{{model="{MODEL}",version="1"}} 12\n'
+        f'rfm_waiting_requests{{model="{MODEL}",version="1",device="cpu",instance="{MODEL}_0_0"}} 3\n'
+        f'rfm_waiting_requests{{model="{MODEL}",version="1",device="cpu",instance="{MODEL}_0_1"}} 4\n'
+        f'rfm_waiting_requests{{model="{MODEL}_encoder",version="1",device="cpu",instance="encoder"}} 5\n'
+        + "".join(
+            f'rfm_{name}{{model="{MODEL}",version="1",device="cpu",instance="{MODEL}_0_{instance}"}} {value}\n'
+            for name, values in BATCHES.items()
+            for instance, value in enumerate(values)
+        )
     )
     with web_server(tmp_path) as url:
         result = invoke("status", "--url", served.url("grpc"), "--metrics-url", f"{url}/metrics")
     assert result.exit_code == 0
-    assert columns(result.stdout, f"{MODEL} ")[5] == "12"
+    shown = columns(result.stdout, f"{MODEL} ")
+    assert shown[5] == "19"  # in Triton and in the model
+    assert shown[7:] == ["40", "3.0", "250.00"]
+    with web_server(tmp_path) as url:
+        (model,) = (m for m in read_status(served.url("grpc"), metrics_url=f"{url}/metrics").models if m.name == MODEL)
+    assert model.queue_ms_per_request == pytest.approx(model.queue_ms / model.requests_succeeded + 500)
+    assert model.busy_ms == 10_000
     assert columns(result.stdout, "GPU-a") == ["GPU-a", "75%", "3.0 GiB", "80.0 GiB"]
     assert columns(result.stdout, "GPU-b") == ["GPU-b", "0%", "-", "-"]
 
@@ -368,7 +402,7 @@ def test_a_missing_package_costs_a_line(served: Served, monkeypatch: pytest.Monk
 
 
 def test_every_command_and_option_has_help() -> None:
-    assert COMMANDS.keys() == {"score", "compare", "status", "wait", "sample", "bench-input", "gateway"}
+    assert COMMANDS.keys() == {"score", "compare", "status", "wait", "sample", "bench-input", "gateway", "label"}
     for name, command in COMMANDS.items():
         assert command.help, name
         result = invoke(name, "--help")

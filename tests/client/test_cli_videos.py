@@ -40,7 +40,7 @@ from trajectories import random_trajectory
 MAX_FRAMES = 16  # of that checkpoint
 
 
-EVENLY = np.linspace(0, clip.NUM_FRAMES - 1, MAX_FRAMES).astype(int)
+EVENLY = np.rint(np.linspace(0, clip.NUM_FRAMES - 1, MAX_FRAMES)).astype(int)
 
 
 def test_score_writes_what_the_client_gives_and_one_bad_video_does_not_stop_the_others(
@@ -118,7 +118,7 @@ def test_score_takes_at_most_as_many_frames_as_it_is_told_and_the_checkpoint_rea
 ) -> None:
     result = ask(served, "score", video, "--task", TASK, "--fps", 10, "--max-frames", limit, "--json", "-")
     (scored,) = json.loads(result.stdout)["videos"]
-    indices = np.linspace(0, clip.NUM_FRAMES - 1, min(limit, MAX_FRAMES)).astype(int)
+    indices = np.rint(np.linspace(0, clip.NUM_FRAMES - 1, min(limit, MAX_FRAMES))).astype(int)
     assert scored["frame_indices"] == indices.tolist()
     frames = load_trajectory(video, fps=10).frames
     assert frames is not None
@@ -181,7 +181,7 @@ def test_compare_writes_what_the_client_gives(served: Served, protocol: str, vid
     assert document["preference"] == pytest.approx(expected.preference, abs=TOLERANCE)
     assert_scores(document["first"], expected.first)
     assert_scores(document["second"], expected.second)
-    assert document["second"]["frame_indices"] == np.linspace(0, 19, 16).astype(int).tolist()
+    assert document["second"]["frame_indices"] == np.rint(np.linspace(0, 19, 16)).astype(int).tolist()
     assert [document[name]["source"] for name in ("first", "second")] == [str(video), str(still)]
     shares = [columns(result.stdout, str(name))[1] for name in (video, still)]
     assert shares == [f"{document['preference']:.4f}", f"{1 - document['preference']:.4f}"]
@@ -220,7 +220,9 @@ def test_a_lerobot_file_of_several_episodes_is_neither_scored_nor_compared(
     film.write_bytes(video.read_bytes())
     (tmp_path / "meta").mkdir()
     (tmp_path / "meta" / "info.json").write_text('{"codebase_version": "v3.0", "total_episodes": 10}')
-    refused = "video: expected a film of one episode, got a LeRobot v3.0 file that holds 10 episodes: cut one episode "
+    refused = (
+        "video: expected a film of one episode, got a LeRobot v3.0 file that holds 10 episodes: label the dataset "
+    )
     for words in (("score", film), ("compare", video, film)):
         result = ask(served, *words, "--task", TASK)
         assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")

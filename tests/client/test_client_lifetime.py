@@ -34,7 +34,6 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract import wire
-from rfm_client.data.fitting import evenly_spaced
 from rfm_client.transport.access import Access
 from rfm_client.transport.calls import Answer, GrpcTransport
 from trajectories import random_trajectory
@@ -165,12 +164,6 @@ def test_an_asyncio_client_that_is_closed_says_so(served: Served) -> None:
 
     with pytest.raises(RuntimeError, match="this AsyncRewardClient is closed"):
         asyncio.run(ask())
-
-
-def test_of_one_frame_the_newest_is_scored() -> None:
-    assert evenly_spaced(10, 1) == [9]
-    assert evenly_spaced(10, 2).tolist() == [0, 9]  # type: ignore[union-attr]
-    assert evenly_spaced(10, 10) is None
 
 
 def test_a_score_that_is_missing_fails_alone(served: Served) -> None:

@@ -17,8 +17,8 @@ import pytest
 
 from one_model import OneModelServer, answered
 from patients import DEADLY, MARK, Callers, make_repository, references, trajectory
-from rfm.supervise.model_processes import Stub, StubWatch
-from rfm.supervise.process import Endpoints
+from rfm.launch.process import Endpoints
+from rfm.supervise.model_processes import ModelProcess, ProcessWatch
 from rfm_client import (
     AsyncRewardClient,
     InvalidSampleError,
@@ -101,19 +101,19 @@ class Unhealed:
     """A Triton without ``rfm serve``: nobody loads its model anew."""
 
     server: OneModelServer
-    stubs: list[Stub]
+    processes: list[ModelProcess]
 
     @property
     def is_dead(self) -> bool:
-        return not any(stub.is_alive for stub in self.stubs)
+        return not any(process.is_alive for process in self.processes)
 
 
 @contextmanager
 def unhealed(folder: Path) -> Iterator[Unhealed]:
     with OneModelServer(make_repository(folder, more_code=DEADLY), Endpoints.free()) as server:
-        stubs = StubWatch(server.pid, PATIENCE_S).of_model(MODEL)
-        assert stubs
-        yield Unhealed(server, stubs)
+        processes = ProcessWatch(server.pid, PATIENCE_S).of_model(MODEL)
+        assert processes
+        yield Unhealed(server, processes)
 
 
 def test_where_nobody_heals_a_request_ends_two_processes_and_says_so(tmp_path: Path) -> None:

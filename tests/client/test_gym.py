@@ -121,7 +121,7 @@ def test_the_task_may_depend_on_the_reset(client: RewardClient) -> None:
     tasks = iter([TASK, "let the pole fall"])
     env = RewardModelWrapper(cart_pole(), client, lambda info: next(tasks) if info == {} else "")
     first, second = (env.reset(seed=0)[1]["reward_model"]["progress"] for _ in range(2))
-    frames = np.array(env.render())[np.newaxis]
+    frames = np.repeat(np.array(env.render())[np.newaxis], MAX_FRAMES, axis=0)
     for told, task in ((first, TASK), (second, "let the pole fall")):
         assert_close(told, client.progress(Trajectory(frames=frames, task=task)).last_progress)
 
@@ -229,7 +229,7 @@ def test_a_model_that_is_not_served_is_no_reward(served: Served) -> None:
 def test_an_error_comes_out_of_the_step(client: RewardClient, blocking: bool) -> None:
     """At the latest where the episode ends, if the step does not wait."""
     steps = MAX_FRAMES + 4
-    options = RewardOptions(max_frames=100, blocking=blocking, max_pending=steps)
+    options = RewardOptions(sampling="all", blocking=blocking, max_pending=steps)
     env = RewardModelWrapper(cart_pole(max_episode_steps=steps), client, TASK, options)
     env.reset(seed=0)
     with pytest.raises(InvalidSampleError, match=f"^num_frames: expected at most {MAX_FRAMES} .*, got"):

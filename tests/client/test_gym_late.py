@@ -29,7 +29,7 @@ from rfm_client.gym import RewardModelWrapper, RewardOptions, SuccessRule
 
 def not_blocking(late: LateClient, **options: Any) -> tuple[RewardModelWrapper, Camera]:
     camera = Camera(cart_pole())
-    env = RewardModelWrapper(camera, late, TASK, RewardOptions(blocking=False, **options))
+    env = RewardModelWrapper(camera, late, TASK, RewardOptions(sampling="all", blocking=False, **options))
     env.reset(seed=0)
     return env, camera
 
@@ -49,7 +49,7 @@ def test_a_step_goes_on_with_the_newest_answer_that_has_come(client: RewardClien
         rewards.append(reward)
         told.append(info["reward_model"])
     newest = [step for _, step in COMING]
-    values = progress(client, camera.films[0], [0, *newest])
+    values = progress(client, camera.films[0], [0, *newest], None)
     assert_close(rewards, values[1:] if mode == "absolute" else np.diff(values))
     assert [each["step"] for each in told] == newest
     assert [each["lag"] for each in told] == [step - known for step, known in enumerate(newest, 1)]
@@ -75,7 +75,7 @@ def test_the_last_step_waits_so_that_late_rewards_add_up(client: RewardClient, l
     late.hold(1, 2)
     rewards, infos = play_on(env)
     last = len(rewards)
-    first_and_last = progress(client, camera.films[0], [0, last])
+    first_and_last = progress(client, camera.films[0], [0, last], None)
     assert rewards[:-1] == [0] * (last - 1)
     assert_close(sum(rewards), first_and_last[1] - first_and_last[0])
     told = infos[-1]["reward_model"]
@@ -89,7 +89,7 @@ def test_what_is_open_at_the_end_may_be_dropped(client: RewardClient, late: Late
     env.step(PUSH_RIGHT)
     late.let_come(1)
     rewards, infos = play_on(env)
-    values = progress(client, camera.films[0], [0, 1])
+    values = progress(client, camera.films[0], [0, 1], None)
     assert_close(rewards, [values[1] - values[0]] + [0] * (len(rewards) - 1))
     assert infos[-1]["reward_model"]["step"] == 1
     assert sorted(late.answers) == list(range(1, len(rewards) + 1))  # the last step was not asked about
@@ -105,7 +105,7 @@ def test_an_answer_to_an_older_episode_touches_no_newer_one(client: RewardClient
     assert answer.cancelled()
     _, reward, _, _, info = env.step(PUSH_RIGHT)
     assert info["reward_model"]["step"] == 0
-    assert_close(reward, progress(client, camera.films[1], [0]))
+    assert_close(reward, progress(client, camera.films[1], [0], None))
 
 
 def test_success_ends_the_episode_at_the_step_at_which_it_is_known(client: RewardClient, late: LateClient) -> None:
@@ -116,14 +116,14 @@ def test_success_ends_the_episode_at_the_step_at_which_it_is_known(client: Rewar
     _, reward, terminated, truncated, info = env.step(PUSH_RIGHT)
     assert (terminated, truncated, info["reward_model"]["step"]) == (True, False, 3)
     assert info["reward_model"]["succeeded"]
-    assert_close(reward, progress(client, camera.films[0], [3]))
+    assert_close(reward, progress(client, camera.films[0], [3], None))
 
 
 def test_an_episode_that_has_succeeded_stays_so(client: RewardClient, late: LateClient) -> None:
     """The answer about the step at which that became known may say otherwise."""
     camera = Camera(cart_pole())
     play(RewardModelWrapper(camera, client, TASK))
-    success = [float(scores(client, camera.films[0], step).success[-1]) for step in range(6)]
+    success = [float(scores(client, camera.films[0], step, None).success[-1]) for step in range(6)]
     early, later = next((a, b) for b in range(2, 6) for a in range(1, b) if success[a] > success[b])
     rule = SuccessRule(threshold=(success[early] + success[later]) / 2)
     env, _ = not_blocking(late, max_pending=6, terminate_on_success=rule)
@@ -137,12 +137,12 @@ def test_an_episode_that_has_succeeded_stays_so(client: RewardClient, late: Late
 
 def test_after_an_error_delta_pays_what_was_missed(client: RewardClient, late: LateClient) -> None:
     camera = Camera(cart_pole())
-    env = RewardModelWrapper(camera, late, TASK, RewardOptions(mode="delta"))
+    env = RewardModelWrapper(camera, late, TASK, RewardOptions(sampling="all", mode="delta"))
     env.reset(seed=0)
     late.hold(1)
     late.connection.held[2].set_exception(ServerUnavailableError("the server is restarting"))
     with pytest.raises(ServerUnavailableError, match=r"^the server is restarting \(request \w+-\d+\)$"):
         env.step(PUSH_RIGHT)
     reward = env.step(PUSH_RIGHT)[1]
-    first, _, newest = progress(client, camera.films[0], range(3))
+    first, _, newest = progress(client, camera.films[0], range(3), None)
     assert_close(reward, newest - first)

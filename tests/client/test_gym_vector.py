@@ -134,7 +134,9 @@ def test_a_vector_s_rendered_frames_are_scored(client: RewardClient, mode: Autor
 
 def test_a_reset_of_a_vector_takes_back_what_is_open_about_what_it_resets(late: LateClient) -> None:
     envs = vector_env([cart_pole] * 2, AutoresetMode.DISABLED)
-    env = RewardModelVectorWrapper(envs, late, [TASK, "let the pole fall"], RewardOptions(blocking=False))
+    env = RewardModelVectorWrapper(
+        envs, late, [TASK, "let the pole fall"], RewardOptions(sampling="all", blocking=False)
+    )
     env.reset(seed=0)
     late.hold(1)
     env.step(np.array([0, 1]))
@@ -145,7 +147,9 @@ def test_a_reset_of_a_vector_takes_back_what_is_open_about_what_it_resets(late: 
 
 
 def test_the_questions_of_a_step_go_in_one_request(late: LateClient) -> None:
-    env = RewardModelVectorWrapper(vector_env([cart_pole] * 3, AutoresetMode.NEXT_STEP), late, TASK)
+    env = RewardModelVectorWrapper(
+        vector_env([cart_pole] * 3, AutoresetMode.NEXT_STEP), late, TASK, RewardOptions(sampling="all")
+    )
     env.reset(seed=0)
     env.step(np.array([0, 1, 0]))
     assert late.connection.lengths == [1, 2]
@@ -214,7 +218,7 @@ def test_wrapped_environments_work_in_processes_of_their_own(served: Served, cli
         for film, frame in zip(frames, env.render(), strict=True):
             film.append(frame)
     env.close()
-    assert_close(rewards, [progress(client, film, [2])[0] for film in frames])
+    assert_close(rewards, [progress(client, film, [2], max_frames=4)[0] for film in frames])
 
 
 def test_close_closes_only_the_client_that_it_made(served: Served, client: RewardClient) -> None:

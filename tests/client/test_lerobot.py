@@ -36,7 +36,7 @@ V21_FILM = f"videos/chunk-000/{TOP}/episode_000000.mp4"
 ONE_EPISODE = "video: expected a film of one episode, got "
 
 
-INSTEAD = "cut one episode out into a file of its own"
+INSTEAD = "label the dataset with rfm-client label, or name the part of the file"
 
 
 def test_a_lerobot_v3_file_of_several_episodes_is_refused(tmp_path: Path) -> None:
@@ -53,6 +53,20 @@ def test_of_several_lerobot_v3_files_none_is_told_to_hold_all_episodes(tmp_path:
     film.with_name("file-001.mp4").write_bytes(film.read_bytes())
     with pytest.raises(InvalidSampleError, match=r"v3\.0 file that holds some of the dataset's 10 episodes: "):
         read_video(film)
+
+
+def test_a_part_of_a_lerobot_v3_file_is_read(tmp_path: Path) -> None:
+    film = lerobot_dataset(tmp_path, "v3.0", V30_FILM, 10)
+    part = load_trajectory(film, start_s=0.30000001, end_s=0.7, task="stack the cups")
+    assert numbers(part.positions, 10) == [3, 4, 5, 6]
+    assert numbers(read_video(film, 5, start_s=0.0, end_s=0.8), 10) == [0, 2, 4, 7]
+    for start_s, end_s in ((0.3, 0.3), (5.0, 6.0)):
+        with pytest.raises(
+            InvalidSampleError, match=r"^start_s to end_s: expected a part with frames, got .* of 0\.9 s"
+        ):
+            read_video(film, start_s=start_s, end_s=end_s)
+    with pytest.raises(InvalidSampleError, match=ONE_EPISODE):
+        read_video(film, start_s=0.3)
 
 
 @pytest.mark.parametrize("version", ["v3.1", "v4.0", 3])

@@ -13,7 +13,7 @@ import pytest
 from faulty_servers import heavy, ours_in_dev_shm, regions, trajectory, url_of
 from mixtures import assert_same
 from one_model import OneModelServer
-from rfm.supervise.process import Endpoints
+from rfm.launch.process import Endpoints
 from rfm_client import (
     DeadlineExceededError,
     ProgressSample,

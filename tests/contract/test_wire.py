@@ -24,6 +24,7 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract import wire
+from rfm_client.contract.samples import Footage
 
 OUTPUTS = [spec.name for spec in wire.score_outputs(4)]
 TIMING = BatchTiming(1.5, 2.5)
@@ -181,7 +182,7 @@ def test_the_encoder_s_requests_and_answers_arrive_as_they_were() -> None:
     answer = embedded(1, 3)
     outputs = [spec.name for spec in wire.encoder_outputs(5, 3)]
     assert outputs == ["video_embeddings", "text_embedding"]
-    told = wire.encode_trajectories([answer], 4, outputs)
+    told = wire.encode_trajectories([Footage((answer,))], 4, outputs)
     assert told["video_embeddings"].shape == (1, 4, 5)
     assert not told["video_embeddings"][0, 3:].any()
     told["video_embeddings"] = told["video_embeddings"][:, :3]
@@ -245,9 +246,11 @@ def test_the_encoder_reads_what_has_frames(lengths: tuple[int, int], is_refused:
 
 def test_rows_are_padded_with_what_is_asked() -> None:
     one, two = np.array([1.0]), np.array([2.0, 3.0])
-    assert wire.pad_stack([one, two]).tolist() == [[1, 0], [2, 3]]
-    assert wire.pad_stack([two], 3, fill=9).tolist() == [[2, 3, 9]]
-    assert np.shares_memory(wire.pad_stack([two], 2), two)
+    assert wire.pad_stack([[one], [two]]).tolist() == [[1, 0], [2, 3]]
+    assert wire.pad_stack([[two]], 3, fill=9).tolist() == [[2, 3, 9]]
+    assert wire.pad_stack([[one, two], [two]], 4, fill=9).tolist() == [[1, 2, 3, 9], [2, 3, 9, 9]]
+    assert wire.pad_stack([[one, two]]).tolist() == [[1, 2, 3]]
+    assert np.shares_memory(wire.pad_stack([[two]], 2), two)
 
 
 def test_specs_are_those_of_the_contract() -> None:

@@ -1,49 +1,159 @@
 # SPDX-License-Identifier: MIT
+"""One file, its sections, and what commands tell of keys that have no effect in them."""
+
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
+from typer.main import get_command
+from typer.testing import CliRunner
 
-from rfm.config import ConfigError, ServeConfig
+from paths import ROOT
+from rfm.config import ExportConfig, ServeConfig
+from rfm.launch.process import Endpoints
+from rfm.supervise.supervisor import Supervisor
+from rfm_client.contract.settings import ConfigError, settings_of
+from rfm_commands import cli
+from rfm_commands.config import FLAT_KEYS, LIFETIMES, SECTIONS, Config
+from rfm_export.pbtxt import Interface, exported_settings, python_config
+from rfm_gateway.config import GatewayConfig
+
+REPOSITORY = ROOT / "model_repository"
+
+SECTIONED = """
+export:
+  checkpoint: org/name
+  num_gpus: null
+  dtype: bfloat16
+serve:
+  host: http://localhost
+  http_port: 8010
+  grpc_certificate: certificate.pem
+  grpc_key: key.pem
+gateway:
+  port: 8100
+  timeout: 60
+  api_key_file: key.txt
+  cors_origin: [http://a.example, http://b.example]
+"""
+
+
+def read(folder: Path, text: str) -> Config:
+    (folder / "serve.yaml").write_text(text)
+    return Config.from_yaml(folder / "serve.yaml")
+
+
+def test_a_file_has_a_section_for_each_lifetime(tmp_path: Path) -> None:
+    config = read(tmp_path, SECTIONED)
+    assert config.export == ExportConfig(checkpoint="org/name", dtype="bfloat16")
+    tls = {"grpc_certificate": Path("certificate.pem"), "grpc_key": Path("key.pem")}
+    assert config.serve == ServeConfig(host="127.0.0.1", http_port=8010, **tls)
+    origins = ("http://a.example", "http://b.example")
+    assert config.gateway == GatewayConfig(8100, timeout=60.0, api_key_file=Path("key.txt"), cors_origin=origins)
 
 
 def test_the_fastapi_servers_file_is_accepted(tmp_path: Path) -> None:
-    file = tmp_path / "eval_config_server.yaml"
-    file.write_text(
-        "model_path: org/name\nnum_gpus: null\nmax_workers: 4\nbatch_size: 16\nserver_url: http://localhost\nserver_port: 8010\n"
+    config = read(
+        tmp_path,
+        "model_path: org/name\nnum_gpus: null\nmax_workers: 4\nbatch_size: 16\nserver_url: http://localhost\nserver_port: 8010\n",
     )
-    config = ServeConfig.from_yaml(file)
-    assert (config.model_path, config.num_gpus, config.max_workers) == ("org/name", None, 4)
-    assert (config.batch_size, config.max_batch_size) == (16, 64)  # the original never reads it
-    assert (config.host, config.server_port) == ("127.0.0.1", 8010)
+    assert (config.export.checkpoint, config.export.num_gpus, config.serve.http_threads) == ("org/name", None, 4)
+    assert (config.export.batch_size, config.export.max_batch_size) == (16, 64)  # the original never reads it
+    assert (config.serve.host, config.serve.http_port) == ("127.0.0.1", 8010)
 
 
 @pytest.mark.parametrize(
     ("url", "host"), [("http://0.0.0.0/", "0.0.0.0"), ("10.0.0.1", "10.0.0.1"), ("localhost", "127.0.0.1")]
 )
-def test_server_url_is_an_address(url: str, host: str) -> None:
-    assert ServeConfig(server_url=url).host == host
+def test_a_host_may_be_written_as_a_url(url: str, host: str) -> None:
+    assert ServeConfig(host=url).host == host
 
 
-def test_an_empty_file_is_the_defaults(tmp_path: Path) -> None:
-    (tmp_path / "serve.yaml").write_text("# nothing\n")
-    assert ServeConfig.from_yaml(tmp_path / "serve.yaml") == ServeConfig()
+@pytest.mark.parametrize("text", ["# nothing\n", "export:\nserve: {}\ngateway:\n"], ids=["no section", "no keys"])
+def test_an_empty_file_is_the_defaults(tmp_path: Path, text: str) -> None:
+    assert read(tmp_path, text) == Config()
+
+
+def test_every_flat_key_is_a_key_of_a_section() -> None:
+    names = {f"{section}.{key}" for section, kind in SECTIONS.items() for key in settings_of(kind)}
+    assert set(FLAT_KEYS.values()) <= names
+    assert len(set(FLAT_KEYS.values())) == len(FLAT_KEYS)
+    assert LIFETIMES.keys() == SECTIONS.keys()
 
 
 BAD = {
     "unknown key": (
         "num_gpu: 1",
-        r"serve\.yaml: num_gpu: expected one of model_path, num_gpus, .*, got an unknown key",
+        r"serve\.yaml: num_gpu: expected one of export, serve, gateway, model_path, .*, got an unknown key",
     ),
+    "unknown key of a section": (
+        "gateway: {foo: 1}",
+        r"serve\.yaml: gateway\.foo: expected one of port, host, .*, got an unknown key",
+    ),
+    "a key of another section": (
+        "serve: {num_gpus: 1}",
+        r"serve\.yaml: serve\.num_gpus: expected one of host, .*, got an",
+    ),
+    "a flat key in a section": (
+        "export: {model_path: a}",
+        r"serve\.yaml: export\.model_path: expected one of checkpoint,",
+    ),
+    "a key in and outside its section": (
+        "model_path: a\nexport: {checkpoint: b}",
+        r"serve\.yaml: export\.checkpoint: expected once, got export\.checkpoint twice",
+    ),
+    "a key outside and in its section": (
+        "export: {checkpoint: b}\nmodel_path: a",
+        r"serve\.yaml: model_path: expected once, got export\.checkpoint twice",
+    ),
+    "a section that is a list": ("serve: [1]", r"serve\.yaml: serve: expected keys and values, got list"),
+    "a section that is false": ("serve: false", r"serve\.yaml: serve: expected keys and values, got bool"),
     "text for a number": ("batch_size: many", r"serve\.yaml: batch_size: expected int or null, got 'many'"),
+    "text for a number of a section": (
+        "export: {batch_size: many}",
+        r"serve\.yaml: export\.batch_size: expected int or null, got 'many'",
+    ),
     "true for a number": ("num_gpus: true", r"serve\.yaml: num_gpus: expected int or null, got True"),
+    "a number for a file": ("serve: {grpc_key: 1}", r"serve\.yaml: serve\.grpc_key: expected str or null, got 1"),
+    "numbers for texts": ("gateway: {cors_origin: [1]}", r"gateway\.cors_origin: expected list of str, got \[1\]"),
+    "text for texts": (
+        "gateway: {cors_origin: http://a}",
+        r"gateway\.cors_origin: expected list of str, got 'http://a'",
+    ),
+    "null for a number": ("gateway: {timeout: null}", r"serve\.yaml: gateway\.timeout: expected float, got None"),
+    "no number": ("gateway: {timeout: .nan}", r"serve\.yaml: gateway\.timeout: expected at least 0\.001, got nan"),
+    "another dtype": (
+        "dtype: int8",
+        r"serve\.yaml: dtype: expected one of float32, bfloat16, float16 or null, got 'int8'",
+    ),
     "too small": ("batch_size: 0", r"serve\.yaml: batch_size: expected at least 1, got 0"),
     "too small a batch": ("max_batch_size: 0", r"serve\.yaml: max_batch_size: expected at least 1, got 0"),
     "a truth that is a number": ("resize_images: 1", r"serve\.yaml: resize_images: expected bool or null, got 1"),
-    "a port that is none": ("grpc_port: 70000", r"serve\.yaml: ports: expected different ones up to 65535, got"),
-    "one port twice": ("grpc_port: 8000", r"serve\.yaml: ports: expected different ones up to 65535, got"),
-    "a port in the address": ("server_url: http://localhost:8000", r"server_url: expected an address without port"),
+    "a port that is none": ("grpc_port: 70000", r"serve\.yaml: grpc_port: expected at most 65535, got 70000"),
+    "one port twice": (
+        "grpc_port: 8000",
+        r"serve\.yaml: ports: expected different ones, got {.*'serve\.grpc_port': 8000",
+    ),
+    "the gateway's port twice": ("gateway: {port: 8002}", r"serve\.yaml: ports: expected different ones, got"),
+    "a port in the address": (
+        "server_url: http://localhost:8000",
+        r"server_url: expected an address without port \(http_port\), got 'localhost:8000'",
+    ),
+    "half a certificate": (
+        "grpc_key: a",
+        r"serve\.yaml: serve\.grpc_certificate, grpc_key: expected both or none, got one",
+    ),
+    "half a certificate of the gateway": (
+        "gateway: {key: a}",
+        r"serve\.yaml: gateway\.certificate, key: expected both or none, got one",
+    ),
+    "less memory than a body": (
+        "gateway: {max_memory_mib: 100}",
+        r"serve\.yaml: gateway\.max_memory_mib: expected at least max_body_mib \(512\), got less",
+    ),
     "a name that is a path": ("name: ../rfm", r"serve\.yaml: name: expected letters, digits, _ and -, got '\.\./rfm'"),
     "a list": ("- 1", r"serve\.yaml: expected keys and values, got list"),
     "no YAML": ("a: [", r"serve\.yaml: expected a YAML file, got"),
@@ -53,11 +163,189 @@ BAD = {
 
 @pytest.mark.parametrize(("text", "message"), BAD.values(), ids=BAD)
 def test_a_bad_file_is_refused_with_the_key(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "serve.yaml").write_text(text)
     with pytest.raises(ConfigError, match=message):
-        ServeConfig.from_yaml(tmp_path / "serve.yaml")
+        read(tmp_path, text)
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"nothing\.yaml: expected a YAML file, got"):
-        ServeConfig.from_yaml(tmp_path / "nothing.yaml")
+        Config.from_yaml(tmp_path / "nothing.yaml")
+
+
+def test_options_win_over_the_file(tmp_path: Path) -> None:
+    config = read(tmp_path, SECTIONED).with_options(serve={"http_port": 9000}, gateway={"timeout": 5.0})
+    assert (config.serve.http_port, config.serve.host, config.gateway.timeout) == (9000, "127.0.0.1", 5.0)
+    with pytest.raises(ConfigError, match=r"^gateway\.certificate, key: expected both or none, got one"):
+        config.with_options(gateway={"key": Path("key.pem")})
+    with pytest.raises(ConfigError, match=r"^ports: expected different ones, got"):
+        config.with_options(gateway={"port": 9000 + 1}, serve={"grpc_port": 9000 + 1})
+
+
+class RanError(Exception):
+    """A command came to where it would serve."""
+
+
+@pytest.fixture
+def told(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Runs a command up to where it would serve: the gateway's command line, and what the command has told."""
+    started: dict[str, Any] = {}
+
+    def supervised(*_: Any, **options: Any) -> Supervisor:
+        started.update(options)
+        raise RanError
+
+    monkeypatch.setattr(cli, "Supervisor", supervised)
+
+    def run(*words: str) -> tuple[dict[str, Any], list[str]]:
+        result = CliRunner().invoke(cli.app, ["serve", *words])
+        assert isinstance(result.exception, RanError), result.output
+        return started, result.stderr.splitlines()
+
+    return run
+
+
+def test_a_file_that_agrees_with_the_repository_is_not_worth_a_word(told: Any) -> None:
+    _, lines = told("--repository", str(REPOSITORY), "--config", str(REPOSITORY / "serve.yaml"))
+    assert lines == []
+
+
+def test_what_takes_effect_at_export_alone_is_told_by_serve(told: Any, tmp_path: Path) -> None:
+    file = tmp_path / "serve.yaml"
+    file.write_text(
+        "num_gpus: 0\ninstances: 2\nexport: {max_batch_size: 32, dtype: float16, checkpoint: org/name, token_budget: 16384}\n"
+        "serve: {http_port: 8010}\n"
+    )
+    _, lines = told("--repository", str(REPOSITORY), "--config", str(file))
+    says = "takes effect at export; the repository has"
+    assert lines == [
+        f"rfm: {file}: export.max_batch_size: {says} 64, the file 32: export again",
+        f"rfm: {file}: export.dtype: {says} null, the file float16: export again",
+        f"rfm: {file}: export.checkpoint: {says} demo_checkpoint/checkpoint, the file org/name: export again",
+    ]
+
+
+def test_a_name_that_was_not_exported_is_told_by_serve(told: Any, tmp_path: Path) -> None:
+    (tmp_path / "serve.yaml").write_text("export: {name: other, instances: 5}\n")
+    _, (line,) = told("--repository", str(REPOSITORY), "--config", str(tmp_path / "serve.yaml"))
+    assert line.endswith(
+        "export.name: takes effect at export; the repository has no such model, the file other: export again"
+    )
+
+
+@pytest.mark.parametrize("content", ["no configuration {", "name: 'rfm'"], ids=["broken", "of somebody else"])
+def test_a_configuration_that_is_none_of_ours_is_triton_s_affair(told: Any, tmp_path: Path, content: str) -> None:
+    repository = tmp_path / "repository"
+    (repository / "rfm" / "1").mkdir(parents=True)
+    (repository / "rfm" / "config.pbtxt").write_text(content)
+    (tmp_path / "serve.yaml").write_text("export: {instances: 5, torch_threads: 3}\n")
+    _, lines = told("--repository", str(repository), "--config", str(tmp_path / "serve.yaml"))
+    assert lines == []
+
+
+def test_a_gateway_s_settings_without_a_gateway_are_told_by_serve(told: Any, tmp_path: Path) -> None:
+    (tmp_path / "serve.yaml").write_text("gateway: {timeout: 5}\n")
+    words = ("--repository", str(REPOSITORY), "--config", str(tmp_path / "serve.yaml"), "--gateway-max-waiting", "7")
+    started, (line,) = told(*words)
+    assert started["gateway"] is None
+    assert line.endswith("gateway.timeout, gateway.max_waiting: of no effect without gateway.port")
+
+
+def options_of(command: list[str]) -> dict[str, list[str]]:
+    words = iter(command[3:])
+    found: dict[str, list[str]] = {}
+    for name in words:
+        found.setdefault(name, []).append(next(words))
+    return found
+
+
+def test_every_setting_is_an_option_of_its_command() -> None:
+    commands = get_command(cli.app).commands  # type: ignore[attr-defined]
+    for section, kind in SECTIONS.items():
+        for name, setting in settings_of(kind).items():
+            options = {option for each in commands[section].params for option in each.opts}
+            assert (setting.option in options) is setting.has_option, name
+            assert not setting.has_option or len(setting.help.split()) > 1, name
+
+
+def test_every_setting_of_a_gateway_is_an_option_of_serve(told: Any, tmp_path: Path) -> None:
+    (tmp_path / "key.txt").write_text("open sesame")
+    given = {
+        "port": "8100",
+        "host": "127.0.0.2",
+        "triton": "grpc://127.0.0.1:9001",
+        "metrics_url": "http://127.0.0.1:9002/metrics",
+        "model": "reward",
+        "api_key_file": str(tmp_path / "key.txt"),
+        "cors_origin": "http://lab.example",
+        "allow_folder": str(tmp_path),
+        "timeout": "90.0",
+        "max_body_mib": "1",
+        "max_memory_mib": "2",
+        "max_in_flight": "3",
+        "max_waiting": "0",
+    }
+    files = {"certificate", "key", "triton_ca_file", "triton_certificate", "triton_key"}  # which a gateway would read
+    assert given.keys() | files == settings_of(GatewayConfig).keys()
+    words = [word for name, value in given.items() for word in (f"--gateway-{name.replace('_', '-')}", value)]
+    started, lines = told("--repository", str(REPOSITORY), *words)
+    assert lines == []
+    assert options_of(started["gateway"]) == {f"--{name.replace('_', '-')}": [value] for name, value in given.items()}
+
+
+@pytest.mark.parametrize(
+    "name", ["certificate", "triton-ca-file", "triton-certificate", "api-key-file", "allow-folder"]
+)
+def test_a_gateway_that_would_not_start_is_refused_before_triton_starts(name: str) -> None:
+    other = {"certificate": "key", "triton-certificate": "triton-key"}.get(name)
+    words = [f"--gateway-{each}=nowhere" for each in (name, other) if each]
+    result = CliRunner().invoke(cli.app, ["serve", "--repository", str(REPOSITORY), "--gateway-port=8100", *words])
+    assert result.exit_code == 1
+    assert result.stderr.startswith("rfm: gateway: ")
+    assert "nowhere" in result.stderr
+
+
+def test_a_gateway_takes_from_the_server_what_its_section_leaves_open(told: Any, tmp_path: Path) -> None:
+    ends = Endpoints.free()
+    (tmp_path / "serve.yaml").write_text(
+        f"export: {{name: rfm}}\nserve: {{http_port: {ends.http_port}, grpc_port: {ends.grpc_port}, "
+        f"metrics_port: {ends.metrics_port}}}\ngateway: {{port: 8100, cors_origin: [http://a, http://b]}}\n"
+    )
+    started, lines = told("--repository", str(REPOSITORY), "--config", str(tmp_path / "serve.yaml"))
+    assert lines == []
+    options = options_of(started["gateway"])
+    assert options["--triton"] == [ends.grpc_url]
+    assert options["--metrics-url"] == [ends.metrics_url]
+    assert (options["--host"], options["--port"], options["--model"]) == (["127.0.0.1"], ["8100"], ["rfm"])
+    assert options["--cors-origin"] == ["http://a", "http://b"]
+    assert options["--timeout"] == ["120.0"]
+
+
+def test_a_configuration_tells_the_settings_that_it_was_made_from() -> None:
+    made = ExportConfig(
+        instances=3,
+        torch_threads=2,
+        max_batch_size=5,
+        token_budget=6,
+        max_sample_tokens=7,
+        dtype="float16",
+        max_queue_size=8,
+        queue_timeout_ms=9,
+        num_gpus=2,
+    )
+    for settings in (made, ExportConfig(num_gpus=0)):
+        told = exported_settings(python_config(Interface("rfm", (), ()), settings, settings.num_gpus or 0, 1, ()))
+        assert told == {key: getattr(settings, key) for key in told}
+        assert len(told) == 9
+
+
+def test_export_tells_flat_keys_that_another_command_reads(tmp_path: Path) -> None:
+    repository = shutil.copytree(REPOSITORY, tmp_path / "repository")
+    file = tmp_path / "serve.yaml"
+    file.write_text("num_gpus: 0\ninstances: 2\nserver_port: 8010\nserve: {grpc_port: 8011}\ngateway_port: 8100\n")
+    words = ["export", "--check", "--repository", str(repository), "--config", str(file)]
+    result = CliRunner().invoke(cli.app, words)
+    assert result.exit_code == 0, result.output
+    assert result.stderr.splitlines() == [
+        f"rfm: {file}: server_port: of no effect at export, only at serve",
+        f"rfm: {file}: gateway_port: of no effect at export, only in the gateway",
+    ]

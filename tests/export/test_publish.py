@@ -17,10 +17,10 @@ import pytest
 import goldens
 import rfm_export
 from engines import serve_config
-from rfm.supervise.installation import find_installation
-from rfm.supervise.model_processes import StubWatch
-from rfm.supervise.process import Endpoints, TritonServer
-from rfm.supervise.repository_api import RepositoryApi
+from rfm.launch.installation import find_installation
+from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.repository_api import RepositoryApi
+from rfm.supervise.model_processes import ProcessWatch
 from rfm_client import RewardClient
 from rfm_commands.rollout import Rollout, previous_version
 from rfm_export.publish import staging
@@ -135,10 +135,10 @@ def test_triton_does_not_see_what_is_staged(kind: type[TritonServer], tmp_path: 
             client.progress(random_trajectory(0, 3))
 
 
-def living(watch: StubWatch) -> list[int]:
+def living(watch: ProcessWatch) -> list[int]:
     """Processes of ``rfm``, as soon as those of one load alone are alive."""
     deadline_s = time.monotonic() + PATIENCE_S
-    while len(found := [stub.pid for stub in watch.of_model("rfm") if stub.is_alive]) > 1:
+    while len(found := [process.pid for process in watch.of_model("rfm") if process.is_alive]) > 1:
         assert time.monotonic() < deadline_s, found
         time.sleep(POLL_S)
     return found
@@ -149,7 +149,7 @@ def test_an_export_changes_no_model_of_another_name(tmp_path: Path) -> None:
     repository = tmp_path / "repository"
     export(repository)
     with served(repository, tmp_path / "log") as server, RepositoryApi(server.endpoints.grpc_url, KEY) as api:
-        watch = StubWatch(server.pid, HANG_S)
+        watch = ProcessWatch(server.pid, HANG_S)
         api.load("rfm")  # the first load after the start is a new one anyway
         before = living(watch)
         export(repository, "another")

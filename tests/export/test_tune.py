@@ -9,16 +9,18 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import yaml
 from typer.testing import CliRunner
 
 import goldens
 import rfm_export
 from engines import serve_config
-from rfm.config import ServeConfig
-from rfm.supervise.temporary import served
+from rfm.config import ExportConfig
+from rfm.launch.temporary import temporary_server
 from rfm_client import ProgressSample, RewardClient, Sample
 from rfm_commands import tune
 from rfm_commands.cli import app
+from rfm_commands.config import Config, File
 from rfm_commands.tune import Setting, Sweep, Trial, quickest, write_setting
 from rfm_export import ExportError
 from trajectories import random_trajectory
@@ -101,18 +103,20 @@ def test_the_command_writes_what_export_reads(
 ) -> None:
     monkeypatch.setattr(Sweep, "best", lambda self: TWO)  # measured above
     config, output = tmp_path / "serve.yaml", tmp_path / "tuned.yaml"
-    config.write_text("num_gpus: 0\ninstances: 1\n")
+    config.write_text("num_gpus: 0\ninstances: 1\nserver_port: 8010\n")
     words = ["tune", "--repository", str(repository), "--config", str(config), "--output", str(output)]
     assert CliRunner().invoke(app, words).exit_code == 0
-    expected = ServeConfig(num_gpus=0, instances=2, torch_threads=2, max_batch_size=64)
-    assert ServeConfig.from_yaml(output) == expected
+    assert yaml.safe_load(output.read_text()) == {
+        "export": {"num_gpus": 0, "instances": 2, "torch_threads": 2, "max_batch_size": 64},
+        "serve": {"http_port": 8010},
+    }
+    assert Config.from_yaml(output).export == ExportConfig(num_gpus=0, instances=2, torch_threads=2, max_batch_size=64)
 
 
 def test_without_a_configuration_only_the_measured_keys_are_written(tmp_path: Path) -> None:
-    write_setting(FOUR, tmp_path / "tuned.yaml", None)
-    assert ServeConfig.from_yaml(tmp_path / "tuned.yaml") == ServeConfig(
-        instances=4, torch_threads=1, max_batch_size=64
-    )
+    write_setting(FOUR, tmp_path / "tuned.yaml", File())
+    expected = Config(ExportConfig(instances=4, torch_threads=1, max_batch_size=64))
+    assert Config.from_yaml(tmp_path / "tuned.yaml") == expected
 
 
 def test_what_is_no_repository_is_refused(tmp_path: Path) -> None:
@@ -126,6 +130,6 @@ def test_two_instances_score_as_one(repository: Path, tmp_path: Path) -> None:
     trajectories = [random_trajectory(seed, 5) for seed in range(8)]
     answers = []
     for folder in (repository, tmp_path / "two"):
-        with served(folder, tmp_path / "triton.log") as endpoints, RewardClient(endpoints.grpc_url) as client:
+        with temporary_server(folder, tmp_path / "triton.log") as endpoints, RewardClient(endpoints.grpc_url) as client:
             answers.append([client.progress(trajectory).last_progress for trajectory in trajectories])
     assert answers[0] == pytest.approx(answers[1], abs=1e-5)

@@ -330,48 +330,46 @@ LOADS = """
 import json, sys
 from dataclasses import asdict
 from rfm import families
-try:
-    print(json.dumps(asdict(families.load(sys.argv[1]).config)))
-except families.CheckpointError as error:
-    print(error)
+for source in sys.argv[1:]:
+    try:
+        print(json.dumps(asdict(families.load(source).config)))
+    except families.CheckpointError as error:
+        print(error)
 """
+UNTAGGED, TAGGED, WITHOUT = "org/name", f"org/other@{TAG}", "org/without"  # repositories of their own
 
 
-def load_from_hub(source: str, revisions: dict[str, Path], cache: Path) -> str:
-    """What a process of its own says of the checkpoint; huggingface_hub reads its environment once."""
-    with local_hub.hub(revisions) as endpoint:
-        environment = {**os.environ, "HF_ENDPOINT": endpoint, "HF_HOME": str(cache), "HF_HUB_OFFLINE": "0"}
-        command = [sys.executable, "-c", LOADS, source]
-        return subprocess.run(
-            command, env=environment, check=True, capture_output=True, text=True, cwd=cache.parent
-        ).stdout.strip()
+@pytest.fixture(scope="module")
+def from_hub(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """What a process of its own says of checkpoints, since huggingface_hub reads its environment once.
 
-
-@pytest.fixture
-def tagged(tmp_path: Path) -> tuple[Path, Path]:
-    """A multi-image checkpoint as upstream uploads one: the tag's commit lacks config.yaml, which main has."""
-    tag, main = tmp_path / "tag", tmp_path / "main"
+    They are multi-image ones as upstream uploads them: the tag's commit lacks config.yaml, which main has.
+    """
+    folder = tmp_path_factory.mktemp("hub")
+    tag, main, without = folder / "tag", folder / "main", folder / "without"
     shutil.copytree(goldens.config(WITH_IMAGES).checkpoint, tag, copy_function=shutil.copyfile)
     main.mkdir()
+    without.mkdir()
     (tag / "config.yaml").rename(main / "config.yaml")
-    return tag, main
+    shutil.copy(main / "config.yaml", without / "README.md")
+    mains = {UNTAGGED: main, TAGGED: main, WITHOUT: without}
+    repositories = {source.partition("@")[0]: {"main": files, TAG: tag} for source, files in mains.items()}
+    with local_hub.hub(repositories) as endpoint:
+        environment = {**os.environ, "HF_ENDPOINT": endpoint, "HF_HOME": str(folder / "cache"), "HF_HUB_OFFLINE": "0"}
+        command = [sys.executable, "-c", LOADS, *mains]
+        loaded = subprocess.run(command, env=environment, check=True, capture_output=True, text=True, cwd=folder)
+    return dict(zip(mains, loaded.stdout.splitlines(), strict=True))
 
 
-@pytest.mark.parametrize("source", ["org/name", f"org/name@{TAG}"])
-def test_config_yaml_is_found_on_main_of_the_hub_s_repository(
-    tagged: tuple[Path, Path], tmp_path: Path, source: str
-) -> None:
-    tag, main = tagged
+@pytest.mark.parametrize("source", [UNTAGGED, TAGGED])
+def test_config_yaml_is_found_on_main_of_the_hub_s_repository(from_hub: dict[str, str], source: str) -> None:
     expected = asdict(families.load(goldens.config(WITH_IMAGES).checkpoint).config)
     assert expected["multi_image"] and expected["per_frame_progress_token"]
-    said = load_from_hub(source, {"main": main, TAG: tag}, tmp_path / "cache")
-    assert json.loads(said) == json.loads(json.dumps(expected))
+    assert json.loads(from_hub[source]) == json.loads(json.dumps(expected))
 
 
-def test_a_hub_s_checkpoint_without_any_config_yaml_is_refused(tagged: tuple[Path, Path], tmp_path: Path) -> None:
-    tag, main = tagged
-    (main / "config.yaml").rename(main / "README.md")
-    said = load_from_hub("org/name", {"main": main, TAG: tag}, tmp_path / "cache")
+def test_a_hub_s_checkpoint_without_any_config_yaml_is_refused(from_hub: dict[str, str]) -> None:
     assert re.search(
-        r"expected config\.yaml of the training run there, .* or on main of its Hub repository, got none", said
+        r"expected config\.yaml of the training run there, .* or on main of its Hub repository, got none",
+        from_hub[WITHOUT],
     )

@@ -54,6 +54,11 @@ def footage(frames: np.ndarray, task: str) -> Footage:
     return Footage((Trajectory(frames=frames, task=task),))
 
 
+def positions(encoded: Footage) -> np.ndarray:
+    """The embeddings of all frames, one trajectory after the other."""
+    return np.concatenate([trajectory.positions for trajectory in encoded.trajectories])
+
+
 def assert_same(left: object, right: object) -> None:
     assert not isinstance(left, RewardError), left
     assert not isinstance(right, RewardError), right
@@ -88,10 +93,12 @@ def test_embeddings_are_those_of_the_original(case: goldens.Case) -> None:
     films = [Footage(sample.trajectories) for sample in samples]
     kind = goldens.sample_type(samples[0])
     for row, encoded in enumerate(encoders.encode(films)):
-        assert isinstance(encoded, Trajectory)
+        assert isinstance(encoded, Footage)
         expected_video, expected_text = (arrays[f"{kind}.encoder.{name}_embeddings"][row] for name in ("video", "text"))
-        np.testing.assert_allclose(encoded.positions, expected_video, rtol=0, atol=EMBEDDING_TOLERANCE)
-        np.testing.assert_allclose(encoded.text_embedding, expected_text, rtol=0, atol=EMBEDDING_TOLERANCE)
+        np.testing.assert_allclose(positions(encoded), expected_video, rtol=0, atol=EMBEDDING_TOLERANCE)
+        np.testing.assert_allclose(
+            encoded.trajectories[0].text_embedding, expected_text, rtol=0, atol=EMBEDDING_TOLERANCE
+        )
 
 
 def test_a_trajectory_is_encoded_as_alone(encoders: Encoders) -> None:
@@ -103,10 +110,11 @@ def test_a_trajectory_is_encoded_as_alone(encoders: Encoders) -> None:
     ]
     for film, together in zip(films, encoders.encode(films), strict=True):
         (alone,) = encoders.encode([film])
-        assert isinstance(together, Trajectory)
-        assert isinstance(alone, Trajectory)
-        np.testing.assert_allclose(together.positions, alone.positions, rtol=0, atol=EMBEDDING_TOLERANCE)
-        np.testing.assert_allclose(together.text_embedding, alone.text_embedding, rtol=0, atol=EMBEDDING_TOLERANCE)
+        assert isinstance(together, Footage)
+        assert isinstance(alone, Footage)
+        np.testing.assert_allclose(positions(together), positions(alone), rtol=0, atol=EMBEDDING_TOLERANCE)
+        texts = [encoded.trajectories[0].text_embedding for encoded in (together, alone)]
+        np.testing.assert_allclose(*texts, rtol=0, atol=EMBEDDING_TOLERANCE)
 
 
 def test_a_task_that_is_too_long_fails_alone(encoders: Encoders) -> None:
@@ -133,9 +141,8 @@ def test_a_pair_of_two_frame_sizes_is_scored_from_the_embeddings_of_each_traject
     encoders: Encoders, kind: type[PreferenceSample] | type[SimilaritySample]
 ) -> None:
     first, second = sized(1, 5, 48, 100), sized(2, 3, 90, 61)
-    embedded = [encoders.encode([Footage((t,))])[0] for t in (first, replace(second, task=first.task))]
-    assert isinstance(embedded[0], Trajectory)
-    assert isinstance(embedded[1], Trajectory)
+    apart = encoders.encode([Footage((t,)) for t in (first, replace(second, task=first.task))])
+    embedded = [encoded.trajectories[0] for encoded in apart if isinstance(encoded, Footage)]
     expected, pair = load_engine(NAME).evaluate([kind(*embedded), kind(first, second)])
     assert_same(pair, expected)
 
@@ -145,17 +152,19 @@ def test_a_pair_of_one_frame_size_is_encoded_as_one_film(encoders: Encoders) -> 
     first, second = sized(1, 40, 48, 100), sized(2, 40, 48, 100)
     (pair,) = encoders.encode([Footage((first, second))])
     (film,) = encoders.encode_frames([np.concatenate([first.positions, second.positions])])
-    assert isinstance(pair, Trajectory)
-    np.testing.assert_array_equal(pair.positions, film)
-    np.testing.assert_array_equal(pair.text_embedding, encoders.encode_tasks([first.task])[0])
+    assert isinstance(pair, Footage)
+    assert [trajectory.num_frames for trajectory in pair.trajectories] == [40, 40]
+    np.testing.assert_array_equal(positions(pair), film)
+    for trajectory in pair.trajectories:
+        np.testing.assert_array_equal(trajectory.text_embedding, encoders.encode_tasks([first.task])[0])
 
 
 def test_a_sliver_beside_a_film_is_refused(encoders: Encoders) -> None:
     good = Footage((sized(1, 2, 48, 48), sized(2, 2, 30, 60)))
     first, failed, last = encoders.encode([good, Footage((sized(1, 2, 48, 48), sized(2, 2, 2, 200))), good])
     assert str(failed) == "frames: expected frames at most 50 times as long as wide, got 2 x 200"
-    assert isinstance(first, Trajectory)
-    assert isinstance(last, Trajectory)
+    assert isinstance(first, Footage)
+    assert isinstance(last, Footage)
 
 
 def refuse(model: torch.nn.Module, is_too_large: Callable[[Tensor], bool], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,12 +189,13 @@ def test_out_of_memory_halves_images_and_tasks_and_is_counted(
     execution, passes = Execution(), []
     execution.on_forward = lambda: passes.append(None)
     for encoded, other in zip(encoders.encode(films, execution), expected, strict=True):
-        assert isinstance(encoded, Trajectory)
-        assert isinstance(other, Trajectory)
-        np.testing.assert_allclose(encoded.positions, other.positions, rtol=0, atol=EMBEDDING_TOLERANCE)
-        np.testing.assert_allclose(encoded.text_embedding, other.text_embedding, rtol=0, atol=EMBEDDING_TOLERANCE)
+        assert isinstance(encoded, Footage)
+        assert isinstance(other, Footage)
+        np.testing.assert_allclose(positions(encoded), positions(other), rtol=0, atol=EMBEDDING_TOLERANCE)
+        texts = [each.trajectories[0].text_embedding for each in (encoded, other)]
+        np.testing.assert_allclose(*texts, rtol=0, atol=EMBEDDING_TOLERANCE)
     assert execution.out_of_memory_count == 3 + 2  # images: 64 and its halves; tasks: all three and the last two
-    assert len(passes) == 3 + 2 + (1 + 4 + 1) + 3  # ... and what fitted: 5, four times 16 and 6 images; each task
+    assert len(passes) == 3 + 2 + (4 + 1) + 3  # ... and what fitted: four times 16 and 11 images; each task
 
 
 def test_a_film_that_does_not_fit_in_memory_fails_alone(encoders: Encoders, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,17 +205,17 @@ def test_a_film_that_does_not_fit_in_memory_fails_alone(encoders: Encoders, monk
     first, failed, last = encoders.encode([film(0, 3), white, film(0, 3)])
     assert isinstance(failed, InferenceFailedError)
     assert str(failed) == "the sample does not fit in the device's memory"
-    assert isinstance(first, Trajectory)
-    assert isinstance(last, Trajectory)
-    np.testing.assert_allclose(first.positions, last.positions, rtol=0, atol=EMBEDDING_TOLERANCE)
+    assert isinstance(first, Footage)
+    assert isinstance(last, Footage)
+    np.testing.assert_allclose(positions(first), positions(last), rtol=0, atol=EMBEDDING_TOLERANCE)
 
 
 def test_a_task_that_does_not_fit_in_memory_fails_alone(encoders: Encoders, monkeypatch: pytest.MonkeyPatch) -> None:
     refuse(encoders.text_model, lambda tokens: tokens.shape[1] > 10, monkeypatch)
     first, failed, last = encoders.encode([film(0, 2), film(1, 2, "lift the cup " * 5), film(2, 2)])
     assert isinstance(failed, InferenceFailedError)
-    assert isinstance(first, Trajectory)
-    assert isinstance(last, Trajectory)
+    assert isinstance(first, Footage)
+    assert isinstance(last, Footage)
 
 
 def test_what_the_encoders_take_is_forward_time(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -239,8 +249,8 @@ def test_special_tokens_in_a_task_are_text(encoders: Encoders) -> None:
 
 
 def test_saving_and_loading_changes_nothing(encoders: Encoders, tmp_path: Path) -> None:
-    encoders.save_pretrained(tmp_path / "image", tmp_path / "text")
-    copy = Encoders.from_pretrained(tmp_path / "image", tmp_path / "text")
+    encoders.save(tmp_path)
+    copy = Encoders.from_pretrained(tmp_path / "image_encoder", tmp_path / "text_encoder")
     frames = [np.random.default_rng(0).integers(0, 256, (2, 50, 70, 3), np.uint8)]
     np.testing.assert_array_equal(copy.encode_frames(frames)[0], encoders.encode_frames(frames)[0])
     np.testing.assert_array_equal(copy.encode_tasks(["lift the cup"]), encoders.encode_tasks(["lift the cup"]))
@@ -250,9 +260,9 @@ def test_what_an_export_saves_is_loaded_from_its_folder(encoders: Encoders, tmp_
     encoders.save(tmp_path)
     film = Footage([Trajectory(frames=np.full((2, 40, 48, 3), 7, np.uint8), task="lift")])
     (before,), (after,) = (made.encode([film], Execution()) for made in (encoders, Encoders.load(tmp_path)))
-    assert isinstance(before, Trajectory)
-    assert isinstance(after, Trajectory)
-    np.testing.assert_array_equal(before.positions, after.positions)
+    assert isinstance(before, Footage)
+    assert isinstance(after, Footage)
+    np.testing.assert_array_equal(positions(before), positions(after))
     assert Encoders.describe(tmp_path) == encoders.description
 
 

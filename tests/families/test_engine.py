@@ -64,19 +64,21 @@ def test_the_next_batch_is_collated_while_the_current_one_runs() -> None:
 
 IN_LITTLE_MEMORY = """
 import resource, sys
+from dataclasses import replace
 import numpy as np, torch
+from small_network import SMALL
 from trajectories import random_trajectory
 from rfm.engine import Engine
 from rfm.execution import Execution
 from rfm.rewind.predictor import RewindPredictor
-from rfm.rewind.network import RewindConfig, RewindTransformer
+from rfm.rewind.network import RewindTransformer
 from rfm_client import InferenceFailedError, ProgressResult, ProgressSample
 
 MIB = 2**20
 torch.manual_seed(0)
-config = RewindConfig(
-    video_feature_dim=8, text_feature_dim=8, hidden_dim=512, num_layers=1, num_attention_heads=8, max_len=8,
-    causal_mask=True, use_per_frame_progress_token=False, progress_bins=1, has_similarity=False,
+config = replace(
+    SMALL, video_feature_dim=8, text_feature_dim=8, hidden_dim=512, num_layers=1, num_attention_heads=8,
+    use_per_frame_progress_token=False, progress_bins=1, has_similarity=False,
 )
 engine = Engine(RewindPredictor(RewindTransformer(config), torch.device("cpu")))
 samples = [ProgressSample(random_trajectory(seed, 1000, 8, 8)) for seed in range(16)]

@@ -21,19 +21,19 @@ import toy_family
 from paths import ROOT
 from rfm import families
 from rfm.checkpoint.content import CheckpointError
-from rfm.config import ServeConfig
+from rfm.config import ExportConfig
 from rfm.engine import Engine
+from rfm.launch.installation import Installation, find_installation
+from rfm.launch.process import Endpoints, TritonServer
 from rfm.parameters import FAMILY_PARAMETER
 from rfm.rewind.encoders import Encoders
-from rfm.supervise.installation import Installation, find_installation
-from rfm.supervise.process import Endpoints, TritonServer
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, RewardClient, SimilaritySample, Trajectory
 from rfm_export.layout import CONFIG_FILE
 from rfm_export.pbtxt import parse, render
 
 TESTS = ROOT / "tests" / "support"
 DEMO = ROOT / "model_repository"
-TOY = ServeConfig(name="toy", num_gpus=0, torch_threads=1)
+TOY = ExportConfig(name="toy", num_gpus=0, torch_threads=1)
 SLOPE = torch.tensor([[4.0, 0.0, -1.0]])  # of red, green and blue
 
 
@@ -93,6 +93,7 @@ def running(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Itera
         yield Running(repository, server.endpoints.grpc_url)
 
 
+@pytest.mark.triton
 def test_a_family_from_elsewhere_is_served_on_raw_frames(running: Running) -> None:
     first, second = [0.1, 0.5, 0.9], [0.8, 0.2]
     samples = [
@@ -111,6 +112,7 @@ def test_a_family_from_elsewhere_is_served_on_raw_frames(running: Running) -> No
             client.evaluate([SimilaritySample(film(first), film(second))])
 
 
+@pytest.mark.triton
 def test_a_family_from_elsewhere_is_served_on_embeddings(running: Running) -> None:
     colours = np.array([[0.5, 0.25, 1.0]], np.float32)
     sample = ProgressSample(Trajectory(video_embeddings=colours, text_embedding=np.zeros(1, np.float32)))
@@ -119,6 +121,7 @@ def test_a_family_from_elsewhere_is_served_on_embeddings(running: Running) -> No
     np.testing.assert_allclose(result.progress, 1 / (1 + np.exp(2 - 4 * 0.5 + 1.0)), atol=1e-6)
 
 
+@pytest.mark.triton
 def test_what_a_family_from_elsewhere_generates_is_checked(running: Running) -> None:
     assert rfm_export.check(running.repository, TOY) == []
     config = parse((running.repository / "toy" / CONFIG_FILE).read_text())
@@ -126,6 +129,7 @@ def test_what_a_family_from_elsewhere_generates_is_checked(running: Running) -> 
     assert network == {"class": "Redness", "config": {"num_colours": 3}, "parameters": {"line": 4}}
 
 
+@pytest.mark.triton
 def test_a_configuration_that_names_no_family_serves_what_its_folder_holds(running: Running) -> None:
     demo = running.repository / "rfm" / "1" / "checkpoint"
     encoders = families.encoders_of(None).load(running.repository / "rfm_encoder" / "1")

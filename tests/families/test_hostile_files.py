@@ -14,6 +14,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,16 +29,16 @@ import rfm_export
 from engines import serve_config
 from rfm import families
 from rfm.checkpoint.content import MAX_HEADER_BYTES, MAX_JSON_BYTES, CheckpointError
-from rfm.config import ConfigError, ServeConfig
+from rfm.launch.installation import ServerStartError, find_installation
+from rfm.launch.process import Endpoints, TritonServer
 from rfm.plain_yaml import MAX_YAML_BYTES
-from rfm.supervise.installation import ServerStartError, find_installation
-from rfm.supervise.process import Endpoints, TritonServer
+from rfm_client.contract.settings import ConfigError
 from rfm_commands.cli import app
+from rfm_commands.config import Config
 from rfm_export import ExportError
 
 REWIND = goldens.config("legacy_keys_l2")
 VLM = goldens.config("q25_mean_l2")
-RFM = Path(sys.executable).parent / "rfm"
 WEIGHTS, INDEX = "model.safetensors", "model.safetensors.index.json"
 LONGEST_S = 30
 MOST_MEMORY_BYTES = 512 * 2**20  # beyond what the process had at its largest
@@ -370,7 +371,7 @@ BAD_SETTINGS = {
 def test_hostile_settings_are_refused(tmp_path: Path, content: str, message: str) -> None:
     (tmp_path / "serve.yaml").write_text(content)
     with pytest.raises(ConfigError, match=message):
-        ServeConfig.from_yaml(tmp_path / "serve.yaml")
+        Config.from_yaml(tmp_path / "serve.yaml")
 
 
 @pytest.mark.parametrize("source", ["../nowhere", "org/..", "..@tag", "a" * 5000, "~nobody-here/x/y", "a\0b"])
@@ -392,26 +393,65 @@ def test_a_file_that_may_not_be_read_is_told(tmp_path: Path) -> None:
         os.seteuid(user)
 
 
-@pytest.mark.parametrize("room", [0, 100, (REWIND.checkpoint / WEIGHTS).stat().st_size // 2], ids=["0", "100", "half"])
-def test_a_full_disk_is_told_and_changes_nothing(tmp_path: Path, room: int) -> None:
-    """Under a limit of file sizes, of the child alone."""
-    repository = tmp_path / "model_repository"
-    rfm_export.export(REWIND.checkpoint, repository, serve_config(REWIND))
-    before = files_in(repository)
-    failed = subprocess.run(
-        [str(RFM), "export", "--checkpoint", str(REWIND.checkpoint), "--repository", str(repository)],
-        capture_output=True,
+ROOMS = {"0": 0, "100": 100, "half": (REWIND.checkpoint / WEIGHTS).stat().st_size // 2}
+# One `rfm export` after the other, each under a limit of file sizes, in a process of their own.
+IN_LITTLE_ROOM = """
+import io, json, resource, sys
+from contextlib import redirect_stderr
+from rfm_commands.cli import main
+checkpoint, *exports = sys.argv[1:]
+for room, repository in map(json.loads, exports):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
+    sys.argv = ["rfm", "export", "--checkpoint", checkpoint, "--repository", repository]
+    status, errors = 0, io.StringIO()
+    try:
+        with redirect_stderr(errors):
+            main()
+    except SystemExit as ended:
+        status = ended.code
+    print(json.dumps([status, errors.getvalue()]))
+"""
+
+
+@dataclass(frozen=True)
+class FullDisk:
+    """What an export onto one said, and the files there before."""
+
+    folder: Path
+    before: dict[str, bytes]
+    status: int
+    errors: str
+
+
+@pytest.fixture(scope="module")
+def full_disks(tmp_path_factory: pytest.TempPathFactory) -> dict[str, FullDisk]:
+    folders = {name: tmp_path_factory.mktemp(f"room_{name}") for name in ROOMS}
+    before = {}
+    for name, folder in folders.items():
+        rfm_export.export(REWIND.checkpoint, folder / "model_repository", serve_config(REWIND))
+        before[name] = files_in(folder)
+    exports = [json.dumps([room, str(folders[name] / "model_repository")]) for name, room in ROOMS.items()]
+    ended = subprocess.run(
+        [sys.executable, "-c", IN_LITTLE_ROOM, str(REWIND.checkpoint), *exports],
+        check=True,
+        stdout=subprocess.PIPE,
         text=True,
         timeout=LONGEST_S,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (room, room)),
     )
-    assert failed.returncode == 1, failed
-    assert files_in(repository) == before
-    assert not list(tmp_path.rglob(".*"))
+    said = map(json.loads, ended.stdout.splitlines())
+    return {name: FullDisk(folders[name], before[name], *told) for name, told in zip(ROOMS, said, strict=True)}
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_full_disk_is_told_and_changes_nothing(full_disks: dict[str, FullDisk], room: str) -> None:
+    disk = full_disks[room]
+    assert disk.status == 1
+    assert files_in(disk.folder) == disk.before
+    assert not list(disk.folder.rglob(".*"))
     told = (
         r"rfm: .*/model_repository/rfm/\.export-\w+: expected room for the exported files, got: .*[Ff]ile too large.*\n"
     )
-    assert re.fullmatch(told, failed.stderr), failed.stderr
+    assert re.fullmatch(told, disk.errors), disk.errors
 
 
 def test_two_exports_at_a_time_are_one_too_many(tmp_path: Path) -> None:
@@ -430,6 +470,7 @@ def test_two_exports_at_a_time_are_one_too_many(tmp_path: Path) -> None:
     assert not left.exists()
 
 
+@pytest.mark.triton
 def test_weights_that_have_changed_since_their_export_are_not_served(tmp_path: Path) -> None:
     repository = tmp_path / "model_repository"
     rfm_export.export(REWIND.checkpoint, repository, serve_config(REWIND))

@@ -7,6 +7,7 @@ import functools
 import json
 import shutil
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from rfm.checkpoint.content import CheckpointError
 from rfm.engine import Engine
 from rfm.family import Options
 from rfm.rewind.checkpoint import RewindCheckpoint
-from rfm.rewind.network import RewindConfig, RewindTransformer
+from rfm.rewind.network import RewindTransformer
 from rfm_client import (
     InvalidSampleError,
     PreferenceSample,
@@ -37,6 +38,7 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract import wire
+from small_network import SMALL
 
 # The same examples each time: what fails here fails everywhere.
 THOROUGH = settings(max_examples=200, deadline=None, derandomize=True, database=None)
@@ -45,6 +47,14 @@ SLOW = settings(
 )
 TOLERANCE = 1e-5
 VIDEO_DIM, TEXT_DIM, MAX_LEN = 6, 5, 7
+SIZE = replace(
+    SMALL,
+    video_feature_dim=VIDEO_DIM,
+    text_feature_dim=TEXT_DIM,
+    hidden_dim=16,
+    num_attention_heads=4,
+    max_len=MAX_LEN,
+)
 Array = npt.NDArray[Any]
 
 
@@ -121,17 +131,8 @@ def test_any_request_to_the_encoder_is_trajectories_or_a_refusal(tensors: dict[s
 @functools.cache
 def engine(*, causal: bool, tokens: bool, bins: int, similarity: bool) -> Engine:
     torch.manual_seed(0)
-    config = RewindConfig(
-        video_feature_dim=VIDEO_DIM,
-        text_feature_dim=TEXT_DIM,
-        hidden_dim=16,
-        num_layers=2,
-        num_attention_heads=4,
-        max_len=MAX_LEN,
-        causal_mask=causal,
-        use_per_frame_progress_token=tokens,
-        progress_bins=bins,
-        has_similarity=similarity,
+    config = replace(
+        SIZE, causal_mask=causal, use_per_frame_progress_token=tokens, progress_bins=bins, has_similarity=similarity
     )
     return Engine.of(RewindCheckpoint(config, RewindTransformer(config).state_dict()), token_budget=48)
 
@@ -202,11 +203,8 @@ def test_a_sample_is_scored_or_refused_alike_in_any_company(scorer: Engine, samp
 def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("original") / "checkpoint"
     torch.manual_seed(0)
-    checkpoint = RewindCheckpoint(
-        RewindConfig(VIDEO_DIM, TEXT_DIM, 8, 1, 2, MAX_LEN, True, True, 3, True, trained_frames=4),
-        RewindTransformer(RewindConfig(VIDEO_DIM, TEXT_DIM, 8, 1, 2, MAX_LEN, True, True, 3, True)).state_dict(),
-    )
-    checkpoint.save(folder)
+    config = replace(SIZE, num_layers=1, progress_bins=3, trained_frames=4)
+    RewindCheckpoint(config, RewindTransformer(config).state_dict()).save(folder)
     (folder / "config.yaml").write_text(
         "model:\n  rewind: {causal_mask: true, max_len: 7}\ndata: &d {max_frames: 4}\nmore: *d\n"
     )

@@ -32,30 +32,19 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
+from small_network import SMALL
 from trajectories import random_trajectory
 
 TOLERANCE = 1e-6  # seen: 2.1e-7
-BASE = RewindConfig(
-    video_feature_dim=12,
-    text_feature_dim=6,
-    hidden_dim=24,
-    num_layers=2,
-    num_attention_heads=3,
-    max_len=8,
-    causal_mask=True,
-    use_per_frame_progress_token=True,
-    progress_bins=5,
-    has_similarity=True,
-)
 VARIANTS = {
     f"causal={causal} tokens={tokens} bins={bins}": replace(
-        BASE, causal_mask=causal, use_per_frame_progress_token=tokens, progress_bins=bins
+        SMALL, causal_mask=causal, use_per_frame_progress_token=tokens, progress_bins=bins
     )
     for causal, tokens, bins in product((True, False), (True, False), (1, 5))
 } | {
-    "one wide layer": replace(BASE, num_layers=1, hidden_dim=64, num_attention_heads=8),
-    "many narrow layers": replace(BASE, num_layers=5, hidden_dim=4, num_attention_heads=1),
-    "no similarity": replace(BASE, has_similarity=False),
+    "one wide layer": replace(SMALL, num_layers=1, hidden_dim=64, num_attention_heads=8),
+    "many narrow layers": replace(SMALL, num_layers=5, hidden_dim=4, num_attention_heads=1),
+    "no similarity": replace(SMALL, has_similarity=False),
 }
 
 
@@ -72,7 +61,7 @@ def engine_of(network: RewindTransformer, *, device: str = "cpu", token_budget: 
 
 
 def trajectory(seed: int, num_frames: int) -> Trajectory:
-    return random_trajectory(seed, num_frames, BASE.video_feature_dim, BASE.text_feature_dim)
+    return random_trajectory(seed, num_frames, SMALL.video_feature_dim, SMALL.text_feature_dim)
 
 
 def sequence_of(network: RewindTransformer, sample: Sample) -> tuple[Tensor, list[list[int]]]:
@@ -164,9 +153,9 @@ def test_a_result_does_not_depend_on_its_neighbours(config: RewindConfig, token_
 @pytest.mark.parametrize("seed", range(4))
 def test_no_mix_of_lengths_and_types_changes_a_result(seed: int) -> None:
     random = np.random.default_rng(seed)
-    samples = samples_for(BASE)
+    samples = samples_for(SMALL)
     samples += [ProgressSample(trajectory(t, t), frame_steps=3) for t in (2, 5)]
-    engine = engine_of(build(BASE))
+    engine = engine_of(build(SMALL))
     alone = [numbers(engine.evaluate([sample])[0]) for sample in samples]
     for size in range(1, 60):
         chosen = random.integers(0, len(samples), size)
@@ -175,25 +164,25 @@ def test_no_mix_of_lengths_and_types_changes_a_result(seed: int) -> None:
 
 
 def test_frames_beyond_max_len_are_taken_without_progress_tokens() -> None:
-    config = replace(BASE, use_per_frame_progress_token=False)
+    config = replace(SMALL, use_per_frame_progress_token=False)
     (outcome,) = engine_of(build(config)).evaluate([ProgressSample(trajectory(0, 3 * config.max_len))])
     assert isinstance(outcome, ProgressResult)
     assert len(outcome.progress) == 3 * config.max_len
 
 
 def test_the_token_budget_bounds_every_forward() -> None:
-    network = build(BASE)
+    network = build(SMALL)
     sizes: list[int] = []
     network.transformer.register_forward_hook(
         lambda _m, inputs, _o: sizes.append(inputs[1].num_rows * inputs[1].longest)
     )
-    engine_of(network, token_budget=100).evaluate(samples_for(BASE) * 5)
+    engine_of(network, token_budget=100).evaluate(samples_for(SMALL) * 5)
     assert max(sizes) <= 100
     assert len(sizes) < 30
 
 
 def test_dense_mode_takes_as_few_forwards_as_the_budget_allows() -> None:
-    network = build(BASE)
+    network = build(SMALL)
     calls: list[int] = []
     network.transformer.register_forward_hook(lambda *_: calls.append(1))
     samples = [ProgressSample(trajectory(t, t), frame_steps=4) for t in (3, 9, 20)]
@@ -202,7 +191,7 @@ def test_dense_mode_takes_as_few_forwards_as_the_budget_allows() -> None:
 
 
 def test_a_row_over_the_token_budget_runs_alone() -> None:
-    network = build(BASE)
+    network = build(SMALL)
     samples = [ProgressSample(trajectory(seed, 8)) for seed in range(3)] + [ProgressSample(trajectory(3, 2))] * 2
     expected = [numbers(outcome) for outcome in engine_of(network).evaluate(samples)]
     rows: list[int] = []
@@ -214,7 +203,7 @@ def test_a_row_over_the_token_budget_runs_alone() -> None:
 
 
 def test_a_sample_over_the_servers_limit_is_refused_alone() -> None:
-    engine = Engine(RewindPredictor(build(BASE), torch.device("cpu")), max_sample_tokens=16)
+    engine = Engine(RewindPredictor(build(SMALL), torch.device("cpu")), max_sample_tokens=16)
     refused, scored = engine.evaluate([ProgressSample(trajectory(0, 8)), ProgressSample(trajectory(0, 7))])
     assert isinstance(refused, InvalidSampleError)
     assert str(refused) == "num_frames: expected at most 16 tokens (max_sample_tokens of this server), got 17 tokens"
@@ -245,7 +234,7 @@ BAD_FOR_CHECKPOINT: dict[str, tuple[Sample, str]] = {
 @pytest.mark.parametrize(("sample", "message"), BAD_FOR_CHECKPOINT.values(), ids=BAD_FOR_CHECKPOINT)
 def test_what_the_checkpoint_cannot_take_fails_alone(sample: Sample, message: str) -> None:
     good = ProgressSample(trajectory(1, 3))
-    engine = engine_of(build(BASE))
+    engine = engine_of(build(SMALL))
     first, failed, last = engine.evaluate([good, sample, good])
     assert isinstance(failed, InvalidSampleError)
     assert str(failed) == message
@@ -257,7 +246,7 @@ def test_a_score_that_is_no_number_is_an_error() -> None:
     huge = Trajectory(
         video_embeddings=np.full((2, 12), MAX_EMBEDDING, np.float32), text_embedding=np.ones(6, np.float32)
     )
-    network = build(BASE)
+    network = build(SMALL)
     network.video_proj.weight.data *= 1e14  # so that the largest embedding overflows
     failed, good = engine_of(network).evaluate([ProgressSample(huge), ProgressSample(trajectory(0, 2))])
     assert isinstance(failed, InferenceFailedError)
@@ -265,7 +254,7 @@ def test_a_score_that_is_no_number_is_an_error() -> None:
 
 
 def test_no_samples_no_results() -> None:
-    assert engine_of(build(BASE)).evaluate([]) == []
+    assert engine_of(build(SMALL)).evaluate([]) == []
 
 
 def test_prefixes_are_sampled_as_the_original_samples_them() -> None:
@@ -276,7 +265,7 @@ def test_prefixes_are_sampled_as_the_original_samples_them() -> None:
 
 
 def test_rows_of_all_kinds_are_packed_into_one_batch() -> None:
-    collator = RewindCollator(BASE)
+    collator = RewindCollator(SMALL)
     samples: Sequence[Sample] = [
         PreferenceSample(trajectory(0, 1), trajectory(1, 3)),
         ProgressSample(trajectory(4, 2)),
@@ -302,11 +291,11 @@ def test_rows_of_all_kinds_are_packed_into_one_batch() -> None:
 def test_more_frames_than_progress_tokens_are_refused(num_frames: list[int]) -> None:
     frames = torch.zeros(sum(num_frames), 12)
     with pytest.raises(ValueError, match="num_frames: expected at most 8, got 9"):
-        RewindBatch.of(BASE, torch.zeros(1, 6), frames, np.array([num_frames]))
+        RewindBatch.of(SMALL, torch.zeros(1, 6), frames, np.array([num_frames]))
 
 
 def test_frames_that_many_rows_show_are_in_a_batch_once() -> None:
-    collator = RewindCollator(BASE)
+    collator = RewindCollator(SMALL)
     same = trajectory(1, 3)
     samples: Sequence[Sample] = [ProgressSample(trajectory(0, 5), frame_steps=4), PreferenceSample(same, same)]
     batch = collator.collate([row for sample in samples for row in collator.rows(sample)])
@@ -404,9 +393,9 @@ def test_only_discrete_progress_has_logits_and_they_are_those_of_the_progress(
 
 
 def test_the_network_scores_each_frame_and_no_padding_behind_the_last() -> None:
-    network = RewindTransformer(BASE).eval()
-    collator = RewindCollator(BASE)
-    trajectory = random_trajectory(0, 11, BASE.video_feature_dim, BASE.text_feature_dim)
+    network = RewindTransformer(SMALL).eval()
+    collator = RewindCollator(SMALL)
+    trajectory = random_trajectory(0, 11, SMALL.video_feature_dim, SMALL.text_feature_dim)
     rows = collator.rows(ProgressSample(trajectory, frame_steps=3))
     with torch.inference_mode():
         output = network(collator.collate(rows))

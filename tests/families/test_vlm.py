@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -18,10 +19,12 @@ from reference_server import Served
 from rfm.engine import Engine
 from rfm.execution import Execution
 from rfm.predictor import RowScores
+from rfm.vlm.batch import VlmBatch
 from rfm.vlm.collator import QWEN3, VISION_START, VlmRow
-from rfm.vlm.network import VlmBatch
+from rfm.vlm.images import Grid
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.prompts import SPLIT_TOKEN
+from rfm.vlm.vision import UNIT, plan
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,
@@ -33,7 +36,7 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
-from vlm import BFLOAT16, PLAIN, assert_close, film, load, predictor_of
+from vlm import BFLOAT16, PLAIN, assert_close, film, load, predictor_of, upstream_inputs
 
 WITH_SIMILARITY = "q25_peft_adapter_disc10"  # in the copied references too
 
@@ -66,7 +69,7 @@ def test_token_ids_and_pixels_are_those_of_the_original(case: goldens.Case) -> N
         if f"{kind}.collated.input_ids" not in arrays:  # evaluated one by one
             continue
         rows = [row for sample in samples for row in predictor.rows(sample)]
-        inputs = predictor.collate(rows).inputs
+        inputs = upstream_inputs(predictor, rows)
         for name in ("input_ids", "attention_mask", "image_grid_thw", "video_grid_thw"):
             if f"{kind}.collated.{name}" in arrays:
                 np.testing.assert_array_equal(inputs[name].numpy(), arrays[f"{kind}.collated.{name}"])
@@ -193,17 +196,32 @@ def spliced(left: VlmRow, right: VlmRow, predictor: VlmPredictor) -> tuple[np.nd
     return np.concatenate([left.input_ids[:ends], right.input_ids[start:]]), ends - start
 
 
-def spliced_pixels(left: VlmBatch, right: VlmBatch, counts: tuple[int, int]) -> dict[str, torch.Tensor]:
-    """The first ``counts[0]`` images or videos of one batch of one row, and the last ``counts[1]`` of another's."""
-    if "pixel_attention_mask" in left.inputs:
+def spliced_pixels(
+    left: dict[str, torch.Tensor], right: dict[str, torch.Tensor], counts: tuple[int, int]
+) -> dict[str, torch.Tensor]:
+    """The first ``counts[0]`` images or videos of one conversation, and the last ``counts[1]`` of another's."""
+    if "pixel_attention_mask" in left:
         names, axis = ("pixel_values", "pixel_attention_mask"), 1
-        return {n: torch.cat([left.inputs[n][:, : counts[0]], right.inputs[n][:, -counts[1] :]], axis) for n in names}
-    grid = next(name for name in left.inputs if name.endswith("grid_thw"))
-    pixels = next(name for name in left.inputs if name.startswith("pixel_values"))
-    grids = left.inputs[grid][: counts[0]], right.inputs[grid][-counts[1] :]
+        return {n: torch.cat([left[n][:, : counts[0]], right[n][:, -counts[1] :]], axis) for n in names}
+    grid = next(name for name in left if name.endswith("grid_thw"))
+    pixels = next(name for name in left if name.startswith("pixel_values"))
+    grids = left[grid][: counts[0]], right[grid][-counts[1] :]
     patches = [int(of_side.prod(dim=1).sum()) for of_side in grids]
-    both = [left.inputs[pixels][: patches[0]], right.inputs[pixels][-patches[1] :]]
-    return {grid: torch.cat(grids), pixels: torch.cat(both)}
+    return {grid: torch.cat(grids), pixels: torch.cat([left[pixels][: patches[0]], right[pixels][-patches[1] :]])}
+
+
+def batch_by_hand(batch: VlmBatch, pixels: dict[str, torch.Tensor], vision: dict[str, Any]) -> VlmBatch:
+    """The batch of one conversation with these pixels of two sizes, in the order in which they are shown."""
+    if "pixel_attention_mask" in pixels:
+        return replace(batch, inputs=batch.inputs | pixels, pixels=None)
+    grid = next(grid.tolist() for name, grid in pixels.items() if name.endswith("grid_thw"))
+    patches = next(tensor for name, tensor in pixels.items() if name.startswith("pixel_values"))
+    counts = Counter[tuple[int, int]]()
+    for groups, rows, columns in grid:
+        counts[rows, columns] += groups
+    sizes = [Grid(groups, *size) for size, groups in counts.items()]
+    inputs = batch.inputs | {"pixel_values": patches, "visual_features": torch.arange(len(patches) // UNIT)}
+    return replace(batch, inputs=inputs, pixels=None, plan=plan(sizes, vision))
 
 
 def on_videos(name: str) -> VlmPredictor:
@@ -232,11 +250,11 @@ def test_a_pair_of_two_frame_sizes_is_read_as_its_trajectories_are_beside_one_of
     ids, moved = spliced(left, right, predictor)
     np.testing.assert_array_equal(row.input_ids, ids)
 
-    batch, of_left, of_right = (predictor.collate([each]) for each in (row, left, right))
+    of_row, of_left, of_right = (upstream_inputs(predictor, [each]) for each in (row, left, right))
     counts = (3, 4) if predictor.network.config.multi_image else (1, 1)
     pixels = spliced_pixels(of_left, of_right, counts)
     for name, tensor in pixels.items():
-        torch.testing.assert_close(batch.inputs[name], tensor, rtol=0, atol=0)
+        torch.testing.assert_close(of_row[name], tensor, rtol=0, atol=0)
 
     if not predictor.network.config.multi_image and predictor.network.config.family == QWEN3:
         # There a trajectory's states are read from the vision start of its number on, in the first one's frames.
@@ -247,8 +265,15 @@ def test_a_pair_of_two_frame_sizes_is_read_as_its_trajectories_are_beside_one_of
         moved_spans = moved
     spans = [(0, *span) for span in left.spans[0]] + [(0, a + moved_spans, b + moved_spans) for a, b in right.spans[1]]
     assert right.query is not None
-    inputs = {**batch.inputs, **pixels, "input_ids": torch.from_numpy(ids)[None]}
-    by_hand = VlmBatch(inputs, torch.tensor(spans), torch.tensor([0]), torch.tensor([right.query + moved]))
+    batch = predictor.collate([row])
+    by_hand = replace(
+        batch_by_hand(batch, pixels, predictor.network.config.backbone["vision_config"]),
+        spans=torch.tensor(spans),
+        query_rows=torch.tensor([0]),
+        query_tokens=torch.tensor([right.query + moved]),
+        num_span_tokens=sum(stop - start for _, start, stop in spans),
+    )
+    by_hand.inputs["input_ids"] = torch.from_numpy(ids)[None]
     (expected,) = predictor.score([row], by_hand)
     (outcome,) = Engine(predictor).evaluate([PreferenceSample(wide, tall)])
     assert isinstance(outcome, PreferenceResult)
@@ -312,6 +337,12 @@ def test_what_cannot_be_scored_fails_alone(make: Callable[[], Sample], message: 
 def test_what_is_unusual_is_scored(sample: ProgressSample) -> None:
     (outcome,) = load_engine(PLAIN).evaluate([sample])
     assert isinstance(outcome, ProgressResult)
+
+
+@pytest.mark.parametrize("name", [PLAIN, "smol_mean_disc10"])
+def test_the_written_preprocessing_brings_pixels_to_0_and_1(name: str) -> None:
+    written = predictor_of(name).collator.images.to_config()
+    assert written["rescale_factor"] == 1 / 255
 
 
 def test_the_task_is_not_a_template() -> None:

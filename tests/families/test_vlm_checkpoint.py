@@ -26,7 +26,7 @@ import rfm_export
 from engines import load_engine
 from rfm import families
 from rfm.checkpoint.content import CheckpointError
-from rfm.config import ServeConfig
+from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.vlm.checkpoint import VlmCheckpoint
 from rfm.vlm.images import fitted_size
@@ -123,6 +123,8 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "a run of nothing": (PLAIN, lambda folder: (folder / "config.yaml").write_text("{}") and None, r"config\.yaml: model: expected the settings"),
     "text for a truth": (PLAIN, change_yaml("average_temporal_patches: false", "average_temporal_patches: 'false'"), r"average_temporal_patches: expected bool, got 'false'"),
     "a temperature of zero": (PLAIN, change_yaml("attn_temperature: 1.0", "attn_temperature: 0.0"), r"temperature: expected a number above 0, got 0.0"),
+    "a temperature in words": (PLAIN, change_yaml("attn_temperature: 1.0", "attn_temperature: warm"), r"temperature: expected float, got 'warm'"),
+    "a number for a name": (PLAIN, change_yaml("model_type: default", "model_type: 3"), r"model_type: expected str, got 3$"),
     "pairwise progress": (PLAIN, change_yaml("  model_type: default", "  pairwise_progress: true"), r"model\.pairwise_progress: expected false .*, got true"),
     "a pooling that is none": (PLAIN, change_yaml("frame_pooling: mean", "frame_pooling: max"), r"frame_pooling: expected"),
     "a type that is none": (PLAIN, change_yaml("torch_dtype: float32", "torch_dtype: int8"), r"torch_dtype: expected"),
@@ -302,7 +304,7 @@ def test_a_size_for_images_is_kept_or_ignored_as_told(
     (expected,) = plain.evaluate([resized])
     assert_close(result, expected, 1e-6)
 
-    serve = ServeConfig(num_gpus=0, torch_threads=1, base_model=base, resize_images=resize_images)
+    serve = ExportConfig(num_gpus=0, torch_threads=1, base_model=base, resize_images=resize_images)
     rfm_export.export(sized, tmp_path / "repository", serve)
     text = (tmp_path / "repository" / "rfm_frames" / "config.pbtxt").read_text()
     told = text_format.Parse(text, pb.ModelConfig()).parameters[FRAME_SIZE_PARAMETER].string_value

@@ -23,13 +23,13 @@ from gateway_requests import (
     ask_npy,
     fixture_of,
 )
-from rfm.config import ServeConfig
+from rfm.config import ExportConfig
+from rfm.journal import SHARED_MEMORY
+from rfm.launch.cleanup import REGION_PREFIX
+from rfm.launch.installation import find_installation
+from rfm.launch.process import Endpoints, TritonServer
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer
-from rfm.supervise.cleanup import REGION_PREFIX
-from rfm.supervise.installation import find_installation
-from rfm.supervise.model_processes import SHARED_MEMORY
-from rfm.supervise.process import Endpoints, TritonServer
 
 
 @pytest.fixture(scope="package")
@@ -43,7 +43,7 @@ def triton(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransfo
     folder = tmp_path_factory.mktemp("gateway_triton")
     repository, checkpoint = folder / "model_repository", folder / "two_wide"
     RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()).save(checkpoint)
-    rfm_export.export(checkpoint, repository, ServeConfig(name=TINY, num_gpus=0, torch_threads=1))
+    rfm_export.export(checkpoint, repository, ExportConfig(name=TINY, num_gpus=0, torch_threads=1))
     for config, name in ((goldens.config("enc_c1_t1_disc10"), FILM), (goldens.config("q25_video_last_l2"), VIDEO)):
         rfm_export.export(config.checkpoint, repository, serve_config(config, name))
     ours = f"{REGION_PREFIX}_{os.getpid()}_*"  # others test beside us

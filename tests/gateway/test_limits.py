@@ -41,11 +41,11 @@ from gateway_requests import (
     progress,
 )
 from gateways import Gateway, poll, running
-from rfm.config import ServeConfig
+from rfm.config import ExportConfig
+from rfm.launch.installation import find_installation
+from rfm.launch.process import Endpoints, TritonServer
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer
-from rfm.supervise.installation import find_installation
-from rfm.supervise.process import Endpoints, TritonServer
 from rfm_client import (
     AsyncRewardClient,
     ServerUnavailableError,
@@ -202,7 +202,7 @@ def gated(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransfor
     folder = tmp_path_factory.mktemp("gated")
     repository, checkpoint, gate = folder / "model_repository", folder / "two_wide", folder / "gate"
     RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()).save(checkpoint)
-    rfm_export.export(checkpoint, repository, ServeConfig(name=TINY, num_gpus=0, torch_threads=1))
+    rfm_export.export(checkpoint, repository, ExportConfig(name=TINY, num_gpus=0, torch_threads=1))
     model = repository / TINY / "1" / "model.py"
     model.write_text(model.read_text() + CLOSED_GATE.format(gate=str(gate)))
     with (

@@ -43,9 +43,9 @@ from gateway_requests import (
 )
 from gateways import WITHIN_S, Gateway, answers, free_port, poll, running
 from rfm.checkpoint.content import read_run_config
+from rfm.journal import SHARED_MEMORY
+from rfm.launch.process import Endpoints
 from rfm.rewind.network import RewindTransformer
-from rfm.supervise.model_processes import SHARED_MEMORY
-from rfm.supervise.process import Endpoints
 from rfm_client import (
     InvalidSampleError,
     ModelNotFoundError,
@@ -73,7 +73,7 @@ def test_gpu_status_counts_each_request_once(request: pytest.FixtureRequest, nam
     assert work_done(gateway)[0] == count + 3
     parts = {"tiny": [TINY], "film": [FILM, f"{FILM}_encoder"], "video": [f"{VIDEO}_frames"]}[name]
     status = read_status(gateway.triton_url, metrics_url=request.getfixturevalue("triton").endpoints.metrics_url)
-    computed_s = sum(m.compute_ms for m in status.models if m.name in parts) / 1e3
+    computed_s = sum(m.busy_ms for m in status.models if m.name in parts) / 1e3
     assert busy_s < work_done(gateway)[1] == pytest.approx(computed_s, rel=0.01)
     assert [work_done(other) for other in others] == of_others
     status = requests.get(f"{gateway.url}/gpu_status").json()
@@ -231,7 +231,7 @@ def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed(trito
         process.terminate()
         process.wait(WITHIN_S)
     assert "rfm: gateway is started again: exit status -9" in gateway.log.splitlines()
-    assert len(started) >= 4  # Triton, its stub, the first gateway and the second
+    assert len(started) >= 4  # Triton, its model process, the first gateway and the second
     assert not [child for child in started if Path(f"/proc/{child}").exists()]
     assert not list(SHARED_MEMORY.glob(f"*_rfm_{process.pid}_*"))
 
@@ -243,10 +243,13 @@ BAD_OPTIONS: dict[str, tuple[list[str], str]] = {
     ),
     "no folder": (["--allow-folder", "nowhere"], "No such file or directory"),
     "no key file": (["--api-key-file", "nowhere"], "--api-key-file: expected a text file, got"),
-    "an empty key": (["--api-key-file", os.devnull], "key: expected at least one character, got none"),
+    "an empty key": (
+        ["--api-key-file", os.devnull],
+        "--api-key-file: expected a key, here or in RFM_GATEWAY_API_KEY, got no character",
+    ),
     "less memory than a body": (
         ["--max-memory-mib", "100"],
-        "max_memory_mib: expected at least max_body_mib (512), got less",
+        "--max-memory-mib: expected at least max_body_mib (512), got less",
     ),
     "no port": (["--port", "0"], "Input should be greater than or equal to 1"),
 }

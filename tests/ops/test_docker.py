@@ -31,8 +31,8 @@ import goldens
 import rfm_export
 from engines import serve_config
 from paths import ROOT
-from rfm.supervise.installation import find_installation
-from rfm.supervise.process import Endpoints
+from rfm.launch.installation import find_installation
+from rfm.launch.process import Endpoints
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 

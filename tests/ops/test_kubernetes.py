@@ -36,8 +36,9 @@ from typer.main import get_command
 
 from paths import ROOT
 from repositories import kill_model
-from rfm.supervise import admin_key
-from rfm.supervise.process import KILL_AFTER_S, Endpoints
+from rfm.launch import admin_key
+from rfm.launch.ending import KILL_AFTER_S
+from rfm.launch.process import Endpoints
 from rfm_commands.cli import app
 from rfm_gateway.command import STOP_WITHIN_S
 

@@ -27,7 +27,7 @@ import yaml
 
 from paths import ROOT
 from repositories import kill_model
-from rfm.supervise.process import Endpoints
+from rfm.launch.process import Endpoints
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, RewardClient, RewardError, Trajectory
 from trajectories import random_trajectory
 

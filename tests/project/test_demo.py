@@ -18,7 +18,7 @@ import clip
 import rfm_export
 from commands import nothing_left_behind
 from paths import ROOT, VIDEOS
-from rfm.config import ServeConfig
+from rfm.config import ExportConfig
 from rfm_client import InvalidSampleError
 from rfm_client.data.video import frame_indices, read_video
 from rfm_commands.cli import app
@@ -47,7 +47,7 @@ def video(tmp_path: Path) -> Path:
 def test_the_demo_shows_what_it_promises(tmp_path: Path) -> None:
     with nothing_left_behind():
         shown = example("demo.py", "--output", tmp_path)
-    for text in ("put the red block in the bowl", "a success", "rewound", "P(first) = ", "similarity = ", "executions"):
+    for text in ("put the red block in the bowl", "a success", "rewound", "P(first) = ", "similarity = ", "batches"):
         assert text in shown
     assert (tmp_path / "rewards.png").read_bytes().startswith(PNG)
 
@@ -78,7 +78,7 @@ def test_a_video_is_scored(tmp_path: Path, video: Path, own_checkpoint: bool, mo
     with nothing_left_behind():
         result = CliRunner().invoke(app, ["demo", *(str(word) for pair in options.items() for word in pair)])
     assert result.exit_code == 0, result.output
-    for shown in (clip.TASK, "clip.mp4", "32 frames", "executions"):
+    for shown in (clip.TASK, "clip.mp4", "32 frames", "batches"):
         assert shown in result.output
     assert (tmp_path / "rewards.png").read_bytes().startswith(PNG)
 
@@ -99,7 +99,7 @@ def test_training_is_reproducible_and_its_result_is_served_as_any_checkpoint(tmp
     for name, array in weights[0].items():
         np.testing.assert_array_equal(array, weights[1][name], err_msg=name)
     written = tmp_path / "first"
-    config = ServeConfig(image_encoder=str(written / "image_encoder"), text_encoder=str(written / "text_encoder"))
+    config = ExportConfig(image_encoder=str(written / "image_encoder"), text_encoder=str(written / "text_encoder"))
     assert rfm_export.export(str(written / "checkpoint"), tmp_path / "model_repository", config) == 1  # verified there
     assert json.loads((written / "training.json").read_text())["steps"] == {"encoder": 2, "frozen": 1, "joint": 1}
 

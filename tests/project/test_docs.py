@@ -13,7 +13,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +23,16 @@ from click import Command, Context, Parameter
 from typer.main import get_command
 
 import clip
+from labelling import LEROBOT
 from paths import ROOT
-from rfm.config import ServeConfig
-from rfm.supervise.installation import find_installation
-from rfm.supervise.process import Endpoints, TritonServer
+from rfm.launch.installation import find_installation
+from rfm.launch.process import Endpoints, TritonServer
 from rfm_client import PreferenceSample, ProgressSample, Trajectory
 from rfm_client.cli.commands import app
 from rfm_client.contract import wire
+from rfm_client.contract.settings import Setting, settings_of
 from rfm_commands.cli import app as rfm
+from rfm_commands.config import FLAT_KEYS, LIFETIMES, SECTIONS
 
 pytestmark = pytest.mark.triton
 
@@ -86,6 +87,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The files that the documentation speaks of."""
     for name in ("film.mp4", "a.mp4", "b.mp4", "success.mp4", "failure.mp4"):
         clip.write(tmp_path / name)
+    shutil.copytree(LEROBOT / "toy_v21", tmp_path / "my_dataset")
     np.savez(tmp_path / "episode.npz", frames=pictures(0), task="stack the cups")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -180,7 +182,8 @@ def test_every_exit_code_is_shown() -> None:
 
 
 def test_every_option_of_the_client_is_shown() -> None:
-    from rfm_client.async_client import CallOptions, ClientOptions
+    from rfm_client.async_client import ClientOptions
+    from rfm_client.call import CallOptions
 
     _, of_clients, of_calls = re.split(
         r"^\| option of a (?:client|call) ", CLIENT_README.read_text(), flags=re.MULTILINE
@@ -266,9 +269,30 @@ def test_the_request_of_the_contract_runs(demo_server: Endpoints) -> None:
     assert outputs["progress"]["shape"] == [2, 3]
 
 
-def test_every_key_of_the_configuration_is_documented() -> None:
-    documented = re.findall(r"`(\w+)`", "".join(re.findall(r"^\|([^|]*)\|", CONFIGURATION.read_text(), re.MULTILINE)))
-    assert [field.name for field in fields(ServeConfig) if documented.count(field.name) != 1] == []
+ROW = re.compile(r"^\| `(\w+)` \| (`(--[\w-]+)`[^|]*)?\| .*\(([^()]*)\) \|$", re.MULTILINE)
+
+
+@pytest.mark.parametrize("section", SECTIONS)
+def test_every_key_is_documented_under_its_lifetime_with_its_option_and_default(section: str) -> None:
+    heading = LIFETIMES[section].capitalize()
+    (text,) = re.findall(rf"^## {heading}\n(.*?)^## ", CONFIGURATION.read_text(), re.MULTILINE | re.DOTALL)
+    assert text.startswith(f"\nKeys of the section `{section}`")
+    documented = [(key, option, default) for key, _, option, default in ROW.findall(text)]
+    assert documented == [
+        (key, each.option if each.has_option else "", shown(each))
+        for key, each in settings_of(SECTIONS[section]).items()
+    ]
+
+
+def shown(setting: Setting) -> str:
+    """A default as the document spells it."""
+    value = setting.default
+    return "null" if value is None else "none" if value == () else f"{value:g}" if type(value) is float else str(value)
+
+
+def test_every_flat_key_of_another_name_is_documented() -> None:
+    renamed = {key: name for key, name in FLAT_KEYS.items() if key != name.partition(".")[2]}
+    assert dict(re.findall(r"^\| `(\w+)` \| `([\w.]+)` \|$", CONFIGURATION.read_text(), re.MULTILINE)) == renamed
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda file: str(file.relative_to(ROOT)))

@@ -44,7 +44,8 @@ MAY_IMPORT = {
     "rfm.rewind": SHARED,
     "rfm.vlm": SHARED,
     "rfm.triton_model": {*SHARED, "rfm.journal", "rfm.parameters", "rfm.probe"},
-    "rfm.supervise": {"rfm.config", "rfm.journal", "rfm.probe", "rfm_client.contract"},
+    "rfm.launch": {"rfm.config", "rfm.journal", "rfm_client.contract"},
+    "rfm.supervise": {"rfm.journal", "rfm.launch", "rfm.probe", "rfm.proc", "rfm_client.contract"},
     "rfm": {"rfm_client.contract"},
     "rfm_export": {"rfm", "rfm_client.contract"},
     "rfm_commands": {"rfm", "rfm_client", "rfm_export", "rfm_gateway"},
@@ -58,12 +59,13 @@ EXCEPTIONS = {
     "examples/demo_training/networks.py": {"rfm"},
     "examples/demo.py": {"rfm", "rfm_commands"},  # starts the server
     "examples/evaluate_demo_checkpoint.py": {"rfm"},
-    "benchmarks/bench.py": {"rfm", "rfm_export"},  # the engine without a server, and what is served
+    "benchmarks/bench.py": {"rfm", "rfm_commands", "rfm_export"},  # the engine without a server, and what is served
+    "benchmarks/accelerator.py": {"rfm", "rfm_export"},
+    "benchmarks/peers/simulated.py": {"rfm"},
     "benchmarks/contestants.py": {"rfm"},
     "benchmarks/forward.py": {"rfm"},
     "benchmarks/perf_analyzer.py": {"rfm"},
     "benchmarks/peers/litserve_server.py": {"rfm"},  # the peers score with our engine, or weights
-    "benchmarks/peers/mosec_server.py": {"rfm"},
     "benchmarks/peers/message.py": {"rfm"},
     "benchmarks/peers/upstream_forward.py": {"rfm"},
 }
@@ -71,13 +73,18 @@ FEWEST_WORDS = 4  # of a docstring
 LIGHT = {"numpy", "tritonclient", "aiohttp", "typing_extensions"}  # the last for type checkers only
 # What only an extra brings, and which files need it.
 EXTRAS = {
-    "av": {"video.py"},
+    "av": {"video.py", "films.py"},
     "async_timeout": {"deadline.py"},  # Python 3.10 only
-    "PIL": {"resize.py"},
+    "PIL": {"resize.py", "lerobot.py"},
     "gymnasium": {"gym.py"},
     "typer": {"cli"},
     "rich": {"cli"},
     "matplotlib": {"cli"},
+    "pyarrow": {"lerobot_rows.py", "parts.py", "sidecars.py", "summary.py"},
+    "fsspec": {"parts.py"},
+    "huggingface_hub": {"opening.py"},
+    "h5py": {"hdf5.py", "hdf5_labels.py"},
+    "ray": {"ray_engine.py"},
     "prometheus_client": {"status.py"},
 }
 
@@ -117,15 +124,28 @@ def test_the_client_needs_only_light_packages() -> None:
         assert tops - sys.stdlib_module_names <= LIGHT | extras | {"rfm_client"}, file
 
 
+def test_no_extra_of_the_client_names_a_distribution_of_ours() -> None:
+    """A package index may give such a name to somebody else. It names itself, which pip has then."""
+    named = re.findall(r'"(rfm-[\w-]*)', (ROOT / "client" / "pyproject.toml").read_text())
+    assert set(named) == {"rfm-client"}
+
+
 def test_scoring_embeddings_needs_no_extra() -> None:
     check = "import sys, rfm.engine; print(sorted({'transformers', 'PIL', 'av', 'matplotlib'} & set(sys.modules)))"
     output = subprocess.run([sys.executable, "-c", check], check=True, capture_output=True, text=True).stdout
     assert output.strip() == "[]"
 
 
+def test_labelling_is_imported_without_an_extra() -> None:
+    extras = {"pyarrow", "fsspec", "h5py", "ray", "huggingface_hub", "av", "PIL", "matplotlib", "rich", "typer"}
+    check = f"import sys, rfm_client.labelling; print(sorted({extras} & set(sys.modules)))"
+    output = subprocess.run([sys.executable, "-c", check], check=True, capture_output=True, text=True).stdout
+    assert output.strip() == "[]"
+
+
 def test_the_domain_knows_nothing_of_triton() -> None:
     for file in (ROOT / "rfm").rglob("*.py"):
-        if not {"supervise", "triton_model"} & set(file.parts):
+        if not {"launch", "supervise", "triton_model"} & set(file.parts):
             assert not [name for name in imports(file) if "triton" in name.replace("rfm_triton", "")], file
 
 
@@ -153,7 +173,10 @@ def test_every_ignored_type_error_has_a_code_and_a_reason(package: str) -> None:
         assert not [ignore for ignore in ignores if not re.match(r"# type: ignore\[[\w,-]+\]  # \w", ignore)], file
 
 
-@pytest.mark.parametrize("package", ["rfm_client", "rfm_client.contract", "rfm_client.gym"])
+@pytest.mark.parametrize(
+    "package",
+    ["rfm_client", "rfm_client.contract", "rfm_client.gym", "rfm_client.labelling", "rfm_client.data.datasets"],
+)
 def test_a_package_exports_all_that_it_imports_for_its_users(package: str) -> None:
     module = importlib.import_module(package)
     assert module.__file__ is not None

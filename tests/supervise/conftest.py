@@ -16,9 +16,9 @@ import rollout
 from administered import KEY, Running
 from commands import EXIT_S, command, wait_for_http
 from engines import serve_config
-from rfm.supervise.installation import find_installation
-from rfm.supervise.process import Endpoints, TritonServer
-from rfm.supervise.tls import GrpcTls
+from rfm.launch.installation import find_installation
+from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.tls import GrpcTls
 from rollout import WITH_ENCODERS
 from secured import (
     PLAIN,

@@ -20,9 +20,9 @@ from tritonclient.utils import InferenceServerException
 from administered import KEY, Running, export_plain
 from commands import EXIT_S, command, wait_for_http
 from paths import ROOT
-from rfm.supervise.admin_key import VARIABLE, AdminKeyError, take_key
-from rfm.supervise.installation import ServerStartError, find_installation
-from rfm.supervise.process import Endpoints, TritonServer
+from rfm.launch.admin_key import VARIABLE, AdminKeyError, take_key
+from rfm.launch.installation import ServerStartError, find_installation
+from rfm.launch.process import Endpoints, TritonServer
 from rfm_client import ProgressSample, RewardClient
 from rfm_client.status import read_status
 from rollout import NAME, RFM

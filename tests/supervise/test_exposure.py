@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 
 from rfm.config import ConfigError, ServeConfig
-from rfm.supervise.cleanup import REGION_PREFIX
-from rfm.supervise.installation import Installation, ServerStartError, find_installation
-from rfm.supervise.listen_address import check_version
-from rfm.supervise.process import Endpoints, TritonServer
-from rfm.supervise.triton_options import MAX_HTTP_BYTES, size_limits
+from rfm.launch.cleanup import REGION_PREFIX
+from rfm.launch.installation import Installation, ServerStartError, find_installation
+from rfm.launch.listen_address import check_version
+from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.triton_options import MAX_HTTP_BYTES, size_limits
 from secured import (
     Papers,
     nothing_left_behind,
@@ -107,7 +107,7 @@ def test_files_of_tls_are_read_before_anything_starts(papers: Papers) -> None:
     assert "expected both or none" in refused_to_serve("--grpc-key", papers.key)
     assert "expected an option that rfm serve leaves open" in refused_to_serve("--", "--grpc-use-ssl=true")
     with pytest.raises(ConfigError, match="grpc_client_ca: expected with grpc_certificate and grpc_key"):
-        ServeConfig(grpc_client_ca=str(papers.ca))
+        ServeConfig(grpc_client_ca=papers.ca)
 
 
 def test_a_triton_that_can_limit_requests_is_told_to(tmp_path: Path) -> None:

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from rfm.journal import SUFFIX, Journal
+from rfm import journal, proc
+from rfm.journal import Journal, journal_file
 from rfm.supervise import model_processes
-from rfm.supervise.model_processes import Stub, StubWatch
+from rfm.supervise.model_processes import ModelProcess, ProcessWatch
 
 TRITON = 10
 MODEL = "rfm"
@@ -45,7 +46,7 @@ class Machine:
         (self.proc / str(pid)).rmdir()
 
     def journal(self, pid: int) -> Journal:
-        return Journal.create(self.memory / f"region_{pid}_{MODEL}{SUFFIX}", 1)
+        return Journal.create(journal_file(f"region_{pid}", MODEL), 1)
 
     def _write(self, pid: int, state: str, started_ticks: int) -> None:
         zeros = " ".join(["0"] * 17)
@@ -55,14 +56,14 @@ class Machine:
 @pytest.fixture
 def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
     machine = Machine(tmp_path)
-    monkeypatch.setattr(model_processes, "_PROC", machine.proc)
-    monkeypatch.setattr(model_processes, "SHARED_MEMORY", machine.memory)
+    monkeypatch.setattr(proc, "_PROC", machine.proc)
+    monkeypatch.setattr(journal, "SHARED_MEMORY", machine.memory)
     monkeypatch.setattr(model_processes, "CONFIRM_S", 0.0)
     return machine
 
 
-def pids(found: list[Stub]) -> list[int]:
-    return sorted(stub.pid for stub in found)
+def pids(found: list[ModelProcess]) -> list[int]:
+    return sorted(process.pid for process in found)
 
 
 def later_s() -> float:
@@ -71,7 +72,7 @@ def later_s() -> float:
 
 
 def test_the_dead_of_a_version_that_is_ready_are_reported_until_they_are_forgotten(machine: Machine) -> None:
-    watch = StubWatch(TRITON, 30.0)
+    watch = ProcessWatch(TRITON, 30.0)
     machine.start(21, 1)
     machine.start(22, 1)
     watch.update({ONE}, set(), later_s())
@@ -86,20 +87,20 @@ def test_the_dead_of_a_version_that_is_ready_are_reported_until_they_are_forgott
 
 def test_a_version_that_loads_is_left_to_triton(machine: Machine) -> None:
     """It may die, and its warm-up may take as long as it takes."""
-    watch = StubWatch(TRITON, 0.0)
+    watch = ProcessWatch(TRITON, 0.0)
     for pid, version in ((21, 1), (31, 2), (32, 2)):
         machine.start(pid, version)
     with machine.journal(21).at_work_on([b"12345678"]), machine.journal(32).at_work_on([b"12345678"]):
         watch.update({ONE}, {TWO}, later_s())
         machine.die(31)
         assert watch.dead() == []
-        assert pids([stub for stub, _ in watch.hung()]) == [21]
+        assert pids([process for process, _ in watch.hung()]) == [21]
         watch.update({ONE, TWO}, set(), later_s())
-        assert pids([stub for stub, _ in watch.hung()]) == [21, 32]
+        assert pids([process for process, _ in watch.hung()]) == [21, 32]
 
 
 def test_of_a_version_that_is_loaded_once_more_the_old_ones_count_until_they_are_gone(machine: Machine) -> None:
-    watch = StubWatch(TRITON, 30.0)
+    watch = ProcessWatch(TRITON, 30.0)
     machine.start(21, 1)
     watch.update({ONE}, set(), later_s())
     machine.start(22, 1)
@@ -114,7 +115,7 @@ def test_of_a_version_that_is_loaded_once_more_the_old_ones_count_until_they_are
 
 
 def test_what_was_started_after_triton_was_asked_is_not_loaded(machine: Machine) -> None:
-    watch = StubWatch(TRITON, 30.0)
+    watch = ProcessWatch(TRITON, 30.0)
     requested_s = time.monotonic() - 5.0
     machine.start(21, 1)
     watch.update({ONE}, set(), requested_s)
@@ -123,7 +124,7 @@ def test_what_was_started_after_triton_was_asked_is_not_loaded(machine: Machine)
 
 
 def test_another_process_of_the_same_id_is_another(machine: Machine) -> None:
-    watch = StubWatch(TRITON, 30.0)
+    watch = ProcessWatch(TRITON, 30.0)
     machine.start(21, 1, started_s=1.0)
     watch.update({ONE}, set(), later_s())
     (old,) = watch.all

@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 
 from clock import Clock
-from rfm.supervise import back_off, model_probe, model_reload, model_watch
-from rfm.supervise.http import Http
+from rfm.launch.http import Http
+from rfm.launch.process import Endpoints
+from rfm.launch.repository_api import ModelVersion, RepositoryApiError
+from rfm.supervise import back_off, background, model_probe, model_reload, model_watch
 from rfm.supervise.model_probe import ModelProbe, can_be_probed
 from rfm.supervise.model_states import Event, State
-from rfm.supervise.model_watch import RETRY_S, ServedModel
-from rfm.supervise.process import Endpoints
-from rfm.supervise.repository_api import ModelVersion, RepositoryApiError
+from rfm.supervise.model_watch import RETRY_S, ModelWatch
 from rfm.supervise.status import NO_REASON, Status
 from rfm_serve import MODEL, wait_for
 
@@ -59,7 +59,7 @@ class Triton:
         self.be(*LOADED)
 
 
-class Stub:
+class Process:
     """A process of the model that ends when it is killed."""
 
     def __init__(self) -> None:
@@ -73,27 +73,26 @@ class Stub:
 class Bench:
     """A model under test: its clock, its Triton, its probe's next answer, and what is known of its processes."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, is_ensemble: bool = False) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, is_probed: bool = True) -> None:
         self.clock, self.triton, self.status = Clock(), Triton(), Status()
         self.said: list[str] = []
-        self.stubs: list[Stub] = []
-        self.forgotten: list[Stub] = []
+        self.processes: list[Process] = []
+        self.forgotten: list[Process] = []
         self.probed: Event | None = None
         self.is_getting_on = False
         self.renewed = 0
         for module in (back_off, model_watch, model_reload):
             monkeypatch.setattr(module, "time", self.clock)
-        monkeypatch.setattr(model_reload, "RepositoryApi", lambda *_: self.triton)
-        monkeypatch.setattr(model_watch, "in_background", at_once)
+        monkeypatch.setattr(background, "in_background", at_once)
         probe = SimpleNamespace(look=lambda: self.probed, renew=self.renew)
-        watch = SimpleNamespace(
-            of_model=lambda _: list(self.stubs),
+        processes = SimpleNamespace(
+            of_model=lambda _: list(self.processes),
             forget=self.forgotten.extend,
             is_getting_on=lambda _: self.is_getting_on,
         )
-        server = SimpleNamespace(endpoints=Endpoints.free(), admin_key="", grpc_options={})
-        given = None if is_ensemble else probe
-        self.model = ServedModel(MODEL, given, server, watch, self.status, self.said.append)  # type: ignore[arg-type]
+        server = SimpleNamespace(repository_api=lambda: self.triton)
+        given = probe if is_probed else None
+        self.model = ModelWatch(MODEL, given, server, processes, self.status, self.said.append)  # type: ignore[arg-type]
 
     def renew(self) -> None:
         self.renewed += 1
@@ -118,7 +117,7 @@ def at_once(_: str, call: Callable[[], None]) -> Future[None]:
     future: Future[None] = Future()
     try:
         future.set_result(call())
-    except RepositoryApiError as error:
+    except (RepositoryApiError, LookupError) as error:
         future.set_exception(error)
     return future
 
@@ -157,16 +156,16 @@ def test_who_works_on_a_batch_that_gets_on_is_ready(bench: Bench, probed: Event)
 @pytest.mark.parametrize("fault", [Event.HUNG, Event.DEAD, Event.BROKEN])
 def test_a_fault_is_healed_at_once(bench: Bench, fault: Event) -> None:
     bench.look(Event.ANSWERED)
-    bench.stubs = [Stub()]
+    bench.processes = [Process()]
     assert bench.look(fault) == fault.value
     assert (bench.model.is_healing, bench.model.reason, bench.is_probe_ok) == (True, "it is loaded anew", False)
     assert bench.triton.asked == ["unload", "load 1"]
     assert bench.look(fault) is None  # of the old processes
-    assert (bench.model.state, bench.forgotten, bench.renewed) == (State.NEW, bench.stubs, 1)
-    assert [stub.is_alive for stub in bench.stubs] == [False]
+    assert (bench.model.state, bench.forgotten, bench.renewed) == (State.NEW, bench.processes, 1)
+    assert [process.is_alive for process in bench.processes] == [False]
     assert bench.clock.now_s == pytest.approx(2.0)  # they had this time
     # What a process worked on is to blame if it hung, and not if it was killed for another's fault.
-    assert bench.stubs[0].is_blamed is (fault is Event.HUNG)
+    assert bench.processes[0].is_blamed is (fault is Event.HUNG)
 
 
 def test_a_process_that_has_died_says_how(bench: Bench) -> None:
@@ -174,10 +173,10 @@ def test_a_process_that_has_died_says_how(bench: Bench) -> None:
 
 
 def test_processes_that_have_ended_are_not_waited_for(bench: Bench) -> None:
-    bench.stubs = [Stub()]
-    bench.stubs[0].kill()
+    bench.processes = [Process()]
+    bench.processes[0].kill()
     bench.look(died="its process is dead")
-    assert (bench.clock.now_s, bench.stubs[0].is_blamed) == (0.0, True)
+    assert (bench.clock.now_s, bench.processes[0].is_blamed) == (0.0, True)
 
 
 def test_what_fails_is_tried_again_after_longer_and_longer_pauses_and_then_seldom(bench: Bench) -> None:
@@ -274,7 +273,7 @@ def test_a_model_is_restored_into_a_new_triton(bench: Bench) -> None:
 
 
 def test_an_ensemble_is_restored_once_and_ready_when_triton_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    bench = Bench(monkeypatch, is_ensemble=True)
+    bench = Bench(monkeypatch, is_probed=False)
     bench.triton.be(*UNLOADED)
     assert bench.look() is None
     assert bench.model.state is State.WAITING
@@ -294,6 +293,7 @@ class Answers:
     def __init__(self) -> None:
         self.next: tuple[int, str] | None = (200, "{}")
         self.success: list[dict[str, int]] | None = [{}]
+        self.error: Exception = TimeoutError()  # instead of an answer
         self.sent: list[bytes] = []
         self.timeouts_s: set[float] = set()
         self.got: list[str] = []
@@ -302,14 +302,14 @@ class Answers:
         self.sent.append(body)
         self.timeouts_s.add(timeout_s)
         if self.next is None:
-            raise TimeoutError
+            raise self.error
         return self.next
 
     def get_json(self, path: str) -> Any:
         self.got.append(path.rpartition("/")[2])
         if path.endswith("/stats"):
             if self.success is None:
-                raise TimeoutError
+                raise self.error
             return {"model_stats": [{"inference_stats": {"success": success}} for success in self.success]}
         inputs = [{"name": "num_frames", "dims": [2]}, {"name": "task", "dims": [1]}]
         return {"input": inputs, "output": [{"name": "progress"}, {"name": "success"}]}
@@ -323,7 +323,7 @@ class Prober:
         self.clock.now_s = 100.0
         self.observed: list[float] = []
         monkeypatch.setattr(model_probe, "time", self.clock)
-        monkeypatch.setattr(model_probe, "in_background", self.at_once)
+        monkeypatch.setattr(background, "in_background", self.at_once)
         self.has_stats = True  # else that they never come
         self.probe = ModelProbe(self.http, MODEL, 2.0, 30.0, self.observed.append)  # type: ignore[arg-type]
 
@@ -333,7 +333,7 @@ class Prober:
             return future
         try:
             future.set_result(call())
-        except TimeoutError as error:
+        except (TimeoutError, TypeError) as error:
             future.set_exception(error)
         return future
 
@@ -467,6 +467,41 @@ def test_who_was_slow_of_late_may_be_three_times_as_slow(prober: Prober, num_fas
     prober.after(10.0)
     assert prober.after(2.9) is (Event.ANSWERED if num_fast == 19 else Event.LATE)  # the 20 last answers count
     assert prober.after(0.11) is Event.LATE
+
+
+def test_what_no_probe_should_end_with_is_logged_once_and_counts_as_no_answer(
+    prober: Prober, caplog: pytest.LogCaptureFixture
+) -> None:
+    def after(duration_s: float) -> list[str]:
+        """What was logged since then."""
+        caplog.clear()
+        prober.after(duration_s)
+        assert all(record.exc_info is not None for record in caplog.records)
+        return caplog.messages
+
+    prober.http.next = prober.http.success = None
+    assert after(0.0) + after(2.0) == []  # no answer in time
+    prober.http.error = TypeError("a mistake of ours")
+    assert after(2.0) == [f"rfm-{what}-{MODEL}: an unexpected error" for what in ("probe", "stats")]
+    assert "TypeError: a mistake of ours" in caplog.text
+    assert after(2.0) == []
+    assert prober.after(0.0) is Event.LATE
+    prober.http.next, prober.http.success = (200, "{}"), [{}]
+    assert after(2.0) == []
+    prober.http.next = None
+    assert after(2.0) == [f"rfm-probe-{MODEL}: an unexpected error"]
+
+
+def test_a_load_that_fails_unexpectedly_is_logged(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    bench.triton.while_loading = lambda: [].pop()
+    bench.look(died="its process is dead")
+    bench.wait(0.0)
+    assert caplog.messages == [f"rfm-heal-{MODEL}: an unexpected error"]
+    assert bench.model.reason == "it is loaded anew, after: pop from empty list"
+    bench.triton.while_loading = damaged
+    bench.wait(0.5)
+    assert bench.model.reason == "it is loaded anew, after: the weights are damaged"
+    assert len(caplog.messages) == 1
 
 
 @pytest.mark.parametrize(

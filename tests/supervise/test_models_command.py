@@ -20,7 +20,7 @@ import rollout
 from administered import KEY, PLAIN, Running, export_plain
 from engines import load_engine
 from rfm.engine import Engine
-from rfm.supervise.repository_api import RepositoryApi, RepositoryApiError
+from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
 from rfm_client import ModelNotFoundError, ProgressSample, RewardClient, ServerError
 from rfm_commands import rollout as rfm_rollout
 from rfm_commands.rollout import Rollout, RolloutError

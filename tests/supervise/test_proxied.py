@@ -20,8 +20,8 @@ import httpx
 import pytest
 
 from commands import EXIT_S
-from rfm.supervise.process import Endpoints
-from rfm.supervise.triton_options import MAX_HTTP_BYTES
+from rfm.launch.process import Endpoints
+from rfm.launch.triton_options import MAX_HTTP_BYTES
 from rfm_client import AccessDeniedError, ServerUnavailableError
 from rfm_client.status import read_status
 from rfm_client.transport.access import Access

@@ -18,10 +18,10 @@ import pytest
 
 import clip
 from commands import EXIT_S, REPOSITORY, RFM, command, nothing_left_behind, wait_for_http
-from rfm.journal import is_alive
-from rfm.supervise import installation
-from rfm.supervise.installation import ServerStartError, find_installation
-from rfm.supervise.process import Endpoints, TritonServer
+from rfm.launch import installation
+from rfm.launch.installation import ServerStartError, find_installation
+from rfm.launch.process import Endpoints, TritonServer
+from rfm.proc import is_alive
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_serve import children, serving, wait_for
 
@@ -105,7 +105,7 @@ def test_neither_triton_nor_a_model_process_has_a_key_in_its_environment(
     with serving(repository, f"--gateway-port={Endpoints.free().http_port}") as served:
         served.wait_ready()
         (gateway,) = [pid for pid in children(served.process.pid, ".") if pid != served.triton]
-        for pid in (served.triton, *(stub.pid for stub in served.stubs)):
+        for pid in (served.triton, *(process.pid for process in served.model_processes)):
             assert not [word for word in environment(pid) if "a-secret-of-" in word]
         assert [word for word in environment(gateway) if "a-secret-of-" in word] == [
             f"RFM_GATEWAY_API_KEY={keys['RFM_GATEWAY_API_KEY']}"

@@ -11,8 +11,8 @@ from contextlib import ExitStack, closing
 import httpx
 import pytest
 
+from rfm.launch.process import Endpoints
 from rfm.supervise import status
-from rfm.supervise.process import Endpoints
 from rfm.supervise.status import MOST_CONNECTIONS, NO_REASON, Status, StatusServer
 from rfm_serve import wait_for
 

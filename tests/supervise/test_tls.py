@@ -19,9 +19,9 @@ import rfm_export
 from commands import EXIT_S, REPOSITORY, command, wait_for_http
 from engines import serve_config
 from repositories import kill_model
-from rfm.supervise.installation import find_installation
-from rfm.supervise.process import Endpoints, TritonServer
-from rfm.supervise.tls import GrpcTls, OwnTls
+from rfm.launch.installation import find_installation
+from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.tls import GrpcTls, OwnTls
 from rfm_client import ServerUnavailableError
 from rfm_client.status import read_status
 from rfm_client.transport.access import Access

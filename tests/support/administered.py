@@ -9,7 +9,7 @@ from pathlib import Path
 import goldens
 import rfm_export
 from engines import serve_config
-from rfm.supervise.process import Endpoints
+from rfm.launch.process import Endpoints
 from rfm_client import RewardClient
 from rfm_export.publish import read_config
 from rollout import models

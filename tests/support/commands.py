@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from paths import ROOT
-from rfm.journal import is_alive
-from rfm.supervise.cleanup import REGION_PREFIX
-from rfm.supervise.model_processes import SHARED_MEMORY
-from rfm.supervise.process import Endpoints
+from rfm.journal import SHARED_MEMORY
+from rfm.launch.cleanup import REGION_PREFIX
+from rfm.launch.process import Endpoints
+from rfm.proc import is_alive
 from rfm_client import RewardClient
 
 REPOSITORY = ROOT / "model_repository"

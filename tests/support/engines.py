@@ -7,14 +7,14 @@ import functools
 
 import goldens
 from rfm import families
-from rfm.config import ServeConfig
+from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.rewind.predictor import RewindPredictor
 
 
-def serve_config(config: goldens.Config, name: str = "rfm") -> ServeConfig:
+def serve_config(config: goldens.Config, name: str = "rfm") -> ExportConfig:
     """How the tests export a reference checkpoint."""
-    return ServeConfig(
+    return ExportConfig(
         name=name,
         num_gpus=0,
         torch_threads=1,

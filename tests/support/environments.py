@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from concurrent.futures import Future
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -71,13 +72,23 @@ def cart_pole_with_pixels() -> gym.Env[Any, Any]:
     return AddRenderObservation(cart_pole(), render_only=False, render_key="pixels", obs_key="state")
 
 
-def scores(client: RewardClient, film: Film, step: int, max_frames: int = MAX_FRAMES) -> ProgressResult:
-    """Of the frames up to a step, or as many of them as may be sent."""
-    picked = np.linspace(0, step, min(step + 1, max_frames)).astype(int)
-    return client.progress(Trajectory(frames=np.stack([film[index] for index in picked]), task=TASK))
+def scores(client: RewardClient, film: Film, step: int, max_frames: int | None = MAX_FRAMES) -> ProgressResult:
+    """Of the frames up to a step as upstream's RL loop sends them, cut or padded to ``max_frames``; None: all frames.
+
+    Without the padded slots but the last, which is the newest frame's.
+    """
+    slots = step + 1 if max_frames is None else max_frames
+    count = min(step + 1, slots)
+    picked = np.rint(np.linspace(0, step, count)).astype(int)
+    padded = [*picked, *[step] * (slots - count)]
+    result = client.progress(Trajectory(frames=np.stack([film[index] for index in padded]), task=TASK))
+    shown = [*range(count - 1), slots - 1]
+    return replace(result, progress=result.progress[shown], success=result.success[shown])
 
 
-def progress(client: RewardClient, film: Film, steps: Sequence[int], max_frames: int = MAX_FRAMES) -> list[float]:
+def progress(
+    client: RewardClient, film: Film, steps: Sequence[int], max_frames: int | None = MAX_FRAMES
+) -> list[float]:
     return [float(scores(client, film, step, max_frames).progress[-1]) for step in steps]
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import tritonclient.grpc
 
-from rfm.supervise.process import Endpoints
+from rfm.launch.process import Endpoints
 from rfm_client import (
     Trajectory,
 )

@@ -10,7 +10,7 @@ import re
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -20,8 +20,7 @@ import pytest
 import requests
 
 from gateways import Gateway, running
-from rfm.rewind.network import RewindConfig
-from rfm.supervise.process import Endpoints
+from rfm.launch.process import Endpoints
 from rfm_client import (
     PreferenceSample,
     ProgressSample,
@@ -30,6 +29,7 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
+from small_network import SMALL
 
 Json: TypeAlias = dict[str, Any]
 
@@ -43,18 +43,10 @@ Ask: TypeAlias = Callable[..., requests.Response]
 TINY, FILM, VIDEO = "rfm", "film", "film_video"  # models: two numbers a frame; encoders; vision-language in video mode
 
 
-TINY_CONFIG = RewindConfig(
-    video_feature_dim=2,
-    text_feature_dim=2,
-    hidden_dim=8,
-    num_layers=1,
-    num_attention_heads=2,
-    max_len=16,
-    causal_mask=True,
-    use_per_frame_progress_token=True,
+TINY_CONFIG = replace(
+    SMALL, video_feature_dim=2, text_feature_dim=2, hidden_dim=8, num_layers=1, num_attention_heads=2, max_len=16,
     progress_bins=10,
-    has_similarity=True,
-)
+)  # fmt: skip
 
 
 FILM_DIMS = (48, 32)  # widths D and Dt of FILM's encoders

@@ -17,7 +17,7 @@ from pathlib import Path
 import requests
 from prometheus_client.parser import text_string_to_metric_families
 
-from rfm.supervise.process import Endpoints
+from rfm.launch.process import Endpoints
 from rfm_client import (
     RewardClient,
 )

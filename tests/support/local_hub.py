@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A Hugging Face Hub of one repository on the loopback, for the real ``huggingface_hub`` (``HF_ENDPOINT``)."""
+"""A Hugging Face Hub on the loopback, for the real ``huggingface_hub`` (``HF_ENDPOINT``)."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
-REPOSITORY = "org/name"
-
 
 def commit_of(revision: str) -> str:
     """Forty digits, as git names commits."""
@@ -20,9 +18,11 @@ def commit_of(revision: str) -> str:
 
 
 @contextmanager
-def hub(revisions: Mapping[str, Path]) -> Iterator[str]:
-    """Serves REPOSITORY with the files of a folder at each revision; all but main are tags. Gives the endpoint."""
-    folders = {**revisions, **{commit_of(name): folder for name, folder in revisions.items()}}
+def hub(repositories: Mapping[str, Mapping[str, Path]], kind: str = "models") -> Iterator[str]:
+    """Serves repositories by id (``org/name``), each with the files of a folder at each revision. Gives the endpoint.
+
+    kind: ``models`` or ``datasets``. All revisions but main are tags
+    """
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -32,7 +32,12 @@ def hub(revisions: Mapping[str, Path]) -> Iterator[str]:
             self._answer(with_body=False)
 
         def _answer(self, *, with_body: bool) -> None:
-            api, files = f"/api/models/{REPOSITORY}", f"/{REPOSITORY}/resolve/"
+            place = "" if kind == "models" else f"/{kind}"
+            words = self.path.removeprefix(f"/api/{kind}" if self.path.startswith("/api/") else place).split("/")
+            repository = "/".join(words[1:3])
+            revisions = repositories[repository]
+            folders = {**revisions, **{commit_of(name): folder for name, folder in revisions.items()}}
+            api, files = f"/api/{kind}/{repository}", f"{place}/{repository}/resolve/"
             if self.path == f"{api}/refs":
                 tags = [
                     {"name": name, "ref": f"refs/tags/{name}", "targetCommit": commit_of(name)}
@@ -42,8 +47,10 @@ def hub(revisions: Mapping[str, Path]) -> Iterator[str]:
                 self._send(200, json.dumps({"branches": [], "converts": [], "tags": tags}).encode(), with_body)
             elif self.path == api or self.path.startswith(f"{api}/revision/"):
                 revision = self.path.removeprefix(f"{api}/revision/") if self.path != api else "main"
-                siblings = [{"rfilename": file.name} for file in sorted(folders[revision].iterdir())]
-                told = {"id": REPOSITORY, "sha": self._commit(revision), "siblings": siblings}
+                folder = folders[revision]
+                names = [str(file.relative_to(folder)) for file in sorted(folder.rglob("*")) if file.is_file()]
+                siblings = [{"rfilename": name} for name in names]
+                told = {"id": repository, "sha": _commit(revisions, revision), "siblings": siblings}
                 self._send(200, json.dumps(told).encode(), with_body)
             else:
                 revision, _, name = self.path.removeprefix(files).partition("/")
@@ -53,10 +60,7 @@ def hub(revisions: Mapping[str, Path]) -> Iterator[str]:
                     return
                 content = file.read_bytes()
                 etag = f'"{hashlib.sha1(content).hexdigest()}"'
-                self._send(200, content, with_body, {"ETag": etag, "X-Repo-Commit": self._commit(revision)})
-
-        def _commit(self, revision: str) -> str:
-            return commit_of(revision) if revision in revisions else revision
+                self._send(200, content, with_body, {"ETag": etag, "X-Repo-Commit": _commit(revisions, revision)})
 
         def _send(self, status: int, body: bytes, with_body: bool, headers: Mapping[str, str] | None = None) -> None:
             self.send_response(status)
@@ -79,3 +83,8 @@ def hub(revisions: Mapping[str, Path]) -> Iterator[str]:
         server.shutdown()
         thread.join()
         server.server_close()
+
+
+def _commit(revisions: Mapping[str, Path], revision: str) -> str:
+    """The commit of a revision, which may be one."""
+    return commit_of(revision) if revision in revisions else revision

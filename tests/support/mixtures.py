@@ -3,13 +3,19 @@
 
 from __future__ import annotations
 
+import re
+import time
 from collections.abc import Callable
 
+import httpx
 import numpy as np
 import tritonclient.grpc
+from prometheus_client.parser import text_string_to_metric_families
 
 import goldens
 from reference_server import Served
+from rfm.journal import SHARED_MEMORY, Journal
+from rfm.launch.cleanup import REGION_PREFIX
 from rfm_client import (
     PreferenceSample,
     ProgressSample,
@@ -17,9 +23,11 @@ from rfm_client import (
     Sample,
     SimilaritySample,
 )
+from rfm_serve import wait_for
 from trajectories import random_trajectory
 
 TOLERANCE = 1e-5
+TOLD_S = 1.0  # for a model to tell Triton what it has counted
 MODEL = "c1_t1_disc10"  # tokens, so T <= 16; discrete; all heads
 
 
@@ -47,10 +55,25 @@ def plug() -> list[Sample]:
 
 
 def counts(served: Served, model: str) -> tuple[int, int]:
-    """Requests and executions so far."""
+    """Requests answered well, and executions of the model's pipeline, so far. Triton's own count is of its calls."""
+    time.sleep(TOLD_S)
     with tritonclient.grpc.InferenceServerClient(served.url("grpc").removeprefix("grpc://")) as client:
         stats = client.get_inference_statistics(model).model_stats[0]
-    return stats.inference_stats.success.count, stats.execution_count
+    families = text_string_to_metric_families(httpx.get(served.endpoints.metrics_url).text)
+    samples = (sample for family in families for sample in family.samples)
+    of_model = (s.value for s in samples if s.name == "rfm_batch_samples_count" and s.labels["model"] == model)
+    return stats.inference_stats.success.count, int(sum(of_model))
+
+
+def wait_until_at_work(model: str) -> None:
+    """Returns when a process of the model works on a request."""
+    name = re.compile(rf"{REGION_PREFIX}_\d+_[0-9a-f]+_[^_]+_{model}_batch")
+
+    def is_at_work() -> bool:
+        files = (file for file in SHARED_MEMORY.iterdir() if name.fullmatch(file.name))
+        return any(journal.busy_s > 0 for file in files if (journal := Journal.open(file)) is not None)
+
+    wait_for(is_at_work)
 
 
 def assert_same(left: object, right: object) -> None:

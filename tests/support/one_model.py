@@ -9,8 +9,8 @@ from pathlib import Path
 
 import tritonclient.grpc
 
-from rfm.supervise.installation import find_installation
-from rfm.supervise.process import Endpoints, TritonServer
+from rfm.launch.installation import find_installation
+from rfm.launch.process import Endpoints, TritonServer
 
 
 class OneModelServer(TritonServer):

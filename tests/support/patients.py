@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 import threading
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 
 from paths import ROOT
+from repositories import configure
 from rfm_client import (
     ProgressSample,
     RewardClient,
@@ -37,7 +37,7 @@ _answer = TritonPythonModel.answer
 def deadly(self, questions, execution):
     import os
 
-    marked = [q for q in questions if q.trajectories[0].text_embedding[0] == {MARK}]
+    marked = [q for q in questions if q.sample.trajectories[0].text_embedding[0] == {MARK}]
     if marked:
         os._exit(1)
     return _answer(self, questions, execution)
@@ -48,22 +48,14 @@ TritonPythonModel.answer = deadly
 
 
 def make_repository(
-    folder: Path, *, more_code: str = "", instances: int = 1, batch_size: int = 64, queue: str = ""
+    folder: Path, *, more_code: str = "", instances: int = 1, batch_size: int = 64, **settings: int
 ) -> Path:
-    """The demo's ``rfm`` on one thread, changed as a test needs it."""
+    """The demo's ``rfm`` on one thread, changed as a test needs it; ``settings``: such as ``max_queue_size``."""
     repository = folder / "model_repository"
     shutil.copytree(ROOT / "model_repository" / MODEL, repository / MODEL, ignore=shutil.ignore_patterns("__pycache__"))
     model = repository / MODEL / "1" / "model.py"
     model.write_text(model.read_text() + more_code)
-    config = repository / MODEL / "config.pbtxt"
-    text = config.read_text()
-    changes = {r"count: \d+": f"count: {instances}", r'("torch_threads"\s+value {\s+string_value: )"\d+"': r'\1"1"'}
-    changes |= {r"max_batch_size: \d+": f"max_batch_size: {batch_size}"}
-    changes |= {r"dynamic_batching {\n}": f"dynamic_batching {{ default_queue_policy {{ {queue} }} }}"} if queue else {}
-    for pattern, wanted in changes.items():
-        text, count = re.subn(pattern, wanted, text)
-        assert count == 1, pattern
-    config.write_text(text)
+    configure(repository / MODEL, instances=instances, batch_size=batch_size, torch_threads=1, **settings)
     return repository
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from rfm.supervise.process import Endpoints
+from rfm.launch.process import Endpoints
 from rfm_client import RewardClient
 
 

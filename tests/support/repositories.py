@@ -25,6 +25,26 @@ def forget_input(repository: Path, model: str, name: str) -> None:
     file.write_text(render(config))
 
 
+def configure(model: Path, *, instances: int = 1, batch_size: int = 64, **parameters: int) -> None:
+    """Changes an exported model's configuration: one instance, or ``instances``, whose queue Triton does not bound."""
+    file = model / CONFIG_FILE
+    config = parse(file.read_text())
+    config.instance_group[0].count, config.max_batch_size = instances, batch_size
+    config.dynamic_batching.ClearField("default_queue_policy")
+    for name, value in parameters.items():
+        assert name in config.parameters
+        config.parameters[name].string_value = str(value)
+    file.write_text(render(config))
+
+
+def bound_triton_s_queue(model: Path, size: int) -> None:
+    """Changes an exported model's configuration: Triton lets so many requests wait, as for several instances."""
+    file = model / CONFIG_FILE
+    config = parse(file.read_text())
+    config.dynamic_batching.default_queue_policy.max_queue_size = size
+    file.write_text(render(config))
+
+
 def kill_model(repository: Path, model: str = "rfm") -> None:
     """Kills each process of a model that a server of ``repository`` runs."""
     model_file = f"{repository}/{model}/1/model.py"

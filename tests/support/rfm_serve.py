@@ -16,8 +16,9 @@ from typing import Any
 import httpx
 from prometheus_client.parser import text_string_to_metric_families
 
-from rfm.supervise.model_processes import SHARED_MEMORY, Stub, StubWatch
-from rfm.supervise.process import Endpoints
+from rfm.journal import SHARED_MEMORY
+from rfm.launch.process import Endpoints
+from rfm.supervise.model_processes import ModelProcess, ProcessWatch
 from rfm_client import RewardClient
 
 RFM = Path(sys.executable).parent / "rfm"
@@ -69,11 +70,11 @@ class Serving:
         return pid
 
     @property
-    def stubs(self) -> list[Stub]:
-        return self.stubs_of(MODEL)
+    def model_processes(self) -> list[ModelProcess]:
+        return self.model_processes_of(MODEL)
 
-    def stubs_of(self, model: str) -> list[Stub]:
-        return [stub for stub in StubWatch(self.triton, PATIENCE_S).of_model(model) if stub.is_alive]
+    def model_processes_of(self, model: str) -> list[ModelProcess]:
+        return [process for process in ProcessWatch(self.triton, PATIENCE_S).of_model(model) if process.is_alive]
 
     def reasons(self) -> dict[str, str]:
         """Why models are not ready, of all that it knows; empty: they are."""

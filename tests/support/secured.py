@@ -18,8 +18,8 @@ import pytest
 import goldens
 from commands import EXIT_S, REPOSITORY, command, regions
 from engines import load_engine
-from rfm.supervise.cleanup import REGION_PREFIX
-from rfm.supervise.process import Endpoints, TritonServer
+from rfm.launch.cleanup import REGION_PREFIX
+from rfm.launch.process import Endpoints, TritonServer
 from rfm_client import AccessDeniedError, ProgressSample, RewardClient
 from trajectories import random_trajectory
 

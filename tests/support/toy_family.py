@@ -69,14 +69,14 @@ class Palette:
     def to(self, device: torch.device) -> Palette:
         return Palette(self.scale.to(device))
 
-    def encode(self, samples: Sequence[Footage], execution: Execution) -> list[Trajectory | RewardError]:
+    def encode(self, samples: Sequence[Footage], execution: Execution) -> list[Footage | RewardError]:
         return [self._encoded(sample) for sample in samples]
 
-    def _encoded(self, sample: Footage) -> Trajectory:
-        colours = np.concatenate([each.positions.mean(axis=(1, 2)) for each in sample.trajectories])
+    def _encoded(self, sample: Footage) -> Footage:
         letters = np.full(1, len(sample.trajectories[0].task), np.float32)
-        embeddings = self.scale.cpu().numpy() * colours.astype(np.float32)
-        return Trajectory(video_embeddings=embeddings, text_embedding=letters)
+        colours = [each.positions.mean(axis=(1, 2)).astype(np.float32) for each in sample.trajectories]
+        videos = [self.scale.cpu().numpy() * colour for colour in colours]
+        return Footage(tuple(Trajectory(video_embeddings=video, text_embedding=letters) for video in videos))
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,7 @@ class ToyPredictor:
     """A row is the embeddings of a sample's trajectories."""
 
     network: Redness
+    works_ahead: bool = False
 
     def rows(self, sample: Sample) -> list[list[np.ndarray]]:
         if isinstance(sample, SimilaritySample):
@@ -95,6 +96,9 @@ class ToyPredictor:
 
     def num_tokens(self, row: list[np.ndarray]) -> int:
         return sum(map(len, row))
+
+    def work_ahead(self, rows: Sequence[list[np.ndarray]]) -> None:
+        pass
 
     def collate(self, rows: Sequence[list[np.ndarray]]) -> Tensor:
         return torch.from_numpy(np.concatenate([video for row in rows for video in row]))

@@ -3,15 +3,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 
 import goldens
 from engines import load_engine
 from rfm import families
 from rfm.vlm.checkpoint import VlmCheckpoint
+from rfm.vlm.collator import QwenCollator, VlmRow
 from rfm.vlm.predictor import VlmPredictor
+from rfm.vlm.vision import UNIT
 from rfm_client import (
     Trajectory,
 )
@@ -49,3 +53,22 @@ def load(name: str, folder: Path | None = None, base: str | None = None) -> VlmC
     checkpoint = families.load(folder or config.checkpoint, base_model=base or str(config.base_model))
     assert isinstance(checkpoint, VlmCheckpoint)
     return checkpoint
+
+
+def upstream_inputs(predictor: VlmPredictor, rows: Sequence[VlmRow]) -> dict[str, torch.Tensor]:
+    """The arguments that upstream gives to the backbone: each shot as often, and in the order, as it is shown."""
+    batch = predictor.collate(rows).to(torch.device("cpu"), torch.float32)
+    if not isinstance(predictor.collator, QwenCollator):
+        return batch.inputs
+    mask = torch.zeros_like(batch.inputs["input_ids"])
+    for index, row in enumerate(rows):
+        mask[index, : row.num_tokens] = 1
+    merged = batch.inputs["pixel_values"].unflatten(0, (-1, UNIT))
+    pixels = merged[batch.inputs["visual_features"]].flatten(0, 1)
+    inputs = {"input_ids": batch.inputs["input_ids"], "attention_mask": mask}
+    grids = [predictor.collator.grid(film) for row in rows for film in row.films]
+    if not predictor.network.config.multi_image:
+        grid = torch.tensor([[each.groups, each.rows, each.columns] for each in grids])
+        return inputs | {"pixel_values_videos": pixels, "video_grid_thw": grid}
+    grid = torch.tensor([[1, each.rows, each.columns] for each in grids for _ in range(each.groups)])
+    return inputs | {"pixel_values": pixels, "image_grid_thw": grid}

@@ -17,8 +17,8 @@ from engines import load_engine, serve_config
 from mixtures import FRAMES_MODEL, assert_same, counts
 from reference_server import Served
 from repositories import forget_input
-from rfm.supervise.installation import find_installation
-from rfm.supervise.process import Endpoints, TritonServer
+from rfm.launch.installation import find_installation
+from rfm.launch.process import Endpoints, TritonServer
 from rfm_client import (
     InvalidSampleError,
     ModelNotFoundError,

@@ -27,8 +27,8 @@ from engines import serve_config
 from gateways import Gateway
 from gateways import running as running_gateway
 from paths import ROOT
-from rfm.supervise.installation import find_installation
-from rfm.supervise.process import Endpoints, TritonServer
+from rfm.launch.installation import find_installation
+from rfm.launch.process import Endpoints, TritonServer
 from rfm_client import (
     DeadlineExceededError,
     InferenceFailedError,
@@ -41,6 +41,7 @@ from rfm_client import (
 )
 from rfm_client.contract import wire
 from rfm_client.contract.names import PROBE_PREFIX
+from rfm_serve import wait_for
 from trajectories import random_trajectory
 
 pytestmark = pytest.mark.triton
@@ -57,7 +58,7 @@ FAULTY = f"""
 
 class TritonPythonModel(TritonPythonModel):
     def answer(self, questions, execution):
-        if any(getattr(question, "frame_steps", 0) == {FAILING_STEPS} for question in questions):
+        if any(getattr(question.sample, "frame_steps", 0) == {FAILING_STEPS} for question in questions):
             raise ZeroDivisionError("a fault of the model's")
         return super().answer(questions, execution)
 """
@@ -85,8 +86,13 @@ class Running:
         return found
 
     def said_of(self, request_id: str) -> tuple[str, dict[str, Any]]:
-        """The one line about a request."""
-        (line,) = (line for line in self.lines() if line[1].get("request_id") == request_id)
+        """The one line about a request. Triton may write it a moment after it has answered."""
+
+        def found() -> list[tuple[str, dict[str, Any]]]:
+            return [line for line in self.lines() if line[1].get("request_id") == request_id]
+
+        wait_for(lambda: bool(found()), 10.0)
+        (line,) = found()
         return line
 
 

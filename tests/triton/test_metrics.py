@@ -21,9 +21,9 @@ import goldens
 import rfm_export
 from engines import load_engine, serve_config
 from rfm.execution import Execution
-from rfm.supervise.installation import find_installation
-from rfm.supervise.process import Endpoints, TritonServer
-from rfm.supervise.repository_api import RepositoryApi
+from rfm.launch.installation import find_installation
+from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.repository_api import RepositoryApi
 from rfm.triton_model.metrics import BUCKETS_S, PADDING_BUCKETS, SAMPLES_BUCKETS
 from rfm.triton_model.request import OUTCOMES, UNKNOWN_TYPE
 from rfm_client import (
@@ -54,6 +54,7 @@ TYPES = ("progress", "preference", "similarity")
 HISTOGRAMS = {
     "batch_samples": SAMPLES_BUCKETS,
     "batch_padding_ratio": PADDING_BUCKETS,
+    "wait_seconds": BUCKETS_S,
     "collate_seconds": BUCKETS_S,
     "forward_seconds": BUCKETS_S,
 }
@@ -120,17 +121,16 @@ import time
 
 
 class TritonPythonModel(TritonPythonModel):
-    def _serve(self, batch, execution):
+    def _answer_together(self, batch, execution):
         ends_s = time.monotonic() + {PATIENCE_S}
         for request in batch:
             if request.request_id.startswith("{UNTIL_CANCELLED}"):
-                while not request.inference.is_cancelled() and time.monotonic() < ends_s:
+                while not request.is_cancelled() and time.monotonic() < ends_s:
                     time.sleep(0.01)
                 self._cancellation.answer_s = 1.0
-        responses = super()._serve(batch, execution)
+        super()._answer_together(batch, execution)
         if any(request.request_id.startswith("{TO_FAIL}") for request in batch):
             raise ZeroDivisionError("a fault of the model's")
-        return responses
 """
 
 

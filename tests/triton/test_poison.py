@@ -6,10 +6,12 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import time
+from collections import Counter
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,20 +24,18 @@ import rfm.journal
 import rfm_export
 from engines import load_engine, serve_config
 from rfm.execution import Execution
-from rfm.journal import Journal
+from rfm.journal import Journal, journal_file, journal_files
 from rfm.probe import blank_question
 from rfm.supervise.status import NO_REASON
+from rfm.triton_model import quarantine
 from rfm.triton_model.batch_model import BatchModel
-from rfm.triton_model.cancellation import Cancellation
 from rfm.triton_model.metrics import Counted
-from rfm.triton_model.quarantine import Quarantine, journals
-from rfm.triton_model.request import Origins
+from rfm.triton_model.quarantine import Quarantine
 from rfm.triton_model.request_digest import digest
-from rfm.triton_model.self_check import SelfCheck
 from rfm_client import InferenceFailedError, ProgressResult, ProgressSample, Result, Sample
 from rfm_client.contract import wire
 from rfm_client.contract.names import PROBE_PREFIX
-from rfm_serve import PATIENCE_S, serving
+from rfm_serve import PATIENCE_S, serving, wait_for
 from trajectories import random_trajectory
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
@@ -49,7 +49,8 @@ CONFIG = {  # as Triton tells it to a model
         {"name": "frame_steps", "dims": [1]},
         {"name": "video_embeddings", "dims": [-1, WIDTHS[0]]},
         {"name": "text_embedding", "dims": [WIDTHS[1]]},
-    ]
+    ],
+    "max_batch_size": 4,
 }
 HANG_S = 2
 DENSE_FRAMES = 8
@@ -138,25 +139,67 @@ def test_a_journal_tells_since_when_nothing_has_come_of_a_batch(
     own.close()
 
 
-def test_journals_are_those_of_the_model_and_the_server(tmp_path: Path) -> None:
+def test_a_journal_names_what_is_prepared_and_its_progress_hides_no_hang(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 100.0
+    monkeypatch.setattr(rfm.journal, "time", SimpleNamespace(monotonic=lambda: now_s))
+    own = Quarantine(tmp_path / "1_batch", (), 4, 2)
+    journal = Journal.open(tmp_path / "1_batch")
+    assert journal is not None
+    with own.at_work_on([b"in_batch"]):
+        now_s += 20
+        with own.preparing(b"prepared"):
+            now_s += 5
+            with own.preparing(b"in_there"):
+                assert journal.busy_s == 25
+                assert sorted(journal.digests) == [b"in_batch", b"in_there", b"prepared"]
+            own.renew()
+            assert journal.busy_s == 5
+        assert (journal.busy_s, journal.digests) == (0, [b"in_batch"])
+    with own.preparing(b"prepared"):
+        now_s += 7
+        assert (journal.busy_s, journal.digests) == (7, [b"prepared"])
+        journal.forget(b"prepared")
+        assert journal.digests == [rfm.journal.NO_DIGEST]
+    assert (journal.busy_s, journal.digests) == (0, [])
+    own.close()
+
+
+def test_nobody_is_a_suspect_for_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sample = sample_of(0)
+    known = deadly(tmp_path, sample)
+    assert known.has_suspects
+    assert known.is_suspect(digest(sample))
+    now_s = time.monotonic()
+    monkeypatch.setattr(quarantine, "time", SimpleNamespace(monotonic=lambda: now_s + quarantine.QUARANTINE_S + 1))
+    assert not known.has_suspects
+    assert not known.is_suspect(digest(sample))
+    known.check(digest(sample))
+
+
+def test_journals_are_those_of_the_model_and_the_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rfm.journal, "SHARED_MEMORY", tmp_path)
     server, other = "triton_python_backend_shm_region_rfm_7_f_a", "triton_python_backend_shm_region_rfm_7_f_b"
     own = [f"{server}_0-1_rfm_batch", f"{server}_0-2_rfm_batch"]
     others = [f"{server}_0-3_b_rfm_batch", f"{server}_0-4_rfm_encoder_batch", f"{server}_0-5", f"{other}_0-6_rfm_batch"]
     for name in (*own, *others):
         (tmp_path / name).touch()
-    assert sorted(file.name for file in journals(tmp_path, f"{server}_0-2", "rfm")) == own
-    assert [file.name for file in journals(tmp_path, f"{server}_0-2", "b_rfm")] == [others[0]]
+    assert sorted(file.name for file in journal_files(f"{server}_0-2", "rfm")) == own
+    assert [file.name for file in journal_files(f"{server}_0-2", "b_rfm")] == [others[0]]
+    assert journal_file(f"{server}_0-1", "rfm") == tmp_path / own[0]
 
 
 # Who is a health probe
 
 
-@dataclass(frozen=True)
+@dataclass
 class Request:
-    """As Triton hands it over, as far as a model asks."""
+    """As Triton hands it over, as far as a model asks, and what is sent in answer."""
 
     id: str
     tensors: wire.Tensors
+    responses: list[Any] = field(default_factory=list)
 
     def request_id(self) -> str:
         return self.id
@@ -164,30 +207,40 @@ class Request:
     def requested_output_names(self) -> list[str]:
         return []
 
+    def timeout(self) -> int:
+        return 0
+
+    def get_response_sender(self) -> Request:
+        return self
+
     def is_cancelled(self) -> bool:
         return False
 
+    def send(self, response: Any, flags: int) -> None:
+        self.responses.append(response)
+
 
 class TritonError(Exception):
-    INVALID_ARG, INTERNAL = 1, 2
+    INVALID_ARG, INTERNAL, CANCELLED, UNAVAILABLE = range(4)
 
 
 class Model(BatchModel[Sample, Result]):
-    """Never gets an answer, and says how many questions it was asked."""
+    """Never gets an answer, and says how many questions it was asked, and how many it was told to work ahead on."""
 
-    def __init__(self, deadly: Quarantine) -> None:
-        self.input_names = [tensor["name"] for tensor in CONFIG["input"]]
+    def __init__(self, deadly: Quarantine, num_preparing: int = 0) -> None:
+        self.ahead = 0
         self.counted: list[Counted] = []
         self.asked = 0
         self._quarantine = deadly
-        self._cancellation = Cancellation()
-        self._origins = Origins(0, digest(blank_question(CONFIG)))
-        self._self_check = SelfCheck(lambda: None, lambda error: None)
         self._metrics = SimpleNamespace(at_work_on=lambda batch: nullcontext(), add=self.counted.append)  # type: ignore[assignment]
-        self._log = SimpleNamespace(report=lambda request: None)  # type: ignore[assignment]
+        self._log = SimpleNamespace(report=lambda request: None, report_end=lambda error: None)  # type: ignore[assignment]
+        self.start(CONFIG, {}, num_preparing=num_preparing)
 
     def decode(self, tensors: wire.Tensors) -> list[Sample]:
         return wire.decode_samples(tensors)
+
+    def work_ahead(self, prepared: Sample) -> None:
+        self.ahead += 1
 
     def answer(self, questions: Sequence[Sample], execution: Execution) -> list[InferenceFailedError]:
         self.asked += len(questions)
@@ -208,6 +261,7 @@ def backend(monkeypatch: pytest.MonkeyPatch) -> None:
         get_input_tensor_by_name=tensor_of,
         InferenceResponse=lambda error: error,
         TritonError=TritonError,
+        TRITONSERVER_RESPONSE_COMPLETE_FINAL=1,
     )
     monkeypatch.setitem(sys.modules, "triton_python_backend_utils", module)  # type: ignore[arg-type]
 
@@ -218,28 +272,56 @@ def sample_of(seed: int) -> wire.Tensors:
 
 def deadly(folder: Path, tensors: wire.Tensors) -> Quarantine:
     """What a process knows when two before it have died of these inputs."""
-    code = "import os, sys; from pathlib import Path; from rfm.triton_model.quarantine import Journal\n"
-    code += "with Journal.create(Path(sys.argv[1]), 1).at_work_on([bytes.fromhex(sys.argv[2])]): os._exit(1)"
-    dead = [folder / "1_batch", folder / "2_batch"]
-    for file in dead:
-        subprocess.run([sys.executable, "-c", code, file, digest(tensors).hex()], check=False, timeout=PATIENCE_S)
+    dead = [died_of(folder / f"{number}_batch", tensors, work) for number, work in enumerate((SCORING, PREPARING))]
     return Quarantine(folder / "3_batch", dead, 4)
+
+
+SCORING, PREPARING = "at_work_on([digest])", "preparing(0, digest)"
+
+
+def died_of(file: Path, tensors: wire.Tensors, work: str) -> Path:
+    """The journal of a process that has died in its ``work`` on these inputs."""
+    code = "import os, sys; from pathlib import Path; from rfm.triton_model.quarantine import Journal\n"
+    code += f"digest = bytes.fromhex(sys.argv[2])\nwith Journal.create(Path(sys.argv[1]), 1, 1).{work}: os._exit(1)"
+    subprocess.run([sys.executable, "-c", code, file, digest(tensors).hex()], check=False, timeout=PATIENCE_S)
+    return file
 
 
 @pytest.mark.usefixtures("backend")
 @pytest.mark.parametrize("request_id", ["", PROBE_PREFIX, f"{PROBE_PREFIX}-rfm"])
 def test_poison_is_refused_and_counted_whoever_it_says_it_is_from(tmp_path: Path, request_id: str) -> None:
     model = Model(deadly(tmp_path, sample_of(0)))
-    model.execute([Request(request_id, sample_of(0)), Request("", sample_of(1))])
+    respond(model, Request(request_id, sample_of(0)), Request("", sample_of(1)))
     assert model.asked == 1
-    (counted,) = model.counted
-    assert counted.samples == {("progress", "refused"): 1, ("progress", "failed"): 1}
-    assert counted.num_executed == 1  # what was refused took no part in it
+    samples = sum((counted.samples for counted in model.counted), Counter[tuple[str, str]]())
+    assert samples == {("progress", "refused"): 1, ("progress", "failed"): 1}
+    assert sum(counted.num_executed for counted in model.counted) == 1  # what was refused took no part in it
 
 
 @pytest.mark.usefixtures("backend")
 def test_the_blank_question_of_a_probe_is_answered_and_not_counted(tmp_path: Path) -> None:
     blank = blank_question(CONFIG)
     model = Model(deadly(tmp_path, blank))
-    model.execute([Request(f"{PROBE_PREFIX}-rfm", blank)])
+    respond(model, Request(f"{PROBE_PREFIX}-rfm", blank))
     assert (model.asked, model.counted) == (1, [Counted()])
+
+
+@pytest.mark.usefixtures("backend")
+def test_nothing_is_prepared_beside_a_batch_while_there_are_suspects(tmp_path: Path) -> None:
+    suspect, other = sample_of(0), sample_of(1)
+    known = Quarantine(tmp_path / "3_batch", [died_of(tmp_path / "1_batch", suspect, PREPARING)], 4, 2)
+    model = Model(known, num_preparing=2)
+    model._cheap_answer_s = 0.0  # two requests go through the pipeline, whatever they take
+    respond(model, Request("", other), Request("", other))
+    assert (model.asked, model.ahead) == (2, 0)
+    respond(model, Request("", suspect))
+    assert not known.has_suspects  # this process has survived it
+    respond(model, Request("", other), Request("", suspect))
+    assert (model.asked, model.ahead) == (5, 2)
+
+
+def respond(model: Model, *requests: Request) -> None:
+    """Returns when each has its answer, and is counted."""
+    for request, response in zip(requests, model.execute(requests) or (), strict=False):
+        request.responses.append(response)
+    wait_for(lambda: all(request.responses for request in requests) and model.counted)

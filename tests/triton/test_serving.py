@@ -11,7 +11,7 @@ import pytest
 
 import goldens
 from engines import load_engine, rewind_of
-from mixtures import FRAMES_MODEL, MODEL, assert_same, counts, mixed_samples, plug
+from mixtures import FRAMES_MODEL, MODEL, assert_same, counts, mixed_samples, plug, wait_until_at_work
 from reference_server import Served
 from rfm_client import (
     InvalidSampleError,
@@ -73,6 +73,7 @@ def test_concurrent_callers_of_mixed_lengths_and_types_share_batches(served: Ser
             return client.evaluate([sample])[0]
 
         plugged = pool.submit(client.evaluate, plug())
+        wait_until_at_work(MODEL)
         answers = list(pool.map(ask, samples))
         plugged.result()
         requests, executions = (after - b for after, b in zip(counts(served, MODEL), before, strict=True))
@@ -126,6 +127,7 @@ def test_a_bad_request_in_a_batch_of_callers_fails_alone(served: Served, protoco
             return client.evaluate([sample], return_errors=True)[0]
 
         plugged = pool.submit(client.evaluate, plug())
+        wait_until_at_work(MODEL)
         outcomes = list(pool.map(ask, samples))
         plugged.result()
         _, executions = (after - b for after, b in zip(counts(served, MODEL), before, strict=True))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,11 @@ import tritonclient.http
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
 from commands import REPOSITORY
-from repositories import kill_model
-from rfm.supervise.installation import find_installation
-from rfm.supervise.process import Endpoints, TritonServer
-from rfm.supervise.repository_api import RepositoryApi
+from patients import make_repository
+from repositories import bound_triton_s_queue, kill_model
+from rfm.launch.installation import find_installation
+from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.repository_api import RepositoryApi
 from rfm_client import (
     InvalidSampleError,
     ModelNotFoundError,
@@ -127,6 +129,58 @@ def test_triton_says_so_in_these_words(asked: Triton, name: str) -> None:
     assert type(error) is kind
     with pytest.raises(kind, match=meant):
         raise error
+
+
+SLOW = """
+
+_answer = TritonPythonModel.answer
+
+
+def slow(self, questions, execution):
+    import time
+
+    time.sleep(0.3)
+    return _answer(self, questions, execution)
+
+
+TritonPythonModel.answer = slow
+"""
+FULL = {"the model": (1, triton.QUEUE_FULL), "Triton, of several instances": (2, triton.TRITON_QUEUE_FULL)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FULL)
+def test_a_full_queue_says_so_in_these_words(tmp_path: Path, protocol: str, name: str) -> None:
+    instances, phrase = FULL[name]
+    repository = make_repository(tmp_path, more_code=SLOW, instances=instances, batch_size=1, max_queue_size=1)
+    if instances > 1:
+        bound_triton_s_queue(repository / "rfm", 1)
+    with (
+        (tmp_path / "tritonserver.log").open("wb") as log,
+        TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+        ThreadPoolExecutor(12) as callers,
+    ):
+
+        def ask() -> tuple[str, str] | None:
+            asked = Triton(repository, server.endpoints, protocol)
+            with asked.client:
+                try:
+                    asked.infer()
+                except InferenceServerException as error:
+                    return str(error.status()), error.message()
+            return None
+
+        told = {outcome for outcome in callers.map(lambda _: ask(), range(12)) if outcome is not None}
+    assert told
+    for status, message in told:
+        assert phrase in message
+        assert triton.is_full(message)
+        assert status in triton.UNAVAILABLE
+        assert type(triton.error_of(status, message, InvalidSampleError)) is ServerUnavailableError
+
+
+def test_what_waited_for_too_long_did_not_meet_a_full_queue() -> None:
+    assert not triton.is_full("the request has waited for longer than 0.02 s (queue_timeout_ms)")
 
 
 def test_a_request_id_is_no_part_of_the_error(asked: Triton) -> None:

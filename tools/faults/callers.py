@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import re
 import threading
 import time
 from array import array
@@ -31,16 +30,15 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
+from rfm_client.contract import triton
 from rfm_gateway.scoring import FRAME_STEPS
 
-TOLERANCE = 1e-5
+TOLERANCE = 1e-5  # of numbers up to 1; of a larger one, which only similarity can be, this share of it
 PATIENCE_S = 60.0
 PAUSE_S = 0.1  # of a caller that was refused
 VIDEO_DIM, TEXT_DIM = 64, 32  # of the demo's checkpoint
 MOST_FRAMES = 32
 NUM_SAMPLES = 48
-
-FULL = re.compile("maximum queue size")  # of a queue with no room
 
 Numbers = np.ndarray[Any, np.dtype[np.float32]]
 Ask = Callable[[Sample], Awaitable[Numbers]]
@@ -71,7 +69,9 @@ class Exam:
     def is_right(self, number: int, got: Numbers) -> bool:
         """Whether an answer is the engine's; NaN never is."""
         expected = self.expected[number]
-        return got.shape == expected.shape and bool(np.abs(got - expected).max() <= TOLERANCE)
+        if got.shape != expected.shape:
+            return False
+        return bool((np.abs(got - expected) <= TOLERANCE * np.maximum(1, np.abs(expected))).all())
 
 
 def trajectory(random: np.random.Generator, num_frames: int) -> Trajectory:
@@ -122,7 +122,7 @@ def direct(url: str, **options: Any) -> Connect:
                 try:
                     return numbers(await client.score(sample))
                 except ServerUnavailableError as error:
-                    if not options.get("retry", True) and FULL.search(str(error)):
+                    if not options.get("retry", True) and triton.is_full(str(error)):
                         raise RefusedError from error
                     raise
 

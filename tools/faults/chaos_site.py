@@ -14,8 +14,8 @@ import httpx
 import rfm_export
 from callers import Callers, Connect, Exam, Tally, direct, mixed_samples, progress_samples
 from paths import ROOT
-from rfm.config import ServeConfig
-from rfm.supervise.process import Endpoints
+from rfm.config import ExportConfig
+from rfm.launch.process import Endpoints
 from rfm_serve import Serving, serving, wait_for
 
 CHECKPOINT = ROOT / "model_repository" / "rfm" / "1" / "checkpoint"
@@ -111,7 +111,7 @@ def wait_healthy(gateway_url: str, within_s: float = 60.0) -> float:
 def site(folder: Path, checkpoint: Path = CHECKPOINT, **settings: int) -> Iterator[Site]:
     """``rfm serve`` with a gateway, on a checkpoint exported with these settings."""
     repository, key_file = folder / "model_repository", folder / "key"
-    rfm_export.export(checkpoint, repository, ServeConfig(num_gpus=0, torch_threads=1, **settings))
+    rfm_export.export(checkpoint, repository, ExportConfig(num_gpus=0, torch_threads=1, **settings))
     key_file.touch(0o600)
     key_file.write_text(KEY)
     port = Endpoints.free().http_port

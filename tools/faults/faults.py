@@ -18,8 +18,8 @@ import httpx
 import rfm_export
 from callers import Callers, direct, through_gateway
 from chaos_site import BACK_S, CALLERS, CHECKPOINT, Row, Site, wait_healthy
-from rfm.config import ServeConfig
-from rfm.journal import is_alive
+from rfm.config import ExportConfig
+from rfm.proc import is_alive
 from rfm_client import RewardClient
 from rfm_client.transport.shared_memory import FOLDER
 from rfm_export.publish import read_config
@@ -55,16 +55,18 @@ def _survived(site: Site, name: str, fault: Callable[[], None]) -> list[Row]:
     return [row]
 
 
-def kill_stub(site: Site) -> list[Row]:
+def kill_model_process(site: Site) -> list[Row]:
     """Readiness is false meanwhile, and no caller notices more than a wait."""
-    return _survived(site, "kill -9 of the stub", lambda: site.served.stubs[0].kill())
+    return _survived(site, "kill -9 of the model process", lambda: site.served.model_processes[0].kill())
 
 
-def stop_stub(site: Site) -> list[Row]:
+def stop_model_process(site: Site) -> list[Row]:
     """It would go on after STOPPED_S; it is loaded anew before."""
-    pid, stopped_s = site.served.stubs[0].pid, time.monotonic()
+    pid, stopped_s = site.served.model_processes[0].pid, time.monotonic()
     try:
-        return _survived(site, f"SIGSTOP of the stub for {STOPPED_S:g} s", lambda: os.kill(pid, signal.SIGSTOP))
+        return _survived(
+            site, f"SIGSTOP of the model process for {STOPPED_S:g} s", lambda: os.kill(pid, signal.SIGSTOP)
+        )
     finally:
         wait_for(lambda: time.monotonic() - stopped_s > STOPPED_S or not is_alive(pid), STOPPED_S + 1)
         if is_alive(pid):
@@ -124,7 +126,7 @@ def kill_client(site: Site) -> list[Row]:
 
 def corrupt_weights(site: Site) -> list[Row]:
     """A version whose weights are not those of its export is not rolled out; the one before goes on."""
-    version = rfm_export.export(CHECKPOINT, site.repository, ServeConfig(num_gpus=0, torch_threads=1))
+    version = rfm_export.export(CHECKPOINT, site.repository, ExportConfig(num_gpus=0, torch_threads=1))
     (weights,) = (site.repository / MODEL / str(version)).rglob("*.safetensors")
     content = bytearray(weights.read_bytes())
     content[-1] ^= 0x40
@@ -215,8 +217,8 @@ def _dripping(host: str, port: int, head: bytes) -> Iterator[list[float]]:
 
 
 FAULTS: dict[str, Callable[[Site], list[Row]]] = {
-    "kill -9 of the stub": kill_stub,
-    "SIGSTOP of the stub": stop_stub,
+    "kill -9 of the model process": kill_model_process,
+    "SIGSTOP of the model process": stop_model_process,
     "kill -9 of Triton": kill_triton,
     "kill -9 of the gateway": kill_gateway,
     "kill -9 of a client with shared memory": kill_client,

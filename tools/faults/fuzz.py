@@ -48,11 +48,12 @@ from odd_requests import (
     post,
     samples,
 )
-from rfm.supervise.installation import find_installation
-from rfm.supervise.process import Endpoints, TritonServer
+from rfm.launch.installation import find_installation
+from rfm.launch.process import Endpoints, TritonServer
 from rfm_client import ProgressSample, RewardClient, Sample
 from rfm_client.contract import wire
 from rfm_gateway.command import gateway_command
+from rfm_gateway.config import GatewayConfig
 
 CHECKPOINT = goldens.config("enc_c1_t1_disc10")
 DEADLINE_S = 20.0
@@ -64,8 +65,8 @@ GATEWAY_START_S = 60
 SERVERS_FAULT = re.compile(r"5\d\d|INTERNAL|UNKNOWN|UNAVAILABLE|DATA_LOSS|ABORTED")
 
 # What Triton 2.51 does not survive, and cannot be kept from it at its own doors: memory for a shape in JSON is taken
-# before the shape is compared with the data (its process ends), and one whose size overflows reaches the stub, whose
-# process ends before model.py sees it (docs/security.md). Such shapes are left out here.
+# before the shape is compared with the data (its process ends), and one whose size overflows reaches the model process,
+# which ends before model.py sees it (docs/security.md). Such shapes are left out here.
 KILLS_TRITON = re.compile(rb'"shape": *\[[^\]]*\d{6}')
 
 Fault = tuple[str, str, str]  # kind of request, status, text
@@ -320,7 +321,8 @@ def served(folder: Path) -> Iterator[Doors]:
     ):
         port = int(bound.getsockname()[1])
         bound.close()
-        command = gateway_command(server.endpoints.grpc_url, server.endpoints.metrics_url, "rfm", "127.0.0.1", port)
+        ends = server.endpoints
+        command = gateway_command(GatewayConfig(port, triton=ends.grpc_url, metrics_url=ends.metrics_url))
         with subprocess.Popen(command, stdout=log, stderr=log) as gateway:
             try:
                 without_us = Doors(bare, 0, (), folder / "control" / "tritonserver.log")

@@ -35,9 +35,9 @@ from safetensors.torch import load_file, save_file
 import goldens
 from engines import serve_config
 from rfm.engine import Engine, Outcome
+from rfm.launch.installation import find_installation
+from rfm.launch.process import Endpoints, TritonServer
 from rfm.rewind.encoders import Encoders
-from rfm.supervise.installation import find_installation
-from rfm.supervise.process import Endpoints, TritonServer
 from rfm.triton_model.weights import check_digest
 from rfm_client import ProgressResult, ProgressSample, RewardClient, Sample, Trajectory
 from rfm_client.contract.model_info import DIGEST_PARAMETER

@@ -16,7 +16,7 @@ import rfm_export
 from callers import Callers, Exam, direct, progress_samples
 from chaos_site import BACK_S, CHECKPOINT, Row, site
 from faults import SHARING
-from rfm.config import ServeConfig
+from rfm.config import ExportConfig
 from rfm.triton_model.weights import check_digest
 from rfm_client.contract.model_info import DIGEST_PARAMETER
 from rfm_client.transport.shared_memory import FOLDER
@@ -115,7 +115,7 @@ def full_disk(folder: Path) -> list[Row]:
 
 def _export_without_room(disk: Path) -> Row:
     repository = disk / "model_repository"
-    version = rfm_export.export(CHECKPOINT, repository, ServeConfig(num_gpus=0))
+    version = rfm_export.export(CHECKPOINT, repository, ExportConfig(num_gpus=0))
     words = [RFM, "export", "--checkpoint", CHECKPOINT, "--repository", repository]
     done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=INSIDE_S)
     row = Row("full disk at export", told=f"the export failed, and said so; version {version} is whole")

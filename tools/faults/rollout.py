@@ -29,7 +29,7 @@ import rfm_export
 from engines import serve_config
 from rfm import families
 from rfm.engine import Engine, Outcome
-from rfm.supervise.process import Endpoints
+from rfm.launch.process import Endpoints
 from rfm_client import (
     AsyncRewardClient,
     DeadlineExceededError,

@@ -14,14 +14,14 @@ import typer
 
 from rfm_client.async_client import DEFAULT_TIMEOUT_S
 from rfm_client.cli import options, outputs, scoring, toy
+from rfm_client.cli.label import label
 from rfm_client.cli.options import EXIT_CODES, STANDARD_OUTPUT, OneLineCommand, Server
 from rfm_client.cli.scoring import Failed, Question, Scored
+from rfm_client.cli.show import print_tables
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.names import DEFAULT_MODEL, frames_name
 from rfm_client.contract.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS
-
-FILE_WIDTH = 200
 
 app = typer.Typer(
     name="rfm-client",
@@ -83,6 +83,8 @@ def score(
             help="Dense mode: score frame t on its prefix 0..t alone, sampled to so many frames.",
         ),
     ] = 0,
+    sampling: options.SamplingRule = None,
+    frames: options.SampledFrames = None,
     resize: options.Resize = False,
     plot: options.Plot = None,
     json: options.Json = None,
@@ -99,14 +101,15 @@ def score(
     from rfm_client.cli import show
 
     options.check_outputs(json, plot)
-    _check_arrays(npy, videos)
+    outputs.check_arrays(npy, videos)
     if plot is not None and len(videos) > show.MAX_PANELS:
         raise typer.BadParameter(f"expected at most {show.MAX_PANELS} videos, got {len(videos)}", param_hint="--plot")
     if 0 < frame_steps < MIN_FRAME_STEPS:
         expected = f"expected 0 or at least {MIN_FRAME_STEPS}, got {frame_steps}"
         raise typer.BadParameter(expected, param_hint="--frame-steps")
+    options.check_sampling(sampling, frames, others={"--frame-steps": frame_steps, "--max-frames": max_frames})
     server = Server(urls, model, timeout, context.obj)
-    question = Question(task, fps, max_frames, frame_steps, subsample, resize)
+    question = Question(task, fps, max_frames, frame_steps, subsample, resize, sampling, frames)
     outcomes = scoring.score_all(server, videos, question)
     scored = [outcome for outcome in outcomes if isinstance(outcome, Scored)]
     for outcome in outcomes:
@@ -115,7 +118,7 @@ def score(
         else:
             _report_subsampled(outcome.name, len(outcome.result.progress), outcome.num_frames)
     if json != STANDARD_OUTPUT and scored:
-        _print(scoring.scored_table(scored))
+        print_tables(scoring.scored_table(scored))
     if json is not None:
         outputs.write_json(json, outputs.score_document(server, question, outcomes))
     if npy is not None:
@@ -151,7 +154,7 @@ def compare(
     for source, scores, _ in comparison.sides:
         _report_subsampled(source.name, len(scores.progress), source.trajectory.num_frames)
     if json != STANDARD_OUTPUT:
-        _print(comparison.table())
+        print_tables(comparison.table())
     if json is not None:
         outputs.write_json(json, outputs.comparison_document(server, question, comparison))
     if plot is not None:
@@ -178,7 +181,7 @@ def status(
     with options.usage_errors("--url"):
         statuses = [read_status(url, metrics_url=metrics_url, timeout_s=timeout, access=context.obj) for url in urls]
     if json != STANDARD_OUTPUT:
-        _print(*(table for status in statuses for table in status_tables(status)))
+        print_tables(*(table for status in statuses for table in status_tables(status)))
     if json is not None:
         outputs.write_json(json, outputs.status_document(statuses))
 
@@ -227,7 +230,7 @@ def sample(
             options.report(f"samples[{index}]: {outcome}")
     rows = [(f"{index}", outcome) for index, outcome in enumerate(outcomes) if not isinstance(outcome, RewardError)]
     if json != STANDARD_OUTPUT and rows:
-        _print(scores_table(f"{kind.value} of random {'frames' if use_frames else 'embeddings'}", rows))
+        print_tables(scores_table(f"{kind.value} of random {'frames' if use_frames else 'embeddings'}", rows))
     if json is not None:
         outputs.write_json(json, outputs.samples_document(server, kind.value, outcomes))
     raise typer.Exit(options.exit_code_of(failures, some_succeeded=len(failures) < len(outcomes)))
@@ -268,32 +271,17 @@ def bench_input(
     typer.echo(shlex.join([*arguments, "--async", "--concurrency-range", "1:16:5"]))
 
 
+app.command(cls=OneLineCommand, epilog=EXIT_CODES)(label)
+
+
 def _toy(kind: toy.SampleKind, num_samples: int, num_frames: str, use_frames: bool, seed: int) -> toy.Toy:
     with options.usage_errors("--num-frames"):
         return toy.Toy(kind, num_samples, toy.parse_lengths(num_frames), use_frames, seed)
 
 
-def _check_arrays(npy: Path | None, videos: list[str]) -> None:
-    if npy is None or npy.is_dir() or (not npy.suffix and npy.parent.is_dir()):
-        return
-    if npy.suffix != ".npy" or not npy.parent.is_dir():
-        raise typer.BadParameter(f"expected a .npy file or a folder, got {npy}", param_hint="--npy")
-    if len(videos) > 1:
-        raise typer.BadParameter(f"expected a folder for {len(videos)} videos, got {npy}", param_hint="--npy")
-
-
 def _report_subsampled(name: str, num_scored: int, num_frames: int) -> None:
     if num_scored < num_frames:
         options.report(f"note: {name}: {num_scored} of {num_frames} frames were scored, evenly spaced")
-
-
-def _print(*tables: object) -> None:
-    """Prints as wide as the terminal; into a file or a pipe, as wide as the content."""
-    from rich.console import Console
-
-    console = Console()
-    console = console if console.is_terminal else Console(width=FILE_WIDTH)
-    console.print(*tables, sep="\n")
 
 
 def _add_gateway() -> None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -17,6 +17,7 @@ from rfm_client.async_client import DEFAULT_TIMEOUT_S
 from rfm_client.client import RewardClient
 from rfm_client.contract import errors
 from rfm_client.contract.names import DEFAULT_MODEL
+from rfm_client.data.sampling import Rule, Sampling
 from rfm_client.transport.access import Access
 
 DEFAULT_URL = "grpc://localhost:8001"
@@ -85,6 +86,14 @@ Task = Annotated[str, typer.Option("--task", help="What is to be done, as a sent
 Fps = Annotated[float, typer.Option("--fps", min=0.001, help="Frames a second that are taken from a video.")]
 Subsample = Annotated[
     bool, typer.Option(help="Score no more frames than the checkpoint was trained on, evenly spaced; else all.")
+]
+SamplingRule = Annotated[
+    Rule | None,
+    typer.Option("--sampling", help="Rule by which each frame is scored on its prefix (see docs/guides/sampling.md)."),
+]
+SampledFrames = Annotated[
+    int | None,
+    typer.Option("--frames", min=1, help="Frames that the rule shows the model; else as many as in training."),
 ]
 MaxFrames = Annotated[int | None, typer.Option(min=1, help="Score at most so many frames, evenly.")]
 Resize = Annotated[bool, typer.Option("--resize", help="Make frames as small as the checkpoint reads them, then send.")]
@@ -213,6 +222,22 @@ def check_outputs(json: str | None, plot: Path | None) -> None:
     for option, file in (("--json", json), ("--plot", plot)):
         if file is not None and not Path(file).parent.is_dir():
             raise typer.BadParameter(f"expected a folder at {Path(file).parent}, got none", param_hint=option)
+
+
+def check_sampling(rule: Rule | None, frames: int | None, *, others: Mapping[str, object]) -> None:
+    """Checks that the rule takes the number of frames. Raises typer.BadParameter.
+
+    others: values of options that say otherwise which frames are scored, by their names
+    """
+    if rule is None:
+        if frames is not None:
+            raise typer.BadParameter("expected --sampling with it, got none", param_hint="--frames")
+        return
+    for option, value in others.items():
+        if value:
+            raise typer.BadParameter(f"expected no {option} with it, got {value}", param_hint="--sampling")
+    with usage_errors("--frames"):
+        Sampling.of(rule, frames, trained_frames=1)
 
 
 def _check_served(client: RewardClient) -> None:

@@ -40,6 +40,7 @@ def origin(server: Server) -> dict[str, Any]:
 def score_document(server: Server, question: Question, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """The JSON document that ``score --json`` writes."""
     parameters = {"task": question.task, "fps": question.fps, "frame_steps": question.frame_steps}
+    parameters |= {"sampling": question.sampling, "sampled_frames": question.sampled_frames}
     return {**origin(server), **parameters, "videos": [_outcome(outcome) for outcome in outcomes]}
 
 
@@ -92,9 +93,9 @@ def status_document(statuses: Sequence[ServerStatus]) -> dict[str, Any]:
         models = [
             {
                 **asdict(model),
-                "samples_per_execution": model.samples_per_execution,
+                "samples_per_batch": model.samples_per_batch,
                 "queue_ms_per_request": model.queue_ms_per_request,
-                "compute_ms_per_execution": model.compute_ms_per_execution,
+                "compute_ms_per_batch": model.compute_ms_per_batch,
             }
             for model in status.models
         ]
@@ -115,6 +116,16 @@ def write_arrays(target: Path, outcomes: Sequence[Outcome]) -> None:
     for file, outcome in zip(files, outcomes, strict=True):
         if isinstance(outcome, Scored):
             np.save(file, np.stack([outcome.result.progress, outcome.result.success], axis=1))
+
+
+def check_arrays(npy: Path | None, videos: Sequence[str]) -> None:
+    """Checks, before the first request, that arrays can be written. Raises typer.BadParameter."""
+    if npy is None or npy.is_dir() or (not npy.suffix and npy.parent.is_dir()):
+        return
+    if npy.suffix != ".npy" or not npy.parent.is_dir():
+        raise typer.BadParameter(f"expected a .npy file or a folder, got {npy}", param_hint="--npy")
+    if len(videos) > 1:
+        raise typer.BadParameter(f"expected a folder for {len(videos)} videos, got {npy}", param_hint="--npy")
 
 
 def _outcome(outcome: Outcome) -> dict[str, Any]:

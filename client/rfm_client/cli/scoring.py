@@ -19,14 +19,17 @@ from rfm_client.cli import options
 from rfm_client.cli.options import ExitCode, Server, missing_package
 from rfm_client.cli.show import Panel, number, table
 from rfm_client.client import RewardClient
-from rfm_client.contract.errors import RewardError
+from rfm_client.contract.errors import InvalidSampleError, RewardError
 from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, Trajectory
 from rfm_client.data.fitting import fitted, with_frame_indices
+from rfm_client.data.prefixes import of_prefixes, prefix_samples
+from rfm_client.data.sampling import Rule, Sampling
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+PREFIXES_AT_A_TIME = 64  # of one video: their frames lie in memory
 WORKERS = 8  # videos that are read, and lie in memory, at a time
 
 Times = npt.NDArray[np.float64]
@@ -37,6 +40,8 @@ class Question:
     """The settings with which each source is scored.
 
     max_frames: frames that are sent at most, besides the checkpoint's own limit, which ``subsample`` applies
+    sampling, sampled_frames: each frame is scored on its prefix, sampled by this rule to so many frames (None: as the
+        checkpoint was trained); None: the frames are scored together
     """
 
     task: str
@@ -45,6 +50,8 @@ class Question:
     frame_steps: int = 0
     subsample: bool = True
     resize: bool = False
+    sampling: Rule | None = None
+    sampled_frames: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,14 +221,32 @@ def _evaluate(client: RewardClient, sample: Sample, question: Question) -> Resul
     The frames are left out here: the client knows of no other limit than the checkpoint's.
     """
     info = client.model_info(frames=sample.trajectories[0].frames is not None)
-    dense = question.frame_steps > 0  # then the server samples each prefix
+    dense = question.frame_steps > 0 or question.sampling is not None  # then each prefix is sampled
     limits = (question.max_frames, info.max_frames if question.subsample and not dense else None)
     limit = min((frames for frames in limits if frames is not None), default=None)
     fit = fitted(sample, replace(info, max_frames=limit), subsample=True, resize=question.resize)
     sent = fit.sample
+    if isinstance(sent, ProgressSample) and question.sampling is not None:
+        sampling = _sampling(question, question.sampling, info.max_frames)
+        return with_frame_indices(_prefix_result(client, sent.trajectory, sampling), fit.frame_indices)
     if isinstance(sent, ProgressSample):
         sent = replace(sent, frame_steps=question.frame_steps)
     return with_frame_indices(client.evaluate([sent])[0], fit.frame_indices)
+
+
+def _sampling(question: Question, rule: Rule, trained_frames: int | None) -> Sampling:
+    try:
+        return Sampling.of(rule, question.sampled_frames, trained_frames)
+    except ValueError as error:  # the options are checked: only the checkpoint leaves it open
+        raise InvalidSampleError(f"--{error}") from error
+
+
+def _prefix_result(client: RewardClient, trajectory: Trajectory, sampling: Sampling) -> ProgressResult:
+    samples = prefix_samples(trajectory, sampling)
+    results: list[Result] = []
+    while part := list(itertools.islice(samples, PREFIXES_AT_A_TIME)):
+        results += client.evaluate(part)
+    return of_prefixes(cast("list[ProgressResult]", results), sampling)
 
 
 @contextmanager

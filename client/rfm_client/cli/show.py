@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import SubFigure
     from rich.table import Table
 
+FILE_WIDTH = 200
 STRIP_FRAMES = 8
 WIDTH_IN = 10.0
 COLUMN_WIDTH_IN = 7.0  # where panels stand side by side
@@ -58,6 +59,15 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, 
     return shown
 
 
+def print_tables(*tables: object) -> None:
+    """Prints tables as wide as the terminal; into a file or a pipe, as wide as the content."""
+    from rich.console import Console
+
+    console = Console()
+    console = console if console.is_terminal else Console(width=FILE_WIDTH)
+    console.print(*tables, sep="\n")
+
+
 def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> Table:
     """One row a result: its question's answer, and the scores of its (first) trajectory's last frame."""
     shown = []
@@ -78,11 +88,11 @@ def status_tables(status: ServerStatus) -> list[Table]:
     version = f" {status.version}" if status.version else ""
     title = f"{status.url}: Triton{version}, {'ready' if status.ready else 'not ready'}"
     columns = (
-        "model", "v", "state", "requests", "failed", "pending", "queue ms", "executions", "samples each", "ms each",
+        "model", "v", "state", "requests", "failed", "pending", "queue ms", "batches", "samples each", "ms each",
     )  # fmt: skip
     caption = (
         status.metrics_error
-        or "since the model was loaded, warm-up included; queue ms: of a request; each: of an execution"
+        or "since the model was loaded, warm-up included; queue ms: until a request's turn; each: of a callers' batch"
     )
     tables = [table(title, columns, [_model_row(model) for model in status.models], caption=caption)]
     if status.devices:
@@ -190,9 +200,9 @@ def _model_row(model: ModelStatus) -> tuple[str, ...]:
         *map(str, counts),
         "-" if model.requests_pending is None else str(model.requests_pending),
         number(model.queue_ms_per_request, 2),
-        str(model.executions),
-        number(model.samples_per_execution, 1),
-        number(model.compute_ms_per_execution, 2),
+        str(model.batch_count),
+        number(model.samples_per_batch, 1),
+        number(model.compute_ms_per_batch, 2),
     )
 
 

@@ -27,6 +27,7 @@ class ModelInfo:
 
     versions: those that its configuration asks the server to serve; empty: the latest
     max_batch_size: most samples of one request
+    instances: of the model that one server runs; 0: of an ensemble, whose parts have them
     max_frames: frames of a trajectory that the checkpoint was trained on, at most; None: it does not say
     frame_size: to what the checkpoint brings each frame; None: that depends on the frame
     video_dim, text_dim: widths D and Dt of the embeddings; None: it reads raw frames
@@ -48,6 +49,7 @@ class ModelInfo:
     text_dim: int | None
     progress_bins: int | None
     frames_per_value: int = 1
+    instances: int = 1
     source: str | None = None
     revision: str | None = None
     weights_digest: str | None = None
@@ -80,9 +82,15 @@ class ModelInfo:
             text_dim=last_dims.get(wire.TEXT_EMBEDDING),
             progress_bins=last_dims.get(wire.PROGRESS_LOGITS),
             frames_per_value=int(parameters.get(FRAMES_PER_VALUE_PARAMETER) or 1),
+            instances=sum(map(_num_instances, config.get("instance_group", []))),
             source=parameters.get(SOURCE_PARAMETER) or None,
             revision=parameters.get(REVISION_PARAMETER) or None,
             weights_digest=parameters.get(DIGEST_PARAMETER) or None,
             network=json.loads(parameters.get(NETWORK_PARAMETER) or "{}"),
             run_config=json.loads(parameters.get(RUN_CONFIG_PARAMETER) or "{}"),
         )
+
+
+def _num_instances(group: Mapping[str, Any]) -> int:
+    """Instances of one group of a configuration: so many on each of its GPUs, or on the CPU."""
+    return int(group.get("count", 1)) * max(len(group.get("gpus", [])), 1)

@@ -8,7 +8,7 @@ Arrays are checked once, here; everything behind trusts them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any, TypeAlias
 
@@ -143,9 +143,9 @@ Sample: TypeAlias = ProgressSample | PreferenceSample | SimilaritySample
 
 @dataclass(frozen=True, eq=False)
 class Footage:
-    """What an encoder reads: the trajectories of raw frames of one sample, and the task of the first.
+    """The trajectories of one sample, for an encoder: those that it reads have frames, and the first one's task counts.
 
-    Those of one size may already be joined.
+    Those that it gives have embeddings of the frames and of that task.
     """
 
     trajectories: tuple[Trajectory, ...]
@@ -153,13 +153,17 @@ class Footage:
 
 def stackable(trajectories: Sequence[Trajectory]) -> list[list[Trajectory]]:
     """The trajectories, those together that one array can hold: neighbours whose positions have one shape."""
+    if len(trajectories) == 1:
+        return [list(trajectories)]
     return [list(group) for _, group in groupby(trajectories, lambda trajectory: trajectory.positions.shape[1:])]
 
 
-def joined(trajectories: Sequence[Trajectory]) -> npt.NDArray[Any]:
-    """[P, ...], the positions of trajectories of one shape, one after the other; a view if there is one."""
-    arrays = [trajectory.positions for trajectory in trajectories]
-    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
+def with_trajectories(sample: Sample, trajectories: Sequence[Trajectory]) -> Sample:
+    """A sample that asks the same of other trajectories."""
+    if isinstance(sample, ProgressSample):
+        return replace(sample, trajectory=trajectories[0])
+    first, second = trajectories
+    return type(sample)(first, second)
 
 
 def float_frames_to_uint8(frames: npt.ArrayLike) -> UInt8Array:

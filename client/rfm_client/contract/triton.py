@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How Triton says what went wrong: the status of an answer, and its wording where the status does not say enough.
+"""How a server says what went wrong: the status of an answer, and its wording where the status does not say enough.
 
 Statuses are as tritonclient gives them: gRPC's by name, HTTP's by number. tests/triton/test_wording.py asks a real
 Triton for each phrase.
@@ -32,6 +32,8 @@ NO_VERSIONS = "no available versions"  # of a model that is being loaded again, 
 NOT_READY = "is not ready"  # of a version
 LOST_REGION = "Unable to find shared memory region"  # of a server that was started again
 RESTRICTED = "is restricted, expecting header"  # of an API that wants a key
+QUEUE_FULL = "the queue is full"  # of a model, in which as many requests wait as may
+TRITON_QUEUE_FULL = "Exceeds maximum queue size"  # of Triton, in which requests for a model of several instances wait
 
 _NO_TRUST = re.compile(f"CERTIFICATE|certificate|[Vv]erification [Cc]heck failed|WRONG_VERSION_NUMBER|{RESTRICTED}")
 _WRONG_SHAPE = re.compile(  # behind the batch axis, which the caller did not make
@@ -49,6 +51,11 @@ def is_denied(status: str, message: str) -> bool:
 def is_absent(message: str) -> bool:
     """Whether Triton says that a model, or its version, is not loaded."""
     return any(words in message for words in (UNKNOWN_MODEL, NO_VERSIONS, NOT_READY))
+
+
+def is_full(message: str) -> bool:
+    """Whether a request was rejected because too many waited already, in Triton or in the model."""
+    return QUEUE_FULL in message or TRITON_QUEUE_FULL in message
 
 
 def error_of(status: str, message: str, bad_request: type[errors.RewardError]) -> errors.RewardError:

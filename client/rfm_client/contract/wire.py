@@ -39,7 +39,6 @@ from rfm_client.contract.samples import (
     Sample,
     SimilaritySample,
     Trajectory,
-    joined,
     stackable,
 )
 
@@ -79,6 +78,12 @@ _SAMPLE_TYPES = {
     ProgressSample: SampleType.PROGRESS,
     PreferenceSample: SampleType.PREFERENCE,
     SimilaritySample: SampleType.SIMILARITY,
+}
+_ASKED_BY: dict[str, frozenset[type]] = {
+    PROGRESS: frozenset(_SAMPLE_TYPES),
+    SUCCESS: frozenset(_SAMPLE_TYPES),
+    PREFERENCE: frozenset({PreferenceSample}),
+    SIMILARITY: frozenset({SimilaritySample}),
 }
 
 
@@ -145,21 +150,27 @@ def score_outputs(progress_bins: int | None) -> tuple[TensorSpec, ...]:
     return (*scores, TensorSpec(PROGRESS_LOGITS, "FP32", (VARIABLE, progress_bins)))
 
 
+def outputs_for(samples: Sequence[Sample]) -> tuple[str, ...]:
+    """The scores that these samples ask for. The others would be NaN, and cost their way from the server."""
+    kinds = set(map(type, samples))
+    return tuple(name for name, asked_by in _ASKED_BY.items() if not asked_by.isdisjoint(kinds))
+
+
 def encode_samples(samples: Sequence[Sample]) -> Tensors:
     """One request for samples whose positions have the same shape beyond the time axis, trajectory by trajectory."""
-    arrays = zip(*([joined(part) for part in stackable(sample.trajectories)] for sample in samples), strict=True)
     tensors: Tensors = {
         SAMPLE_TYPE: np.array([[_SAMPLE_TYPES[type(sample)]] for sample in samples], np.uint8),
         NUM_FRAMES: np.array([_num_frames(sample) for sample in samples], np.int32),
         FRAME_STEPS: np.array([[getattr(sample, "frame_steps", 0)] for sample in samples], np.int32),
     }
     texts = [sample.trajectories[0] for sample in samples]
-    if texts[0].frames is not None:
-        tensors |= {name: pad_stack(array) for name, array in zip((FRAMES, SECOND_FRAMES), arrays, strict=False)}
+    has_frames = texts[0].frames is not None
+    arrays = zip(*(stackable(sample.trajectories) for sample in samples), strict=True)
+    for name, rows in zip((FRAMES, SECOND_FRAMES) if has_frames else (VIDEO_EMBEDDINGS,), arrays, strict=False):
+        tensors[name] = pad_stack([[trajectory.positions for trajectory in row] for row in rows])
+    if has_frames:
         tensors[TASK] = np.array([[text.task.encode()] for text in texts], np.object_)
     else:
-        (positions,) = arrays
-        tensors[VIDEO_EMBEDDINGS] = pad_stack(positions)
         embeddings = [text.text_embedding for text in texts if text.text_embedding is not None]
         tensors[TEXT_EMBEDDING] = embeddings[0][np.newaxis] if len(embeddings) == 1 else np.stack(embeddings)
     return tensors
@@ -188,24 +199,25 @@ def decode_embeddings(tensors: Mapping[str, npt.NDArray[Any]], trajectory: Traje
 
 
 def decode_trajectories(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Footage]:
-    """What the encoder is to encode: per sample its frames without padding, and its task."""
+    """What the encoder is to encode: of each sample the frames of its trajectories, without padding, and its task."""
 
     def decode(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> Footage:
         lengths = tensors[NUM_FRAMES][row].tolist()
         if lengths[0] < 1 or lengths[1] < 0:
             raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, at least 0]", str(lengths))
         arrays = _positions(tensors, row, lengths)
-        return Footage(tuple(_trajectory(tensors, row, positions) for positions in arrays if len(positions)))
+        return Footage(tuple(_trajectory(tensors, row, array) for array in arrays if len(array)))
 
     return [_located(decode, tensors, row) for row in range(len(tensors[NUM_FRAMES]))]
 
 
-def encode_trajectories(trajectories: Sequence[Trajectory], num_positions: int, outputs: Collection[str]) -> Tensors:
+def encode_trajectories(encoded: Sequence[Footage], num_positions: int, outputs: Collection[str]) -> Tensors:
     """The requested outputs of the encoder for one request of ``num_positions`` = P, padded with zeros."""
-    texts = [t.text_embedding for t in trajectories if t.text_embedding is not None]
+    rows = [[trajectory.positions for trajectory in footage.trajectories] for footage in encoded]
+    texts = [footage.trajectories[0].text_embedding for footage in encoded]
     embeddings = {
-        VIDEO_EMBEDDINGS: pad_stack([trajectory.positions for trajectory in trajectories], num_positions),
-        TEXT_EMBEDDING: np.stack(texts),
+        VIDEO_EMBEDDINGS: pad_stack(rows, num_positions),
+        TEXT_EMBEDDING: np.stack([text for text in texts if text is not None]),
     }
     return {name: embeddings[name] for name in outputs}
 
@@ -230,15 +242,25 @@ def decode_results(
     return [_decode_result(tensors, row, sample, model_version) for row, sample in enumerate(samples)]
 
 
-def pad_stack(arrays: Sequence[npt.NDArray[Any]], length: int | None = None, *, fill: float = 0) -> npt.NDArray[Any]:
-    """[B, length, ...] from B arrays [P_b, ...] of one dtype; length is the longest unless given."""
+def pad_stack(
+    rows: Sequence[Sequence[npt.NDArray[Any]]], length: int | None = None, *, fill: float = 0
+) -> npt.NDArray[Any]:
+    """[B, length, ...] from B rows of arrays [P, ...] of one dtype, which lie one after the other.
+
+    length: the longest row's unless given
+    """
     if length is None:
-        length = max(len(array) for array in arrays)
-    if len(arrays) == 1 and len(arrays[0]) == length:
-        return arrays[0][np.newaxis]  # no copy for the common single sample
-    padded = np.full((len(arrays), length, *arrays[0].shape[1:]), fill, arrays[0].dtype)
-    for row, array in zip(padded, arrays, strict=True):
-        row[: len(array)] = array
+        length = max(sum(map(len, parts)) for parts in rows)
+    first = rows[0][0]
+    if len(rows) == 1 and sum(map(len, rows[0])) == length:  # a single sample: no padding, and of one array no copy
+        return (first if len(rows[0]) == 1 else np.concatenate(rows[0]))[np.newaxis]
+    shape = len(rows), length, *first.shape[1:]
+    padded = np.full(shape, fill, first.dtype) if fill else np.zeros(shape, first.dtype)
+    for row, parts in zip(padded, rows, strict=True):
+        start = 0
+        for part in parts:
+            row[start : start + len(part)] = part
+            start += len(part)
     return padded
 
 
@@ -252,8 +274,7 @@ def _encode_frames(field: str) -> Callable[[Sequence[Result], int], Float32Array
 
     def encode(results: Sequence[Result], num_positions: int) -> Float32Array:
         rows = [[getattr(scores, field) for scores in _frame_scores(result)] for result in results]
-        joined = [parts[0] if len(parts) == 1 else np.concatenate(parts) for parts in rows]
-        return pad_stack(joined, num_positions, fill=np.nan)
+        return pad_stack(rows, num_positions, fill=np.nan)
 
     return encode
 
@@ -301,16 +322,13 @@ def _decode_sample(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> Sample:
     if sample_type == SampleType.PROGRESS:
         if lengths[0] < 1 or lengths[1] != 0:
             raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, 0] for progress", str(lengths))
-        positions = _positions(tensors, row, lengths)
-        return ProgressSample(_trajectory(tensors, row, positions[0]), frame_steps=frame_steps)
+        positions, _ = _positions(tensors, row, lengths)
+        return ProgressSample(_trajectory(tensors, row, positions), frame_steps=frame_steps)
     if min(lengths) < 1:
         raise InvalidSampleError.at(NUM_FRAMES, "at least one frame of each of the two trajectories", str(lengths))
     if frame_steps != 0:
         raise InvalidSampleError.at(FRAME_STEPS, "0 unless the sample is of type progress", str(frame_steps))
-    positions = _positions(tensors, row, lengths)
-    if len(positions) == 1:
-        positions = np.split(positions[0], lengths[:1])
-    first, second = (_trajectory(tensors, row, array) for array in positions)
+    first, second = (_trajectory(tensors, row, array) for array in _positions(tensors, row, lengths))
     return (PreferenceSample if sample_type == SampleType.PREFERENCE else SimilaritySample)(first, second)
 
 
@@ -321,14 +339,15 @@ def _trajectory(tensors: Mapping[str, npt.NDArray[Any]], row: int, positions: np
 
 
 def _positions(tensors: Mapping[str, npt.NDArray[Any]], row: int, lengths: Sequence[int]) -> list[npt.NDArray[Any]]:
-    """The frame positions of one sample without padding.
+    """The frame positions of the first and the second trajectory of one sample, without padding.
 
-    Both trajectories are in one array or, if there are second frames, each is in its own.
+    Both are in one array or, if there are second frames, each is in its own.
     """
     if SECOND_FRAMES in tensors:
         arrays = zip((FRAMES, SECOND_FRAMES), lengths, strict=True)
         return [_unpadded(tensors, name, row, length) for name, length in arrays]
-    return [_unpadded(tensors, FRAMES if FRAMES in tensors else VIDEO_EMBEDDINGS, row, sum(lengths))]
+    both = _unpadded(tensors, FRAMES if FRAMES in tensors else VIDEO_EMBEDDINGS, row, sum(lengths))
+    return [both[: lengths[0]], both[lengths[0] :]]
 
 
 def _unpadded(tensors: Mapping[str, npt.NDArray[Any]], name: str, row: int, total: int) -> npt.NDArray[Any]:

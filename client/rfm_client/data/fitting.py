@@ -6,16 +6,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-import numpy.typing as npt
-
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
-from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
+from rfm_client.contract.samples import ProgressSample, Sample, Trajectory, with_trajectories
+from rfm_client.data.prefixes import taken
 from rfm_client.data.resize import resize_frames
-
-FrameIndices = npt.NDArray[np.int64]
+from rfm_client.data.sampling import FrameIndices, thinned
 
 
 @dataclass(frozen=True)
@@ -42,38 +39,27 @@ def snapshot(sample: Sample) -> Sample:
         arrays = {name: getattr(trajectory, name) for name in names}
         return replace(trajectory, **{name: array.copy() for name, array in arrays.items() if array is not None})
 
-    return (
-        _with_trajectories(sample, [copied(t) for t in sample.trajectories]) if isinstance(sample, Sample) else sample
-    )
+    return with_trajectories(sample, [copied(t) for t in sample.trajectories]) if isinstance(sample, Sample) else sample
 
 
 def fitted(sample: Sample, info: ModelInfo, *, subsample: bool, resize: bool) -> FittedSample:
     """The sample with at most ``info.max_frames`` frames a trajectory, of at most ``info.frame_size``, as requested.
 
-    In dense mode each prefix is sampled by the server, so no frame is taken away here.
+    Frames are left out as in training (``sampling.thinned``). In dense mode each prefix is sampled by the server, so
+    none is left out here.
     """
     dense = isinstance(sample, ProgressSample) and sample.frame_steps > 0
     limit = info.max_frames if subsample and not dense else None
-    kept = [evenly_spaced(trajectory.num_frames, limit) for trajectory in sample.trajectories]
-    trajectories = [_taken(t, indices) for t, indices in zip(sample.trajectories, kept, strict=True)]
+    kept = [thinned(trajectory.num_frames, limit) for trajectory in sample.trajectories]
+    trajectories = [
+        t if indices is None else taken(t, indices) for t, indices in zip(sample.trajectories, kept, strict=True)
+    ]
     if resize and info.frame_size is not None:
         size = info.frame_size
         trajectories = [
             t if t.frames is None else replace(t, frames=resize_frames(t.frames, size)) for t in trajectories
         ]
-    return FittedSample(_with_trajectories(sample, trajectories), kept)
-
-
-def evenly_spaced(num_frames: int, limit: int | None) -> FrameIndices | None:
-    """int64 [limit], indices from the first to the last of so many frames, truncated; None: no need to leave any out.
-
-    The original takes its training clips by this rule, but of one frame the first; here that is the last, the newest.
-    """
-    if limit is None or num_frames <= limit:
-        return None
-    if limit == 1:
-        return np.array([num_frames - 1], np.int64)
-    return np.linspace(0, num_frames - 1, limit).astype(np.int64)
+    return FittedSample(with_trajectories(sample, trajectories), kept)
 
 
 def with_frame_indices(result: Result, indices: Sequence[FrameIndices | None]) -> Result:
@@ -86,22 +72,6 @@ def with_frame_indices(result: Result, indices: Sequence[FrameIndices | None]) -
     if isinstance(result, PreferenceResult):
         return replace(result, first=_of_frames(result.first, first), second=_of_frames(result.second, second))
     return replace(result, reference=_of_frames(result.reference, first), other=_of_frames(result.other, second))
-
-
-def _taken(trajectory: Trajectory, indices: FrameIndices | None) -> Trajectory:
-    if indices is None:
-        return trajectory
-    if trajectory.frames is not None:
-        return replace(trajectory, frames=trajectory.frames[indices])
-    assert trajectory.video_embeddings is not None  # a Trajectory has one of them
-    return replace(trajectory, video_embeddings=trajectory.video_embeddings[indices])
-
-
-def _with_trajectories(sample: Sample, trajectories: Sequence[Trajectory]) -> Sample:
-    if isinstance(sample, ProgressSample):
-        return replace(sample, trajectory=trajectories[0])
-    first, second = trajectories
-    return PreferenceSample(first, second) if isinstance(sample, PreferenceSample) else SimilaritySample(first, second)
 
 
 def _of_frames(scores: FrameScores, indices: FrameIndices | None) -> FrameScores:

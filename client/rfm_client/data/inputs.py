@@ -34,7 +34,14 @@ _FRAMES = "uint8 or float in 0..1 [T, H, W, 3] or [T, 3, H, W]"
 _KEYS = f"{_CAMERA_PREFIX}<camera>, frames or video_embeddings"
 
 
-def load_trajectory(source: str | Path, *, task: str = "", fps: float | None = None) -> Trajectory:
+def load_trajectory(
+    source: str | Path,
+    *,
+    task: str = "",
+    fps: float | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
+) -> Trajectory:
     """The trajectory in a file or behind an http(s) URL.
 
     ``.npy``: frames, or embeddings [T, D]. ``.npz``: ``frames``, or ``video_embeddings`` and ``text_embedding``, and
@@ -42,14 +49,16 @@ def load_trajectory(source: str | Path, *, task: str = "", fps: float | None = N
 
     task: instead of the file's own
     fps: frames a second to take of a video; None: all frames
+    start_s, end_s: the part of a video to take, by its time stamps; None: from the start, to the end
 
     Raises InvalidSampleError. Arrays of Python objects are refused: to read them is to run code. So are video files in
-    which LeRobot v3.0 keeps several episodes.
+    which LeRobot v3.0 keeps several episodes, unless ``start_s`` and ``end_s`` name a part.
     """
     if is_url(source) or Path(source).suffix.lower() not in ARRAY_SUFFIXES:
-        return Trajectory(frames=read_video(source, fps), task=task)
-    if fps is not None:
-        raise InvalidSampleError.at("fps", "None with arrays, which do not tell their own", repr(fps))
+        return Trajectory(frames=read_video(source, fps, start_s=start_s, end_s=end_s), task=task)
+    for name, value in (("fps", fps), ("start_s", start_s), ("end_s", end_s)):
+        if value is not None:
+            raise InvalidSampleError.at(name, "None with arrays, which do not tell their own", repr(value))
     arrays = _arrays(Path(source))
     try:
         return as_trajectory(arrays, task=task)

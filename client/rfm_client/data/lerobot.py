@@ -17,8 +17,8 @@ from rfm_client.contract.errors import InvalidSampleError
 
 _ONE_EPISODE = "a film of one episode"
 _INSTEAD = (
-    "cut one episode out into a file of its own (meta/episodes tells its from_timestamp and to_timestamp), "
-    "or load its steps with LeRobot and pass them to as_trajectory"
+    "label the dataset with rfm-client label, or name the part of the file that is one episode: start_s and end_s of "
+    "load_trajectory (meta/episodes tells its from_timestamp and to_timestamp)"
 )
 _INFO = Path("meta", "info.json")
 _FILM_AN_EPISODE = re.compile(r"v[12]\.")

@@ -41,7 +41,14 @@ def is_url(source: str | Path) -> bool:
     return isinstance(source, str) and source.lower().startswith(("http://", "https://"))
 
 
-def read_video(source: str | Path, fps: float | None = None, *, timeout_s: float = DOWNLOAD_TIMEOUT_S) -> UInt8Array:
+def read_video(
+    source: str | Path,
+    fps: float | None = None,
+    *,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    timeout_s: float = DOWNLOAD_TIMEOUT_S,
+) -> UInt8Array:
     """uint8 [T, H, W, 3], the frames at ``fps`` of a video file or http(s) URL; None: all of them.
 
     Frames are counted, not timed: in a video of variable frame rate, T is that of its average rate, and frames are
@@ -49,10 +56,11 @@ def read_video(source: str | Path, fps: float | None = None, *, timeout_s: float
     be shown mirrored is not. Of all decoded frames only those that are returned are held in memory. A URL is
     downloaded once, to a temporary file.
 
+    start_s, end_s: only the frames from here to before there, by their time stamps; None: from the start, to the end
     timeout_s: the longest that the server of a URL may be silent
 
     Raises InvalidSampleError for what is no video, or cannot be had, and for a file of several LeRobot episodes
-    (``lerobot``).
+    (``lerobot``) unless ``start_s`` and ``end_s`` name a part of it.
     """
     try:
         import av
@@ -61,9 +69,10 @@ def read_video(source: str | Path, fps: float | None = None, *, timeout_s: float
     if fps is not None and not 0 < fps < math.inf:
         raise InvalidSampleError.at("fps", "a number above 0", repr(fps))
     try:
-        check_film_behind(str(source)) if is_url(source) else check_local_film(source)
+        if start_s is None or end_s is None:
+            check_film_behind(str(source)) if is_url(source) else check_local_film(source)
         with _opened(source, timeout_s) as file:
-            return _sampled(av, file, fps)
+            return _part(av, file, fps, start_s, end_s) if (start_s, end_s) != (None, None) else _sampled(av, file, fps)
     except InvalidSampleError as error:
         raise InvalidSampleError(f"{error} ({source})") from error
     except (av.FFmpegError, OSError) as error:
@@ -125,6 +134,27 @@ def _sampled(av: Any, file: BinaryIO, fps: float | None) -> UInt8Array:
         raise InvalidSampleError.at("video", "at least one frame", "none")
     if len({frame.shape for frame in frames}) > 1:
         raise InvalidSampleError.at("video", "frames of one size", "several")
+    return np.stack(frames)
+
+
+def _part(av: Any, file: BinaryIO, fps: float | None, start_s: float | None, end_s: float | None) -> UInt8Array:
+    """The frames at ``fps`` of the part from ``start_s`` to before ``end_s``, within half a frame."""
+    num_packets, native_fps = _length(av, file)
+    if not native_fps:
+        raise InvalidSampleError.at("video", "a frame rate", "none")
+    file.seek(0)
+    with av.open(file) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size and packet.pts is not None]
+        times_s = np.sort([float(packet.pts * packet.time_base) for packet in packets])
+    half_s = 0.5 / native_fps
+    first, end = np.searchsorted(times_s, [(start_s or 0.0) - half_s, (math.inf if end_s is None else end_s) - half_s])
+    if first >= end:
+        got = f"{start_s} to {end_s} of {times_s[-1] if len(times_s) else 0.0:g} s"
+        raise InvalidSampleError.at("start_s to end_s", "a part with frames", got)
+    native_fps, fps = (1.0, 1.0) if fps is None else (native_fps, fps)
+    frames, total = _decoded(av, file, (first + frame_indices(int(end - first), native_fps, fps)).tolist())
+    if total != num_packets or len(times_s) != total:
+        raise InvalidSampleError.at("video", f"{num_packets} frames with time stamps", str(total))
     return np.stack(frames)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, TypeAlias, cast
 
@@ -15,7 +15,7 @@ from rfm_client.client import RewardClient
 from rfm_client.contract.errors import InvalidSampleError, RewardError
 from rfm_client.contract.results import SUCCESS_THRESHOLD, ProgressResult, Result
 from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array
-from rfm_client.data.fitting import evenly_spaced
+from rfm_client.data.sampling import Prefix, Rule, Sampling
 
 Info: TypeAlias = dict[str, Any]
 ClientSource: TypeAlias = RewardClient | Callable[[], RewardClient]
@@ -28,7 +28,10 @@ def _check_at_least_one(name: str, value: int) -> None:
 
 @dataclass(frozen=True)
 class SuccessRule:
-    """A scored step succeeds when most of the ``last`` frames sent for it have a success of ``threshold`` or more."""
+    """A scored step succeeds when most of the ``last`` frames sent for it have a success of ``threshold`` or more.
+
+    Padding and repeated frames count once.
+    """
 
     threshold: float = SUCCESS_THRESHOLD
     last: int = 1
@@ -49,7 +52,10 @@ class RewardOptions:
     terminate_on_success: terminates the episode when an answer says success, except one about the frame of the reset
     frames_from: where frames, uint8 [H, W, 3], come from. None: ``render()``; or a key of the observation; or what
         takes one environment's observation and gives its frame
-    max_frames: most frames that are sent; None: as many as the checkpoint was trained on, all if it does not say
+    sampling: which frames of the episode so far are sent: a rule of ``rfm_client.data.sampling``. ``rint_pad`` is that
+        of upstream's own RL loop
+    max_frames: the rule's number of frames; None: as many as the checkpoint was trained on. If it does not say, a rule
+        that needs a number raises ValueError at the first reset
     blocking: a step waits for its score
     max_pending: most open questions of one environment when not blocking
     await_last: the last step of an episode is waited for even when not blocking; otherwise what is open is dropped
@@ -61,6 +67,7 @@ class RewardOptions:
     every: int = 1
     terminate_on_success: SuccessRule | None = None
     frames_from: str | Callable[[Any], UInt8Array] | None = None
+    sampling: Rule = "rint_pad"
     max_frames: int | None = None
     blocking: bool = True
     max_pending: int = 4
@@ -73,6 +80,7 @@ class RewardOptions:
         _check_at_least_one("max_pending", self.max_pending)
         if self.max_frames is not None:
             _check_at_least_one("max_frames", self.max_frames)
+        Sampling.of(self.sampling, self.max_frames, trained_frames=1)  # whether rule and number go together
 
 
 class Scorer:
@@ -114,14 +122,14 @@ class Scorer:
         if episode.num_pending >= self._options.max_pending:
             episode.num_skipped += 1
         else:
-            episode.expect(self._client.submit(episode.sample(self._max_frames)))
+            episode.expect(self._client.submit(episode.sample(self._sampling)), self._sampling)
 
     def _await(self, episodes: Sequence[Episode]) -> None:
-        samples = [episode.sample(self._max_frames) for episode in episodes]
+        samples = [episode.sample(self._sampling) for episode in episodes]
         outcomes = self._client.evaluate(samples, return_errors=True)
         results = [episode.checked(outcome) for episode, outcome in zip(episodes, outcomes, strict=True)]
         for episode, result in zip(episodes, results, strict=True):
-            episode.learn(episode.step, result)
+            episode.learn(episode.step, result, self._sampling.prefix(episode.step))
 
     @property
     def _client(self) -> RewardClient:
@@ -132,8 +140,12 @@ class Scorer:
         return self._made
 
     @cached_property
-    def _max_frames(self) -> int | None:
-        return self._options.max_frames or self._client.model_info(frames=True).max_frames
+    def _sampling(self) -> Sampling:
+        asked = self._options
+        try:
+            return Sampling(asked.sampling, asked.max_frames)
+        except ValueError:  # it needs a number that nobody has said
+            return Sampling.of(asked.sampling, None, self._client.model_info(frames=True).max_frames)
 
 
 class Episode:
@@ -147,7 +159,7 @@ class Episode:
         self._task = task
         self._where = where
         self._frames: list[UInt8Array] = []
-        self._pending: dict[int, Future[ProgressResult]] = {}  # by step
+        self._pending: dict[int, tuple[Prefix, Future[ProgressResult]]] = {}  # by step
         self._known_step = -1
         self._progress = self._success = self._paid_progress = np.nan
         self.num_skipped = 0
@@ -179,28 +191,27 @@ class Episode:
             raise self._located(InvalidSampleError.at("frame", first, got))
         self._frames.append(kept)
 
-    def sample(self, max_frames: int | None) -> ProgressSample:
+    def sample(self, sampling: Sampling) -> ProgressSample:
         """The sample of the newest frame."""
-        indices = evenly_spaced(len(self._frames), max_frames)
-        frames = self._frames if indices is None else [self._frames[index] for index in indices]
+        frames = [self._frames[index] for index in sampling.prefix(self.step).indices]
         return ProgressSample(Trajectory(frames=np.stack(frames), task=self._task))
 
-    def expect(self, answer: Future[ProgressResult]) -> None:
-        """Records that an answer about the newest frame is to come."""
-        self._pending[self.step] = answer
+    def expect(self, answer: Future[ProgressResult], sampling: Sampling) -> None:
+        """Records that an answer about the newest frame, sampled so, is to come."""
+        self._pending[self.step] = sampling.prefix(self.step), answer
 
     def collect(self) -> None:
         """Takes over the answers that have come. Raises the RewardError of one that failed."""
-        for step in [step for step, answer in self._pending.items() if answer.done()]:
-            answer = self._pending.pop(step)
+        for step in [step for step, (_, answer) in self._pending.items() if answer.done()]:
+            prefix, answer = self._pending.pop(step)
             error = answer.exception()
             if isinstance(error, RewardError):
                 raise self._located(error)
-            self.learn(step, answer.result())
+            self.learn(step, answer.result(), prefix)
 
     def cancel(self) -> None:
         """Cancels the requests that have no answer yet."""
-        for answer in self._pending.values():
+        for _, answer in self._pending.values():
             answer.cancel()
         self._pending.clear()
 
@@ -210,17 +221,20 @@ class Episode:
             raise self._located(outcome)
         return cast(ProgressResult, outcome)
 
-    def learn(self, step: int, result: ProgressResult) -> None:
-        """Takes over an answer unless a newer one is known."""
+    def learn(self, step: int, result: ProgressResult, prefix: Prefix) -> None:
+        """Takes over an answer about what ``prefix`` shows, unless a newer one is known."""
         if step <= self._known_step:
             return
+        slots = prefix.frame_slots
+        frames = replace(result, progress=result.progress[slots], success=result.success[slots])
+        progress = frames.last_progress
         if not self.is_known:
-            self._paid_progress = result.last_progress
+            self._paid_progress = progress
         self._known_step = step
-        self._progress, self._success = result.last_progress, float(result.success[-1])
+        self._progress, self._success = progress, float(frames.success[-1])
         rule = self._options.terminate_on_success
         if rule is not None and step > 0:
-            self.succeeded |= result.succeeded(last=rule.last, threshold=rule.threshold)
+            self.succeeded |= frames.succeeded(last=rule.last, threshold=rule.threshold)
 
     def reward(self, env_reward: float) -> float:
         """The reward of the step."""

@@ -5,7 +5,7 @@ env = gymnasium.make("CartPole-v1", render_mode="rgb_array")
 env = RewardModelWrapper(env, partial(RewardClient, "grpc://localhost:8001"), "balance the pole")
 
 Frames: each step's frame is kept until the next reset, and so is that of the reset: H * W * 3 bytes a step. All are
-needed: ``max_frames`` of them are sent, evenly from the first to the newest, and which ones moves as episodes grow.
+needed: the rule ``sampling`` says which are sent, and which ones moves as episodes grow.
 
 Scored are the frame of the reset, every ``every``-th step, and the last step of an episode. With ``blocking`` a step
 waits for its score. Without, it sends its frames and goes on with the newest answer that has come; an answer older

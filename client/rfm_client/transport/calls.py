@@ -8,13 +8,12 @@ import io
 import logging
 import os
 import ssl
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping
-from contextlib import asynccontextmanager
+from collections.abc import Awaitable, Callable, Collection, Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cache, cached_property, lru_cache, partial
 from typing import Any, Protocol, TypeVar
 
-import numpy.typing as npt
+import numpy as np
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
 from rfm_client.contract import errors, triton
@@ -24,12 +23,15 @@ from rfm_client.contract.wire import Tensors
 from rfm_client.transport.access import SECURE_SCHEMES, Access
 from rfm_client.transport.connection import GRPC_OPTIONS, Connection
 from rfm_client.transport.deadline import timeout
-from rfm_client.transport.off_loop import off_loop
+from rfm_client.transport.off_loop import MIN_BYTES, off_loop
 from rfm_client.transport.shared_memory import Region, SharedMemory
 
 Answered = TypeVar("Answered")
 
 _US_PER_S = 1_000_000
+_AS_IT_IS = {"Accept-Encoding": "identity"}  # else aiohttp asks for gzip, which makes floats little smaller
+_SMALL_BYTES = 16  # what is asked about one sample, but for its embeddings
+_NUM_SMALL_INPUTS = 512  # that are kept
 
 logger = logging.getLogger("rfm_client")
 
@@ -89,6 +91,7 @@ class _TritonTransport:
             raise ValueError(f"url: expected grpcs:// or https:// with certificates, got {url}")
         self._shared_memory = SharedMemory(self) if shared_memory else None
         self._requested = cache(lambda name: self._triton.InferRequestedOutput(name))
+        self._small_input = lru_cache(_NUM_SMALL_INPUTS)(self._new_small_input)
         self._connection: Connection | None = None
         self._left: list[Connection] = []  # and perhaps not closed yet
 
@@ -132,33 +135,38 @@ class _TritonTransport:
     async def _infer(
         self, model: str, inputs: Tensors, outputs: Collection[str], request_id: str, timeout_s: float, client: Any
     ) -> Answer:
+        requested = [self._requested(name) for name in outputs]
+        # Triton drops a request that waits in its queue for longer, over HTTP too: no client waits for the answer.
+        waits_us = max(int(timeout_s * _US_PER_S), 1)
+        ask = partial(client.infer, model, outputs=requested, request_id=request_id, timeout=waits_us)
         largest = max(inputs, key=lambda name: inputs[name].nbytes)
-        async with self._lent(inputs[largest]) as region:
+        if self._shared_memory is None:
+            answer = await ask(await off_loop(inputs[largest].nbytes, self._inputs, inputs, {}))
+        else:
+            answer = await self._sharing(self._shared_memory, largest, inputs, ask)
+        return Answer(_outputs(answer, outputs), self._model_version(answer))
+
+    async def _sharing(
+        self, memory: SharedMemory, largest: str, inputs: Tensors, ask: Callable[[list[Any]], Awaitable[Answered]]
+    ) -> Answered:
+        """What the server answers to inputs of which it finds the ``largest`` in shared memory, if that can be."""
+        async with memory.lend(inputs[largest]) as region:
             regions = {largest: region} if region is not None else {}
             through_socket = 0 if regions else inputs[largest].nbytes
             tensors = await off_loop(through_socket, self._inputs, inputs, regions)
-            requested = [self._requested(name) for name in outputs]
-            # Triton drops a request that waits in its queue for longer, over HTTP too: no client waits for the answer.
-            waits_us = max(int(timeout_s * _US_PER_S), 1)
-            answer = await client.infer(model, tensors, outputs=requested, request_id=request_id, timeout=waits_us)
-        return Answer(_outputs(answer, outputs), self._model_version(answer))
-
-    @asynccontextmanager
-    async def _lent(self, array: npt.NDArray[Any]) -> AsyncIterator[Region | None]:
-        if self._shared_memory is None:
-            yield None
-            return
-        async with self._shared_memory.lend(array) as region:
             try:
-                yield region
+                return await ask(tensors)
             except InferenceServerException as error:
                 if region is not None and triton.LOST_REGION in (error.message() or ""):
-                    self._shared_memory.forget(region)
+                    memory.forget(region)
                 raise
 
     def _inputs(self, inputs: Tensors, regions: Mapping[str, Region]) -> list[Any]:
         tensors = []
         for name, array in inputs.items():
+            if array.nbytes <= _SMALL_BYTES and not array.dtype.hasobject:
+                tensors.append(self._small_input(name, array.shape, array.dtype.str, array.tobytes()))
+                continue
             tensor = self._triton.InferInput(name, array.shape, np_to_triton_dtype(array.dtype))
             if name in regions:
                 tensor.set_shared_memory(regions[name].name, array.nbytes)
@@ -166,6 +174,13 @@ class _TritonTransport:
                 tensor.set_data_from_numpy(array)
             tensors.append(tensor)
         return tensors
+
+    def _new_small_input(self, name: str, shape: tuple[int, ...], dtype: str, content: bytes) -> Any:
+        """An input that requests share, since tensors so small are the same again and again."""
+        array = np.frombuffer(content, dtype).reshape(shape)
+        tensor = self._triton.InferInput(name, shape, np_to_triton_dtype(array.dtype))
+        tensor.set_data_from_numpy(array)
+        return tensor
 
     async def _call(
         self,
@@ -324,10 +339,11 @@ class HttpTransport(_TritonTransport):
         self._access.show_with_each_request(client)
         post = client._post
 
-        async def post_stream(request_uri: str, request_body: str | bytes, headers: Any, query_params: Any) -> Any:
+        async def post_stream(request_uri: str, request_body: Any, headers: Any, query_params: Any) -> Any:
             # As a stream aiohttp sends it piece by piece; in one piece it would hold the event loop, and warns.
-            body = io.BytesIO(request_body) if isinstance(request_body, bytes) else request_body
-            return await post(request_uri, body, headers, query_params)
+            is_large = isinstance(request_body, bytes) and len(request_body) >= MIN_BYTES
+            body = io.BytesIO(request_body) if is_large else request_body
+            return await post(request_uri, body, {**(headers or {}), **_AS_IT_IS}, query_params)
 
         client._post = post_stream
         return client

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Iterable
 
 if sys.version_info >= (3, 11):
     from asyncio import timeout as timeout
@@ -24,24 +25,29 @@ def check_timeout(timeout_s: float) -> None:
 
 
 class Deadline:
-    """A moment ``timeout_s`` seconds from now, shared by everything that one call does."""
+    """A moment ``timeout_s`` seconds from now, shared by everything that one call does. at_s: by the monotonic clock"""
 
     def __init__(self, timeout_s: float) -> None:
         check_timeout(timeout_s)
-        self._timeout_s = timeout_s
-        self._at_s = time.monotonic() + timeout_s
+        self.timeout_s = timeout_s
+        self.at_s = time.monotonic() + timeout_s
 
     def ends_within(self, seconds: float) -> bool:
         """Whether less than that is left."""
-        return time.monotonic() + seconds >= self._at_s
+        return time.monotonic() + seconds >= self.at_s
 
     def remaining_s(self) -> float:
         """Seconds left, more than 0. Raises DeadlineExceededError when there are none."""
-        remaining_s = self._at_s - time.monotonic()
+        remaining_s = self.at_s - time.monotonic()
         if remaining_s <= 0:
             raise self.exceeded()
         return remaining_s
 
     def exceeded(self, where: str = "") -> DeadlineExceededError:
         """The error of a call that came to its end, while it waited for the server ``where``."""
-        return DeadlineExceededError(f"{where}{': ' if where else ''}no answer within {self._timeout_s:g} s")
+        return DeadlineExceededError(f"{where}{': ' if where else ''}no answer within {self.timeout_s:g} s")
+
+
+def latest(deadlines: Iterable[Deadline]) -> Deadline:
+    """The one that comes last."""
+    return max(deadlines, key=lambda deadline: deadline.at_s)

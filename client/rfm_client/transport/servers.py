@@ -69,16 +69,29 @@ class Servers:
     def __str__(self) -> str:
         return ", ".join(server.transport.url for server in self._servers)
 
+    def __len__(self) -> int:
+        return len(self._servers)
+
     async def infer(
-        self, model: str, inputs: Tensors, outputs: Collection[str], deadline: Deadline, *, request_id: str
+        self,
+        model: str,
+        inputs: Tensors,
+        outputs: Collection[str],
+        deadline: Deadline,
+        *,
+        request_id: str,
+        retry_ended: bool = True,
     ) -> Answer:
-        """The named ``outputs`` of ``model`` for ``inputs``. Raises RewardError, which names the request."""
+        """The named ``outputs`` of ``model`` for ``inputs``. Raises RewardError, which names the request.
+
+        retry_ended: False: it is not sent again when a process ends that has it
+        """
 
         def request(server: Transport, left_s: float) -> Awaitable[Answer]:
             return server.infer(model, inputs, outputs, left_s, request_id=request_id)
 
         try:
-            return await self._request(model, request, deadline)
+            return await self._request(model, request, deadline, retry_ended=retry_ended)
         except RewardError as error:
             error.request_id = request_id
             raise
@@ -111,14 +124,16 @@ class Servers:
             self._looking_up.cancel()
         await asyncio.gather(*(server.close() for server in (*self._servers, *self._gone)))
 
-    async def _request(self, model: str, request: Request[Answered], deadline: Deadline) -> Answered:
+    async def _request(
+        self, model: str, request: Request[Answered], deadline: Deadline, *, retry_ended: bool = True
+    ) -> Answered:
         """The answer to a request, retried as the module's docstring says."""
         self._keep_up()
         try:
-            return await self._request_among(None, model, request, deadline)
+            return await self._request_among(None, model, request, deadline, is_last_end=not retry_ended)
         except _EndedAtError as ended:
             first, error = ended.server, ended.error
-        if not self._retry or deadline.ends_within(0):
+        if not self._retry or not retry_ended or deadline.ends_within(0):
             raise error
         if await first.is_healed(min(HEALED_WITHIN_S, deadline.remaining_s() / 2)):
             return await self._request_among(first, model, request, deadline)
@@ -130,11 +145,18 @@ class Servers:
             raise ProcessEndedError(f"{message}: {ended.error.message}") from ended.error
 
     async def _request_among(
-        self, only: Server | None, model: str, request: Request[Answered], deadline: Deadline
+        self,
+        only: Server | None,
+        model: str,
+        request: Request[Answered],
+        deadline: Deadline,
+        *,
+        is_last_end: bool = False,
     ) -> Answered:
         """The answer of the server ``only`` or, if that is None, of any.
 
-        With several servers it raises _EndedAtError where a process of the model has ended.
+        With several servers, or if the first end is to be the last, it raises _EndedAtError where a process of the
+        model has ended.
         """
         refusals: dict[Server, RewardError] = {}
         for attempt in itertools.count():
@@ -161,13 +183,16 @@ class Servers:
                     break
             except ServerUnavailableError as error:
                 self._record_failure(server, model, error)
-                if isinstance(error, ProcessEndedError) and only is None and len(self._servers) > 1:
+                is_told_apart = is_last_end or (only is None and len(self._servers) > 1)
+                if is_told_apart and isinstance(error, ProcessEndedError):
                     raise _EndedAtError(server, error) from error
-                busy = {server, *refusals}
-                has_other = only is None and any(not other.is_left_out for other in self._servers if other not in busy)
+                has_other = only is None and self._has_other({server, *refusals})
                 await self._pause(0.0 if has_other else pause_s(attempt, LONGEST_RETRY_PAUSE_S), deadline, error)
-        others = [error for error in refusals.values() if not isinstance(error, ModelNotFoundError)]
-        raise (others or list(refusals.values()))[0]
+        raise min(refusals.values(), key=lambda error: isinstance(error, ModelNotFoundError))  # which says the least
+
+    def _has_other(self, busy: Collection[Server]) -> bool:
+        """Whether a server that is neither busy nor left out can take the request at once."""
+        return any(not server.is_left_out for server in self._servers if server not in busy)
 
     async def _pause(self, duration_s: float, deadline: Deadline, error: ServerUnavailableError) -> None:
         """Raises the error if it is not worth while."""

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import torch
 
-from rfm.engine import Engine, Outcome
+from rfm.engine import Engine, Outcome, Prepared
 from rfm.execution import Execution
 from rfm.parameters import BUDGET_PARAMETER, DTYPE_PARAMETER, FAMILY_PARAMETER, SAMPLE_TOKENS_PARAMETER
 from rfm.triton_model.batch_model import BatchModel
 from rfm.version_folder import CHECKPOINT_FOLDER
-from rfm_client.contract import Result, Sample, wire
+from rfm_client.contract import Result, RewardError, Sample, wire
 
 
 class TritonPythonModel(BatchModel[Sample, Result]):
@@ -32,8 +32,21 @@ class TritonPythonModel(BatchModel[Sample, Result]):
     def decode(self, tensors: wire.Tensors) -> list[Sample]:
         return wire.decode_samples(tensors)
 
-    def answer(self, questions: Sequence[Sample], execution: Execution) -> list[Outcome]:
-        return self.engine.evaluate(questions, execution)
+    def prepare(self, question: Sample) -> tuple[Prepared, int]:
+        prepared = self.engine.prepare(question)
+        if isinstance(prepared.rows, RewardError):
+            raise prepared.rows
+        return prepared, prepared.num_tokens
+
+    @property
+    def works_ahead(self) -> bool:
+        return self.engine.works_ahead
+
+    def work_ahead(self, prepared: Prepared) -> None:
+        self.engine.work_ahead(prepared)
+
+    def answer(self, questions: Sequence[Prepared], execution: Execution) -> list[Outcome]:
+        return self.engine.score(questions, execution)
 
     def encode(self, answers: Sequence[Result], tensors: wire.Tensors, outputs: Collection[str]) -> wire.Tensors:
         return wire.encode_results(answers, wire.num_positions(tensors), outputs)

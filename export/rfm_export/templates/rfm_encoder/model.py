@@ -12,11 +12,11 @@ from rfm import families
 from rfm.execution import Execution
 from rfm.parameters import FAMILY_PARAMETER
 from rfm.triton_model.batch_model import BatchModel
-from rfm_client.contract import RewardError, Trajectory, wire
+from rfm_client.contract import RewardError, wire
 from rfm_client.contract.samples import Footage
 
 
-class TritonPythonModel(BatchModel[Footage, Trajectory]):
+class TritonPythonModel(BatchModel[Footage, Footage]):
     """One instance: one pair of encoders on one device."""
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
@@ -25,8 +25,8 @@ class TritonPythonModel(BatchModel[Footage, Trajectory]):
     def decode(self, tensors: wire.Tensors) -> list[Footage]:
         return wire.decode_trajectories(tensors)
 
-    def answer(self, questions: Sequence[Footage], execution: Execution) -> list[Trajectory | RewardError]:
+    def answer(self, questions: Sequence[Footage], execution: Execution) -> list[Footage | RewardError]:
         return self.encoders.encode(questions, execution)
 
-    def encode(self, answers: Sequence[Trajectory], tensors: wire.Tensors, outputs: Collection[str]) -> wire.Tensors:
+    def encode(self, answers: Sequence[Footage], tensors: wire.Tensors, outputs: Collection[str]) -> wire.Tensors:
         return wire.encode_trajectories(answers, wire.num_positions(tensors), outputs)

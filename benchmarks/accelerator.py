@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: MIT
+"""Does an accelerator ever wait? This server and its peers before a simulated one, whose forward passes only sleep.
+
+    python benchmarks/accelerator.py
+
+What it shows depends little on the machine: the share of the time in which the accelerator is busy, and what a request
+costs of the CPU, in the server and in its callers. Rounds are interleaved, so a machine that drifts hits all alike.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import psutil
+from bench import DEMO, RESULTS, machine
+from contestants import PEER_SCRIPTS, Callers, running_peer
+from load import Load
+from rich.console import Console
+
+import rfm_export
+from rfm.config import ExportConfig
+from rfm.engine import Engine
+from rfm.launch.temporary import temporary_server
+
+sys.path.insert(0, str(Path(__file__).parent / "peers"))
+from simulated import SIMULATION, Ledger
+
+CHECKPOINT = DEMO / "rfm" / "1" / "checkpoint"
+BATCH_S, ROW_S = 4e-3, 0.5e-3
+CHEAP_ANSWER_S = 0.2e-3  # as on a GPU: the CPU is free while it computes
+FRAMES = (16, 16)
+OURS = "this server"
+SIMULATED = """
+
+import sys
+
+sys.path.insert(0, {peers!r})
+_load, _start = TritonPythonModel.load, TritonPythonModel.start
+
+
+def load(self, version, device, settings):
+    from pathlib import Path
+
+    from simulated import simulate
+
+    _load(self, version, device, settings)
+    simulate(self.engine, Path({file!r}), {batch_s}, {row_s})
+
+
+def start(self, *arguments, **options):
+    _start(self, *arguments, **options)
+    self._cheap_answer_s = {cheap_answer_s}  # an accelerator's: while it computes, the CPU is free
+
+
+TritonPythonModel.load, TritonPythonModel.start = load, start
+"""
+US_PER_S = 1e6
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """A server: its callers, what its accelerator does, and its processes."""
+
+    callers: Callers
+    ledger: Ledger
+    processes: list[psutil.Process]
+
+    def cpu_s(self) -> float:
+        """Seconds of the CPU that the server has taken since its start."""
+        return sum(sum(process.cpu_times()[:2]) for process in self.processes)
+
+
+def main() -> None:
+    """Measures, writes and shows."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=3.0, help="of each measurement")
+    parser.add_argument("--callers", type=int, nargs="+", default=[1, 32, 64])
+    parser.add_argument("--peers", nargs="*", default=["LitServe", "mosec"], choices=["LitServe", "mosec"])
+    parser.add_argument("--output", type=Path, default=RESULTS, help="folder for the results")
+    arguments = parser.parse_args()
+    rows = []
+    with TemporaryDirectory(prefix="rfm-accelerator-") as folder, contestants(Path(folder), arguments.peers) as of_name:
+        for number in range(arguments.rounds):
+            for callers in arguments.callers:
+                for name, contestant in of_name.items():
+                    row = {"way": name, "callers": callers, "round": number}
+                    rows.append(row | measure(contestant, Load(callers, arguments.seconds, FRAMES)))
+                    Console().print(rows[-1], highlight=False)
+    results = {"machine": machine(), "batch_s": BATCH_S, "row_s": ROW_S, "measurements": rows}
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    (arguments.output / "accelerator.json").write_text(json.dumps(results, indent=1) + "\n")
+    (arguments.output / "accelerator.md").write_text(table(rows))
+    print((arguments.output / "accelerator.md").read_text())
+
+
+def measure(contestant: Contestant, load: Load) -> dict[str, float]:
+    """One load of one server."""
+    (busy_s, num_rows), cpu_s = contestant.ledger.read(), contestant.cpu_s()
+    client = psutil.Process(contestant.callers.pid)
+    client_s = sum(client.cpu_times()[:2])
+    measured = contestant.callers.measure(load)
+    after_s, after_rows = contestant.ledger.read()
+    count = after_rows - num_rows
+    return {
+        "busy": (after_s - busy_s) / measured.took_s,
+        "samples_per_s": measured.samples_per_s,
+        "p50_ms": measured.p50_ms,
+        "p99_ms": measured.p99_ms,
+        "failed": measured.failed,
+        "server_us": (contestant.cpu_s() - cpu_s) / count * US_PER_S,
+        "client_us": (sum(client.cpu_times()[:2]) - client_s) / count * US_PER_S,
+    }
+
+
+@contextmanager
+def contestants(folder: Path, peers: list[str]) -> Iterator[Mapping[str, Contestant]]:
+    """All servers, each before an accelerator of its own."""
+    config = Engine.from_checkpoint(CHECKPOINT).predictor.network.config
+    widths = config.video_feature_dim, config.text_feature_dim
+    with ExitStack() as stack:
+        urls = {}
+        repository, file = folder / "repository", folder / OURS
+        rfm_export.export(CHECKPOINT, repository, ExportConfig(num_gpus=0, torch_threads=1))
+        model = repository / "rfm" / "1" / "model.py"
+        peers_folder = str(Path(__file__).parent / "peers")
+        times_s = {"batch_s": BATCH_S, "row_s": ROW_S, "cheap_answer_s": CHEAP_ANSWER_S}
+        code = SIMULATED.format(peers=peers_folder, file=str(file), **times_s)
+        model.write_text(model.read_text() + code)
+        before = set(psutil.Process().children(recursive=True))
+        urls[OURS] = stack.enter_context(temporary_server(repository, folder / "triton.log")).grpc_url
+        processes = {OURS: list(set(psutil.Process().children(recursive=True)) - before)}
+        for peer in peers:
+            checkpoint = folder / f"checkpoint_{peer}"
+            checkpoint.mkdir()
+            for source in CHECKPOINT.iterdir():
+                (checkpoint / source.name).symlink_to(source)
+            (checkpoint / SIMULATION).write_text(json.dumps([str(folder / peer), BATCH_S, ROW_S]))
+            before = set(psutil.Process().children(recursive=True))
+            words = {"checkpoint": checkpoint, "threads": 1, "workers": 1}
+            port = stack.enter_context(running_peer(PEER_SCRIPTS[peer], words, folder / f"{peer}.log"))
+            urls[peer] = f"http://127.0.0.1:{port}"
+            processes[peer] = list(set(psutil.Process().children(recursive=True)) - before)
+        made = {}
+        for name, url in urls.items():
+            callers = Callers("gRPC" if name == OURS else name, url, widths)
+            stack.callback(callers.close)
+            made[name] = Contestant(callers, Ledger(folder / name), processes[name])
+        yield made
+
+
+def table(rows: list[dict[str, object]]) -> str:
+    """Medians of the rounds, as Markdown."""
+    columns = ("busy", "samples_per_s", "p50_ms", "p99_ms", "server_us", "client_us")
+    lines = [
+        f"# A simulated accelerator: {1e3 * BATCH_S:g} ms a batch and {1e3 * ROW_S:g} ms a sample, asleep",
+        "",
+        "Medians of the rounds. busy: share of the time; us: CPU microseconds a sample, of all of the server's",
+        "processes, and of its callers' process.",
+        "",
+        "| callers | server | busy | samples/s | p50 ms | p99 ms | server us | client us |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for callers, way in sorted({(row["callers"], row["way"]) for row in rows}, key=str):
+        of_way = [row for row in rows if (row["callers"], row["way"]) == (callers, way)]
+        medians = [statistics.median(float(str(row[column])) for row in of_way) for column in columns]
+        lines.append(f"| {callers} | {way} | " + " | ".join(f"{value:.3g}" for value in medians) + " |")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    main()

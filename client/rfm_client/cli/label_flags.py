@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: MIT
+"""The options of labelling, as a dataclass and as options of a command: one table for ``rfm-client`` and ``rfm``."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_type_hints
+
+import typer
+
+from rfm_client.cli.options import usage_errors
+from rfm_client.data.sampling import Rule
+from rfm_client.labelling.options import (
+    DEFAULT_RULE,
+    DEFAULT_WORKERS,
+    FORMATS,
+    Format,
+    Fuse,
+    LabelOptions,
+    Mode,
+    parse_episodes,
+    parse_shard,
+)
+from rfm_client.labelling.ray_engine import RayOptions
+
+Engine = Literal["threads", "ray"]
+
+_LISTED = "KEY[,KEY...]"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelFlags:
+    """What a command is told of a labelling run; ``LabelOptions`` says what each means."""
+
+    output: Annotated[
+        Path | None, typer.Option(help="Folder of the labels; else the dataset's own.", show_default=False)
+    ] = None
+    name: Annotated[str, typer.Option(help="Name of the reward: NAME_progress.parquet.")] = "rfm"
+    alias: Annotated[
+        str | None,
+        typer.Option(help="Write the progress file under this name, too: sarm_progress is what LeRobot reads."),
+    ] = None
+    format: Annotated[
+        str | None,
+        typer.Option(
+            metavar=",".join(FORMATS),
+            help="Files to write; else progress,signals, of an HDF5 file hdf5.",
+            show_default=False,
+        ),
+    ] = None
+    cameras: Annotated[
+        str | None, typer.Option(metavar=_LISTED, help="Cameras to score; else all of the dataset.", show_default=False)
+    ] = None
+    fuse: Annotated[Fuse, typer.Option(help="How the scores of several cameras become one.")] = "mean"
+    sampling: Annotated[
+        Rule | None,
+        typer.Option(
+            help=f"Rule by which frame t's prefix is sampled; else {DEFAULT_RULE}, as training does.",
+            show_default=False,
+        ),
+    ] = None
+    frames: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Frames that the rule shows the model; else as many as in training.", show_default=False
+        ),
+    ] = None
+    mode: Annotated[
+        Mode, typer.Option(help="prefix: frame t is scored on the frames up to t. whole: all frames together.")
+    ] = "prefix"
+    resize: Annotated[
+        bool, typer.Option("--resize", help="Make frames as small as the checkpoint reads them, then send.")
+    ] = False
+    task: Annotated[
+        str | None, typer.Option(help="What is to be done, for an HDF5 file that does not say it.", show_default=False)
+    ] = None
+    episodes: Annotated[
+        str | None, typer.Option(metavar="0:100,205", help="Some of the episodes, by number.", show_default=False)
+    ] = None
+    limit: Annotated[int | None, typer.Option(min=1, help="At most so many episodes.", show_default=False)] = None
+    shard: Annotated[
+        str | None,
+        typer.Option(
+            metavar="I/N",
+            help="Label part I of N alone, from 0; run without it to write the files.",
+            show_default=False,
+        ),
+    ] = None
+    parts: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FOLDER|URL",
+            help="Where finished episodes are kept; else .NAME_parts in the output.",
+            show_default=False,
+        ),
+    ] = None
+    workers: Annotated[int, typer.Option(min=1, help="Episodes under way at a time.")] = DEFAULT_WORKERS
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace labels that were made of something else.")] = (
+        False
+    )
+    in_place: Annotated[bool, typer.Option("--in-place", help="Write the labels into the HDF5 file itself.")] = False
+    engine: Annotated[Engine, typer.Option(help="threads: in this process. ray: by actors of a Ray cluster.")] = (
+        "threads"
+    )
+    address: Annotated[
+        str | None, typer.Option(help="Ray cluster; else one that is found, or made here.", show_default=False)
+    ] = None
+    actors: Annotated[int, typer.Option(min=1, help="Ray actors, each with a scorer.")] = 1
+    num_gpus_per_actor: Annotated[float, typer.Option(min=0, help="GPUs of its node that a Ray actor takes.")] = 0.0
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Check everything, measure a few episodes, write nothing.")
+    ] = False
+    report: Annotated[bool, typer.Option("--report", help="Only show the summary of labels that are there.")] = False
+    picture: Annotated[bool, typer.Option(help="Draw the summary: NAME_summary.png in the output.")] = True
+
+    @property
+    def ray(self) -> RayOptions:
+        """Where and how many Ray actors label."""
+        return RayOptions(self.address, self.actors, self.num_gpus_per_actor)
+
+    def options(self) -> LabelOptions:
+        """The options of the run. Raises typer.BadParameter for what contradicts itself."""
+        with usage_errors("DATASET"):
+            return LabelOptions(
+                output=self.output,
+                name=self.name,
+                alias=self.alias,
+                formats=_formats(self.format),
+                cameras=tuple(self.cameras.split(",")) if self.cameras else (),
+                sampling=self.sampling,
+                frames=self.frames,
+                mode=self.mode,
+                fuse=self.fuse,
+                resize=self.resize,
+                episodes=parse_episodes(self.episodes) if self.episodes else None,
+                limit=self.limit,
+                shard=parse_shard(self.shard) if self.shard else None,
+                parts=self.parts,
+                workers=self.workers,
+                overwrite=self.overwrite,
+                in_place=self.in_place,
+            )
+
+
+def with_label_flags(command: Callable[..., None]) -> Callable[..., None]:
+    """Gives a command that takes ``flags: LabelFlags`` an option for each of them."""
+
+    @functools.wraps(command)
+    def run(**options: Any) -> None:
+        flags = LabelFlags(**{each.name: options.pop(each.name) for each in fields(LabelFlags)})
+        command(**options, flags=flags)
+
+    own = get_type_hints(command, include_extras=True)
+    kept = [
+        parameter.replace(annotation=own[name], kind=inspect.Parameter.KEYWORD_ONLY)
+        for name, parameter in inspect.signature(command).parameters.items()
+        if name != "flags"
+    ]
+    hints = get_type_hints(LabelFlags, include_extras=True)
+    added = [
+        inspect.Parameter(each.name, inspect.Parameter.KEYWORD_ONLY, default=each.default, annotation=hints[each.name])
+        for each in fields(LabelFlags)
+        if each.default is not MISSING
+    ]
+    run.__signature__ = inspect.Signature([*kept, *added])  # type: ignore[attr-defined]  # what typer reads
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in (*kept, *added)}
+    return run
+
+
+def _formats(text: str | None) -> tuple[Format, ...]:
+    names = text.split(",") if text else []
+    for name in names:
+        if name not in FORMATS:
+            raise ValueError(f"format: expected some of {', '.join(FORMATS)}, got {name!r}")
+    return tuple(name for name in FORMATS if name in names)

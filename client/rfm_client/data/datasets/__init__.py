@@ -1,0 +1,7 @@
+# SPDX-License-Identifier: MIT
+"""Datasets of episodes, of any layout: LeRobot, HDF5, folders of videos. Needs ``pip install "./client[label]"``."""
+
+from rfm_client.data.datasets.opening import open_dataset
+from rfm_client.data.datasets.protocol import Dataset, DatasetError, Episode, iter_episodes
+
+__all__ = ["Dataset", "DatasetError", "Episode", "iter_episodes", "open_dataset"]

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: MIT
+"""LeRobot datasets of all versions, without LeRobot: frame t is the dataset's frame t. Needs pyarrow, and PyAV.
+
+A frame in a film is found by its time stamp: where the episode begins in the film, plus the row's own.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Sequence
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.data.datasets import lerobot_v21, lerobot_v30
+from rfm_client.data.datasets.films import Packets, Span, decode
+from rfm_client.data.datasets.lerobot_info import Info
+from rfm_client.data.datasets.lerobot_rows import Entry, RowReader, read_table
+from rfm_client.data.datasets.protocol import Contents, DatasetError, Episode, contents_of
+
+FILMS_AT_A_TIME = 4  # whose tables of packets are kept in memory
+
+
+class LeRobotDataset:
+    """A LeRobot dataset in a local folder.
+
+    source, revision: of the Hub, if it came from there
+    """
+
+    def __init__(self, root: Path, *, source: str | None = None, revision: str | None = None) -> None:
+        self.root = root
+        self.source = source or root.resolve().name
+        self.revision = revision
+        self.info = Info.read(root)
+        self._packets = lru_cache(FILMS_AT_A_TIME)(Packets.read)
+        version = lerobot_v30 if self.info.version == "v3.0" else lerobot_v21
+        self._entries = {entry.index: entry for entry in version.read_entries(root, self.info)}
+        self._rows = RowReader(version.read_tasks(root))
+        self._check_totals()
+
+    @property
+    def kind(self) -> str:
+        """Its layout, with the version."""
+        return f"LeRobot {self.info.version}"
+
+    @property
+    def cameras(self) -> Sequence[str]:
+        """Keys of the features that are video or images."""
+        return (*self.info.films, *self.info.images)
+
+    @cached_property
+    def episodes(self) -> Sequence[Episode]:
+        """All episodes. Reads and checks the rows of all of them; raises DatasetError."""
+        return [self._episode(entry) for _, entry in sorted(self._entries.items())]
+
+    def check(self, episode: Episode, camera: str) -> Contents:
+        """What the episode's frames are made of; each is there. Raises DatasetError."""
+        if camera in self.info.films:
+            span = self._span(episode, camera)
+            return self._packets(span.file).check(span)
+        return contents_of(self._images(episode, camera))
+
+    def frames(self, episode: Episode, camera: str) -> Iterator[UInt8Array]:
+        """The episode's frames, uint8 [H, W, 3]. Raises DatasetError."""
+        if camera in self.info.films:
+            return decode(self._span(episode, camera))
+        images = self._images(episode, camera)
+        return (_decoded_image(self._where(episode, camera, t), image) for t, image in enumerate(images))
+
+    def _episode(self, entry: Entry) -> Episode:
+        rows = self._rows.read(entry)
+        return Episode(entry.index, entry.where, rows.task, len(rows.times_s), rows.first_index)
+
+    def _span(self, episode: Episode, camera: str) -> Span:
+        entry = self._entries[episode.index]
+        file, from_s = entry.films[camera]
+        where = f"{entry.where}: {camera}"
+        return Span(file, from_s + self._rows.read(entry).times_s, 0.5 / self.info.fps, where)
+
+    def _images(self, episode: Episode, camera: str) -> list[bytes]:
+        """The episode's images as they are stored: encoded as PNG or JPEG."""
+        file = self._entries[episode.index].data_file
+        stored = read_table(file, [camera], filters=[("episode_index", "=", episode.index)])[camera].to_pylist()
+        if len(stored) != episode.num_frames:
+            raise DatasetError.at(f"{file}: {camera}", f"{episode.num_frames} images", str(len(stored)))
+        return [self._image_bytes(self._where(episode, camera, t), image) for t, image in enumerate(stored)]
+
+    def _image_bytes(self, where: str, image: Any) -> bytes:
+        image = image if isinstance(image, dict) else {}
+        if isinstance(image.get("bytes"), bytes):
+            return bytes(image["bytes"])
+        path = image.get("path")
+        if not isinstance(path, str) or Path(path).is_absolute() or ".." in Path(path).parts:
+            raise DatasetError.at(where, "an image, or its path inside the dataset", repr(path))
+        try:
+            return (self.root / path).read_bytes()
+        except OSError as error:
+            raise DatasetError.at(where, "an image file", f"{error.strerror} ({path})") from error
+
+    def _where(self, episode: Episode, camera: str, t: int) -> str:
+        return f"{episode.name}: {camera}: frame {t}"
+
+    def _check_totals(self) -> None:
+        where, info = self.root / "meta", self.info
+        if len(self._entries) != info.total_episodes or sorted(self._entries) != list(range(info.total_episodes)):
+            raise DatasetError.at(where, f"{info.total_episodes} episodes, as info.json says", str(len(self._entries)))
+        num_frames = sum(entry.length for entry in self._entries.values())
+        if num_frames != info.total_frames:
+            raise DatasetError.at(where, f"{info.total_frames} frames, as info.json says", str(num_frames))
+
+
+def _decoded_image(where: str, image: bytes) -> UInt8Array:
+    try:
+        from PIL import Image, UnidentifiedImageError
+    except ImportError as error:
+        raise ImportError('datasets of images need Pillow: pip install "./client[label]"') from error
+    try:
+        with Image.open(io.BytesIO(image)) as opened:
+            return np.asarray(opened.convert("RGB"))
+    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+        raise DatasetError.at(where, "an image", str(error)) from error

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: MIT
+"""Episodes of LeRobot v2.0 and v2.1: a table and a film for each episode and camera."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from rfm_client.data.datasets.lerobot_info import Info
+from rfm_client.data.datasets.lerobot_rows import Entry
+from rfm_client.data.datasets.protocol import DatasetError
+
+EPISODES_FILE = Path("meta", "episodes.jsonl")
+TASKS_FILE = Path("meta", "tasks.jsonl")
+
+
+def read_entries(root: Path, info: Info) -> Iterator[Entry]:
+    """The episodes that the metadata list. Raises DatasetError."""
+    for where, line in _lines(root / EPISODES_FILE):
+        index, length = _number(where, line, "episode_index"), _number(where, line, "length")
+        values = {"episode_chunk": index // info.chunks_size, "episode_index": index}
+        tasks = line.get("tasks")
+        yield Entry(
+            index=index,
+            tasks=[task for task in tasks if isinstance(task, str)] if isinstance(tasks, list) else [],
+            length=length,
+            first_index=None,
+            data_file=info.path(root, info.data_path, **values),
+            films={key: (info.path(root, info.video_path, **values, video_key=key), 0.0) for key in info.films},
+        )
+
+
+def read_tasks(root: Path) -> dict[int, str]:
+    """Each task's sentence by its number. Raises DatasetError."""
+    return {_number(where, line, "task_index"): line.get("task", "") for where, line in _lines(root / TASKS_FILE)}
+
+
+def _lines(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Each line of a file of JSON objects, and how messages name it."""
+    try:
+        texts = file.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError as error:
+        raise DatasetError.at(file, "a file of JSON lines", "none") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError.at(file, "a readable file of JSON lines", str(error)) from error
+    for number, text in enumerate(texts, 1):
+        where = f"{file}: line {number}"
+        if not text.strip():
+            continue
+        try:
+            line = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise DatasetError.at(where, "a JSON object", str(error)) from error
+        if not isinstance(line, dict):
+            raise DatasetError.at(where, "a JSON object", type(line).__name__)
+        yield where, line
+
+
+def _number(where: str, line: Mapping[str, Any], name: str) -> int:
+    value = line.get(name)
+    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+        raise DatasetError.at(f"{where}: {name}", "a whole number from 0", repr(value))
+    return value

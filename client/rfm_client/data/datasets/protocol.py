@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: MIT
+"""What a dataset gives: episodes with their tasks, and each camera's frames when they are asked for.
+
+T frames of an episode, H x W pixels.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from rfm_client.contract.errors import RewardError
+from rfm_client.contract.samples import Trajectory, UInt8Array
+
+DIGEST_BYTES = 16
+
+_CAMERA_PREFIX = "observation.images."
+
+
+class DatasetError(RewardError, ValueError):
+    """A dataset that contradicts itself or cannot be read, reported as ``where: expected X, got Y``."""
+
+    @classmethod
+    def at(cls, where: object, expected: str, got: str) -> DatasetError:
+        """The error at a file, or at a place in it."""
+        return cls(f"{where}: expected {expected}, got {got}")
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode of a dataset.
+
+    index: its number in the dataset
+    name: what it is called there
+    first_index: the dataset's number of its first frame; the others follow one by one
+    """
+
+    index: int
+    name: str
+    task: str
+    num_frames: int
+    first_index: int
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What an episode's frames are made of. num_bytes: as they are stored"""
+
+    digest: str
+    num_bytes: int
+
+
+class Dataset(Protocol):
+    """Episodes on disk. Opening one reads tables and no frames."""
+
+    @property
+    def kind(self) -> str:
+        """Its layout, for example ``LeRobot v3.0``."""
+
+    @property
+    def root(self) -> Path:
+        """The folder in which labels are written unless the caller names another one."""
+
+    @property
+    def source(self) -> str:
+        """Its id on the Hub, or the name of its folder or file."""
+
+    @property
+    def revision(self) -> str | None:
+        """The commit of the Hub; None: a local folder."""
+
+    @property
+    def cameras(self) -> Sequence[str]:
+        """Names of the cameras, in the dataset's order."""
+
+    @property
+    def episodes(self) -> Sequence[Episode]:
+        """All episodes, by index."""
+
+    def check(self, episode: Episode, camera: str) -> Contents:
+        """Finds every frame of the episode without decoding one. DatasetError for what contradicts itself, or is
+        missing.
+        """
+
+    def frames(self, episode: Episode, camera: str) -> Iterator[UInt8Array]:
+        """The T frames in order, uint8 [H, W, 3], RGB, each decoded once. Raises DatasetError for a frame that is not
+        there or cannot be decoded.
+        """
+
+
+def chosen_cameras(dataset: Dataset, names: Iterable[str]) -> tuple[str, ...]:
+    """The dataset's cameras of these names, which may leave LeRobot's ``observation.images.`` out; none: all.
+
+    Raises DatasetError for a camera that the dataset does not have.
+    """
+    chosen = []
+    for name in names:
+        camera = next((known for known in dataset.cameras if known in (name, _CAMERA_PREFIX + name)), None)
+        if camera is None:
+            raise DatasetError.at("cameras", f"some of {', '.join(dataset.cameras)}", repr(name))
+        chosen.append(camera)
+    return tuple(chosen or dataset.cameras)
+
+
+def iter_episodes(
+    dataset: Dataset, cameras: Sequence[str] | None = None
+) -> Iterator[tuple[Episode, Mapping[str, Trajectory]]]:
+    """Each episode with its trajectory as each camera filmed it, for loops of one's own. Raises DatasetError.
+
+    cameras: some of the dataset's; None: all. The frames of one episode are in memory at a time.
+    """
+    names = chosen_cameras(dataset, cameras or ())
+    for episode in dataset.episodes:
+        for camera in names:
+            dataset.check(episode, camera)
+        yield (
+            episode,
+            {
+                camera: Trajectory(frames=np.stack(list(dataset.frames(episode, camera))), task=episode.task)
+                for camera in names
+            },
+        )
+
+
+def contents_of(parts: Iterable[bytes]) -> Contents:
+    """Digest and size of these bytes."""
+    num_bytes = 0
+
+    def counted() -> Iterator[bytes]:
+        nonlocal num_bytes
+        for part in parts:
+            num_bytes += len(part)
+            yield part
+
+    return Contents(digest_of(counted()), num_bytes)
+
+
+def digest_of(parts: Iterable[bytes]) -> str:
+    """A digest of these bytes, in which it matters where one part ends and the next begins."""
+    digest = hashlib.blake2b(digest_size=DIGEST_BYTES)
+    for part in parts:
+        digest.update(len(part).to_bytes(8, "little"))
+        digest.update(part)
+    return digest.hexdigest()
+
+
+def checked_task(where: object, task: object) -> str:
+    """The task's sentence. Raises DatasetError if there is none."""
+    if not isinstance(task, str) or not task.strip():
+        raise DatasetError.at(where, "a task as a sentence", "none" if not task else repr(task))
+    return task

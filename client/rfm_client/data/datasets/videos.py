@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: MIT
+"""A folder of videos, one an episode, with a table of their tasks: ``tasks.csv`` or ``tasks.json``. Needs PyAV.
+
+The CSV file has the columns ``video`` and ``task``; the JSON file is ``{"film.mp4": "put the block in the bowl"}``.
+Paths are relative to the table. The table's order is the order of the episodes. Every frame of a video counts.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.data.datasets.films import Packets, Span, decode
+from rfm_client.data.datasets.protocol import Contents, DatasetError, Episode, checked_task, chosen_cameras, digest_of
+from rfm_client.data.lerobot import check_local_film
+
+TABLES = ("tasks.csv", "tasks.json")
+CAMERA = "video"
+
+_FILES_AT_A_TIME = 4
+
+
+class VideoFolder:
+    """Videos and their tasks.
+
+    table: the file of tasks, or the folder that holds it
+    """
+
+    kind = "videos"
+    revision = None
+    cameras: Sequence[str] = (CAMERA,)
+
+    def __init__(self, table: Path) -> None:
+        self._table = _table_in(table) if table.is_dir() else table
+        self.root = self._table.parent
+        self.source = self.root.resolve().name
+        self._packets = lru_cache(_FILES_AT_A_TIME)(Packets.read)
+        self._tasks = _read(self._table)
+
+    @cached_property
+    def episodes(self) -> Sequence[Episode]:
+        """All videos, in the table's order. Counts their frames; raises DatasetError."""
+        episodes: list[Episode] = []
+        first = 0
+        for index, (name, task) in enumerate(self._tasks.items()):
+            check_local_film(self.root / name)
+            num_frames = len(self._packets(self.root / name).times_s)
+            if not num_frames:
+                raise DatasetError.at(self.root / name, "frames", "none")
+            episodes.append(Episode(index, name, checked_task(f"{self._table}: {name}", task), num_frames, first))
+            first += num_frames
+        return episodes
+
+    def check(self, episode: Episode, camera: str) -> Contents:
+        """What the video's frames are made of. Raises DatasetError."""
+        chosen_cameras(self, [camera])
+        packets = self._packets(self.root / episode.name)
+        return Contents(digest_of(packets.digests), sum(packets.sizes))
+
+    def frames(self, episode: Episode, camera: str) -> Iterator[UInt8Array]:
+        """The video's frames, uint8 [H, W, 3]. Raises DatasetError."""
+        file = self.root / episode.name
+        times_s = self._packets(file).times_s
+        gaps_s = times_s[1:] - times_s[:-1]
+        tolerance_s = 0.5 * float(gaps_s.min()) if len(gaps_s) else 0.5
+        return decode(Span(file, times_s, tolerance_s, episode.name))
+
+
+def _table_in(folder: Path) -> Path:
+    found = [folder / name for name in TABLES if (folder / name).is_file()]
+    if len(found) != 1:
+        got = "none" if not found else "both"
+        raise DatasetError.at(folder, f"one of {' and '.join(TABLES)} with the task of each video", got)
+    return found[0]
+
+
+def _read(table: Path) -> Mapping[str, str]:
+    """The task of each video, by its path."""
+    try:
+        text = table.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError.at(table, "a readable table of tasks", str(error)) from error
+    return _from_json(table, text) if table.suffix.lower() == ".json" else _from_csv(table, text)
+
+
+def _from_json(table: Path, text: str) -> Mapping[str, str]:
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise DatasetError.at(table, "JSON", str(error)) from error
+    if not isinstance(document, dict) or not document:
+        raise DatasetError.at(table, "an object of tasks by video", type(document).__name__)
+    return document
+
+
+def _from_csv(table: Path, text: str) -> Mapping[str, str]:
+    rows = csv.DictReader(text.splitlines())
+    missing = {"video", "task"} - set(rows.fieldnames or ())
+    if missing:
+        raise DatasetError.at(table, "the columns video and task", ", ".join(rows.fieldnames or ()) or "none")
+    tasks: dict[str, str] = {}
+    for row in rows:
+        if row["video"] in tasks:
+            raise DatasetError.at(f"{table}: line {rows.line_num}", "each video once", row["video"])
+        tasks[row["video"]] = row["task"]
+    if not tasks:
+        raise DatasetError.at(table, "at least one video", "none")
+    return tasks

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: MIT
+"""A reward for every frame of a dataset, written where training reads it. Needs ``pip install "./client[label]"``.
+
+from rfm_client import RewardClient
+from rfm_client.labelling import ClientScorer, LabelOptions, label, open_dataset
+
+with RewardClient("grpc://localhost:8001") as client:
+    report = label(open_dataset("my_dataset"), ClientScorer(client), LabelOptions(cameras=("top",)))
+"""
+
+from rfm_client.data.datasets import Dataset, DatasetError, Episode, iter_episodes, open_dataset
+from rfm_client.labelling.label import Report, label, label_with_ray
+from rfm_client.labelling.options import LabelOptions, parse_episodes
+from rfm_client.labelling.ray_engine import RayOptions
+from rfm_client.labelling.run import Watch
+from rfm_client.labelling.scorer import CheckpointFacts, ClientScorer, Scorer
+from rfm_client.labelling.summary import Summary, summarise
+
+__all__ = [
+    "CheckpointFacts",
+    "ClientScorer",
+    "Dataset",
+    "DatasetError",
+    "Episode",
+    "LabelOptions",
+    "RayOptions",
+    "Report",
+    "Scorer",
+    "Summary",
+    "Watch",
+    "iter_episodes",
+    "label",
+    "label_with_ray",
+    "open_dataset",
+    "parse_episodes",
+    "summarise",
+]

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: MIT
+"""The labels of one episode: every camera's frames decoded once, scored, and fused. T frames."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator
+from typing import TypeAlias
+
+import numpy as np
+
+from rfm_client.contract.errors import InferenceFailedError
+from rfm_client.contract.results import ProgressResult
+from rfm_client.contract.samples import Float32Array, ProgressSample, Trajectory, UInt8Array
+from rfm_client.data.datasets.protocol import Dataset, DatasetError, Episode
+from rfm_client.data.prefixes import of_prefixes, prefix_samples
+from rfm_client.data.resize import resize_frames
+from rfm_client.labelling.options import FUSES
+from rfm_client.labelling.recipe import Recipe
+from rfm_client.labelling.scorer import Scorer, joined_embeddings
+
+Columns: TypeAlias = dict[str, Float32Array]
+
+PROGRESS, SUCCESS = "progress", "success"
+FRAMES_AT_A_TIME = 64  # of one request to the encoder: as many as it encodes in one forward pass
+MAX_BYTES = 32 * 2**20  # of the samples that are made and sent together
+
+
+def episode_columns(
+    dataset: Dataset, episode: Episode, scorer: Scorer, recipe: Recipe, go_on: Callable[[], None]
+) -> Columns:
+    """float32 [T] each: ``progress``, ``success`` if the checkpoint predicts it, and of several cameras each one's,
+    ``progress.<camera>`` and ``success.<camera>``.
+
+    go_on: called between requests; what it raises ends the episode
+
+    Raises RewardError.
+    """
+    by_camera = {}
+    for camera in recipe.cameras:
+        frames = _checked(dataset.frames(episode, camera), episode, camera)
+        by_camera[camera] = _scores(frames, episode.task, scorer, recipe, go_on)
+    columns: Columns = {}
+    for name in (PROGRESS, SUCCESS):
+        scores = [getattr(result, name) for result in by_camera.values()]
+        if name == SUCCESS and all(np.isnan(score).all() for score in scores):
+            continue
+        _check_numbers(name, scores, episode)
+        columns[name] = np.asarray(FUSES[recipe.fuse](np.stack(scores), axis=0), np.float32)
+        if len(by_camera) > 1:
+            columns |= {f"{name}.{camera}": score for camera, score in zip(by_camera, scores, strict=True)}
+    return columns
+
+
+def _scores(
+    frames: Iterator[UInt8Array], task: str, scorer: Scorer, recipe: Recipe, go_on: Callable[[], None]
+) -> ProgressResult:
+    trajectory = _trajectory(frames, task, scorer, recipe, go_on)
+    if recipe.in_one_pass:
+        (result,) = scorer.evaluate([ProgressSample(trajectory)])
+        return result
+    results: list[ProgressResult] = []
+    samples = prefix_samples(trajectory, recipe.sampling)
+    for together in _by_bytes(samples):
+        go_on()
+        results += scorer.evaluate(together)
+    return of_prefixes(results, recipe.sampling)
+
+
+def _trajectory(
+    frames: Iterator[UInt8Array], task: str, scorer: Scorer, recipe: Recipe, go_on: Callable[[], None]
+) -> Trajectory:
+    """The episode as embeddings, if the checkpoint encodes: then few of its frames are in memory at a time."""
+    parts: list[Trajectory] = []
+    chunks: list[UInt8Array] = []
+    while chunk := list(itertools.islice(frames, FRAMES_AT_A_TIME)):
+        go_on()
+        stacked = np.stack(chunk)
+        if recipe.resize and recipe.checkpoint.frame_size is not None:
+            stacked = resize_frames(stacked, recipe.checkpoint.frame_size)
+        if recipe.checkpoint.encodes:
+            parts.append(scorer.encode(stacked, task))
+        else:
+            chunks.append(stacked)
+    return joined_embeddings(parts) if parts else Trajectory(frames=np.concatenate(chunks), task=task)
+
+
+def _by_bytes(samples: Iterable[ProgressSample]) -> Iterator[list[ProgressSample]]:
+    """The samples in lists of at most MAX_BYTES, or of one sample."""
+    together: list[ProgressSample] = []
+    num_bytes = 0
+    for sample in samples:
+        if together and num_bytes + sample.trajectory.positions.nbytes > MAX_BYTES:
+            yield together
+            together, num_bytes = [], 0
+        together.append(sample)
+        num_bytes += sample.trajectory.positions.nbytes
+    if together:
+        yield together
+
+
+def _checked(frames: Iterator[UInt8Array], episode: Episode, camera: str) -> Iterator[UInt8Array]:
+    """The frames. Raises DatasetError if there are more or fewer than the episode has, or of several sizes."""
+    where, count, shape = f"{episode.name}: {camera}", 0, None
+    for frame in frames:
+        if shape not in (None, frame.shape):
+            raise DatasetError.at(f"{where}: frame {count}", f"the size {shape}", str(frame.shape))
+        shape = frame.shape
+        count += 1
+        yield frame
+    if count != episode.num_frames:
+        raise DatasetError.at(where, f"{episode.num_frames} frames", str(count))
+
+
+def _check_numbers(name: str, scores: list[Float32Array], episode: Episode) -> None:
+    for score in scores:
+        if score.shape != (episode.num_frames,) or not np.isfinite(score).all():
+            got = "NaN: this checkpoint does not predict it" if np.isnan(score).any() else str(list(score.shape))
+            raise InferenceFailedError(f"{name}: expected a score of each of {episode.num_frames} frames, got {got}")

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: MIT
+"""Labels on a Ray cluster: Ray Data hands episodes to actors, each of which holds a scorer. Needs ``rfm-client[ray]``.
+
+Ray only schedules. Parts, claims and provenance are those of a run without Ray, so either goes on with what the other
+has left. Dataset and parts must be at the same place for every node: a shared folder, or for the parts a URL.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+from rfm_client.contract.errors import RewardError
+from rfm_client.data.datasets.opening import open_dataset
+from rfm_client.labelling.parts import Parts
+from rfm_client.labelling.plan import Plan
+from rfm_client.labelling.run import Failure, Run, Watch
+from rfm_client.labelling.scorer import Scorer
+
+Connect: TypeAlias = Callable[[], AbstractContextManager[Scorer]]
+
+BATCHES_AN_ACTOR = 4  # at least, where there are enough episodes, so that all actors end at about the same time
+
+
+@dataclass(frozen=True)
+class RayOptions:
+    """Where and how many actors label.
+
+    address: of the cluster; None: one that is found, or else made on this machine
+    actors: each holds a scorer
+    num_gpus_per_actor: of a node's GPUs that an actor takes; 0 for actors that ask servers
+    """
+
+    address: str | None = None
+    actors: int = 1
+    num_gpus_per_actor: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.actors < 1:
+            raise ValueError(f"actors: expected at least 1, got {self.actors}")
+        if self.num_gpus_per_actor < 0:
+            raise ValueError(f"num_gpus_per_actor: expected 0 or more, got {self.num_gpus_per_actor}")
+
+
+@dataclass(frozen=True)
+class Job:
+    """What every actor is told.
+
+    source, task: with which the dataset is opened
+    connect: gives the actor's scorer
+    """
+
+    source: str
+    task: str | None
+    connect: Connect
+    plan: Plan
+    parts: str
+    workers: int
+
+
+class EpisodeActor:
+    """Labels batches of episodes: while one is scored, the next is decoded."""
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+        self._parts = Parts(job.parts)
+        self._dataset = open_dataset(job.source, task=job.task)
+        self._scorer = ExitStack().enter_context(job.connect())  # open as long as the actor lives
+
+    def __call__(self, batch: Mapping[str, Any]) -> dict[str, list[Any]]:
+        """Labels the episodes of these places in the plan. Gives for each the reason if it failed, else nothing."""
+        (places,) = batch["places"]
+        plan = replace(self._job.plan, items=[self._job.plan.items[int(place)] for place in places])
+        failures = Run(plan, self._dataset, self._scorer, self._parts, Watch()).finish_all(self._job.workers)
+        reasons = {failure.episode.index: str(failure.error) for failure in failures}
+        return {
+            "place": [int(place) for place in places],
+            "reason": [reasons.get(item.episode.index, "") for item in plan.items],
+        }
+
+
+def finish_all_with_ray(job: Job, options: RayOptions, watch: Watch) -> list[Failure]:
+    """Labels what has no part, on a cluster. Gives what failed; raises what stops an actor, as ``RewardError``."""
+    ray = _import_ray()
+    items = job.plan.items
+    finished = Parts(job.parts).finished(items)
+    num_finished = sum(item.episode.num_frames for item in items if item.key in finished)
+    watch.begin(job.plan.num_frames, num_finished)
+    places = [place for place, item in enumerate(items) if item.key not in finished]
+    if not places:
+        return []
+    labelled = _labelled(ray, job, options, places)
+    failures = []
+    try:
+        for row in labelled.iter_rows():
+            episode = items[row["place"]].episode
+            if row["reason"]:
+                failures.append(Failure(episode, RewardError(row["reason"])))
+                watch.failed(episode, failures[-1].error)
+            else:
+                watch.scored(episode)
+    except ray.exceptions.RayError as error:
+        raise RewardError(f"ray: expected actors that label, got {str(error).strip().splitlines()[-1]}") from error
+    return sorted(failures, key=lambda failure: failure.episode.index)
+
+
+def _labelled(ray: Any, job: Job, options: RayOptions, places: Sequence[int]) -> Any:
+    """The Ray dataset whose rows come as episodes are labelled; connects to the cluster."""
+    if not ray.is_initialized():
+        ray.init(address=options.address, log_to_driver=False, include_dashboard=False)
+    ray.data.DataContext.get_current().enable_progress_bars = False
+    batches = _batches(places, options.actors, job.workers)
+    dataset = ray.data.from_items([{"places": batch} for batch in batches], override_num_blocks=len(batches))
+    return dataset.map_batches(
+        EpisodeActor,
+        fn_constructor_args=(job,),
+        batch_size=1,
+        batch_format="numpy",
+        compute=ray.data.ActorPoolStrategy(size=min(options.actors, len(batches))),
+        num_gpus=options.num_gpus_per_actor,
+    )
+
+
+def _batches(places: Sequence[int], actors: int, workers: int) -> list[list[int]]:
+    """As many episodes together as an actor has under way, fewer if there are few for each actor."""
+    size = max(1, min(workers, len(places) // (actors * BATCHES_AN_ACTOR)))
+    return [list(places[start : start + size]) for start in range(0, len(places), size)]
+
+
+def _import_ray() -> Any:
+    try:
+        import ray
+        import ray.data
+    except ImportError as error:
+        raise ImportError('labelling on a cluster needs Ray: pip install "./client[ray]"') from error
+    return ray

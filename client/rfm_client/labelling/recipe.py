@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: MIT
+"""What decides the content of labels, besides the frames: checkpoint, cameras, sampling. And who decided it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from rfm_client.data.datasets.protocol import Dataset, DatasetError, Episode, chosen_cameras
+from rfm_client.data.sampling import Sampling
+from rfm_client.labelling.options import DEFAULT_RULE, Fuse, LabelOptions, Mode
+from rfm_client.labelling.scorer import CheckpointFacts
+
+RECIPE_FORMAT = 1  # another one wherever the same recipe would give other scores
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How an episode's frames become labels."""
+
+    checkpoint: CheckpointFacts
+    cameras: tuple[str, ...]
+    sampling: Sampling
+    mode: Mode
+    fuse: Fuse
+    resize: bool
+
+    @classmethod
+    def of(cls, options: LabelOptions, dataset: Dataset, checkpoint: CheckpointFacts) -> Recipe:
+        """The recipe that the options, or else the dataset and the checkpoint, decide. Raises DatasetError for a camera
+        that is not there, ValueError if nobody says how many frames the rule shows.
+        """
+        if not dataset.cameras:
+            raise DatasetError.at(dataset.source, "at least one camera", "none")
+        cameras = chosen_cameras(dataset, options.cameras)
+        rule = options.sampling or ("all" if options.mode == "whole" else DEFAULT_RULE)
+        sampling = Sampling.of(rule, options.frames, checkpoint.max_frames)
+        return cls(checkpoint, cameras, sampling, options.mode, options.fuse, options.resize)
+
+    @property
+    def in_one_pass(self) -> bool:
+        """Whether one pass over an episode gives every frame's score."""
+        return self.mode == "whole" or (self.sampling.rule == "all" and self.checkpoint.is_causal)
+
+    def document(self) -> dict[str, Any]:
+        """The recipe as provenance tells it."""
+        told = asdict(self.sampling)
+        return {
+            "format": RECIPE_FORMAT,
+            "checkpoint": self.checkpoint.document(),
+            "cameras": list(self.cameras),
+            "sampling": told,
+            "mode": self.mode,
+            "fuse": self.fuse if len(self.cameras) > 1 else None,
+            "resize": str(self.checkpoint.frame_size) if self.resize else None,
+        }
+
+    def told(self, options: LabelOptions) -> list[str]:
+        """What is done, a line each, with who decided it."""
+        of_rule = "asked for" if options.sampling else "the rule of upstream's training and RL loop"
+        of_frames = "asked for" if options.frames else "as many as the checkpoint was trained on"
+        one = len(self.cameras) == 1
+        lines = [f"cameras: {', '.join(self.cameras)} ({'asked for' if options.cameras else 'all of the dataset'})"]
+        if self.mode == "whole":
+            lines.append("mode: whole: the score of frame t may depend on later frames, unless the network is causal")
+        else:
+            lines.append(f"sampling: {self.sampling.rule} ({of_rule})")
+        if self.sampling.frames is not None:
+            lines.append(f"frames: {self.sampling.frames} ({of_frames})")
+        return lines if one else [*lines, f"fuse: {self.fuse} of {len(self.cameras)} cameras"]
+
+    def check_lengths(self, episodes: Sequence[Episode]) -> None:
+        """Raises DatasetError for an episode that the checkpoint cannot take at once, where it must."""
+        limit = self.checkpoint.max_frames
+        longest = max(episodes, key=lambda episode: episode.num_frames)
+        shows_all = self.mode == "whole" or self.sampling.frames is None
+        if shows_all and limit is not None and longest.num_frames > limit:
+            got = f"{longest.num_frames}: use mode prefix and a rule with a number of frames"
+            raise DatasetError.at(longest.name, f"at most {limit} frames, as the checkpoint takes", got)

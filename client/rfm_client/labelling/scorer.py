@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: MIT
+"""What scores: a server behind a client, or an engine in this process. T frames, H x W pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol, cast
+
+import numpy as np
+
+from rfm_client.client import RewardClient
+from rfm_client.contract.errors import InvalidSampleError, ModelNotFoundError
+from rfm_client.contract.frame_size import FrameSize
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.results import ProgressResult
+from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array
+
+
+@dataclass(frozen=True)
+class CheckpointFacts:
+    """What decides a checkpoint's scores, and what it takes.
+
+    source, revision: where it came from; None: not known
+    weights_digest: of its weights
+    max_frames: frames of a trajectory that it was trained on, at most; None: it does not say
+    frame_size: to what it brings each frame; None: that depends on the frame
+    encodes: frames can be encoded by themselves, and prefixes scored from their embeddings
+    is_causal: no frame's score depends on later frames
+    """
+
+    source: str | None
+    revision: str | None
+    weights_digest: str
+    max_frames: int | None
+    frame_size: FrameSize | None
+    encodes: bool
+    is_causal: bool
+
+    def document(self) -> dict[str, Any]:
+        """What provenance says of it."""
+        told = ("source", "revision", "weights_digest")
+        return {name: value for name, value in asdict(self).items() if name in told}
+
+
+class Scorer(Protocol):
+    """Scores samples of one checkpoint. Used by several threads at a time."""
+
+    def checkpoint(self) -> CheckpointFacts:
+        """The facts of the checkpoint that answers now. Raises RewardError."""
+
+    def encode(self, frames: UInt8Array, task: str) -> Trajectory:
+        """The embeddings of frames, uint8 [T, H, W, 3], and task, if the checkpoint ``encodes``. Raises RewardError."""
+
+    def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
+        """The result of each sample. Raises RewardError for the first that fails."""
+
+
+class ClientScorer:
+    """Scores by asking the servers of a client, which stays open."""
+
+    def __init__(self, client: RewardClient) -> None:
+        self._client = client
+
+    def checkpoint(self) -> CheckpointFacts:
+        """The facts that the server tells. Raises RewardError."""
+        info = self._client.model_info(frames=True)
+        embedded = self._of_embeddings()
+        if info.weights_digest is None:
+            raise InvalidSampleError.at(
+                f"model {info.name}", "a weights_digest, as exports have since version 0.1.0", "none: export it again"
+            )
+        network = info.network if embedded is None else embedded.network
+        return CheckpointFacts(
+            source=info.source,
+            revision=info.revision,
+            weights_digest=info.weights_digest,
+            max_frames=info.max_frames,
+            frame_size=info.frame_size,
+            encodes=embedded is not None,
+            is_causal=network.get("config", {}).get("causal_mask") is True,
+        )
+
+    def encode(self, frames: UInt8Array, task: str) -> Trajectory:
+        """The embeddings of frames and task. Raises RewardError."""
+        return self._client.encode(Trajectory(frames=frames, task=task))
+
+    def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
+        """The result of each sample. Raises RewardError for the first that fails."""
+        return cast("list[ProgressResult]", self._client.evaluate(samples))
+
+    def _of_embeddings(self) -> ModelInfo | None:
+        """The model that scores embeddings; None: only frames are scored."""
+        try:
+            info = self._client.model_info()
+        except ModelNotFoundError:
+            return None
+        return None if info.widths is None else info
+
+
+def joined_embeddings(parts: Sequence[Trajectory]) -> Trajectory:
+    """One trajectory of the embeddings of parts that follow one another; the text is the first's."""
+    return Trajectory(
+        video_embeddings=np.concatenate([part.positions for part in parts]), text_embedding=parts[0].text_embedding
+    )

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: MIT
+"""Samples in, outcomes out: which requests a call makes of them, and what comes of each."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping, Sequence
+from copy import copy
+from functools import partial
+from typing import Any, TypeVar
+
+from rfm_client.batching import groups, model_of, padded_bytes, parts
+from rfm_client.call import Call, new_request_ids
+from rfm_client.contract import wire
+from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, ProcessEndedError, RewardError
+from rfm_client.contract.names import encoder_name
+from rfm_client.contract.results import Result
+from rfm_client.contract.samples import Sample, Trajectory
+from rfm_client.data.fitting import FittedSample, fitted, whole, with_frame_indices
+from rfm_client.joining import Joining, Outcome
+from rfm_client.model_infos import ModelInfos
+from rfm_client.transport.calls import Answer
+from rfm_client.transport.deadline import Deadline
+from rfm_client.transport.in_flight import InFlight
+from rfm_client.transport.off_loop import off_loop
+from rfm_client.transport.servers import Servers
+
+Answered = TypeVar("Answered")
+
+_EMBEDDINGS = (wire.VIDEO_EMBEDDINGS, wire.TEXT_EMBEDDING)
+
+
+class Scorer:
+    """Scores samples on the servers of one client, for one event loop.
+
+    model: name of the model that scores embeddings
+    join: samples of concurrent calls may share a request
+    """
+
+    def __init__(self, model: str, servers: Servers, in_flight: InFlight, *, join: bool) -> None:
+        self._model = model
+        self._servers = servers
+        self._in_flight = in_flight
+        self.model_infos = ModelInfos(servers)
+        self._join = join
+        self._joining = Joining(self._request, self.model_infos, servers)
+
+    async def result(self, sample: Sample, call: Call) -> Result:
+        """The result of one sample. Raises RewardError."""
+        fit = await self._fitted(sample, call)
+        outcome = await self._outcome(fit.sample, call)
+        if isinstance(outcome, RewardError):
+            raise outcome
+        return with_frame_indices(outcome, fit.frame_indices)
+
+    async def outcomes(self, samples: Sequence[Sample], call: Call) -> list[Outcome]:
+        """The result or error of each sample."""
+        fits: dict[int, FittedSample] = {}
+        outcomes: dict[int, Outcome] = {}
+        for index, sample in enumerate(samples):
+            try:
+                fits[index] = await self._fitted(sample, call)
+            except RewardError as error:
+                outcomes[index] = error
+        sent = {index: fit.sample for index, fit in fits.items()}
+        scored = await _together([self._scored(*group, sent, call) for group in groups(sent, self._model)])
+        for index, outcome in itertools.chain(*scored):
+            indices = fits[index].frame_indices
+            outcomes[index] = outcome if isinstance(outcome, RewardError) else with_frame_indices(outcome, indices)
+        return [outcomes[index] for index in range(len(samples))]
+
+    async def embeddings(self, trajectory: Trajectory, deadline: Deadline, request_id: str | None) -> Trajectory:
+        """The trajectory with embeddings in place of its frames. Raises RewardError."""
+        if trajectory.frames is None:
+            raise InvalidSampleError.at("trajectory", "frames", "video_embeddings")
+        tensors, model = partial(wire.encode_frames, trajectory), encoder_name(self._model)
+        size, name = trajectory.frames.nbytes, next(new_request_ids(request_id))
+        answer = await self._infer(model, size, tensors, _EMBEDDINGS, deadline, name)
+        return wire.decode_embeddings(answer.tensors, trajectory)
+
+    async def _fitted(self, sample: Sample, call: Call) -> FittedSample:
+        """The sample as it is sent. Raises RewardError."""
+        fit = whole(sample)
+        if not (call.subsample or call.resize):
+            return fit
+        call.deadline.remaining_s()
+        info = await self.model_infos.get(model_of(sample, self._model), call.deadline)
+        # in a thread: resizing takes a while, and other calls wait for this event loop
+        return await asyncio.to_thread(fitted, sample, info, subsample=call.subsample, resize=call.resize)
+
+    async def _outcome(self, sample: Sample, call: Call) -> Outcome:
+        """The outcome of one sample, which goes with those of other calls if it may."""
+        model = model_of(sample, self._model)
+        if self._join and model == self._model and not call.is_named:
+            return await self._joining.outcome(model, sample, call)
+        (outcome,) = await self._request(model, [sample], call)
+        return outcome
+
+    async def _scored(
+        self, model: str, group: Sequence[int], samples: Mapping[int, Sample], call: Call
+    ) -> Iterable[tuple[int, Outcome]]:
+        """The outcomes of a group of samples that fit the same arrays, with their indices."""
+        if len(group) == 1:
+            return [(group[0], await self._outcome(samples[group[0]], call))]
+        try:
+            limit = (await self.model_infos.get(model, call.deadline)).max_batch_size
+        except RewardError as error:
+            return zip(group, _for_each(error, len(group)), strict=True)
+        requests = [[samples[index] for index in part] for part in parts(samples, group, limit)]
+        answered = await _together([self._request(model, request, call) for request in requests])
+        return zip(group, itertools.chain(*answered), strict=True)
+
+    async def _request(self, model: str, samples: Sequence[Sample], call: Call) -> Sequence[Outcome]:
+        """One request. It fails whole if one sample cannot be scored; then each sample is sent alone.
+
+        A request that is refused because it has ended its process is not taken apart: all its samples fail. But samples
+        of several calls are asked about alone as soon as a process ends that has them.
+        """
+        request_id = next(call.request_ids)
+        is_joint = call.is_joint and len(samples) > 1
+        outputs, tensors = (*wire.outputs_for(samples), *call.outputs), partial(wire.encode_samples, samples)
+        size, deadline = padded_bytes(samples), call.deadline
+        try:
+            answer = await self._infer(model, size, tensors, outputs, deadline, request_id, retry_ended=not is_joint)
+            return wire.decode_results(answer.tensors, samples, answer.model_version)
+        except (InvalidSampleError, InferenceFailedError) as error:
+            error.request_id = request_id
+            if len(samples) == 1:
+                return [error]
+            if isinstance(error, InvalidSampleError) and error.is_deadly and not is_joint:
+                return _for_each(error, len(samples))  # alone, the one that is would end two more processes
+        except RewardError as error:
+            if not (is_joint and isinstance(error, ProcessEndedError)):
+                return _for_each(error, len(samples))
+            self._joining.stay_apart()
+        alone = await asyncio.gather(*(self._request(model, [sample], call) for sample in samples))
+        return [outcome for (outcome,) in alone]
+
+    async def _infer(
+        self,
+        model: str,
+        num_bytes: int,
+        tensors: Callable[[], wire.Tensors],
+        outputs: Collection[str],
+        deadline: Deadline,
+        request_id: str,
+        *,
+        retry_ended: bool = True,
+    ) -> Answer:
+        async with self._in_flight.room(num_bytes, deadline):  # tensors are made in turn, so they do not pile up
+            inputs = await off_loop(num_bytes, tensors)
+            answer = await self._servers.infer(
+                model, inputs, outputs, deadline, request_id=request_id, retry_ended=retry_ended
+            )
+        self.model_infos.note_answer(model, answer.model_version)
+        return answer
+
+
+async def _together(calls: Sequence[Coroutine[Any, Any, Answered]]) -> Sequence[Answered]:
+    """What all coroutines give. A single one, as in most calls, needs no task of its own."""
+    return [await calls[0]] if len(calls) == 1 else await asyncio.gather(*calls)
+
+
+def _for_each(error: RewardError, count: int) -> list[Outcome]:
+    """One error of its own for each sample that shares the failure; they may be raised apart."""
+    copies: list[Outcome] = []
+    for _ in range(count):
+        one = copy(error)
+        one.__cause__ = error
+        copies.append(one)
+    return copies

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: MIT
+"""``rfm label``: a reward for every frame of a dataset, from a checkpoint in this process, without Triton."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, cast
+
+import typer
+
+from rfm import families
+from rfm.checkpoint.digest import weights_digest
+from rfm.engine import Engine
+from rfm.execution import Execution
+from rfm.family import Checkpoint
+from rfm_client import ProgressResult, ProgressSample, RewardError, Trajectory
+from rfm_client.cli.label import Source
+from rfm_client.cli.label_flags import LabelFlags, with_label_flags
+from rfm_client.cli.options import missing_package
+from rfm_client.contract.samples import Footage, UInt8Array
+from rfm_client.labelling import CheckpointFacts, Scorer
+
+EXIT_FAILED = 1
+
+
+class EngineScorer:
+    """Scores with an engine, one call at a time: while one thread scores, the others decode.
+
+    The engine is on its device as soon as it scores; until then only the checkpoint is in memory.
+    """
+
+    def __init__(self, source: str, *, device: str = "cpu", **options: Any) -> None:
+        """The scorer of a checkpoint folder or Hugging Face id. Raises CheckpointError.
+
+        options: as in ``rfm.families.load``
+        """
+        self._checkpoint = families.load(source, **options)
+        self._encoders = self._checkpoint.encoders()
+        self._facts = _facts(source, self._checkpoint, self._encoders is not None, _folders(source, options))
+        self._device = device
+        self._lock = threading.Lock()
+
+    def checkpoint(self) -> CheckpointFacts:
+        """The facts of the checkpoint."""
+        return self._facts
+
+    def encode(self, frames: UInt8Array, task: str) -> Trajectory:
+        """The embeddings of frames and task. Raises RewardError."""
+        with self._lock:
+            encoders = self._engine.encoders
+            assert encoders is not None  # or the facts would not say that it encodes
+            footage = Footage((Trajectory(frames=frames, task=task),))
+            (outcome,) = encoders.encode([footage], Execution())
+        return cast(Footage, _result(outcome)).trajectories[0]
+
+    def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
+        """The result of each sample. Raises RewardError for the first that fails."""
+        with self._lock:
+            outcomes = self._engine.evaluate(samples)
+        return [cast(ProgressResult, _result(outcome)) for outcome in outcomes]
+
+    @cached_property
+    def _engine(self) -> Engine:
+        return Engine.of(self._checkpoint, encoders=self._encoders, device=self._device)
+
+
+@with_label_flags
+def label(
+    dataset: Source,
+    checkpoint: Annotated[str, typer.Option(help="Folder, or Hugging Face id org/name@tag.")],
+    device: Annotated[str, typer.Option(help="Device of PyTorch: cpu, cuda, cuda:1.")] = "cpu",
+    image_encoder: Annotated[str | None, typer.Option(help="Folder or id of ReWiND's image encoder.")] = None,
+    text_encoder: Annotated[str | None, typer.Option(help="Folder or id of ReWiND's text encoder.")] = None,
+    base_model: Annotated[
+        str | None, typer.Option(help="Folder or id of a vision-language checkpoint's base model.")
+    ] = None,
+    resize_images: Annotated[bool | None, typer.Option(help="As in rfm export.", show_default=False)] = None,
+    *,
+    flags: LabelFlags,
+) -> None:
+    """A reward for every frame of a dataset, by a checkpoint in this process, without Triton."""
+    options = {
+        "image_encoder": image_encoder,
+        "text_encoder": text_encoder,
+        "base_model": base_model,
+        "resize_images": resize_images,
+    }
+
+    @contextmanager
+    def connect() -> Iterator[Scorer]:
+        yield EngineScorer(checkpoint, device=device, **options)
+
+    with _errors_on_one_line(_say):
+        from rfm_client.cli.labelling import run
+
+        status = run(dataset, flags, connect, _say)
+    raise typer.Exit(status)
+
+
+def _facts(source: str, checkpoint: Checkpoint, has_encoders: bool, folders: Sequence[Path]) -> CheckpointFacts:
+    description = checkpoint.description
+    limits = [limit for limit in (description.trained_frames, description.max_frames) if limit is not None]
+    name, _, tag = source.partition("@")
+    is_local = Path(source).is_dir()
+    return CheckpointFacts(
+        source="/".join(Path(source).resolve().parts[-2:]) if is_local else name,
+        revision=None if is_local else tag or None,
+        weights_digest=weights_digest(folders),
+        max_frames=min(limits, default=None),
+        frame_size=description.frame_size,
+        encodes=has_encoders,
+        is_causal=getattr(checkpoint.config, "causal_mask", None) is True,
+    )
+
+
+def _folders(source: str, options: dict[str, Any]) -> list[Path]:
+    """The local folders whose weights decide the scores."""
+    named = [options.get(name) for name in ("image_encoder", "text_encoder", "base_model")]
+    return [families.find(source), *(Path(folder) for folder in named if folder and Path(folder).is_dir())]
+
+
+def _result(outcome: Any) -> Any:
+    if isinstance(outcome, RewardError):
+        raise outcome
+    return outcome
+
+
+@contextmanager
+def _errors_on_one_line(say: Callable[[str], None]) -> Iterator[None]:
+    try:
+        yield
+    except ImportError as error:
+        say(missing_package(error))
+    except (families.CheckpointError, RewardError, OSError) as error:
+        say(str(error))
+    else:
+        return
+    raise typer.Exit(EXIT_FAILED)
+
+
+def _say(message: str) -> None:
+    typer.echo(f"rfm: {' '.join(message.split())}", err=True)

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: MIT
+"""What a gateway is told: the section ``gateway`` of ``rfm serve``'s YAML file, and the options of ``rfm gateway``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rfm_client.contract.addresses import MAX_PORT, check_certificate, split_url
+from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
+from rfm_client.contract.settings import ConfigError, Settings, setting
+from rfm_client.transport.access import Access
+
+MIB = 2**20
+_SHORTEST_S = 0.001
+
+
+@dataclass(frozen=True)
+class GatewayConfig(Settings):
+    """Where a gateway listens, whom it asks and lets in, and what it takes on; docs/gateway.md has the reasons.
+
+    Where it listens and whom it asks may be None: ``rfm serve`` and ``rfm gateway`` have different defaults for that.
+    """
+
+    port: int | None = setting(
+        None, "Port to listen on; else rfm serve runs no gateway, and rfm gateway takes 8000.", least=1, most=MAX_PORT
+    )
+    host: str | None = setting(None, "Address to listen on; else 127.0.0.1, or that of rfm serve.")
+    triton: str | None = setting(
+        None, "grpc://host:port or http://host:port of Triton, with TLS grpcs:// or https://; else that of rfm serve."
+    )
+    metrics_url: str | None = setting(None, "Triton's metrics; else port 8002 of the same host, or of rfm serve.")
+    model: str | None = setting(None, "Name under which the checkpoint was exported; else rfm, or export.name.")
+    api_key_file: Path | None = setting(
+        None, f"File with the key that requests must show; else {GATEWAY_KEY_VARIABLE}."
+    )
+    certificate: Path | None = setting(None, "Serve HTTPS with this certificate (PEM), and its key.")
+    key: Path | None = setting(None, "The certificate's key (PEM).")
+    triton_ca_file: Path | None = setting(None, "Authorities (PEM) that Triton is trusted by; else the system's.")
+    triton_certificate: Path | None = setting(None, "By which Triton knows the gateway (PEM).")
+    triton_key: Path | None = setting(None, "That certificate's key (PEM).")
+    cors_origin: tuple[str, ...] = setting((), "Origin from which browsers may ask. Again for more.")
+    allow_folder: Path | None = setting(None, "Folder whose files requests may name.")
+    timeout: float = setting(
+        120.0, "Seconds that a request may wait, then take to arrive, then to be scored.", least=_SHORTEST_S
+    )
+    max_body_mib: int = setting(512, "Largest request.", least=1)
+    max_memory_mib: int = setting(1024, "What all requests under way may hold; others wait.", least=1)
+    max_in_flight: int = setting(256, "Evaluations at a time; others wait.", least=1)
+    max_waiting: int = setting(1024, "Evaluations that wait for their turn; more are refused with 503.", least=0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.max_memory_mib < self.max_body_mib:
+            raise ConfigError("max_memory_mib", f"expected at least max_body_mib ({self.max_body_mib}), got less")
+        if (self.certificate is None) != (self.key is None):
+            raise ConfigError("certificate, key", "expected both or none, got one")
+
+    @property
+    def triton_url(self) -> str:
+        """Where Triton is. Raises ConfigError for none."""
+        if self.triton is None:
+            raise ConfigError("triton", "expected the URL of a Triton, got none")
+        return self.triton
+
+    @property
+    def access(self) -> Access:
+        """What Triton is shown. Raises ValueError for files that cannot be used."""
+        return Access(self.triton_ca_file, self.triton_certificate, self.triton_key)
+
+    @property
+    def tls(self) -> dict[str, Any]:
+        """Arguments of uvicorn. Raises ValueError for files that it could not serve with."""
+        if self.certificate is None or self.key is None:
+            return {}
+        check_certificate(self.certificate, self.key, "certificate, key")
+        return {"ssl_certfile": self.certificate, "ssl_keyfile": self.key}
+
+    def api_key(self, environment: Mapping[str, str]) -> str | None:
+        """The key that requests must show; None: they need none. Raises ConfigError."""
+        try:
+            key = environment.get(GATEWAY_KEY_VARIABLE) if self.api_key_file is None else self.api_key_file.read_text()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError("api_key_file", f"expected a text file, got {error}") from None
+        if key is not None and not key.strip():
+            raise ConfigError("api_key_file", f"expected a key, here or in {GATEWAY_KEY_VARIABLE}, got no character")
+        return None if key is None else key.strip()
+
+    def check(self, environment: Mapping[str, str]) -> None:
+        """Raises ValueError or OSError for what a gateway would not start with."""
+        split_url(self.triton_url)
+        if self.allow_folder is not None:
+            self.allow_folder.resolve(strict=True)
+        _ = self.access, self.tls, self.api_key(environment)

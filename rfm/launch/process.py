@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: MIT
+"""One tritonserver process: started, ready, stopped, and nothing of it left behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO
+
+from rfm.config import DEFAULT_HOST, ServeConfig
+from rfm.journal import journals_of_the_dead, restore_journals
+from rfm.launch.admin_key import VARIABLE, http_headers, new_key, restrictions
+from rfm.launch.cleanup import Claim
+from rfm.launch.ending import EXIT_TIMEOUT_S, end, ending_with_parent
+from rfm.launch.http import NO_ANSWER, Http
+from rfm.launch.installation import Installation, ServerStartError
+from rfm.launch.listen_address import check_before_start, check_version
+from rfm.launch.repository_api import INDEX_PATH, RepositoryApi, versions_of
+from rfm.launch.tls import GrpcTls, OwnTls
+from rfm.launch.triton_options import check_arguments, size_limits
+from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
+
+POLL_S = 0.1
+ANSWER_TIMEOUT_S = 10.0  # of one that starts
+NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # a `load` would load all versions anew: their folders have changed
+SECRETS = (VARIABLE, GATEWAY_KEY_VARIABLE)  # variables that neither Triton nor a model process needs
+_REGIONS = "--backend-config=python,shm-region-prefix-name="
+
+
+@dataclass(frozen=True)
+class Endpoints:
+    """Addresses of one server. grpc_tls: gRPC is encrypted; HTTP cannot be, and then listens on 127.0.0.1 alone"""
+
+    host: str = DEFAULT_HOST
+    http_port: int = 8000
+    grpc_port: int = 8001
+    metrics_port: int = 8002
+    grpc_tls: GrpcTls | None = None
+
+    @classmethod
+    def of(cls, config: ServeConfig) -> Endpoints:
+        """The endpoints that a configuration names."""
+        return cls(config.host, config.http_port, config.grpc_port, config.metrics_port, GrpcTls.of(config))
+
+    @classmethod
+    def free(cls) -> Endpoints:
+        """Loopback endpoints on ports that are free now."""
+        sockets = [socket.create_server((DEFAULT_HOST, 0)) for _ in range(3)]
+        ports = [bound.getsockname()[1] for bound in sockets]
+        for bound in sockets:
+            bound.close()
+        return cls(DEFAULT_HOST, *ports)
+
+    @property
+    def http_url(self) -> str:
+        """URL at which RewardClient reaches the server over HTTP."""
+        return f"http://{self.http_host}:{self.http_port}"
+
+    @property
+    def http_host(self) -> str:
+        """Listen address of the server's HTTP port."""
+        return self.host if self.grpc_tls is None else DEFAULT_HOST
+
+    @property
+    def grpc_url(self) -> str:
+        """URL at which RewardClient reaches the server over gRPC."""
+        return f"{'grpc' if self.grpc_tls is None else 'grpcs'}://{self.host}:{self.grpc_port}"
+
+    @property
+    def metrics_url(self) -> str:
+        """URL of the metrics that Prometheus scrapes."""
+        return f"http://{self.host}:{self.metrics_port}/metrics"
+
+    def check_free(self) -> None:
+        """Raises ServerStartError for a port that is taken or an address that is not this machine's."""
+        listening = (
+            ("HTTP", self.http_host, self.http_port),
+            ("gRPC", self.host, self.grpc_port),
+            ("metrics", self.host, self.metrics_port),
+        )
+        for name, host, port in listening:
+            try:
+                socket.create_server((host, port)).close()
+            except (OSError, OverflowError) as error:
+                expected = f"a free port of this machine at {host}:{port}"
+                number = getattr(error, "errno", None)
+                reason = os.strerror(number) if number and number > 0 else str(error)
+                raise ServerStartError(f"{name}: expected {expected}, got: {reason}") from error
+
+
+class TritonServer:
+    """A tritonserver on ``repository`` with every model of it loaded. A context manager that stops it.
+
+    http_threads: threads that read HTTP requests; None: Triton's choice
+    log: where Triton's log goes; None: this process's standard output and error
+    admin_key: what requests to the restricted APIs must show (``admin_key``); None: a new one, known to this alone
+    ends_with_parent: it is killed when the thread that starts it ends, be it by kill -9
+    accepts_known_vulnerabilities: it may be reached from elsewhere although its Triton has some
+    more_arguments: of tritonserver, such as ``--trace-config=...``; not those that this class sets
+    """
+
+    def __init__(
+        self,
+        repository: Path,
+        endpoints: Endpoints,
+        installation: Installation,
+        *,
+        http_threads: int | None = None,
+        log: IO[bytes] | None = None,
+        admin_key: str | None = None,
+        accepts_known_vulnerabilities: bool = False,
+        more_arguments: Sequence[str] = (),
+        ends_with_parent: bool = False,
+    ) -> None:
+        self.endpoints = endpoints
+        self.repository = repository
+        self._installation = installation
+        self._http_threads = http_threads
+        self._log = log
+        self._admin_key = admin_key or new_key()
+        self._accepts_known_vulnerabilities = accepts_known_vulnerabilities
+        self._more_arguments = tuple(more_arguments)
+        self._ends_with_parent = ends_with_parent
+        self._claim: Claim | None = None
+        self._journals: Mapping[str, bytes] = {}
+        self._own_tls: OwnTls | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._loading: frozenset[str] = frozenset()  # what it is to load at its start
+
+    @property
+    def models(self) -> list[str]:
+        """The names of the models in the repository."""
+        return sorted(file.parent.name for file in self.repository.glob("*/config.pbtxt"))
+
+    @property
+    def pid(self) -> int:
+        """The id of the process that was started last."""
+        assert self._process is not None  # started
+        return self._process.pid
+
+    @property
+    def exit_status(self) -> int | None:
+        """The process' exit status; None: it runs."""
+        assert self._process is not None  # started
+        return self._process.poll()
+
+    @property
+    def admin_key(self) -> str:
+        """The key that requests to the restricted APIs must show."""
+        return self._admin_key
+
+    def repository_api(self) -> RepositoryApi:
+        """The model-repository API of the server, once it is started. A context manager."""
+        options = {} if self._own_tls is None else self._own_tls.options
+        return RepositoryApi(self.endpoints.grpc_url, self._admin_key, options)
+
+    def signal(self, number: int) -> None:
+        """Sends a signal to the process, if it runs."""
+        if self._process is not None:
+            self._process.send_signal(number)
+
+    def kill(self) -> None:
+        """Ends the process and its children at once."""
+        with suppress(ProcessLookupError):
+            os.killpg(self.pid, signal.SIGKILL)
+
+    def remember_the_dead(self) -> None:
+        """Keeps for the next start what model processes were working on that are dead now. All else is forgotten."""
+        if self._claim is not None:
+            self._journals = journals_of_the_dead(self._claim.region_prefix)
+
+    def start(self, restored: Collection[str] | None = None) -> None:
+        """Starts the process. Raises ServerStartError for what is known to be wrong before.
+
+        restored: models that it loads, and ``wait_ready`` does not insist on; None: all, and it does
+        """
+        models = self.models
+        self._loading = frozenset(models if restored is None else ())
+        if not models:
+            raise ServerStartError(f"repository: expected a folder of models, got {self.repository}")
+        own = self._arguments(sorted(models if restored is None else restored))
+        check_arguments(self._more_arguments, [*own, _REGIONS])
+        self._check_listen_address()
+        self.endpoints.check_free()
+        self._claim = Claim()
+        restore_journals(self._claim.region_prefix, self._journals)
+        self._journals = {}
+        arguments = [*own, f"{_REGIONS}{self._claim.region_prefix}"]
+        arguments += self._installation.lay_out_backends(self._claim.backends)
+        arguments += self._own_tls.arguments(self._claim.backends) if self._own_tls else []
+        arguments += [*size_limits(self._installation, self._more_arguments), *self._more_arguments]
+        try:
+            self._process = subprocess.Popen(
+                [self._installation.executable, *arguments],
+                env=self._environment(),
+                stdin=subprocess.DEVNULL,
+                stdout=self._log,
+                stderr=self._log,
+                preexec_fn=ending_with_parent() if self._ends_with_parent else None,
+                pass_fds=self._claim.lock_files,
+                start_new_session=True,  # a Ctrl-C in the terminal reaches it once, through us
+            )
+        except OSError as error:
+            self._release()
+            program = self._installation.executable
+            raise ServerStartError(f"tritonserver: expected a program at {program}, got: {error.strerror}") from error
+
+    def wait_ready(self) -> None:
+        """Returns when every model is ready. Raises ServerStartError with the reason of one that is not."""
+        assert self._process is not None  # started
+        triton = Http(self.endpoints.http_host, self.endpoints.http_port)
+        headers = http_headers(self._admin_key)
+        while self._process.poll() is None:
+            try:
+                version = triton.get_json("/v2", ANSWER_TIMEOUT_S).get("version", "")
+                index = triton.get_json(INDEX_PATH, ANSWER_TIMEOUT_S, method="POST", headers=headers)
+            except NO_ANSWER:
+                time.sleep(POLL_S)  # Triton answers nothing while it loads
+                continue
+            failed = [entry for entry in versions_of(index) if not entry.is_ready and entry.name in self._loading]
+            if failed:
+                reasons = "; ".join(f"{entry.name}: {entry.reason or 'not loaded'}" for entry in failed)
+                raise ServerStartError(f"models: expected all to be ready, got {reasons}")
+            check_version(self.endpoints.host, version, accepted=self._accepts_known_vulnerabilities)
+            return
+        raise ServerStartError(f"tritonserver: expected to run, got exit status {self._process.returncode}")
+
+    def stop(self) -> int:
+        """Ends the server gracefully, by force after KILL_AFTER_S, and gives its exit status (0 if it never ran)."""
+        if self._process is None:
+            return 0
+        end(self._process)
+        return self._wait()
+
+    def __enter__(self) -> TritonServer:
+        try:
+            self.start()
+            self.wait_ready()
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _arguments(self, models: Sequence[str]) -> list[str]:
+        endpoints = self.endpoints
+        return [
+            f"--model-repository={self.repository}",
+            "--model-control-mode=explicit",
+            *(f"--load-model={model}" for model in models),
+            "--disable-auto-complete-config",
+            "--strict-readiness=false",  # else one version that cannot be loaded keeps all models from being ready
+            "--exit-on-error=false",  # so that the reason of each model that fails can be read
+            f"--exit-timeout-secs={EXIT_TIMEOUT_S}",
+            f"--http-address={endpoints.http_host}",
+            f"--http-port={endpoints.http_port}",
+            f"--grpc-address={endpoints.host}",
+            f"--grpc-port={endpoints.grpc_port}",
+            f"--metrics-address={endpoints.host}",
+            f"--metrics-port={endpoints.metrics_port}",
+            *([f"--http-thread-count={self._http_threads}"] if self._http_threads else []),
+            *restrictions(self._admin_key),
+        ]
+
+    def _environment(self) -> dict[str, str]:
+        """Environment of tritonserver: that of this process, without its secrets."""
+        own = {name: value for name, value in os.environ.items() if name not in SECRETS}
+        return {**own, **self._installation.environment, **NO_BYTECODE}
+
+    def _check_listen_address(self) -> None:
+        check_before_start(self.endpoints.host, self._installation, accepted=self._accepts_known_vulnerabilities)
+        if self.endpoints.grpc_tls is not None:
+            self.endpoints.grpc_tls.check()
+            self._own_tls = OwnTls(self.endpoints.grpc_tls)
+
+    def _wait(self) -> int:
+        """Waits for the server to end and clears away what it leaves; gives its exit status."""
+        assert self._process is not None  # started
+        status = self._process.wait()
+        with suppress(ProcessLookupError):  # model processes that Triton ran out of time to end
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._release()
+        return status
+
+    def _release(self) -> None:
+        if self._claim is not None:
+            self._claim.release()
+            self._claim = None

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: MIT
+"""A running server's model-repository API: what is loaded, load, unload; and a probe of one version.
+
+Over gRPC, where Triton works on a load in a thread of its own. Over HTTP a load holds the thread that took the request,
+and with it all connections of that thread, until the model is loaded.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+import tritonclient.grpc
+from google.protobuf.json_format import MessageToDict
+from tritonclient.utils import InferenceServerException, np_to_triton_dtype
+
+from rfm.launch.admin_key import VARIABLE, grpc_metadata
+from rfm_client.contract import triton
+from rfm_client.contract.addresses import split_url
+from rfm_client.contract.names import PROBE_PREFIX
+from rfm_client.contract.wire import Tensors
+
+INDEX_PATH = "/v2/repository/index"  # over HTTP
+READY, LOADING, UNLOADING = "READY", "LOADING", "UNLOADING"
+POLL_S = 0.1
+CONNECT_S = 10.0
+ANSWER_S = 1800.0  # of one request: a load answers when the model is warmed up
+FINISH_S = 600.0  # requests in flight on a version that is taken out
+
+_GRPC = ("grpc", "grpcs")
+_UNBOUNDED = -1
+_MS_PER_S = 1000
+_CHANNEL = [
+    ("grpc.max_send_message_length", _UNBOUNDED),
+    ("grpc.max_receive_message_length", _UNBOUNDED),
+    ("grpc.min_reconnect_backoff_ms", int(CONNECT_S * _MS_PER_S)),  # how long it may take to connect, too
+    ("grpc.enable_http_proxy", 0),
+]
+_OF_SERVER = (*triton.UNAVAILABLE, *triton.OUT_OF_TIME, *triton.CANCELLED)
+_GOING = (READY, UNLOADING)
+_NOT_LOADED = "not loaded"  # Triton gives no state
+_UNAVAILABLE, _UNLOADED = "UNAVAILABLE", "unloaded"
+
+
+class RepositoryApiError(Exception):
+    """A request that the server did not fulfil, and why."""
+
+
+@dataclass(frozen=True)
+class ModelVersion:
+    """A version as the server knows it; one that it does not know yet has no number. state: READY, UNAVAILABLE, ..."""
+
+    name: str
+    version: int | None
+    state: str
+    reason: str
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether it answers requests, as far as the server knows."""
+        return self.state == READY
+
+    @property
+    def is_unloaded(self) -> bool:
+        """Whether the version is not loaded because somebody unloaded it. A version that failed has another reason."""
+        return self.state == _NOT_LOADED or (self.state, self.reason) == (_UNAVAILABLE, _UNLOADED)
+
+
+class RepositoryApi:
+    """The server at ``url`` (grpc://host:port, or grpcs:// with TLS). A context manager.
+
+    options: of tritonclient's gRPC client, as Access and OwnTls have them
+    Its methods raise RepositoryApiError, and so does the constructor for another kind of URL.
+    """
+
+    def __init__(self, url: str, admin_key: str | None, options: Mapping[str, Any] | None = None) -> None:
+        scheme, address = _split(url)
+        if scheme not in _GRPC:
+            raise RepositoryApiError(
+                f"url: expected grpc://host:port (its gRPC port, 8001) or with TLS grpcs://host:port, got {url}"
+            )
+        self._url = url
+        self._headers = grpc_metadata(admin_key)
+        given = dict(options or {})
+        channel = [*_CHANNEL, *given.pop("channel_args", ())]
+        self._client = tritonclient.grpc.InferenceServerClient(address, channel_args=channel, **given)
+
+    def index(self) -> list[ModelVersion]:
+        """Everything in the repository, by name and version."""
+        answer = self._request(self._client.get_model_repository_index)
+        return versions_of(MessageToDict(entry) for entry in answer.models)
+
+    def ready_versions(self, model: str) -> list[int]:
+        """The versions of ``model`` that are served now."""
+        ready = (entry for entry in self.index() if entry.name == model and entry.is_ready)
+        return [entry.version for entry in ready if entry.version is not None]
+
+    def config(self, model: str, version: int) -> dict[str, Any]:
+        """The configuration with which the version was loaded."""
+        answer = self._request(self._client.get_model_config, model, str(version))
+        config: dict[str, Any] = MessageToDict(answer.config, preserving_proto_field_name=True)
+        return config
+
+    def load(self, model: str, config: Mapping[str, Any] | None = None) -> None:
+        """Has the server serve what the model's configuration says; what was served before stays if that fails.
+
+        config: instead of the one in the model's file
+        """
+        instead = None if config is None else json.dumps(config)
+        self._request(self._client.load_model, model, config=instead)
+
+    def unload(self, model: str) -> None:
+        """Has the server forget the model, after the requests that it is working on."""
+        self._request(self._client.unload_model, model)
+
+    def wait_gone(self, model: str, kept: Collection[int] = ()) -> None:
+        """Returns when no version of the model but ``kept`` works on a request."""
+        deadline_s = time.monotonic() + FINISH_S
+        while time.monotonic() < deadline_s:
+            going = [entry for entry in self.index() if entry.name == model and entry.state in _GOING]
+            if all(entry.version in kept for entry in going):
+                return
+            time.sleep(POLL_S)
+        raise RepositoryApiError(f"{model}: expected its old versions to finish within {FINISH_S:g} s, got no end")
+
+    def infer(self, model: str, version: int, inputs: Tensors, outputs: Collection[str]) -> Tensors:
+        """What one version answers to a probe. The probe's request id sets it apart from callers' requests in logs."""
+        tensors = []
+        for name, array in inputs.items():
+            tensors.append(tritonclient.grpc.InferInput(name, array.shape, np_to_triton_dtype(array.dtype)))
+            tensors[-1].set_data_from_numpy(array)
+        answer = self._request(
+            self._client.infer,
+            model,
+            tensors,
+            model_version=str(version),
+            outputs=[tritonclient.grpc.InferRequestedOutput(name) for name in outputs],
+            request_id=f"{PROBE_PREFIX}-{model}-{version}",
+        )
+        return {name: answer.as_numpy(name) for name in outputs}
+
+    def _request(self, call: Any, *arguments: Any, **options: Any) -> Any:
+        try:
+            return call(*arguments, headers=self._headers, client_timeout=ANSWER_S, **options)
+        except InferenceServerException as error:
+            message = one_line(error.message() or "no reason given")
+            if triton.RESTRICTED in message:
+                got = "another" if self._headers else "none"
+                raise RepositoryApiError(
+                    f"admin key: expected that of the server at {self._url} (--admin-key-file or {VARIABLE}), got {got}"
+                ) from None
+            is_server_s = str(error.status()) in _OF_SERVER
+            raise RepositoryApiError(f"{self._url}: {message}" if is_server_s else message) from error
+
+    def __enter__(self) -> RepositoryApi:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._client.close()
+
+
+def versions_of(index: Iterable[Mapping[str, str]]) -> list[ModelVersion]:
+    """The entries of a server's index, by name and version."""
+    versions = [
+        ModelVersion(
+            entry["name"],
+            int(entry["version"]) if entry.get("version") else None,
+            entry.get("state", _NOT_LOADED),
+            one_line(entry.get("reason", "")),
+        )
+        for entry in index
+    ]
+    return sorted(versions, key=lambda entry: (entry.name, entry.version or 0))
+
+
+def one_line(reason: str) -> str:
+    """The first line of an error, which says what happened; the lines behind it say where."""
+    lines = reason.strip().splitlines()
+    return lines[0].strip() if lines else ""
+
+
+def _split(url: str) -> tuple[str, str]:
+    try:
+        return split_url(url)
+    except ValueError as error:
+        raise RepositoryApiError(str(error)) from None

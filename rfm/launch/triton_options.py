@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: MIT
+"""tritonserver's options: those that may be given to ``rfm serve`` behind ``--``, and the limit of a request's size."""
+
+from __future__ import annotations
+
+import mmap
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from rfm.launch.installation import Installation, ServerStartError
+
+MAX_HTTP_BYTES = 256 * 2**20  # of a request's body, as in the gateway; over gRPC Triton takes 2 GiB
+
+# Refused besides the options that are set here: their other names, and options that take away what a start waits for.
+_KEPT = {
+    "--model-store",
+    "--backend-directory",
+    "--http-thread-count",
+    "--allow-http",
+    "--allow-grpc",
+    "--allow-metrics",
+    "--reuse-http-port",
+    "--reuse-grpc-port",
+    "--grpc-use-ssl",
+    "--grpc-use-ssl-mutual",
+    "--grpc-server-cert",
+    "--grpc-server-key",
+    "--grpc-root-cert",
+}
+# May be given again, for other APIs: Triton refuses to start with two keys for one.
+_REPEATED = {"--http-restricted-api", "--grpc-restricted-protocol"}
+_SIZE_OPTION = "http-max-input-size"
+_ARGUMENT = re.compile(r"(--[a-z][a-z0-9-]+)=.*")
+
+
+def check_arguments(more: Sequence[str], own: Sequence[str]) -> None:
+    """Raises ServerStartError for one that ``own`` has, also if it is abbreviated, or that is no ``--option=value``."""
+    kept = {argument.partition("=")[0] for argument in own} - _REPEATED | _KEPT
+    for argument in more:
+        match = _ARGUMENT.fullmatch(argument)
+        if match is None:
+            raise ServerStartError(f"tritonserver: expected --option=value, got {argument.partition('=')[0]}")
+        if match[1] not in _REPEATED and any(option.startswith(match[1]) for option in kept):
+            raise ServerStartError(f"tritonserver: expected an option that rfm serve leaves open, got {match[1]}")
+
+
+def size_limits(installation: Installation, given: Sequence[str]) -> list[str]:
+    """Arguments of tritonserver, as far as it has such options (2.51 has none) and they are not ``given``."""
+    if any(argument.startswith(f"--{_SIZE_OPTION}=") for argument in given):
+        return []
+    return [f"--{_SIZE_OPTION}={MAX_HTTP_BYTES}"] if _knows(installation.executable, _SIZE_OPTION) else []
+
+
+def _knows(program: Path, option: str) -> bool:
+    """Whether the option's name stands in the program: asking by --help would start it."""
+    try:
+        with program.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            return content.find(option.encode()) >= 0
+    except (OSError, ValueError):  # it cannot be read, or is empty: starting it gives the reason
+        return False

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: MIT
+"""A model with several instances: none takes requests from Triton's queue that another could begin at once."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rfm.journal import Journal
+from rfm.triton_model.pipeline import Pipeline
+from rfm.triton_model.quarantine import all_journals, own_journal
+
+POLL_S = 2e-3  # between two questions whether a neighbour is idle, while this instance computes
+LOOK_S = 1.0  # between two looks for neighbours: they come and go with a load
+
+
+class Neighbours:
+    """The other instances of a model, as their journals show them.
+
+    files: finds the journals of all instances, this one's included
+    own: this instance's journal
+    """
+
+    def __init__(self, files: Callable[[], Iterable[Path]], own: Path) -> None:
+        self._files = files
+        self._own = own
+        self._journals: dict[Path, Journal] = {}
+        self._looked_s = -math.inf
+
+    @classmethod
+    def of_this_process(cls, model: str) -> Neighbours:
+        """Those of the running process, which Triton has started for ``model``."""
+        return cls(partial(all_journals, model), own_journal(model))
+
+    def wait_for_turn(self, pipeline: Pipeline[Any, Any], max_waiting: int) -> None:
+        """Returns when the pipeline should take more requests from Triton.
+
+        That is when it has nothing to do; or when nobody has, and fewer than ``max_waiting`` wait here.
+        """
+        while not pipeline.is_idle and (pipeline.num_waiting >= max_waiting or self._is_one_idle()):
+            pipeline.wait_for(lambda: pipeline.is_idle, POLL_S)
+
+    def _is_one_idle(self) -> bool:
+        if time.monotonic() - self._looked_s >= LOOK_S:
+            self._look()
+        return any(not journal.busy_s and journal.is_alive for journal in self._journals.values())
+
+    def _look(self) -> None:
+        """Finds the journals of instances that were started since, and forgets those that are gone."""
+        self._looked_s = time.monotonic()
+        files = {file for file in self._files() if file != self._own}
+        for gone in self._journals.keys() - files:
+            del self._journals[gone]
+        for file in files - self._journals.keys():
+            if (journal := Journal.open(file)) is not None:
+                self._journals[file] = journal

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: MIT
+"""On which device, and with how many CPU threads, an instance of a model computes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from rfm.layers.precision import keep_float32
+from rfm.parameters import THREADS_PARAMETER
+
+
+@dataclass(frozen=True)
+class Placement:
+    """device: of the network; num_threads: of PyTorch on the CPU"""
+
+    device: torch.device
+    num_threads: int
+
+    @property
+    def num_preparing(self) -> int:
+        """Threads that prepare samples beside the scoring, which needs the CPU itself unless it is on a GPU."""
+        return self.num_threads if self.device.type == "cuda" else 1
+
+    @classmethod
+    def of(cls, args: Mapping[str, str], config: Mapping[str, Any], settings: Mapping[str, str]) -> Placement:
+        """Where Triton places an instance; ``args`` of ``initialize``. All instances share the machine's cores."""
+        on_gpu = args["model_instance_kind"] == "GPU"
+        num_threads = int(settings[THREADS_PARAMETER]) or max(torch.get_num_threads() // num_instances(config), 1)
+        device = torch.device("cuda", int(args["model_instance_device_id"])) if on_gpu else torch.device("cpu")
+        return cls(device, num_threads)
+
+    def apply(self) -> None:
+        """To be called in each thread that computes: both settings are a thread's own."""
+        torch.set_num_threads(self.num_threads)
+        if self.device.type == "cuda":
+            torch.cuda.set_device(self.device)  # some kernels launch on the current device, whatever their tensors'
+            keep_float32()
+
+
+def num_instances(config: Mapping[str, Any]) -> int:
+    """Instances of a model, on all its devices; ``config``: its configuration as Triton gives it."""
+    return sum(group["count"] * max(len(group.get("gpus", [])), 1) for group in config["instance_group"])

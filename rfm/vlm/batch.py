@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: MIT
+"""A batch of conversations on its way to the device: tokens and uint8 pixels on the host, float pixels on the device.
+
+B conversations of L tokens. Frames of one size, H' x W' pixels, go together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from rfm.vlm.images import QwenImages, SmolImages
+from rfm.vlm.vision import VisionPlan
+
+
+class Pixels(Protocol):
+    """The frames that a batch shows, each once, and what the backbone reads of them."""
+
+    @property
+    def films(self) -> list[Tensor]:
+        """uint8 [T, H', W', 3] each, on the host or already on the device."""
+
+    def changed(self, change: Callable[[Tensor], Tensor]) -> Pixels:
+        """The same with ``change`` made to the tensors that say where pixels go."""
+
+    def inputs(self, device: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
+        """The backbone's arguments about pixels, made on ``device`` of frames there, and given in ``dtype``."""
+
+
+@dataclass(frozen=True)
+class FramesOfOneSize:
+    """Frames that share a size, film by film, and the shots that are read of them.
+
+    films: uint8 [T, H', W', 3] each
+    shots: int64 [S, 1], which frames are images, or [S, 2], which pairs are temporal groups; None: each frame an image
+    """
+
+    films: Sequence[Tensor]
+    shots: Tensor | None
+
+    def frames(self, device: torch.device) -> Tensor:
+        """uint8 [T of all films, H', W', 3] on ``device``."""
+        return torch.cat([film.to(device, non_blocking=True) for film in self.films])
+
+
+@dataclass(frozen=True)
+class QwenPixels:
+    """Pixels as the Qwen backbones read them: patches of images, or of pairs of frames, in the order of ``sizes``."""
+
+    images: QwenImages
+    sizes: Sequence[FramesOfOneSize]
+
+    @property
+    def films(self) -> list[Tensor]:
+        """uint8 [T, H', W', 3] each."""
+        return [film for size in self.sizes for film in size.films]
+
+    def changed(self, change: Callable[[Tensor], Tensor]) -> QwenPixels:
+        """The same with ``change`` made to the shots."""
+        shots = [None if size.shots is None else change(size.shots) for size in self.sizes]
+        sizes = [replace(size, shots=changed) for size, changed in zip(self.sizes, shots, strict=True)]
+        return replace(self, sizes=sizes)
+
+    def inputs(self, device: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
+        """The patches of all shots."""
+        patches = [self.images.patches(size.frames(device), size.shots, dtype) for size in self.sizes]
+        return {"pixel_values": torch.cat(patches) if len(patches) > 1 else patches[0]}
+
+
+@dataclass(frozen=True)
+class SmolPixels:
+    """Pixels as SmolVLM reads them: of each conversation as many squares as of the one with the most.
+
+    squares: uint8 [T, side, side, 3] of all films
+    rows, places, frames: int64 [I], in which conversation each square stands, at which place, and which frame it is
+    shape: conversations, and squares of each
+    """
+
+    images: SmolImages
+    squares: FramesOfOneSize
+    rows: Tensor
+    places: Tensor
+    frames: Tensor
+    shape: tuple[int, int]
+
+    @property
+    def films(self) -> list[Tensor]:
+        """uint8 [T, side, side, 3] each."""
+        return list(self.squares.films)
+
+    def changed(self, change: Callable[[Tensor], Tensor]) -> SmolPixels:
+        """The same with ``change`` made to where each square stands."""
+        return replace(self, rows=change(self.rows), places=change(self.places), frames=change(self.frames))
+
+    def inputs(self, device: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
+        """The squares, and where there are some; the backbone leaves out squares of zeros."""
+        squares = self.images.normalisation(self.squares.frames(device)).to(dtype)
+        pixels = squares.new_zeros(*self.shape, *squares.shape[1:])
+        mask = torch.zeros(*self.shape, *squares.shape[2:], dtype=torch.bool, device=device)
+        pixels[self.rows, self.places] = squares[self.frames]
+        mask[self.rows, self.places] = True
+        return {"pixel_values": pixels, "pixel_attention_mask": mask}
+
+
+@dataclass(frozen=True)
+class VlmBatch:
+    """Conversations, padded to the longest.
+
+    inputs: the backbone's arguments by name
+    spans: int64 [F, 3], row and first and behind-the-last token of each frame's state
+    query_rows, query_tokens: int64 [Q], where the questions' tokens stand
+    num_tokens, num_span_tokens: of all conversations, without padding; of all spans
+    pixels: of which the arguments about pixels are made; None: they are among the inputs
+    plan: of a Qwen backbone's vision tower
+    """
+
+    inputs: dict[str, Tensor]
+    spans: Tensor
+    query_rows: Tensor
+    query_tokens: Tensor
+    num_tokens: int
+    num_span_tokens: int
+    pixels: Pixels | None = None
+    plan: VisionPlan | None = None
+
+    def pinned(self) -> VlmBatch:
+        """The batch in memory from which a GPU copies while the host goes on; its frames stay where they are."""
+        return self._changed(lambda tensor: tensor.pin_memory())
+
+    def to(self, device: torch.device, dtype: torch.dtype) -> VlmBatch:
+        """The batch on ``device``. Pixels are rescaled, normalised and put in order there, and come in ``dtype``."""
+        moved = self._changed(lambda tensor: tensor.to(device, non_blocking=True))
+        made = {} if moved.pixels is None else moved.pixels.inputs(device, dtype)
+        return replace(moved, inputs=moved.inputs | made, pixels=None)
+
+    def _changed(self, change: Callable[[Tensor], Tensor]) -> VlmBatch:
+        return replace(
+            self,
+            inputs={name: change(tensor) for name, tensor in self.inputs.items()},
+            spans=change(self.spans),
+            query_rows=change(self.query_rows),
+            query_tokens=change(self.query_tokens),
+            pixels=None if self.pixels is None else self.pixels.changed(change),
+            plan=None if self.plan is None else self.plan.changed(change),
+        )

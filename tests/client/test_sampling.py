@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: MIT
+"""The sampling rules, against the frames that the original functions took."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import goldens
+from client_commands import MODEL, TASK, ask, assert_scores
+from paths import GOLDEN
+from reference_server import Served
+from rfm_client import ProgressSample, Trajectory
+from rfm_client.data.inputs import load_trajectory
+from rfm_client.data.sampling import RULES, Sampling, thinned
+
+VECTORS = GOLDEN / "sampling-vectors.json"
+ELSEWHERE = goldens.ROOT.parent / VECTORS.name  # beside the further reference cases, where there are some
+READINGS = {"rewind_pad16": ("rewind_pad16_online", "rewind_pad16_offline")}  # the two of one function
+
+
+def cases(file: Path) -> Iterator[tuple[Sampling, int, list[int]]]:
+    """A rule with its number of frames, the newest frame, and what the original shows of the frames up to it."""
+    for frames, lengths in json.loads(file.read_text()).items():
+        for length, rules in lengths.items():
+            for name, indices in rules.items():
+                for rule in READINGS.get(name, (name,)):
+                    yield Sampling(rule, int(frames)), int(length) - 1, indices
+
+
+@pytest.mark.parametrize(
+    "file",
+    [
+        VECTORS,
+        pytest.param(
+            ELSEWHERE,
+            marks=[pytest.mark.reference, pytest.mark.skipif(not ELSEWHERE.exists(), reason="RFM_GOLDENS names none")],
+        ),
+    ],
+    ids=["here", "elsewhere"],
+)
+def test_each_rule_shows_the_frames_that_the_original_takes(file: Path) -> None:
+    seen = set()
+    for sampling, t, indices in cases(file):
+        prefix = sampling.prefix(t)
+        assert prefix.indices.dtype == np.int64
+        assert prefix.indices.tolist() == indices, (sampling, t)
+        seen.add((sampling.rule, sampling.frames))
+    assert {rule for rule, _ in seen} == set(RULES) - {"all"}
+    assert len(seen) == 3 * 6 + 2
+
+
+PADDED = {
+    "linspace_trunc repeats frames and pads none": (Sampling("linspace_trunc", 4), 1, [0, 0, 0, 1], 0, 3),
+    "linspace_trunc of one frame shows the first": (Sampling("linspace_trunc", 1), 9, [0], 0, 0),
+    "linspace_round rounds half to even": (Sampling("linspace_round", 3), 5, [0, 2, 5], 0, 2),
+    "rint_pad reads a padded slot": (Sampling("rint_pad", 4), 1, [0, 1, 1, 1], 2, 3),
+    "rint_pad of one frame shows the newest": (Sampling("rint_pad", 1), 9, [9], 0, 0),
+    "rint_pad of a long episode": (Sampling("rint_pad", 4), 9, [0, 3, 6, 9], 0, 3),
+    "rewind online reads a padded slot": (Sampling("rewind_pad16_online"), 2, [0, 1, *[2] * 14], 13, 15),
+    "rewind offline reads the frame's own": (Sampling("rewind_pad16_offline"), 2, [0, 1, *[2] * 14], 13, 2),
+    "rewind offline of a long episode": (Sampling("rewind_pad16_offline"), 15, list(range(16)), 0, 15),
+    "all": (Sampling("all"), 3, [0, 1, 2, 3], 0, 3),
+}
+
+
+@pytest.mark.parametrize(("sampling", "t", "indices", "padding", "read"), PADDED.values(), ids=PADDED)
+def test_a_rule_says_what_is_padding_and_which_slot_counts(
+    sampling: Sampling, t: int, indices: list[int], padding: int, read: int
+) -> None:
+    prefix = sampling.prefix(t)
+    assert (prefix.indices.tolist(), prefix.num_padding, prefix.read) == (indices, padding, read)
+    assert prefix.indices[prefix.read] == t or sampling.frames == 1
+    slots = prefix.frame_slots
+    assert prefix.indices[slots].tolist() == sorted(set(indices))
+    assert slots[-1] == read
+
+
+def test_no_rule_shows_a_frame_behind_the_newest() -> None:
+    for sampling in (Sampling.of(rule, None, trained_frames=8) for rule in RULES):
+        for t in range(60):
+            indices = sampling.prefix(t).indices
+            assert (np.diff(indices) >= 0).all()
+            assert 0 <= indices[0] <= indices[-1] <= t
+
+
+def test_a_long_clip_is_cut_as_in_training() -> None:
+    assert thinned(10, 1).tolist() == [9]  # type: ignore[union-attr]
+    assert thinned(10, 4).tolist() == [0, 3, 6, 9]  # type: ignore[union-attr]
+    assert thinned(6, 3).tolist() == [0, 2, 5]  # type: ignore[union-attr]
+    assert thinned(10, 10) is None
+    assert thinned(10, None) is None
+
+
+REFUSED: dict[str, tuple[Any, ...]] = {
+    "another rule": ("evenly", 4, "sampling: expected one of linspace_trunc, linspace_round, .*, all, got 'evenly'"),
+    "a number with all": ("all", 4, "frames: expected none with the rule all, got 4"),
+    "another number than 16": (
+        "rewind_pad16_online",
+        8,
+        "frames: expected 16 with the rule rewind_pad16_online, got 8",
+    ),
+    "no number": ("rint_pad", None, "frames: expected at least 1 with the rule rint_pad, got None"),
+    "no frame": ("linspace_trunc", 0, "frames: expected at least 1 with the rule linspace_trunc, got 0"),
+}
+
+
+@pytest.mark.parametrize(("rule", "frames", "message"), REFUSED.values(), ids=REFUSED)
+def test_what_no_rule_takes_is_refused(rule: Any, frames: int | None, message: str) -> None:
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        Sampling(rule, frames)
+
+
+def test_the_checkpoint_says_how_many_frames_if_the_caller_does_not() -> None:
+    assert Sampling.of("rint_pad", None, 8) == Sampling("rint_pad", 8)
+    assert Sampling.of("rint_pad", 4, 8) == Sampling("rint_pad", 4)
+    assert Sampling.of("all", None, 8) == Sampling("all")
+    assert Sampling.of("rewind_pad16_offline", None, 8).frames == 16
+    with pytest.raises(
+        ValueError, match="frames: expected how many frames the rule rint_pad shows the model, got none"
+    ):
+        Sampling.of("rint_pad", None, None)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_score_scores_each_frame_on_its_prefix(served: Served, video: Path, rule: Any) -> None:
+    words = [] if rule in ("all", "rewind_pad16_online", "rewind_pad16_offline") else ["--frames", 4]
+    result = ask(served, "score", video, "--task", TASK, "--sampling", rule, *words, "--json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    (scored,) = json.loads(result.stdout)["videos"]
+    film = load_trajectory(video, task=TASK, fps=3.0)
+    assert film.frames is not None
+    sampling = Sampling.of(rule, 4 if words else None, None)
+    with served.client("grpc", MODEL) as client:
+        shown = [sampling.prefix(t) for t in range(film.num_frames)]
+        results = client.evaluate(
+            ProgressSample(Trajectory(frames=film.frames[prefix.indices], task=TASK)) for prefix in shown
+        )
+        if rule == "linspace_trunc":
+            assert_scores(scored, client.progress(film, frame_steps=4))
+    for name in ("progress", "success"):
+        expected = [getattr(each, name)[prefix.read] for each, prefix in zip(results, shown, strict=True)]
+        np.testing.assert_allclose(scored[name], expected, rtol=0, atol=1e-5)
+
+
+CONTRADICTIONS = {
+    "a number without a rule": (["--frames", 4], "Invalid value for --frames: expected --sampling with it, got none"),
+    "two ways of sampling": (["--sampling", "all", "--frame-steps", 4], "expected no --frame-steps with it, got 4"),
+    "a number that the rule does not take": (["--sampling", "all", "--frames", 4], "expected none with the rule all"),
+}
+
+
+@pytest.mark.parametrize(("words", "message"), CONTRADICTIONS.values(), ids=CONTRADICTIONS)
+def test_score_refuses_contradictory_sampling(video: Path, words: list[object], message: str) -> None:
+    from client_commands import invoke
+
+    result = invoke("score", video, "--task", TASK, *words)
+    assert result.exit_code == 2
+    assert message in " ".join(result.stderr.replace("│", " ").split())

@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: MIT
+"""What is finished stays finished: after a kill, beside another process, without a server, on a full disk."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import labelling
+from labelling import LEROBOT, BrightnessScorer, PickyScorer
+from rfm_client import ProgressResult, ProgressSample, ServerUnavailableError
+from rfm_client.labelling import DatasetError, LabelOptions, Watch, label, open_dataset
+from rfm_client.labelling.claims import Claims
+from rfm_client.labelling.parts import Parts
+from rfm_client.labelling.plan import Item
+
+ROOT = LEROBOT / "toy_v30_many"
+FILES = ("rfm_progress.parquet", "reward_signals/rfm.parquet")
+PATIENCE_S = 60
+
+
+def contents(output: Path) -> list[bytes]:
+    return [(output / name).read_bytes() for name in FILES]
+
+
+def start(output: Path, *more: object) -> subprocess.Popen[bytes]:
+    words = [sys.executable, labelling.__file__, str(ROOT), str(output), *map(str, more)]
+    return subprocess.Popen(words, stderr=subprocess.PIPE)
+
+
+def finish(process: subprocess.Popen[bytes]) -> None:
+    _, told = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0, told.decode()
+
+
+def parts_of(output: Path) -> list[str]:
+    return sorted(path.name for path in (output / ".rfm_parts").glob("*.parquet"))
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
+    output = tmp_path_factory.mktemp("undisturbed")
+    label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(output=output))
+    return contents(output)
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_again_and_again_ends_as_one_that_was_not(output: Path, undisturbed: list[bytes]) -> None:
+    random = np.random.default_rng(0)
+    kills = 0
+    while kills < 20:
+        process = start(output, 0.02)
+        try:
+            process.wait(timeout=random.uniform(0.3, 2.5))
+        except subprocess.TimeoutExpired:
+            kills += 1
+        process.kill()
+        process.communicate()
+        if all((output / name).exists() for name in FILES):
+            assert contents(output) == undisturbed
+            for name in FILES:
+                (output / name).unlink()
+            for part in list((output / ".rfm_parts").glob("*.parquet"))[:5]:
+                part.unlink()
+    finish(start(output))
+    assert contents(output) == undisturbed
+    left = {path.name for path in output.rglob("*") if path.is_file()} - {Path(name).name for name in FILES}
+    assert {name for name in left if name.endswith(".claim")} == set()
+    assert {name for name in left if name.startswith("episode-")} == set(parts_of(output))
+
+
+@pytest.mark.slow
+def test_two_processes_share_the_work_and_one_may_be_killed(output: Path, undisturbed: list[bytes]) -> None:
+    processes = [start(output, 0.05) for _ in range(2)]
+    while len(parts_of(output)) < 2:
+        assert all(process.poll() is None for process in processes)
+        time.sleep(0.01)
+    processes[0].kill()
+    processes[0].communicate()
+    finish(processes[1])
+    assert contents(output) == undisturbed
+
+
+def test_two_runs_at_a_time_score_each_frame_once(output: Path, undisturbed: list[bytes]) -> None:
+    scorers = [BrightnessScorer(0.01), BrightnessScorer(0.01)]
+    options = LabelOptions(output=output, workers=2)
+    threads = [threading.Thread(target=label, args=(open_dataset(ROOT), scorer, options)) for scorer in scorers]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert contents(output) == undisturbed
+    num_samples = [scorer.num_samples for scorer in scorers]
+    assert sum(num_samples) == 2 * 428
+    assert all(num_samples)
+
+
+def test_shards_are_put_together_by_a_run_without_one(output: Path, undisturbed: list[bytes]) -> None:
+    for shard in ((0, 3), (2, 3), (1, 3)):
+        report = label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(output=output, shard=shard))
+        assert (report.files, report.failures, report.summary) == ([], [], None)
+    assert len(parts_of(output)) == 10
+    last = BrightnessScorer()
+    label(open_dataset(ROOT), last, LabelOptions(output=output))
+    assert last.num_samples == 0
+    assert contents(output) == undisturbed
+
+
+class FailingScorer(BrightnessScorer):
+    """Fails for one task, with an error that a test gives it."""
+
+    def __init__(self, error: Exception, after: int = 0) -> None:
+        super().__init__()
+        self.error, self.after = error, after
+
+    def evaluate(self, samples: Any) -> list[ProgressResult]:
+        if self.num_samples >= self.after and isinstance(samples[0], ProgressSample):
+            raise self.error
+        return super().evaluate(samples)
+
+
+class Failures(Watch):
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def failed(self, episode: Any, error: Any) -> None:
+        self.lines.append(f"{episode.name}: {error}")
+
+
+def test_an_episode_that_fails_is_told_and_the_others_go_on(output: Path, undisturbed: list[bytes]) -> None:
+    failures = Failures()
+    dataset = open_dataset(ROOT)
+    failing = [e for e in dataset.episodes if e.task == PickyScorer.REFUSED]
+    assert failing
+    report = label(dataset, PickyScorer(), LabelOptions(output=output), failures)
+    assert [failure.episode for failure in report.failures] == failing
+    assert sorted(failures.lines) == sorted(f"{e.name}: task: expected another one, got this" for e in failing)
+    assert report.files == []
+    assert not (output / FILES[0]).exists()
+    assert len(parts_of(output)) == 10 - len(failing)
+
+    rest = BrightnessScorer()
+    label(dataset, rest, LabelOptions(output=output))
+    assert rest.num_samples == 2 * sum(e.num_frames for e in failing)
+    assert contents(output) == undisturbed
+
+
+def test_a_server_that_is_gone_stops_the_run_at_once(output: Path, undisturbed: list[bytes]) -> None:
+    """And not one episode after the other."""
+    scorer = FailingScorer(ServerUnavailableError("no server"), after=150)
+    with pytest.raises(ServerUnavailableError, match=r"^no server$"):
+        label(open_dataset(ROOT), scorer, LabelOptions(output=output, workers=1))
+    finished = len(parts_of(output))
+    assert 0 < finished < 10
+    label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(output=output))
+    assert contents(output) == undisturbed
+
+
+def test_a_full_disk_stops_the_run_and_leaves_no_half_of_a_part(
+    output: Path, undisturbed: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced = os.fsync
+    count = 0
+
+    def full(file: int) -> None:
+        nonlocal count
+        count += 1
+        if count == 4:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        synced(file)
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left on device"):
+        label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(output=output, workers=1))
+    assert len(parts_of(output)) == 3
+    assert [path.name for path in (output / ".rfm_parts").iterdir() if not path.name.startswith("episode")] == []
+    label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(output=output))
+    assert contents(output) == undisturbed
+
+
+def test_parts_of_something_else_are_never_used(output: Path) -> None:
+    first = BrightnessScorer()
+    label(open_dataset(ROOT), first, LabelOptions(output=output, episodes=[0]))
+    for options in ({"frames": 4}, {"cameras": ("observation.images.wrist",)}, {"fuse": "max"}):
+        scorer = BrightnessScorer()
+        label(open_dataset(ROOT), scorer, LabelOptions(output=output, episodes=[0], overwrite=True, **options))  # type: ignore[arg-type]
+        assert scorer.num_samples > 0
+    other = BrightnessScorer(digest="other")
+    label(open_dataset(ROOT), other, LabelOptions(output=output, episodes=[0], overwrite=True))
+    assert other.num_samples == first.num_samples
+
+
+def test_labels_of_something_else_are_replaced_only_when_asked(output: Path) -> None:
+    label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(output=output, limit=2))
+    before = contents(output)
+    scorer = BrightnessScorer()
+    with pytest.raises(
+        DatasetError, match=r"rfm_progress\.parquet: expected no file, or labels of the same provenance"
+    ):
+        label(open_dataset(ROOT), scorer, LabelOptions(output=output, limit=2, frames=4))
+    assert scorer.num_samples == 0
+    assert contents(output) == before
+    label(open_dataset(ROOT), scorer, LabelOptions(output=output, limit=2, frames=4, overwrite=True))
+    assert contents(output) != before
+    (output / "sarm_progress.parquet").write_bytes(b"not ours")
+    with pytest.raises(DatasetError, match=r"sarm_progress\.parquet: expected no file"):
+        label(open_dataset(ROOT), scorer, LabelOptions(output=output, limit=2, frames=4, alias="sarm_progress"))
+
+
+BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
+    "truncated": (lambda part: part.write_bytes(part.read_bytes()[:100]), "expected a whole part"),
+    "another's": (
+        lambda part: part.write_bytes(sorted(part.parent.glob("*.parquet"))[3].read_bytes()),
+        "expected the part of episode 0",
+    ),
+}
+
+
+@pytest.mark.parametrize(("break_it", "message"), BROKEN.values(), ids=BROKEN)
+def test_a_part_that_is_not_whole_is_no_label(output: Path, break_it: Callable[[Path], object], message: str) -> None:
+    label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(output=output))
+    before = contents(output)
+    break_it(sorted((output / ".rfm_parts").glob("*.parquet"))[0])
+    with pytest.raises(DatasetError, match=f"{message}.*delete it, and run the same command"):
+        label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(output=output))
+    assert contents(output) == before
+
+
+@pytest.mark.parametrize("url", ["memory://labels/parts", "file://{}/elsewhere"])
+def test_parts_may_be_behind_a_url(output: Path, undisturbed: list[bytes], url: str) -> None:
+    options = LabelOptions(output=output, parts=url.format(output))
+    report = label(open_dataset(ROOT), BrightnessScorer(), options)
+    assert report.parts == options.parts
+    assert contents(output) == undisturbed
+    again = BrightnessScorer()
+    label(open_dataset(ROOT), again, options)
+    assert again.num_samples == 0
+    assert not (output / ".rfm_parts").exists()
+
+
+def item() -> Item:
+    return Item(open_dataset(ROOT).episodes[0], "0" * 32, 0)
+
+
+@pytest.mark.parametrize("url", ["memory://labels/claims", "{}"])
+def test_a_claim_holds_until_it_is_given_back_or_its_process_ends(output: Path, url: str) -> None:
+    parts = Parts(url.format(output))
+    with Claims(parts) as first, Claims(parts) as second:
+        assert first.take(item())
+        assert not second.take(item())
+        first.give_back(item())
+        assert second.take(item())
+        second.give_back(item())
+        ended = subprocess.Popen([sys.executable, "-c", ""])
+        ended.wait()
+        owner = json.dumps({"host": socket.gethostname(), "pid": ended.pid}).encode()
+        parts.fs.pipe_file(parts.path(item().key + ".claim"), owner)
+        assert first.take(item())
+
+
+def test_a_claim_of_another_machine_expires_unless_it_is_renewed(output: Path) -> None:
+    parts = Parts(str(output))
+    path = output / (item().key + ".claim")
+    path.write_text(json.dumps({"host": "another machine", "pid": 1}))
+    with Claims(parts, expiry_s=30, renewal_s=0.01) as claims:
+        assert not claims.take(item())
+        os.utime(path, (time.time() - 31, time.time() - 31))
+        assert claims.take(item())
+        os.utime(path, (time.time() - 31, time.time() - 31))
+        while path.stat().st_mtime < time.time() - 30:
+            time.sleep(0.005)  # until it is renewed
+        assert not Claims(parts, expiry_s=30).take(item())
+    assert not path.exists()
+
+
+@pytest.mark.slow
+def test_ctrl_c_leaves_what_is_finished(output: Path, undisturbed: list[bytes]) -> None:
+    process = start(output, 0.05)
+    while not parts_of(output):
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=PATIENCE_S)
+    assert 0 < len(parts_of(output)) < 10
+    assert list((output / ".rfm_parts").glob("*.claim")) == []
+    finish(start(output))
+    assert contents(output) == undisturbed

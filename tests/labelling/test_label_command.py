@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: MIT
+"""rfm-client label and rfm label."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pyarrow import parquet
+from typer.testing import CliRunner, Result
+
+from client_commands import RFM_CLIENT, invoke
+from commands import RFM
+from gateways import free_port
+from labelling import LEROBOT
+from paths import ROOT
+from rfm.launch.process import Endpoints
+from rfm_client.cli.options import ExitCode
+from rfm_commands.cli import app
+
+DATASET = LEROBOT / "toy_v30_many"
+FRONT = "observation.images.front"
+MODELS = ROOT / "model_repository"
+FILES = ("rfm_progress.parquet", "reward_signals/rfm.parquet")
+ENGINE = (
+    *("--checkpoint", MODELS / "rfm" / "1" / "checkpoint"),
+    *("--image-encoder", MODELS / "rfm_encoder" / "1" / "image_encoder"),
+    *("--text-encoder", MODELS / "rfm_encoder" / "1" / "text_encoder"),
+)
+
+
+def own(*words: object) -> Result:
+    """rfm label in this process."""
+    return CliRunner().invoke(app, ["label", *map(str, words)])
+
+
+def cells(output: str) -> dict[str, str]:
+    """The rows of the table of two columns that is shown."""
+    rows = [re.split(r"\s{2,}", line.strip()) for line in output.splitlines()]
+    return {row[0]: row[1] for row in rows if len(row) == 2}
+
+
+@pytest.mark.triton
+def test_both_commands_write_the_same_labels_and_tell_what_they_did(demo_server: Endpoints, output: Path) -> None:
+    words = ("--episodes", "2,3,9", "--frames", 8, "--cameras", "front", "--alias", "sarm_progress")
+    served = invoke("label", DATASET, *words, "--output", output, "--url", demo_server.http_url)
+    assert (served.exit_code, served.stderr.splitlines()) == (
+        0,
+        [
+            f"rfm-client: note: cameras: {FRONT} (asked for)",
+            "rfm-client: note: sampling: rint_pad (the rule of upstream's training and RL loop)",
+            "rfm-client: note: frames: 8 (asked for)",
+        ],
+    )
+    assert {"episodes": "3", "frames": "121"}.items() <= cells(served.stdout).items()
+    written = [output / name for name in ("rfm_summary.png", FILES[0], "sarm_progress.parquet", FILES[1])]
+    assert [line for line in served.stdout.splitlines() if line.startswith(str(output))] == list(map(str, written))
+    assert written[0].read_bytes().startswith(b"\x89PNG")
+
+    (output / "own").mkdir()
+    result = own(DATASET, *ENGINE, *words, "--output", output / "own", "--format", "progress", "--no-picture")
+    assert result.exit_code == 0, result.stderr
+    assert sorted(path.name for path in (output / "own").iterdir() if path.is_file()) == [
+        FILES[0],
+        "sarm_progress.parquet",
+    ]
+    told, other = (parquet.read_table(folder / FILES[0]) for folder in (output, output / "own"))
+    assert told.column_names == other.column_names
+    for name in told.column_names:
+        np.testing.assert_allclose(told[name], other[name], rtol=0, atol=1e-5)
+
+
+@pytest.mark.triton
+def test_a_dry_run_tells_what_is_to_be_done_and_writes_nothing(demo_server: Endpoints, output: Path) -> None:
+    result = invoke("label", DATASET, "--dry-run", "--output", output, "--url", demo_server.grpc_url)
+    assert result.exit_code == 0, result.stderr
+    told = cells(result.stdout)
+    assert told["dataset"] == "LeRobot v3.0: toy_v30_many"
+    assert told["episodes"] == "10"
+    assert told["frames"] == "428, of 2 cameras: 856 to be decoded"
+    assert told["to be decoded"] == "0.2 MiB"
+    assert "put the blue block in the bowl" in told["tasks: 5"]
+    assert re.fullmatch(r"\d+ s", told["it will take about"])
+    assert list(output.iterdir()) == []
+
+
+@pytest.mark.triton
+def test_a_second_run_scores_nothing_and_a_report_needs_no_server(demo_server: Endpoints, output: Path) -> None:
+    words = ("label", DATASET, "--limit", 2, "--output", output)
+    first = invoke(*words, "--url", demo_server.grpc_url)
+    again = invoke(*words, "--url", demo_server.grpc_url)
+    assert (first.exit_code, again.exit_code) == (0, 0)
+    assert "rfm-client: note: 97 of 97 frames are labelled already" in again.stderr
+    assert again.stdout == first.stdout
+    for source in (DATASET, output / FILES[0], output / FILES[1]):
+        where = ["--output", output] if source == DATASET else []
+        report = invoke("label", source, "--report", "--no-picture", *where, "--url", "grpc://localhost:1")
+        assert (report.exit_code, report.stderr) == (0, "")
+        assert cells(report.stdout) == cells(first.stdout)
+
+
+def test_what_cannot_be_labelled_ends_with_one_line(output: Path) -> None:
+    broken = shutil.copytree(DATASET, output / "broken")
+    film = broken / "videos" / FRONT / "chunk-000" / "file-001.mp4"
+    film.unlink()
+    result = own(broken, *ENGINE, "--output", output)
+    assert result.exit_code == 1
+    assert result.stderr.splitlines()[-1] == f"rfm: {film}: expected a video file, got none"
+    assert not list(output.glob("*.parquet"))
+
+
+WRONG = {
+    "a shard": (["--shard", "3/3"], "shard: expected i/n with i from 0 to n - 1, got 3/3"),
+    "episodes": (["--episodes", "5:2"], "episodes: expected numbers and ranges such as 0:100,205, got '5:2'"),
+    "a format": (["--format", "csv"], "format: expected some of progress, signals, hdf5, got 'csv'"),
+    "a rule in mode whole": (["--mode", "whole", "--sampling", "rint_pad"], "sampling: expected all in mode whole"),
+}
+
+
+@pytest.mark.parametrize(("words", "message"), WRONG.values(), ids=WRONG)
+def test_wrong_options_are_told(words: list[str], message: str) -> None:
+    result = invoke("label", DATASET, *words)
+    assert result.exit_code == ExitCode.USAGE
+    assert message in " ".join(result.stderr.replace("│", " ").split())
+
+
+def test_without_a_server_it_ends_at_once(output: Path) -> None:
+    result = invoke("label", DATASET, "--output", output, "--url", f"grpc://127.0.0.1:{free_port()}")
+    assert result.exit_code == ExitCode.UNAVAILABLE
+    assert list(output.iterdir()) == []
+
+
+def test_score_names_the_command_for_a_file_of_several_episodes() -> None:
+    film = DATASET / "videos" / FRONT / "chunk-000" / "file-000.mp4"
+    result = invoke("score", film, "--task", "stack", "--url", f"grpc://127.0.0.1:{free_port()}")
+    assert result.exit_code != 0
+    assert "rfm-client label" in result.stderr or result.exit_code == ExitCode.UNAVAILABLE
+
+
+@pytest.mark.slow
+def test_an_engine_that_is_killed_gives_the_same_bytes_in_the_end(output: Path) -> None:
+    def start(folder: Path) -> subprocess.Popen[bytes]:
+        folder.mkdir(exist_ok=True)
+        words = [RFM, "label", DATASET, *ENGINE, "--output", folder, "--no-picture", "--workers", 2]
+        return subprocess.Popen(list(map(str, words)), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+
+    def finish(process: subprocess.Popen[bytes]) -> None:
+        _, told = process.communicate(timeout=300)
+        assert process.returncode == 0, told.decode()
+
+    undisturbed, killed = output / "undisturbed", output / "killed"
+    finish(start(undisturbed))
+    for fewest in (1, 3, 6, 9):
+        process = start(killed)
+        while len(list((killed / ".rfm_parts").glob("*.parquet"))) < fewest:
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.kill()
+        process.communicate()
+    finish(start(killed))
+    for name in FILES:
+        assert (killed / name).read_bytes() == (undisturbed / name).read_bytes()
+
+
+@pytest.mark.triton
+@pytest.mark.slow
+def test_a_server_that_is_away_for_ten_seconds_costs_no_frame(tmp_path: Path, output: Path) -> None:
+    from rfm.launch.installation import find_installation
+    from rfm.launch.process import TritonServer
+
+    repository = shutil.copytree(MODELS, tmp_path / "model_repository")
+    endpoints = Endpoints.free()
+    server = TritonServer(repository, endpoints, find_installation())
+    with server:
+        words = [RFM_CLIENT, "label", DATASET, "--output", output, "--url", endpoints.grpc_url, "--timeout", 120]
+        process = subprocess.Popen(list(map(str, words)), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        while not list((output / ".rfm_parts").glob("*.parquet")):
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.01)
+    threading.Event().wait(10)
+    with TritonServer(repository, endpoints, find_installation()):
+        _, told = process.communicate(timeout=300)
+    assert process.returncode == 0, told.decode()
+    assert len(parquet.read_table(output / FILES[0])) == 428

@@ -1,0 +1,305 @@
+# SPDX-License-Identifier: MIT
+"""What the labels of a dataset are: each frame's score on its prefix, through Triton, through the engine, by hand."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pyarrow import parquet
+
+import goldens
+from labelling import LEROBOT, BrightnessScorer
+from paths import ROOT
+from rfm_client import ProgressSample, RewardClient, Trajectory
+from rfm_client.data.sampling import RULES, Sampling
+from rfm_client.labelling import (
+    ClientScorer,
+    DatasetError,
+    LabelOptions,
+    Report,
+    Watch,
+    iter_episodes,
+    label,
+    open_dataset,
+    parse_episodes,
+)
+from rfm_commands.label import EngineScorer
+
+FRONT, WRIST = "observation.images.front", "observation.images.wrist"
+TOLERANCE = 1e-5
+MODELS = ROOT / "model_repository"
+ELSEWHERE = goldens.ROOT.parent / "lerobot"
+DATASETS = [
+    *(pytest.param(LEROBOT / name, id=name) for name in ("toy_v21", "toy_v30_many")),
+    pytest.param(
+        ELSEWHERE / "toy_v30",
+        id="elsewhere toy_v30",
+        marks=[
+            pytest.mark.reference,
+            pytest.mark.skipif(not (ELSEWHERE / "toy_v30").exists(), reason="RFM_GOLDENS names none"),
+        ],
+    ),
+]
+
+
+def engine_scorer() -> EngineScorer:
+    encoders = MODELS / "rfm_encoder" / "1"
+    return EngineScorer(
+        str(MODELS / "rfm" / "1" / "checkpoint"),
+        image_encoder=str(encoders / "image_encoder"),
+        text_encoder=str(encoders / "text_encoder"),
+    )
+
+
+def columns(file: Path) -> dict[str, np.ndarray[Any, Any]]:
+    return {name: column.to_numpy() for name, column in zip(*table_of(file), strict=True)}
+
+
+def table_of(file: Path) -> tuple[list[str], list[Any]]:
+    table = parquet.read_table(file)
+    return table.column_names, table.columns
+
+
+def progress_of(report: Report) -> dict[str, np.ndarray[Any, Any]]:
+    return columns(report.files[0])
+
+
+def area_under_curve(scores: Any, is_success: Any) -> float:
+    good, bad = np.asarray(scores)[is_success], np.asarray(scores)[~np.asarray(is_success)]
+    return float(np.mean((good[:, None] > bad) + 0.5 * (good[:, None] == bad)))
+
+
+@pytest.mark.triton
+@pytest.mark.parametrize("root", DATASETS)
+def test_triton_and_the_engine_give_every_frame_the_score_of_its_prefix(
+    client: RewardClient, root: Path, output: Path
+) -> None:
+    dataset = open_dataset(root)
+    (output / "engine").mkdir()
+    served = progress_of(label(dataset, ClientScorer(client), LabelOptions(output=output)))
+    own = progress_of(label(dataset, engine_scorer(), LabelOptions(output=output / "engine")))
+    assert list(served) == list(own)
+    np.testing.assert_array_equal(served["index"], np.arange(sum(e.num_frames for e in dataset.episodes)))
+    for name in served:
+        np.testing.assert_allclose(served[name], own[name], rtol=0, atol=TOLERANCE)
+
+    sampling = Sampling("rint_pad", client.model_info(frames=True).max_frames)
+    episode, trajectories = next(iter_episodes(dataset))
+    by_hand = {}
+    for camera, film in trajectories.items():
+        assert film.frames is not None
+        shown = [sampling.prefix(t) for t in range(episode.num_frames)]
+        samples = [ProgressSample(Trajectory(frames=film.frames[p.indices], task=episode.task)) for p in shown]
+        results = client.evaluate(samples)
+        by_hand[camera] = [(r.progress[p.read], r.success[p.read]) for r, p in zip(results, shown, strict=True)]
+        for name, number in (("progress", 0), ("success", 1)):
+            expected = [scores[number] for scores in by_hand[camera]]
+            np.testing.assert_allclose(
+                served[f"{name}.{camera}"][: episode.num_frames], expected, rtol=0, atol=TOLERANCE
+            )
+    fused = np.mean([[scores[0] for scores in by_hand[camera]] for camera in by_hand], axis=0)
+    np.testing.assert_allclose(served["progress_sparse"][: episode.num_frames], fused, rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.triton
+@pytest.mark.parametrize("root", DATASETS)
+def test_final_progress_tells_successes_from_failures(client: RewardClient, root: Path, output: Path) -> None:
+    report = label(open_dataset(root), ClientScorer(client), LabelOptions(output=output))
+    kinds = json.loads((root.parent / "kinds.json").read_text())[root.name]
+    assert report.summary is not None
+    is_success = np.array(kinds) == "success"
+    assert area_under_curve(report.summary.final_progress, is_success) >= 0.95
+    assert set(report.summary.episodes[is_success]).isdisjoint(report.summary.never_succeed)
+
+
+@pytest.mark.triton
+def test_all_of_a_causal_network_in_one_pass_is_what_its_prefixes_give(client: RewardClient, output: Path) -> None:
+    dataset = open_dataset(LEROBOT / "toy_v21")
+    short = [episode.index for episode in dataset.episodes if episode.num_frames <= 32]
+    options = LabelOptions(output=output, cameras=(FRONT,), sampling="all", episodes=short)
+    told = progress_of(label(dataset, ClientScorer(client), options))
+    assert "progress." + FRONT not in told  # of one camera there is nothing to be fused
+    start = 0
+    for episode, films in iter_episodes(dataset, [FRONT]):
+        if episode.index in short:
+            frames = films[FRONT].frames
+            assert frames is not None
+            results = client.evaluate(
+                ProgressSample(Trajectory(frames=frames[: t + 1], task=episode.task)) for t in range(len(frames))
+            )
+            expected = [result.last_progress for result in results]
+            np.testing.assert_allclose(
+                told["progress_sparse"][start : start + len(frames)], expected, rtol=0, atol=TOLERANCE
+            )
+            start += len(frames)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_any_rule_labels_each_frame_with_the_slot_that_it_reads(rule: Any, output: Path) -> None:
+    """The scorer gives each slot its own frame's brightness: what a rule reads is always frame t, but for K = 1."""
+    dataset = open_dataset(LEROBOT / "toy_v21")
+    scorer = BrightnessScorer(max_frames=None)
+    frames = None if rule == "all" or rule.startswith("rewind") else 4
+    options = LabelOptions(output=output, sampling=rule, frames=frames, cameras=(WRIST,), episodes=[3, 7])
+    told = progress_of(label(dataset, scorer, options))
+    expected = [frame.mean() / 255 for index in (3, 7) for frame in dataset.frames(dataset.episodes[index], WRIST)]
+    np.testing.assert_allclose(told["progress_sparse"], expected, atol=1e-6)
+    assert told["episode_index"].tolist() == [3] * 21 + [7] * 20
+    assert told["index"].tolist() == [*range(112, 133), *range(251, 271)]
+    assert told["frame_index"].tolist() == [*range(21), *range(20)]
+    assert scorer.tasks == {dataset.episodes[index].task for index in (3, 7)}
+
+
+@pytest.mark.parametrize(("fuse", "function"), [("mean", np.mean), ("min", np.min), ("max", np.max)])
+def test_cameras_of_two_sizes_are_fused_and_each_is_kept(fuse: Any, function: Any, output: Path) -> None:
+    options = LabelOptions(output=output, frames=4, fuse=fuse, episodes=[0])
+    told = progress_of(label(open_dataset(LEROBOT / "toy_v21"), BrightnessScorer(), options))
+    for name, fused in (("progress", "progress_sparse"), ("success", "success")):
+        both = np.stack([told[f"{name}.{FRONT}"], told[f"{name}.{WRIST}"]])
+        assert not np.array_equal(both[0], both[1])
+        np.testing.assert_allclose(told[fused], function(both, axis=0), atol=1e-7)
+
+
+def test_the_files_have_the_documented_form(output: Path) -> None:
+    options = LabelOptions(output=output, name="mine", alias="sarm_progress", episodes=[1, 2])
+    report = label(open_dataset(LEROBOT / "toy_v30_many"), BrightnessScorer(), options)
+    assert [str(file.relative_to(output)) for file in report.files] == [
+        "mine_progress.parquet",
+        "sarm_progress.parquet",
+        "reward_signals/mine.parquet",
+    ]
+    progress, alias, signals = (parquet.read_table(file) for file in report.files)
+    assert alias.equals(progress, check_metadata=True)
+    identity = ["index", "episode_index", "frame_index"]
+    cameras = [f".{FRONT}", f".{WRIST}"]
+    scores = ["progress_sparse", *(f"progress{c}" for c in cameras), "success", *(f"success{c}" for c in cameras)]
+    assert progress.column_names == [*identity, *scores]
+    signal_names = [
+        f"reward.mine.{name}{camera}" for name in ("progress", "success_probability") for camera in ("", *cameras)
+    ]
+    assert signals.column_names == [*identity, *signal_names]
+    for table in (progress, signals):
+        assert [str(field.type) for field in table.schema] == ["int64"] * 3 + ["float"] * 6
+        assert not any(field.nullable for field in table.schema)
+        assert table["index"].to_pylist() == list(range(58, 156))
+        assert table["frame_index"].to_pylist() == [*range(39), *range(59)]
+    np.testing.assert_array_equal(progress["progress_sparse"], signals["reward.mine.progress"])
+    np.testing.assert_array_equal(progress["success"], signals["reward.mine.success_probability"])
+
+    metadata = {key.decode(): value.decode() for key, value in signals.schema.metadata.items()}
+    own = {key.removeprefix("lerobot.reward_scoring."): value for key, value in metadata.items()}
+    assert sorted(own) == ["descriptors", "episode_indices", "format", "provenance", "schema_version"]
+    assert (own["format"], own["schema_version"], own["episode_indices"]) == ("lerobot.frame_signals", "1", "[1,2]")
+    descriptors = json.loads(own["descriptors"])
+    assert sorted(descriptors) == signal_names
+    assert descriptors["reward.mine.progress"] == {
+        "description": "Share of the task that is done",
+        "direction": "higher",
+        "bounds": [0.0, 1.0],
+        "unit": None,
+        "missing_values": "forbidden",
+        "allow_nan": False,
+    }
+    provenance = json.loads(own["provenance"])
+    assert provenance["checkpoint"] == {"source": "toy/brightness", "revision": None, "weights_digest": "brightness"}
+    assert provenance["sampling"] == {"rule": "rint_pad", "frames": 16}
+    assert provenance["cameras"] == [FRONT, WRIST]
+    assert (provenance["dataset"]["kind"], provenance["dataset"]["source"]) == ("LeRobot v3.0", "toy_v30_many")
+    assert progress.schema.metadata[b"reward_model_path"] == b"toy/brightness"
+    assert json.loads(progress.schema.metadata[b"rfm.provenance"]) == provenance
+
+
+def test_lerobot_s_reader_finds_a_delta_for_every_frame(output: Path) -> None:
+    """As its reader of today is documented: by the global index, with the end of the episode for what lies behind."""
+    dataset = open_dataset(LEROBOT / "toy_v30_many")
+    told = progress_of(label(dataset, BrightnessScorer(), LabelOptions(output=output)))
+    progress = dict(zip(told["index"].tolist(), told["progress_sparse"].tolist(), strict=True))
+    assert not np.isnan(told["progress_sparse"]).any()
+    bounds = {
+        episode: (
+            told["index"][told["episode_index"] == episode].min(),
+            told["index"][told["episode_index"] == episode].max(),
+        )
+        for episode in np.unique(told["episode_index"])
+    }
+    for episode in dataset.episodes:
+        first, last = bounds[episode.index]
+        assert (first, last) == (episode.first_index, episode.first_index + episode.num_frames - 1)
+        assert all(min(index + 16, last) in progress for index in range(first, last + 1))
+
+
+class Notes(Watch):
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def note(self, text: str) -> None:
+        self.lines.append(text)
+
+
+def test_the_run_tells_what_was_decided_and_by_whom(output: Path) -> None:
+    notes = Notes()
+    label(open_dataset(LEROBOT / "toy_v21"), BrightnessScorer(), LabelOptions(output=output, limit=1), notes)
+    assert notes.lines == [
+        f"cameras: {FRONT}, {WRIST} (all of the dataset)",
+        "sampling: rint_pad (the rule of upstream's training and RL loop)",
+        "frames: 16 (as many as the checkpoint was trained on)",
+        "fuse: mean of 2 cameras",
+    ]
+    notes = Notes()
+    options = LabelOptions(output=output, name="b", limit=1, sampling="linspace_round", frames=4, cameras=(WRIST,))
+    label(open_dataset(LEROBOT / "toy_v21"), BrightnessScorer(), options, notes)
+    assert notes.lines == [
+        f"cameras: {WRIST} (asked for)",
+        "sampling: linspace_round (asked for)",
+        "frames: 4 (asked for)",
+    ]
+
+
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "a camera that is not there": ({"cameras": ("top",)}, f"cameras: expected some of {FRONT}, {WRIST}, got 'top'"),
+    "an episode that is not there": ({"episodes": [3, 8]}, "episodes: expected some of the 8 of the dataset, got 8"),
+    "a whole episode that is too long": (
+        {"mode": "whole"},
+        "episode 2: expected at most 16 frames, as the checkpoint takes, got 53: use mode prefix and a rule with a",
+    ),
+    "no output": ({"output": Path("/nothing/here")}, "/nothing/here: expected a folder for the labels, got none"),
+}
+
+
+@pytest.mark.parametrize(("options", "message"), REFUSED.values(), ids=REFUSED)
+def test_what_cannot_be_labelled_is_refused_before_the_first_frame(
+    options: dict[str, Any], message: str, output: Path
+) -> None:
+    scorer = BrightnessScorer()
+    with pytest.raises(DatasetError) as caught:
+        label(open_dataset(LEROBOT / "toy_v21"), scorer, LabelOptions(**{"output": output, **options}))
+    assert str(caught.value).startswith(message)
+    assert scorer.num_samples == 0
+
+
+CONTRADICTORY: dict[str, tuple[dict[str, Any], str]] = {
+    "a name that is no file": ({"name": "../x"}, "name: expected 1 to 64 letters, digits, _ or -, got '../x'"),
+    "another mode": ({"mode": "dense"}, "mode: expected one of prefix, whole, got 'dense'"),
+    "whole with a rule": ({"mode": "whole", "sampling": "rint_pad"}, "sampling: expected all in mode whole"),
+    "a camera twice": ({"cameras": ("a", "a")}, "cameras: expected each once, got a, a"),
+    "a shard behind the last": ({"shard": (2, 2)}, "shard: expected i/n with i from 0 to n - 1, got 2/2"),
+    "no worker": ({"workers": 0}, "workers: expected at least 1, got 0"),
+}
+
+
+@pytest.mark.parametrize(("options", "message"), CONTRADICTORY.values(), ids=CONTRADICTORY)
+def test_options_that_contradict_themselves_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError) as caught:
+        LabelOptions(**options)
+    assert str(caught.value).startswith(message)
+
+
+def test_episodes_are_named_by_numbers_and_ranges() -> None:
+    assert parse_episodes("0:3,205, 7") == [0, 1, 2, 7, 205]
+    for text in ("", "3:1", "a", "1-3"):
+        with pytest.raises(ValueError, match=r"^episodes: expected numbers and ranges such as 0:100,205, got "):
+            parse_episodes(text)

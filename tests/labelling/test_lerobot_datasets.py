@@ -1,0 +1,339 @@
+# SPDX-License-Identifier: MIT
+"""LeRobot datasets that LeRobot's own writer made: frame t is the dataset's frame t, and contradictions are refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+import goldens
+import local_hub
+from labelling import LEROBOT
+from rfm_client.labelling import DatasetError, iter_episodes, open_dataset
+
+HUB_ID = "org/name"
+FRONT, WRIST = "observation.images.front", "observation.images.wrist"
+ELSEWHERE = goldens.ROOT.parent / "lerobot"  # beside the further reference cases, where there are some
+DATASETS = [
+    pytest.param(LEROBOT / "toy_v21", id="v2.1"),
+    pytest.param(LEROBOT / "toy_v30_many", id="v3.0 in several files"),
+    *(
+        pytest.param(folder, id=f"elsewhere {folder.name}", marks=pytest.mark.reference)
+        for folder in (sorted(ELSEWHERE.glob("toy_*")) if ELSEWHERE != LEROBOT else [])
+    ),
+]
+
+
+def whole_film(file: Path) -> list[np.ndarray[Any, Any]]:
+    with av.open(str(file)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def films(root: Path, camera: str) -> list[Path]:
+    found = [file for file in root.rglob("*.mp4") if camera in file.parts]
+    return sorted(found, key=lambda file: (file.parent.name if "chunk" in file.parent.name else "", file.name))
+
+
+@pytest.mark.parametrize("root", DATASETS)
+def test_every_frame_is_that_of_the_film_in_order(root: Path) -> None:
+    """LeRobot writes episodes one behind the other: all films of a camera, decoded whole, are all frames."""
+    dataset = open_dataset(root)
+    assert list(dataset.cameras) == [FRONT, WRIST]
+    info = json.loads((root / "meta" / "info.json").read_text())
+    for camera, size in ((FRONT, 256), (WRIST, 128)):
+        expected = [frame for file in films(root, camera) for frame in whole_film(file)]
+        read = [frame for episode in dataset.episodes for frame in dataset.frames(episode, camera)]
+        assert len(read) == len(expected) == info["total_frames"]
+        for frame, other in zip(read, expected, strict=True):
+            assert frame.shape == (size, size, 3)
+            np.testing.assert_array_equal(frame, other)
+
+
+@pytest.mark.parametrize("root", DATASETS)
+def test_episodes_and_tasks_are_those_of_the_rows(root: Path) -> None:
+    tables = [parquet.read_table(file, partitioning=None) for file in sorted((root / "data").rglob("*.parquet"))]
+    rows = pa.concat_tables([table.select(["index", "episode_index", "task_index"]) for table in tables]).to_pylist()
+    dataset = open_dataset(root)
+    sentences = {episode.task for episode in dataset.episodes}
+    assert all(sentence.startswith("put the ") for sentence in sentences)
+    assert len(sentences) == len({row["task_index"] for row in rows})
+    for episode in dataset.episodes:
+        own = [row for row in rows if row["episode_index"] == episode.index]
+        assert (episode.num_frames, episode.first_index) == (len(own), own[0]["index"])
+
+
+def test_one_may_walk_through_the_episodes_of_some_cameras() -> None:
+    dataset = open_dataset(LEROBOT / "toy_v21")
+    seen = 0
+    for episode, trajectories in iter_episodes(dataset, [WRIST]):
+        assert list(trajectories) == [WRIST]
+        assert trajectories[WRIST].num_frames == episode.num_frames
+        assert trajectories[WRIST].task == episode.task
+        seen += 1
+    assert seen == 8
+    with pytest.raises(DatasetError, match=r"^cameras: expected some of .*front, .*wrist, got 'top'$"):
+        next(iter_episodes(dataset, ["top"]))
+
+
+def test_a_frame_is_the_nearest_to_its_time_stamp(tmp_path: Path) -> None:
+    """Films at twice the rate of the rows, whose time stamps are rounded: each second frame is one of the dataset."""
+    root = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "twice")
+    film = root / "videos" / "chunk-000" / FRONT / "episode_000000.mp4"
+    frames = whole_film(film)
+    with av.open(str(film), "w") as container:
+        stream = container.add_stream("libx264", rate=20, options={"crf": "1"})
+        stream.height, stream.width, stream.pix_fmt = 256, 256, "yuv444p"
+        for frame in frames:
+            for image in (frame, 255 - frame):
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+    dataset = open_dataset(root)
+    read = list(dataset.frames(dataset.episodes[0], FRONT))
+    assert len(read) == len(frames)
+    for frame, expected in zip(read, frames, strict=True):
+        assert np.abs(frame.astype(int) - expected).mean() < 8
+
+
+def test_av1_and_images_in_tables_are_read(tmp_path: Path) -> None:
+    root = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "mixed")
+    film = root / "videos" / "chunk-000" / FRONT / "episode_000000.mp4"
+    frames = whole_film(film)
+    with av.open(str(film), "w") as container:
+        stream = container.add_stream("libsvtav1", rate=10, options={"crf": "20", "g": "2", "svtav1-params": "lp=1"})
+        stream.height, stream.width, stream.pix_fmt = 256, 256, "yuv420p"
+        for image in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+    stored = store_as_images(root, WRIST)
+    dataset = open_dataset(root)
+    assert list(dataset.cameras) == [FRONT, WRIST]
+    first = dataset.episodes[0]
+    for frame, expected in zip(dataset.frames(first, FRONT), frames, strict=True):
+        assert np.abs(frame.astype(int) - expected).mean() < 8
+    for frame, expected in zip(dataset.frames(first, WRIST), stored, strict=True):
+        np.testing.assert_array_equal(frame, expected)
+    assert dataset.check(first, WRIST).num_bytes > 0
+
+
+def store_as_images(root: Path, camera: str) -> list[np.ndarray[Any, Any]]:
+    """Episode 0's film of a camera goes into its table, as PNG in the rows and as files; gives its frames."""
+    import io
+
+    from PIL import Image
+
+    frames = whole_film(root / "videos" / "chunk-000" / camera / "episode_000000.mp4")
+    images = []
+    for t, frame in enumerate(frames):
+        content = io.BytesIO()
+        Image.fromarray(frame).save(content, "PNG")
+        if t % 2:
+            (root / "images").mkdir(exist_ok=True)
+            (root / "images" / f"{t}.png").write_bytes(content.getvalue())
+        images.append({"bytes": None if t % 2 else content.getvalue(), "path": f"images/{t}.png"})
+    file = root / "data" / "chunk-000" / "episode_000000.parquet"
+    table = parquet.read_table(file, partitioning=None).append_column(camera, pa.array(images))
+    parquet.write_table(table, file)
+    change_info(root, lambda info: info["features"][camera].update(dtype="image"))
+    return frames
+
+
+def change_info(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    file = root / "meta" / "info.json"
+    info = json.loads(file.read_text())
+    change(info)
+    file.write_text(json.dumps(info))
+
+
+def change_table(file: Path, column: str, change: Callable[[list[Any]], object]) -> None:
+    table = parquet.read_table(file, partitioning=None)
+    values = table[column].to_pylist()
+    change(values)
+    field = table.schema.field(column)
+    number = table.schema.get_field_index(column)
+    parquet.write_table(table.set_column(number, field, pa.array(values, field.type)), file)
+
+
+def truncate(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[: file.stat().st_size * 2 // 3])
+
+
+V30_EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+V30_ROWS = "data/chunk-000/file-000.parquet"
+V30_FILM = f"videos/{FRONT}/chunk-000/file-001.mp4"
+V21_ROWS = "data/chunk-000/episode_000003.parquet"
+V21_FILM = f"videos/chunk-000/{WRIST}/episode_000005.mp4"
+
+CONTRADICTIONS: dict[str, tuple[str, Callable[[Path], object], str]] = {
+    "v3.0: a truncated film": (
+        "toy_v30_many",
+        lambda root: truncate(root / V30_FILM),
+        r"file-001\.mp4: expected a whole video file, got ",
+    ),
+    "v3.0: a missing film": (
+        "toy_v30_many",
+        lambda root: (root / V30_FILM).unlink(),
+        r"file-001\.mp4: expected a video file, got none",
+    ),
+    "v3.0: a length that the rows do not have": (
+        "toy_v30_many",
+        lambda root: change_table(root / V30_EPISODES, "length", lambda values: values.__setitem__(2, values[2] + 1)),
+        r"episode 2: .*file-000\.parquet: length: expected 59, from 97 to 156, got 60",
+    ),
+    "v3.0: a film that is too short for its episode": (
+        "toy_v30_many",
+        lambda root: change_table(
+            root / V30_EPISODES, f"videos/{FRONT}/to_timestamp", lambda values: values.__setitem__(1, values[1] - 0.2)
+        ),
+        r"episode 1: .*to_timestamp: expected 3\.9000 s for 39 frames, got 3\.7000 s",
+    ),
+    "v3.0: an episode that begins behind its film's end": (
+        "toy_v30_many",
+        lambda root: [
+            change_table(
+                root / V30_EPISODES,
+                f"videos/{FRONT}/{name}",
+                lambda values: values.__setitem__(9, values[9] + 100),
+            )
+            for name in ("from_timestamp", "to_timestamp")
+        ],
+        r"episode 9: .*front: .*mp4: expected frame 0 at \d+\.\d+ s, got the nearest at \d+\.\d+ s",
+    ),
+    "v3.0: episodes that share frames": (
+        "toy_v30_many",
+        lambda root: [
+            change_table(
+                root / V30_EPISODES, f"videos/{FRONT}/{name}", lambda values: values.__setitem__(1, values[1] - 0.3)
+            )
+            for name in ("from_timestamp", "to_timestamp")
+        ],
+        r"episode 1: .*mp4: expected a start at 5\.8000 s or later, behind episode 0, got 5\.5000 s",
+    ),
+    "v3.0: a row that is missing": (
+        "toy_v30_many",
+        lambda root: change_table(root / V30_ROWS, "episode_index", lambda values: values.__setitem__(60, 0)),
+        r"episode 0: .*file-000\.parquet: expected 58 rows, as its metadata say, got 59",
+    ),
+    "v3.0: rows out of order": (
+        "toy_v30_many",
+        lambda root: change_table(root / V30_ROWS, "frame_index", lambda values: values.__setitem__(5, 6)),
+        r"episode 0: .*frame_index: expected 5 in row 5, got 6",
+    ),
+    "v3.0: no task": (
+        "toy_v30_many",
+        lambda root: change_table(
+            root / V30_ROWS, "task_index", lambda values: values.__setitem__(slice(0, 58), [9] * 58)
+        ),
+        r"episode 0: task 9 in meta/tasks: expected a task as a sentence, got none",
+    ),
+    "v3.0: two tasks in an episode": (
+        "toy_v30_many",
+        lambda root: change_table(root / V30_ROWS, "task_index", lambda values: values.__setitem__(3, 4)),
+        r"episode 0: .*task_index: expected one task in an episode, got 2: \[0, 4\]",
+    ),
+    "v3.0: no metadata of episodes": (
+        "toy_v30_many",
+        lambda root: shutil.rmtree(root / "meta" / "episodes"),
+        r"meta/episodes: expected Parquet files, got none",
+    ),
+    "v3.0: fewer episodes than it says": (
+        "toy_v30_many",
+        lambda root: change_info(root, lambda info: info.update(total_episodes=11)),
+        r"meta: expected 11 episodes, as info\.json says, got 10",
+    ),
+    "v3.0: fewer frames than it says": (
+        "toy_v30_many",
+        lambda root: change_info(root, lambda info: info.update(total_frames=430)),
+        r"meta: expected 430 frames, as info\.json says, got 428",
+    ),
+    "v2.1: a missing table": (
+        "toy_v21",
+        lambda root: (root / V21_ROWS).unlink(),
+        r"episode_000003\.parquet: expected a Parquet file, got none",
+    ),
+    "v2.1: a truncated table": (
+        "toy_v21",
+        lambda root: truncate(root / V21_ROWS),
+        r"episode_000003\.parquet: expected a readable Parquet file, got ",
+    ),
+    "v2.1: a truncated film": (
+        "toy_v21",
+        lambda root: truncate(root / V21_FILM),
+        r"episode_000005\.mp4: expected a whole video file, got ",
+    ),
+    "v2.1: a film that is too short": (
+        "toy_v21",
+        lambda root: shutil.copy(root / V21_FILM.replace("005", "007"), root / V21_FILM),
+        r"episode 5: .*wrist: .*mp4: expected frame 20 at 2\.0000 s, got the nearest at 1\.9000 s \(20 frames in the file\)",
+    ),
+    "v2.1: an empty task": (
+        "toy_v21",
+        lambda root: (root / "meta" / "tasks.jsonl").write_text('{"task_index": 0, "task": " "}\n'),
+        r"episode 0: task 0 in meta/tasks: expected a task as a sentence, got ' '",
+    ),
+    "v2.1: a line that is no JSON": (
+        "toy_v21",
+        lambda root: (root / "meta" / "episodes.jsonl").write_text('{"episode_index": 0\n'),
+        r"episodes\.jsonl: line 1: expected a JSON object, got ",
+    ),
+    "a version of the future": (
+        "toy_v21",
+        lambda root: change_info(root, lambda info: info.update(codebase_version="v4.0")),
+        r"codebase_version: expected one of v2\.0, v2\.1, v3\.0, got 'v4\.0'",
+    ),
+    "a path out of the dataset": (
+        "toy_v21",
+        lambda root: change_info(root, lambda info: info.update(data_path="../{episode_index}.parquet")),
+        r"meta/info\.json: expected a path inside the dataset, got '\.\./0\.parquet'",
+    ),
+}
+
+
+@pytest.mark.parametrize(("name", "break_it", "message"), CONTRADICTIONS.values(), ids=CONTRADICTIONS)
+def test_a_dataset_that_contradicts_itself_is_refused_before_a_frame_is_decoded(
+    tmp_path: Path, name: str, break_it: Callable[[Path], object], message: str
+) -> None:
+    root = shutil.copytree(LEROBOT / name, tmp_path / name)
+    break_it(root)
+    with pytest.raises(DatasetError, match=message):
+        dataset = open_dataset(root)
+        for episode in dataset.episodes:
+            for camera in dataset.cameras:
+                dataset.check(episode, camera)
+
+
+@pytest.mark.parametrize("source", ["/nothing/here", "no dataset"])
+def test_what_is_no_dataset_is_refused(source: str) -> None:
+    with pytest.raises(DatasetError, match=f"^{source}: expected a LeRobot dataset .* got none$"):
+        open_dataset(source)
+
+
+def test_a_dataset_of_the_hub_is_fetched_at_its_revision(tmp_path: Path) -> None:
+    """By a process of its own: the Hub's library reads its settings when it is imported."""
+    ask = (
+        "import sys; from rfm_client.labelling import open_dataset; d = open_dataset(sys.argv[1]); "
+        f"print(d.source, d.revision, len(d.episodes), len(list(d.frames(d.episodes[7], {FRONT!r}))))"
+    )
+    revisions = {"main": LEROBOT / "toy_v30_many", "v1": LEROBOT / "toy_v21"}
+    with local_hub.hub({HUB_ID: revisions}, "datasets") as endpoint:
+        environment = {**os.environ, "HF_ENDPOINT": endpoint, "HF_HOME": str(tmp_path)}
+        for revision, expected in (("", "main"), ("@v1", "v1"), ("@v2", None)):
+            words = [sys.executable, "-c", ask, HUB_ID + revision]
+            done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=100, check=False)
+            if expected is None:
+                assert "org/name: expected a local dataset or one of the Hub, got " in done.stderr
+            else:
+                dataset = open_dataset(revisions[expected])
+                told = f"{local_hub.commit_of(expected)} {len(dataset.episodes)} {dataset.episodes[7].num_frames}"
+                assert done.stdout.split() == [HUB_ID, *told.split()], done.stderr

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: MIT
+"""Datasets of HDF5 and of videos, and the labels of HDF5 files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from pyarrow import parquet
+
+from labelling import BrightnessScorer, brightness
+from pictures import numbered, numbers, write_video
+from rfm_client.labelling import DatasetError, LabelOptions, label, open_dataset
+
+LENGTHS = (5, 7, 3)
+TASK = "put the bowl on the stove"
+
+
+def frames_of(index: int, camera: str) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    size = 24 if camera == "agentview_rgb" else 16
+    return np.random.default_rng([index, size]).integers(0, 256, (LENGTHS[index], size, size, 3), np.uint8)
+
+
+@pytest.fixture
+def libero(tmp_path: Path) -> Path:
+    """As LIBERO writes it: the sentence in problem_info, two cameras of two sizes, actions and states."""
+    file = tmp_path / "demos.hdf5"
+    with h5py.File(file, "w") as opened:
+        data = opened.create_group("data")
+        data.attrs["problem_info"] = json.dumps({"language_instruction": TASK})
+        data.attrs["env_args"] = json.dumps({"env_name": "Libero"})
+        for index, length in reversed(list(enumerate(LENGTHS))):
+            demo = data.create_group(f"demo_{index}")
+            demo["actions"] = np.zeros((length, 7))
+            for camera in ("agentview_rgb", "eye_in_hand_rgb"):
+                demo[f"obs/{camera}"] = frames_of(index, camera)
+            demo["obs/gripper_states"] = np.zeros((length, 2))
+    return file
+
+
+def test_an_hdf5_file_gives_its_demonstrations_in_the_order_of_their_numbers(libero: Path) -> None:
+    dataset = open_dataset(libero)
+    assert (dataset.kind, dataset.source, dataset.root) == ("HDF5", "demos.hdf5", libero.parent)
+    assert list(dataset.cameras) == ["agentview_rgb", "eye_in_hand_rgb"]
+    told = [(e.index, e.name, e.task, e.num_frames, e.first_index) for e in dataset.episodes]
+    assert told == [(0, "demo_0", TASK, 5, 0), (1, "demo_1", TASK, 7, 5), (2, "demo_2", TASK, 3, 12)]
+    for episode in dataset.episodes:
+        for camera in dataset.cameras:
+            np.testing.assert_array_equal(list(dataset.frames(episode, camera)), frames_of(episode.index, camera))
+            assert dataset.check(episode, camera).num_bytes == frames_of(episode.index, camera).nbytes
+
+
+def expected(index: int) -> Any:
+    both = [brightness(frames_of(index, camera)) for camera in ("agentview_rgb", "eye_in_hand_rgb")]
+    return np.mean(both, axis=0)
+
+
+def test_labels_of_an_hdf5_file_go_to_a_file_beside_it(libero: Path) -> None:
+    before = libero.read_bytes()
+    report = label(open_dataset(libero), BrightnessScorer(), LabelOptions())
+    assert report.files == [libero.with_name("demos.rfm_rewards.hdf5")]
+    assert libero.read_bytes() == before
+    with h5py.File(report.files[0]) as opened:
+        assert sorted(opened["data"]) == ["demo_0", "demo_1", "demo_2"]
+        provenance = json.loads(opened["data"].attrs["rfm_provenance"])
+        assert provenance["dataset"]["kind"] == "HDF5"
+        for index in range(3):
+            demo = opened[f"data/demo_{index}"]
+            assert demo["rfm_progress"].dtype == np.float32
+            np.testing.assert_allclose(demo["rfm_progress"], expected(index), atol=1e-6)
+            np.testing.assert_allclose(
+                demo["rfm_progress.agentview_rgb"], brightness(frames_of(index, "agentview_rgb")), atol=1e-6
+            )
+            assert demo["rfm_success"].shape == (LENGTHS[index],)
+    label(open_dataset(libero), BrightnessScorer(), LabelOptions())  # the same again
+    with pytest.raises(DatasetError, match=r"rfm_rewards\.hdf5: expected no labels rfm, or of the same provenance"):
+        label(open_dataset(libero), BrightnessScorer(), LabelOptions(frames=2))
+
+
+def test_labels_go_into_the_hdf5_file_when_asked(libero: Path) -> None:
+    scorer = BrightnessScorer()
+    for _ in range(2):
+        report = label(open_dataset(libero), scorer, LabelOptions(in_place=True, name="mine"))
+        assert report.files == [libero]
+    assert scorer.num_samples == 2 * sum(LENGTHS)
+    with h5py.File(libero) as opened:
+        np.testing.assert_allclose(opened["data/demo_1/mine_progress"], expected(1), atol=1e-6)
+        assert opened["data/demo_1/actions"].shape == (7, 7)
+    assert report.summary is not None
+    np.testing.assert_allclose(report.summary.final_progress, [expected(index)[-1] for index in range(3)], atol=1e-6)
+
+
+def test_an_hdf5_file_may_have_parquet_labels(libero: Path) -> None:
+    report = label(open_dataset(libero), BrightnessScorer(), LabelOptions(formats=("progress",)))
+    table = parquet.read_table(report.files[0])
+    assert table["index"].to_pylist() == list(range(15))
+
+
+def broken(change: Any) -> Any:
+    def apply(file: Path) -> None:
+        with h5py.File(file, "r+") as opened:
+            change(opened["data"])
+
+    return apply
+
+
+def shorten(data: Any) -> None:
+    del data["demo_1/actions"]
+    data["demo_1/actions"] = np.zeros((6, 7))
+
+
+BROKEN: dict[str, tuple[Any, str]] = {
+    "lengths that differ": (
+        broken(shorten),
+        r"data/demo_1: expected one length, above 0, got obs/agentview_rgb 7, .*actions 6",
+    ),
+    "a camera that is missing": (
+        broken(lambda data: data["demo_2/obs"].pop("eye_in_hand_rgb")),
+        r"data/demo_2/obs: expected the camera eye_in_hand_rgb, got none",
+    ),
+    "no task": (
+        broken(lambda data: data.attrs.__delitem__("problem_info")),
+        r"problem_info or env_args: expected a task as a sentence, got none",
+    ),
+    "no demonstration": (
+        broken(lambda data: [data.pop(name) for name in list(data)]),
+        r"data: expected demo_0, demo_1 and so on, got none",
+    ),
+    "a truncated file": (
+        lambda file: file.write_bytes(file.read_bytes()[:3000]),
+        r"demos\.hdf5: expected an HDF5 file, got ",
+    ),
+}
+
+
+@pytest.mark.parametrize(("break_it", "message"), BROKEN.values(), ids=BROKEN)
+def test_an_hdf5_file_that_contradicts_itself_is_refused(libero: Path, break_it: Any, message: str) -> None:
+    break_it(libero)
+    scorer = BrightnessScorer()
+    with pytest.raises(DatasetError, match=message):
+        label(open_dataset(libero), scorer, LabelOptions())
+    assert scorer.num_samples == 0
+
+
+def test_the_caller_may_say_the_task_of_an_hdf5_file(libero: Path) -> None:
+    broken(lambda data: data.attrs.__delitem__("problem_info"))(libero)
+    assert {episode.task for episode in open_dataset(libero, task="open the drawer").episodes} == {"open the drawer"}
+
+
+@pytest.fixture
+def videos(tmp_path: Path) -> Path:
+    folder = tmp_path / "videos"
+    (folder / "day").mkdir(parents=True)
+    write_video(folder / "b.mp4", numbered(6))
+    write_video(folder / "day" / "a.mp4", numbered(4), times=[0, 1, 5, 6])
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("tasks.csv", "task,video\nstack the cups,b.mp4\nopen the box,day/a.mp4\n"),
+        ("tasks.json", '{"b.mp4": "stack the cups", "day/a.mp4": "open the box"}'),
+    ],
+)
+@pytest.mark.parametrize("by_table", [True, False])
+def test_a_folder_of_videos_is_read_in_the_order_of_its_table(
+    videos: Path, name: str, text: str, by_table: bool, output: Path
+) -> None:
+    (videos / name).write_text(text)
+    dataset = open_dataset(videos / name if by_table else videos)
+    assert [(e.name, e.task, e.num_frames, e.first_index) for e in dataset.episodes] == [
+        ("b.mp4", "stack the cups", 6, 0),
+        ("day/a.mp4", "open the box", 4, 6),
+    ]
+    for episode in dataset.episodes:
+        film = np.stack(list(dataset.frames(episode, "video")))
+        assert numbers(film, episode.num_frames) == list(range(episode.num_frames))
+    report = label(dataset, BrightnessScorer(), LabelOptions(output=output))
+    assert parquet.read_table(report.files[0])["episode_index"].to_pylist() == [0] * 6 + [1] * 4
+
+
+REFUSED = {
+    "no table": (None, "", "expected one of tasks.csv and tasks.json with the task of each video, got none"),
+    "no column of tasks": ("tasks.csv", "video\nb.mp4\n", "expected the columns video and task, got video"),
+    "a video twice": ("tasks.csv", "video,task\nb.mp4,a\nb.mp4,b\n", "line 3: expected each video once, got b.mp4"),
+    "no task": ("tasks.csv", "video,task\nb.mp4,\n", "b.mp4: expected a task as a sentence, got none"),
+    "a video that is missing": ("tasks.json", '{"c.mp4": "a"}', "c.mp4: expected a video file, got none"),
+    "no JSON": ("tasks.json", "{", "tasks.json: expected JSON, got "),
+}
+
+
+@pytest.mark.parametrize(("name", "text", "message"), REFUSED.values(), ids=REFUSED)
+def test_a_table_of_videos_that_is_wrong_is_refused(videos: Path, name: str | None, text: str, message: str) -> None:
+    if name is not None:
+        (videos / name).write_text(text)
+    with pytest.raises(DatasetError) as caught:
+        _ = open_dataset(videos).episodes
+    assert message in str(caught.value)

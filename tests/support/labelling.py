@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: MIT
+"""Labelling without a server: a scorer of a few lines, and a process that labels with it and may be killed.
+
+python tests/support/labelling.py DATASET OUTPUT [SECONDS_A_REQUEST [WORKERS [SHARD]]]
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, RewardError, Trajectory
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.labelling import CheckpointFacts, LabelOptions, Scorer, label, open_dataset
+from rfm_client.labelling.options import parse_shard
+
+LEROBOT = Path(__file__).parents[1] / "lerobot"
+
+
+class BrightnessScorer:
+    """Progress is how bright the slot's frame is, success how red: what is read can be recomputed by hand."""
+
+    def __init__(self, seconds: float = 0.0, digest: str = "brightness", max_frames: int | None = 16) -> None:
+        self.seconds = seconds
+        self.digest = digest
+        self.max_frames = max_frames
+        self.num_samples = 0
+        self.tasks: set[str] = set()
+        self._lock = threading.Lock()
+
+    def checkpoint(self) -> CheckpointFacts:
+        return CheckpointFacts("toy/brightness", None, self.digest, self.max_frames, None, False, False)
+
+    def encode(self, frames: UInt8Array, task: str) -> Trajectory:
+        raise AssertionError("it does not encode")
+
+    def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
+        time.sleep(self.seconds)
+        with self._lock:
+            self.num_samples += len(samples)
+            self.tasks |= {sample.trajectory.task for sample in samples}
+        return [self._result(sample) for sample in samples]
+
+    def _result(self, sample: ProgressSample) -> ProgressResult:
+        frames = sample.trajectory.frames
+        assert frames is not None
+        return ProgressResult(progress=brightness(frames), success=redness(frames))
+
+
+class PickyScorer(BrightnessScorer):
+    """Refuses the samples of one task."""
+
+    REFUSED = "put the red block on the plate"
+
+    def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
+        if samples[0].trajectory.task == self.REFUSED:
+            raise InvalidSampleError.at("task", "another one", "this")
+        return super().evaluate(samples)
+
+
+class AbsentScorer(BrightnessScorer):
+    """Fails for every sample."""
+
+    def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
+        raise RewardError("no server")
+
+
+@contextmanager
+def slow() -> Iterator[Scorer]:
+    yield BrightnessScorer(0.05)
+
+
+@contextmanager
+def picky() -> Iterator[Scorer]:
+    yield PickyScorer()
+
+
+@contextmanager
+def absent() -> Iterator[Scorer]:
+    yield AbsentScorer()
+
+
+def brightness(frames: UInt8Array) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
+    return np.array([frame.mean() / 255 for frame in frames], np.float32)
+
+
+def redness(frames: UInt8Array) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
+    return np.array([frame[..., 0].mean() / 255 for frame in frames], np.float32)
+
+
+if __name__ == "__main__":
+    source, output, *more = sys.argv[1:]
+    seconds, workers, shard = [*more, "0", "2", ""][:1], [*more[1:], "2"][:1], more[2:3]
+    options = LabelOptions(output=Path(output), workers=int(workers[0]), shard=parse_shard(shard[0]) if shard else None)
+    label(open_dataset(source), BrightnessScorer(float(seconds[0])), options)

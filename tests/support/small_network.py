@@ -1,0 +1,19 @@
+# SPDX-License-Identifier: MIT
+"""A ReWiND network that is small, from which tests change what they are about."""
+
+from __future__ import annotations
+
+from rfm.rewind.network import RewindConfig
+
+SMALL = RewindConfig(
+    video_feature_dim=12,
+    text_feature_dim=6,
+    hidden_dim=24,
+    num_layers=2,
+    num_attention_heads=3,
+    max_len=8,
+    causal_mask=True,
+    use_per_frame_progress_token=True,
+    progress_bins=5,
+    has_similarity=True,
+)

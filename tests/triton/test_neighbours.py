@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: MIT
+"""When an instance of several takes more requests from Triton: real journals, and a real pipeline."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from rfm.journal import NO_DIGEST, Journal
+from rfm.triton_model.neighbours import Neighbours
+from rfm.triton_model.pipeline import Bounds, Pipeline, Stages
+from rfm_serve import PATIENCE_S, wait_for
+
+MAX_WAITING = 2
+
+
+@dataclass(eq=False)
+class Job:
+    num_samples: int = 1
+    num_tokens: int = 1
+    may_be_rejected: bool = True
+
+
+@dataclass
+class Instance:
+    """This one, which scores its first job until ``may_score`` is set, and the journal of another."""
+
+    pipeline: Pipeline[Job, None]
+    neighbours: Neighbours
+    other: Journal
+    may_score: threading.Event
+
+    def wait(self) -> None:
+        self.neighbours.wait_for_turn(self.pipeline, MAX_WAITING)
+
+
+@pytest.fixture
+def busy(tmp_path: Path) -> Iterator[Instance]:
+    may_score = threading.Event()
+    stages = Stages[Job, None](
+        lambda batch: may_score.wait(PATIENCE_S) and None, lambda batch, scored: None, lambda error: None
+    )
+    pipeline = Pipeline(stages, Bounds(8, 100, 8))
+    own, other = tmp_path / "own", Journal.create(tmp_path / "other", 1)
+    pipeline.put([Job()])
+    wait_for(lambda: pipeline.num_waiting == 0)
+    yield Instance(pipeline, Neighbours(lambda: [own, tmp_path / "other"], own), other, may_score)
+    may_score.set()
+    pipeline.close()
+
+
+def test_while_another_is_idle_nothing_more_is_taken(busy: Instance) -> None:
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(busy.wait)
+        assert not busy.pipeline.wait_for(waiting.done, 0.1)
+        with busy.other.at_work_on([NO_DIGEST]):
+            waiting.result(PATIENCE_S)
+
+
+def test_where_all_are_busy_a_batch_is_taken_ahead_and_no_more(busy: Instance) -> None:
+    with busy.other.at_work_on([NO_DIGEST]), ThreadPoolExecutor(1) as pool:
+        busy.wait()
+        busy.pipeline.put([Job(), Job()])
+        waiting = pool.submit(busy.wait)
+        assert not busy.pipeline.wait_for(waiting.done, 0.1)
+        busy.may_score.set()
+        waiting.result(PATIENCE_S)
+
+
+def test_an_idle_instance_waits_for_nobody(busy: Instance) -> None:
+    busy.may_score.set()
+    assert busy.pipeline.wait_for(lambda: busy.pipeline.is_idle, PATIENCE_S)
+    busy.wait()
