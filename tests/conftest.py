@@ -38,7 +38,13 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         (folder / "tritonserver.log").open("wb") as log,
         TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
     ):
-        yield Served(repository, server.endpoints)
+        yield Served(server)
+
+
+@pytest.fixture(autouse=True)
+def _served_lives(request: pytest.FixtureRequest) -> None:
+    if "served" in request.fixturenames:
+        request.getfixturevalue("served").revive()
 
 
 @pytest.fixture(params=["grpc", "http"])

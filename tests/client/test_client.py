@@ -153,9 +153,9 @@ def test_a_cancelled_call_is_cancelled_on_the_server(served: Served) -> None:
     before = num_cancelled()
     with served.client("grpc") as client, ThreadPoolExecutor(3) as pool:
         for _ in range(10):
-            plugs = [pool.submit(client.evaluate, full_batch()) for _ in range(3)]
+            plugs = [pool.submit(client.evaluate, long_samples()) for _ in range(3)]
             next(as_completed(plugs))  # so the next one runs, and what is asked now has to wait
-            late = [client.submit(ProgressSample(random_trajectory(0, 4)), timeout_s=0.2) for _ in range(5)]
+            late = [client.submit(ProgressSample(random_trajectory(0, 4)), timeout_s=0.1) for _ in range(5)]
             assert {type(future.exception()) for future in late} <= {DeadlineExceededError, type(None)}
             for plug in plugs:
                 plug.result()
@@ -176,6 +176,11 @@ def metric(served: Served, name: str, **labels: str) -> float:
         for s in family.samples
         if s.name.removesuffix("_total") == name and wanted <= s.labels.items()
     )
+
+
+def long_samples() -> list[Sample]:
+    """Each takes so long to score that the model asks whether those behind it have been cancelled."""
+    return [ProgressSample(random_trajectory(0, 2048), frame_steps=16) for _ in range(8)]
 
 
 def full_batch() -> list[Sample]:

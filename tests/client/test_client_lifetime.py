@@ -87,8 +87,9 @@ def test_a_fork_of_what_used_grpc_is_told_so(served: Served, monkeypatch: pytest
 
 
 def test_submitting_while_it_is_closed_leaves_no_future_open(served: Served) -> None:
+    """Over HTTP, where closing cancels nothing on the server: see ``Served.revive``."""
     for _ in range(20):
-        client = served.client("grpc")
+        client = served.client("http")
         futures: list[Future[ProgressResult]] = []
 
         def submit(client: RewardClient = client, futures: list[Future[ProgressResult]] = futures) -> None:

@@ -152,7 +152,7 @@ def served_from_before(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ser
         (folder / "tritonserver.log").open("wb") as log,
         TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
     ):
-        yield Served(repository, server.endpoints)
+        yield Served(server)
 
 
 @pytest.mark.parametrize("model", [FRAMES_MODEL, VLM])
