@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_TOKEN_BUDGET = 16_384
 DEFAULT_SAMPLE_TOKENS = 131_072
+DEFAULT_FEATURE_CACHE_MB = 64  # some 20,000 embeddings of 768 numbers
 DEFAULT_QUEUE_SIZE = 1024  # as many as a gateway lets wait
 MAX_OF_A_MACHINE = 4096  # GPUs, instances, threads
 MAX_INT32 = 2**31 - 1
@@ -67,6 +68,12 @@ class ExportConfig(Settings):
     )
     queue_timeout_ms: int | None = setting(
         None, "Longest that a request waits before it is rejected, if it asks for no less; else any time.", **_COUNT
+    )
+    feature_cache_mb: int = setting(
+        DEFAULT_FEATURE_CACHE_MB,
+        "MiB of embeddings that each instance of ReWiND's encoders keeps, for frames that come again. 0: none.",
+        least=0,
+        most=MAX_INT32,
     )
     batch_size: int | None = setting(
         None, "Of no effect, as in the FastAPI server; max_batch_size bounds a batch.", least=1, has_option=False

@@ -18,7 +18,7 @@ def embedded(samples: Sequence[Sample], encoders: FrameEncoders, execution: Exec
     """
     outcomes: list[Sample | RewardError] = list(samples)
     raw = {i: Footage(s.trajectories) for i, s in enumerate(samples) if s.trajectories[0].frames is not None}
-    encoded = encoders.encode(list(raw.values()), execution) if raw else []
+    encoded = encoders.encode(list(raw.values()), execution, None) if raw else []
     for index, outcome in zip(raw, encoded, strict=True):
         if isinstance(outcome, Footage):
             outcomes[index] = with_trajectories(samples[index], outcome.trajectories)

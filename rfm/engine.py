@@ -232,6 +232,7 @@ class Engine:
             of_part = batch if part is rows and batch is not None else self.predictor.collate(part)
             scores = self.predictor.score(part, of_part)
             execution.add_tokens(*self.predictor.occupancy(of_part))
+            execution.num_encoded += self.predictor.num_encoded(of_part)
             return scores
 
         return execution.run(forward, rows)

@@ -50,6 +50,8 @@ class Execution:
     collate_s: seconds in which no forward pass ran: rows were made, and batches of them
     forward_s: seconds in forward passes, with what it takes to read their results
     num_tokens, num_slots: tokens of the rows that were scored, and of the forward passes, padding included
+    num_encoded, num_found: frames that went through an encoder or a vision tower; frames whose features were at hand
+    cache_bytes: of the features that are kept now; None: none are
     out_of_memory_count: forward passes that did not fit in memory; their halves were tried again
     on_forward: called after each forward pass, one that did not fit included
     """
@@ -58,6 +60,9 @@ class Execution:
     forward_s: float = 0.0
     num_tokens: int = 0
     num_slots: int = 0
+    num_encoded: int = 0
+    num_found: int = 0
+    cache_bytes: int | None = None
     out_of_memory_count: int = 0
     on_forward: Callable[[], None] = field(default=_nothing, compare=False, repr=False)
 

@@ -14,8 +14,10 @@ import torch
 from torch import Tensor
 
 from rfm.execution import Execution
+from rfm.feature_cache import FeatureCache
 from rfm.predictor import Predictor
 from rfm_client.contract import FrameSize, RewardError
+from rfm_client.contract.named_frames import NamedFootage
 from rfm_client.contract.samples import Footage
 
 NETWORK = "network"  # in Checkpoint.parts: the weights of the network that scores
@@ -96,10 +98,13 @@ class FrameEncoders(Protocol):
     def to(self, device: torch.device) -> FrameEncoders:
         """Moves the encoders to ``device``, and returns them."""
 
-    def encode(self, samples: Sequence[Footage], execution: Execution) -> list[Footage | RewardError]:
+    def encode(
+        self, samples: Sequence[Footage | NamedFootage], execution: Execution, cache: FeatureCache | None
+    ) -> list[Footage | RewardError]:
         """Each sample with embeddings of its trajectories' frames and of its task, or why it has none.
 
         execution: what it took is added to it
+        cache: where it keeps embeddings, and finds those that it has kept; None: nowhere, and no frames are named
         """
 
 

@@ -43,6 +43,9 @@ class Predictor(Protocol[Row, Batch]):
     def occupancy(self, batch: Batch) -> tuple[int, int]:
         """Tokens of the batch's rows, and of its forward pass, padding included."""
 
+    def num_encoded(self, batch: Batch) -> int:
+        """Frames that the batch's forward pass encodes; 0: it reads embeddings."""
+
     def score(self, rows: Sequence[Row], batch: Batch) -> list[RowScores | RewardError]:
         """One forward pass, read back to the CPU; an error for a row that has no scores."""
 

@@ -15,6 +15,8 @@ from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.names import DEFAULT_MODEL, frames_name
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
+from rfm_client.episodes.async_episodes import AsyncEpisode, AsyncEpisodes
+from rfm_client.episodes.options import EpisodeOptions, EpisodeSettings
 from rfm_client.scorer import Scorer
 from rfm_client.transport.access import Access, AccessOptions
 from rfm_client.transport.calls import Transport, connect
@@ -23,6 +25,7 @@ from rfm_client.transport.host_names import of_urls
 from rfm_client.transport.in_flight import InFlight
 from rfm_client.transport.server import PROBE_TIMEOUT_S
 from rfm_client.transport.servers import Servers
+from rfm_client.windows import Window, WindowScorer
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -82,6 +85,7 @@ class AsyncRewardClient:
         self._servers = Servers(transports or fixed, retry=options.get("retry", True), names=names)
         in_flight = InFlight(options.get("max_in_flight", DEFAULT_IN_FLIGHT))
         self._scorer = Scorer(self._model, self._servers, in_flight, join=options.get("join", False))
+        self._windows = WindowScorer(self._model, self._scorer)
         self._is_closed = False
 
     async def progress(
@@ -132,6 +136,40 @@ class AsyncRewardClient:
             if isinstance(outcome, RewardError):
                 raise outcome
         return cast("list[Result]", outcomes)
+
+    def episode(self, task: str, *, timeout_s: float | None = None, **options: Unpack[EpisodeSettings]) -> AsyncEpisode:
+        """An episode that is scored step by step: each step sends its new frame alone, if the server keeps features.
+
+        options: as of EpisodeOptions; ValueError for contradictory ones
+        timeout_s: the longest that a step may take; None: the client's
+        """
+        return AsyncEpisode(self, task, EpisodeOptions(**options), timeout_s)
+
+    def episodes(
+        self, num: int, task: str | Sequence[str], *, timeout_s: float | None = None, **options: Unpack[EpisodeSettings]
+    ) -> AsyncEpisodes:
+        """Episodes side by side, as those of vectorised environments: one request a step for all.
+
+        task: of all, or of each
+        others: as of ``episode``
+        """
+        tasks = [task] * num if isinstance(task, str) else list(task)
+        if len(tasks) != num:
+            raise ValueError(f"task: expected one for each of {num} episodes, got {len(tasks)}")
+        return AsyncEpisodes(self, tasks, EpisodeOptions(**options), timeout_s)
+
+    async def score_windows(
+        self, windows: Sequence[Window], *, timeout_s: float | None = None
+    ) -> list[Result | RewardError]:
+        """The result or error of each window, a progress question about frames that the server may know."""
+        return await self._windows.outcomes(windows, Call.of({}, self._deadline(timeout_s)))
+
+    async def score_window(self, window: Window) -> ProgressResult:
+        """The result of a window. Raises RewardError."""
+        (outcome,) = await self.score_windows([window])
+        if isinstance(outcome, RewardError):
+            raise outcome
+        return cast(ProgressResult, outcome)
 
     async def encode(
         self, trajectory: Trajectory, *, timeout_s: float | None = None, request_id: str | None = None

@@ -16,8 +16,11 @@ from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.data.fitting import snapshot
+from rfm_client.episodes.episodes import Episode, Episodes
+from rfm_client.episodes.options import EpisodeSettings
 from rfm_client.transport.calls import Transport
 from rfm_client.transport.loop_thread import LoopThread
+from rfm_client.windows import Window
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -88,6 +91,34 @@ class RewardClient:
         """
         future = self._loop.start(self._client.score(snapshot(sample), **options))
         future.add_done_callback(lambda _done: self)  # until then the client lives, even without another reference
+        return future
+
+    def episode(self, task: str, *, timeout_s: float | None = None, **options: Unpack[EpisodeSettings]) -> Episode:
+        """An episode that is scored step by step: each step sends its new frame alone, if the server keeps features.
+
+        options: as of EpisodeOptions; ValueError for contradictory ones
+        timeout_s: the longest that a step may take; None: the client's
+        """
+        return Episode(self._client.episode(task, timeout_s=timeout_s, **options), self._loop)
+
+    def episodes(
+        self, num: int, task: str | Sequence[str], *, timeout_s: float | None = None, **options: Unpack[EpisodeSettings]
+    ) -> Episodes:
+        """Episodes side by side, as those of vectorised environments: one request a step for all.
+
+        task: of all, or of each
+        others: as of ``episode``
+        """
+        return Episodes(self._client.episodes(num, task, timeout_s=timeout_s, **options), self._loop)
+
+    def score_windows(self, windows: Sequence[Window], *, timeout_s: float | None = None) -> list[Result | RewardError]:
+        """The result or error of each window, a progress question about frames that the server may know."""
+        return self._loop.wait(self._client.score_windows(windows, timeout_s=timeout_s))
+
+    def submit_window(self, window: Window) -> Future[ProgressResult]:
+        """The result of a window to come, as of ``submit``."""
+        future = self._loop.start(self._client.score_window(window))
+        future.add_done_callback(lambda _done: self)
         return future
 
     def encode(

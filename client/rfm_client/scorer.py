@@ -76,7 +76,7 @@ class Scorer:
             raise InvalidSampleError.at("trajectory", "frames", "video_embeddings")
         tensors, model = partial(wire.encode_frames, trajectory), encoder_name(self._model)
         size, name = trajectory.frames.nbytes, next(new_request_ids(request_id))
-        answer = await self._infer(model, size, tensors, _EMBEDDINGS, deadline, name)
+        answer = await self.infer(model, size, tensors, _EMBEDDINGS, deadline, name)
         return wire.decode_embeddings(answer.tensors, trajectory)
 
     async def _fitted(self, sample: Sample, call: Call) -> FittedSample:
@@ -106,7 +106,7 @@ class Scorer:
         try:
             limit = (await self.model_infos.get(model, call.deadline)).max_batch_size
         except RewardError as error:
-            return zip(group, _for_each(error, len(group)), strict=True)
+            return zip(group, for_each(error, len(group)), strict=True)
         requests = [[samples[index] for index in part] for part in parts(samples, group, limit)]
         answered = await _together([self._request(model, request, call) for request in requests])
         return zip(group, itertools.chain(*answered), strict=True)
@@ -122,22 +122,22 @@ class Scorer:
         outputs, tensors = (*wire.outputs_for(samples), *call.outputs), partial(wire.encode_samples, samples)
         size, deadline = padded_bytes(samples), call.deadline
         try:
-            answer = await self._infer(model, size, tensors, outputs, deadline, request_id, retry_ended=not is_joint)
+            answer = await self.infer(model, size, tensors, outputs, deadline, request_id, retry_ended=not is_joint)
             return wire.decode_results(answer.tensors, samples, answer.model_version)
         except (InvalidSampleError, InferenceFailedError) as error:
             error.request_id = request_id
             if len(samples) == 1:
                 return [error]
             if isinstance(error, InvalidSampleError) and error.is_deadly and not is_joint:
-                return _for_each(error, len(samples))  # alone, the one that is would end two more processes
+                return for_each(error, len(samples))  # alone, the one that is would end two more processes
         except RewardError as error:
             if not (is_joint and isinstance(error, ProcessEndedError)):
-                return _for_each(error, len(samples))
+                return for_each(error, len(samples))
             self._joining.stay_apart()
         alone = await asyncio.gather(*(self._request(model, [sample], call) for sample in samples))
         return [outcome for (outcome,) in alone]
 
-    async def _infer(
+    async def infer(
         self,
         model: str,
         num_bytes: int,
@@ -148,6 +148,10 @@ class Scorer:
         *,
         retry_ended: bool = True,
     ) -> Answer:
+        """The model's outputs for the tensors, which are made when it is the request's turn. Raises RewardError.
+
+        num_bytes: of the tensors
+        """
         async with self._in_flight.room(num_bytes, deadline):  # tensors are made in turn, so they do not pile up
             inputs = await off_loop(num_bytes, tensors)
             answer = await self._servers.infer(
@@ -162,7 +166,7 @@ async def _together(calls: Sequence[Coroutine[Any, Any, Answered]]) -> Sequence[
     return [await calls[0]] if len(calls) == 1 else await asyncio.gather(*calls)
 
 
-def _for_each(error: RewardError, count: int) -> list[Outcome]:
+def for_each(error: RewardError, count: int) -> list[Outcome]:
     """One error of its own for each sample that shares the failure; they may be raised apart."""
     copies: list[Outcome] = []
     for _ in range(count):

@@ -54,7 +54,7 @@ class EngineScorer:
             encoders = self._engine.encoders
             assert encoders is not None  # or the facts would not say that it encodes
             footage = Footage((Trajectory(frames=frames, task=task),))
-            (outcome,) = encoders.encode([footage], Execution())
+            (outcome,) = encoders.encode([footage], Execution(), None)
         return cast(Footage, _result(outcome)).trajectories[0]
 
     def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:

@@ -19,6 +19,7 @@ from rfm.engine import Engine
 from rfm.family import Checkpoint, Description, Family, FrameEncoders, Options
 from rfm.parameters import FAMILY_PARAMETER
 from rfm.version_folder import CHECKPOINT_FOLDER
+from rfm_client.contract import wire
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_export.about import Origin, about, record_weights
 from rfm_export.errors import ExportError
@@ -177,7 +178,8 @@ def _read_config(repository: Path, name: str) -> Any:
 def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], settings: ExportConfig) -> None:
     """Raises ExportError for a model that would lose inputs or outputs, on which its clients rely.
 
-    A model may gain an optional input, which clients need not know.
+    A model may gain an optional input, which clients need not know, and lose that of frames' digests, without which
+    they send pixels.
     """
     names = {model.name for model in models}
     for name in (settings.name, encoder_name(settings.name), frames_name(settings.name)):
@@ -191,9 +193,10 @@ def _check_replaceable(repository: Path, models: Sequence[GeneratedModel], setti
         if not (repository / model.name).exists():
             continue
         there = _read_config(repository, model.name)
-        known = {tensor.name for tensor in there.input}
+        known, kept = ({tensor.name for tensor in config.input} for config in (there, model.config))
         inputs = [tensor for tensor in model.config.input if tensor.name in known or not tensor.optional]
-        for kind, before, after in (("input", there.input, inputs), ("output", there.output, model.config.output)):
+        asked = [tensor for tensor in there.input if tensor.name in kept or tensor.name != wire.FRAME_DIGESTS]
+        for kind, before, after in (("input", asked, inputs), ("output", there.output, model.config.output)):
             if list(before) != list(after):
                 raise ExportError(
                     f"{repository / model.name}: expected a checkpoint with the same {kind}s as its other versions, "

@@ -9,14 +9,14 @@ Of a checkpoint that scores embeddings ``<name>`` does so; with encoders there a
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 
 from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.config import ExportConfig
 from rfm.family import Description, EncodersDescription
-from rfm.parameters import FAMILY_PARAMETER
+from rfm.parameters import FAMILY_PARAMETER, FEATURE_CACHE_PARAMETER
 from rfm_client.contract import FrameSize, PreferenceSample, ProgressSample, Sample, SimilaritySample, wire
 from rfm_client.contract.made_up import blank_trajectory
 from rfm_client.contract.model_info import FRAME_SIZE_PARAMETER, FRAMES_PER_VALUE_PARAMETER, MAX_FRAMES_PARAMETER
@@ -97,14 +97,23 @@ def generated_models(
     if encoders is None or widths is None:
         return models
     about = about_encoders(encoders, version.about)
-    encoder = Interface(encoder_name(name), wire.encoder_inputs(), wire.encoder_outputs(*widths), about)
+    cache_mb = version.settings.feature_cache_mb
+    inputs = wire.encoder_inputs(by_digest=cache_mb > 0)
+    encoder = Interface(encoder_name(name), inputs, wire.encoder_outputs(*widths), about)
     about = {**_limits(description, encoders.frame_size), **version.about}
-    frames = Interface(frames_name(name), wire.frame_inputs(), outputs, about)
-    models.append(_python_model(encoder, "rfm_encoder", version, [_encoder_warmup()]))
+    frames = Interface(frames_name(name), wire.frame_inputs(by_digest=cache_mb > 0), outputs, about)
+    models.append(_python_model(encoder, "rfm_encoder", _with_one_cache(version), [_encoder_warmup()]))
+    models[-1].config.parameters[FEATURE_CACHE_PARAMETER].string_value = str(cache_mb)
     models.append(
         GeneratedModel(ensemble_config(frames, version.settings, version.number, encoder, scorer), version.number)
     )
     return models
+
+
+def _with_one_cache(version: Version) -> Version:
+    """As the encoder is served: with a cache by one instance on each device, or each would have to see all frames."""
+    settings = version.settings
+    return replace(version, settings=replace(settings, instances=1)) if settings.feature_cache_mb else version
 
 
 def _limits(description: Description, frame_size: FrameSize | None) -> dict[str, str]:

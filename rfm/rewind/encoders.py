@@ -8,6 +8,7 @@ C = 3 channels, H x W pixels, T frames, L tokens, Dv and Dt widths of the embedd
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
@@ -22,12 +23,14 @@ from rfm.checkpoint.content import read_json
 from rfm.checkpoint.preprocessor import PREPROCESSOR_CONFIG
 from rfm.execution import Execution
 from rfm.family import EncodersDescription
+from rfm.feature_cache import FeatureCache
 from rfm.layers.linear import speed_up
 from rfm.layers.tensors import as_tensor
 from rfm.rewind.preprocessing import ImagePreprocessor
 from rfm.rewind.pretrained import load_model, load_preprocessor, load_tokenizer
 from rfm.version_folder import IMAGE_ENCODER_FOLDER, TEXT_ENCODER_FOLDER
-from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError, Trajectory
+from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError, Trajectory, wire
+from rfm_client.contract.named_frames import NamedFootage, NamedTrajectory
 from rfm_client.contract.samples import Float32Array, Footage, UInt8Array
 
 IMAGES_PER_FORWARD = 64
@@ -114,32 +117,74 @@ class Encoders:
         """Dt, the width of a task's embedding."""
         return int(self.text_model.config.hidden_size)
 
-    def encode(self, samples: Sequence[Footage], execution: Execution | None = None) -> list[Footage | RewardError]:
+    def encode(
+        self,
+        samples: Sequence[Footage | NamedFootage],
+        execution: Execution | None = None,
+        cache: FeatureCache | None = None,
+    ) -> list[Footage | RewardError]:
         """Each sample with embeddings of its trajectories' frames and of its task, or why it has none.
 
         execution: what it took is added to it; its tokens are those of images, which have no padding, and of tasks
+        cache: of embeddings that were made before; equal frames, and equal tasks, are encoded once. Without it only
+            pixels can be encoded
         """
         execution = execution or Execution()
         with execution.forwarding():
-            return self._encoded(samples, execution)
+            return self._encoded(samples, execution, cache)
 
-    def _encoded(self, samples: Sequence[Footage], execution: Execution) -> list[Footage | RewardError]:
+    def _encoded(
+        self, samples: Sequence[Footage | NamedFootage], execution: Execution, cache: FeatureCache | None
+    ) -> list[Footage | RewardError]:
         outcomes: dict[int, Footage | RewardError] = {}
         for index, footage in enumerate(samples):
             try:
                 self._check_task(footage.trajectories[0].task)
                 for trajectory in footage.trajectories:
-                    _check_shape(trajectory)
+                    _check_shapes(trajectory)
             except InvalidSampleError as error:
                 outcomes[index] = error
         good = [index for index in range(len(samples)) if index not in outcomes]
         if good:
             trajectories = [trajectory for index in good for trajectory in samples[index].trajectories]
-            videos = iter(self.encode_frames([trajectory.positions for trajectory in trajectories], execution))
-            texts = self.encode_tasks([samples[index].trajectories[0].task for index in good], execution)
+            tasks = [samples[index].trajectories[0].task for index in good]
+            videos, texts = self._all_of(trajectories, tasks, execution, cache)
+            remaining = iter(videos)
             for index, text in zip(good, texts, strict=True):
-                outcomes[index] = _embedded([next(videos) for _ in samples[index].trajectories], text)
+                outcomes[index] = _embedded([next(remaining) for _ in samples[index].trajectories], text)
         return [outcomes[index] for index in range(len(samples))]
+
+    def _all_of(
+        self,
+        trajectories: Sequence[Trajectory | NamedTrajectory],
+        tasks: Sequence[str],
+        execution: Execution,
+        cache: FeatureCache | None,
+    ) -> tuple[Sequence[Float32Array | RewardError], Sequence[Float32Array | RewardError]]:
+        """The embeddings of each trajectory's frames [T, Dv], and of each task [Dt]."""
+        if cache is None:
+            whole = [each.positions for each in trajectories if isinstance(each, Trajectory)]
+            assert len(whole) == len(trajectories)  # a model without a cache takes no digests
+            execution.num_encoded += sum(map(len, whole))
+            return self.encode_frames(whole, execution), self.encode_tasks(tasks, execution)
+        with execution.collating():
+            named = [_named(trajectory) for trajectory in trajectories]
+            pixels = dict(pair for each in named for pair in each.pixels.items())
+        wanted = list(dict.fromkeys(digest for each in named for digest in each.digests))
+        images, num_made = cache.of(wanted, pixels, lambda frames: self._each_frame(frames, execution))
+        execution.num_encoded += num_made
+        execution.num_found += len(images) - num_made
+        sources = {task_digest(task): task for task in tasks}
+        texts, _ = cache.of(sources, sources, lambda missing: self.encode_tasks(missing, execution))
+        execution.cache_bytes = cache.num_bytes
+        return [_of_named(each, images) for each in named], [texts[task_digest(task)] for task in tasks]
+
+    def _each_frame(
+        self, frames: Sequence[UInt8Array], execution: Execution
+    ) -> Sequence[Float32Array | InferenceFailedError]:
+        """float32 [Dv] of each frame [H, W, 3], or why there is none."""
+        videos = self.encode_frames([frame[np.newaxis] for frame in frames], execution)
+        return [video if isinstance(video, InferenceFailedError) else video[0] for video in videos]
 
     @torch.inference_mode()
     def encode_frames(
@@ -205,6 +250,33 @@ class Encoders:
         return self.tokenizer(text, split_special_tokens=True, verbose=False, **options)
 
 
+def task_digest(task: str) -> bytes:
+    """The key of a task's embedding; longer than a frame's, which a caller may claim."""
+    return b"task" + hashlib.sha256(task.encode()).digest()
+
+
+def _named(trajectory: Trajectory | NamedTrajectory) -> NamedTrajectory:
+    if isinstance(trajectory, NamedTrajectory):
+        return trajectory
+    return NamedTrajectory.of(trajectory.positions, trajectory.task)
+
+
+def _of_named(
+    trajectory: NamedTrajectory, images: Mapping[bytes, Float32Array | RewardError]
+) -> Float32Array | RewardError:
+    """float32 [T, Dv], or why there is none."""
+    frames = []
+    for digest in trajectory.digests:
+        if digest not in images:
+            unknown = sum(each not in images for each in trajectory.digests)
+            return InvalidSampleError.at(wire.FRAME_DIGESTS, wire.UNKNOWN_FRAMES, f"{unknown} others")
+        image = images[digest]
+        if isinstance(image, RewardError):
+            return image
+        frames.append(image)
+    return np.stack(frames)
+
+
 def _of_video(images: Sequence[Tensor | InferenceFailedError]) -> Float32Array | InferenceFailedError:
     """float32 [T, Dv] from each frame's."""
     for image in images:
@@ -213,12 +285,10 @@ def _of_video(images: Sequence[Tensor | InferenceFailedError]) -> Float32Array |
     return torch.stack(images).float().cpu().numpy()  # type: ignore[arg-type]  # all are tensors
 
 
-def _embedded(
-    videos: Sequence[Float32Array | InferenceFailedError], text: Float32Array | InferenceFailedError
-) -> Footage | RewardError:
+def _embedded(videos: Sequence[Float32Array | RewardError], text: Float32Array | RewardError) -> Footage | RewardError:
     embeddings = []
     for outcome in (*videos, text):
-        if isinstance(outcome, InferenceFailedError):
+        if isinstance(outcome, RewardError):
             return outcome
         if not np.isfinite(outcome).all():
             return InferenceFailedError("an encoder gave an embedding that is not finite")
@@ -227,9 +297,18 @@ def _embedded(
     return Footage(tuple(Trajectory(video_embeddings=video, text_embedding=of_text) for video in of_videos))
 
 
-def _check_shape(trajectory: Trajectory) -> None:
+def _check_shapes(trajectory: Trajectory | NamedTrajectory) -> None:
     """The shorter side is brought to size; a sliver of an image would become a huge one."""
-    height, width = trajectory.positions.shape[1:3]
+    if isinstance(trajectory, NamedTrajectory):
+        own = [trajectory.pixels[digest] for digest in trajectory.digests if digest in trajectory.pixels]
+        sizes = {frame.shape[:2] for frame in own}
+    else:
+        sizes = {trajectory.positions.shape[1:3]}
+    for height, width in sizes:
+        _check_shape(height, width)
+
+
+def _check_shape(height: int, width: int) -> None:
     if max(height, width) > MAX_ENCODER_ASPECT_RATIO * min(height, width):
         expected = f"frames at most {MAX_ENCODER_ASPECT_RATIO} times as long as wide"
         raise InvalidSampleError.at("frames", expected, f"{height} x {width}")

@@ -46,6 +46,10 @@ class RewindPredictor:
         """Number of tokens of the rows, and of slots that the network computes, the last few of which hold no token."""
         return batch.packing.num_tokens, len(batch.packing.at)
 
+    def num_encoded(self, batch: RewindBatch) -> int:
+        """None: the network reads embeddings."""
+        return 0
+
     @torch.inference_mode()
     def score(self, rows: Sequence[Row], batch: RewindBatch) -> list[RowScores | RewardError]:
         """The scores of each row of the batch, or why it has none, from one forward pass."""

@@ -31,6 +31,7 @@ from rfm.triton_model.self_check import SelfCheck
 from rfm.triton_model.weights import check_digest
 from rfm_client.contract import InvalidSampleError, RewardError, wire
 from rfm_client.contract.model_info import DIGEST_PARAMETER, NETWORK_PARAMETER, REVISION_PARAMETER, SOURCE_PARAMETER
+from rfm_client.contract.named_frames import NamedFootage
 from rfm_client.contract.samples import Footage
 from rfm_client.contract.triton import QUEUE_FULL
 from rfm_client.contract.wire import Tensors
@@ -334,7 +335,8 @@ def _bounds(config: Mapping[str, Any], settings: Mapping[str, str]) -> Bounds:
 def _sample_types(input_names: Sequence[str]) -> list[str]:
     """The types of samples that a model with these inputs scores."""
     of_samples = wire.SAMPLE_TYPE in input_names
-    return [name for kind, name in SAMPLE_TYPES.items() if issubclass(kind, Footage) != of_samples]
+    kinds = {name: not issubclass(kind, (Footage, NamedFootage)) for kind, name in SAMPLE_TYPES.items()}
+    return [name for name, is_sample in kinds.items() if is_sample == of_samples]
 
 
 def _checkpoint(settings: Mapping[str, str]) -> dict[str, str]:

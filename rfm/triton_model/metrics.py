@@ -28,6 +28,8 @@ BATCH_SAMPLES, BATCH_PADDING = "batch_samples", "batch_padding_ratio"
 WAIT_SECONDS, COLLATE_SECONDS, FORWARD_SECONDS = "wait_seconds", "collate_seconds", "forward_seconds"
 
 BATCH_REQUESTS, WAITING_REQUESTS = "batch_requests", "waiting_requests"
+ENCODED, FOUND, MISSED = "frames_encoded_total", "feature_cache_hits_total", "feature_cache_misses_total"
+CACHE_BYTES = "feature_cache_bytes"
 
 SAMPLES_BUCKETS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
 PADDING_BUCKETS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
@@ -36,10 +38,14 @@ BUCKETS_S = tuple(digit * 10.0**power for power in range(-4, 2) for digit in (1,
 _TOTALS = {
     FRAMES: "Frames scored.",
     RETRIES: "Forward passes that ran out of memory and were tried again in halves.",
+    ENCODED: "Frames that went through an encoder or a vision tower.",
+    FOUND: "Frames of a batch, each once, whose features were kept.",
+    MISSED: "Frames of a batch, each once, whose features were not kept, and had to be made.",
 }
 _GAUGES = {
     BATCH_REQUESTS: "Requests of the batch that is worked on now; 0: idle.",
     WAITING_REQUESTS: "Requests that wait in the model for their turn.",
+    CACHE_BYTES: "Bytes of the features that are kept.",
 }
 _HISTOGRAMS = {
     BATCH_SAMPLES: ("Samples of one execution.", SAMPLES_BUCKETS),
@@ -83,7 +89,10 @@ class Counted:
 
     def totals(self) -> dict[str, int]:
         """What each counter grows by, by its name."""
-        return {FRAMES: self.num_frames, RETRIES: self.execution.out_of_memory_count}
+        done = self.execution
+        missed = 0 if done.cache_bytes is None else done.num_encoded
+        frames = {FRAMES: self.num_frames, ENCODED: done.num_encoded, FOUND: done.num_found, MISSED: missed}
+        return {**frames, RETRIES: done.out_of_memory_count}
 
     def observed(self) -> dict[str, float]:
         """What each histogram observes, by its name; nothing if no forward pass was spent on a caller."""
@@ -109,7 +118,7 @@ class Metrics:
 
     def __init__(self, labels: Mapping[str, str], checkpoint: Mapping[str, str], sample_types: Collection[str]) -> None:
         self.num_waiting = 0
-        self._at_work = 0
+        self._at_work = self._cache_bytes = 0
         self._queue: SimpleQueue[Counted | None] = SimpleQueue()  # None only wakes the thread
         self._closing = threading.Event()
         self._has_failed = False
@@ -162,7 +171,10 @@ class Metrics:
         try:
             batches = [batch for batch in (first, *_drained(self._queue)) if batch is not None]
             self._series.add(batches)
-            self._series.show(at_work=self._at_work, waiting=self.num_waiting, is_served=is_served)
+            for batch in batches:
+                self._cache_bytes = batch.execution.cache_bytes or self._cache_bytes
+            waiting, cached = self.num_waiting, self._cache_bytes
+            self._series.show(at_work=self._at_work, waiting=waiting, cached=cached, is_served=is_served)
         except Exception:  # noqa: BLE001  requests are answered all the same
             self._log_once()
 
@@ -201,7 +213,7 @@ class _Series:
         info = self._family("checkpoint_info", GAUGE, "1: the checkpoint is served.")
         model = {name: labels[name] for name in ("model", "version")}
         self._checkpoint = info.Metric(labels={**model, **checkpoint})
-        self.show(at_work=0, waiting=0, is_served=True)
+        self.show(at_work=0, waiting=0, cached=0, is_served=True)
 
     def _family(self, name: str, kind: str, description: str) -> Any:
         import triton_python_backend_utils as pb_utils
@@ -224,9 +236,9 @@ class _Series:
         for name, total in totals.items():
             self._totals[name].increment(total)
 
-    def show(self, *, at_work: int, waiting: int, is_served: bool) -> None:
+    def show(self, *, at_work: int, waiting: int, cached: int, is_served: bool) -> None:
         """Sets the gauges whose values have changed."""
-        for name, value in {BATCH_REQUESTS: at_work, WAITING_REQUESTS: waiting}.items():
+        for name, value in {BATCH_REQUESTS: at_work, WAITING_REQUESTS: waiting, CACHE_BYTES: cached}.items():
             if value != self._shown[name]:
                 self._gauges[name].set(value)
                 self._shown[name] = value

@@ -22,6 +22,7 @@ from rfm_client.contract import (
     SimilaritySample,
     wire,
 )
+from rfm_client.contract.named_frames import NamedFootage
 from rfm_client.contract.names import PROBE_PREFIX
 from rfm_client.contract.samples import Footage
 
@@ -36,6 +37,7 @@ SAMPLE_TYPES = {
     PreferenceSample: "preference",
     SimilaritySample: "similarity",
     Footage: "encode",
+    NamedFootage: "encode",
 }
 US_PER_S = 1e6
 UNKNOWN_TYPE = "unknown"  # of the samples of a request that could not be decoded

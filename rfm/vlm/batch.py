@@ -24,6 +24,10 @@ class Pixels(Protocol):
     def films(self) -> list[Tensor]:
         """uint8 [T, H', W', 3] each, on the host or already on the device."""
 
+    @property
+    def num_shown(self) -> int:
+        """Frames that the backbone reads."""
+
     def changed(self, change: Callable[[Tensor], Tensor]) -> Pixels:
         """The same with ``change`` made to the tensors that say where pixels go."""
 
@@ -42,6 +46,11 @@ class FramesOfOneSize:
     films: Sequence[Tensor]
     shots: Tensor | None
 
+    @property
+    def num_shown(self) -> int:
+        """Frames in the shots; of a group that is filled up with a frame, that frame twice."""
+        return sum(map(len, self.films)) if self.shots is None else self.shots.numel()
+
     def frames(self, device: torch.device) -> Tensor:
         """uint8 [T of all films, H', W', 3] on ``device``."""
         return torch.cat([film.to(device, non_blocking=True) for film in self.films])
@@ -58,6 +67,11 @@ class QwenPixels:
     def films(self) -> list[Tensor]:
         """uint8 [T, H', W', 3] each."""
         return [film for size in self.sizes for film in size.films]
+
+    @property
+    def num_shown(self) -> int:
+        """Frames of all shots."""
+        return sum(size.num_shown for size in self.sizes)
 
     def changed(self, change: Callable[[Tensor], Tensor]) -> QwenPixels:
         """The same with ``change`` made to the shots."""
@@ -91,6 +105,11 @@ class SmolPixels:
     def films(self) -> list[Tensor]:
         """uint8 [T, side, side, 3] each."""
         return list(self.squares.films)
+
+    @property
+    def num_shown(self) -> int:
+        """Frames of all squares."""
+        return self.squares.num_shown
 
     def changed(self, change: Callable[[Tensor], Tensor]) -> SmolPixels:
         """The same with ``change`` made to where each square stands."""

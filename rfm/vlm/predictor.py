@@ -64,6 +64,10 @@ class VlmPredictor:
         """Number of tokens of the conversations, and of slots with the padding to the longest."""
         return batch.num_tokens, batch.inputs["input_ids"].numel()
 
+    def num_encoded(self, batch: VlmBatch) -> int:
+        """Frames that go through the vision tower: each once, in whichever conversations it stands."""
+        return 0 if batch.pixels is None else batch.pixels.num_shown
+
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch) -> list[RowScores | RewardError]:
         """The scores of each row of the batch, or why it has none, from one forward pass."""

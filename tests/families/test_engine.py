@@ -43,6 +43,9 @@ class Pipelined:
     def occupancy(self, batch: Any) -> tuple[int, int]:
         return 1, 1
 
+    def num_encoded(self, batch: Any) -> int:
+        return 0
+
     def score(self, rows: Sequence[int], batch: Any) -> list[RowScores | RewardError]:
         if rows[0] + 1 < len(self.collated):
             assert self.collated[rows[0] + 1].wait(WAIT_S)

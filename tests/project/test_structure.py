@@ -17,6 +17,7 @@ from paths import ROOT
 SHARED = {  # what a family may import beside itself
     "rfm.checkpoint",
     "rfm.execution",
+    "rfm.feature_cache",
     "rfm.family",
     "rfm.layers",
     "rfm.predictor",

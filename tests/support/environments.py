@@ -22,6 +22,7 @@ from rfm_client.contract import wire
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.transport.access import Access
 from rfm_client.transport.calls import Answer, GrpcTransport
+from rfm_client.windows import Window
 
 MODEL = "enc_c1_t1_disc10"
 
@@ -144,10 +145,10 @@ class LateClient(RewardClient):
     def hold(self, *steps: int) -> None:
         self.connection.held |= {step + 1: Future() for step in steps}
 
-    def submit(self, sample: Any, **options: Any) -> Future[Any]:
-        answer = super().submit(sample, **options)
+    def submit_window(self, window: Window) -> Future[ProgressResult]:
+        answer = super().submit_window(window)
         self.submitted.append(answer)
-        self.answers[sample.trajectory.num_frames - 1] = answer
+        self.answers[len(window.frames) - 1] = answer
         return answer
 
     def let_come(self, *steps: int) -> None:

@@ -20,8 +20,10 @@ from rfm.checkpoint.files import NETWORK_CONFIG, WEIGHTS
 from rfm.dense_mode import prefix_indices
 from rfm.execution import Execution
 from rfm.family import NETWORK, Description, EncodersDescription, Family, Options
+from rfm.feature_cache import FeatureCache
 from rfm.predictor import RowScores, frame_scores
 from rfm_client.contract import InvalidSampleError, ProgressSample, RewardError, Sample, SimilaritySample, Trajectory
+from rfm_client.contract.named_frames import NamedFootage, NamedTrajectory
 from rfm_client.contract.samples import Footage
 
 MODEL_TYPE = "redness"
@@ -69,14 +71,22 @@ class Palette:
     def to(self, device: torch.device) -> Palette:
         return Palette(self.scale.to(device))
 
-    def encode(self, samples: Sequence[Footage], execution: Execution) -> list[Footage | RewardError]:
+    def encode(
+        self, samples: Sequence[Footage | NamedFootage], execution: Execution, cache: FeatureCache | None = None
+    ) -> list[Footage | RewardError]:
         return [self._encoded(sample) for sample in samples]
 
-    def _encoded(self, sample: Footage) -> Footage:
+    def _encoded(self, sample: Footage | NamedFootage) -> Footage:
         letters = np.full(1, len(sample.trajectories[0].task), np.float32)
-        colours = [each.positions.mean(axis=(1, 2)).astype(np.float32) for each in sample.trajectories]
+        colours = [_frames(each).mean(axis=(1, 2)).astype(np.float32) for each in sample.trajectories]
         videos = [self.scale.cpu().numpy() * colour for colour in colours]
         return Footage(tuple(Trajectory(video_embeddings=video, text_embedding=letters) for video in videos))
+
+
+def _frames(trajectory: Trajectory | NamedTrajectory) -> np.ndarray:
+    if isinstance(trajectory, NamedTrajectory):
+        return np.stack([trajectory.pixels[digest] for digest in trajectory.digests])
+    return trajectory.positions
 
 
 @dataclass(frozen=True)
@@ -105,6 +115,9 @@ class ToyPredictor:
 
     def occupancy(self, batch: Tensor) -> tuple[int, int]:
         return len(batch), len(batch)
+
+    def num_encoded(self, batch: Tensor) -> int:
+        return 0
 
     @torch.inference_mode()
     def score(self, rows: Sequence[list[np.ndarray]], batch: Tensor) -> list[RowScores | RewardError]:

@@ -27,6 +27,7 @@ class ModelInfo:
 
     versions: those that its configuration asks the server to serve; empty: the latest
     max_batch_size: most samples of one request
+    by_digest: whether it keeps what it made of frames, and takes their digests in place of pixels
     instances: of the model that one server runs; 0: of an ensemble, whose parts have them
     max_frames: frames of a trajectory that the checkpoint was trained on, at most; None: it does not say
     frame_size: to what the checkpoint brings each frame; None: that depends on the frame
@@ -49,6 +50,7 @@ class ModelInfo:
     text_dim: int | None
     progress_bins: int | None
     frames_per_value: int = 1
+    by_digest: bool = False
     instances: int = 1
     source: str | None = None
     revision: str | None = None
@@ -82,6 +84,7 @@ class ModelInfo:
             text_dim=last_dims.get(wire.TEXT_EMBEDDING),
             progress_bins=last_dims.get(wire.PROGRESS_LOGITS),
             frames_per_value=int(parameters.get(FRAMES_PER_VALUE_PARAMETER) or 1),
+            by_digest=wire.FRAME_DIGESTS in last_dims,
             instances=sum(map(_num_instances, config.get("instance_group", []))),
             source=parameters.get(SOURCE_PARAMETER) or None,
             revision=parameters.get(REVISION_PARAMETER) or None,

@@ -9,6 +9,11 @@ requests of different callers, lengths and sample types into one batch. The one 
 trajectories differ in frame size: ``frames`` then holds the first trajectories alone, and it the second ones. It is
 optional, so that requests without it stay what they were before it existed. Triton batches requests that have it among
 themselves. P is then the positions of both arrays.
+
+A model that keeps what its encoders made of frames takes ``frame_digests``, too: the name of each of the P frames
+(``named_frames``). ``frames`` then holds, in any order and in any sample's row, the pixels of those that the model may
+not know; zeros may lie between them. A request with a digest that the model does not know is refused, and its caller
+asks again with all pixels.
 """
 
 from __future__ import annotations
@@ -23,6 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError
+from rfm_client.contract.named_frames import DIGEST_BYTES, NamedFootage, NamedTrajectory, frame_digest
 from rfm_client.contract.results import (
     BatchTiming,
     FrameScores,
@@ -39,6 +45,7 @@ from rfm_client.contract.samples import (
     Sample,
     SimilaritySample,
     Trajectory,
+    UInt8Array,
     stackable,
 )
 
@@ -51,6 +58,7 @@ VIDEO_EMBEDDINGS = "video_embeddings"
 TEXT_EMBEDDING = "text_embedding"
 FRAMES = "frames"
 SECOND_FRAMES = "second_frames"
+FRAME_DIGESTS = "frame_digests"
 TASK = "task"
 
 PROGRESS = "progress"
@@ -61,6 +69,8 @@ PROGRESS_LOGITS = "progress_logits"
 TIMING_MS = "timing_ms"
 
 REQUEST_ID = re.compile(r"[\w.:/+=@-]{1,64}", re.ASCII)  # what a request's id may be
+
+UNKNOWN_FRAMES = "digests of frames that this model knows or has been sent"  # what is told of others
 
 VARIABLE = -1  # a dimension that differs from request to request
 
@@ -109,6 +119,7 @@ _FRAMES_SPECS = (
     TensorSpec(SECOND_FRAMES, "UINT8", (VARIABLE, VARIABLE, VARIABLE, 3), ragged=True, optional=True),
     TensorSpec(TASK, "BYTES", (1,)),
 )
+_DIGESTS_SPEC = TensorSpec(FRAME_DIGESTS, "UINT8", (VARIABLE, DIGEST_BYTES), ragged=True, optional=True)
 
 
 def embedding_inputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
@@ -117,14 +128,14 @@ def embedding_inputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
     return (*_QUESTION_SPECS, video, TensorSpec(TEXT_EMBEDDING, "FP32", (text_dim,)))
 
 
-def frame_inputs() -> tuple[TensorSpec, ...]:
-    """Inputs of a model that scores raw frames."""
-    return (*_QUESTION_SPECS, *_FRAMES_SPECS)
+def frame_inputs(*, by_digest: bool = False) -> tuple[TensorSpec, ...]:
+    """Inputs of a model that scores raw frames. ``by_digest``: of one that takes the digests of those it knows."""
+    return (*_QUESTION_SPECS, *_FRAMES_SPECS, *([_DIGESTS_SPEC] if by_digest else []))
 
 
-def encoder_inputs() -> tuple[TensorSpec, ...]:
-    """Inputs of the encoder; num_frames keeps it from encoding padding."""
-    return (_NUM_FRAMES_SPEC, *_FRAMES_SPECS)
+def encoder_inputs(*, by_digest: bool = False) -> tuple[TensorSpec, ...]:
+    """Inputs of the encoder; num_frames keeps it from encoding padding. ``by_digest``: as of ``frame_inputs``."""
+    return (_NUM_FRAMES_SPEC, *_FRAMES_SPECS, *([_DIGESTS_SPEC] if by_digest else []))
 
 
 def encoder_outputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
@@ -198,17 +209,47 @@ def decode_embeddings(tensors: Mapping[str, npt.NDArray[Any]], trajectory: Traje
         raise InferenceFailedError(f"embeddings: {error}") from error
 
 
-def decode_trajectories(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Footage]:
+def decode_trajectories(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Footage | NamedFootage]:
     """What the encoder is to encode: of each sample the frames of its trajectories, without padding, and its task."""
+    pixels: dict[bytes, UInt8Array] = {}
+    if FRAME_DIGESTS in tensors:
+        if SECOND_FRAMES in tensors:
+            raise InvalidSampleError.at(FRAME_DIGESTS, f"none with {SECOND_FRAMES}", "both")
+        pixels = {frame_digest(frame): frame for row in tensors[FRAMES] for frame in row}
 
-    def decode(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> Footage:
+    def decode(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> Footage | NamedFootage:
         lengths = tensors[NUM_FRAMES][row].tolist()
         if lengths[0] < 1 or lengths[1] < 0:
             raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, at least 0]", str(lengths))
-        arrays = _positions(tensors, row, lengths)
-        return Footage(tuple(_trajectory(tensors, row, array) for array in arrays if len(array)))
+        arrays = [array for array in _positions(tensors, row, lengths) if len(array)]
+        if FRAME_DIGESTS in tensors:
+            task = _task(tensors, row)
+            return NamedFootage(tuple(NamedTrajectory(tuple(map(bytes, array)), pixels, task) for array in arrays))
+        return Footage(tuple(_trajectory(tensors, row, array) for array in arrays))
 
     return [_located(decode, tensors, row) for row in range(len(tensors[NUM_FRAMES]))]
+
+
+def encode_named(trajectories: Sequence[NamedTrajectory], sent: Sequence[UInt8Array]) -> Tensors:
+    """One request for the progress of each trajectory, whose frames have the digests.
+
+    sent: uint8 [H, W, 3] of one size, the frames that the model may not know; none: it knows all
+    """
+    count = len(trajectories)
+    num_rows = -(-len(sent) // count)
+    shape = sent[0].shape if sent else (1, 1, 3)  # an input is never empty
+    frames = np.zeros((count, max(num_rows, 1), *shape), np.uint8)
+    for index, frame in enumerate(sent):
+        frames[index % count, index // count] = frame
+    digests = [[np.frombuffer(b"".join(named.digests), np.uint8).reshape(-1, DIGEST_BYTES)] for named in trajectories]
+    return {
+        SAMPLE_TYPE: np.full((count, 1), SampleType.PROGRESS, np.uint8),
+        NUM_FRAMES: np.array([[named.num_frames, 0] for named in trajectories], np.int32),
+        FRAME_STEPS: np.zeros((count, 1), np.int32),
+        FRAMES: frames,
+        FRAME_DIGESTS: pad_stack(digests),
+        TASK: np.array([[named.task.encode()] for named in trajectories], np.object_),
+    }
 
 
 def encode_trajectories(encoded: Sequence[Footage], num_positions: int, outputs: Collection[str]) -> Tensors:
@@ -224,6 +265,8 @@ def encode_trajectories(encoded: Sequence[Footage], num_positions: int, outputs:
 
 def num_positions(inputs: Mapping[str, npt.NDArray[Any]]) -> int:
     """P, the frame positions of one request: its widths of the time axis, added up."""
+    if FRAME_DIGESTS in inputs:
+        return int(inputs[FRAME_DIGESTS].shape[1])
     return sum(int(inputs[name].shape[1]) for name in (FRAMES, SECOND_FRAMES, VIDEO_EMBEDDINGS) if name in inputs)
 
 
@@ -346,7 +389,8 @@ def _positions(tensors: Mapping[str, npt.NDArray[Any]], row: int, lengths: Seque
     if SECOND_FRAMES in tensors:
         arrays = zip((FRAMES, SECOND_FRAMES), lengths, strict=True)
         return [_unpadded(tensors, name, row, length) for name, length in arrays]
-    both = _unpadded(tensors, FRAMES if FRAMES in tensors else VIDEO_EMBEDDINGS, row, sum(lengths))
+    name = next(name for name in (FRAME_DIGESTS, FRAMES, VIDEO_EMBEDDINGS) if name in tensors)
+    both = _unpadded(tensors, name, row, sum(lengths))
     return [both[: lengths[0]], both[lengths[0] :]]
 
 
@@ -376,16 +420,32 @@ def _frame_scores(result: Result) -> tuple[FrameScores, ...]:
     return (result.reference, result.other)
 
 
+def decode_progress(
+    tensors: Mapping[str, npt.NDArray[Any]], row: int, num_frames: int, model_version: str | None = None
+) -> ProgressResult:
+    """The result of one sample of type progress, whose trajectory has ``num_frames``. Raises InferenceFailedError."""
+    scores = _scores_between(tensors, row, slice(0, num_frames))
+    return ProgressResult(
+        progress=scores.progress,
+        success=scores.success,
+        progress_logits=scores.progress_logits,
+        timing=_timing(tensors, row),
+        model_version=model_version,
+    )
+
+
+def _timing(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> BatchTiming | None:
+    return BatchTiming(*tensors[TIMING_MS][row].tolist()) if TIMING_MS in tensors else None
+
+
 def _decode_result(
     tensors: Mapping[str, npt.NDArray[Any]], row: int, sample: Sample, model_version: str | None
 ) -> Result:
     num_first, num_second = _num_frames(sample)
-    first = _scores_between(tensors, row, slice(0, num_first))
-    timing = BatchTiming(*tensors[TIMING_MS][row].tolist()) if TIMING_MS in tensors else None
-    of_request: dict[str, Any] = {"timing": timing, "model_version": model_version}
     if isinstance(sample, ProgressSample):
-        progress, success, logits = first.progress, first.success, first.progress_logits
-        return ProgressResult(progress=progress, success=success, progress_logits=logits, **of_request)
+        return decode_progress(tensors, row, num_first, model_version)
+    first = _scores_between(tensors, row, slice(0, num_first))
+    of_request: dict[str, Any] = {"timing": _timing(tensors, row), "model_version": model_version}
     second = _scores_between(tensors, row, slice(num_first, num_first + num_second))
     if isinstance(sample, PreferenceSample):
         preference = float(_present(tensors, PREFERENCE, row, slice(0, 1))[0])

@@ -13,9 +13,13 @@ import numpy as np
 
 from rfm_client.client import RewardClient
 from rfm_client.contract.errors import InvalidSampleError, RewardError
-from rfm_client.contract.results import SUCCESS_THRESHOLD, ProgressResult, Result
-from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array
+from rfm_client.contract.results import ProgressResult, Result
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.data.resize import resize_frames
 from rfm_client.data.sampling import Prefix, Rule, Sampling
+from rfm_client.episodes.frames import checked_frame
+from rfm_client.episodes.options import SuccessRule
+from rfm_client.windows import NamedFrame, Window
 
 Info: TypeAlias = dict[str, Any]
 ClientSource: TypeAlias = RewardClient | Callable[[], RewardClient]
@@ -24,20 +28,6 @@ ClientSource: TypeAlias = RewardClient | Callable[[], RewardClient]
 def _check_at_least_one(name: str, value: int) -> None:
     if value < 1:
         raise ValueError(f"{name}: expected at least 1, got {value}")
-
-
-@dataclass(frozen=True)
-class SuccessRule:
-    """A scored step succeeds when most of the ``last`` frames sent for it have a success of ``threshold`` or more.
-
-    Padding and repeated frames count once.
-    """
-
-    threshold: float = SUCCESS_THRESHOLD
-    last: int = 1
-
-    def __post_init__(self) -> None:
-        _check_at_least_one("last", self.last)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +44,8 @@ class RewardOptions:
         takes one environment's observation and gives its frame
     sampling: which frames of the episode so far are sent: a rule of ``rfm_client.data.sampling``. ``rint_pad`` is that
         of upstream's own RL loop
+    resize: frames are made as small as the checkpoint reads them before they are kept and sent (needs Pillow); ReWiND's
+        scores differ slightly from those of the frames as they are
     max_frames: the rule's number of frames; None: as many as the checkpoint was trained on. If it does not say, a rule
         that needs a number raises ValueError at the first reset
     blocking: a step waits for its score
@@ -68,6 +60,7 @@ class RewardOptions:
     terminate_on_success: SuccessRule | None = None
     frames_from: str | Callable[[Any], UInt8Array] | None = None
     sampling: Rule = "rint_pad"
+    resize: bool = False
     max_frames: int | None = None
     blocking: bool = True
     max_pending: int = 4
@@ -122,11 +115,10 @@ class Scorer:
         if episode.num_pending >= self._options.max_pending:
             episode.num_skipped += 1
         else:
-            episode.expect(self._client.submit(episode.sample(self._sampling)), self._sampling)
+            episode.expect(self._client.submit_window(episode.window(self._sampling)), self._sampling)
 
     def _await(self, episodes: Sequence[Episode]) -> None:
-        samples = [episode.sample(self._sampling) for episode in episodes]
-        outcomes = self._client.evaluate(samples, return_errors=True)
+        outcomes = self._client.score_windows([episode.window(self._sampling) for episode in episodes])
         results = [episode.checked(outcome) for episode, outcome in zip(episodes, outcomes, strict=True)]
         for episode, result in zip(episodes, results, strict=True):
             episode.learn(episode.step, result, self._sampling.prefix(episode.step))
@@ -138,6 +130,12 @@ class Scorer:
         if self._made is None:
             self._made = self._source()
         return self._made
+
+    @property
+    def fit(self) -> Callable[[UInt8Array], UInt8Array] | None:
+        """What makes a frame [H, W, 3] as small as it is sent; None: it stays as it is."""
+        size = self._client.model_info(frames=True).frame_size if self._options.resize else None
+        return None if size is None else lambda frame: resize_frames(frame[np.newaxis], size)[0]
 
     @cached_property
     def _sampling(self) -> Sampling:
@@ -158,7 +156,8 @@ class Episode:
         self._options = options
         self._task = task
         self._where = where
-        self._frames: list[UInt8Array] = []
+        self._frames: list[NamedFrame] = []
+        self._size: tuple[int, ...] | None = None  # of the frames as they came
         self._pending: dict[int, tuple[Prefix, Future[ProgressResult]]] = {}  # by step
         self._known_step = -1
         self._progress = self._success = self._paid_progress = np.nan
@@ -180,21 +179,21 @@ class Episode:
         """Number of requests that have no answer yet."""
         return len(self._pending)
 
-    def add(self, frame: Any) -> None:
-        """Adds a copy of the frame: an environment may draw into the same array again."""
-        kept = np.array(frame)
-        got = f"{kept.dtype} {list(kept.shape)}"
-        if kept.dtype != np.uint8 or kept.ndim != 3 or kept.shape[2] != 3:
-            raise self._located(InvalidSampleError.at("frame", "uint8 [H, W, 3]", got))
-        if self._frames and kept.shape != self._frames[0].shape:
-            first = f"uint8 {list(self._frames[0].shape)}, as the episode's first"
-            raise self._located(InvalidSampleError.at("frame", first, got))
-        self._frames.append(kept)
+    def add(self, frame: Any, fit: Callable[[UInt8Array], UInt8Array] | None = None) -> None:
+        """Adds a copy of the frame: an environment may draw into the same array again. ``fit``: makes it smaller."""
+        try:
+            kept = checked_frame(frame)
+            if self._size is not None and kept.shape != self._size:
+                first = f"uint8 {list(self._size)}, as the episode's first"
+                raise InvalidSampleError.at("frame", first, f"{kept.dtype} {list(kept.shape)}")
+        except InvalidSampleError as error:
+            raise self._located(error) from None
+        self._size = kept.shape
+        self._frames.append(NamedFrame(kept if fit is None else fit(kept)))
 
-    def sample(self, sampling: Sampling) -> ProgressSample:
-        """The sample of the newest frame."""
-        frames = [self._frames[index] for index in sampling.prefix(self.step).indices]
-        return ProgressSample(Trajectory(frames=np.stack(frames), task=self._task))
+    def window(self, sampling: Sampling) -> Window:
+        """The question about the newest frame."""
+        return Window(tuple(self._frames[index] for index in sampling.prefix(self.step).indices), self._task)
 
     def expect(self, answer: Future[ProgressResult], sampling: Sampling) -> None:
         """Records that an answer about the newest frame, sampled so, is to come."""

@@ -30,7 +30,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.integrations.episode import ClientSource, Episode, Info, RewardOptions, Scorer, SuccessRule
+from rfm_client.episodes.options import SuccessRule
+from rfm_client.integrations.episode import ClientSource, Episode, Info, RewardOptions, Scorer
 
 try:
     import gymnasium
@@ -78,7 +79,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
             self._episode.cancel()
         task = self._task if isinstance(self._task, str) else self._task(info)
         self._episode = Episode(self._options, task)
-        self._episode.add(self._frame(observation))
+        self._episode.add(self._frame(observation), self._scorer.fit)
         self._scorer.score({self._episode: False})
         return observation, {**info, INFO: self._episode.info()}
 
@@ -87,7 +88,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
         observation, env_reward, terminated, truncated, info = self.env.step(action)
         if self._episode is None:
             raise ResetNeeded("step: expected a reset before it")
-        self._episode.add(self._frame(observation))
+        self._episode.add(self._frame(observation), self._scorer.fit)
         self._scorer.score({self._episode: terminated or truncated})
         reward = self._episode.reward(float(env_reward))
         scores = {**self._episode.info(), "env_reward": float(env_reward)}
@@ -166,7 +167,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         reset_alone = self._ended if self._autoreset_mode is AutoresetMode.NEXT_STEP else np.zeros_like(ended)
         stepped = {index: self._episodes[index] for index in np.flatnonzero(~reset_alone).tolist()}
         for index, episode in stepped.items():
-            episode.add(final.get(index, frames[index]))
+            episode.add(final.get(index, frames[index]), self._scorer.fit)
         fresh = {index: self._begin(index, frames[index]) for index in (*np.flatnonzero(reset_alone).tolist(), *final)}
         self._ended = ended
         self._scorer.score(
@@ -189,7 +190,7 @@ class RewardModelVectorWrapper(VectorWrapper):
 
     def _begin(self, index: int, frame: Any) -> Episode:
         self._episodes[index] = Episode(self._options, self._tasks[index], f"envs[{index}]")
-        self._episodes[index].add(frame)
+        self._episodes[index].add(frame, self._scorer.fit)
         return self._episodes[index]
 
     def _frames(self, observations: Any) -> Sequence[Any]:

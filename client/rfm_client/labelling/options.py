@@ -4,23 +4,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias, get_args
 
-import numpy as np
-import numpy.typing as npt
-
+from rfm_client.data.fusing import FUSES, Fuse
 from rfm_client.data.sampling import Rule
 
 Mode: TypeAlias = Literal["prefix", "whole"]
-Fuse: TypeAlias = Literal["mean", "min", "max"]
 Format: TypeAlias = Literal["progress", "signals", "hdf5"]
 
 MODES: tuple[Mode, ...] = get_args(Mode)
 FORMATS: tuple[Format, ...] = get_args(Format)
-FUSES: dict[Fuse, Callable[..., npt.NDArray[np.float32]]] = {"mean": np.mean, "min": np.min, "max": np.max}
 DEFAULT_RULE: Rule = "rint_pad"  # by which upstream's training cuts its clips, and its RL loop the episode so far
 DEFAULT_WORKERS = 4
 

@@ -8,8 +8,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from rfm_client.data.datasets.protocol import Dataset, DatasetError, Episode, chosen_cameras
+from rfm_client.data.fusing import Fuse
 from rfm_client.data.sampling import Sampling
-from rfm_client.labelling.options import DEFAULT_RULE, Fuse, LabelOptions, Mode
+from rfm_client.labelling.options import DEFAULT_RULE, LabelOptions, Mode
 from rfm_client.labelling.scorer import CheckpointFacts
 
 RECIPE_FORMAT = 1  # another one wherever the same recipe would give other scores

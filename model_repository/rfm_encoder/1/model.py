@@ -10,23 +10,27 @@ import torch
 
 from rfm import families
 from rfm.execution import Execution
-from rfm.parameters import FAMILY_PARAMETER
+from rfm.feature_cache import BYTES_PER_MB, FeatureCache
+from rfm.parameters import FAMILY_PARAMETER, FEATURE_CACHE_PARAMETER
 from rfm.triton_model.batch_model import BatchModel
 from rfm_client.contract import RewardError, wire
+from rfm_client.contract.named_frames import NamedFootage
 from rfm_client.contract.samples import Footage
 
 
-class TritonPythonModel(BatchModel[Footage, Footage]):
+class TritonPythonModel(BatchModel[Footage | NamedFootage, Footage]):
     """One instance: one pair of encoders on one device."""
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
         self.encoders = families.encoders_of(settings.get(FAMILY_PARAMETER)).load(version).to(device)
+        cache_mb = int(settings.get(FEATURE_CACHE_PARAMETER) or 0)
+        self.cache = FeatureCache(cache_mb * BYTES_PER_MB) if cache_mb else None
 
-    def decode(self, tensors: wire.Tensors) -> list[Footage]:
+    def decode(self, tensors: wire.Tensors) -> list[Footage | NamedFootage]:
         return wire.decode_trajectories(tensors)
 
-    def answer(self, questions: Sequence[Footage], execution: Execution) -> list[Footage | RewardError]:
-        return self.encoders.encode(questions, execution)
+    def answer(self, questions: Sequence[Footage | NamedFootage], execution: Execution) -> list[Footage | RewardError]:
+        return self.encoders.encode(questions, execution, self.cache)
 
     def encode(self, answers: Sequence[Footage], tensors: wire.Tensors, outputs: Collection[str]) -> wire.Tensors:
         return wire.encode_trajectories(answers, wire.num_positions(tensors), outputs)

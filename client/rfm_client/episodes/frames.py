@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: MIT
+"""Frames as a caller hands them over."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.contract.samples import UInt8Array, as_array
+
+
+def checked_frame(frame: Any, where: str = "frame") -> UInt8Array:
+    """A copy of a frame: an environment may draw into the same array again. Raises InvalidSampleError."""
+    kept = np.array(as_array(frame))
+    if kept.dtype != np.uint8 or kept.ndim != 3 or kept.shape[2] != 3 or 0 in kept.shape:
+        raise InvalidSampleError.at(where, "uint8 [H, W, 3]", f"{kept.dtype} {list(kept.shape)}")
+    return kept
+
+
+def copied(frame: Any) -> Any:
+    """A copy of a frame, or of such by camera, that may be scored later."""
+    if isinstance(frame, Mapping):
+        return {camera: np.array(as_array(each)) for camera, each in frame.items()}
+    return np.array(as_array(frame))

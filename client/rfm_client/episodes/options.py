@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: MIT
+"""How episodes are scored step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypedDict
+
+from rfm_client.contract.results import SUCCESS_THRESHOLD
+from rfm_client.data.fusing import FUSES, Fuse
+from rfm_client.data.sampling import Rule, Sampling
+
+
+@dataclass(frozen=True)
+class SuccessRule:
+    """A scored step succeeds when most of the ``last`` frames sent for it have a success of ``threshold`` or more.
+
+    Padding and repeated frames count once.
+    """
+
+    threshold: float = SUCCESS_THRESHOLD
+    last: int = 1
+
+    def __post_init__(self) -> None:
+        if self.last < 1:
+            raise ValueError(f"last: expected at least 1, got {self.last}")
+
+
+class EpisodeSettings(TypedDict, total=False):
+    """The fields of EpisodeOptions, as arguments."""
+
+    sampling: Rule
+    frames: int | None
+    cameras: Sequence[str]
+    fuse: Fuse
+    resize: bool
+    success: SuccessRule
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeOptions:
+    """How each step of an episode is scored. Raises ValueError for contradictory options.
+
+    sampling: which frames of the episode so far a model is shown: a rule of ``rfm_client.data.sampling``. ``rint_pad``
+        is that of upstream's own RL loop
+    frames: the rule's number of frames; None: as many as the checkpoint was trained on. If it does not say, a rule
+        that needs a number raises ValueError at the first step
+    cameras: names of the cameras whose frames each step brings; none: there is one, without a name
+    fuse: how the scores of several cameras become one
+    resize: frames are made as small as the checkpoint reads them before they are kept and sent (needs Pillow);
+        ReWiND's scores differ slightly from those of the frames as they are
+    success: when a step counts as a success
+    """
+
+    sampling: Rule = "rint_pad"
+    frames: int | None = None
+    cameras: Sequence[str] = ()
+    fuse: Fuse = "mean"
+    resize: bool = False
+    success: SuccessRule = SuccessRule()
+
+    def __post_init__(self) -> None:
+        if isinstance(self.cameras, str):
+            raise ValueError(f"cameras: expected a sequence of names, got {self.cameras!r}")
+        object.__setattr__(self, "cameras", tuple(self.cameras))
+        if len(set(self.cameras)) < len(self.cameras):
+            raise ValueError(f"cameras: expected names that differ, got {list(self.cameras)}")
+        if self.fuse not in FUSES:
+            raise ValueError(f"fuse: expected one of {', '.join(FUSES)}, got {self.fuse!r}")
+        Sampling.of(self.sampling, self.frames, trained_frames=1)  # whether rule and number go together

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: MIT
+"""Progress questions about frames of which the server may know most: only the others are sent.
+
+A server that does not know what it was expected to (it was restarted, is another one, or has let frames go) refuses.
+Then all pixels are sent: the answer is that of a ``ProgressSample`` of the same frames, whatever the server knows.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from itertools import groupby
+
+import numpy as np
+
+from rfm_client.call import Call
+from rfm_client.contract import wire
+from rfm_client.contract.errors import InvalidSampleError, RewardError
+from rfm_client.contract.named_frames import NamedTrajectory, frame_digest
+from rfm_client.contract.names import frames_name
+from rfm_client.contract.results import ProgressResult, Result
+from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array
+from rfm_client.scorer import Scorer, for_each
+from rfm_client.transport.off_loop import off_loop
+
+MAX_REMEMBERED = 2**17  # digests of frames that have been sent; the oldest are forgotten
+_OUTPUTS = (wire.PROGRESS, wire.SUCCESS)
+
+
+@dataclass(frozen=True, eq=False)
+class NamedFrame:
+    """A frame, uint8 [H, W, 3], which nobody changes any more."""
+
+    pixels: UInt8Array
+
+    @cached_property
+    def digest(self) -> bytes:
+        """What a server knows it by."""
+        return frame_digest(self.pixels)
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """How far has the task come at each of these frames? All are of one size."""
+
+    frames: tuple[NamedFrame, ...]
+    task: str
+
+    @property
+    def sample(self) -> ProgressSample:
+        """The same question with all pixels. Raises InvalidSampleError."""
+        return ProgressSample(Trajectory(frames=np.stack([frame.pixels for frame in self.frames]), task=self.task))
+
+    @property
+    def named(self) -> NamedTrajectory:
+        """The frames' digests, without pixels."""
+        return NamedTrajectory(tuple(frame.digest for frame in self.frames), {}, self.task)
+
+
+class Remembered:
+    """Digests of the frames that the servers have been sent."""
+
+    def __init__(self) -> None:
+        self._digests: OrderedDict[bytes, None] = OrderedDict()
+
+    def __contains__(self, digest: bytes) -> bool:
+        return digest in self._digests
+
+    def add(self, digests: Iterable[bytes]) -> None:
+        """Remembers digests; the oldest are forgotten if there are too many."""
+        for digest in digests:
+            self._digests[digest] = None
+            self._digests.move_to_end(digest)
+        while len(self._digests) > MAX_REMEMBERED:
+            self._digests.popitem(last=False)
+
+    def forget(self, digests: Iterable[bytes]) -> None:
+        """Forgets digests that a server does not know."""
+        for digest in digests:
+            self._digests.pop(digest, None)
+
+
+class WindowScorer:
+    """Scores windows for one client, in its event loop.
+
+    model: name under which the checkpoint was exported
+    """
+
+    def __init__(self, model: str, scorer: Scorer) -> None:
+        self._model = frames_name(model)
+        self._scorer = scorer
+        self._remembered = Remembered()
+
+    async def outcomes(self, windows: Sequence[Window], call: Call) -> list[Result | RewardError]:
+        """The result or error of each window."""
+        try:
+            info = await self._scorer.model_infos.get(self._model, call.deadline)
+        except RewardError as error:
+            return for_each(error, len(windows))
+        if not info.by_digest:
+            return await self._whole(windows, call)
+        parts = list(_parts(windows, info.max_batch_size))
+        asked = [self._outcomes([windows[index] for index in part], call) for part in parts]
+        answered = await asyncio.gather(*asked)
+        found = {
+            index: outcome
+            for part, of_part in zip(parts, answered, strict=True)
+            for index, outcome in zip(part, of_part, strict=True)
+        }
+        return [found[index] for index in range(len(windows))]
+
+    async def _outcomes(self, windows: Sequence[Window], call: Call) -> Sequence[Result | RewardError]:
+        """One request, and one with all pixels if the server lacks some."""
+        new = {frame.digest: frame.pixels for window in windows for frame in window.frames}
+        digests = list(new)
+        sent = [pixels for digest, pixels in new.items() if digest not in self._remembered]
+        try:
+            results = await self._request(windows, sent, call)
+        except InvalidSampleError as error:
+            if error.is_deadly:
+                return for_each(error, len(windows))
+            self._remembered.forget(digests)
+            return await self._in_whole(windows, digests, call)
+        except RewardError as error:
+            return for_each(error, len(windows))
+        self._remembered.add(digests)
+        return results
+
+    async def _in_whole(
+        self, windows: Sequence[Window], digests: Sequence[bytes], call: Call
+    ) -> Sequence[Result | RewardError]:
+        """The outcomes, all pixels sent; after that the server knows them."""
+        outcomes = await self._whole(windows, call)
+        if not any(isinstance(outcome, RewardError) for outcome in outcomes):
+            self._remembered.add(digests)
+        return outcomes
+
+    async def _request(
+        self, windows: Sequence[Window], sent: Sequence[UInt8Array], call: Call
+    ) -> Sequence[ProgressResult]:
+        request_id = next(call.request_ids)
+        num_bytes = sum(frame.nbytes for frame in sent)
+        tensors = partial(wire.encode_named, [window.named for window in windows], sent)
+        try:
+            answer = await self._scorer.infer(self._model, num_bytes, tensors, _OUTPUTS, call.deadline, request_id)
+        except RewardError as error:
+            error.request_id = request_id
+            raise
+        return [
+            wire.decode_progress(answer.tensors, row, len(window.frames), answer.model_version)
+            for row, window in enumerate(windows)
+        ]
+
+    async def _whole(self, windows: Sequence[Window], call: Call) -> list[Result | RewardError]:
+        num_bytes = sum(frame.pixels.nbytes for window in windows for frame in window.frames)
+        samples = await off_loop(num_bytes, lambda: [window.sample for window in windows])
+        return await self._scorer.outcomes(samples, call)
+
+
+def _parts(windows: Sequence[Window], limit: int) -> Iterator[list[int]]:
+    """Indices of the windows of each request: frames of one size, at most ``limit`` windows."""
+
+    def size(index: int) -> tuple[int, ...]:
+        return windows[index].frames[0].pixels.shape
+
+    for _, group in groupby(sorted(range(len(windows)), key=size), key=size):
+        of_size = list(group)
+        yield from (of_size[start : start + limit] for start in range(0, len(of_size), limit))

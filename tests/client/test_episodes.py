@@ -1,0 +1,338 @@
+# SPDX-License-Identifier: MIT
+"""An episode scored step by step has the scores of the same frames asked as a whole, whatever the server knows."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+import urllib.request
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+import goldens
+import rfm_export
+from engines import serve_config
+from reference_server import Served
+from rfm.launch.installation import find_installation
+from rfm.launch.process import Endpoints, TritonServer
+from rfm_client import (
+    AsyncRewardClient,
+    InvalidSampleError,
+    ModelNotFoundError,
+    ProgressResult,
+    RewardClient,
+    Trajectory,
+)
+from rfm_client.contract import wire
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.data.prefixes import of_prefixes, prefix_samples
+from rfm_client.data.sampling import RULES, Rule, Sampling
+from rfm_client.episodes import Episode, SuccessRule
+from rfm_client.transport.access import Access
+from rfm_client.transport.calls import Answer, GrpcTransport
+
+pytestmark = pytest.mark.triton
+
+MODEL = "enc_c1_t1_disc10"  # takes digests
+IMAGES, VIDEO = "q3_tok_disc10", "q25_video_avg_disc10"  # do not
+TASK = "stack the cups"
+TOLERANCE, VLM_TOLERANCE = 1e-5, 1e-4
+TOLD_S = 1.0  # in which the model tells Triton what it has counted
+
+
+def film(seed: int, count: int, size: tuple[int, int] = (40, 56)) -> UInt8Array:
+    return np.random.default_rng(seed).integers(0, 256, (count, *size, 3), np.uint8)
+
+
+def offline(client: RewardClient, frames: UInt8Array, sampling: Sampling, task: str = TASK) -> ProgressResult:
+    """Each frame's score from the prefix that ends with it, all pixels sent."""
+    results = client.evaluate(list(prefix_samples(Trajectory(frames=frames, task=task), sampling)))
+    return of_prefixes([result for result in results if isinstance(result, ProgressResult)], sampling)
+
+
+def online(episode: Episode, frames: UInt8Array) -> tuple[list[float], list[float]]:
+    scores = [episode.add(frame) for frame in frames]
+    assert [score.step for score in scores] == list(range(len(frames)))
+    return [score.progress for score in scores], [score.success for score in scores]
+
+
+def assert_same(
+    scores: tuple[Sequence[float], Sequence[float]], expected: ProgressResult, tolerance: float = TOLERANCE
+) -> None:
+    np.testing.assert_allclose(scores[0], expected.progress, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(scores[1], expected.success, rtol=0, atol=tolerance)
+
+
+def counted(endpoints: Endpoints, name: str, model: str = MODEL) -> float:
+    """What the encoder's metrics say."""
+    time.sleep(TOLD_S)
+    with urllib.request.urlopen(endpoints.metrics_url, timeout=10) as answer:
+        families = list(text_string_to_metric_families(answer.read().decode()))
+    found = [
+        sample.value
+        for family in families
+        for sample in family.samples
+        if sample.name == f"rfm_{name}" and sample.labels["model"] == f"{model}_encoder"
+    ]
+    return sum(found)
+
+
+class Recording(GrpcTransport):
+    """To the real server; notes the inputs of each request."""
+
+    def __init__(self, url: str) -> None:
+        super().__init__(url, Access(), shared_memory=False)
+        self.requests: list[wire.Tensors] = []
+
+    async def infer(self, model: str, inputs: wire.Tensors, outputs: object, timeout_s: float, **more: str) -> Answer:
+        self.requests.append(inputs)
+        return await super().infer(model, inputs, outputs, timeout_s, **more)  # type: ignore[arg-type]
+
+    @property
+    def num_bytes(self) -> list[int]:
+        return [sum(array.nbytes for array in inputs.values()) for inputs in self.requests]
+
+
+@pytest.fixture
+def recorded(served: Served) -> Iterator[tuple[Recording, RewardClient]]:
+    transport = Recording(served.url("grpc"))
+    with RewardClient([], transports=[transport], model=MODEL) as client:
+        yield transport, client
+
+
+def of_rule(rule: Rule, frames: int = 5) -> Sampling:
+    """The rule with few frames; ``all`` takes no number, and the first ReWiND code's rules have their own."""
+    return Sampling(rule, None if rule == "all" or rule.startswith("rewind") else frames)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_steps_have_the_scores_of_the_whole(served: Served, protocol: str, rule: Rule) -> None:
+    count = 16 if rule == "all" else 40  # the checkpoint takes 16 frames
+    sampling, frames = of_rule(rule, 7), film(RULES.index(rule), count)
+    given = None if rule == "all" else sampling.frames
+    with served.client(protocol, MODEL) as client, client.episode(TASK, sampling=rule, frames=given) as episode:
+        assert_same(online(episode, frames), offline(client, frames, sampling))
+
+
+@pytest.mark.parametrize("rule", ["rint_pad", "linspace_trunc"])
+@pytest.mark.parametrize("model", [IMAGES, VIDEO])
+def test_steps_of_a_vision_language_checkpoint_have_the_scores_of_the_whole(
+    served: Served, model: str, rule: Rule
+) -> None:
+    sampling, frames = of_rule(rule, 4), film(3, 6, (56, 84))
+    with served.client("grpc", model) as client, client.episode(TASK, sampling=rule, frames=4) as episode:
+        assert not client.model_info(frames=True).by_digest
+        assert_same(online(episode, frames), offline(client, frames, sampling), VLM_TOLERANCE)
+
+
+def test_a_step_sends_and_encodes_its_new_frame_alone(served: Served, recorded: tuple[Recording, RewardClient]) -> None:
+    transport, client = recorded
+    frames = film(100, 24, (64, 96))
+    before = counted(served.endpoints, "frames_encoded_total")
+    with client.episode(TASK, frames=8) as episode:
+        for frame in frames:
+            episode.add(frame)
+    assert counted(served.endpoints, "frames_encoded_total") - before == len(frames)
+    assert [len(inputs[wire.FRAMES][0]) for inputs in transport.requests] == [1] * len(frames)
+    assert max(transport.num_bytes) < frames[0].nbytes + 512
+    assert counted(served.endpoints, "feature_cache_hits_total") >= 7 * 16
+
+
+def test_equal_frames_of_another_episode_are_not_encoded_again(
+    served: Served, recorded: tuple[Recording, RewardClient]
+) -> None:
+    transport, client = recorded
+    frames = film(101, 5)
+    with client.episode(TASK, frames=4) as episode:
+        first = online(episode, frames)
+    before = counted(served.endpoints, "frames_encoded_total")
+    with served.client("http", MODEL) as other, other.episode(TASK, frames=4) as episode:
+        np.testing.assert_allclose(online(episode, frames), first, atol=TOLERANCE)  # sent again: another client
+    with client.episode(TASK, frames=4) as episode:
+        np.testing.assert_allclose(online(episode, frames), first, atol=TOLERANCE)  # not even sent
+    assert counted(served.endpoints, "frames_encoded_total") == before
+    assert [inputs[wire.FRAMES].shape for inputs in transport.requests[-5:]] == [(1, 1, 1, 1, 3)] * 5
+
+
+def test_callers_of_plain_tensors_notice_nothing_and_fill_the_cache_too(served: Served) -> None:
+    frames = film(102, 6)
+    with served.client("grpc", MODEL) as client:
+        client.progress(Trajectory(frames=frames, task=TASK))
+        before = counted(served.endpoints, "frames_encoded_total")
+        client.progress(Trajectory(frames=frames[::-1], task=TASK))
+        assert counted(served.endpoints, "frames_encoded_total") == before
+
+
+def test_episodes_side_by_side_are_one_request_and_score_alike(
+    served: Served, recorded: tuple[Recording, RewardClient]
+) -> None:
+    transport, client = recorded
+    films = np.stack([film(seed, 7) for seed in (200, 201, 202)], axis=1)  # [T, N, H, W, 3]
+    tasks = ["stack the cups", "open the drawer", "stack the cups"]
+    episodes = client.episodes(3, tasks, frames=4)
+    added = [episodes.add(frames) for frames in films]
+    assert len(transport.requests) == len(films)
+    for index, task in enumerate(tasks):
+        scores = [float(step.progress[index]) for step in added], [float(step.success[index]) for step in added]
+        assert_same(scores, offline(client, films[:, index], Sampling("rint_pad", 4), task))
+    assert added[-1].step.tolist() == [6, 6, 6]
+
+
+def test_a_mask_leaves_episodes_out_and_a_reset_begins_some_anew(served: Served) -> None:
+    frames = film(103, 4)
+    with served.client("grpc", MODEL) as client:
+        episodes = client.episodes(2, TASK, frames=4)
+        episodes.add(frames[[0, 1]])
+        scores = episodes.add([None, frames[2]], mask=[False, True])
+        assert np.isnan([scores.progress[0], scores.success[0]]).all()
+        assert not scores.succeeded[0]
+        assert scores.step.tolist() == [0, 1]
+        expected = offline(client, frames[[1, 2]], Sampling("rint_pad", 4))
+        np.testing.assert_allclose(scores.progress[1], expected.progress[-1], atol=TOLERANCE)
+        episodes.reset([False, True], task="open the drawer")
+        scores = episodes.add(frames[[3, 3]])
+        assert scores.step.tolist() == [1, 0]
+        expected = offline(client, frames[[3]], Sampling("rint_pad", 4), "open the drawer")
+        np.testing.assert_allclose(scores.progress[1], expected.progress[-1], atol=TOLERANCE)
+        with pytest.raises(ValueError, match=r"mask: expected bool \[2\], got int64 \[2\]"):
+            episodes.add(frames[[0, 1]], mask=[0, 1])
+
+
+def test_cameras_are_scored_apart_and_fused(served: Served) -> None:
+    front, wrist = film(104, 5), film(105, 5, (48, 48))  # of two sizes
+    with served.client("grpc", MODEL) as client:
+        apart = [offline(client, frames, Sampling("rint_pad", 4)).progress[-1] for frames in (front, wrist)]
+        for fuse, expected in {"mean": np.mean(apart), "min": min(apart), "max": max(apart)}.items():
+            episode = client.episode(TASK, frames=4, cameras=("front", "wrist"), fuse=fuse)  # type: ignore[arg-type]
+            scores = [episode.add({"front": a, "wrist": b}) for a, b in zip(front, wrist, strict=True)]
+            np.testing.assert_allclose(scores[-1].progress, expected, atol=TOLERANCE)
+        wanted = r"frames: expected frames of the cameras \['front', 'wrist'\], got \['front'\]"
+        with pytest.raises(InvalidSampleError, match=wanted):
+            episode.add({"front": front[0]})
+
+
+def test_the_success_rule_decides(served: Served) -> None:
+    frames = film(106, 3)
+    with served.client("grpc", MODEL) as client:
+        result = client.progress(Trajectory(frames=frames, task=TASK))
+        for threshold in (0.0, 1.0):
+            episode = client.episode(TASK, sampling="all", success=SuccessRule(threshold, last=2))
+            score = [episode.add(frame) for frame in frames][-1]
+            assert score.succeeded == result.succeeded(last=2, threshold=threshold)
+
+
+def test_a_frame_that_is_wrong_leaves_the_episode_as_it_was(served: Served) -> None:
+    frames = film(107, 3)
+    with served.client("grpc", MODEL) as client, client.episode(TASK, frames=4) as episode:
+        episode.add(frames[0])
+        with pytest.raises(InvalidSampleError, match=r"^frame: expected uint8 \[H, W, 3\], got float64 \[2, 2, 3\]"):
+            episode.add(np.zeros((2, 2, 3)))
+        with pytest.raises(InvalidSampleError, match=r"expected uint8 \[40, 56, 3\], as the episode's first, got"):
+            episode.add(film(0, 1, (8, 8))[0])
+        assert_same(online_from(episode, frames[1:], 1), later(offline(client, frames, Sampling("rint_pad", 4)), 1))
+        episodes = client.episodes(2, TASK, frames=4)
+        with pytest.raises(InvalidSampleError, match=r"^episodes\[1\]\.frame: expected uint8 \[H, W, 3\]"):
+            episodes.add([frames[0], np.zeros((2, 2, 3))])
+        assert episodes.add(frames[:2]).step.tolist() == [0, 0]
+
+
+def online_from(episode: Episode, frames: UInt8Array, step: int) -> tuple[list[float], list[float]]:
+    scores = [episode.add(frame) for frame in frames]
+    assert scores[0].step == step
+    return [score.progress for score in scores], [score.success for score in scores]
+
+
+def later(result: ProgressResult, start: int) -> ProgressResult:
+    return ProgressResult(progress=result.progress[start:], success=result.success[start:])
+
+
+def test_the_newest_frame_takes_the_place_of_one_that_waits(served: Served) -> None:
+    frames = film(108, 30)
+    with served.client("grpc", MODEL) as client, client.episode(TASK, frames=4) as episode:
+        answers = [episode.add_nowait(frame) for frame in frames]
+        score = answers[-1].result()
+        taken = [index for index, answer in enumerate(answers) if not answer.cancelled()]
+        assert score.step == len(taken) - 1
+        assert (taken[0], taken[-1]) == (0, len(frames) - 1)
+        assert 1 < len(taken) < len(frames)
+        expected = offline(client, frames[taken], Sampling("rint_pad", 4))
+        np.testing.assert_allclose(score.progress, expected.progress[-1], atol=TOLERANCE)
+        with pytest.raises(InvalidSampleError, match="frame: expected uint8"):
+            episode.add_nowait(np.zeros((2, 2, 3))).result()
+        episode.reset("open the drawer")
+        assert episode.add(frames[0]).step == 0
+
+
+def test_an_episode_for_asyncio_scores_alike(served: Served) -> None:
+    frames = film(109, 4)
+
+    async def play() -> list[float]:
+        async with (
+            AsyncRewardClient(served.url("grpc"), model=MODEL) as client,
+            client.episode(TASK, frames=4) as episode,
+        ):
+            scores = [await episode.add(frame) for frame in frames[:3]]
+            scores.append(await episode.add_nowait(frames[3]))
+            return [score.progress for score in scores]
+
+    with served.client("grpc", MODEL) as client:
+        expected = offline(client, frames, Sampling("rint_pad", 4))
+    np.testing.assert_allclose(asyncio.run(play()), expected.progress, rtol=0, atol=TOLERANCE)
+
+
+def test_a_task_or_model_that_is_not_there_is_told(served: Served) -> None:
+    frames = film(110, 1)
+    with served.client("grpc", MODEL) as client, pytest.raises(InvalidSampleError, match=r"task: expected a task"):
+        client.episode(" ", frames=4).add(frames[0])
+    with served.client("grpc", "nobody") as client, pytest.raises(ModelNotFoundError):
+        client.episode(TASK, frames=4).add(frames[0])
+    with served.client("grpc", MODEL) as client, pytest.raises(ValueError, match="expected one for each of 3 episodes"):
+        client.episodes(3, ["a", "b"])
+    with pytest.raises(ValueError, match=r"cameras: expected a sequence of names, got 'front'"):
+        client.episode(TASK, cameras="front")
+
+
+def repository_of_encoders(folder: Path, **changes: Any) -> Path:
+    config = goldens.config(MODEL)
+    repository = folder / "model_repository"
+    rfm_export.export(config.checkpoint, repository, replace(serve_config(config, MODEL), **changes))
+    return repository
+
+
+@pytest.mark.slow
+def test_an_episode_goes_on_when_its_server_was_restarted(tmp_path: Path, protocol: str) -> None:
+    repository, endpoints = repository_of_encoders(tmp_path), Endpoints.free()
+    frames = film(111, 9)
+    url = endpoints.grpc_url if protocol == "grpc" else endpoints.http_url
+    with RewardClient(url, model=MODEL) as client, client.episode(TASK, frames=4) as episode:
+        with TritonServer(repository, endpoints, find_installation()):
+            before = [episode.add(frame) for frame in frames[:4]]
+        with TritonServer(repository, endpoints, find_installation()):
+            after = [episode.add(frame) for frame in frames[4:]]
+            scores = [*before, *after]
+            expected = offline(client, frames, Sampling("rint_pad", 4))
+    assert_same(([score.progress for score in scores], [score.success for score in scores]), expected)
+
+
+@pytest.mark.slow
+def test_two_servers_that_know_different_frames_and_one_without_a_cache_score_alike(tmp_path: Path) -> None:
+    frames = film(112, 12)
+    caching = repository_of_encoders(tmp_path / "caching")
+    plain = repository_of_encoders(tmp_path / "plain", feature_cache_mb=0)
+    first, second, third = Endpoints.free(), Endpoints.free(), Endpoints.free()
+    with (
+        TritonServer(caching, first, find_installation()),
+        TritonServer(caching, second, find_installation()),
+        TritonServer(plain, third, find_installation()),
+        RewardClient([each.grpc_url for each in (first, second, third)], model=MODEL) as client,
+    ):
+        expected = offline(client, frames, Sampling("rint_pad", 4))
+        for _ in range(3):
+            with client.episode(TASK, frames=4) as episode:
+                assert_same(online(episode, frames), expected)

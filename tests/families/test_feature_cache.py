@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: MIT
+"""Embeddings are made once for each frame and task, kept by what these show, and never wrong for it."""
+
+from __future__ import annotations
+
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from engines import load_engine
+from rfm.execution import Execution
+from rfm.family import FrameEncoders
+from rfm.feature_cache import FeatureCache
+from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError, Trajectory
+from rfm_client.contract.named_frames import NamedFootage, NamedTrajectory, frame_digest
+from rfm_client.contract.samples import Footage, UInt8Array
+
+TASK = "stack the cups"
+MANY = 10_000
+
+
+@pytest.fixture(scope="module")
+def encoders() -> FrameEncoders:
+    loaded = load_engine("enc_c1_t1_disc10").encoders
+    assert loaded is not None
+    return loaded
+
+
+def film(seed: int, count: int, size: tuple[int, int] = (40, 56)) -> UInt8Array:
+    return np.random.default_rng(seed).integers(0, 256, (count, *size, 3), np.uint8)
+
+
+def footage(frames: UInt8Array, task: str = TASK) -> Footage:
+    return Footage((Trajectory(frames=frames, task=task),))
+
+
+def named(frames: UInt8Array, sent: UInt8Array, task: str = TASK) -> NamedFootage:
+    """A question about frames of which only some are sent."""
+    pixels = {frame_digest(frame): frame for frame in sent}
+    return NamedFootage((NamedTrajectory(tuple(map(frame_digest, frames)), pixels, task),))
+
+
+def embeddings(outcome: Footage | RewardError) -> tuple[np.ndarray, np.ndarray]:
+    assert isinstance(outcome, Footage), outcome
+    (trajectory,) = outcome.trajectories
+    assert trajectory.video_embeddings is not None
+    assert trajectory.text_embedding is not None
+    return trajectory.video_embeddings, trajectory.text_embedding
+
+
+def test_a_digest_tells_apart_what_a_frame_shows_and_how_it_lies() -> None:
+    wide, tall = np.zeros((2, 4, 3), np.uint8), np.zeros((4, 2, 3), np.uint8)
+    other = wide.copy()
+    other[1, 3, 2] = 1
+    assert len({frame_digest(wide), frame_digest(tall), frame_digest(other)}) == 3
+    assert frame_digest(other) == frame_digest(np.asfortranarray(other))
+
+
+@pytest.mark.parametrize("limit_bytes", [2**20, 0], ids=["kept", "evicted at once"])
+def test_episodes_that_grow_by_a_frame_are_embedded_as_without_a_cache(
+    encoders: FrameEncoders, limit_bytes: int
+) -> None:
+    frames, cache, execution = film(0, 12), FeatureCache(limit_bytes), Execution()
+    for stop in range(1, 13):
+        (expected,) = encoders.encode([footage(frames[:stop])], Execution(), None)
+        sent = frames[stop - 1 : stop] if limit_bytes else frames[:stop]
+        (outcome,) = encoders.encode([named(frames[:stop], sent)], execution, cache)
+        for got, wanted in zip(embeddings(outcome), embeddings(expected), strict=True):
+            np.testing.assert_allclose(got, wanted, atol=1e-5)
+    assert execution.num_encoded == (12 if limit_bytes else 78)
+    assert execution.num_found == (66 if limit_bytes else 0)
+
+
+def test_equal_frames_of_one_batch_are_encoded_once(encoders: FrameEncoders) -> None:
+    frames, execution = film(1, 5), Execution()
+    batch = [footage(frames), footage(frames[[0, 0, 4, 4]], "another task"), named(frames[:3], frames[:0])]
+    outcomes = encoders.encode(batch, execution, FeatureCache(2**20))
+    assert execution.num_encoded == 5
+    whole, others, first = (embeddings(outcome)[0] for outcome in outcomes)
+    np.testing.assert_array_equal(others, whole[[0, 0, 4, 4]])
+    np.testing.assert_array_equal(first, whole[:3])
+
+
+def test_a_digest_that_is_not_known_fails_its_sample_alone(encoders: FrameEncoders) -> None:
+    frames, cache = film(2, 4), FeatureCache(2**20)
+    batch = [named(frames, frames[2:3]), footage(film(3, 2))]
+    failed, scored = encoders.encode(batch, Execution(), cache)
+    assert isinstance(failed, InvalidSampleError)
+    assert str(failed) == (
+        "frame_digests: expected digests of frames that this model knows or has been sent, got 3 others"
+    )
+    assert isinstance(scored, Footage)
+    (healed,) = encoders.encode([named(frames, frames)], Execution(), cache)
+    assert isinstance(healed, Footage)
+
+
+def test_nobody_can_say_what_a_digest_shows(encoders: FrameEncoders) -> None:
+    """Pixels are named by who reads them: a digest that a caller gives them counts for nothing."""
+    frames, cache = film(4, 2), FeatureCache(2**20)
+    honest = frame_digest(frames[0])
+    question = NamedTrajectory((honest,), {frame_digest(frames[1]): frames[1]}, TASK)
+    (outcome,) = encoders.encode([NamedFootage((question,))], Execution(), cache)
+    assert isinstance(outcome, InvalidSampleError)
+    (expected,) = encoders.encode([footage(frames[:1])], Execution(), None)
+    (outcome,) = encoders.encode([footage(frames[:1])], Execution(), cache)
+    np.testing.assert_allclose(embeddings(outcome)[0], embeddings(expected)[0], atol=1e-5)
+
+
+def test_what_is_not_finite_is_not_kept() -> None:
+    cache = FeatureCache(2**20)
+    sources = {b"nan": np.float32(np.nan), b"error": np.float32(0), b"good": np.float32(1)}
+
+    def make(values: object) -> list[np.ndarray | RewardError]:
+        return [np.full(2, np.nan, np.float32), InferenceFailedError("no memory"), np.ones(2, np.float32)]
+
+    features, num_made = cache.of([*sources, b"unknown"], sources, make)
+    assert (list(features), num_made) == ([b"nan", b"error", b"good"], 3)
+    assert list(cache.found(sources)) == [b"good"]
+
+
+def test_memory_is_bounded_whatever_comes() -> None:
+    limit = 256 * 2**10
+    cache = FeatureCache(limit)
+    tracemalloc.start()
+    for number in range(MANY):
+        cache.keep({number.to_bytes(32, "little"): np.full(64, number, np.float32)})
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert cache.num_bytes <= limit
+    assert held < 2 * limit
+    last = (MANY - 1).to_bytes(32, "little")
+    assert cache.found([last])[last][0] == MANY - 1
+    assert not cache.found([bytes(32)])
+
+
+def test_what_was_used_last_stays() -> None:
+    cache = FeatureCache(3 * (64 * 4 + 256))
+    features = {bytes([number]): np.zeros(64, np.float32) for number in range(4)}
+    for key in (b"\x00", b"\x01", b"\x02"):
+        cache.keep({key: features[key]})
+    cache.found([b"\x00"])
+    cache.keep({b"\x03": features[b"\x03"]})
+    assert list(cache.found(features)) == [b"\x00", b"\x02", b"\x03"]
