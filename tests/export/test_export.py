@@ -124,15 +124,20 @@ def test_a_checkpoint_without_similarity_is_not_warmed_up_with_it(tmp_path: Path
 def test_frames_go_through_the_encoder_into_the_scorer(exported: Path) -> None:
     encoder, ensemble = read(exported, "film_encoder"), read(exported, "film_frames")
     assert dims(encoder.output) == {"video_embeddings": ("FP32", [-1, 48]), "text_embedding": ("FP32", [32])}
-    assert [tensor.name for tensor in encoder.input if tensor.allow_ragged_batch] == ["frames", "second_frames"]
+    assert [tensor.name for tensor in encoder.input if tensor.allow_ragged_batch] == [
+        "frames",
+        "second_frames",
+        "frame_digests",
+    ]
     for config in (encoder, ensemble):
-        assert [tensor.name for tensor in config.input if tensor.optional] == ["second_frames"]
+        assert [tensor.name for tensor in config.input if tensor.optional] == ["second_frames", "frame_digests"]
     assert dims(ensemble.input) == {
         "sample_type": ("UINT8", [1]),
         "num_frames": ("INT32", [2]),
         "frame_steps": ("INT32", [1]),
         "frames": ("UINT8", [-1, -1, -1, 3]),
         "second_frames": ("UINT8", [-1, -1, -1, 3]),
+        "frame_digests": ("UINT8", [-1, 32]),
         "task": ("STRING", [1]),
     }
     steps = [(step.model_name, step.model_version) for step in ensemble.ensemble_scheduling.step]
@@ -271,6 +276,8 @@ def test_a_model_may_gain_an_optional_input_and_lose_none(tmp_path: Path) -> Non
         forget_input(tmp_path, name, wire.SECOND_FRAMES)
     assert export(FRAMES, tmp_path) == 2
     assert wire.SECOND_FRAMES in dims(read(tmp_path, "rfm_frames").input)
+    assert export(FRAMES, tmp_path, feature_cache_mb=0) == 3
+    assert wire.FRAME_DIGESTS not in dims(read(tmp_path, "rfm_frames").input)
     config = read(tmp_path, "rfm_encoder")
     config.input.add(name="third_frames", data_type=pb.TYPE_UINT8, dims=[1], optional=True)
     (tmp_path / "rfm_encoder" / "config.pbtxt").write_text(text_format.MessageToString(config))

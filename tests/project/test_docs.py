@@ -27,7 +27,7 @@ from labelling import LEROBOT
 from paths import ROOT
 from rfm.launch.installation import find_installation
 from rfm.launch.process import Endpoints, TritonServer
-from rfm_client import PreferenceSample, ProgressSample, Trajectory
+from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_client.cli.commands import app
 from rfm_client.contract import wire
 from rfm_client.contract.settings import Setting, settings_of
@@ -114,6 +114,10 @@ def names() -> dict[str, Any]:
         "trajectories": [filmed, rewound],
         "dataset": steps,
         "images": pictures(4),
+        "camera": pictures(6),
+        "done": np.arange(8) < 3,
+        "moved": np.arange(8) > 5,
+        "RewardClient": RewardClient,
         "models": ["rfm"],
         "successes": [filmed],
         "failures": [Trajectory(frames=pictures(5), task="stack the cups")],

@@ -62,6 +62,7 @@ EXCEPTIONS = {
     "examples/evaluate_demo_checkpoint.py": {"rfm"},
     "benchmarks/bench.py": {"rfm", "rfm_commands", "rfm_export"},  # the engine without a server, and what is served
     "benchmarks/accelerator.py": {"rfm", "rfm_export"},
+    "benchmarks/episodes.py": {"rfm", "rfm_export"},
     "benchmarks/peers/simulated.py": {"rfm"},
     "benchmarks/contestants.py": {"rfm"},
     "benchmarks/forward.py": {"rfm"},
