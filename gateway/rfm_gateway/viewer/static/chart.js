@@ -7,9 +7,13 @@ const HEIGHT_PX = 300;
 const NUM_COLOURS = 8;
 const PNG_LINE_PX = 22;
 
-/** The colour of curve number `index`, in the theme of the moment. */
-export function colour(index) {
-  return themed(`--curve-${index % NUM_COLOURS}`);
+/** The name of the colour of curve number `index`, which the style sheet has for each theme. */
+export function colourName(index) {
+  return `curve-${index % NUM_COLOURS}`;
+}
+
+function colour(index) {
+  return themed(`--${colourName(index)}`);
 }
 
 function themed(name) {
@@ -92,7 +96,7 @@ export class Chart {
   #newPlot(indices, data) {
     const axis = { stroke: () => themed("--text"), grid: { stroke: () => themed("--grid"), width: 1 } };
     const series = indices.flatMap((index) => {
-      const line = { stroke: () => colour(index), width: 2 };
+      const line = { stroke: () => colour(index), width: 2, points: { fill: () => themed("--page") } };
       return [line, { ...line, dash: [7, 5] }];
     });
     const options = {

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: MIT
 // The curves as a table: what was asked, and the numbers at the time that is shown.
 
-import { colour } from "./chart.js";
+import { colourName } from "./chart.js";
 
-const NONE = "–";
+const NONE = "-";
 
 /** A number as the page writes it. */
 export function shown(value) {
@@ -32,8 +32,7 @@ function named(curve) {
   const header = document.createElement("th");
   const swatch = document.createElement("span");
   header.scope = "row";
-  swatch.className = "swatch";
-  swatch.style.background = colour(curve.index);
+  swatch.className = `swatch ${colourName(curve.index)}`;
   header.append(swatch, curve.film.name);
   return header;
 }
