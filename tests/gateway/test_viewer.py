@@ -24,6 +24,8 @@ from gateway_requests import FILM, TINY, TOLERANCE, VIDEO, Triton, check_refused
 from gateways import Gateway, running
 from paths import ROOT
 from rfm_client.data.sampling import RULES
+from rfm_gateway.command import gateway_command, page_link
+from rfm_gateway.config import GatewayConfig
 from viewer_requests import COMPARE, SCORE, SERVED, by_command_line, curve_of, events, post
 
 pytestmark = pytest.mark.triton
@@ -265,3 +267,23 @@ def test_the_endpoints_of_the_page_are_not_those_of_the_evaluation_server(tiny: 
     document: dict[str, Any] = requests.get(f"{tiny.url}/openapi.json").json()
     assert not [path for path in document["paths"] if path.startswith(("/viewer", "/docs"))]
     assert "/" not in document["paths"]
+
+
+@pytest.mark.parametrize(
+    ("config", "link"),
+    [
+        (GatewayConfig(8100), "http://127.0.0.1:8100/"),
+        (GatewayConfig(host="0.0.0.0"), "http://127.0.0.1:8000/"),
+        (GatewayConfig(8100, host="::1"), "http://[::1]:8100/"),
+        (GatewayConfig(8443, host="robot", certificate=Path("a.pem"), key=Path("a.key")), "https://robot:8443/"),
+    ],
+    ids=["loopback", "every address", "IPv6", "HTTPS"],
+)
+def test_the_link_is_one_that_a_browser_can_open(config: GatewayConfig, link: str) -> None:
+    assert page_link(config) == link
+
+
+@pytest.mark.parametrize("viewer", [True, False])
+def test_a_gateway_beside_triton_is_told_whether_there_is_a_page(viewer: bool) -> None:
+    words = gateway_command(GatewayConfig(8100, viewer=viewer))
+    assert [word for word in words if "viewer" in word] == ["--viewer" if viewer else "--no-viewer"]

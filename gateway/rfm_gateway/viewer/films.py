@@ -35,7 +35,7 @@ class Film:
 
 
 async def read_film(upload: UploadFile, fps: float, take: Callable[[int], object]) -> Film:
-    """The frames at ``fps`` of an uploaded video. Raises InvalidSampleError, ImportError, and what ``take`` raises.
+    """The frames at ``fps`` of an uploaded video. Raises InvalidSampleError, and what ``take`` raises.
 
     take: told how many bytes of memory are taken, before they are
     """

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import anyio
-from fastapi import APIRouter, HTTPException, Request, Response
+from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 from starlette.datastructures import UploadFile
 from starlette.types import Receive, Scope, Send
@@ -159,8 +159,6 @@ async def _film(admitted: Admitted, uploads: Mapping[str, UploadFile], name: str
     except InvalidSampleError as error:
         where, _, message = error.message.partition(": ")
         raise invalid((name if where == "video" else where,), message) from None
-    except ImportError as error:
-        raise HTTPException(501, str(error)) from None
 
 
 async def _score_events(behind: Behind, asked: _Asked, call: Call) -> AsyncIterator[str]:
