@@ -21,7 +21,7 @@ import requests
 
 import clip
 from gateway_requests import FILM, TINY, TOLERANCE, VIDEO, Triton, check_refused, failure
-from gateways import Gateway, running
+from gateways import Gateway, poll, running
 from paths import ROOT
 from rfm_client.data.sampling import RULES
 from rfm_gateway.command import gateway_command, page_link
@@ -158,6 +158,14 @@ def test_points_come_before_the_last_one_is_scored(film: Gateway, films: Path) -
     counts = [len(points["progress"]) for name, points in told if name == "scores"]
     assert len(curve_of(told)["progress"]) == clip.NUM_FRAMES
     assert counts == [1, 2, 4, 8, 16, 1]
+
+
+def test_a_caller_who_leaves_frees_what_the_curve_holds(film: Gateway, films: Path) -> None:
+    answered = film.metric("samples_total", sample_type="progress")
+    with post(film.url, SCORE, {"video": films / "film.mp4"}, fps="10", frames="16", **QUESTION) as response:
+        assert next(response.iter_lines()) == b"event: film"
+    poll(lambda: film.metric("requests_in_flight") == 0)
+    assert film.metric("samples_total", sample_type="progress") < answered + clip.NUM_FRAMES
 
 
 def test_a_preference_is_asked_in_both_orders(film: Gateway, films: Path, tmp_path: Path) -> None:

@@ -4,7 +4,7 @@
 const NEAR_S = 0.05; // a video that is so near to a time shows it
 const INSIDE_S = 0.001; // behind the begin of a frame, so that rounding does not show the one before
 
-/** Videos in `host`. `onTime(seconds)` is called when one plays, or when somebody moves it. */
+/** Videos in `host`. `onTime(seconds, film)` is called as long as one plays. The page has the controls. */
 export class Films {
   #host;
   #onTime;
@@ -29,7 +29,7 @@ export class Films {
     const video = document.createElement("video");
     const caption = document.createElement("figcaption");
     const entry = { id: crypto.randomUUID?.() ?? `${Math.random()}`, file, name: file.name, figure, video, wanted: null };
-    Object.assign(video, { src: URL.createObjectURL(file), controls: true, muted: true, playsInline: true, preload: "auto" });
+    Object.assign(video, { src: URL.createObjectURL(file), muted: true, playsInline: true, preload: "auto" });
     video.setAttribute("aria-label", `Video ${file.name}`);
     caption.textContent = file.name;
     video.addEventListener("error", () => {
@@ -76,9 +76,7 @@ export class Films {
 
   #arrived(entry) {
     const { video, wanted } = entry;
-    if (wanted === null) {
-      this.#onTime(video.currentTime, entry); // somebody used the video's own controls
-    } else if (Math.abs(video.currentTime - wanted) > NEAR_S && wanted < video.duration) {
+    if (wanted !== null && Math.abs(video.currentTime - wanted) > NEAR_S && wanted < video.duration) {
       video.currentTime = wanted;
     } else {
       entry.wanted = null;
