@@ -53,6 +53,12 @@ def test_memory_is_told_before_it_is_taken(film: Path) -> None:
         read_video(film, take=refuse)
 
 
+def test_a_file_is_read_as_the_format_that_is_named_alone(film: Path) -> None:
+    np.testing.assert_array_equal(read_video(film, 3, container="mov"), read_video(film, 3))
+    with pytest.raises(InvalidSampleError, match=r"^video: expected a file with a video stream, got "):
+        read_video(film, container="matroska")
+
+
 def test_frames_of_a_variable_rate_are_even_in_number(tmp_path: Path) -> None:
     write_video(tmp_path / "film.mp4", numbered(10), [0, 1, 2, 3, 4, 5, 6, 20, 40, 60])  # 1.6 fps on average
     assert numbers(read_video(tmp_path / "film.mp4"), 10) == list(range(10))

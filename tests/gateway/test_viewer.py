@@ -183,10 +183,12 @@ def test_a_preference_is_asked_in_both_orders(film: Gateway, films: Path, tmp_pa
 
 
 KINDS = "MP4, MOV, WebM, Matroska, Ogg or AVI"
+SESSION = b"v=0\nfree\nc=IN IP4 127.0.0.1\nm=video 5004 RTP/AVP 96\na=rtpmap:96 H264/90000\n"  # to FFmpeg an address
 PLAY_LIST = b"#EXTM3U\n#EXTINF:1,\n/etc/passwd\n"
 BROKEN: dict[str, tuple[bytes | None, dict[str, str], list[str], str]] = {
     "text": (b"no video", {}, ["video"], rf"expected a file of the kind {KINDS}, got another kind \(video\.mp4\)"),
     "a play list": (PLAY_LIST, {}, ["video"], rf"expected a file of the kind {KINDS}, got another kind \(video\.mp4\)"),
+    "disguised": (SESSION, {}, ["video"], r"expected a file with a video stream, got .* \(video\.mp4\)"),
     "cut off": (b"\0\0\0\x18ftypisom", {}, ["video"], r"expected a file with a video stream, got .* \(video\.mp4\)"),
     "nothing": (b"", {}, ["video"], rf"expected a file of the kind {KINDS}, got another kind \(video\.mp4\)"),
     "no task": (None, {"task": " "}, ["task"], "expected what is to be done, as a sentence, got none"),

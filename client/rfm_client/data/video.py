@@ -50,6 +50,7 @@ def read_video(
     end_s: float | None = None,
     timeout_s: float = DOWNLOAD_TIMEOUT_S,
     take: Callable[[int], object] | None = None,
+    container: str | None = None,
 ) -> UInt8Array:
     """uint8 [T, H, W, 3], the frames at ``fps`` of a video file or http(s) URL; None: all of them.
 
@@ -61,6 +62,8 @@ def read_video(
     start_s, end_s: only the frames from here to before there, by their time stamps; None: from the start, to the end
     timeout_s: the longest that the server of a URL may be silent
     take: told how many bytes of memory are taken, before they are; what it raises ends the reading
+    container: FFmpeg's name of the format that the file is read as, for files that nobody vouches for: some formats
+        name other files or addresses, which are then opened; None: whatever it looks like
 
     Raises InvalidSampleError for what is no video, or cannot be had, and for a file of several LeRobot episodes
     (``lerobot``) unless ``start_s`` and ``end_s`` name a part of it.
@@ -75,7 +78,7 @@ def read_video(
         if start_s is None or end_s is None:
             check_film_behind(str(source)) if is_url(source) else check_local_film(source)
         with _opened(source, timeout_s) as file:
-            decoder = _Decoder(av, file, take or _untold)
+            decoder = _Decoder(av, file, take or _untold, container)
             if (start_s, end_s) == (None, None):
                 return _sampled(decoder, fps)
             return _part(decoder, fps, start_s, end_s)
@@ -85,12 +88,15 @@ def read_video(
         raise InvalidSampleError.at("video", _EXPECTED, f"{error.strerror or error} ({source})") from error
 
 
-def frame_times_s(file: str | Path, num_frames: int) -> npt.NDArray[np.float64] | None:
-    """float64 [T], when each of T frames that ``read_video`` took of a file is shown, the first at 0; None: unknown."""
+def frame_times_s(file: str | Path, num_frames: int, *, container: str | None = None) -> npt.NDArray[np.float64] | None:
+    """float64 [T], when each of T frames that ``read_video`` took of a file is shown, the first at 0; None: unknown.
+
+    container: as in ``read_video``
+    """
     import av
 
-    with av.open(str(file)) as container:
-        packets = [packet for packet in container.demux(video=0) if packet.size]
+    with av.open(str(file), format=container) as opened:
+        packets = [packet for packet in opened.demux(video=0) if packet.size]
         times = sorted(float(packet.pts * packet.time_base) for packet in packets if packet.pts is not None)
     if len(times) < num_frames:
         return None
@@ -166,12 +172,13 @@ def _part(decoder: _Decoder, fps: float | None, start_s: float | None, end_s: fl
 
 
 class _Decoder:
-    """Reads a video file with PyAV, from its start each time. take: as in ``read_video``"""
+    """Reads a video file with PyAV, from its start each time. take, container: as in ``read_video``"""
 
-    def __init__(self, av: Any, file: BinaryIO, take: Callable[[int], object]) -> None:
+    def __init__(self, av: Any, file: BinaryIO, take: Callable[[int], object], container: str | None) -> None:
         self._av = av
         self._file = file
         self._take = take
+        self._container = container
 
     def length(self) -> tuple[int, float]:
         """Packets, which are counted since what the container says may be wrong, and frames a second (0: unknown)."""
@@ -206,4 +213,4 @@ class _Decoder:
 
     def _opened(self) -> Any:
         self._file.seek(0)
-        return self._av.open(self._file)
+        return self._av.open(self._file, format=self._container)

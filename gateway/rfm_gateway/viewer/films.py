@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Uploaded videos -> frames. Nobody vouches for them: only kinds of files that name no other files are opened."""
+"""Uploaded videos -> frames.
+
+Nobody vouches for them. So they are read as one of a few formats, by how they begin, and never as what they look like
+to the decoder: a play list or a session description names other files or addresses, which the decoder would open.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +28,7 @@ Times: TypeAlias = npt.NDArray[np.float64]
 KINDS = "MP4, MOV, WebM, Matroska, Ogg or AVI"
 _BEGINNING_BYTES = 12
 _MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
+_EBML, _OGG, _RIFF, _AVI = b"\x1a\x45\xdf\xa3", b"OggS", b"RIFF", b"AVI "
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +50,8 @@ async def read_film(upload: UploadFile, fps: float, take: Callable[[int], object
 def _read(upload: UploadFile, fps: float, take: Callable[[int], object]) -> Film:
     name = upload.filename or "the video"
     upload.file.seek(0)
-    if not _is_film(upload.file.read(_BEGINNING_BYTES)):
+    container = _container(upload.file.read(_BEGINNING_BYTES))
+    if container is None:
         raise InvalidSampleError.at("video", f"a file of the kind {KINDS}", f"another kind ({name})")
     with TemporaryDirectory(prefix="rfm-gateway-") as folder:
         file = Path(folder) / "video"
@@ -53,17 +59,18 @@ def _read(upload: UploadFile, fps: float, take: Callable[[int], object]) -> Film
         with file.open("wb") as copy:
             shutil.copyfileobj(upload.file, copy)
         try:
-            frames = read_video(file, fps, take=take)
-            return Film(frames, frame_times_s(file, len(frames)))
+            frames = read_video(file, fps, take=take, container=container)
+            return Film(frames, frame_times_s(file, len(frames), container=container))
         except InvalidSampleError as error:
             raise InvalidSampleError(str(error).replace(str(file), name)) from None
 
 
-def _is_film(beginning: bytes) -> bool:
-    """Whether a file that begins so is a video by itself.
-
-    Play lists are text that names other files or addresses, which the decoder would open.
-    """
-    is_avi = beginning[:4] == b"RIFF" and beginning[8:12] == b"AVI "
-    is_other = beginning.startswith((b"\x1a\x45\xdf\xa3", b"OggS"))
-    return is_avi or is_other or beginning[4:8] in _MP4_BOXES
+def _container(beginning: bytes) -> str | None:
+    """FFmpeg's name of the format of a video that begins so; None: it is none of KINDS."""
+    if beginning[4:8] in _MP4_BOXES:
+        return "mov"
+    if beginning.startswith(_EBML):
+        return "matroska"
+    if beginning.startswith(_OGG):
+        return "ogg"
+    return "avi" if beginning[:4] == _RIFF and beginning[8:12] == _AVI else None

@@ -41,6 +41,7 @@ from rfm_gateway.viewer.models import Models, names_of
 from rfm_gateway.viewer.question import DEFAULT_FPS, DEFAULT_RULE, Question
 
 STATUS_TIMEOUT_S = 5.0
+_AS_THEY_COME = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}  # the second for proxies that gather answers
 
 logger = logging.getLogger("rfm_gateway")
 
@@ -215,7 +216,7 @@ class _Events(StreamingResponse):
     """Server-sent events. ``held`` ends with the answer, also if nobody reads it."""
 
     def __init__(self, events: AsyncIterator[str], held: ExitStack) -> None:
-        super().__init__(events, media_type="text/event-stream", headers={"Cache-Control": "no-store"})
+        super().__init__(events, media_type="text/event-stream", headers=_AS_THEY_COME)
         self._held = held
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -9,6 +9,7 @@ export class Films {
   #host;
   #onTime;
   #entries = [];
+  #numAdded = 0;
 
   constructor(host, onTime) {
     this.#host = host;
@@ -28,7 +29,7 @@ export class Films {
     const figure = document.createElement("figure");
     const video = document.createElement("video");
     const caption = document.createElement("figcaption");
-    const entry = { id: crypto.randomUUID?.() ?? `${Math.random()}`, file, name: file.name, figure, video, wanted: null };
+    const entry = { id: (this.#numAdded += 1), file, name: file.name, figure, video, wanted: null };
     Object.assign(video, { src: URL.createObjectURL(file), muted: true, playsInline: true, preload: "auto" });
     video.setAttribute("aria-label", `Video ${file.name}`);
     caption.textContent = file.name;
