@@ -87,7 +87,10 @@ export class Films {
   /** Tells the time of a video as long as it plays; of several the first one leads. */
   #follow(entry) {
     const step = () => {
-      if (entry.video.paused || entry.video.ended) return;
+      if (entry.video.paused || entry.video.ended) {
+        if (!this.isPlaying && entry.wanted === null) this.#onTime(entry.video.currentTime, entry); // where it stopped
+        return;
+      }
       const leader = this.#entries.find(({ video }) => !video.paused && !video.ended);
       if (leader === entry && entry.wanted === null) this.#onTime(entry.video.currentTime, entry);
       requestAnimationFrame(step);
