@@ -87,7 +87,7 @@ ops-check: ops-tools
 AS_ROOT = $(shell if [ "$$(id -u)" = 0 ]; then :; elif sudo -n true 2>/dev/null; then echo sudo -n; else echo false; fi)
 MISSING = { echo "make ops-tools: expected $(1) in PATH, got none; install it (Debian, Ubuntu: $(2))" >&2; exit 1; }
 
-# Get the programs of Debian and Ubuntu that tests run: Prometheus, docker-compose.
+# Get the programs of Debian and Ubuntu that tests run: Prometheus, docker-compose, Chromium.
 # Prometheus is unpacked into $(VENV), since its package starts a service when it is installed.
 ops-tools: $(INSTALLED)
 	@test -x $(BIN)/promtool || { command -v promtool && command -v prometheus; } >/dev/null || \
@@ -99,6 +99,10 @@ ops-tools: $(INSTALLED)
 	  { $(AS_ROOT) apt-get update -qq && \
 	  $(AS_ROOT) apt-get install --yes -qq --no-install-recommends docker-compose; } || \
 	  $(call MISSING,docker-compose,apt-get install docker-compose)
+	@{ command -v chromium && command -v chromedriver; } >/dev/null || \
+	  { $(AS_ROOT) apt-get update -qq && \
+	  $(AS_ROOT) apt-get install --yes -qq --no-install-recommends chromium chromium-driver; } || \
+	  $(call MISSING,chromium and chromedriver,apt-get install chromium chromium-driver)
 
 # Report known vulnerabilities of the pinned packages. Needs the network.
 audit: $(INSTALLED)

@@ -6,7 +6,8 @@ from __future__ import annotations
 import logging
 import secrets
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from contextlib import asynccontextmanager
+from contextlib import aclosing, asynccontextmanager
+from functools import partial
 from typing import Annotated, Any
 
 import anyio
@@ -32,6 +33,9 @@ from rfm_gateway.memory import RETRY_AFTER
 from rfm_gateway.observe import CALLER_LEFT, REQUEST_ID_HEADER, Metrics, Observed
 from rfm_gateway.scoring import Scorer
 from rfm_gateway.state import State
+from rfm_gateway.viewer.files import docs_files, viewer_files
+from rfm_gateway.viewer.models import Models
+from rfm_gateway.viewer.routes import Behind, viewer_routes
 
 _KEY_HEADER = APIKeyHeader(name="X-API-Key", auto_error=False)  # FastAPI looks annotations up in the module
 _KEY_BEARER = HTTPBearer(auto_error=False)
@@ -57,26 +61,34 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
     """
     folder = AllowedFolder(config.allow_folder, config.max_body_mib * MIB)
     model, access, metrics = config.model or DEFAULT_MODEL, config.access, Metrics()
-    client = AsyncRewardClient(
+    new_client = partial(
+        AsyncRewardClient,
         config.triton_url,
-        model=model,
         timeout_s=config.timeout,
         retry=False,  # the caller gets the error at once, and decides
         max_in_flight=config.max_in_flight,
         **access.options,
     )
+    client, models = new_client(model=model), Models(lambda name: new_client(model=name))
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        async with client:
+        async with client, aclosing(models):
             yield
 
-    app = FastAPI(title="RFM evaluation gateway", summary="Rewards for robot trajectories.", lifespan=lifespan)
+    title, summary = "RFM evaluation gateway", "Rewards for robot trajectories."
+    app = FastAPI(title=title, summary=summary, lifespan=lifespan, docs_url=None, redoc_url=None)
     app.add_middleware(Observed, metrics=metrics, config=config)
     _allow_origins(app, config.cors_origin)
     state = State(client, config.triton_url, config.metrics_url, model, access)
-    evaluations = _Evaluations(config, Scorer(client, folder, config.timeout), metrics)
-    for router in (_health(state), _guarded(api_key, evaluations, state, metrics)):
+    limits = BodyLimits(config.max_body_mib * MIB, config.max_memory_mib * MIB)
+    evaluations = _Evaluations(config, limits, Scorer(client, folder, config.timeout), metrics)
+    guarded = _guarded(api_key, evaluations, state, metrics)
+    routers = [_health(state), docs_files()]
+    if config.viewer:
+        routers.append(viewer_files())
+        guarded.include_router(viewer_routes(Behind(config, model, models, limits, metrics)))
+    for router in (*routers, guarded):
         app.include_router(router)
     _answer_errors(app)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]  # FastAPI's way to extend it
@@ -98,8 +110,8 @@ def _allow_origins(app: FastAPI, origins: Sequence[str]) -> None:
 class _Evaluations:
     """Reads requests within the limits, has them scored, and counts their samples."""
 
-    def __init__(self, config: GatewayConfig, scorer: Scorer, metrics: Metrics) -> None:
-        self._limits = BodyLimits(config.max_body_mib * MIB, config.max_memory_mib * MIB)
+    def __init__(self, config: GatewayConfig, limits: BodyLimits, scorer: Scorer, metrics: Metrics) -> None:
+        self._limits = limits
         self._timeout_s = config.timeout
         self._scorer = scorer
         self._metrics = metrics

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import re
 import reprlib
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
@@ -28,6 +28,8 @@ from rfm_gateway.memory import Memory, Share
 from rfm_gateway.npy import Upload, read_npy
 
 NPY_ENDPOINT = "/evaluate_batch_npy"
+SCORE_ENDPOINT, COMPARE_ENDPOINT = "/viewer/score", "/viewer/compare"  # of the page
+MULTIPART_ENDPOINTS = (NPY_ENDPOINT, SCORE_ENDPOINT, COMPARE_ENDPOINT)
 MAX_PARTS = 10_000  # files, and fields, of one multipart request
 MAX_SAMPLES = 10_000  # of one request
 MAX_JSON_BYTES = 32 * 2**20  # arrays have a better way
@@ -78,7 +80,7 @@ class Admitted:
     async def wait_for_room(self, deadline: Deadline) -> None:
         """Waits until there is memory for the announced body. Raises HTTPException 503."""
         announced = self.request.headers.get("content-length", "")
-        growth = 1 if self.request.url.path.endswith(NPY_ENDPOINT) else READ_JSON_GROWTH
+        growth = 1 if _is_multipart(self.request) else READ_JSON_GROWTH
         await self.share.reserve(int(announced) * growth if announced.isdecimal() else 0, deadline)
 
 
@@ -93,24 +95,35 @@ async def read_multipart(admitted: Admitted) -> Batch:
 
     Raises RequestValidationError, HTTPException.
     """
-    form = await _Form(admitted).parse()
-    try:
-        uploads: dict[str, Upload] = {}
-        fields: dict[str, str] = {}
-        for name, value in form.multi_items():
-            if name in uploads or name in fields:
-                raise invalid((name,), "expected one part of this name, got several")
-            if not isinstance(value, UploadFile):
-                fields[name] = value
-            elif name == _STEPS_FIELD or _ANY_SAMPLE_FIELD.fullmatch(name):
+    async with parts_of(admitted) as (fields, uploads):
+        for name in uploads:
+            if name == _STEPS_FIELD or _ANY_SAMPLE_FIELD.fullmatch(name):
                 raise invalid((name,), "expected a form field, got a file")
-            else:
-                uploads[name] = value
         json_bytes = sum(map(len, fields.values()))
         if json_bytes > MAX_JSON_BYTES:
             raise HTTPException(413, f"body: expected at most {MAX_JSON_BYTES} bytes of JSON, got more")
         num_bytes = json_bytes + sum(upload.size or 0 for upload in uploads.values())
         return await off_loop(num_bytes, _of_form, fields, uploads, admitted.share)
+
+
+@asynccontextmanager
+async def parts_of(admitted: Admitted) -> AsyncIterator[tuple[dict[str, str], dict[str, UploadFile]]]:
+    """Fields and files of a multipart request by name; the files are there as long as the context lasts.
+
+    Raises RequestValidationError for two of one name, HTTPException.
+    """
+    form = await _Form(admitted).parse()
+    try:
+        uploads: dict[str, UploadFile] = {}
+        fields: dict[str, str] = {}
+        for name, value in form.multi_items():
+            if name in uploads or name in fields:
+                raise invalid((name,), "expected one part of this name, got several")
+            if isinstance(value, UploadFile):
+                uploads[name] = value
+            else:
+                fields[name] = value
+        yield fields, uploads
     finally:
         await form.close()
 
@@ -215,7 +228,7 @@ class BodyLimits:
 
 def _ending(request: Request) -> bytes:
     """The bytes with which a multipart body ends; empty for the JSON endpoint."""
-    if not request.url.path.endswith(NPY_ENDPOINT):
+    if not _is_multipart(request):
         return b""
     kind, options = parse_options_header(request.headers.get("content-type", ""))
     if kind != b"multipart/form-data" or not options.get(b"boundary"):
@@ -228,6 +241,10 @@ def _ending(request: Request) -> bytes:
             415, f"content-type: expected a charset of utf-8, us-ascii or iso-8859-1, got {reprlib.repr(charset)}"
         )
     return b"--" + options[b"boundary"] + b"--"
+
+
+def _is_multipart(request: Request) -> bool:
+    return request.url.path.endswith(MULTIPART_ENDPOINTS)
 
 
 def _flag(value: Any, flags: Mapping[str, bool] = _FLAGS) -> bool:

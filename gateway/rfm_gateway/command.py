@@ -43,6 +43,8 @@ def gateway(*, given: Given) -> None:
     host = config.host or DEFAULT_HOST
     if api_key is None and not is_loopback(host):
         logger.warning("%s is no loopback address, and no key is required: whoever reaches it may use it", host)
+    if config.viewer:
+        logger.info("look at rewards in the browser: %s", page_link(config))
     uvicorn.run(
         app,
         host=host,
@@ -60,6 +62,17 @@ def gateway_command(config: GatewayConfig) -> list[str]:
     words = []
     for name, each in settings_of(GatewayConfig).items():
         value = getattr(config, name)
+        if isinstance(value, bool):
+            words.append(each.option if value else each.no_option)
+            continue
         values = value if isinstance(value, tuple) else () if value is None else (value,)
         words += [word for value in values for word in (each.option, str(value))]
     return [sys.executable, "-m", "rfm_gateway", *words]
+
+
+def page_link(config: GatewayConfig) -> str:
+    """Where a browser on this machine, or one that may reach the address, finds the page."""
+    host = config.host or DEFAULT_HOST
+    shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
+    scheme = "http" if config.certificate is None else "https"
+    return f"{scheme}://{shown}:{config.port or DEFAULT_PORT}/"

@@ -50,6 +50,7 @@ class GatewayConfig(Settings):
     max_memory_mib: int = setting(1024, "What all requests under way may hold; others wait.", least=1)
     max_in_flight: int = setting(256, "Evaluations at a time; others wait.", least=1)
     max_waiting: int = setting(1024, "Evaluations that wait for their turn; more are refused with 503.", least=0)
+    viewer: bool = setting(True, "Serve the page in the browser, at /.")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -16,11 +16,11 @@ from rfm_client.contract.errors import DeadlineExceededError
 from rfm_client.contract.names import PROBE_PREFIX
 from rfm_client.contract.wire import REQUEST_ID
 from rfm_client.transport.deadline import Deadline, timeout
-from rfm_gateway.body import NPY_ENDPOINT
+from rfm_gateway.body import MULTIPART_ENDPOINTS
 from rfm_gateway.config import GatewayConfig
 from rfm_gateway.memory import RETRY_AFTER
 
-EVALUATIONS = ("/evaluate_batch", NPY_ENDPOINT)
+EVALUATIONS = ("/evaluate_batch", *MULTIPART_ENDPOINTS)
 ENDPOINTS = (*EVALUATIONS, "/gpu_status", "/health", "/model_info", "/metrics")
 CALLER_LEFT = 499  # as other servers log it; nobody reads the answer
 REJECTIONS = {

@@ -47,7 +47,7 @@ def with_options(
             for name, parameter in inspect.signature(command).parameters.items()
             if name != into
         ]
-        added = [_option(prefix + each.name, each, each.name in required) for each in chosen]
+        added = [_option(prefix, each, each.name in required) for each in chosen]
         run.__signature__ = inspect.Signature([*kept, *added])  # type: ignore[attr-defined]  # what typer reads
         run.__annotations__ = {parameter.name: parameter.annotation for parameter in (*kept, *added)}
         return run
@@ -62,16 +62,29 @@ def refused(error: ConfigError, settings: type[Settings]) -> typer.BadParameter:
     return typer.BadParameter(f"{names}: {error.expected}")
 
 
-def _option(name: str, setting: Setting, is_required: bool) -> inspect.Parameter:
+def _option(prefix: str, setting: Setting, is_required: bool) -> inspect.Parameter:
     """A parameter that is None if the option is not given: a file or the settings' own default then decides."""
     default = inspect.Parameter.empty if is_required else None
     shown = False if setting.default in (None, ()) else str(setting.default)
-    option = typer.Option(help=setting.help, min=setting.least, max=setting.most, show_default=shown)
+    option = typer.Option(
+        *_switch(prefix, setting), help=setting.help, min=setting.least, max=setting.most, show_default=shown
+    )
     kind = list[str] if setting.kind == Texts else setting.kind
     optional = kind if is_required or isinstance(kind, types.UnionType) else kind | None
     return inspect.Parameter(
-        name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[optional, option]
+        prefix + setting.name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=default,
+        annotation=Annotated[optional, option],
     )
+
+
+def _switch(prefix: str, setting: Setting) -> tuple[str, ...]:
+    """The names of both options of a setting that is true or false; none for others, which typer names itself."""
+    if setting.kind is not bool:
+        return ()
+    begin = "--" + prefix.replace("_", "-")
+    return (f"{setting.option.replace('--', begin, 1)}/{setting.no_option.replace('--', begin, 1)}",)
 
 
 def _value(value: Any) -> Any:

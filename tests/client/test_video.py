@@ -40,6 +40,25 @@ def test_a_frame_rate_is_a_number_above_0(film: Path, fps: float) -> None:
         read_video(film, fps)
 
 
+def test_memory_is_told_before_it_is_taken(film: Path) -> None:
+    frame_bytes = clip.SIZE_PX**2 * 3
+    told: list[int] = []
+    frames = read_video(film, 1, take=told.append)
+    assert told == [*[frame_bytes] * len(frames), frames.nbytes]
+
+    def refuse(num_bytes: int) -> None:
+        raise MemoryError(num_bytes)
+
+    with pytest.raises(MemoryError, match=f"^{frame_bytes}$"):
+        read_video(film, take=refuse)
+
+
+def test_a_file_is_read_as_the_format_that_is_named_alone(film: Path) -> None:
+    np.testing.assert_array_equal(read_video(film, 3, container="mov"), read_video(film, 3))
+    with pytest.raises(InvalidSampleError, match=r"^video: expected a file with a video stream, got "):
+        read_video(film, container="matroska")
+
+
 def test_frames_of_a_variable_rate_are_even_in_number(tmp_path: Path) -> None:
     write_video(tmp_path / "film.mp4", numbered(10), [0, 1, 2, 3, 4, 5, 6, 20, 40, 60])  # 1.6 fps on average
     assert numbers(read_video(tmp_path / "film.mp4"), 10) == list(range(10))

@@ -251,10 +251,14 @@ def test_a_gateway_s_settings_without_a_gateway_are_told_by_serve(told: Any, tmp
 
 
 def options_of(command: list[str]) -> dict[str, list[str]]:
-    words = iter(command[3:])
+    """The values of each option; none of one that is a switch."""
     found: dict[str, list[str]] = {}
-    for name in words:
-        found.setdefault(name, []).append(next(words))
+    for word in command[3:]:
+        if word.startswith("--"):
+            name = word
+            found.setdefault(name, [])
+        else:
+            found[name].append(word)
     return found
 
 
@@ -285,11 +289,13 @@ def test_every_setting_of_a_gateway_is_an_option_of_serve(told: Any, tmp_path: P
         "max_waiting": "0",
     }
     files = {"certificate", "key", "triton_ca_file", "triton_certificate", "triton_key"}  # which a gateway would read
-    assert given.keys() | files == settings_of(GatewayConfig).keys()
+    assert given.keys() | files | {"viewer"} == settings_of(GatewayConfig).keys()
     words = [word for name, value in given.items() for word in (f"--gateway-{name.replace('_', '-')}", value)]
-    started, lines = told("--repository", str(REPOSITORY), *words)
-    assert lines == []
-    assert options_of(started["gateway"]) == {f"--{name.replace('_', '-')}": [value] for name, value in given.items()}
+    options = {f"--{name.replace('_', '-')}": [value] for name, value in given.items()}
+    for switch in ("viewer", "no-viewer"):
+        started, lines = told("--repository", str(REPOSITORY), *words, f"--gateway-{switch}")
+        assert lines == []
+        assert options_of(started["gateway"]) == {**options, f"--{switch}": []}
 
 
 @pytest.mark.parametrize(

@@ -291,6 +291,8 @@ def test_every_key_is_documented_under_its_lifetime_with_its_option_and_default(
 def shown(setting: Setting) -> str:
     """A default as the document spells it."""
     value = setting.default
+    if isinstance(value, bool):
+        return str(value).lower()
     return "null" if value is None else "none" if value == () else f"{value:g}" if type(value) is float else str(value)
 
 

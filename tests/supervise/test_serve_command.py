@@ -12,12 +12,15 @@ import socket
 import subprocess
 import sysconfig
 from pathlib import Path
+from urllib.parse import urlsplit
 
+import httpx
 import numpy as np
 import pytest
 
 import clip
 from commands import EXIT_S, REPOSITORY, RFM, command, nothing_left_behind, wait_for_http
+from gateways import answers, poll
 from rfm.launch import installation
 from rfm.launch.installation import ServerStartError, find_installation
 from rfm.launch.process import Endpoints, TritonServer
@@ -110,6 +113,17 @@ def test_neither_triton_nor_a_model_process_has_a_key_in_its_environment(
         assert [word for word in environment(gateway) if "a-secret-of-" in word] == [
             f"RFM_GATEWAY_API_KEY={keys['RFM_GATEWAY_API_KEY']}"
         ]
+
+
+def test_the_page_of_a_gateway_beside_triton_is_where_its_link_says(tmp_path: Path) -> None:
+    repository = tmp_path / "model_repository"
+    shutil.copytree(REPOSITORY, repository)
+    link = f"http://127.0.0.1:{Endpoints.free().http_port}/"
+    with serving(repository, f"--gateway-port={urlsplit(link).port}") as served:
+        served.wait_ready()
+        poll(lambda: f"look at rewards in the browser: {link}\n" in served.log.read_text())
+        poll(lambda: answers(link.rstrip("/")))
+        assert "<title>Rewards of robot videos</title>" in httpx.get(link).text
 
 
 def test_a_model_that_cannot_be_loaded_is_named(tmp_path: Path) -> None:

@@ -29,15 +29,16 @@ def render() -> UInt8Array:
     return np.stack([_frame(time) for time in np.linspace(0, len(_WAYPOINTS) - 1, NUM_FRAMES)])
 
 
-def write(file: Path) -> None:
-    """Writes the clip as a video file."""
+def write(file: Path, frames: UInt8Array | None = None, fps: int = FPS) -> None:
+    """Writes the clip, or other frames, as a video file."""
     import av
 
     with av.open(str(file), "w") as container:
-        stream = container.add_stream("libx264", rate=Fraction(FPS))
-        stream.width = stream.height = SIZE_PX
+        stream = container.add_stream("libx264", rate=Fraction(fps))
+        images = render() if frames is None else frames
+        stream.height, stream.width = images.shape[1:3]
         stream.pix_fmt = "yuv420p"
-        for image in render():
+        for image in images:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode())
 

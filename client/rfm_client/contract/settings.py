@@ -49,6 +49,11 @@ class Setting:
         """The option of this setting, in a command that has no other settings of that name."""
         return f"--{self.name.replace('_', '-')}"
 
+    @property
+    def no_option(self) -> str:
+        """The option that says no, of a setting that is true or false."""
+        return f"--no-{self.name.replace('_', '-')}"
+
     def from_plain(self, value: Any) -> Any:
         """The value that YAML or JSON spells so. Raises ConfigError for one of another type."""
         kinds = typing.get_args(self.kind) if isinstance(self.kind, types.UnionType) else (self.kind,)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from http.client import HTTPException
 from pathlib import Path
@@ -24,6 +24,7 @@ from rfm_client.data.lerobot import check_film_behind, check_local_film
 DOWNLOAD_TIMEOUT_S = 60.0
 
 _EXPECTED = "a file with a video stream"
+_RGB_BYTES = 3  # of a pixel
 
 
 def frame_indices(total: int, native_fps: float, fps: float) -> npt.NDArray[np.int64]:
@@ -48,6 +49,8 @@ def read_video(
     start_s: float | None = None,
     end_s: float | None = None,
     timeout_s: float = DOWNLOAD_TIMEOUT_S,
+    take: Callable[[int], object] | None = None,
+    container: str | None = None,
 ) -> UInt8Array:
     """uint8 [T, H, W, 3], the frames at ``fps`` of a video file or http(s) URL; None: all of them.
 
@@ -58,6 +61,9 @@ def read_video(
 
     start_s, end_s: only the frames from here to before there, by their time stamps; None: from the start, to the end
     timeout_s: the longest that the server of a URL may be silent
+    take: told how many bytes of memory are taken, before they are; what it raises ends the reading
+    container: FFmpeg's name of the format that the file is read as, for files that nobody vouches for: some formats
+        name other files or addresses, which are then opened; None: whatever it looks like
 
     Raises InvalidSampleError for what is no video, or cannot be had, and for a file of several LeRobot episodes
     (``lerobot``) unless ``start_s`` and ``end_s`` name a part of it.
@@ -72,19 +78,25 @@ def read_video(
         if start_s is None or end_s is None:
             check_film_behind(str(source)) if is_url(source) else check_local_film(source)
         with _opened(source, timeout_s) as file:
-            return _part(av, file, fps, start_s, end_s) if (start_s, end_s) != (None, None) else _sampled(av, file, fps)
+            decoder = _Decoder(av, file, take or _untold, container)
+            if (start_s, end_s) == (None, None):
+                return _sampled(decoder, fps)
+            return _part(decoder, fps, start_s, end_s)
     except InvalidSampleError as error:
         raise InvalidSampleError(f"{error} ({source})") from error
     except (av.FFmpegError, OSError) as error:
         raise InvalidSampleError.at("video", _EXPECTED, f"{error.strerror or error} ({source})") from error
 
 
-def frame_times_s(file: str | Path, num_frames: int) -> npt.NDArray[np.float64] | None:
-    """float64 [T], when each of T frames that ``read_video`` took of a file is shown, the first at 0; None: unknown."""
+def frame_times_s(file: str | Path, num_frames: int, *, container: str | None = None) -> npt.NDArray[np.float64] | None:
+    """float64 [T], when each of T frames that ``read_video`` took of a file is shown, the first at 0; None: unknown.
+
+    container: as in ``read_video``
+    """
     import av
 
-    with av.open(str(file)) as container:
-        packets = [packet for packet in container.demux(video=0) if packet.size]
+    with av.open(str(file), format=container) as opened:
+        packets = [packet for packet in opened.demux(video=0) if packet.size]
         times = sorted(float(packet.pts * packet.time_base) for packet in packets if packet.pts is not None)
     if len(times) < num_frames:
         return None
@@ -120,62 +132,85 @@ def _download(url: str, file: BinaryIO, timeout_s: float) -> None:
         raise InvalidSampleError.at("video", _EXPECTED, str(error)) from error
 
 
-def _sampled(av: Any, file: BinaryIO, fps: float | None) -> UInt8Array:
+def _untold(_num_bytes: int) -> None:
+    """For callers who do not ask how much memory is taken."""
+
+
+def _sampled(decoder: _Decoder, fps: float | None) -> UInt8Array:
     """The frames at ``fps``, decoded once if each packet holds one frame, as nearly always, and else once more."""
-    num_packets, native_fps = _length(av, file)
+    num_packets, native_fps = decoder.length()
     if fps is None:
         fps = native_fps = 1.0
     if not native_fps:
         raise InvalidSampleError.at("video", "a frame rate", "none")
-    frames, total = _decoded(av, file, frame_indices(num_packets, native_fps, fps).tolist())
+    frames, total = decoder.frames(frame_indices(num_packets, native_fps, fps).tolist())
     if total != num_packets:
-        frames, total = _decoded(av, file, frame_indices(total, native_fps, fps).tolist())
+        frames, total = decoder.frames(frame_indices(total, native_fps, fps).tolist())
     if not total:
         raise InvalidSampleError.at("video", "at least one frame", "none")
     if len({frame.shape for frame in frames}) > 1:
         raise InvalidSampleError.at("video", "frames of one size", "several")
-    return np.stack(frames)
+    return decoder.stacked(frames)
 
 
-def _part(av: Any, file: BinaryIO, fps: float | None, start_s: float | None, end_s: float | None) -> UInt8Array:
+def _part(decoder: _Decoder, fps: float | None, start_s: float | None, end_s: float | None) -> UInt8Array:
     """The frames at ``fps`` of the part from ``start_s`` to before ``end_s``, within half a frame."""
-    num_packets, native_fps = _length(av, file)
+    num_packets, native_fps = decoder.length()
     if not native_fps:
         raise InvalidSampleError.at("video", "a frame rate", "none")
-    file.seek(0)
-    with av.open(file) as container:
-        packets = [packet for packet in container.demux(video=0) if packet.size and packet.pts is not None]
-        times_s = np.sort([float(packet.pts * packet.time_base) for packet in packets])
+    times_s = decoder.times_s()
     half_s = 0.5 / native_fps
     first, end = np.searchsorted(times_s, [(start_s or 0.0) - half_s, (math.inf if end_s is None else end_s) - half_s])
     if first >= end:
         got = f"{start_s} to {end_s} of {times_s[-1] if len(times_s) else 0.0:g} s"
         raise InvalidSampleError.at("start_s to end_s", "a part with frames", got)
     native_fps, fps = (1.0, 1.0) if fps is None else (native_fps, fps)
-    frames, total = _decoded(av, file, (first + frame_indices(int(end - first), native_fps, fps)).tolist())
+    frames, total = decoder.frames((first + frame_indices(int(end - first), native_fps, fps)).tolist())
     if total != num_packets or len(times_s) != total:
         raise InvalidSampleError.at("video", f"{num_packets} frames with time stamps", str(total))
-    return np.stack(frames)
+    return decoder.stacked(frames)
 
 
-def _length(av: Any, file: BinaryIO) -> tuple[int, float]:
-    """Packets, which are counted since what the container says may be wrong, and frames a second (0: unknown)."""
-    file.seek(0)
-    with av.open(file) as container:
-        if not container.streams.video:
-            raise InvalidSampleError.at("video", _EXPECTED, "none")
-        stream = container.streams.video[0]
-        return sum(1 for packet in container.demux(stream) if packet.size), float(stream.average_rate or 0)
+class _Decoder:
+    """Reads a video file with PyAV, from its start each time. take, container: as in ``read_video``"""
 
+    def __init__(self, av: Any, file: BinaryIO, take: Callable[[int], object], container: str | None) -> None:
+        self._av = av
+        self._file = file
+        self._take = take
+        self._container = container
 
-def _decoded(av: Any, file: BinaryIO, indices: Collection[int]) -> tuple[list[UInt8Array], int]:
-    """The frames of these indices, and how many there are in all."""
-    wanted, picked, total = set(indices), [], 0
-    file.seek(0)
-    with av.open(file) as container:
-        for frame in container.decode(video=0):
-            if total in wanted:
-                image = frame.to_ndarray(format="rgb24")
-                picked.append(np.rot90(image, round(frame.rotation / 90)))  # both count counter-clockwise
-            total += 1
-    return picked, total
+    def length(self) -> tuple[int, float]:
+        """Packets, which are counted since what the container says may be wrong, and frames a second (0: unknown)."""
+        with self._opened() as container:
+            if not container.streams.video:
+                raise InvalidSampleError.at("video", _EXPECTED, "none")
+            stream = container.streams.video[0]
+            return sum(1 for packet in container.demux(stream) if packet.size), float(stream.average_rate or 0)
+
+    def times_s(self) -> npt.NDArray[np.float64]:
+        """float64 [T], the time stamps of the packets that have one, in order."""
+        with self._opened() as container:
+            packets = [packet for packet in container.demux(video=0) if packet.size and packet.pts is not None]
+            return np.sort([float(packet.pts * packet.time_base) for packet in packets])
+
+    def frames(self, indices: Collection[int]) -> tuple[list[UInt8Array], int]:
+        """The frames of these indices, and how many there are in all."""
+        wanted, picked, total = set(indices), [], 0
+        with self._opened() as container:
+            for frame in container.decode(video=0):
+                if total in wanted:
+                    self._take(frame.width * frame.height * _RGB_BYTES)
+                    image = frame.to_ndarray(format="rgb24")
+                    picked.append(np.rot90(image, round(frame.rotation / 90)))  # both count counter-clockwise
+                total += 1
+        return picked, total
+
+    def stacked(self, frames: list[UInt8Array]) -> UInt8Array:
+        """uint8 [T, H, W, 3], the frames in one array."""
+        self._take(sum(frame.nbytes for frame in frames))
+        return np.stack(frames)
+
+    def _opened(self) -> Any:
+        self._file.seek(0)
+        return self._av.open(self._file, format=self._container)

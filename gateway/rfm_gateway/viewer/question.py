@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: MIT
+"""What the page asks: the fields of its forms."""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from rfm_client.contract.samples import MAX_FRAME_STEPS
+from rfm_client.data.sampling import RULES, Rule, Sampling
+from rfm_gateway.body import invalid
+
+DEFAULT_FPS = 3.0  # as rfm-client score has it
+DEFAULT_RULE: Rule = "rint_pad"  # what RL loops show the model
+_FLAGS = {"true": True, "false": False, "": False}
+
+
+@dataclass(frozen=True)
+class Question:
+    """How videos are scored.
+
+    fps: frames a second that are taken of a video; frames: K of the rule, None: as the checkpoint was trained
+    resize: frames are made as small as the checkpoint reads them
+    """
+
+    task: str
+    model: str
+    fps: float
+    rule: Rule
+    frames: int | None
+    resize: bool
+
+    @classmethod
+    def of(cls, fields: Mapping[str, str], default_model: str) -> Question:
+        """The question of a form. Raises RequestValidationError for a field that is not allowed."""
+        rule = fields.get("sampling") or DEFAULT_RULE
+        if rule not in RULES:
+            raise invalid(("sampling",), f"expected one of {', '.join(RULES)}, got {reprlib.repr(rule)}")
+        if not fields.get("task", "").strip():
+            raise invalid(("task",), "expected what is to be done, as a sentence, got none")
+        resize = fields.get("resize", "")
+        if resize not in _FLAGS:
+            raise invalid(("resize",), f"expected true or false, got {reprlib.repr(resize)}")
+        return cls(
+            task=fields["task"].strip(),
+            model=fields.get("model") or default_model,
+            fps=_fps(fields.get("fps") or str(DEFAULT_FPS)),
+            rule=rule,
+            frames=_frames(fields.get("frames", "").strip()),
+            resize=_FLAGS[resize],
+        )
+
+    def sampling(self, trained_frames: int | None) -> Sampling:
+        """The rule with its frames. Raises RequestValidationError for a number that the rule does not take."""
+        try:
+            return Sampling.of(self.rule, self.frames, trained_frames)
+        except ValueError as error:
+            where, _, message = str(error).partition(": ")
+            raise invalid((where,), message) from None
+
+
+def _fps(text: str) -> float:
+    try:
+        fps = float(text)
+    except ValueError:
+        fps = math.nan
+    if not 0 < fps < math.inf:
+        raise invalid(("fps",), f"expected a number above 0, got {reprlib.repr(text)}")
+    return fps
+
+
+def _frames(text: str) -> int | None:
+    if not text:
+        return None
+    if not (text.isascii() and text.isdecimal() and len(text) < 6 and 0 < int(text) <= MAX_FRAME_STEPS):
+        raise invalid(("frames",), f"expected a whole number from 1 to {MAX_FRAME_STEPS}, got {reprlib.repr(text)}")
+    return int(text)

@@ -1,0 +1,75 @@
+// SPDX-License-Identifier: MIT
+// Asks the gateway. Every error is an Error whose message reads `where: expected X, got Y`.
+
+/** An answer that wants the gateway's key. */
+export class KeyWanted extends Error {}
+
+let key = "";
+
+/** From now on, requests show this key. */
+export function useKey(text) {
+  key = text;
+}
+
+/** Which models are served, and what may be asked of them. */
+export async function served() {
+  return (await answer("viewer/served")).json();
+}
+
+/** What the model prefers of two videos, asked in both orders. */
+export async function compare(form, signal) {
+  return (await answer("viewer/compare", { method: "POST", body: form, signal })).json();
+}
+
+/** Scores a video, and calls `onEvent(name, document)` with each event as it comes. */
+export async function score(form, signal, onEvent) {
+  const response = await answer("viewer/score", { method: "POST", body: form, signal });
+  let isOver = false;
+  for await (const [name, document] of events(response.body)) {
+    if (name === "failed") throw new Error(document.detail);
+    isOver ||= name === "done";
+    onEvent(name, document);
+  }
+  if (!isOver) throw new Error("gateway: expected all points, got an answer that breaks off");
+}
+
+async function answer(path, options = {}) {
+  const headers = key ? { "X-API-Key": key } : {};
+  let response;
+  try {
+    response = await fetch(path, { ...options, headers });
+  } catch (error) {
+    if (error.name === "AbortError") throw error;
+    throw new Error(`gateway: expected an answer, got none (${error.message})`);
+  }
+  if (response.ok) return response;
+  const reason = await reasonOf(response);
+  throw response.status === 401 ? new KeyWanted(reason) : new Error(reason);
+}
+
+async function reasonOf(response) {
+  try {
+    const { detail } = await response.json();
+    if (typeof detail === "string") return detail;
+    return detail.map(({ loc, msg }) => `${loc.slice(1).join(".")}: ${msg}`).join("; ");
+  } catch {
+    return `gateway: expected an answer, got the status ${response.status}`;
+  }
+}
+
+/** The server-sent events of a body, as [name, document]. */
+async function* events(body) {
+  const reader = body.pipeThrough(new TextDecoderStream()).getReader();
+  let text = "";
+  for (;;) {
+    const { value, done } = await reader.read();
+    if (done) return;
+    text += value;
+    const whole = text.split("\n\n");
+    text = whole.pop();
+    for (const each of whole) {
+      const fields = Object.fromEntries(each.split("\n").map((line) => line.split(/: (.*)/s, 2)));
+      yield [fields.event, JSON.parse(fields.data)];
+    }
+  }
+}

@@ -1,0 +1,30 @@
+// SPDX-License-Identifier: MIT
+// Which of two videos does a task better: the model is asked in both orders, and both answers are shown.
+
+import { shown } from "./table.js";
+
+const EVEN = 0.5;
+
+/** Writes what the model says of a pair into `host`. verdict: films, task, model, answer of the gateway */
+export function addVerdict(host, { films, task, model, answer }) {
+  const names = Object.fromEntries(["first", "second"].map((side, index) => [side, films[index].name]));
+  const list = document.createElement("ul");
+  for (const { asked, preference } of answer.orders) {
+    const [one, other] = asked.map((side) => names[side]);
+    list.append(element("li", `Asked as ${one}, then ${other}: P(${one} is better) = ${shown(preference)}`));
+  }
+  const [forth, back] = answer.orders.map(({ preference }) => preference > EVEN);
+  const better = forth ? names.first : names.second;
+  const verdict = forth === back
+    ? "The model contradicts itself: its answer depends on the order."
+    : `Both orders agree: ${better} is better.`;
+  const box = document.createElement("div");
+  box.append(element("h3", `${task} (${model})`), list, element("p", verdict));
+  host.append(box);
+}
+
+function element(name, text) {
+  const made = document.createElement(name);
+  made.textContent = text;
+  return made;
+}

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: MIT
+"""Chromium without a window, which reaches this machine alone, and what it has asked for and complained about."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from selenium.webdriver import Chrome, ChromeOptions
+from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.common.by import By
+from selenium.webdriver.remote.webelement import WebElement
+
+from gateways import poll
+
+WINDOW_PX = (1280, 1400)
+QUIET = (  # nothing but the page asks for anything
+    "--disable-background-networking", "--disable-component-update", "--disable-default-apps", "--disable-sync",
+    "--no-first-run", "--no-default-browser-check", "--disable-features=OptimizationHints,MediaRouter",
+    "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",
+)  # fmt: skip
+
+
+class Browser:
+    """A page in Chromium."""
+
+    def __init__(self, driver: Chrome) -> None:
+        self.driver = driver
+        self._asked: list[str] = []
+
+    def open(self, url: str) -> None:
+        self.driver.get(url)
+
+    def __getitem__(self, name: str) -> WebElement:
+        """The element of this id."""
+        return self.driver.find_element(By.ID, name)
+
+    def all(self, selector: str) -> list[WebElement]:
+        return self.driver.find_elements(By.CSS_SELECTOR, selector)
+
+    def run(self, script: str, *arguments: Any) -> Any:
+        return self.driver.execute_script(script, *arguments)
+
+    def write(self, name: str, text: str) -> None:
+        self[name].clear()
+        self[name].send_keys(text)
+
+    def drop(self, files: Sequence[Path]) -> None:
+        """Drops files onto the page, as a person does with the mouse."""
+        data = {"items": [], "files": [str(file) for file in files], "dragOperationsMask": 1}
+        box = self["drop"].rect
+        for kind in ("dragEnter", "dragOver", "drop"):
+            event = {"type": kind, "x": box["x"] + 20, "y": box["y"] + 20, "data": data}
+            self.driver.execute_cdp_cmd("Input.dispatchDragEvent", event)
+
+    def until(self, script: str) -> Any:
+        """What a script gives, once it gives anything."""
+        found: list[Any] = []
+
+        def is_there() -> bool:
+            found[:] = [self.run(f"return {script}")]
+            return bool(found[0])
+
+        poll(is_there)
+        return found[0]
+
+    def complaints(self) -> list[str]:
+        """What the console has shown since the last time: errors, and what the policy of the page forbids."""
+        return [entry["message"] for entry in self.driver.get_log("browser") if entry["level"] == "SEVERE"]
+
+    def asked(self) -> list[str]:
+        """The addresses of all requests."""
+        for entry in self.driver.get_log("performance"):
+            message = json.loads(entry["message"])["message"]
+            if message["method"] == "Network.requestWillBeSent":
+                self._asked.append(message["params"]["request"]["url"])
+        return self._asked
+
+
+@contextmanager
+def chromium(downloads: Path, *options: str) -> Iterator[Browser]:
+    """A browser that saves files in a folder."""
+    programs = [shutil.which(name) for name in ("chromium", "chromedriver")]
+    assert all(programs), "expected chromium and chromedriver in PATH, got none: make ops-tools"
+    chosen = ChromeOptions()
+    chosen.binary_location = str(programs[0])
+    width, height = WINDOW_PX
+    is_root = ["--no-sandbox"] if os.geteuid() == 0 else []
+    for option in (
+        "--headless=new",
+        f"--window-size={width},{height}",
+        "--disable-dev-shm-usage",
+        *is_root,
+        *QUIET,
+        *options,
+    ):
+        chosen.add_argument(option)
+    chosen.add_experimental_option("prefs", {"download.default_directory": str(downloads)})
+    chosen.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    driver = Chrome(options=chosen, service=Service(str(programs[1])))
+    try:
+        yield Browser(driver)
+    finally:
+        driver.quit()
