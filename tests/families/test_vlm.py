@@ -395,3 +395,15 @@ def test_a_sample_that_does_not_fit_in_memory_fails_alone(monkeypatch: pytest.Mo
     assert isinstance(failed, InferenceFailedError)
     assert str(failed) == "the sample does not fit in the device's memory"
     assert_close(first, last, MIXED_TOLERANCE)
+
+
+@pytest.mark.parametrize("name", ["q3_tok_disc10", "q25_video_avg_disc10"])
+def test_dense_mode_encodes_each_shot_once(name: str) -> None:
+    """Of a video a shot is a pair of frames; 5 of its frames, 4 at a time, make the pairs that are counted here."""
+    frames = np.random.default_rng(0).integers(0, 256, (5, 56, 84, 3), np.uint8)
+    engine, execution = load_engine(name), Execution()
+    (result,) = engine.evaluate([ProgressSample(Trajectory(frames=frames, task="stack"), frame_steps=4)], execution)
+    assert isinstance(result, ProgressResult)
+    shown = [np.linspace(0, t, 4).astype(int) for t in range(5)]
+    pairs = {tuple(pair) for picked in shown for pair in picked.reshape(-1, 2).tolist()}
+    assert execution.num_encoded == (5 if name.startswith("q3") else 2 * len(pairs))
