@@ -48,7 +48,7 @@ HASHES = re.compile(r"( --hash=sha256:[0-9a-f]{64})+")
 STEP = re.compile(r"/source/docker/install\.sh ([a-z]+ /.*)$", re.MULTILINE)
 VARIABLE = re.compile(r"\$\{(\w+):-(.*?)\}")
 OURS = {"rfm-client", "rfm-gateway", "rfm-triton"}
-NOT_FOR_SERVING = {"pip", "pytest", "ruff", "mypy", "nvidia-pytriton", "matplotlib", "av", "gymnasium", "hypothesis"}
+NOT_FOR_SERVING = {"pip", "pytest", "ruff", "mypy", "nvidia-pytriton", "matplotlib", "gymnasium", "hypothesis"}
 UNAVAILABLE = 3
 SYSTEM_PATH = "/usr/local/bin:/usr/bin:/bin"
 
