@@ -68,6 +68,27 @@ def random_episode(kind: str, task: Task, scene: Scene, random: np.random.Genera
     return _stopped(episode, task, random) if kind == "stopped" else episode
 
 
+def pick_and_place(scene: Scene, grasp_x: float, release_x: float, random: np.random.Generator) -> Episode:
+    """What happens when the gripper closes above one place of the table and opens above another. It grasps a block
+    only where it is.
+    """
+    path = _Path(random, [scene.gripper], [False])
+    path.move(grasp_x, CARRY_Y)
+    path.move(grasp_x, REST_Y)
+    path.grip(True)
+    path.move(grasp_x, CARRY_Y)
+    path.move(release_x, CARRY_Y)
+    path.move(release_x, IN_TARGET_Y)
+    path.grip(False)
+    path.move(release_x, CARRY_Y)
+    return _simulated(scene, np.stack(path.points), np.array(path.closed), reach=BLOCK_SIZE / 2)
+
+
+def resting(scene: Scene) -> Episode:
+    """The one moment before anything moves."""
+    return _simulated(scene, scene.gripper[None], np.array([False]))
+
+
 def _carry_and_drop(path: _Path, block: float, target: float, scene: Scene) -> None:
     """Lets the block fall on the way, where the table is free, and goes on with nothing or goes up."""
     random, y = path.random, float(path.points[-1][1])
@@ -86,8 +107,11 @@ def _carry_and_drop(path: _Path, block: float, target: float, scene: Scene) -> N
         path.move(drop_x + random.uniform(-0.1, 0.1), random.uniform(0.15, 0.3))
 
 
-def _simulated(scene: Scene, gripper: Float64Array, is_closed: np.ndarray) -> Episode:
-    """What the blocks do while the gripper goes its way: they are held, or they fall."""
+def _simulated(scene: Scene, gripper: Float64Array, is_closed: np.ndarray, reach: float = np.inf) -> Episode:
+    """What the blocks do while the gripper goes its way: they are held, or they fall.
+
+    reach: how far the gripper may be from the block that it grasps
+    """
     blocks = np.stack([scene.blocks, np.where(np.isnan(scene.blocks), np.nan, REST_Y)], axis=1)
     history = np.empty((len(gripper), *blocks.shape))
     held = np.full(len(gripper), NOTHING)
@@ -95,8 +119,11 @@ def _simulated(scene: Scene, gripper: Float64Array, is_closed: np.ndarray) -> Ep
         if is_closed[moment]:
             held[moment] = held[moment - 1]
             if held[moment] == NOTHING:
-                held[moment] = int(np.nanargmin(np.abs(blocks - position).sum(axis=1)))
-            blocks[held[moment]] = position
+                away = np.abs(blocks - position).sum(axis=1)
+                nearest = int(np.nanargmin(away))
+                held[moment] = nearest if away[nearest] <= reach else NOTHING
+            if held[moment] != NOTHING:
+                blocks[held[moment]] = position
         elif (blocks[:, 1] < REST_Y).any():
             in_target = np.abs(blocks[:, :1] - scene.targets).min(axis=1) < BLOCK_SIZE
             floor = np.where(in_target, IN_TARGET_Y, REST_Y)

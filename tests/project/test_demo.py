@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -50,6 +51,16 @@ def test_the_demo_shows_what_it_promises(tmp_path: Path) -> None:
     for text in ("put the red block in the bowl", "a success", "rewound", "P(first) = ", "similarity = ", "batches"):
         assert text in shown
     assert (tmp_path / "rewards.png").read_bytes().startswith(PNG)
+
+
+def test_a_policy_is_paid_by_the_served_checkpoint(tmp_path: Path) -> None:
+    """Two short rounds; ten whole ones, which take minutes, teach it the task."""
+    few = ("--rounds", 2, "--population", 6, "--scenes", 1, "--tests", 3, "--log", tmp_path / "triton.log")
+    with nothing_left_behind():
+        shown = example("train_policy.py", *few).splitlines()
+    assert [line.split(":")[0] for line in shown] == ["round  1", "round  2", "success of untrained policies"]
+    paid = [float(re.findall(r"reward ([\d.]+)", line)[0]) for line in shown[:2]]
+    assert all(0 < reward < 1 for reward in paid)
 
 
 def test_the_served_checkpoint_keeps_its_bounds_on_clips_it_never_saw(tmp_path: Path) -> None:

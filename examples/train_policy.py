@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: MIT
+"""A policy learns from pixels, in the toy world, with no other reward than the served demo checkpoint's.
+
+    python examples/train_policy.py
+
+The policy sees the first picture of a scene, and chooses where the gripper closes and where it opens: where the columns
+of the picture look most like two colours, which it has to find out. The cross-entropy method (CEM) tries colours, keeps
+those of the policies that were paid most, and goes on around them. Each step is paid the progress of the episode so
+far, as the served model sees it. The truth of the world is used only to print how often a policy succeeds.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from rfm.launch.temporary import stopped_by_signals, temporary_server
+from rfm_client import RewardClient
+from toy_world import Task, forward, pick_and_place, random_scene, render, resting
+
+TASK = Task("red", "plate")
+REPOSITORY = Path(__file__).parents[1] / "model_repository"
+FRAMES, ELITES, LEAST_SPREAD = 16, 0.15, 8.0  # colours are 0..255
+TABLE_ROWS = slice(46, 62)  # of a picture, in which blocks, bowl and plate stand
+
+Policies = np.ndarray  # float64 [P, 2, 3]: RGB of what is grasped, and of where it is let go
+
+
+def places(policies: Policies, picture: np.ndarray) -> np.ndarray:
+    """float64 [P, 2]: the columns, as shares of the picture's width, that look most like each policy's colours."""
+    columns = picture[TABLE_ROWS].astype(float)  # [rows, W, 3]
+    away = np.abs(columns[None, None] - policies[:, :, None, None]).sum(axis=-1)  # [P, 2, rows, W]
+    looks = np.sort(away, axis=2)[:, :, :4].mean(axis=2)  # of the most alike rows
+    smooth = np.apply_along_axis(np.convolve, 2, -looks, np.ones(7) / 7, "same")[:, :, 4:-4]
+    return (smooth.argmax(axis=2) + 4.5) / picture.shape[1]
+
+
+def rewards(client: RewardClient, policies: Policies, seeds: range) -> tuple[np.ndarray, np.ndarray]:
+    """float64 [P] each: the progress that a step is paid, on average, and the share of episodes that succeed."""
+    films, successes = [], []
+    for seed in seeds:
+        scene = random_scene(TASK, np.random.default_rng(seed))
+        for grasp_x, release_x in places(policies, render(resting(scene))[0]):
+            episode = forward(pick_and_place(scene, grasp_x, release_x, np.random.default_rng(seed)), FRAMES)
+            films.append(render(episode))
+            successes.append(episode.success(TASK)[-1])
+    steps = np.stack(films, axis=1)  # [T, N, H, W, 3]
+    episodes = client.episodes(len(films), TASK.sentence(), frames=FRAMES)
+    progress = np.mean([episodes.add(frames).progress for frames in steps], axis=0)
+    shape = len(seeds), len(policies)
+    return progress.reshape(shape).mean(axis=0), np.reshape(successes, shape).mean(axis=0)
+
+
+def any_policies(count: int, random: np.random.Generator) -> Policies:
+    """Policies that know nothing: any colours."""
+    return random.uniform(0, 255, (count, 2, 3))
+
+
+def train(client: RewardClient, rounds: int, population: int, scenes: int, seed: int) -> np.ndarray:
+    """The policy, float64 [2, 3], that CEM ends with."""
+    random = np.random.default_rng(seed)
+    policies = any_policies(population, random)
+    for number in range(rounds):
+        reward, success = rewards(client, policies, range(1000 * number, 1000 * number + scenes))
+        best = policies[np.argsort(reward)[-max(2, int(ELITES * population)) :]]
+        mean, spread = best.mean(axis=0), best.std(axis=0) + LEAST_SPREAD
+        policies = np.clip(mean + spread * random.standard_normal(policies.shape), 0, 255)
+        print(f"round {number + 1:2}: reward {reward.mean():.3f}, success {success.mean():.2f}", flush=True)
+    return mean
+
+
+def main(
+    rounds: Annotated[int, typer.Option(help="Of CEM.")] = 10,
+    population: Annotated[int, typer.Option(help="Policies of a round.")] = 40,
+    scenes: Annotated[int, typer.Option(help="Episodes of each policy in a round.")] = 3,
+    tests: Annotated[int, typer.Option(help="Scenes that training did not see, to tell success.")] = 50,
+    seed: Annotated[int, typer.Option(help="Of the policies.")] = 0,
+    log: Annotated[Path, typer.Option(help="File for Triton's log.")] = Path("tritonserver.log"),
+) -> None:
+    """Prints success rates before and after training."""
+    with (
+        stopped_by_signals(),
+        temporary_server(REPOSITORY, log) as endpoints,
+        RewardClient(endpoints.grpc_url) as client,
+    ):
+        untrained = any_policies(20, np.random.default_rng(seed + 1))
+        trained = train(client, rounds, population, scenes, seed)
+        held_out = range(10**6, 10**6 + tests)
+        _, before = rewards(client, untrained, held_out[: max(tests // 5, 1)])
+        _, after = rewards(client, trained[None], held_out)
+        print(f"success of untrained policies: {before.mean():.2f}; of the trained one: {after.mean():.2f}")
+
+
+if __name__ == "__main__":
+    typer.run(main)
