@@ -64,7 +64,7 @@ class FeatureCache:
         """Keeps features, and lets go of those that were used least recently if there are too many."""
         for key, array in features.items():
             if key not in self._features:
-                self._features[key] = array
+                self._features[key] = array if array.base is None else array.copy()  # a view keeps all that it is of
                 self.num_bytes += _size(array)
         while self.num_bytes > self.limit_bytes:
             _, array = self._features.popitem(last=False)

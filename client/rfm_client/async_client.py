@@ -148,7 +148,7 @@ class AsyncRewardClient:
     def episodes(
         self, num: int, task: str | Sequence[str], *, timeout_s: float | None = None, **options: Unpack[EpisodeSettings]
     ) -> AsyncEpisodes:
-        """Episodes side by side, as those of vectorised environments: one request a step for all.
+        """Episodes side by side, as those of vectorised environments: as few requests a step as fit.
 
         task: of all, or of each
         others: as of ``episode``

@@ -99,17 +99,17 @@ class RewardClient:
         options: as of EpisodeOptions; ValueError for contradictory ones
         timeout_s: the longest that a step may take; None: the client's
         """
-        return Episode(self._client.episode(task, timeout_s=timeout_s, **options), self._loop)
+        return Episode(self._client.episode(task, timeout_s=timeout_s, **options), self._loop, self)
 
     def episodes(
         self, num: int, task: str | Sequence[str], *, timeout_s: float | None = None, **options: Unpack[EpisodeSettings]
     ) -> Episodes:
-        """Episodes side by side, as those of vectorised environments: one request a step for all.
+        """Episodes side by side, as those of vectorised environments: as few requests a step as fit.
 
         task: of all, or of each
         others: as of ``episode``
         """
-        return Episodes(self._client.episodes(num, task, timeout_s=timeout_s, **options), self._loop)
+        return Episodes(self._client.episodes(num, task, timeout_s=timeout_s, **options), self._loop, self)
 
     def score_windows(self, windows: Sequence[Window], *, timeout_s: float | None = None) -> list[Result | RewardError]:
         """The result or error of each window, a progress question about frames that the server may know."""

@@ -16,13 +16,14 @@ from itertools import groupby
 
 import numpy as np
 
+from rfm_client.batching import MAX_REQUEST_BYTES
 from rfm_client.call import Call
 from rfm_client.contract import wire
-from rfm_client.contract.errors import InvalidSampleError, RewardError
+from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, RewardError
 from rfm_client.contract.named_frames import NamedTrajectory, frame_digest
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.results import ProgressResult, Result
-from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array
+from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array, check_task
 from rfm_client.scorer import Scorer, for_each
 from rfm_client.transport.off_loop import off_loop
 
@@ -44,10 +45,20 @@ class NamedFrame:
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """How far has the task come at each of these frames? All are of one size."""
+    """How far has the task come at each of these frames? All are of one size. Raises InvalidSampleError."""
 
     frames: tuple[NamedFrame, ...]
     task: str
+
+    def __post_init__(self) -> None:
+        check_task(self.task)
+        if not self.task.strip():
+            raise InvalidSampleError.at("task", "a task sentence with frames", repr(self.task))
+
+    @property
+    def num_bytes(self) -> int:
+        """Bytes of all its frames."""
+        return sum(frame.pixels.nbytes for frame in self.frames)
 
     @property
     def sample(self) -> ProgressSample:
@@ -102,7 +113,9 @@ class WindowScorer:
             return for_each(error, len(windows))
         if not info.by_digest:
             return await self._whole(windows, call)
-        parts = list(_parts(windows, info.max_batch_size))
+        num_new = sum(w.num_bytes // len(w.frames) for w in windows)  # about one frame of each is new
+        await off_loop(num_new, lambda: [frame.digest for window in windows for frame in window.frames])
+        parts = list(self._parts(windows, info.max_batch_size))
         asked = [self._outcomes([windows[index] for index in part], call) for part in parts]
         answered = await asyncio.gather(*asked)
         found = {
@@ -112,6 +125,28 @@ class WindowScorer:
         }
         return [found[index] for index in range(len(windows))]
 
+    def _parts(self, windows: Sequence[Window], limit: int) -> Iterator[list[int]]:
+        """Indices of the windows of each request: frames of one size, at most ``limit`` windows, and MAX_REQUEST_BYTES
+        unless one has more.
+        """
+
+        def size(index: int) -> tuple[int, ...]:
+            return windows[index].frames[0].pixels.shape
+
+        for _, of_size in groupby(sorted(range(len(windows)), key=size), key=size):
+            part: list[int] = []
+            sent: set[bytes] = set()
+            for index in of_size:
+                frames = windows[index].frames
+                own = {frame.digest for frame in frames if frame.digest not in self._remembered}
+                num_bytes = _padded_bytes(len(part) + 1, len(sent | own), frames[0].pixels.nbytes)
+                if part and (len(part) == limit or num_bytes > MAX_REQUEST_BYTES):
+                    yield part
+                    part, sent = [], set()
+                part.append(index)
+                sent |= own
+            yield part
+
     async def _outcomes(self, windows: Sequence[Window], call: Call) -> Sequence[Result | RewardError]:
         """One request, and one with all pixels if the server lacks some."""
         new = {frame.digest: frame.pixels for window in windows for frame in window.frames}
@@ -119,8 +154,8 @@ class WindowScorer:
         sent = [pixels for digest, pixels in new.items() if digest not in self._remembered]
         try:
             results = await self._request(windows, sent, call)
-        except InvalidSampleError as error:
-            if error.is_deadly:
+        except (InvalidSampleError, InferenceFailedError) as error:
+            if isinstance(error, InvalidSampleError) and error.is_deadly:
                 return for_each(error, len(windows))
             self._remembered.forget(digests)
             return await self._in_whole(windows, digests, call)
@@ -142,7 +177,7 @@ class WindowScorer:
         self, windows: Sequence[Window], sent: Sequence[UInt8Array], call: Call
     ) -> Sequence[ProgressResult]:
         request_id = next(call.request_ids)
-        num_bytes = sum(frame.nbytes for frame in sent)
+        num_bytes = _padded_bytes(len(windows), len(sent), sent[0].nbytes if sent else 0)
         tensors = partial(wire.encode_named, [window.named for window in windows], sent)
         try:
             answer = await self._scorer.infer(self._model, num_bytes, tensors, _OUTPUTS, call.deadline, request_id)
@@ -155,17 +190,10 @@ class WindowScorer:
         ]
 
     async def _whole(self, windows: Sequence[Window], call: Call) -> list[Result | RewardError]:
-        num_bytes = sum(frame.pixels.nbytes for window in windows for frame in window.frames)
-        samples = await off_loop(num_bytes, lambda: [window.sample for window in windows])
+        samples = await off_loop(sum(w.num_bytes for w in windows), lambda: [window.sample for window in windows])
         return await self._scorer.outcomes(samples, call)
 
 
-def _parts(windows: Sequence[Window], limit: int) -> Iterator[list[int]]:
-    """Indices of the windows of each request: frames of one size, at most ``limit`` windows."""
-
-    def size(index: int) -> tuple[int, ...]:
-        return windows[index].frames[0].pixels.shape
-
-    for _, group in groupby(sorted(range(len(windows)), key=size), key=size):
-        of_size = list(group)
-        yield from (of_size[start : start + limit] for start in range(0, len(of_size), limit))
+def _padded_bytes(num_windows: int, num_frames: int, frame_bytes: int) -> int:
+    """Bytes of a request's frames: each window's row has as many."""
+    return num_windows * -(-num_frames // num_windows) * frame_bytes

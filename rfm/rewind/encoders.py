@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import islice
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ from rfm_client.contract.named_frames import NamedFootage, NamedTrajectory
 from rfm_client.contract.samples import Float32Array, Footage, UInt8Array
 
 IMAGES_PER_FORWARD = 64
+FRAMES_TOGETHER = 16  # that are brought to size in one call, for which they are copied
 MAX_ENCODER_ASPECT_RATIO = 50
 
 
@@ -183,15 +184,27 @@ class Encoders:
         self, frames: Sequence[UInt8Array], execution: Execution
     ) -> Sequence[Float32Array | InferenceFailedError]:
         """float32 [Dv] of each frame [H, W, 3], or why there is none."""
-        videos = self.encode_frames([frame[np.newaxis] for frame in frames], execution)
-        return [video if isinstance(video, InferenceFailedError) else video[0] for video in videos]
+        by_size = sorted(range(len(frames)), key=lambda index: frames[index].shape)
+        sizes = groupby(by_size, key=lambda index: frames[index].shape)
+        parts = [part for _, of_size in sizes for part in _cut(list(of_size), FRAMES_TOGETHER)]
+        images = self._images([np.stack([frames[index] for index in part]) for part in parts], execution)
+        made = [image for image in images if isinstance(image, Tensor)]
+        read = iter(torch.stack(made).float().cpu().numpy() if made else ())
+        outcomes = [next(read) if isinstance(image, Tensor) else image for image in images]
+        of_index = dict(zip([index for part in parts for index in part], outcomes, strict=True))
+        return [of_index[index] for index in range(len(frames))]
 
     @torch.inference_mode()
     def encode_frames(
         self, videos: Sequence[UInt8Array], execution: Execution | None = None
     ) -> list[Float32Array | InferenceFailedError]:
         """uint8 [T, H, W, 3] of any T, H, W each -> float32 [T, Dv] each, or why there is none."""
-        execution = execution or Execution()
+        images = iter(self._images(videos, execution or Execution()))
+        return [_of_video(list(islice(images, len(video)))) for video in videos]
+
+    @torch.inference_mode()
+    def _images(self, videos: Sequence[UInt8Array], execution: Execution) -> list[Tensor | InferenceFailedError]:
+        """[Dv] of each frame of all videos, on the device, or why there is none."""
 
         def forward(crops: Tensor) -> list[Tensor]:
             output = self.image_model(pixel_values=crops.to(self.image_model.device))
@@ -200,8 +213,7 @@ class Encoders:
             return list(output.pooler_output.clone())  # as a view it would keep the states of all tokens
 
         batches = self._crop_batches(videos, execution)
-        images = iter([image for crops in batches for image in execution.run(forward, crops)])
-        return [_of_video(list(islice(images, len(video)))) for video in videos]
+        return [image for crops in batches for image in execution.run(forward, crops)]
 
     @torch.inference_mode()
     def encode_tasks(
@@ -251,8 +263,12 @@ class Encoders:
 
 
 def task_digest(task: str) -> bytes:
-    """The key of a task's embedding; longer than a frame's, which a caller may claim."""
+    """The key of a task's embedding. No frame's digest, which a caller may claim, is as long."""
     return b"task" + hashlib.sha256(task.encode()).digest()
+
+
+def _cut(indices: Sequence[int], most: int) -> list[Sequence[int]]:
+    return [indices[start : start + most] for start in range(0, len(indices), most)]
 
 
 def _named(trajectory: Trajectory | NamedTrajectory) -> NamedTrajectory:
@@ -299,9 +315,8 @@ def _embedded(videos: Sequence[Float32Array | RewardError], text: Float32Array |
 
 def _check_shapes(trajectory: Trajectory | NamedTrajectory) -> None:
     """The shorter side is brought to size; a sliver of an image would become a huge one."""
-    if isinstance(trajectory, NamedTrajectory):
-        own = [trajectory.pixels[digest] for digest in trajectory.digests if digest in trajectory.pixels]
-        sizes = {frame.shape[:2] for frame in own}
+    if isinstance(trajectory, NamedTrajectory):  # all that came with it: another may name them
+        sizes = {frame.shape[:2] for frame in trajectory.pixels.values()}
     else:
         sizes = {trajectory.positions.shape[1:3]}
     for height, width in sizes:
@@ -309,6 +324,6 @@ def _check_shapes(trajectory: Trajectory | NamedTrajectory) -> None:
 
 
 def _check_shape(height: int, width: int) -> None:
-    if max(height, width) > MAX_ENCODER_ASPECT_RATIO * min(height, width):
+    if min(height, width) < 1 or max(height, width) > MAX_ENCODER_ASPECT_RATIO * min(height, width):
         expected = f"frames at most {MAX_ENCODER_ASPECT_RATIO} times as long as wide"
         raise InvalidSampleError.at("frames", expected, f"{height} x {width}")

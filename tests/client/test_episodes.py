@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import time
 import urllib.request
 from collections.abc import Iterator, Sequence
@@ -286,6 +287,90 @@ def test_an_episode_for_asyncio_scores_alike(served: Served) -> None:
     np.testing.assert_allclose(asyncio.run(play()), expected.progress, rtol=0, atol=TOLERANCE)
 
 
+def test_frames_stay_in_the_order_in_which_they_were_added(served: Served) -> None:
+    """Whether they are waited for or not, and with a reset between them."""
+    frames = film(113, 4)
+
+    async def play() -> tuple[list[float], list[int]]:
+        async with AsyncRewardClient(served.url("grpc"), model=MODEL) as client:
+            episode = client.episode(TASK, frames=4)
+            open_, waiting = episode.add_nowait(frames[0]), episode.add_nowait(frames[3])
+            second = await episode.add(frames[1])
+            assert open_.done()
+            assert waiting.cancelled()
+            buffer = frames[2].copy()
+            third = episode.add_nowait(buffer)
+            buffer[:] = 0  # drawn over before it was sent
+            await episode.reset()
+            first = await episode.add(frames[0])
+            scores = [open_.result(), second, third.result(), first]
+            return [score.progress for score in scores], [score.step for score in scores]
+
+    with served.client("grpc", MODEL) as client:
+        expected = offline(client, frames[:3], Sampling("rint_pad", 4)).progress
+    progress, steps = asyncio.run(play())
+    assert steps == [0, 1, 2, 0]
+    np.testing.assert_allclose(progress, [*expected, expected[0]], rtol=0, atol=TOLERANCE)
+
+
+def test_who_stops_to_wait_for_a_reset_loses_no_answer(served: Served) -> None:
+    frames = film(114, 2)
+
+    async def play() -> float:
+        async with AsyncRewardClient(served.url("grpc"), model=MODEL) as client:
+            episode = client.episode(TASK, frames=4)
+            answer = episode.add_nowait(frames[0])
+            reset = asyncio.create_task(episode.reset())
+            await asyncio.sleep(0)
+            reset.cancel()
+            first = await answer
+            assert (await episode.add(frames[1])).step == 1
+            return first.progress
+
+    with served.client("grpc", MODEL) as client:
+        expected = offline(client, frames[:1], Sampling("rint_pad", 4))
+    np.testing.assert_allclose(asyncio.run(play()), expected.progress[0], atol=TOLERANCE)
+
+
+def test_an_episode_keeps_its_client(served: Served) -> None:
+    episode = RewardClient(served.url("grpc"), model=MODEL).episode(TASK, frames=4)
+    gc.collect()
+    assert [episode.add(frame).step for frame in film(115, 2)] == [0, 1]
+
+
+def test_large_frames_go_in_several_requests(recorded: tuple[Recording, RewardClient]) -> None:
+    transport, client = recorded
+    large = film(116, 5, (1000, 1000))  # 3 MB each
+    episodes = client.episodes(5, TASK, frames=2)
+    scores = episodes.add(large)
+    assert sorted(len(inputs[wire.NUM_FRAMES]) for inputs in transport.requests) == [1, 2, 2]
+    expected = [offline(client, large[[index]], Sampling("rint_pad", 2)).progress[0] for index in range(5)]
+    np.testing.assert_allclose(scores.progress, expected, atol=TOLERANCE)
+    alike = client.episodes(5, TASK, frames=2)
+    alike.add(np.repeat(film(117, 1, (1000, 1000)), 5, axis=0))  # each row of a request is as long as its longest
+    assert max(transport.num_bytes) < 9 * 2**20
+
+
+def test_a_request_of_very_many_frames_is_refused_before_memory_is_taken(served: Served) -> None:
+    frames = np.zeros((1, 140_000, 1, 1, 3), np.uint8)
+    named = {wire.FRAME_DIGESTS: np.zeros((1, 140_000, 32), np.uint8)}
+    inputs = {
+        wire.NUM_FRAMES: np.array([[140_000, 0]], np.int32),
+        wire.TASK: np.array([[TASK.encode()]], np.object_),
+    }
+
+    async def ask(**more: np.ndarray) -> None:
+        transport = GrpcTransport(served.url("grpc"), Access(), shared_memory=False)
+        try:
+            await transport.infer(f"{MODEL}_encoder", {**inputs, **more}, [wire.VIDEO_EMBEDDINGS], 30)
+        finally:
+            await transport.close()
+
+    for more in ({wire.FRAMES: frames}, {wire.FRAMES: frames[:, :1], **named}):
+        with pytest.raises(InvalidSampleError, match=r"num_frames: expected at most 131072 frames in a request"):
+            asyncio.run(ask(**more))
+
+
 def test_a_task_or_model_that_is_not_there_is_told(served: Served) -> None:
     frames = film(110, 1)
     with served.client("grpc", MODEL) as client, pytest.raises(InvalidSampleError, match=r"task: expected a task"):
@@ -296,6 +381,13 @@ def test_a_task_or_model_that_is_not_there_is_told(served: Served) -> None:
         client.episodes(3, ["a", "b"])
     with pytest.raises(ValueError, match=r"cameras: expected a sequence of names, got 'front'"):
         client.episode(TASK, cameras="front")
+    with served.client("grpc", MODEL) as client:
+        with pytest.raises(
+            InvalidSampleError, match=r"frames: expected frames of one camera .*, got frames of \['a'\]"
+        ):
+            client.episode(TASK, frames=4).add({"a": frames[0]})
+        with pytest.raises(InvalidSampleError, match="task: expected text that UTF-8 can encode"):
+            client.episode("\ud800", frames=4).add(frames[0])
 
 
 def repository_of_encoders(folder: Path, **changes: Any) -> Path:

@@ -142,3 +142,21 @@ def test_what_was_used_last_stays() -> None:
     cache.found([b"\x00"])
     cache.keep({b"\x03": features[b"\x03"]})
     assert list(cache.found(features)) == [b"\x00", b"\x02", b"\x03"]
+
+
+def test_what_is_kept_keeps_nothing_else() -> None:
+    cache = FeatureCache(2**20)
+    batch = np.zeros((64, 8), np.float32)
+    cache.keep({b"one": batch[3]})
+    assert cache.found([b"one"])[b"one"].base is None
+
+
+def test_a_sliver_is_refused_though_only_another_request_names_it(encoders: FrameEncoders) -> None:
+    """In one batch the second would bring what the first has sent to size."""
+    sliver, cache, frames = np.zeros((1, 3000, 3), np.uint8), FeatureCache(2**20), film(5, 1)
+    encoders.encode([footage(frames)], Execution(), cache)
+    sends = NamedTrajectory((frame_digest(frames[0]),), {frame_digest(sliver): sliver}, TASK)
+    names = NamedTrajectory((frame_digest(sliver),), {}, TASK)
+    refused, unknown = encoders.encode([NamedFootage((sends,)), NamedFootage((names,))], Execution(), cache)
+    assert str(refused) == "frames: expected frames at most 50 times as long as wide, got 1 x 3000"
+    assert "frame_digests: expected digests of frames that this model knows" in str(unknown)

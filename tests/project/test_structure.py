@@ -60,6 +60,7 @@ EXCEPTIONS = {
     "examples/demo_training/networks.py": {"rfm"},
     "examples/demo.py": {"rfm", "rfm_commands"},  # starts the server
     "examples/evaluate_demo_checkpoint.py": {"rfm"},
+    "examples/train_policy.py": {"rfm"},
     "benchmarks/bench.py": {"rfm", "rfm_commands", "rfm_export"},  # the engine without a server, and what is served
     "benchmarks/accelerator.py": {"rfm", "rfm_export"},
     "benchmarks/episodes.py": {"rfm", "rfm_export"},

@@ -26,7 +26,7 @@ class NamedTrajectory:
     """A trajectory whose frames are named.
 
     digests: of each frame
-    pixels: uint8 [H, W, 3] by digest, those that are at hand, each named by who reads this; perhaps those of others too
+    pixels: uint8 [H, W, 3] by digest, which the receiver has computed; frames of other trajectories may be among them
     """
 
     digests: tuple[bytes, ...]

@@ -45,10 +45,7 @@ class Trajectory:
         if (self.frames is None) == (self.video_embeddings is None):
             got = "neither" if self.frames is None else "both"
             raise InvalidSampleError.at("trajectory", "either frames or video_embeddings", got)
-        if not isinstance(self.task, str):
-            raise InvalidSampleError.at("task", "str", type(self.task).__name__)
-        if any(0xD800 <= ord(character) <= 0xDFFF for character in self.task):
-            raise InvalidSampleError.at("task", "text that UTF-8 can encode", "a lone surrogate")
+        check_task(self.task)
         if self.frames is not None and self.text_embedding is not None:
             raise InvalidSampleError.at("text_embedding", "None with frames, which go with task", "an embedding")
         if self.frames is not None:
@@ -149,6 +146,14 @@ class Footage:
     """
 
     trajectories: tuple[Trajectory, ...]
+
+
+def check_task(task: Any) -> None:
+    """Raises InvalidSampleError for what is no text that can be sent."""
+    if not isinstance(task, str):
+        raise InvalidSampleError.at("task", "str", type(task).__name__)
+    if any(0xD800 <= ord(character) <= 0xDFFF for character in task):
+        raise InvalidSampleError.at("task", "text that UTF-8 can encode", "a lone surrogate")
 
 
 def stackable(trajectories: Sequence[Trajectory]) -> list[list[Trajectory]]:

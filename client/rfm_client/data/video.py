@@ -61,7 +61,7 @@ def read_video(
 
     start_s, end_s: only the frames from here to before there, by their time stamps; None: from the start, to the end
     timeout_s: the longest that the server of a URL may be silent
-    take: told how many bytes of memory are taken, before they are; what it raises ends the reading
+    take: told at each frame how many bytes of memory are taken, before they are; what it raises ends the reading
     container: FFmpeg's name of the format that the file is read as, for files that nobody vouches for: some formats
         name other files or addresses, which are then opened; None: whatever it looks like
 
@@ -199,8 +199,8 @@ class _Decoder:
         wanted, picked, total = set(indices), [], 0
         with self._opened() as container:
             for frame in container.decode(video=0):
+                self._take(frame.width * frame.height * _RGB_BYTES if total in wanted else 0)
                 if total in wanted:
-                    self._take(frame.width * frame.height * _RGB_BYTES)
                     image = frame.to_ndarray(format="rgb24")
                     picked.append(np.rot90(image, round(frame.rotation / 90)))  # both count counter-clockwise
                 total += 1

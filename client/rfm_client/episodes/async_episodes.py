@@ -19,9 +19,10 @@ from rfm_client.contract.samples import UInt8Array, as_array
 from rfm_client.data.fusing import FUSES
 from rfm_client.data.resize import resize_frames
 from rfm_client.data.sampling import Prefix, Sampling
-from rfm_client.episodes.frames import checked_frame
+from rfm_client.episodes.frames import checked_frame, copied
 from rfm_client.episodes.options import EpisodeOptions
 from rfm_client.episodes.scores import StepScore, StepScores
+from rfm_client.transport.deadline import Deadline
 from rfm_client.windows import NamedFrame, Window
 
 if TYPE_CHECKING:
@@ -38,12 +39,13 @@ class Windows(Protocol):
     ) -> list[Result | RewardError]:
         """The result or error of each window."""
 
-    async def model_info(self, *, frames: bool = False) -> ModelInfo:
+    async def model_info(self, *, frames: bool = False, timeout_s: float | None = None) -> ModelInfo:
         """What the server says of its model."""
 
 
 class AsyncEpisodes:
-    """N episodes that grow side by side, as those of vectorised environments; one request a step for all.
+    """N episodes that grow side by side, as those of vectorised environments; for all in as few requests a
+    step as fit.
 
     All frames of the running episodes are kept, as later ones are shown with them.
 
@@ -79,15 +81,16 @@ class AsyncEpisodes:
         again.
         """
         started_s = time.perf_counter()
+        deadline = None if self._timeout_s is None else Deadline(self._timeout_s)
         async with self._adding:
             added = _indices(mask, len(self))
-            await self._prepare()
+            await self._prepare(deadline)
             new = [await asyncio.to_thread(self._named, self._given(frames, index), index) for index in added]
             for index, of_cameras in zip(added, new, strict=True):
                 for camera, frame in of_cameras.items():
                     self._frames[index][camera].append(frame)
             try:
-                results = await self._results(added)
+                results = await self._results(added, deadline)
             except BaseException:
                 for index in added:
                     for kept in self._frames[index].values():
@@ -117,12 +120,12 @@ class AsyncEpisodes:
     def _none(self) -> dict[str, list[NamedFrame]]:
         return {camera: [] for camera in self._cameras}
 
-    async def _prepare(self) -> None:
+    async def _prepare(self, deadline: Deadline | None) -> None:
         """Finds out what the checkpoint reads, if that is not known."""
         asked = self._options
         needs_number = asked.frames is None and self._sampling is None
         if self._info is None and (asked.resize or needs_number):
-            self._info = await self._client.model_info(frames=True)
+            self._info = await self._client.model_info(frames=True, timeout_s=_left_s(deadline))
         if self._sampling is None:
             trained_frames = None if self._info is None else self._info.max_frames
             self._sampling = Sampling.of(asked.sampling, asked.frames, trained_frames)
@@ -130,6 +133,9 @@ class AsyncEpisodes:
     def _given(self, frames: Any, index: int) -> Mapping[str, Any]:
         """The new frame of one episode, by camera."""
         if not self._options.cameras:
+            if isinstance(frames, Mapping):
+                expected = "frames of one camera (cameras=... names several)"
+                raise InvalidSampleError.at("frames", expected, f"frames of {sorted(frames)}")
             return {ONLY_CAMERA: self._one_of(frames, index, "frames")}
         if not isinstance(frames, Mapping) or set(frames) != set(self._cameras):
             got = sorted(frames) if isinstance(frames, Mapping) else type(frames).__name__
@@ -163,7 +169,9 @@ class AsyncEpisodes:
         size = None if self._info is None else self._info.frame_size
         return resize_frames(frame[np.newaxis], size)[0] if self._options.resize and size is not None else frame
 
-    async def _results(self, indices: Sequence[int]) -> list[list[tuple[Prefix, ProgressResult]]]:
+    async def _results(
+        self, indices: Sequence[int], deadline: Deadline | None
+    ) -> list[list[tuple[Prefix, ProgressResult]]]:
         """Of each of these episodes, what each camera's frames so far were answered. Raises RewardError."""
         assert self._sampling is not None  # prepared
         windows, prefixes = [], []
@@ -171,7 +179,7 @@ class AsyncEpisodes:
             for kept in self._frames[index].values():
                 prefixes.append(self._sampling.prefix(len(kept) - 1))
                 windows.append(Window(tuple(kept[shown] for shown in prefixes[-1].indices), self._tasks[index]))
-        outcomes = await self._client.score_windows(windows, timeout_s=self._timeout_s)
+        outcomes = await self._client.score_windows(windows, timeout_s=_left_s(deadline))
         count = len(self._cameras)
         for number, outcome in enumerate(outcomes):
             if isinstance(outcome, RewardError):
@@ -210,29 +218,27 @@ class AsyncEpisode:
         self._asking: asyncio.Task[None] | None = None
 
     async def add(self, frame: Any) -> StepScore:
-        """Adds a frame, uint8 [H, W, 3] or such by camera, and gives the score of the episode so far.
+        """Adds a frame, uint8 [H, W, 3] or such by camera, and gives the score of the episode so far. It waits for a
+        question that is open; a frame that waits for that, too, is dropped.
 
         Raises RewardError. Then the episode has not grown: the step may be tried again.
         """
-        frames = {camera: [each] for camera, each in frame.items()} if isinstance(frame, Mapping) else [frame]
-        return (await self._episodes.add(frames)).of(0)
+        await self.close()
+        return await self._add(frame)
 
-    def add_nowait(self, frame: Any) -> asyncio.Task[StepScore]:
+    def add_nowait(self, frame: Any) -> asyncio.Future[StepScore]:
         """Adds a frame, and gives the score to come. While a question is open the frame waits; if another comes
         meanwhile, the newer one takes its place, and the older's answer is cancelled: that frame is not part of the
         episode.
         """
-        return asyncio.get_running_loop().create_task(self.newest(frame))
-
-    async def newest(self, frame: Any) -> StepScore:
-        """The score that ``add_nowait`` promises, of the newest frame."""
+        frame = copied(frame)
         answer: asyncio.Future[StepScore] = asyncio.get_running_loop().create_future()
         if self._asking is None or self._asking.done():
             self._asking = asyncio.create_task(self._ask(frame, answer))
         else:
             self._drop_waiting()
             self._waiting = frame, answer
-        return await answer
+        return answer
 
     async def reset(self, task: str | None = None) -> None:
         """Begins a new episode, when no question is open; a frame that waits is dropped. ``task``: None: as before."""
@@ -242,8 +248,8 @@ class AsyncEpisode:
     async def close(self) -> None:
         """Returns when no question is open; a frame that waits is dropped."""
         self._drop_waiting()
-        if self._asking is not None:
-            await self._asking
+        if self._asking is not None and not self._asking.done():
+            await asyncio.wait({self._asking})  # who stops to wait does not stop the question
 
     async def __aenter__(self) -> AsyncEpisode:
         return self
@@ -252,6 +258,10 @@ class AsyncEpisode:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         await self.close()
+
+    async def _add(self, frame: Any) -> StepScore:
+        frames = {camera: [each] for camera, each in frame.items()} if isinstance(frame, Mapping) else [frame]
+        return (await self._episodes.add(frames)).of(0)
 
     def _drop_waiting(self) -> None:
         if self._waiting is not None:
@@ -264,10 +274,14 @@ class AsyncEpisode:
         while waiting is not None:
             frame, answer = waiting
             try:
-                score = await self.add(frame)
+                score = await self._add(frame)
             except Exception as error:  # noqa: BLE001  whatever it is, who waits for the answer is told
                 if not answer.done():
                     answer.set_exception(error)
+            except BaseException:
+                answer.cancel()
+                self._drop_waiting()
+                raise
             else:
                 if not answer.done():
                     answer.set_result(score)
@@ -278,6 +292,10 @@ def _of_frames(result: ProgressResult, prefix: Prefix) -> ProgressResult:
     """The scores of the frames that were shown, each once, without padding."""
     slots = prefix.frame_slots
     return replace(result, progress=result.progress[slots], success=result.success[slots])
+
+
+def _left_s(deadline: Deadline | None) -> float | None:
+    return None if deadline is None else deadline.remaining_s()
 
 
 def _indices(mask: npt.ArrayLike | None, count: int) -> list[int]:

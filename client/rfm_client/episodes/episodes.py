@@ -29,10 +29,10 @@ class Loop(Protocol):
 
 
 class Episodes:
-    """AsyncEpisodes without ``await``. Built by ``RewardClient.episodes``."""
+    """AsyncEpisodes without ``await``. Built by ``RewardClient.episodes``, whose client lives as long as this."""
 
-    def __init__(self, episodes: AsyncEpisodes, loop: Loop) -> None:
-        self._episodes, self._loop = episodes, loop
+    def __init__(self, episodes: AsyncEpisodes, loop: Loop, client: object) -> None:
+        self._episodes, self._loop, self._client = episodes, loop, client
 
     def __len__(self) -> int:
         return len(self._episodes)
@@ -53,13 +53,16 @@ class Episodes:
 
 
 class Episode:
-    """One episode that grows. Built by ``RewardClient.episode``. A context manager that closes it."""
+    """One episode that grows. Built by ``RewardClient.episode``, whose client lives as long as this. A context manager
+    that closes it.
+    """
 
-    def __init__(self, episode: AsyncEpisode, loop: Loop) -> None:
-        self._episode, self._loop = episode, loop
+    def __init__(self, episode: AsyncEpisode, loop: Loop, client: object) -> None:
+        self._episode, self._loop, self._client = episode, loop, client
 
     def add(self, frame: Any) -> StepScore:
-        """Adds a frame, uint8 [H, W, 3] or such by camera, and gives the score of the episode so far.
+        """Adds a frame, uint8 [H, W, 3] or such by camera, and gives the score of the episode so far. It waits for a
+        question that is open; a frame that waits for that, too, is dropped.
 
         Raises RewardError. Then the episode has not grown: the step may be tried again.
         """
@@ -71,7 +74,12 @@ class Episode:
 
         The future raises RewardError.
         """
-        return self._loop.start(self._episode.newest(copied(frame)))
+        frame = copied(frame)
+
+        async def answer() -> StepScore:
+            return await self._episode.add_nowait(frame)
+
+        return self._loop.start(answer())
 
     def reset(self, task: str | None = None) -> None:
         """Begins a new episode; a frame that waits is dropped. ``task``: None: as before."""

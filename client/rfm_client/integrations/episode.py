@@ -22,6 +22,7 @@ from rfm_client.episodes.options import SuccessRule
 from rfm_client.windows import NamedFrame, Window
 
 Info: TypeAlias = dict[str, Any]
+Fit: TypeAlias = Callable[[UInt8Array], UInt8Array]
 ClientSource: TypeAlias = RewardClient | Callable[[], RewardClient]
 
 
@@ -131,9 +132,8 @@ class Scorer:
             self._made = self._source()
         return self._made
 
-    @property
-    def fit(self) -> Callable[[UInt8Array], UInt8Array] | None:
-        """What makes a frame [H, W, 3] as small as it is sent; None: it stays as it is."""
+    def fit(self) -> Fit | None:
+        """What makes a frame [H, W, 3] as small as it is sent; None: it stays as it is. Raises RewardError."""
         size = self._client.model_info(frames=True).frame_size if self._options.resize else None
         return None if size is None else lambda frame: resize_frames(frame[np.newaxis], size)[0]
 
@@ -158,6 +158,7 @@ class Episode:
         self._where = where
         self._frames: list[NamedFrame] = []
         self._size: tuple[int, ...] | None = None  # of the frames as they came
+        self._fit: Fit | None = None
         self._pending: dict[int, tuple[Prefix, Future[ProgressResult]]] = {}  # by step
         self._known_step = -1
         self._progress = self._success = self._paid_progress = np.nan
@@ -179,8 +180,11 @@ class Episode:
         """Number of requests that have no answer yet."""
         return len(self._pending)
 
-    def add(self, frame: Any, fit: Callable[[UInt8Array], UInt8Array] | None = None) -> None:
-        """Adds a copy of the frame: an environment may draw into the same array again. ``fit``: makes it smaller."""
+    def add(self, frame: Any, find_fit: Callable[[], Fit | None] = lambda: None) -> None:
+        """Adds a copy of the frame: an environment may draw into the same array again.
+
+        find_fit: gives what makes the episode's frames smaller; asked at its first
+        """
         try:
             kept = checked_frame(frame)
             if self._size is not None and kept.shape != self._size:
@@ -188,8 +192,10 @@ class Episode:
                 raise InvalidSampleError.at("frame", first, f"{kept.dtype} {list(kept.shape)}")
         except InvalidSampleError as error:
             raise self._located(error) from None
+        if self._size is None:
+            self._fit = find_fit()
         self._size = kept.shape
-        self._frames.append(NamedFrame(kept if fit is None else fit(kept)))
+        self._frames.append(NamedFrame(kept if self._fit is None else self._fit(kept)))
 
     def window(self, sampling: Sampling) -> Window:
         """The question about the newest frame."""

@@ -11,7 +11,7 @@ import dataclasses
 import json
 import logging
 import time
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
@@ -148,8 +148,20 @@ async def _asked(behind: Behind, request: Request, stack: ExitStack, names: tupl
             question = Question.of(fields, behind.model)
             client, info = await behind.models.client(question.model, timeout_s)
             sampling = question.sampling(info.max_frames)
-            films = tuple([await _film(admitted, uploads, name, question.fps) for name in names])
+            films = await while_connected(request, _films(admitted, uploads, names, question.fps, timeout_s))
     return _Asked(question, sampling, client, info, films, admitted.share)
+
+
+async def _films(
+    admitted: Admitted, uploads: Mapping[str, UploadFile], names: Sequence[str], fps: float, timeout_s: float
+) -> tuple[Film, ...]:
+    """The films of these names. Raises RequestValidationError, also for one that takes too long to read.
+
+    A thread that reads one that nobody waits for ends at its next frame: the request's share of the memory is over.
+    """
+    with anyio.move_on_after(timeout_s):
+        return tuple([await _film(admitted, uploads, name, fps) for name in names])
+    raise invalid((names[0],), f"expected videos that are read within {timeout_s:g} s, got longer ones")
 
 
 async def _film(admitted: Admitted, uploads: Mapping[str, UploadFile], name: str, fps: float) -> Film:

@@ -9,11 +9,12 @@ from pathlib import Path
 import torch
 
 from rfm import families
+from rfm.config import DEFAULT_SAMPLE_TOKENS
 from rfm.execution import Execution
 from rfm.feature_cache import BYTES_PER_MB, FeatureCache
-from rfm.parameters import FAMILY_PARAMETER, FEATURE_CACHE_PARAMETER
+from rfm.parameters import FAMILY_PARAMETER, FEATURE_CACHE_PARAMETER, SAMPLE_TOKENS_PARAMETER
 from rfm.triton_model.batch_model import BatchModel
-from rfm_client.contract import RewardError, wire
+from rfm_client.contract import InvalidSampleError, RewardError, wire
 from rfm_client.contract.named_frames import NamedFootage
 from rfm_client.contract.samples import Footage
 
@@ -25,8 +26,13 @@ class TritonPythonModel(BatchModel[Footage | NamedFootage, Footage]):
         self.encoders = families.encoders_of(settings.get(FAMILY_PARAMETER)).load(version).to(device)
         cache_mb = int(settings.get(FEATURE_CACHE_PARAMETER) or 0)
         self.cache = FeatureCache(cache_mb * BYTES_PER_MB) if cache_mb else None
+        self.max_frames = int(settings.get(SAMPLE_TOKENS_PARAMETER) or DEFAULT_SAMPLE_TOKENS)
 
     def decode(self, tensors: wire.Tensors) -> list[Footage | NamedFootage]:
+        num_frames = len(tensors[wire.NUM_FRAMES]) * wire.num_positions(tensors)
+        if num_frames > self.max_frames:  # a frame may be much smaller than what is made of it, and a digest is
+            expected = f"at most {self.max_frames} frames in a request, with padding (max_sample_tokens of this server)"
+            raise InvalidSampleError.at(wire.NUM_FRAMES, expected, str(num_frames))
         return wire.decode_trajectories(tensors)
 
     def answer(self, questions: Sequence[Footage | NamedFootage], execution: Execution) -> list[Footage | RewardError]:
