@@ -44,7 +44,8 @@ def test_memory_is_told_before_it_is_taken(film: Path) -> None:
     frame_bytes = clip.SIZE_PX**2 * 3
     told: list[int] = []
     frames = read_video(film, 1, take=told.append)
-    assert told == [*[frame_bytes] * len(frames), frames.nbytes]
+    assert len(told) > len(frames) + 1  # at each frame that is decoded, so that what it raises ends the reading soon
+    assert [size for size in told if size] == [*[frame_bytes] * len(frames), frames.nbytes]
 
     def refuse(num_bytes: int) -> None:
         raise MemoryError(num_bytes)
