@@ -327,7 +327,7 @@ def served(folder: Path) -> Iterator[Doors]:
             try:
                 without_us = Doors(bare, 0, (), folder / "control" / "tritonserver.log")
                 doors = Doors(server.endpoints, port, (server.pid, gateway.pid), log_file, without_us)
-                _wait(lambda: gateway.poll() is not None or doors.http(port, post("/", b"")).status == "404")
+                _wait(lambda: gateway.poll() is not None or doors.http(port, post("/nowhere", b"")).status == "404")
                 yield doors
                 doors.channel.close()
                 without_us.channel.close()
