@@ -47,7 +47,7 @@ MS_PER_S = 1e3
 
 @dataclass(frozen=True)
 class Step:
-    """bytes: of all inputs of its requests; num_encoded: frames; ms: of the call"""
+    """One step of all environments. num_bytes: of all inputs of its requests; ms: of the call"""
 
     t: int
     num_bytes: int

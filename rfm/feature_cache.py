@@ -34,7 +34,7 @@ class FeatureCache:
     def __len__(self) -> int:
         return len(self._features)
 
-    def of(
+    def get_or_make(
         self,
         wanted: Iterable[bytes],
         sources: Mapping[bytes, Source],

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import uuid
 from collections.abc import Callable, Iterator
 
@@ -12,6 +13,7 @@ import goldens
 import rfm_export
 from commands import RUN
 from engines import load_engine, serve_config
+from paths import ROOT
 from patients import references  # noqa: F401  a fixture
 from reference_server import Served
 from rfm.engine import Engine
@@ -39,6 +41,18 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
     ):
         yield Served(server)
+
+
+@pytest.fixture(scope="module")
+def demo_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Endpoints]:
+    """A server of the demo's repository, whose checkpoint has the default name."""
+    folder = tmp_path_factory.mktemp("demo")
+    repository = shutil.copytree(ROOT / "model_repository", folder / "model_repository")
+    with (
+        (folder / "tritonserver.log").open("wb") as log,
+        TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+    ):
+        yield server.endpoints
 
 
 @pytest.fixture(autouse=True)

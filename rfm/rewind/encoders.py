@@ -171,12 +171,12 @@ class Encoders:
         with execution.collating():
             named = [_named(trajectory) for trajectory in trajectories]
             pixels = dict(pair for each in named for pair in each.pixels.items())
-        wanted = list(dict.fromkeys(digest for each in named for digest in each.digests))
-        images, num_made = cache.of(wanted, pixels, lambda frames: self._each_frame(frames, execution))
+        wanted = (digest for each in named for digest in each.digests)
+        images, num_made = cache.get_or_make(wanted, pixels, lambda frames: self._each_frame(frames, execution))
         execution.num_encoded += num_made
         execution.num_found += len(images) - num_made
         sources = {task_digest(task): task for task in tasks}
-        texts, _ = cache.of(sources, sources, lambda missing: self.encode_tasks(missing, execution))
+        texts, _ = cache.get_or_make(sources, sources, lambda missing: self.encode_tasks(missing, execution))
         execution.cache_bytes = cache.num_bytes
         return [_of_named(each, images) for each in named], [texts[task_digest(task)] for task in tasks]
 

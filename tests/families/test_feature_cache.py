@@ -114,7 +114,7 @@ def test_what_is_not_finite_is_not_kept() -> None:
     def make(values: object) -> list[np.ndarray | RewardError]:
         return [np.full(2, np.nan, np.float32), InferenceFailedError("no memory"), np.ones(2, np.float32)]
 
-    features, num_made = cache.of([*sources, b"unknown"], sources, make)
+    features, num_made = cache.get_or_make([*sources, b"unknown"], sources, make)
     assert (list(features), num_made) == ([b"nan", b"error", b"good"], 3)
     assert list(cache.found(sources)) == [b"good"]
 

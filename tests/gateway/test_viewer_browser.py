@@ -6,7 +6,6 @@ from __future__ import annotations
 import csv
 import json
 import os
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +20,7 @@ import clip
 from browsers import Browser, chromium
 from gateway_requests import TOLERANCE
 from gateways import Gateway, poll, running
-from paths import ROOT
-from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.process import Endpoints
 from toy_world import Task, make_clip
 from viewer_requests import by_command_line
 
@@ -62,18 +59,7 @@ class Stage:
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Endpoints]:
-    folder = tmp_path_factory.mktemp("demo")
-    repository = shutil.copytree(ROOT / "model_repository", folder / "model_repository")
-    with (
-        (folder / "tritonserver.log").open("wb") as log,
-        TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
-    ):
-        yield server.endpoints
-
-
-@pytest.fixture(scope="module")
-def stage(demo: Endpoints, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
+def stage(demo_server: Endpoints, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
     folder = tmp_path_factory.mktemp("stage")
     films, downloads = folder / "films", folder / "downloads"
     films.mkdir()
@@ -82,7 +68,7 @@ def stage(demo: Endpoints, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     long = make_clip("success", Task("red", "bowl"), 2_000_000, num_frames=200)
     clip.write(films / "long.mp4", long.frames, FPS)
     (films / "broken.mp4").write_text("no video")
-    with running(demo, folder) as gateway, chromium(downloads) as browser:
+    with running(demo_server, folder) as gateway, chromium(downloads) as browser:
         yield Stage(gateway, browser, films, downloads)
         asked = browser.asked()
         assert f"{gateway.url}/viewer/score" in asked
@@ -293,8 +279,8 @@ def test_axe_finds_nothing(page: Stage, theme: str) -> None:
         page.browser.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
 
 
-def test_a_wrong_key_is_refused_and_the_right_one_opens(stage: Stage, demo: Endpoints, tmp_path: Path) -> None:
-    with running(demo, tmp_path, "rfm", RFM_GATEWAY_API_KEY=KEY) as keyed, chromium(tmp_path) as browser:
+def test_a_wrong_key_is_refused_and_the_right_one_opens(stage: Stage, demo_server: Endpoints, tmp_path: Path) -> None:
+    with running(demo_server, tmp_path, "rfm", RFM_GATEWAY_API_KEY=KEY) as keyed, chromium(tmp_path) as browser:
         browser.open(keyed.url)
         for key in (None, "sesame"):
             if key:

@@ -25,8 +25,7 @@ from typer.main import get_command
 import clip
 from labelling import LEROBOT
 from paths import ROOT
-from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.process import Endpoints
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_client.cli.commands import app
 from rfm_client.contract import wire
@@ -68,18 +67,6 @@ def found(pattern: re.Pattern[str], files: Iterable[Path] = RUN) -> list[Any]:
     ]
     assert matches
     return matches
-
-
-@pytest.fixture(scope="module")
-def demo_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Endpoints]:
-    """The demo's repository, whose checkpoint has the default name."""
-    folder = tmp_path_factory.mktemp("demo")
-    repository = shutil.copytree(ROOT / "model_repository", folder / "model_repository")
-    with (
-        (folder / "tritonserver.log").open("wb") as log,
-        TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
-    ):
-        yield server.endpoints
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ import numpy as np
 
 from rfm_client.contract.results import ProgressResult
 from rfm_client.contract.samples import ProgressSample, Trajectory
-from rfm_client.data.sampling import FrameIndices, Sampling
+from rfm_client.data.sampling import FrameIndices, Prefix, Sampling
 
 
 def taken(trajectory: Trajectory, indices: FrameIndices) -> Trajectory:
@@ -41,3 +41,9 @@ def of_prefixes(results: Sequence[ProgressResult], sampling: Sampling) -> Progre
         success=np.array([result.success[read] for result, read in zip(results, reads, strict=True)], np.float32),
         model_version=results[-1].model_version,
     )
+
+
+def of_frames(result: ProgressResult, prefix: Prefix) -> ProgressResult:
+    """The scores of the frames that a prefix shows, each once, without padding."""
+    slots = prefix.frame_slots
+    return replace(result, progress=result.progress[slots], success=result.success[slots])

@@ -17,6 +17,7 @@ from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import ProgressResult, Result
 from rfm_client.contract.samples import UInt8Array, as_array
 from rfm_client.data.fusing import FUSES
+from rfm_client.data.prefixes import of_frames
 from rfm_client.data.resize import resize_frames
 from rfm_client.data.sampling import Prefix, Sampling
 from rfm_client.episodes.frames import checked_frame, copied
@@ -44,8 +45,7 @@ class Windows(Protocol):
 
 
 class AsyncEpisodes:
-    """N episodes that grow side by side, as those of vectorised environments; for all in as few requests a
-    step as fit.
+    """N episodes that grow side by side, as those of vectorised environments; as few requests a step as fit.
 
     All frames of the running episodes are kept, as later ones are shown with them.
 
@@ -85,7 +85,7 @@ class AsyncEpisodes:
         async with self._adding:
             added = _indices(mask, len(self))
             await self._prepare(deadline)
-            new = [await asyncio.to_thread(self._named, self._given(frames, index), index) for index in added]
+            new = await asyncio.to_thread(lambda: [self._named(self._given(frames, index), index) for index in added])
             for index, of_cameras in zip(added, new, strict=True):
                 for camera, frame in of_cameras.items():
                     self._frames[index][camera].append(frame)
@@ -149,7 +149,7 @@ class AsyncEpisodes:
         return frames[index]
 
     def _named(self, frames: Mapping[str, Any], index: int) -> dict[str, NamedFrame]:
-        """The new frames of one episode, checked, resized if that is asked, and named. Raises InvalidSampleError."""
+        """The new frames of one episode, checked, and resized if that is asked. Raises InvalidSampleError."""
         named = {}
         for camera, frame in frames.items():
             where = f"frame[{camera!r}]" if camera else "frame"
@@ -162,7 +162,6 @@ class AsyncEpisodes:
             except InvalidSampleError as error:
                 raise self._located(error, index) from None
             named[camera] = NamedFrame(pixels)
-            _ = named[camera].digest  # here, since it takes a while
         return named
 
     def _sized(self, frame: UInt8Array) -> UInt8Array:
@@ -194,7 +193,7 @@ class AsyncEpisodes:
         progress, success = (np.full(len(self), np.nan, np.float32) for _ in range(2))
         succeeded = np.zeros(len(self), bool)
         for index, of_cameras in zip(indices, results, strict=True):
-            shown = [_of_frames(result, prefix) for prefix, result in of_cameras]
+            shown = [of_frames(result, prefix) for prefix, result in of_cameras]
             progress[index] = fuse([each.progress[-1] for each in shown])
             fused = fuse([each.success for each in shown], axis=0)
             success[index] = fused[-1]
@@ -286,12 +285,6 @@ class AsyncEpisode:
                 if not answer.done():
                     answer.set_result(score)
             waiting, self._waiting = self._waiting, None
-
-
-def _of_frames(result: ProgressResult, prefix: Prefix) -> ProgressResult:
-    """The scores of the frames that were shown, each once, without padding."""
-    slots = prefix.frame_slots
-    return replace(result, progress=result.progress[slots], success=result.success[slots])
 
 
 def _left_s(deadline: Deadline | None) -> float | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, TypeAlias, cast
 
@@ -15,6 +15,7 @@ from rfm_client.client import RewardClient
 from rfm_client.contract.errors import InvalidSampleError, RewardError
 from rfm_client.contract.results import ProgressResult, Result
 from rfm_client.contract.samples import UInt8Array
+from rfm_client.data.prefixes import of_frames
 from rfm_client.data.resize import resize_frames
 from rfm_client.data.sampling import Prefix, Rule, Sampling
 from rfm_client.episodes.frames import checked_frame
@@ -230,8 +231,7 @@ class Episode:
         """Takes over an answer about what ``prefix`` shows, unless a newer one is known."""
         if step <= self._known_step:
             return
-        slots = prefix.frame_slots
-        frames = replace(result, progress=result.progress[slots], success=result.success[slots])
+        frames = of_frames(result, prefix)
         progress = frames.last_progress
         if not self.is_known:
             self._paid_progress = progress
