@@ -18,6 +18,7 @@ from rfm.config import DEFAULT_SAMPLE_TOKENS, DEFAULT_TOKEN_BUDGET
 from rfm.embedding import embedded
 from rfm.execution import Execution, memory_errors
 from rfm.family import Checkpoint, FrameEncoders
+from rfm.feature_cache import BYTES_PER_MB, FeatureCache
 from rfm.layers.precision import keep_float32
 from rfm.predictor import Predictor, RowScores
 from rfm_client.contract import (
@@ -33,6 +34,7 @@ from rfm_client.contract import (
     Sample,
     SimilarityResult,
 )
+from rfm_client.contract.named_frames import NamedProgressSample
 
 Outcome: TypeAlias = Result | RewardError
 
@@ -45,7 +47,7 @@ class Prepared:
     num_tokens: of all rows
     """
 
-    sample: Sample
+    sample: Sample | NamedProgressSample
     rows: Sequence[Any] | RewardError
     num_tokens: int = 0
 
@@ -85,6 +87,7 @@ class Engine:
         dtype: torch.dtype | None = None,
         token_budget: int = DEFAULT_TOKEN_BUDGET,
         max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS,
+        feature_cache_mb: int = 0,
     ) -> Engine:
         """The engine of a checkpoint folder or Hugging Face id. Raises CheckpointError.
 
@@ -98,6 +101,7 @@ class Engine:
             dtype=dtype,
             token_budget=token_budget,
             max_sample_tokens=max_sample_tokens,
+            feature_cache_mb=feature_cache_mb,
         )
 
     @classmethod
@@ -110,16 +114,19 @@ class Engine:
         dtype: torch.dtype | None = None,
         token_budget: int = DEFAULT_TOKEN_BUDGET,
         max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS,
+        feature_cache_mb: int = 0,
     ) -> Engine:
         """The engine of a checkpoint in memory. Raises CheckpointError.
 
         encoders: for samples of raw frames, where the network scores embeddings
         dtype: of the network; None: float32, and a vision-language checkpoint's own on a GPU
+        feature_cache_mb: MiB of what a network that reads raw frames makes of each; 0: nothing is kept
         """
         on = torch.device(device)
         if on.type == "cuda":
             keep_float32()
-        predictor = checkpoint.predictor(on, dtype)
+        cache = FeatureCache[Any](feature_cache_mb * BYTES_PER_MB) if feature_cache_mb else None
+        predictor = checkpoint.predictor(on, dtype, cache)
         encoders = None if encoders is None else encoders.to(on)
         return cls(predictor, encoders=encoders, token_budget=token_budget, max_sample_tokens=max_sample_tokens)
 
@@ -137,7 +144,7 @@ class Engine:
             prepared = [self._prepared(sample, of) for sample, of in zip(samples, embedded_samples, strict=True)]
         return self._results(prepared, execution, before)
 
-    def prepare(self, sample: Sample) -> Prepared:
+    def prepare(self, sample: Sample | NamedProgressSample) -> Prepared:
         """The first half of ``evaluate``. Takes no forward pass, and may run in one thread while another scores.
 
         sample: of what the network reads; no encoders are asked
@@ -163,7 +170,9 @@ class Engine:
     def _embedded(self, samples: Sequence[Sample], execution: Execution) -> Sequence[Sample | RewardError]:
         return samples if self.encoders is None else embedded(samples, self.encoders, execution)
 
-    def _prepared(self, sample: Sample, embedded_sample: Sample | RewardError) -> Prepared:
+    def _prepared(
+        self, sample: Sample | NamedProgressSample, embedded_sample: Sample | NamedProgressSample | RewardError
+    ) -> Prepared:
         if isinstance(embedded_sample, RewardError):
             return Prepared(sample, embedded_sample)
         try:
@@ -231,8 +240,7 @@ class Engine:
         def forward(part: Sequence[Any]) -> Sequence[RowScores | RewardError]:
             of_part = batch if part is rows and batch is not None else self.predictor.collate(part)
             scores = self.predictor.score(part, of_part)
-            execution.add_tokens(*self.predictor.occupancy(of_part))
-            execution.num_encoded += self.predictor.num_encoded(of_part)
+            self.predictor.count(of_part, execution)
             return scores
 
         return execution.run(forward, rows)
@@ -250,11 +258,13 @@ class Engine:
             yield part
 
 
-def _outcome(sample: Sample, scores: Sequence[RowScores | RewardError], timing: BatchTiming) -> Outcome:
+def _outcome(
+    sample: Sample | NamedProgressSample, scores: Sequence[RowScores | RewardError], timing: BatchTiming
+) -> Outcome:
     rows = [row for row in scores if isinstance(row, RowScores)]
     if len(rows) < len(scores):
         return next(row for row in scores if isinstance(row, RewardError))
-    if isinstance(sample, ProgressSample):
+    if isinstance(sample, (ProgressSample, NamedProgressSample)):
         frames = _last_of_each(rows) if sample.frame_steps else rows[0].frames[0]
         logits = frames.progress_logits
         return ProgressResult(progress=frames.progress, success=frames.success, progress_logits=logits, timing=timing)

@@ -18,7 +18,7 @@ from rfm.feature_cache import FeatureCache
 from rfm.predictor import Predictor
 from rfm_client.contract import FrameSize, RewardError
 from rfm_client.contract.named_frames import NamedFootage
-from rfm_client.contract.samples import Footage
+from rfm_client.contract.samples import Float32Array, Footage
 
 NETWORK = "network"  # in Checkpoint.parts: the weights of the network that scores
 
@@ -51,6 +51,7 @@ class Description:
     trained_frames: the most frames of a trajectory in training; None: the checkpoint does not say
     frame_size: to what it brings each raw frame; None: that depends on the frame
     frames_per_value: frames that share their scores
+    keeps_features: it can keep what it makes of frames, and takes samples with named frames then
     is_large: its exports are verified on the device and in the type that serve it, since float32 on the CPU takes long
     """
 
@@ -62,6 +63,7 @@ class Description:
     trained_frames: int | None = None
     frame_size: FrameSize | None = None
     frames_per_value: int = 1
+    keeps_features: bool = False
     is_large: bool = False
 
 
@@ -99,7 +101,7 @@ class FrameEncoders(Protocol):
         """Moves the encoders to ``device``, and returns them."""
 
     def encode(
-        self, samples: Sequence[Footage | NamedFootage], execution: Execution, cache: FeatureCache | None
+        self, samples: Sequence[Footage | NamedFootage], execution: Execution, cache: FeatureCache[Float32Array] | None
     ) -> list[Footage | RewardError]:
         """Each sample with embeddings of its trajectories' frames and of its task, or why it has none.
 
@@ -126,10 +128,13 @@ class Checkpoint(Protocol):
     def encoders(self) -> FrameEncoders | None:
         """The checkpoint's encoders; None: it has none. Raises CheckpointError if they cannot be had or do not fit."""
 
-    def predictor(self, device: torch.device, dtype: torch.dtype | None = None) -> Predictor[Any, Any]:
+    def predictor(
+        self, device: torch.device, dtype: torch.dtype | None = None, cache: FeatureCache[Any] | None = None
+    ) -> Predictor[Any, Any]:
         """The checkpoint's network on ``device``, as a predictor. Raises CheckpointError.
 
         dtype: of the network; None: as checkpoint and device decide
+        cache: where it keeps what it makes of frames, if the description says that it does; None: nowhere
         """
 
     def save(self, folder: Path) -> None:

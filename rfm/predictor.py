@@ -11,8 +11,10 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
+from rfm.execution import Execution
 from rfm.layers.heads import progress_from_logits
 from rfm_client.contract import FrameScores, InferenceFailedError, RewardError, Sample
+from rfm_client.contract.named_frames import NamedProgressSample
 
 Row = TypeVar("Row")
 Batch = TypeVar("Batch")
@@ -25,9 +27,10 @@ class Predictor(Protocol[Row, Batch]):
     def works_ahead(self) -> bool:
         """Whether ``work_ahead`` is worth a thread."""
 
-    def rows(self, sample: Sample) -> list[Row]:
+    def rows(self, sample: Sample | NamedProgressSample) -> list[Row]:
         """The sample's rows, in dense mode one a frame; takes no forward pass.
 
+        sample: has named frames only where the checkpoint's description says that it keeps features
         Raises InvalidSampleError if this checkpoint cannot score it.
         """
 
@@ -40,11 +43,8 @@ class Predictor(Protocol[Row, Batch]):
     def collate(self, rows: Sequence[Row]) -> Batch:
         """One batch, on the CPU; may run while the device computes."""
 
-    def occupancy(self, batch: Batch) -> tuple[int, int]:
-        """Tokens of the batch's rows, and of its forward pass, padding included."""
-
-    def num_encoded(self, batch: Batch) -> int:
-        """Frames that the batch's forward pass encodes; 0: it reads embeddings."""
+    def count(self, batch: Batch, execution: Execution) -> None:
+        """Adds what the batch's forward pass works on: tokens, with and without padding, and frames that it encodes."""
 
     def score(self, rows: Sequence[Row], batch: Batch) -> list[RowScores | RewardError]:
         """One forward pass, read back to the CPU; an error for a row that has no scores."""

@@ -30,6 +30,7 @@ from rfm.checkpoint.files import (
     trained_frames,
 )
 from rfm.family import NETWORK, Description, Options
+from rfm.feature_cache import FeatureCache
 from rfm.rewind.encoders import Encoders
 from rfm.rewind.network import RewindConfig, RewindTransformer
 from rfm.rewind.predictor import RewindPredictor
@@ -116,10 +117,13 @@ class RewindCheckpoint:
             raise CheckpointError(f"{where}: expected widths {expected}, got {widths}")
         return encoders
 
-    def predictor(self, device: torch.device, dtype: torch.dtype | None = None) -> RewindPredictor:
+    def predictor(
+        self, device: torch.device, dtype: torch.dtype | None = None, cache: FeatureCache[Any] | None = None
+    ) -> RewindPredictor:
         """The network on ``device``. Raises CheckpointError.
 
         dtype: of the network; None: float32
+        cache: of no use: it reads embeddings
         """
         return RewindPredictor(self.build(), device, dtype or torch.float32)
 

@@ -23,7 +23,7 @@ from rfm.checkpoint.content import read_json
 from rfm.checkpoint.preprocessor import PREPROCESSOR_CONFIG
 from rfm.execution import Execution
 from rfm.family import EncodersDescription
-from rfm.feature_cache import FeatureCache
+from rfm.feature_cache import FeatureCache, get_or_make
 from rfm.layers.linear import speed_up
 from rfm.layers.tensors import as_tensor
 from rfm.rewind.preprocessing import ImagePreprocessor
@@ -122,7 +122,7 @@ class Encoders:
         self,
         samples: Sequence[Footage | NamedFootage],
         execution: Execution | None = None,
-        cache: FeatureCache | None = None,
+        cache: FeatureCache[Float32Array] | None = None,
     ) -> list[Footage | RewardError]:
         """Each sample with embeddings of its trajectories' frames and of its task, or why it has none.
 
@@ -135,7 +135,7 @@ class Encoders:
             return self._encoded(samples, execution, cache)
 
     def _encoded(
-        self, samples: Sequence[Footage | NamedFootage], execution: Execution, cache: FeatureCache | None
+        self, samples: Sequence[Footage | NamedFootage], execution: Execution, cache: FeatureCache[Float32Array] | None
     ) -> list[Footage | RewardError]:
         outcomes: dict[int, Footage | RewardError] = {}
         for index, footage in enumerate(samples):
@@ -160,7 +160,7 @@ class Encoders:
         trajectories: Sequence[Trajectory | NamedTrajectory],
         tasks: Sequence[str],
         execution: Execution,
-        cache: FeatureCache | None,
+        cache: FeatureCache[Float32Array] | None,
     ) -> tuple[Sequence[Float32Array | RewardError], Sequence[Float32Array | RewardError]]:
         """The embeddings of each trajectory's frames [T, Dv], and of each task [Dt]."""
         if cache is None:
@@ -172,11 +172,11 @@ class Encoders:
             named = [_named(trajectory) for trajectory in trajectories]
             pixels = dict(pair for each in named for pair in each.pixels.items())
         wanted = (digest for each in named for digest in each.digests)
-        images, num_made = cache.get_or_make(wanted, pixels, lambda frames: self._each_frame(frames, execution))
+        images, num_made = get_or_make(cache, wanted, pixels, lambda frames: self._each_frame(frames, execution))
         execution.num_encoded += num_made
         execution.num_found += len(images) - num_made
         sources = {task_digest(task): task for task in tasks}
-        texts, _ = cache.get_or_make(sources, sources, lambda missing: self.encode_tasks(missing, execution))
+        texts, _ = get_or_make(cache, sources, sources, lambda missing: self.encode_tasks(missing, execution))
         execution.cache_bytes = cache.num_bytes
         return [_of_named(each, images) for each in named], [texts[task_digest(task)] for task in tasks]
 

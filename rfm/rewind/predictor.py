@@ -7,10 +7,12 @@ from collections.abc import Sequence
 
 import torch
 
+from rfm.execution import Execution
 from rfm.predictor import RowScores, are_finite, checked, frame_scores, part_of
 from rfm.rewind.collator import RewindCollator, Row
 from rfm.rewind.network import RewindBatch, RewindTransformer
-from rfm_client.contract import RewardError, Sample
+from rfm_client.contract import InvalidSampleError, RewardError, Sample
+from rfm_client.contract.named_frames import NamedProgressSample
 
 
 class RewindPredictor:
@@ -27,8 +29,10 @@ class RewindPredictor:
         self.dtype = dtype
         self.collator = RewindCollator(network.config)
 
-    def rows(self, sample: Sample) -> list[Row]:
+    def rows(self, sample: Sample | NamedProgressSample) -> list[Row]:
         """The rows of a sample of embeddings. Raises InvalidSampleError."""
+        if isinstance(sample, NamedProgressSample):
+            raise InvalidSampleError.at("frames", "video_embeddings (this checkpoint reads embeddings)", "named frames")
         return self.collator.rows(sample)
 
     def num_tokens(self, row: Row) -> int:
@@ -42,13 +46,9 @@ class RewindPredictor:
         """One batch of rows, which may be of different kinds."""
         return self.collator.collate(rows)
 
-    def occupancy(self, batch: RewindBatch) -> tuple[int, int]:
-        """Number of tokens of the rows, and of slots that the network computes, the last few of which hold no token."""
-        return batch.packing.num_tokens, len(batch.packing.at)
-
-    def num_encoded(self, batch: RewindBatch) -> int:
-        """None: the network reads embeddings."""
-        return 0
+    def count(self, batch: RewindBatch, execution: Execution) -> None:
+        """Counts tokens, and slots that the network computes, the last few of which hold no token."""
+        execution.add_tokens(batch.packing.num_tokens, len(batch.packing.at))
 
     @torch.inference_mode()
     def score(self, rows: Sequence[Row], batch: RewindBatch) -> list[RowScores | RewardError]:

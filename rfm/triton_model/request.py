@@ -22,7 +22,7 @@ from rfm_client.contract import (
     SimilaritySample,
     wire,
 )
-from rfm_client.contract.named_frames import NamedFootage
+from rfm_client.contract.named_frames import NamedFootage, NamedProgressSample
 from rfm_client.contract.names import PROBE_PREFIX
 from rfm_client.contract.samples import Footage
 
@@ -34,6 +34,7 @@ OUTCOMES = (SCORED, REFUSED, FAILED, CANCELLED, REJECTED)
 
 SAMPLE_TYPES = {
     ProgressSample: "progress",
+    NamedProgressSample: "progress",
     PreferenceSample: "preference",
     SimilaritySample: "similarity",
     Footage: "encode",

@@ -6,13 +6,15 @@ B conversations of L tokens. Frames of one size, H' x W' pixels, go together.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from rfm.vlm.film import Indices
 from rfm.vlm.images import QwenImages, SmolImages
 from rfm.vlm.vision import VisionPlan
 
@@ -125,6 +127,28 @@ class SmolPixels:
         return {"pixel_values": pixels, "pixel_attention_mask": mask}
 
 
+class Layout:
+    """Where the merged tokens of each shot lie: those that the tower makes in order of size, then those that are kept.
+
+    made: of each shot that the tower reads
+    kept: [tokens, levels, D] of each of the others
+    """
+
+    def __init__(self, made: dict[Hashable, slice], kept: dict[Hashable, Tensor]) -> None:
+        self.made, self.kept = made, kept
+        self._tokens, start = dict(made), max((tokens.stop for tokens in made.values()), default=0)
+        for key, features in kept.items():
+            self._tokens[key] = slice(start, start + len(features))
+            start += len(features)
+
+    def tokens(self, keys: Sequence[Hashable]) -> Indices:
+        """int64 [M]: the merged tokens of shots of one size, one shot after the other."""
+        first = self._tokens[keys[0]]
+        starts = np.array([self._tokens[key].start for key in keys], np.int64)
+        tokens: Indices = (starts[:, None] + np.arange(first.stop - first.start)).ravel()
+        return tokens
+
+
 @dataclass(frozen=True)
 class VlmBatch:
     """Conversations, padded to the longest.
@@ -133,8 +157,9 @@ class VlmBatch:
     spans: int64 [F, 3], row and first and behind-the-last token of each frame's state
     query_rows, query_tokens: int64 [Q], where the questions' tokens stand
     num_tokens, num_span_tokens: of all conversations, without padding; of all spans
-    pixels: of which the arguments about pixels are made; None: they are among the inputs
-    plan: of a Qwen backbone's vision tower
+    pixels: of which the arguments about pixels are made; None: they are among the inputs, or all shots are kept
+    plan: of a Qwen backbone's vision tower; None: all shots are kept
+    layout: of the shots of a Qwen backbone
     """
 
     inputs: dict[str, Tensor]
@@ -145,6 +170,7 @@ class VlmBatch:
     num_span_tokens: int
     pixels: Pixels | None = None
     plan: VisionPlan | None = None
+    layout: Layout | None = None
 
     def pinned(self) -> VlmBatch:
         """The batch in memory from which a GPU copies while the host goes on; its frames stay where they are."""

@@ -36,6 +36,7 @@ from rfm.checkpoint.files import (
     read_weights,
 )
 from rfm.family import NETWORK, Description, Options
+from rfm.feature_cache import FeatureCache
 from rfm.version_folder import PROCESSOR_FOLDER
 from rfm.vlm.collator import VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP
@@ -86,6 +87,7 @@ class VlmCheckpoint:
             trained_frames=self.config.trained_frames,
             frame_size=frame_size(self.config),
             frames_per_value=1 if self.config.multi_image else FRAMES_PER_GROUP,
+            keeps_features=self.config.family != SMOL,
             is_large=True,
         )
 
@@ -103,15 +105,19 @@ class VlmCheckpoint:
     def encoders(self) -> None:
         """None: the network reads raw frames, and needs no encoders."""
 
-    def predictor(self, device: torch.device, dtype: torch.dtype | None = None) -> VlmPredictor:
+    def predictor(
+        self, device: torch.device, dtype: torch.dtype | None = None, cache: FeatureCache[Any] | None = None
+    ) -> VlmPredictor:
         """The network on ``device``. Raises CheckpointError.
 
         dtype: of the network; None: float32 on the CPU, else the checkpoint's own
+        cache: of what the vision tower makes of frames; None: nothing is kept. SmolVLM keeps nothing
         """
         if dtype is None and device.type == "cpu":
             dtype = torch.float32
         collator = self.collator  # first: what is missing is reported before the weights are read
-        return VlmPredictor(self.build(dtype), collator, device)
+        kept = cache if self.description.keeps_features else None
+        return VlmPredictor(self.build(dtype), collator, device, kept)
 
     def save(self, folder: Path) -> None:
         """Writes merged weights, one config.json that says all, and the processor."""

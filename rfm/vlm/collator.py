@@ -8,18 +8,18 @@ Reading a row is cheap. Bringing its frames to size is not: that may be done bef
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from rfm.dense_mode import prefix_indices
+from rfm.feature_cache import FeatureCache
 from rfm.vlm.batch import FramesOfOneSize, QwenPixels, SmolPixels, VlmBatch
+from rfm.vlm.film import Film, Indices, Shot, SizedFrames, named_frames
 from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, Grid, QwenImages, SmolImages
 from rfm.vlm.network import VlmConfig
 from rfm.vlm.positions import Box, positions
@@ -27,6 +27,7 @@ from rfm.vlm.prompts import PREFERENCE_TOKEN, PROGRESS_TOKEN, SIMILARITY_TOKEN, 
 from rfm.vlm.shots import Shots
 from rfm.vlm.vision import plan
 from rfm_client.contract import InvalidSampleError, ProgressSample, Sample, SimilaritySample, Trajectory
+from rfm_client.contract.named_frames import NamedProgressSample, NamedTrajectory
 from rfm_client.contract.samples import UInt8Array
 
 SECONDS_PER_GROUP = 1  # the original gives it to Qwen2.5-VL with its videos
@@ -38,27 +39,6 @@ IMAGE_PAD, VIDEO_PAD = "<|image_pad|>", "<|video_pad|>"
 SMOL_IMAGE, GLOBAL_IMAGE, FAKE = "<image>", "<global-img>", "<fake_token_around_image>"
 
 Spans: TypeAlias = list[tuple[int, int]]
-Indices: TypeAlias = npt.NDArray[np.int64]
-
-
-@dataclass(eq=False)
-class Film:
-    """A trajectory's frames, which all rows about it share.
-
-    frames: uint8 [T, H, W, 3]
-    num_shown: of them, in one conversation
-    pixels: uint8 [T, H', W', 3], brought to size, on the CPU or the device; None: not yet
-    """
-
-    frames: UInt8Array
-    num_shown: int
-    pixels: Tensor | None = None
-
-    @property
-    def sized(self) -> Tensor:
-        """The pixels of a film that has been brought to size."""
-        assert self.pixels is not None
-        return self.pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +62,8 @@ class VlmRow:
     position_ids: Indices | None = None
 
     @property
-    def frames(self) -> tuple[UInt8Array, ...]:
-        """uint8 [T, H, W, 3] of each trajectory, as they came."""
+    def frames(self) -> tuple[Sequence[UInt8Array] | UInt8Array, ...]:
+        """uint8 [H, W, 3] of each frame of each trajectory, as they came."""
         return tuple(film.frames for film in self.films)
 
     @property
@@ -115,22 +95,39 @@ class VlmCollator:
         self.images = images
         self._special_tokens = tuple(tokenizer.get_added_vocab())
 
-    def rows(self, sample: Sample) -> list[VlmRow]:
-        """The conversations about a sample. Raises InvalidSampleError if the checkpoint cannot score it."""
+    @property
+    def frames_per_shot(self) -> int:
+        """Frames that the vision tower reads as one."""
+        return 1 if self.config.multi_image else FRAMES_PER_GROUP
+
+    def rows(self, sample: Sample | NamedProgressSample) -> list[VlmRow]:
+        """The conversations about a sample, all of whose frames are at hand.
+
+        Raises InvalidSampleError if the checkpoint cannot score it.
+        """
         if isinstance(sample, SimilaritySample) and not self.config.has_similarity:
             supported = "progress or preference (this checkpoint has no similarity head)"
             raise InvalidSampleError.at("sample_type", supported, "similarity")
-        frames = [_frames(trajectory) for trajectory in sample.trajectories]
+        frame_steps = sample.frame_steps if isinstance(sample, (ProgressSample, NamedProgressSample)) else 0
+        films = tuple(_film(trajectory, frame_steps) for trajectory in sample.trajectories)
         self._check_task(sample.trajectories[0].task)
-        frame_steps = sample.frame_steps if isinstance(sample, ProgressSample) else 0
-        row = self._row(sample, tuple(Film(each, frame_steps or len(each)) for each in frames))
+        row = self._row(sample, films)
         if frame_steps:
             # Every prefix is as long and its frames are as large, so all conversations have the same tokens.
-            return [replace(row, picked=picked) for picked in prefix_indices(len(frames[0]), frame_steps)]
+            return [replace(row, picked=picked) for picked in films[0].conversations]
         return [row]
 
-    def to_size(self, film: Film) -> Tensor:
-        """uint8 [T, H', W', 3]: a film's frames as large as the backbone reads them."""
+    def to_size(self, film: Film, cache: FeatureCache[Any] | None = None) -> SizedFrames:
+        """A film's frames as large as the backbone reads them.
+
+        cache: of shots whose frames need not be brought to size; None: there is none
+        """
+        frames = np.arange(len(film.frames))
+        keys = {shot: (id(film), shot) for shot in film.shots(are_images=self.config.multi_image)}
+        return SizedFrames(self._to_size(film, frames.tolist()), frames, keys)
+
+    def _to_size(self, film: Film, needed: Sequence[int]) -> Tensor:
+        """uint8 [N, H', W', 3] of some of a film's frames."""
         raise NotImplementedError
 
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
@@ -161,7 +158,7 @@ class VlmCollator:
         )
         return self._with_pixels(batch, rows)
 
-    def _row(self, sample: Sample, films: tuple[Film, ...]) -> VlmRow:
+    def _row(self, sample: Sample | NamedProgressSample, films: tuple[Film, ...]) -> VlmRow:
         parts: list[str | dict[str, str]] = []
         for part in question(sample, progress_in_preference=self.config.progress_in_preference):
             parts += self._frame_parts(films[part.index].num_shown) if isinstance(part, TrajectoryPart) else [part]
@@ -239,11 +236,29 @@ class QwenCollator(VlmCollator):
 
     images: QwenImages
 
-    def to_size(self, film: Film) -> Tensor:
-        """uint8 [T, H', W', 3] of images, or of a video's frames."""
+    def to_size(self, film: Film, cache: FeatureCache[Any] | None = None) -> SizedFrames:
+        """The frames of the shots that are not kept."""
+        if cache is None:
+            return super().to_size(film)
+        keys = self.shot_keys(film)
+        kept = cache.found(keys.values())
+        needed = sorted({frame for shot, key in keys.items() if key not in kept for frame in shot})
+        places = np.full(len(film.frames), -1)
+        places[needed] = np.arange(len(needed))
+        return SizedFrames(self._to_size(film, needed), places, keys, kept)
+
+    def shot_keys(self, film: Film) -> dict[Shot, Hashable]:
+        """What is shown of each of a film's shots, in which size: all that the vision tower's answer depends on."""
+        grid, digests = self.grid(film), film.digests
+        shots = film.shots(are_images=self.config.multi_image)
+        return {shot: (grid.rows, grid.columns, *(digests[frame] for frame in shot)) for shot in shots}
+
+    def _to_size(self, film: Film, needed: Sequence[int]) -> Tensor:
+        """uint8 [N, H', W', 3] of images, or of a video's frames."""
+        frames = film.stack(needed)
         if self.config.multi_image:
-            return self.images.images_to_size(film.frames)
-        return self.images.video_to_size(film.frames, film.num_shown)
+            return self.images.images_to_size(frames)
+        return self.images.video_to_size(frames, film.num_shown)
 
     @property
     def _pad(self) -> str:
@@ -252,8 +267,8 @@ class QwenCollator(VlmCollator):
     def grid(self, film: Film) -> Grid:
         """The grid of all that is shown of a film: images, or temporal groups."""
         if self.config.multi_image:
-            return replace(self.images.image_grid(film.frames), groups=film.num_shown)
-        return self.images.video_grid(film.frames, film.num_shown)
+            return replace(self.images.image_grid(*film.size), groups=film.num_shown)
+        return self.images.video_grid(*film.size, film.num_shown)
 
     def _placed(self, text: str, films: tuple[Film, ...]) -> tuple[str, str, list[int]]:
         grids = [self.grid(film) for film in films]
@@ -295,13 +310,9 @@ class QwenCollator(VlmCollator):
 
     def _with_pixels(self, batch: VlmBatch, rows: Sequence[VlmRow]) -> VlmBatch:
         shots = Shots(are_images=self.config.multi_image)
-        read = [shots.add(film.sized, shown) for row in rows for film, shown in row.shown]
-        grids = [self.images.grid(len(each.numbers), *each.films[0].shape[1:3]) for each in shots.sizes]
-        firsts = np.cumsum([0, *(grid.groups * grid.tokens_per_group for grid in grids)])
-        features = []
-        for size, numbers in read:
-            per_shot = grids[size].tokens_per_group
-            features.append((firsts[size] + numbers[:, None] * per_shot + np.arange(per_shot)).ravel())
+        read = [shots.add(film, shown) for row in rows for film, shown in row.shown]
+        grids = [self.images.grid(len(each.shots), *each.films[0].shape[1:3]) for each in shots.sizes]
+        layout = shots.layout([grid.tokens_per_group for grid in grids])
         ids = batch.inputs["input_ids"]
         position_ids = torch.zeros(3, *ids.shape, dtype=torch.int64)
         for index, row in enumerate(rows):
@@ -311,11 +322,13 @@ class QwenCollator(VlmCollator):
             "input_ids": ids,
             "position_ids": position_ids,
             "visual_tokens": (ids.flatten() == self.tokenizer.convert_tokens_to_ids(self._pad)).nonzero()[:, 0],
-            "visual_features": torch.from_numpy(np.concatenate(features)),
+            "visual_features": torch.from_numpy(np.concatenate([layout.tokens(keys) for keys in read])),
         }
+        batch = replace(batch, inputs=inputs, layout=layout)
+        if not grids:
+            return batch
         pixels = QwenPixels(self.images, [each.frames() for each in shots.sizes])
-        vision = plan(grids, self.config.backbone["vision_config"])
-        return replace(batch, inputs=inputs, pixels=pixels, plan=vision)
+        return replace(batch, pixels=pixels, plan=plan(grids, self.config.backbone["vision_config"]))
 
 
 class SmolCollator(VlmCollator):
@@ -323,9 +336,9 @@ class SmolCollator(VlmCollator):
 
     images: SmolImages
 
-    def to_size(self, film: Film) -> Tensor:
-        """uint8 [T, side, side, 3]."""
-        return self.images.images_to_size(film.frames)
+    def _to_size(self, film: Film, needed: Sequence[int]) -> Tensor:
+        """uint8 [N, side, side, 3]."""
+        return self.images.images_to_size(film.stack(needed))
 
     def _placed(self, text: str, films: tuple[Film, ...]) -> tuple[str, str, list[int]]:
         text = text.replace(SMOL_IMAGE, FAKE + GLOBAL_IMAGE + SMOL_IMAGE + FAKE)
@@ -345,7 +358,7 @@ class SmolCollator(VlmCollator):
         counts = torch.tensor([len(each) for each in frames])
         pixels = SmolPixels(
             self.images,
-            FramesOfOneSize([film.sized for film in firsts], None),
+            FramesOfOneSize([film.ready.pixels for film in firsts], None),
             rows=torch.arange(len(rows)).repeat_interleave(counts),
             places=torch.cat([torch.arange(count) for count in counts.tolist()]),
             frames=torch.from_numpy(np.concatenate(frames)),
@@ -354,10 +367,12 @@ class SmolCollator(VlmCollator):
         return replace(batch, pixels=pixels)
 
 
-def _frames(trajectory: Trajectory) -> UInt8Array:
+def _film(trajectory: Trajectory | NamedTrajectory, frame_steps: int) -> Film:
+    if isinstance(trajectory, NamedTrajectory):
+        return Film.of(named_frames(trajectory), frame_steps, trajectory.digests)
     if trajectory.frames is None:
         raise InvalidSampleError.at("video_embeddings", "frames (this checkpoint reads raw frames)", "embeddings")
-    return trajectory.frames
+    return Film.of(trajectory.frames, frame_steps)
 
 
 def _replaced(text: str, placeholder: str, replacements: Sequence[str]) -> str:

@@ -114,22 +114,22 @@ class QwenImages:
         """The fields of preprocessor_config.json that describe this."""
         return {"patch_size": self.patch_px, **self.normalisation.to_config()}
 
-    def image_grid(self, frames: UInt8Array) -> Grid:
-        """Grid of each of the frames [T, H, W, 3] as an image of its own."""
-        return self.grid(1, *self._image_size(frames))
+    def image_grid(self, height: int, width: int) -> Grid:
+        """Grid of a frame [H, W, 3] as an image of its own."""
+        return self.grid(1, *self._image_size(height, width))
 
-    def video_grid(self, frames: UInt8Array, num_shown: int) -> Grid:
-        """Grid of a video that shows so many of the frames [T, H, W, 3]."""
+    def video_grid(self, height: int, width: int, num_shown: int) -> Grid:
+        """Grid of a video that shows so many frames [H, W, 3]."""
         groups = math.ceil(num_shown / FRAMES_PER_GROUP)
-        return self.grid(groups, *self._video_sizes(frames, num_shown)[-1])
+        return self.grid(groups, *self._video_sizes(height, width, num_shown)[-1])
 
     def images_to_size(self, frames: UInt8Array) -> Tensor:
         """uint8 [T, H, W, 3] -> [T, H', W', 3]: each frame as the image of its own that the network reads."""
-        return _to_sizes(frames, [self._image_size(frames)])
+        return _to_sizes(frames, [self._image_size(frames.shape[1], frames.shape[2])])
 
     def video_to_size(self, frames: UInt8Array, num_shown: int) -> Tensor:
         """uint8 [T, H, W, 3] -> [T, H', W', 3]: each frame as the network reads it in a video of ``num_shown``."""
-        *first_sizes, last_size = self._video_sizes(frames, num_shown)
+        *first_sizes, last_size = self._video_sizes(frames.shape[1], frames.shape[2], num_shown)
         video = _to_sizes(frames, first_sizes)
         if first_sizes[-1] == last_size:
             return video
@@ -159,15 +159,13 @@ class QwenImages:
         )  # fmt: skip
         return patches.permute(0, 3, 6, 4, 7, 2, 1, 5, 8).flatten(0, 4).flatten(1)
 
-    def _image_size(self, frames: UInt8Array) -> tuple[int, int]:
-        height, width = self.size_px or frames.shape[1:3]
-        return fitted_size(height, width, self.patch_px * MERGE)
+    def _image_size(self, height: int, width: int) -> tuple[int, int]:
+        return fitted_size(*(self.size_px or (height, width)), self.patch_px * MERGE)
 
-    def _video_sizes(self, frames: UInt8Array, num_shown: int) -> list[tuple[int, int]]:
+    def _video_sizes(self, height: int, width: int, num_shown: int) -> list[tuple[int, int]]:
         """Height and width to which the frames of a video of ``num_shown`` are brought one after the other."""
         factor = self.patch_px * MERGE
         sizes = []
-        height, width = frames.shape[1:3]
         fitted_size(height, width, factor)  # refuses slivers, which scaling down would leave without pixels
         if max(height, width) > MAX_VIDEO_SIDE_PX:
             scale = MAX_VIDEO_SIDE_PX / max(height, width)

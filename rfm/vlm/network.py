@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from rfm.layers.heads import PredictionHead
 from rfm.vlm.batch import VlmBatch
 from rfm.vlm.qwen import check_attention, last_hidden_state
+from rfm.vlm.vision import features
 
 Pooling: TypeAlias = Literal["mean", "boundary", "attention"]
 
@@ -78,12 +79,16 @@ class VlmConfig:
 
 @dataclass(frozen=True)
 class VlmOutput:
-    """Raw scores: progress logits [F, K], success logits [F], preference and similarity logits [Q]."""
+    """Raw scores: progress logits [F, K], success logits [F], preference and similarity logits [Q].
+
+    made: [N, levels, D], what the vision tower has made of the shots that it was shown; None: it was shown none
+    """
 
     progress: Tensor
     success: Tensor
     preference: Tensor
     similarity: Tensor | None
+    made: Tensor | None = None
 
 
 class VlmRewardModel(nn.Module):
@@ -103,10 +108,15 @@ class VlmRewardModel(nn.Module):
 
     def forward(self, batch: VlmBatch) -> VlmOutput:
         """Raw scores of every frame and question of the batch, which is on the network's device."""
-        if batch.plan is None:
+        made = None
+        if self.config.family == SMOL:
             hidden = self.model(**batch.inputs, use_cache=False).last_hidden_state
         else:
-            hidden = last_hidden_state(self.model, batch.inputs, batch.plan)
+            if batch.plan is not None:
+                made = features(self.model.visual, batch.inputs["pixel_values"], batch.plan)
+            assert batch.layout is not None
+            shots = [*([] if made is None else [made]), *batch.layout.kept.values()]
+            hidden = last_hidden_state(self.model.language_model, batch.inputs, torch.cat(shots))
         frames = self._frame_states(hidden, batch.spans, batch.num_span_tokens)
         queries = hidden[batch.query_rows, batch.query_tokens]
         return VlmOutput(
@@ -114,6 +124,7 @@ class VlmRewardModel(nn.Module):
             self.success_head(frames).squeeze(-1),
             self.preference_head(queries).squeeze(-1),
             self.similarity_head(queries).squeeze(-1) if self.config.has_similarity else None,
+            made,
         )
 
     def _frame_states(self, hidden: Tensor, spans: Tensor, num_tokens: int) -> Tensor:

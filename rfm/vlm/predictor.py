@@ -4,39 +4,50 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 
+from rfm.execution import Execution
+from rfm.feature_cache import FeatureCache
 from rfm.layers.heads import progress_from_logits
 from rfm.layers.linear import speed_up
 from rfm.predictor import RowScores, checked, part_of
-from rfm.vlm.batch import VlmBatch
+from rfm.vlm.batch import Layout, VlmBatch
 from rfm.vlm.collator import VlmCollator, VlmRow
 from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm.vlm.network import VlmOutput
 from rfm.vlm.upload import Upload
 from rfm_client.contract import FrameScores, InvalidSampleError, RewardError, Sample
+from rfm_client.contract.named_frames import NamedProgressSample
 
 
 class VlmPredictor:
-    """A vision-language reward model on a device."""
+    """A vision-language reward model on a device.
+
+    cache: of what the vision tower makes of shots, on the device, and of frames, which callers may name then; None:
+        nothing is kept
+    """
 
     works_ahead = True
 
-    def __init__(self, network: Any, collator: VlmCollator, device: torch.device) -> None:
+    def __init__(
+        self, network: Any, collator: VlmCollator, device: torch.device, cache: FeatureCache[Any] | None = None
+    ) -> None:
         self.network = network.to(device).eval()
         speed_up(self.network)
         self.collator = collator
         self.device = device
+        self.cache = cache
         self._upload = Upload(device)
         self._dtype = next(network.parameters()).dtype
         self._max_tokens = int(network.model.config.get_text_config().max_position_embeddings)
 
-    def rows(self, sample: Sample) -> list[VlmRow]:
-        """The conversations about a sample. Raises InvalidSampleError."""
-        rows = self.collator.rows(sample)
+    def rows(self, sample: Sample | NamedProgressSample) -> list[VlmRow]:
+        """The conversations about a sample. Raises InvalidSampleError, too for named frames that are not known."""
+        rows = self.collator.rows(self._completed(sample) if isinstance(sample, NamedProgressSample) else sample)
         # The backbone has learned no positions beyond its own; its scores of those would mean nothing.
         longest = max(row.num_tokens for row in rows)
         if longest > self._max_tokens:
@@ -51,8 +62,9 @@ class VlmPredictor:
     def work_ahead(self, rows: Sequence[VlmRow]) -> None:
         """Brings each frame to size once, and sends it on its way to the device."""
         for film in (film for row in rows for film in row.films):
-            if film.pixels is None:
-                film.pixels = self._upload(self.collator.to_size(film))
+            if film.sized is None:
+                sized = self.collator.to_size(film, self.cache)
+                film.sized = replace(sized, pixels=self._upload(sized.pixels))
 
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
         """Conversations of any kind."""
@@ -60,19 +72,21 @@ class VlmPredictor:
         batch = self.collator.collate(rows)
         return batch.pinned() if self.device.type == "cuda" else batch
 
-    def occupancy(self, batch: VlmBatch) -> tuple[int, int]:
-        """Number of tokens of the conversations, and of slots with the padding to the longest."""
-        return batch.num_tokens, batch.inputs["input_ids"].numel()
-
-    def num_encoded(self, batch: VlmBatch) -> int:
-        """Frames that go through the vision tower: each once, in whichever conversations it stands."""
-        return 0 if batch.pixels is None else batch.pixels.num_shown
+    def count(self, batch: VlmBatch, execution: Execution) -> None:
+        """Counts tokens, padding to the longest conversation, and frames that go through the vision tower: each once,
+        in whichever conversations it stands.
+        """
+        execution.add_tokens(batch.num_tokens, batch.inputs["input_ids"].numel())
+        execution.num_encoded += 0 if batch.pixels is None else batch.pixels.num_shown
+        execution.num_found += 0 if batch.layout is None else len(batch.layout.kept) * self.collator.frames_per_shot
+        execution.cache_bytes = None if self.cache is None else self.cache.num_bytes
 
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch) -> list[RowScores | RewardError]:
         """The scores of each row of the batch, or why it has none, from one forward pass."""
         self._upload.wait_for([] if batch.pixels is None else batch.pixels.films)
-        scores, preference, similarity = _read(self.network(batch.to(self.device, self._dtype)))
+        output = self.network(batch.to(self.device, self._dtype))
+        scores, preference, similarity = _read(output)
         of_rows, read, num_queries = [], 0, 0
         for row in rows:
             frames = []
@@ -84,7 +98,31 @@ class VlmPredictor:
                 query = (similarity if row.is_similarity else preference)[num_queries]
                 num_queries += 1
             of_rows.append(RowScores(frames, query))
-        return checked(of_rows)
+        outcomes = checked(of_rows)
+        if self.cache is not None and batch.layout is not None:
+            good = [row for row, outcome in zip(rows, outcomes, strict=True) if isinstance(outcome, RowScores)]
+            self._keep(good, batch.layout, output.made)
+        return outcomes
+
+    def _completed(self, sample: NamedProgressSample) -> NamedProgressSample:
+        """The sample with the pixels of frames that were kept."""
+        named = sample.trajectory
+        kept = {} if self.cache is None else self.cache.found(named.digests)
+        pixels = {
+            digest: known[digest] for known in (kept, named.pixels) for digest in named.digests if digest in known
+        }
+        return replace(sample, trajectory=replace(named, pixels=pixels))
+
+    def _keep(self, rows: Sequence[VlmRow], layout: Layout, made: torch.Tensor | None) -> None:
+        """Keeps the frames and shots of rows whose scores are finite, as then the features are that they depend on."""
+        assert self.cache is not None
+        for film in dict.fromkeys(film for row in rows for film in row.films):
+            frames = dict(zip(film.digests, film.frames, strict=True))
+            missing = frames.keys() - self.cache.found(frames).keys()
+            self.cache.keep({digest: frames[digest].copy() for digest in missing})
+            if made is not None:
+                new = (key for key in film.ready.keys.values() if key in layout.made)
+                self.cache.keep({key: made[layout.made[key]].clone() for key in new})
 
     def _per_frame(self, scores: FrameScores, num_frames: int) -> FrameScores:
         """The scores of each frame: in video mode both frames of a temporal group carry its value."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from rfm_client.contract import PreferenceSample, ProgressSample, Sample
+from rfm_client.contract.named_frames import NamedProgressSample
 
 SPLIT_TOKEN = "<|split_token|>"
 REWARD_TOKEN = "<|reward_token|>"
@@ -49,13 +50,13 @@ class TrajectoryPart:
 Part: TypeAlias = str | TrajectoryPart
 
 
-def question(sample: Sample, *, progress_in_preference: bool) -> list[Part]:
+def question(sample: Sample | NamedProgressSample, *, progress_in_preference: bool) -> list[Part]:
     """The parts of the prompt for a sample.
 
     progress_in_preference: the checkpoint was trained with preference prompts that request progress, too
     """
     task = sample.trajectories[0].task
-    if isinstance(sample, ProgressSample):
+    if isinstance(sample, (ProgressSample, NamedProgressSample)):
         return [PROGRESS_PROMPT.replace("{task}", task), TrajectoryPart(0)]
     if isinstance(sample, PreferenceSample):
         also = PREFERENCE_PROGRESS_PROMPT if progress_in_preference else ""

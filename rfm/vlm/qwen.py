@@ -13,30 +13,30 @@ from typing import Any
 from torch import Tensor
 
 from rfm.checkpoint.content import CheckpointError
-from rfm.vlm.vision import VisionPlan, features
 
 FULL_ATTENTION = "full_attention"
 
 
-def last_hidden_state(backbone: Any, inputs: dict[str, Tensor], plan: VisionPlan) -> Tensor:
+def last_hidden_state(language: Any, inputs: dict[str, Tensor], features: Tensor) -> Tensor:
     """[B, L, D], behind the final norm.
 
-    inputs: of a batch on the backbone's device
-    input_ids: int64 [B, L]; position_ids: int64 [3, B, L]; pixel_values: the patches of all shots
+    language: transformers' language model
+    inputs: of a batch on its device
+    input_ids: int64 [B, L]; position_ids: int64 [3, B, L]
     visual_tokens: int64 [M], where visual tokens stand among all B * L
     visual_features: int64 [M], which of the shots' merged tokens each of them is
+    features: [N, levels, D], the merged tokens of all shots
     """
-    language = backbone.language_model
-    merged, deeper = features(backbone.visual, inputs["pixel_values"], plan)
-    at, picked = inputs["visual_tokens"], inputs["visual_features"]
+    at, of_tokens = inputs["visual_tokens"], features[inputs["visual_features"]]
     hidden = language.embed_tokens(inputs["input_ids"])
-    hidden.flatten(0, 1).index_copy_(0, at, merged[picked].to(hidden.dtype))
+    merged, *deeper = of_tokens.to(hidden.dtype).unbind(1)
+    hidden.flatten(0, 1).index_copy_(0, at, merged)
     turned = language.rotary_emb(hidden, inputs["position_ids"])
     for number, layer in enumerate(language.layers):
         hidden = layer(hidden, position_embeddings=turned, attention_mask=None)
         hidden = hidden[0] if isinstance(hidden, tuple) else hidden  # transformers 4.57 of Qwen2.5-VL
         if number < len(deeper):
-            hidden.flatten(0, 1).index_add_(0, at, deeper[number][picked].to(hidden.dtype))
+            hidden.flatten(0, 1).index_add_(0, at, deeper[number])
     return language.norm(hidden)
 
 

@@ -1,48 +1,43 @@
 # SPDX-License-Identifier: MIT
-"""The shots that the conversations of a batch show, each once: images, or temporal groups of two frames of a video.
-
-In dense mode a film's frames stand in many conversations. Whatever the network makes of a shot alone is made once.
-"""
+"""The shots that the conversations of a batch show, each once, whichever films and conversations they stand in."""
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from rfm.vlm.batch import FramesOfOneSize
-from rfm.vlm.images import FRAMES_PER_GROUP
-
-Indices = npt.NDArray[np.int64]
+from rfm.vlm.batch import FramesOfOneSize, Layout
+from rfm.vlm.film import Film, Indices, Shot, shots_of
 
 
 @dataclass(frozen=True)
 class SizedShots:
-    """Shots of one size.
+    """Shots of one size that the vision tower is to read.
 
-    films: uint8 [T, H', W', 3] each
+    films: uint8 [N, H', W', 3] each
     firsts: of each film, by its id, its first frame among those of all films
-    numbers: of each shot, by its frames among those of all films, its number
+    shots: by key, its frames among those of all films
     """
 
     films: list[Tensor] = field(default_factory=list)
     firsts: dict[int, int] = field(default_factory=dict)
-    numbers: dict[tuple[int, ...], int] = field(default_factory=dict)
+    shots: dict[Hashable, Shot] = field(default_factory=dict)
 
-    def add(self, film: Tensor, shots: Indices) -> Indices:
-        """int64 [S], the numbers of a film's shots, int64 [S, frames of each]."""
+    def add(self, film: Film, key: Hashable, shot: Shot) -> None:
+        """Adds a shot of a film."""
+        sized = film.ready
         if id(film) not in self.firsts:
             self.firsts[id(film)] = sum(map(len, self.films))
-            self.films.append(film)
-        of_all = (shots + self.firsts[id(film)]).tolist()
-        return np.array([self.numbers.setdefault(tuple(frames), len(self.numbers)) for frames in of_all])
+            self.films.append(sized.pixels)
+        first = self.firsts[id(film)]
+        self.shots[key] = tuple(first + int(sized.places[frame]) for frame in shot)
 
     def frames(self) -> FramesOfOneSize:
         """The films, and which of their frames each shot is made of."""
-        shots = torch.tensor(list(self.numbers))
+        shots = torch.tensor(list(self.shots.values()))
         is_each = torch.equal(shots, torch.arange(sum(map(len, self.films)))[:, None])
         return FramesOfOneSize(self.films, None if is_each else shots)
 
@@ -50,28 +45,44 @@ class SizedShots:
 class Shots:
     """Finds the shots of a batch.
 
-    are_images: each frame is a shot; else two, and an odd count is filled up with the last frame
+    are_images: each frame is a shot; else two
     """
 
     def __init__(self, *, are_images: bool) -> None:
         self._are_images = are_images
         self._of_size: dict[torch.Size, SizedShots] = {}
+        self._kept: dict[Hashable, Tensor] = {}
+        self._seen: set[Hashable] = set()
 
     @property
     def sizes(self) -> list[SizedShots]:
-        """The shots of each size, in the order in which they first came."""
+        """The shots of each size that are to be read, in the order in which they first came."""
         return list(self._of_size.values())
 
-    def add(self, film: Tensor, shown: Indices) -> tuple[int, Indices]:
-        """The number of the size of a film's pixels, uint8 [T, H', W', 3], and int64 [S], those of the shots of it.
+    def add(self, film: Film, shown: Indices) -> list[Hashable]:
+        """The keys of the shots of a conversation that shows these frames of a film."""
+        keys = []
+        for shot in shots_of(shown, are_images=self._are_images):
+            key = film.ready.keys[shot]
+            if key not in self._seen:
+                self._seen.add(key)
+                self._place(film, key, shot)
+            keys.append(key)
+        return keys
 
-        shown: int64 [K], the frames that a conversation shows
-        """
-        size = film.shape[1:3]
-        of_size = self._of_size.setdefault(size, SizedShots())
-        if self._are_images:
-            shots = shown[:, None]
+    def layout(self, tokens_per_shot: Sequence[int]) -> Layout:
+        """Where each shot's tokens lie. ``tokens_per_shot``: of each of ``sizes``."""
+        made: dict[Hashable, slice] = {}
+        start = 0
+        for size, tokens in zip(self.sizes, tokens_per_shot, strict=True):
+            for key in size.shots:
+                made[key] = slice(start, start + tokens)
+                start += tokens
+        return Layout(made, self._kept)
+
+    def _place(self, film: Film, key: Hashable, shot: Shot) -> None:
+        sized = film.ready
+        if key in sized.kept:
+            self._kept[key] = sized.kept[key]
         else:
-            filling = shown[-1:].repeat(-len(shown) % FRAMES_PER_GROUP)
-            shots = np.concatenate([shown, filling]).reshape(-1, FRAMES_PER_GROUP)
-        return list(self._of_size).index(size), of_size.add(film, shots)
+            self._of_size.setdefault(sized.pixels.shape[1:3], SizedShots()).add(film, key, shot)

@@ -76,8 +76,9 @@ def plan(grids: Sequence[Grid], config: dict[str, Any]) -> VisionPlan:
     )
 
 
-def features(visual: Any, patches: Tensor, plan: VisionPlan) -> tuple[Tensor, list[Tensor]]:
-    """[N / U, D] of patches [N, C * T * P * P]: the merged tokens of all shots; and those of Qwen3-VL's deeper layers.
+def features(visual: Any, patches: Tensor, plan: VisionPlan) -> Tensor:
+    """[N / U, levels, D] of patches [N, C * T * P * P]: the merged tokens of all shots, and those of Qwen3-VL's deeper
+    layers.
 
     visual: transformers' vision tower; of it only the layers are used
     """
@@ -97,7 +98,8 @@ def features(visual: Any, patches: Tensor, plan: VisionPlan) -> tuple[Tensor, li
             at = deeper.index(number)
             of_deeper[at] = visual.deepstack_merger_list[at](hidden)
     merged = visual.merger(hidden)
-    return (merged if plan.back is None else merged[plan.back]), [of_deeper[at] for at in sorted(of_deeper)]
+    levels = torch.stack([merged, *(of_deeper[at] for at in sorted(of_deeper))], dim=1)
+    return levels if plan.back is None else levels[plan.back]
 
 
 def _attention(attention: Any, hidden: Tensor, turned: Turn, plan: VisionPlan, *, is_full: bool) -> Tensor:

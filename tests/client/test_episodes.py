@@ -70,8 +70,8 @@ def assert_same(
     np.testing.assert_allclose(scores[1], expected.success, rtol=0, atol=tolerance)
 
 
-def counted(endpoints: Endpoints, name: str, model: str = MODEL) -> float:
-    """What the encoder's metrics say."""
+def counted(endpoints: Endpoints, name: str, model: str = f"{MODEL}_encoder") -> float:
+    """What the metrics of the model that encodes frames say."""
     time.sleep(TOLD_S)
     with urllib.request.urlopen(endpoints.metrics_url, timeout=10) as answer:
         families = list(text_string_to_metric_families(answer.read().decode()))
@@ -79,7 +79,7 @@ def counted(endpoints: Endpoints, name: str, model: str = MODEL) -> float:
         sample.value
         for family in families
         for sample in family.samples
-        if sample.name == f"rfm_{name}" and sample.labels["model"] == f"{model}_encoder"
+        if sample.name == f"rfm_{name}" and sample.labels["model"] == model
     ]
     return sum(found)
 
@@ -124,12 +124,26 @@ def test_steps_have_the_scores_of_the_whole(served: Served, protocol: str, rule:
 @pytest.mark.parametrize("rule", ["rint_pad", "linspace_trunc"])
 @pytest.mark.parametrize("model", [IMAGES, VIDEO])
 def test_steps_of_a_vision_language_checkpoint_have_the_scores_of_the_whole(
-    served: Served, model: str, rule: Rule
+    served: Served, protocol: str, model: str, rule: Rule
 ) -> None:
-    sampling, frames = of_rule(rule, 4), film(3, 6, (56, 84))
-    with served.client("grpc", model) as client, client.episode(TASK, sampling=rule, frames=4) as episode:
-        assert not client.model_info(frames=True).by_digest
+    sampling, frames = of_rule(rule, 4), film(3, 40, (56, 84))
+    with served.client(protocol, model) as client, client.episode(TASK, sampling=rule, frames=4) as episode:
+        assert client.model_info(frames=True).by_digest
         assert_same(online(episode, frames), offline(client, frames, sampling), VLM_TOLERANCE)
+
+
+@pytest.mark.parametrize("model", [IMAGES, VIDEO])
+def test_a_step_of_a_vision_language_checkpoint_sends_its_new_frame_alone(served: Served, model: str) -> None:
+    transport, frames = Recording(served.url("grpc")), film(4, 12, (56, 84))
+    before = counted(served.endpoints, "frames_encoded_total", f"{model}_frames")
+    with RewardClient([], transports=[transport], model=model) as client, client.episode(TASK, frames=4) as episode:
+        for frame in frames:
+            episode.add(frame)
+    assert [len(inputs[wire.FRAMES][0]) for inputs in transport.requests] == [1] * len(frames)
+    encoded = counted(served.endpoints, "frames_encoded_total", f"{model}_frames") - before
+    shown = [Sampling("rint_pad", 4).prefix(t).indices for t in range(len(frames))]
+    pairs = {tuple(pair) for indices in shown for pair in indices.reshape(-1, 2).tolist()}
+    assert encoded == (len(frames) if model == IMAGES else 2 * len(pairs))
 
 
 def test_a_step_sends_and_encodes_its_new_frame_alone(served: Served, recorded: tuple[Recording, RewardClient]) -> None:

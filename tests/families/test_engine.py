@@ -40,11 +40,8 @@ class Pipelined:
     def collate(self, rows: Sequence[int]) -> Any:
         self.collated[rows[0]].set()
 
-    def occupancy(self, batch: Any) -> tuple[int, int]:
-        return 1, 1
-
-    def num_encoded(self, batch: Any) -> int:
-        return 0
+    def count(self, batch: Any, execution: Execution) -> None:
+        execution.add_tokens(1, 1)
 
     def score(self, rows: Sequence[int], batch: Any) -> list[RowScores | RewardError]:
         if rows[0] + 1 < len(self.collated):

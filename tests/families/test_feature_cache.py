@@ -11,7 +11,7 @@ import pytest
 from engines import load_engine
 from rfm.execution import Execution
 from rfm.family import FrameEncoders
-from rfm.feature_cache import FeatureCache
+from rfm.feature_cache import FeatureCache, get_or_make
 from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError, Trajectory
 from rfm_client.contract.named_frames import NamedFootage, NamedTrajectory, frame_digest
 from rfm_client.contract.samples import Footage, UInt8Array
@@ -114,7 +114,7 @@ def test_what_is_not_finite_is_not_kept() -> None:
     def make(values: object) -> list[np.ndarray | RewardError]:
         return [np.full(2, np.nan, np.float32), InferenceFailedError("no memory"), np.ones(2, np.float32)]
 
-    features, num_made = cache.get_or_make([*sources, b"unknown"], sources, make)
+    features, num_made = get_or_make(cache, [*sources, b"unknown"], sources, make)
     assert (list(features), num_made) == ([b"nan", b"error", b"good"], 3)
     assert list(cache.found(sources)) == [b"good"]
 
@@ -147,7 +147,7 @@ def test_what_was_used_last_stays() -> None:
 def test_what_is_kept_keeps_nothing_else() -> None:
     cache = FeatureCache(2**20)
     batch = np.zeros((64, 8), np.float32)
-    cache.keep({b"one": batch[3]})
+    get_or_make(cache, [b"one"], {b"one": 3}, lambda rows: [batch[row] for row in rows])
     assert cache.found([b"one"])[b"one"].base is None
 
 

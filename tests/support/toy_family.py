@@ -10,6 +10,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -113,11 +114,8 @@ class ToyPredictor:
     def collate(self, rows: Sequence[list[np.ndarray]]) -> Tensor:
         return torch.from_numpy(np.concatenate([video for row in rows for video in row]))
 
-    def occupancy(self, batch: Tensor) -> tuple[int, int]:
-        return len(batch), len(batch)
-
-    def num_encoded(self, batch: Tensor) -> int:
-        return 0
+    def count(self, batch: Tensor, execution: Execution) -> None:
+        execution.add_tokens(len(batch), len(batch))
 
     @torch.inference_mode()
     def score(self, rows: Sequence[list[np.ndarray]], batch: Tensor) -> list[RowScores | RewardError]:
@@ -146,7 +144,9 @@ class ToyCheckpoint:
     def encoders(self) -> Palette:
         return Palette(torch.full((self.config.num_colours,), 1 / 255))
 
-    def predictor(self, device: torch.device, dtype: torch.dtype | None = None) -> ToyPredictor:
+    def predictor(
+        self, device: torch.device, dtype: torch.dtype | None = None, cache: FeatureCache[Any] | None = None
+    ) -> ToyPredictor:
         network = Redness(self.config)
         network.load_state_dict(self.weights)
         return ToyPredictor(network)

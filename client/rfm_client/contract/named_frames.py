@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rfm_client.contract.samples import UInt8Array
+from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.contract.samples import UInt8Array, check_frame_steps, check_task
 
 DIGEST_BYTES = 32  # of SHA-256: nobody can make two frames of one digest
 
@@ -50,3 +51,22 @@ class NamedFootage:
     """The trajectories of one sample, for an encoder, with named frames."""
 
     trajectories: tuple[NamedTrajectory, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class NamedProgressSample:
+    """A ``ProgressSample`` of a trajectory with named frames. Raises InvalidSampleError."""
+
+    trajectory: NamedTrajectory
+    frame_steps: int = 0
+
+    def __post_init__(self) -> None:
+        check_task(self.trajectory.task)
+        if not self.trajectory.task.strip():
+            raise InvalidSampleError.at("trajectory.task", "a task sentence with frames", repr(self.trajectory.task))
+        check_frame_steps(self.frame_steps)
+
+    @property
+    def trajectories(self) -> tuple[NamedTrajectory, ...]:
+        """The one trajectory."""
+        return (self.trajectory,)

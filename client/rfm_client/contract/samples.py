@@ -89,11 +89,7 @@ class ProgressSample:
 
     def __post_init__(self) -> None:
         _check_text(self.trajectory, "trajectory")
-        steps = self.frame_steps
-        is_whole = isinstance(steps, (int, np.integer)) and not isinstance(steps, bool)
-        if not is_whole or not (steps == 0 or MIN_FRAME_STEPS <= steps <= MAX_FRAME_STEPS):
-            expected = f"0 or a whole number from {MIN_FRAME_STEPS} to {MAX_FRAME_STEPS}"
-            raise InvalidSampleError.at("frame_steps", expected, repr(steps))
+        check_frame_steps(self.frame_steps)
 
     @property
     def trajectories(self) -> tuple[Trajectory, ...]:
@@ -146,6 +142,14 @@ class Footage:
     """
 
     trajectories: tuple[Trajectory, ...]
+
+
+def check_frame_steps(steps: Any) -> None:
+    """Raises InvalidSampleError for what is no number of frames of dense mode, nor 0."""
+    is_whole = isinstance(steps, (int, np.integer)) and not isinstance(steps, bool)
+    if not is_whole or not (steps == 0 or MIN_FRAME_STEPS <= steps <= MAX_FRAME_STEPS):
+        expected = f"0 or a whole number from {MIN_FRAME_STEPS} to {MAX_FRAME_STEPS}"
+        raise InvalidSampleError.at("frame_steps", expected, repr(steps))
 
 
 def check_task(task: Any) -> None:

@@ -10,7 +10,7 @@ trajectories differ in frame size: ``frames`` then holds the first trajectories 
 optional, so that requests without it stay what they were before it existed. Triton batches requests that have it among
 themselves. P is then the positions of both arrays.
 
-The other is ``frame_digests``, of a model that keeps what its encoders made of frames: the name of each of the P frames
+The other is ``frame_digests``, of a model that keeps what it made of frames: the name of each of the P frames
 (``named_frames``). ``frames`` then holds, in any order and in any sample's row, the pixels of those that the model may
 not know; zeros may lie between them. A request with a digest that the model does not know is refused, and its caller
 asks again with all pixels.
@@ -22,13 +22,20 @@ import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import partial
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError
-from rfm_client.contract.named_frames import DIGEST_BYTES, NamedFootage, NamedTrajectory, frame_digest
+from rfm_client.contract.named_frames import (
+    DIGEST_BYTES,
+    NamedFootage,
+    NamedProgressSample,
+    NamedTrajectory,
+    frame_digest,
+)
 from rfm_client.contract.results import (
     BatchTiming,
     FrameScores,
@@ -187,9 +194,10 @@ def encode_samples(samples: Sequence[Sample]) -> Tensors:
     return tensors
 
 
-def decode_samples(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Sample]:
+def decode_samples(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Sample | NamedProgressSample]:
     """The samples of one request. Raises InvalidSampleError that names the sample and the field."""
-    return [_located(_decode_sample, tensors, row) for row in range(len(tensors[SAMPLE_TYPE]))]
+    decode = partial(_decode_sample, _pixels(tensors))
+    return [_located(decode, tensors, row) for row in range(len(tensors[SAMPLE_TYPE]))]
 
 
 def encode_frames(trajectory: Trajectory) -> Tensors:
@@ -211,20 +219,15 @@ def decode_embeddings(tensors: Mapping[str, npt.NDArray[Any]], trajectory: Traje
 
 def decode_trajectories(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Footage | NamedFootage]:
     """What the encoder is to encode: of each sample the frames of its trajectories, without padding, and its task."""
-    pixels: dict[bytes, UInt8Array] = {}
-    if FRAME_DIGESTS in tensors:
-        if SECOND_FRAMES in tensors:
-            raise InvalidSampleError.at(FRAME_DIGESTS, f"none with {SECOND_FRAMES}", "both")
-        pixels = {frame_digest(frame): frame for row in tensors[FRAMES] for frame in row}
+    pixels = _pixels(tensors)
 
     def decode(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> Footage | NamedFootage:
         lengths = tensors[NUM_FRAMES][row].tolist()
         if lengths[0] < 1 or lengths[1] < 0:
             raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, at least 0]", str(lengths))
         arrays = [array for array in _positions(tensors, row, lengths) if len(array)]
-        if FRAME_DIGESTS in tensors:
-            task = _task(tensors, row)
-            return NamedFootage(tuple(NamedTrajectory(tuple(map(bytes, array)), pixels, task) for array in arrays))
+        if pixels is not None:
+            return NamedFootage(tuple(_named(pixels, tensors, row, array) for array in arrays))
         return Footage(tuple(_trajectory(tensors, row, array) for array in arrays))
 
     return [_located(decode, tensors, row) for row in range(len(tensors[NUM_FRAMES]))]
@@ -250,6 +253,15 @@ def encode_named(trajectories: Sequence[NamedTrajectory], sent: Sequence[UInt8Ar
         FRAME_DIGESTS: pad_stack(digests),
         TASK: np.array([[named.task.encode()] for named in trajectories], np.object_),
     }
+
+
+def _pixels(tensors: Mapping[str, npt.NDArray[Any]]) -> dict[bytes, UInt8Array] | None:
+    """The frames of a request that names frames, by their digests; None: it names none."""
+    if FRAME_DIGESTS not in tensors:
+        return None
+    if SECOND_FRAMES in tensors:
+        raise InvalidSampleError.at(FRAME_DIGESTS, f"none with {SECOND_FRAMES}", "both")
+    return {frame_digest(frame): frame for row in tensors[FRAMES] for frame in row}
 
 
 def encode_trajectories(encoded: Sequence[Footage], num_positions: int, outputs: Collection[str]) -> Tensors:
@@ -355,7 +367,9 @@ def _located(decode: Any, tensors: Mapping[str, npt.NDArray[Any]], row: int) -> 
         raise error.inside(f"samples[{row}]") from None
 
 
-def _decode_sample(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> Sample:
+def _decode_sample(
+    pixels: Mapping[bytes, UInt8Array] | None, tensors: Mapping[str, npt.NDArray[Any]], row: int
+) -> Sample | NamedProgressSample:
     sample_type = int(tensors[SAMPLE_TYPE][row, 0])
     lengths = tensors[NUM_FRAMES][row].tolist()
     frame_steps = int(tensors[FRAME_STEPS][row, 0])
@@ -366,7 +380,11 @@ def _decode_sample(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> Sample:
         if lengths[0] < 1 or lengths[1] != 0:
             raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, 0] for progress", str(lengths))
         positions, _ = _positions(tensors, row, lengths)
-        return ProgressSample(_trajectory(tensors, row, positions), frame_steps=frame_steps)
+        if pixels is not None:
+            return NamedProgressSample(_named(pixels, tensors, row, positions), frame_steps)
+        return ProgressSample(_trajectory(tensors, row, positions), frame_steps)
+    if pixels is not None:
+        raise InvalidSampleError.at(SAMPLE_TYPE, f"progress with {FRAME_DIGESTS}", SampleType(sample_type).name.lower())
     if min(lengths) < 1:
         raise InvalidSampleError.at(NUM_FRAMES, "at least one frame of each of the two trajectories", str(lengths))
     if frame_steps != 0:
@@ -379,6 +397,12 @@ def _trajectory(tensors: Mapping[str, npt.NDArray[Any]], row: int, positions: np
     if FRAMES in tensors:
         return Trajectory(frames=positions, task=_task(tensors, row))
     return Trajectory(video_embeddings=positions, text_embedding=tensors[TEXT_EMBEDDING][row])
+
+
+def _named(
+    pixels: Mapping[bytes, UInt8Array], tensors: Mapping[str, npt.NDArray[Any]], row: int, digests: npt.NDArray[Any]
+) -> NamedTrajectory:
+    return NamedTrajectory(tuple(map(bytes, digests)), pixels, _task(tensors, row))
 
 
 def _positions(tensors: Mapping[str, npt.NDArray[Any]], row: int, lengths: Sequence[int]) -> list[npt.NDArray[Any]]:

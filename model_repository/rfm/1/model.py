@@ -10,13 +10,20 @@ import torch
 
 from rfm.engine import Engine, Outcome, Prepared
 from rfm.execution import Execution
-from rfm.parameters import BUDGET_PARAMETER, DTYPE_PARAMETER, FAMILY_PARAMETER, SAMPLE_TOKENS_PARAMETER
+from rfm.parameters import (
+    BUDGET_PARAMETER,
+    DTYPE_PARAMETER,
+    FAMILY_PARAMETER,
+    FEATURE_CACHE_PARAMETER,
+    SAMPLE_TOKENS_PARAMETER,
+)
 from rfm.triton_model.batch_model import BatchModel
 from rfm.version_folder import CHECKPOINT_FOLDER
 from rfm_client.contract import Result, RewardError, Sample, wire
+from rfm_client.contract.named_frames import NamedProgressSample
 
 
-class TritonPythonModel(BatchModel[Sample, Result]):
+class TritonPythonModel(BatchModel[Sample | NamedProgressSample, Result]):
     """One instance: one engine on one device."""
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
@@ -27,12 +34,13 @@ class TritonPythonModel(BatchModel[Sample, Result]):
             dtype=getattr(torch, settings[DTYPE_PARAMETER]) if settings[DTYPE_PARAMETER] else None,
             token_budget=int(settings[BUDGET_PARAMETER]),
             max_sample_tokens=int(settings[SAMPLE_TOKENS_PARAMETER]),
+            feature_cache_mb=int(settings.get(FEATURE_CACHE_PARAMETER) or 0),
         )
 
-    def decode(self, tensors: wire.Tensors) -> list[Sample]:
+    def decode(self, tensors: wire.Tensors) -> list[Sample | NamedProgressSample]:
         return wire.decode_samples(tensors)
 
-    def prepare(self, question: Sample) -> tuple[Prepared, int]:
+    def prepare(self, question: Sample | NamedProgressSample) -> tuple[Prepared, int]:
         prepared = self.engine.prepare(question)
         if isinstance(prepared.rows, RewardError):
             raise prepared.rows

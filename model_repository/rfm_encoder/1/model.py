@@ -16,7 +16,7 @@ from rfm.parameters import FAMILY_PARAMETER, FEATURE_CACHE_PARAMETER, SAMPLE_TOK
 from rfm.triton_model.batch_model import BatchModel
 from rfm_client.contract import InvalidSampleError, RewardError, wire
 from rfm_client.contract.named_frames import NamedFootage
-from rfm_client.contract.samples import Footage
+from rfm_client.contract.samples import Float32Array, Footage
 
 
 class TritonPythonModel(BatchModel[Footage | NamedFootage, Footage]):
@@ -25,7 +25,7 @@ class TritonPythonModel(BatchModel[Footage | NamedFootage, Footage]):
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
         self.encoders = families.encoders_of(settings.get(FAMILY_PARAMETER)).load(version).to(device)
         cache_mb = int(settings.get(FEATURE_CACHE_PARAMETER) or 0)
-        self.cache = FeatureCache(cache_mb * BYTES_PER_MB) if cache_mb else None
+        self.cache = FeatureCache[Float32Array](cache_mb * BYTES_PER_MB) if cache_mb else None
         self.max_frames = int(settings.get(SAMPLE_TOKENS_PARAMETER) or DEFAULT_SAMPLE_TOKENS)
 
     def decode(self, tensors: wire.Tensors) -> list[Footage | NamedFootage]:

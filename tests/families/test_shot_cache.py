@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: MIT
+"""What a vision tower makes of a shot is made once, kept by what the shot shows, and never wrong for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from rfm.engine import Engine
+from rfm.execution import Execution
+from rfm.feature_cache import BYTES_PER_MB, FeatureCache
+from rfm.vlm.predictor import VlmPredictor
+from rfm_client import InferenceFailedError, PreferenceSample, ProgressResult, ProgressSample, RewardError, Trajectory
+from rfm_client.contract.named_frames import NamedProgressSample, NamedTrajectory, frame_digest
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.data.sampling import Sampling
+from vlm import assert_close, film, load
+
+TASK = "stack the blocks"
+TOLERANCE = 1e-5
+AS_VIDEO = " as video"  # no reference is a Qwen3-VL that reads videos
+MODELS = ["q3_tok_disc10", f"q3_tok_disc10{AS_VIDEO}", "q25_peft_adapter_disc10", "q25_video_avg_disc10"]
+
+
+def engine(name: str, cache: FeatureCache[Any] | None = None) -> Engine:
+    checkpoint = load(name.removesuffix(AS_VIDEO))
+    if name.endswith(AS_VIDEO):
+        config = replace(checkpoint.config, multi_image=False, per_frame_progress_token=False)
+        checkpoint = replace(checkpoint, config=config)
+    return Engine(checkpoint.predictor(torch.device("cpu"), None, cache))
+
+
+def frames_per_shot(served: Engine) -> int:
+    assert isinstance(served.predictor, VlmPredictor)
+    return served.predictor.collator.frames_per_shot
+
+
+def frames_of(seed: int, count: int, size: tuple[int, int] = (56, 84)) -> UInt8Array:
+    frames = film(seed, count, *size).frames
+    assert frames is not None
+    return frames
+
+
+def whole(frames: UInt8Array) -> ProgressSample:
+    return ProgressSample(Trajectory(frames=frames, task=TASK))
+
+
+def named(frames: Sequence[UInt8Array], sent: Sequence[UInt8Array], frame_steps: int = 0) -> NamedProgressSample:
+    """A question about frames of which only some are sent."""
+    pixels = {frame_digest(frame): frame for frame in sent}
+    return NamedProgressSample(NamedTrajectory(tuple(map(frame_digest, frames)), pixels, TASK), frame_steps)
+
+
+def ask(served: Engine, sample: NamedProgressSample, execution: Execution | None = None) -> Any:
+    (outcome,) = served.score([served.prepare(sample)], execution or Execution())
+    return outcome
+
+
+@pytest.mark.parametrize("rule", ["rint_pad", "linspace_trunc"])
+@pytest.mark.parametrize("name", MODELS)
+def test_an_episode_has_the_scores_of_the_whole_and_each_shot_is_encoded_once(name: str, rule: Any) -> None:
+    cached, plain = engine(name, FeatureCache(64 * BYTES_PER_MB)), engine(name)
+    frames, sampling, execution = frames_of(0, 40), Sampling(rule, 4), Execution()
+    per_shot, shown, num_shown = frames_per_shot(cached), set(), 0
+    for step in range(len(frames)):
+        window = frames[sampling.prefix(step).indices]
+        (expected,) = plain.evaluate([whole(window)])
+        assert_close(ask(cached, named(window, frames[step : step + 1]), execution), expected, TOLERANCE)
+        digests = [*map(frame_digest, window)]
+        shots = {tuple(digests[i : i + per_shot]) for i in range(0, len(digests), per_shot)}
+        shown, num_shown = shown | shots, num_shown + len(shots)
+    assert execution.num_encoded == per_shot * len(shown)
+    assert execution.num_found == per_shot * (num_shown - len(shown))
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_cache_that_holds_nothing_changes_no_score(name: str) -> None:
+    cache = FeatureCache[Any](1)
+    cached, plain = engine(name, cache), engine(name)
+    frames = frames_of(1, 6)
+    for stop in range(1, 7):
+        (expected,) = plain.evaluate([whole(frames[:stop])])
+        assert_close(ask(cached, named(frames[:stop], frames[:stop])), expected, TOLERANCE)
+        assert len(cache) == 0
+    assert str(ask(cached, named(frames[:2], frames[1:]))) == (
+        "frame_digests: expected digests of frames that this model knows or has been sent, got 1 others"
+    )
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_cache_that_evicts_at_every_step_changes_no_score(name: str) -> None:
+    cache = FeatureCache[Any](3 * 56 * 84 * 3 + 2 * BYTES_PER_MB // 100)
+    cached, plain, frames, unknown = engine(name, cache), engine(name), frames_of(2, 12), 0
+    for stop in range(4, 13):
+        window = frames[stop - 4 : stop]
+        (expected,) = plain.evaluate([whole(window)])
+        outcome = ask(cached, named(window, window[-1:]))
+        if isinstance(outcome, RewardError):
+            unknown += 1
+            outcome = ask(cached, named(window, window))
+        assert_close(outcome, expected, TOLERANCE)
+        assert cache.num_bytes <= cache.limit_bytes
+    assert unknown
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_whole_films_of_other_callers_fill_the_cache(name: str) -> None:
+    cached, plain = engine(name, FeatureCache(64 * BYTES_PER_MB)), engine(name)
+    first, second, execution = film(3, 4, 56, 84, TASK), film(4, 6, 84, 56, TASK), Execution()
+    samples = [ProgressSample(first), PreferenceSample(first, second), PreferenceSample(second, first)]
+    for outcome, expected in zip(cached.evaluate(samples, execution), plain.evaluate(samples), strict=True):
+        assert_close(outcome, expected, TOLERANCE)
+    assert execution.num_encoded == 10  # each frame of the batch once, in three samples
+    again = Execution()
+    for outcome, expected in zip(cached.evaluate(samples[1:], again), plain.evaluate(samples[1:]), strict=True):
+        assert_close(outcome, expected, TOLERANCE)
+    assert (again.num_encoded, again.num_found) == (0, 10)
+    assert again.cache_bytes
+    assert first.frames is not None
+    (expected,) = plain.evaluate([whole(first.frames)])
+    assert_close(ask(cached, named(first.frames, ())), expected, TOLERANCE)
+
+
+def test_dense_mode_of_named_frames() -> None:
+    cached, plain, frames = engine(MODELS[0], FeatureCache(BYTES_PER_MB)), engine(MODELS[0]), frames_of(5, 5)
+    (expected,) = plain.evaluate([ProgressSample(Trajectory(frames=frames, task=TASK), frame_steps=4)])
+    assert_close(ask(cached, named(frames, frames, 4)), expected, TOLERANCE)
+    assert_close(ask(cached, named(frames, (), 4)), expected, TOLERANCE)
+
+
+def test_the_size_that_frames_are_brought_to_is_part_of_what_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames of very long videos are made smaller than those of short ones."""
+    cached, plain, frames = (
+        engine(MODELS[3], FeatureCache(64 * BYTES_PER_MB)),
+        engine(MODELS[3]),
+        frames_of(6, 4, (448, 336)),
+    )
+    monkeypatch.setattr("rfm.vlm.images.VIDEO_TOTAL_TOKENS", 300.0)
+    assert isinstance(cached.predictor, VlmPredictor)
+    grid = cached.predictor.collator.grid  # type: ignore[attr-defined]  # of the Qwen backbones
+    for stop in (2, 4):
+        (expected,) = plain.evaluate([whole(frames[:stop])])
+        assert_close(ask(cached, named(frames[:stop], frames[:stop])), expected, TOLERANCE)
+    rows = [cached.predictor.rows(whole(frames[:stop]))[0] for stop in (2, 4)]
+    assert grid(rows[0].films[0]).tokens_per_group != grid(rows[1].films[0]).tokens_per_group
+
+
+def test_what_is_not_finite_is_not_kept() -> None:
+    cache, frames = FeatureCache[Any](BYTES_PER_MB), frames_of(7, 2)
+    cached = engine(MODELS[0], cache)
+    assert isinstance(cached.predictor, VlmPredictor)
+    merger = cached.predictor.network.model.visual.merger
+    handle = merger.register_forward_hook(lambda _module, _inputs, output: output * torch.nan)
+    assert isinstance(ask(cached, named(frames, frames)), InferenceFailedError)
+    assert len(cache) == 0
+    handle.remove()
+    assert isinstance(ask(cached, named(frames, frames)), ProgressResult)
+
+
+def test_frames_of_two_sizes_are_no_film() -> None:
+    frames = [*frames_of(8, 1), *frames_of(9, 1, (84, 56))]
+    outcome = ask(engine(MODELS[0], FeatureCache(BYTES_PER_MB)), named(frames, frames))
+    expected = "frame_digests: expected digests of frames of one size, got sizes [(56, 84), (84, 56)]"
+    assert str(outcome) == expected
+
+
+def test_what_is_kept_holds_on_to_no_request() -> None:
+    """A frame of a large request would keep all of it."""
+    cache, frames = FeatureCache[Any](BYTES_PER_MB), frames_of(10, 3)
+    ask(engine(MODELS[0], cache), named(frames, frames))
+    kept = cache.found([frame_digest(frame) for frame in frames])
+    assert len(kept) == 3
+    assert all(frame.base is None for frame in kept.values())
+
+
+def test_many_frames_stay_within_the_limit() -> None:
+    cache, frames = FeatureCache[Any](BYTES_PER_MB // 4), frames_of(11, 2000, (28, 28))
+    cached = engine(MODELS[0], cache)
+    for start in range(0, 2000, 100):
+        cached.evaluate([whole(frames[at : at + 4]) for at in range(start, start + 100, 4)])
+        assert cache.num_bytes <= BYTES_PER_MB // 4
+    assert len(cache) > 20
