@@ -50,6 +50,14 @@ def journals_of_the_dead(prefix: str) -> dict[str, bytes]:
     return {journal.file.name.removeprefix(prefix): journal.file.read_bytes() for journal in journals}
 
 
+def all_wait(prefix: str) -> bool:
+    """Whether all processes of the server whose regions begin with ``prefix`` have loaded, and have nothing to do."""
+    files = [file for file in SHARED_MEMORY.glob(f"{prefix}*") if not file.name.endswith("_lock")]
+    journals = [Journal.open(file) for file in files if file.name.endswith(_SUFFIX)]
+    regions = [file for file in files if not file.name.endswith(_SUFFIX)]
+    return len(journals) == len(regions) > 0 and all(journal is not None and not journal.busy_s for journal in journals)
+
+
 def restore_journals(prefix: str, journals: Mapping[str, bytes]) -> None:
     """Writes ``journals_of_the_dead`` for a server that was started in place of theirs.
 

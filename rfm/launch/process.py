@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import socket
@@ -16,7 +17,7 @@ from types import TracebackType
 from typing import IO
 
 from rfm.config import DEFAULT_HOST, ServeConfig
-from rfm.journal import journals_of_the_dead, restore_journals
+from rfm.journal import all_wait, journals_of_the_dead, restore_journals
 from rfm.launch.admin_key import VARIABLE, http_headers, new_key, restrictions
 from rfm.launch.cleanup import Claim
 from rfm.launch.ending import EXIT_TIMEOUT_S, end, ending_with_parent
@@ -29,6 +30,7 @@ from rfm.launch.triton_options import check_arguments, size_limits
 from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
 
 POLL_S = 0.1
+STALLED_S = 30.0  # within which Triton takes up processes that have loaded
 ANSWER_TIMEOUT_S = 10.0  # of one that starts
 NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # a `load` would load all versions anew: their folders have changed
 SECRETS = (VARIABLE, GATEWAY_KEY_VARIABLE)  # variables that neither Triton nor a model process needs
@@ -94,6 +96,14 @@ class Endpoints:
                 number = getattr(error, "errno", None)
                 reason = os.strerror(number) if number and number > 0 else str(error)
                 raise ServerStartError(f"{name}: expected {expected}, got: {reason}") from error
+
+
+class SpoiltStartError(ServerStartError):
+    """Triton has lost one of the processes that load: it was not heard of for a second.
+
+    That happens where the machine stands still for a moment. Triton 2.51 then waits for ever for the process to end, or
+    ends itself.
+    """
 
 
 class TritonServer:
@@ -213,17 +223,40 @@ class TritonServer:
             program = self._installation.executable
             raise ServerStartError(f"tritonserver: expected a program at {program}, got: {error.strerror}") from error
 
-    def wait_ready(self) -> None:
-        """Returns when every model is ready. Raises ServerStartError with the reason of one that is not."""
+    def start_ready(self, restored: Collection[str] | None = None) -> None:
+        """Starts the process, and returns when every model is ready; a start that Triton has spoilt is repeated once.
+        Raises ServerStartError. Arguments as of ``start``.
+        """
+        try:
+            self.start(restored)
+            self.wait_ready(STALLED_S)
+        except SpoiltStartError:
+            self.stop()
+            self.start(restored)
+            self.wait_ready()
+
+    def wait_ready(self, stalled_s: float = math.inf) -> None:
+        """Returns when every model is ready. Raises ServerStartError with the reason of one that is not.
+
+        stalled_s: Triton has spoilt its start if all model processes have loaded, and wait for so long. Models of
+            other backends may take longer, so that this is no proof
+        """
         assert self._process is not None  # started
+        assert self._claim is not None
+        last_work_s = time.monotonic()
         triton = Http(self.endpoints.http_host, self.endpoints.http_port)
         headers = http_headers(self._admin_key)
         while self._process.poll() is None:
             try:
                 version = triton.get_json("/v2", ANSWER_TIMEOUT_S).get("version", "")
                 index = triton.get_json(INDEX_PATH, ANSWER_TIMEOUT_S, method="POST", headers=headers)
-            except NO_ANSWER:
-                time.sleep(POLL_S)  # Triton answers nothing while it loads
+            except NO_ANSWER:  # Triton gives none while it loads
+                if not all_wait(self._claim.region_prefix):
+                    last_work_s = time.monotonic()
+                elif time.monotonic() - last_work_s > stalled_s:
+                    self.kill()
+                    raise SpoiltStartError("tritonserver: expected to be ready, got processes that wait") from None
+                time.sleep(POLL_S)
                 continue
             failed = [entry for entry in versions_of(index) if not entry.is_ready and entry.name in self._loading]
             if failed:
@@ -231,7 +264,8 @@ class TritonServer:
                 raise ServerStartError(f"models: expected all to be ready, got {reasons}")
             check_version(self.endpoints.host, version, accepted=self._accepts_known_vulnerabilities)
             return
-        raise ServerStartError(f"tritonserver: expected to run, got exit status {self._process.returncode}")
+        kind = SpoiltStartError if self._process.returncode == -signal.SIGABRT else ServerStartError
+        raise kind(f"tritonserver: expected to run, got exit status {self._process.returncode}")
 
     def stop(self) -> int:
         """Ends the server gracefully, by force after KILL_AFTER_S, and gives its exit status (0 if it never ran)."""
@@ -242,8 +276,7 @@ class TritonServer:
 
     def __enter__(self) -> TritonServer:
         try:
-            self.start()
-            self.wait_ready()
+            self.start_ready()
         except BaseException:
             self.stop()
             raise

@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
-from rfm.launch.process import TritonServer
+from rfm.launch.process import STALLED_S, TritonServer
 from rfm.launch.repository_api import RepositoryApi
 from rfm.supervise.model_processes import ModelProcess
 from rfm.supervise.triton_watch import Config, serving_just
@@ -32,6 +32,7 @@ class Reload:
         self._is_closed = False
         self.out_since_s: float | None = time.monotonic() if is_out else None  # it was unloaded then
         self.ended: list[ModelProcess] = []  # its processes that have ended since
+        self._stalled_since_s: float | None = None  # all its processes have loaded, and wait
 
     def close(self) -> None:
         """Keeps a running attempt from changing anything more."""
@@ -58,6 +59,21 @@ class Reload:
         """
         with self._server.repository_api() as api:
             self._take_out(api, processes)
+
+    def end_stalled(self, processes: Sequence[ModelProcess]) -> None:
+        """Ends processes that have loaded, and that Triton does not take up: it waits for their end (``process``).
+
+        processes: of the model, dead or alive, while an attempt is under way
+        """
+        new = [process for process in processes if process not in self.ended and process.is_alive]
+        journals = [process.journal for process in new]
+        if not new or any(journal is None or journal.busy_s for journal in journals):
+            self._stalled_since_s = None
+        elif self._stalled_since_s is None:
+            self._stalled_since_s = time.monotonic()
+        elif time.monotonic() - self._stalled_since_s > STALLED_S:
+            for process in new:
+                process.kill()
 
     def _take_out(self, api: RepositoryApi, processes: Sequence[ModelProcess]) -> None:
         """Unloads the model, unless somebody has done so: then it is to stay unloaded."""

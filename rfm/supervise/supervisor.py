@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
 from collections.abc import Callable, Sequence
@@ -13,7 +14,7 @@ from types import FrameType
 from rfm.launch import cleanup
 from rfm.launch.ending import stop_signals_to
 from rfm.launch.installation import ServerStartError
-from rfm.launch.process import POLL_S, TritonServer
+from rfm.launch.process import POLL_S, STALLED_S, SpoiltStartError, TritonServer
 from rfm.supervise.back_off import BackOff
 from rfm.supervise.gateway_process import GatewayProcess
 from rfm.supervise.served_models import ServedModels
@@ -54,6 +55,7 @@ class Supervisor:
         )
         self._is_to_stop = threading.Event()
         self._back_off = BackOff("tritonserver")
+        self._stalled_s = STALLED_S
         self._models: ServedModels | None = None  # None: it is started, or has ended
         self._configs: dict[str, Config] | None = None  # the configurations served last; None: those in the files
 
@@ -78,7 +80,7 @@ class Supervisor:
 
     def _serve(self) -> int:
         try:
-            self._start()
+            self._start_first()
             if self._gateway is not None and self._models is not None:
                 self._gateway.start()
             while not self._is_to_stop.wait(POLL_S):
@@ -94,6 +96,12 @@ class Supervisor:
             status = self._server.stop()
         return status
 
+    def _start_first(self) -> None:
+        try:
+            self._start()
+        except SpoiltStartError as error:
+            self._start_again(str(error))
+
     def _start(self) -> None:
         """Starts Triton, and looks after its models from now on. Raises ServerStartError.
 
@@ -103,7 +111,12 @@ class Supervisor:
         self._server.start(self._restored())
         if self._is_to_stop.is_set():  # before there was a process to pass it to
             return
-        self._server.wait_ready()
+        try:
+            self._server.wait_ready(self._stalled_s)
+            self._stalled_s = STALLED_S
+        except SpoiltStartError:
+            self._stalled_s = math.inf  # if it was only slow, it has its time now
+            raise
         ends = self._server.endpoints
         urls = f"{ends.grpc_url}, {ends.http_url}, metrics at {ends.metrics_url}"
         if self._configs is None:

@@ -8,6 +8,7 @@ import gc
 import time
 import urllib.request
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,10 @@ from rfm_client import (
     AsyncRewardClient,
     InvalidSampleError,
     ModelNotFoundError,
+    ProcessEndedError,
     ProgressResult,
     RewardClient,
+    ServerUnavailableError,
     Trajectory,
 )
 from rfm_client.contract import wire
@@ -37,11 +40,12 @@ from rfm_client.data.sampling import RULES, Rule, Sampling
 from rfm_client.episodes import Episode, SuccessRule
 from rfm_client.transport.access import Access
 from rfm_client.transport.calls import Answer, GrpcTransport
+from rfm_serve import serving
 
 pytestmark = pytest.mark.triton
 
-MODEL = "enc_c1_t1_disc10"  # takes digests
-IMAGES, VIDEO = "q3_tok_disc10", "q25_video_avg_disc10"  # do not
+MODEL = "enc_c1_t1_disc10"
+IMAGES, VIDEO = "q3_tok_disc10", "q25_video_avg_disc10"
 TASK = "stack the cups"
 TOLERANCE, VLM_TOLERANCE = 1e-5, 1e-4
 TOLD_S = 1.0  # in which the model tells Triton what it has counted
@@ -404,8 +408,8 @@ def test_a_task_or_model_that_is_not_there_is_told(served: Served) -> None:
             client.episode("\ud800", frames=4).add(frames[0])
 
 
-def repository_of_encoders(folder: Path, **changes: Any) -> Path:
-    config = goldens.config(MODEL)
+def repository_of(folder: Path, checkpoint: str = MODEL, **changes: Any) -> Path:
+    config = goldens.config(checkpoint)
     repository = folder / "model_repository"
     rfm_export.export(config.checkpoint, repository, replace(serve_config(config, MODEL), **changes))
     return repository
@@ -413,7 +417,7 @@ def repository_of_encoders(folder: Path, **changes: Any) -> Path:
 
 @pytest.mark.slow
 def test_an_episode_goes_on_when_its_server_was_restarted(tmp_path: Path, protocol: str) -> None:
-    repository, endpoints = repository_of_encoders(tmp_path), Endpoints.free()
+    repository, endpoints = repository_of(tmp_path), Endpoints.free()
     frames = film(111, 9)
     url = endpoints.grpc_url if protocol == "grpc" else endpoints.http_url
     with RewardClient(url, model=MODEL) as client, client.episode(TASK, frames=4) as episode:
@@ -427,10 +431,33 @@ def test_an_episode_goes_on_when_its_server_was_restarted(tmp_path: Path, protoc
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("checkpoint", "killed", "tolerance"),
+    [(MODEL, f"{MODEL}_encoder", TOLERANCE), (IMAGES, f"{MODEL}_frames", VLM_TOLERANCE)],
+)
+def test_an_episode_goes_on_when_the_process_that_knew_its_frames_was_killed(
+    tmp_path: Path, checkpoint: str, killed: str, tolerance: float
+) -> None:
+    frames = film(118, 9)
+    with serving(repository_of(tmp_path, checkpoint)) as served, served.client(model=MODEL) as client:
+        served.wait_ready()
+        with client.episode(TASK, frames=4) as episode:
+            scores = [episode.add(frame) for frame in frames[:5]]
+            (process,) = served.model_processes_of(killed)
+            process.kill()
+            while len(scores) < len(frames):
+                with suppress(ServerUnavailableError, ProcessEndedError):  # then the episode has not grown
+                    scores.append(episode.add(frames[len(scores)]))
+        expected = offline(client, frames, Sampling("rint_pad", 4))
+    assert [score.step for score in scores] == list(range(len(frames)))
+    assert_same(([score.progress for score in scores], [score.success for score in scores]), expected, tolerance)
+
+
+@pytest.mark.slow
 def test_two_servers_that_know_different_frames_and_one_without_a_cache_score_alike(tmp_path: Path) -> None:
     frames = film(112, 12)
-    caching = repository_of_encoders(tmp_path / "caching")
-    plain = repository_of_encoders(tmp_path / "plain", feature_cache_mb=0)
+    caching = repository_of(tmp_path / "caching")
+    plain = repository_of(tmp_path / "plain", feature_cache_mb=0)
     first, second, third = Endpoints.free(), Endpoints.free(), Endpoints.free()
     with (
         TritonServer(caching, first, find_installation()),

@@ -36,5 +36,4 @@ class Served:
         """
         if self.server.exit_status is not None:
             self.server.stop()
-            self.server.start()
-            self.server.wait_ready()
+            self.server.start_ready()
