@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -175,7 +176,7 @@ def exit_code_of(failures: Sequence[Exception], *, some_succeeded: bool) -> Exit
 
 def report(message: str) -> None:
     """Writes the message as one line to standard error."""
-    typer.echo(f"rfm-client: {' '.join(message.split())}", err=True)
+    print(f"rfm-client: {' '.join(message.split())}", file=sys.stderr, flush=True)  # above a progress bar, if any
 
 
 def fail(message: str, code: ExitCode) -> NoReturn:
