@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import io
+import subprocess
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 import clip
-from client_commands import TASK
+from client_commands import RFM_CLIENT, TASK
 from rfm.launch.process import Endpoints
 from rfm_client.cli.options import ExitCode
 from rfm_client.cli.show import shortened, status_tables, table
@@ -108,3 +110,9 @@ def test_the_reason_of_a_model_that_is_not_ready_has_a_line_of_its_own() -> None
     assert second.split() == ["rfm_encoder", "1", "4", "0.8", "1.50", "5.00"]
     assert "rfm_encoder 1: a [reason]\n" in shown
     assert shown.rstrip().endswith("no metrics")
+
+
+@pytest.mark.parametrize(("program", "distribution"), [("rfm", "rfm-triton"), ("rfm-client", "rfm-client")])
+def test_a_command_tells_its_version(program: str, distribution: str) -> None:
+    done = subprocess.run([RFM_CLIENT.parent / program, "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == f"{program} {importlib.metadata.version(distribution)}\n"
