@@ -20,9 +20,10 @@ from rfm_client.cli.options import EXIT_CODES, STANDARD_OUTPUT, OneLineCommand, 
 from rfm_client.cli.scoring import Failed, Outcome, Question, Scored
 from rfm_client.cli.show import MAX_PANELS, print_tables
 from rfm_client.contract.addresses import split_url
-from rfm_client.contract.errors import RewardError
+from rfm_client.contract.errors import RewardError, ServerUnavailableError
 from rfm_client.contract.names import DEFAULT_MODEL, frames_name
 from rfm_client.contract.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS
+from rfm_client.ports import wrong_port
 
 MIN_COMPARED = 2
 
@@ -190,8 +191,13 @@ def status(
     options.check_outputs(json, None)
     if metrics_url is not None and len(urls) > 1:
         raise typer.BadParameter("expected one --url with it, got several", param_hint="--metrics-url")
-    with options.usage_errors("--url"):
-        statuses = [read_status(url, metrics_url=metrics_url, timeout_s=timeout, access=context.obj) for url in urls]
+    try:
+        with options.usage_errors("--url"):
+            statuses = [
+                read_status(url, metrics_url=metrics_url, timeout_s=timeout, access=context.obj) for url in urls
+            ]
+    except RewardError as error:
+        raise options.port_named(urls, error) from error
     if json != STANDARD_OUTPUT:
         print_tables(*(table for status in statuses for table in status_tables(status)))
     if json is not None:
@@ -211,6 +217,8 @@ def wait(
     with options.usage_errors("--url"):
         client = RewardClient(urls, model=model, **context.obj.options)
     with client:
+        if all(named := [wrong_port(url) for url in urls]):
+            raise ServerUnavailableError(named[0])  # which no wait will mend
         client.wait_ready(timeout)
 
 

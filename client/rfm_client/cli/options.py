@@ -19,6 +19,7 @@ from rfm_client.client import RewardClient
 from rfm_client.contract import errors
 from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_client.data.sampling import Rule, Sampling
+from rfm_client.ports import wrong_port
 from rfm_client.transport.access import Access
 
 DEFAULT_URL = "grpc://localhost:8001"
@@ -148,7 +149,7 @@ class Server:
                     return
                 except errors.RewardError as error:
                     problems.append(error)
-        raise problems[0]
+        raise port_named(self.urls, problems[0])
 
 
 def read_access(ca_file: Path | None, certificate: Path | None, key: Path | None, key_file: Path | None) -> Access:
@@ -159,6 +160,14 @@ def read_access(ca_file: Path | None, certificate: Path | None, key: Path | None
         except (OSError, UnicodeDecodeError) as error:
             raise ValueError(f"expected a text file, got {error}") from None
         return Access(ca_file, certificate, key, api_key=api_key)
+
+
+def port_named(urls: Sequence[str], error: errors.RewardError) -> errors.RewardError:
+    """The error of servers that do not answer as servers do; if a port is to blame, one that names the right one."""
+    if isinstance(error, (errors.DeadlineExceededError, errors.AccessDeniedError, errors.InvalidSampleError)):
+        return error
+    named = next(filter(None, map(wrong_port, urls)), None)
+    return error if named is None else errors.ServerUnavailableError(named)
 
 
 def exit_code(error: BaseException) -> ExitCode:
