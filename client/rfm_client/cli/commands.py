@@ -91,6 +91,7 @@ def score(
     frames: options.SampledFrames = None,
     resize: options.Resize = False,
     plot: options.Plot = None,
+    rrd: options.Recorded = None,
     json: options.Json = None,
     npy: Annotated[
         Path | None,
@@ -104,7 +105,7 @@ def score(
     """Progress and success at each frame of one or many videos. One that fails does not stop the others."""
     from rfm_client.cli import show
 
-    options.check_outputs(json, plot)
+    options.check_outputs(json, plot, rrd)
     outputs.check_arrays(npy, videos)
     _check_panels(plot, videos)
     if 0 < frame_steps < MIN_FRAME_STEPS:
@@ -125,7 +126,8 @@ def score(
         if rows is not None:
             rows.write(outcome.row())
 
-    outcomes = scoring.score_all(server, videos, question, tell)
+    with outputs.recorder(rrd, videos) as record:
+        outcomes = scoring.score_all(server, videos, question, tell, record)
     scored = [outcome for outcome in outcomes if isinstance(outcome, Scored)]
     if json is not None:
         outputs.write_json(json, outputs.score_document(server, question, outcomes))

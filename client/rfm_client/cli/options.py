@@ -25,6 +25,7 @@ from rfm_client.transport.access import Access
 DEFAULT_URL = "grpc://localhost:8001"
 STANDARD_OUTPUT = "-"
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.001, 86_400
+RECORDING = ".rrd"
 PICTURES = (".png", ".pdf", ".svg")
 
 
@@ -83,6 +84,10 @@ Json = Annotated[
 ]
 Plot = Annotated[
     Path | None, typer.Option("--plot", metavar="FILE", help="Draw frames and scores: .png, .pdf or .svg.")
+]
+Recorded = Annotated[
+    Path | None,
+    typer.Option("--rrd", metavar="FILE", help="Record frames and scores on one timeline for Rerun's viewer: .rrd."),
 ]
 Task = Annotated[str, typer.Option("--task", help="What is to be done, as a sentence.")]
 Fps = Annotated[float, typer.Option("--fps", min=0.001, help="Frames a second that are taken from a video.")]
@@ -223,13 +228,15 @@ def missing_package(error: ImportError) -> str:
     return str(error) if "pip install" in str(error) else f'{error}: pip install "./client[cli]"'
 
 
-def check_outputs(json: str | None, plot: Path | None) -> None:
+def check_outputs(json: str | None, plot: Path | None, rrd: Path | None = None) -> None:
     """Checks, before the first request, that results can be written. Raises typer.BadParameter."""
     if json is not None and json != STANDARD_OUTPUT and Path(json).suffix != ".json":
         raise typer.BadParameter(f"expected a .json file or -, got {json}", param_hint="--json")
     if plot is not None and plot.suffix not in PICTURES:
         raise typer.BadParameter(f"expected a file that ends in {', '.join(PICTURES)}, got {plot}", param_hint="--plot")
-    for option, file in (("--json", json), ("--plot", plot)):
+    if rrd is not None and rrd.suffix != RECORDING:
+        raise typer.BadParameter(f"expected a file that ends in {RECORDING}, got {rrd}", param_hint="--rrd")
+    for option, file in (("--json", json), ("--plot", plot), ("--rrd", rrd)):
         if file is not None and not Path(file).parent.is_dir():
             raise typer.BadParameter(f"expected a folder at {Path(file).parent}, got none", param_hint=option)
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 import itertools
 import json
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,17 @@ import typer
 
 from rfm_client.cli.comparing import Comparison
 from rfm_client.cli.options import STANDARD_OUTPUT, Server
-from rfm_client.cli.scoring import COLUMNS, Outcome, Question, Scored, Times, times_of, unique_stems
+from rfm_client.cli.scoring import (
+    COLUMNS,
+    Outcome,
+    Question,
+    Record,
+    Scored,
+    Source,
+    Times,
+    times_of,
+    unique_stems,
+)
 from rfm_client.cli.show import FILE_WIDTH, shortened
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
@@ -146,6 +157,27 @@ class Arrays:
         file = self._files[number]
         if file is not None:
             np.save(file, np.stack([scored.result.progress, scored.result.success], axis=1))
+
+
+@contextmanager
+def recorder(file: Path | None, names: Sequence[str]) -> Iterator[Record | None]:
+    """What records each source in a file of Rerun's, under its name without folder and ending; None: nothing is.
+
+    Raises ImportError if the package is missing.
+    """
+    if file is None:
+        yield None
+        return
+    from rfm_client.integrations.recording import Recording
+
+    stems = unique_stems(names)
+    with Recording(file) as recording:
+
+        def record(number: int, source: Source, scores: FrameScores) -> None:
+            frames = source.trajectory.frames
+            recording.add(stems[number], scores, {} if frames is None else {"": frames}, source.times_s)
+
+        yield record
 
 
 class Rows:

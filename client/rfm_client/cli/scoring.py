@@ -122,15 +122,18 @@ Outcome: TypeAlias = Scored | Failed
 
 
 Tell = Callable[[int, Outcome], None]  # is called with the number of a source, and what came of it
+Record = Callable[[int, Source, FrameScores], None]  # with its frames, too, before they are forgotten; by any thread
 
 
-def score_all(server: Server, names: Sequence[str], question: Question, tell: Tell) -> list[Outcome]:
+def score_all(
+    server: Server, names: Sequence[str], question: Question, tell: Tell, record: Record | None = None
+) -> list[Outcome]:
     """The outcome of each source, in order; each is told when it is there. Raises RewardError if no server answers."""
     with ThreadPoolExecutor(WORKERS) as pool, server.connected() as client, _progress_bar(len(names)) as advance:
-        asking = _Asking(client, question)
+        asking = _Asking(client, question, record)
         try:
             numbers: dict[Future[Outcome], int] = {
-                pool.submit(asking.outcome, name): number for number, name in enumerate(names)
+                pool.submit(asking.outcome, number, name): number for number, name in enumerate(names)
             }
             for future in as_completed(numbers):
                 tell(numbers[future], future.result())
@@ -144,13 +147,14 @@ def score_all(server: Server, names: Sequence[str], question: Question, tell: Te
 class _Asking:
     """Asks about one source after the other, until no server answers any more. For several threads."""
 
-    def __init__(self, client: RewardClient, question: Question) -> None:
+    def __init__(self, client: RewardClient, question: Question, record: Record | None) -> None:
         self._client = client
         self._question = question
+        self._record = record
         self._gone: RewardError | None = None
 
-    def outcome(self, name: str) -> Outcome:
-        """The scores of a source, or why there are none."""
+    def outcome(self, number: int, name: str) -> Outcome:
+        """The scores of the source of this number, or why there are none."""
         started_s = time.monotonic()
         try:
             self._go_on()
@@ -164,6 +168,8 @@ class _Asking:
         except (RewardError, OSError) as error:
             message = str(error).removesuffix(f" ({name})")  # the report names the source in any case
             return Failed(name, error, message, is_server_gone=self._is_server_gone(error))
+        if self._record is not None:
+            self._record(number, source, result)
         return Scored(
             name=name,
             result=result,
