@@ -175,7 +175,7 @@ def recorder(file: Path | None, names: Sequence[str]) -> Iterator[Record | None]
 
         def record(number: int, source: Source, scores: FrameScores) -> None:
             frames = source.trajectory.frames
-            recording.add(stems[number], scores, {} if frames is None else {"": frames}, source.times_s)
+            recording.add((stems[number],), scores, {} if frames is None else {"": frames}, source.times_s)
 
         yield record
 

@@ -7,7 +7,7 @@ Needs ``rfm-client[rerun]``. T frames, S of them scored.
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -29,34 +29,41 @@ _APPLICATION = "rfm-client"
 _COLOURS = {PROGRESS: (31, 119, 180), SUCCESS: (44, 160, 44)}  # as in plots
 
 
+def load_rerun() -> Any:
+    """The package. Raises ImportError, which says how to install it."""
+    try:
+        import rerun
+    except ImportError as error:
+        raise ImportError('recordings need rerun-sdk: pip install "./client[rerun]"') from error
+    return rerun
+
+
 class Recording:
     """A recording file to which trajectories are added, by any threads. The file is made with the first one.
 
-    Each has an entity of its own, which holds ``image``, ``progress`` and ``success``. Scores that the checkpoint does
+    Each is an entity, which holds ``image``, ``progress`` and ``success``. Scores that the checkpoint does
     not predict are left out.
     """
 
     def __init__(self, file: Path) -> None:
         """Raises ImportError if the package is missing."""
-        try:
-            import rerun
-        except ImportError as error:
-            raise ImportError('recordings need rerun-sdk: pip install "./client[rerun]"') from error
-        self._rerun = rerun
+        self._rerun = load_rerun()
         self._file = file
         self._stream: Any = None
         self._lock = threading.Lock()
 
     def add(
         self,
-        name: str,
+        entity: Sequence[str],
         scores: FrameScores,
-        films: Mapping[str, UInt8Array],
+        films: Mapping[str, Iterable[UInt8Array]],
         times_s: npt.NDArray[np.float64] | None = None,
     ) -> None:
         """Adds a trajectory with its scores.
 
-        films: uint8 [T, H, W, 3] by the camera's name, which is empty if there is only one; none: it is of embeddings
+        entity: its name, part by part; empty if it is the only one of the file
+        films: T frames, uint8 [H, W, 3], by the camera's name, which is empty if there is only one; none: it is of
+            embeddings
         times_s: [T], when each frame is in the film; None: it is not known
         """
         scored = np.arange(len(scores.progress)) if scores.frame_indices is None else scores.frame_indices
@@ -66,16 +73,16 @@ class Recording:
             self._stream.reset_time()  # of what this thread has added before
             for curve in curves:
                 style = self._rerun.SeriesLines(names=curve, colors=_COLOURS[curve])
-                self._log((name, curve), style, static=True)
+                self._log((*entity, curve), style, static=True)
             for camera, frames in films.items():
                 for index, frame in enumerate(frames):
                     self._set_time(index, times_s)
                     image = self._rerun.Image(frame).compress(jpeg_quality=JPEG_QUALITY)
-                    self._log((name, IMAGE, *filter(None, [camera])), image)
+                    self._log((*entity, IMAGE, *filter(None, [camera])), image)
             for position, index in enumerate(scored.tolist()):
                 self._set_time(index, times_s)
                 for curve, values in curves.items():
-                    self._log((name, curve), self._rerun.Scalars(float(values[position])))
+                    self._log((*entity, curve), self._rerun.Scalars(float(values[position])))
 
     def close(self) -> None:
         """Writes what is left to the file."""
