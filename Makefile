@@ -140,7 +140,7 @@ $(INSTALLED): pyproject.toml client/pyproject.toml gateway/pyproject.toml constr
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-	  --editable "client[gym,hdf5,label,ray]" --editable gateway --editable ".[encoders,vlm,triton,demo,dev]"
+	  --editable "client[gym,hdf5,label,ray,rerun]" --editable gateway --editable ".[encoders,vlm,triton,demo,dev]"
 	touch $@
 
 # Remove what make has made.

@@ -38,6 +38,7 @@ _DEVICE_METRIC = re.compile("nv_(cpu|gpu)_(utilization|memory_used_bytes|memory_
 _REQUESTS_METRIC = "nv_inference_request_success_total"
 _COMPUTE_METRIC = "nv_inference_compute_infer_duration_us_total"
 _BATCH_SAMPLES_METRIC, _WAIT_METRIC = "rfm_batch_samples", "rfm_wait_seconds"  # histograms
+_SAMPLES_METRIC, _REFUSED = "rfm_samples_total", "refused"  # by outcome
 _SCORING_METRICS = ("rfm_collate_seconds", "rfm_forward_seconds")
 _SAMPLED_METRIC = "nv_cpu_memory_used_bytes"
 _SAMPLING_S = 2.5  # Triton looks at the machine every two seconds; until the first time it reports zeros
@@ -77,6 +78,7 @@ class ModelStatus:
     queue_ms, compute_ms: of all requests in Triton's queue, of all that Triton has handed over until it could go on
     last_used_s: Unix time of the last request; None: there was none
     batches: None: the metrics do not say
+    samples_refused: that cannot be scored, the fault of those who sent them; None: the metrics do not say
     """
 
     name: str
@@ -92,6 +94,7 @@ class ModelStatus:
     compute_ms: float
     last_used_s: float | None = None
     batches: Batches | None = None
+    samples_refused: int | None = None
 
     @property
     def batch_count(self) -> int:
@@ -169,6 +172,7 @@ class _Metrics:
     devices: tuple[Device, ...] = ()
     pending: Mapping[_Version, int] = field(default_factory=dict)
     batches: Mapping[_Version, Batches] = field(default_factory=dict)
+    refused: Mapping[_Version, int] = field(default_factory=dict)
     error: str | None = None
 
 
@@ -292,6 +296,7 @@ def _models(server: _Server, metrics: _Metrics) -> list[ModelStatus]:
                 / _NS_PER_MS,
                 last_used_s=int(done.get("last_inference", 0)) / _MS_PER_S or None,
                 batches=metrics.batches.get(key),
+                samples_refused=metrics.refused.get(key),
             )
         )
     return models
@@ -316,6 +321,7 @@ def _read_metrics(url: str, timeout_s: float) -> _Metrics:
         match = _DEVICE_METRIC.fullmatch(sample.name)
         if match:
             devices.setdefault(sample.labels.get("gpu_uuid", match[1].upper()), {})[match[2]] = sample.value
+    refused = [sample for sample in samples if sample.labels.get("outcome") == _REFUSED]
     return _Metrics(
         devices=tuple(
             Device(
@@ -329,6 +335,7 @@ def _read_metrics(url: str, timeout_s: float) -> _Metrics:
         ),
         pending={version: int(count) for version, count in _totals(samples, *WAITING_METRICS).items()},
         batches=_batches(samples),
+        refused={version: int(count) for version, count in _totals(refused, _SAMPLES_METRIC).items()},
     )
 
 

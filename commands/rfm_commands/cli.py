@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
 from collections.abc import Iterable
 from dataclasses import replace
@@ -62,6 +63,21 @@ MoreArguments = Annotated[
     list[str] | None,
     typer.Argument(metavar="-- --OPTION=VALUE...", help="More of tritonserver's options.", show_default=False),
 ]
+
+
+def _print_version(is_wanted: bool) -> None:
+    if is_wanted:
+        typer.echo(f"rfm {importlib.metadata.version('rfm-triton')}")
+        raise typer.Exit
+
+
+@app.callback()
+def rfm(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Reward models for robot learning, served by Triton."""
 
 
 @app.command()

@@ -28,4 +28,5 @@ def score_video(endpoints: Endpoints, video: Path, task: str, fps: float, pictur
 
 def show_metrics(endpoints: Endpoints, console: Console) -> None:
     """Prints what Triton counted while the demo ran."""
-    console.print(*status_tables(read_status(endpoints.http_url, metrics_url=endpoints.metrics_url)), sep="\n")
+    status = read_status(endpoints.http_url, metrics_url=endpoints.metrics_url)
+    console.print(*status_tables(status), sep="\n", markup=False, highlight=False)

@@ -30,6 +30,7 @@ from client_commands import (
     assert_scores,
     columns,
     invoke,
+    rows,
     run,
     web_server,
 )
@@ -128,6 +129,9 @@ def test_status_shows_the_gpus_and_what_waits(served: Served, tmp_path: Path) ->
         f'nv_inference_pending_request_count{{model="{MODEL}",version="1"}} 12\n'
         f'rfm_waiting_requests{{model="{MODEL}",version="1",device="cpu",instance="{MODEL}_0_0"}} 3\n'
         f'rfm_waiting_requests{{model="{MODEL}",version="1",device="cpu",instance="{MODEL}_0_1"}} 4\n'
+        f'rfm_samples_total{{model="{MODEL}",version="1",outcome="refused",sample_type="progress"}} 4\n'
+        f'rfm_samples_total{{model="{MODEL}",version="1",outcome="refused",sample_type="preference"}} 2\n'
+        f'rfm_samples_total{{model="{MODEL}",version="1",outcome="failed",sample_type="progress"}} 8\n'
         f'rfm_waiting_requests{{model="{MODEL}_encoder",version="1",device="cpu",instance="encoder"}} 5\n'
         + "".join(
             f'rfm_{name}{{model="{MODEL}",version="1",device="cpu",instance="{MODEL}_0_{instance}"}} {value}\n'
@@ -138,9 +142,9 @@ def test_status_shows_the_gpus_and_what_waits(served: Served, tmp_path: Path) ->
     with web_server(tmp_path) as url:
         result = invoke("status", "--url", served.url("grpc"), "--metrics-url", f"{url}/metrics")
     assert result.exit_code == 0
-    shown = columns(result.stdout, f"{MODEL} ")
-    assert shown[5] == "19"  # in Triton and in the model
-    assert shown[7:] == ["40", "3.0", "250.00"]
+    requests, batches = rows(result.stdout, f"{MODEL} ")
+    assert requests[5:] == ["6", "19"]  # refused; pending in Triton and in the model
+    assert batches[2:5] == ["40", "3.0", "250.00"]
     with web_server(tmp_path) as url:
         (model,) = (m for m in read_status(served.url("grpc"), metrics_url=f"{url}/metrics").models if m.name == MODEL)
     assert model.queue_ms_per_request == pytest.approx(model.queue_ms / model.requests_succeeded + 500)
@@ -155,7 +159,9 @@ def test_status_without_metrics_shows_the_rest_and_says_so(served: Served) -> No
     result = invoke("status", "--url", served.url("http"), "--metrics-url", f"{address}/metrics")
     assert result.exit_code == 0
     assert f"no metrics of the machine: {address}/metrics: " in result.stdout
-    assert columns(result.stdout, f"{MODEL} ")[1:3] == ["1", "READY"]
+    requests, _ = rows(result.stdout, f"{MODEL} ")
+    assert requests[1:3] == ["1", "READY"]
+    assert requests[5:] == ["-", "-"]
 
 
 def test_status_looks_for_metrics_at_the_server_s_host(served: Served) -> None:
@@ -371,6 +377,7 @@ USAGE: dict[str, tuple[list[str], str]] = {
         ["status", "--url", "http://localhost:99999"],
         "expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
     ),
+    "nothing to compare": (["compare", "a.mp4"], "expected at least 2 videos, got 1"),
     "long": (["sample", "--num-frames", "10000"], "expected a length (8), several (4,8,16) or a range (4-16)"),
     "no length": (["sample", "--num-frames", "0"], "expected a length (8), several (4,8,16) or a range (4-16)"),
     "metrics": (

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -58,10 +59,12 @@ def test_score_writes_what_the_client_gives_and_one_bad_video_does_not_stop_the_
         RFM_URL=served.url(protocol),
     )
     assert result.returncode == ExitCode.FAILED
-    assert result.stderr.splitlines() == [
-        f"rfm-client: note: {video}: 16 of 32 frames were scored, evenly spaced",
-        f"rfm-client: {missing}: video: expected a file with a video stream, got No such file or directory",
-    ]
+    assert sorted(result.stderr.splitlines()) == sorted(  # as they are done
+        [
+            f"rfm-client: note: {video}: 16 of 32 frames were scored, evenly spaced",
+            f"rfm-client: {missing}: video: expected a file with a video stream, got No such file or directory",
+        ]
+    )
     with served.client(protocol, MODEL) as client:
         filmed = client.progress(load_trajectory(video, task=TASK, fps=10), subsample=True)
         embedded = client.progress(seen)
@@ -159,7 +162,11 @@ def test_score_asks_several_servers(served: Served, video: Path) -> None:
 def test_a_task_that_is_missing_is_told(served: Served, video: Path) -> None:
     result = ask(served, "score", video)
     assert result.exit_code == ExitCode.FAILED
-    assert result.stderr == f"rfm-client: {video}: trajectory.task: expected a task sentence with frames, got ''\n"
+    mend = 'add --task "what is to be done"'
+    assert result.stderr == f"rfm-client: {video}: task: expected a sentence with frames, got none: {mend}\n"
+    compared = ask(served, "compare", video, video)
+    assert compared.exit_code == ExitCode.FAILED
+    assert mend in compared.stderr
 
 
 def test_compare_writes_what_the_client_gives(served: Served, protocol: str, video: Path, tmp_path: Path) -> None:
@@ -183,9 +190,63 @@ def test_compare_writes_what_the_client_gives(served: Served, protocol: str, vid
     assert_scores(document["second"], expected.second)
     assert document["second"]["frame_indices"] == np.rint(np.linspace(0, 19, 16)).astype(int).tolist()
     assert [document[name]["source"] for name in ("first", "second")] == [str(video), str(still)]
-    shares = [columns(result.stdout, str(name))[1] for name in (video, still)]
-    assert shares == [f"{document['preference']:.4f}", f"{1 - document['preference']:.4f}"]
+    with served.client(protocol, MODEL) as client:
+        swapped = client.preference(replace(second, task=TASK), first, subsample=True).preference
+    assert document["orders"] == [
+        {"first": str(video), "second": str(still), "preference": document["preference"]},
+        {"first": str(still), "second": str(video), "preference": pytest.approx(swapped, abs=TOLERANCE)},
+    ]
+    both = (document["preference"] + 1 - document["orders"][1]["preference"]) / 2
+    wins = {str(video): both, str(still): 1 - both}
+    ranked = sorted(wins, key=lambda name: -wins[name])
+    assert [(each["source"], each["wins"]) for each in document["ranking"]] == [
+        (name, pytest.approx(wins[name])) for name in ranked
+    ]
+    scores = {each["source"]: each for each in document["ranking"]}
+    for rank, name in enumerate(ranked, 1):
+        figures = (wins[name], scores[name]["progress"][-1], scores[name]["success"][-1])
+        row, *_ = (columns(line, name) for line in result.stdout.splitlines() if line.strip().startswith(name))
+        assert row[1:] == [str(rank), *(f"{figure:.4f}" for figure in figures), str(len(scores[name]["progress"]))]
     assert (tmp_path / "both.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_compare_ranks_several_videos_by_both_orders_of_every_two(served: Served, tmp_path: Path) -> None:
+    files = [tmp_path / f"{name}.npz" for name in "abc"]
+    trajectories = [random_trajectory(seed, 3 + seed, *WIDTHS) for seed in range(3)]
+    for file, seen in zip(files, trajectories, strict=True):
+        np.savez(file, video_embeddings=seen.video_embeddings, text_embedding=seen.text_embedding)
+    target = tmp_path / "scores.json"
+    result = ask(served, "compare", *files, "--json", target, "--plot", tmp_path / "all.svg")
+    assert (result.exit_code, result.stderr) == (0, "")
+    asked = [replace(seen, text_embedding=trajectories[0].text_embedding) for seen in trajectories]
+    orders = [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)]
+    with served.client("grpc", MODEL) as client:
+        told = {order: client.preference(*(asked[index] for index in order)) for order in orders}
+    document = json.loads(target.read_text())
+    assert document.keys() & {"first", "second", "preference"} == set()
+    assert document["orders"] == [
+        {
+            "first": str(files[first]),
+            "second": str(files[second]),
+            "preference": pytest.approx(told[first, second].preference, abs=TOLERANCE),
+        }
+        for first, second in orders
+    ]
+    wins = [
+        np.mean([(told[a, b].preference + 1 - told[b, a].preference) / 2 for b in range(3) if b != a]) for a in range(3)
+    ]
+    ranked = sorted(range(3), key=lambda index: -wins[index])
+    assert [each["source"] for each in document["ranking"]] == [str(files[index]) for index in ranked]
+    for index, each in zip(ranked, document["ranking"], strict=True):
+        assert each["wins"] == pytest.approx(wins[index], abs=TOLERANCE)
+        assert_scores(each, told[0, 1].first if index == 0 else told[0, index].second)
+    pairs = [line for line in result.stdout.splitlines() if line.rstrip().endswith("agree")]
+    for line, (first, second) in zip(pairs, [(0, 1), (0, 2), (1, 2)], strict=True):
+        answers = told[first, second].preference, 1 - told[second, first].preference
+        agree = "agree" if (answers[0] > 0.5) == (answers[1] > 0.5) else "disagree"
+        shown = [f"{share:.4f}" for share in (*answers, sum(answers) / 2)]
+        assert columns(line, str(files[first])) == [str(files[first]), str(files[second]), *shown, agree]
+    assert (tmp_path / "all.svg").read_text().startswith("<?xml")
 
 
 def test_compare_takes_videos_of_two_sizes(served: Served, protocol: str, video: Path, tmp_path: Path) -> None:
@@ -209,7 +270,7 @@ def test_compare_tells_what_cannot_be_compared(served: Served, video: Path, tmp_
     result = ask(served, "compare", video, tmp_path / "embeddings.npy", "--task", TASK)
     assert result.exit_code == ExitCode.FAILED
     expected = "second: expected frames, as the first trajectory, got video_embeddings"
-    assert result.stderr == f"rfm-client: {expected}\n"
+    assert result.stderr == f"rfm-client: {video} and {tmp_path / 'embeddings.npy'}: {expected}\n"
 
 
 def test_a_lerobot_file_of_several_episodes_is_neither_scored_nor_compared(

@@ -88,6 +88,7 @@ EXTRAS = {
     "huggingface_hub": {"opening.py"},
     "h5py": {"hdf5.py", "hdf5_labels.py"},
     "ray": {"ray_engine.py"},
+    "rerun": {"recording.py"},
     "prometheus_client": {"status.py"},
 }
 

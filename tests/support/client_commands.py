@@ -62,10 +62,15 @@ def run(*words: object, **environment: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+def rows(output: str, row: str) -> list[list[str]]:
+    """The cells of each table row that begins so."""
+    return [re.split(r"\s{2,}", line.strip()) for line in output.splitlines() if line.strip().startswith(row)]
+
+
 def columns(output: str, row: str) -> list[str]:
     """The cells of the table row that begins so."""
-    (line,) = (line for line in output.splitlines() if line.strip().startswith(row))
-    return re.split(r"\s{2,}", line.strip())
+    (cells,) = rows(output, row)
+    return cells
 
 
 def assert_scores(document: dict[str, Any], scores: FrameScores) -> None:

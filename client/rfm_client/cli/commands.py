@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib.metadata
 import logging
 import shlex
+from collections.abc import Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated
@@ -13,15 +14,18 @@ from typing import Annotated
 import typer
 
 from rfm_client.async_client import DEFAULT_TIMEOUT_S
-from rfm_client.cli import options, outputs, scoring, toy
+from rfm_client.cli import comparing, options, outputs, scoring, toy
 from rfm_client.cli.label import label
 from rfm_client.cli.options import EXIT_CODES, STANDARD_OUTPUT, OneLineCommand, Server
-from rfm_client.cli.scoring import Failed, Question, Scored
-from rfm_client.cli.show import print_tables
+from rfm_client.cli.scoring import Failed, Outcome, Question, Scored
+from rfm_client.cli.show import MAX_PANELS, print_tables
 from rfm_client.contract.addresses import split_url
-from rfm_client.contract.errors import RewardError
+from rfm_client.contract.errors import RewardError, ServerUnavailableError
 from rfm_client.contract.names import DEFAULT_MODEL, frames_name
 from rfm_client.contract.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS
+from rfm_client.ports import wrong_port
+
+MIN_COMPARED = 2
 
 app = typer.Typer(
     name="rfm-client",
@@ -87,6 +91,7 @@ def score(
     frames: options.SampledFrames = None,
     resize: options.Resize = False,
     plot: options.Plot = None,
+    rrd: options.Recorded = None,
     json: options.Json = None,
     npy: Annotated[
         Path | None,
@@ -100,29 +105,32 @@ def score(
     """Progress and success at each frame of one or many videos. One that fails does not stop the others."""
     from rfm_client.cli import show
 
-    options.check_outputs(json, plot)
+    options.check_outputs(json, plot, rrd)
     outputs.check_arrays(npy, videos)
-    if plot is not None and len(videos) > show.MAX_PANELS:
-        raise typer.BadParameter(f"expected at most {show.MAX_PANELS} videos, got {len(videos)}", param_hint="--plot")
+    _check_panels(plot, videos)
     if 0 < frame_steps < MIN_FRAME_STEPS:
         expected = f"expected 0 or at least {MIN_FRAME_STEPS}, got {frame_steps}"
         raise typer.BadParameter(expected, param_hint="--frame-steps")
     options.check_sampling(sampling, frames, others={"--frame-steps": frame_steps, "--max-frames": max_frames})
     server = Server(urls, model, timeout, context.obj)
     question = Question(task, fps, max_frames, frame_steps, subsample, resize, sampling, frames)
-    outcomes = scoring.score_all(server, videos, question)
-    scored = [outcome for outcome in outcomes if isinstance(outcome, Scored)]
-    for outcome in outcomes:
+    rows = None if json == STANDARD_OUTPUT else outputs.Rows(videos)
+    arrays = outputs.Arrays(npy, videos)
+
+    def tell(number: int, outcome: Outcome) -> None:
         if isinstance(outcome, Failed):
             options.report(f"{outcome.name}: {outcome.message}")
-        else:
-            _report_subsampled(outcome.name, len(outcome.result.progress), outcome.num_frames)
-    if json != STANDARD_OUTPUT and scored:
-        print_tables(scoring.scored_table(scored))
+            return
+        _report_subsampled(outcome.name, len(outcome.result.progress), outcome.num_frames)
+        arrays.write(number, outcome)
+        if rows is not None:
+            rows.write(outcome.row())
+
+    with outputs.recorder(rrd, videos) as record:
+        outcomes = scoring.score_all(server, videos, question, tell, record)
+    scored = [outcome for outcome in outcomes if isinstance(outcome, Scored)]
     if json is not None:
         outputs.write_json(json, outputs.score_document(server, question, outcomes))
-    if npy is not None:
-        outputs.write_arrays(npy, outcomes)
     if plot is not None and scored:
         show.plot(plot, [outcome.panel for outcome in scored])
     raise typer.Exit(scoring.exit_code_of(outcomes))
@@ -131,8 +139,9 @@ def score(
 @app.command(cls=OneLineCommand, epilog=EXIT_CODES)
 def compare(
     context: typer.Context,
-    first: Annotated[str, typer.Argument(metavar="FIRST", help="Video, .npy or .npz file, or URL of a video.")],
-    second: Annotated[str, typer.Argument(metavar="SECOND", help="The other one.")],
+    videos: Annotated[
+        list[str], typer.Argument(metavar="VIDEO VIDEO...", help="Videos, .npy or .npz files, or URLs of videos.")
+    ],
     urls: options.Urls,
     task: options.Task = "",
     model: options.Model = DEFAULT_MODEL,
@@ -144,17 +153,23 @@ def compare(
     json: options.Json = None,
     timeout: options.TimeoutS = DEFAULT_TIMEOUT_S,
 ) -> None:
-    """Which of two videos does the task better, and the progress in both."""
+    """Which of two or more videos does the task best, and the progress in each.
+
+    Every two are compared in both orders. They are ranked by the mean probability of winning against the others.
+    """
     from rfm_client.cli import show
 
     options.check_outputs(json, plot)
+    if len(videos) < MIN_COMPARED:
+        raise typer.BadParameter(f"expected at least {MIN_COMPARED} videos, got {len(videos)}", param_hint="VIDEO")
+    _check_panels(plot, videos)
     server = Server(urls, model, timeout, context.obj)
     question = Question(task, fps, max_frames, subsample=subsample, resize=resize)
-    comparison = scoring.compare(server, (first, second), question)
-    for source, scores, _ in comparison.sides:
+    comparison = comparing.compare(server, videos, question)
+    for source, scores in zip(comparison.sources, comparison.scores, strict=True):
         _report_subsampled(source.name, len(scores.progress), source.trajectory.num_frames)
     if json != STANDARD_OUTPUT:
-        print_tables(comparison.table())
+        print_tables(*comparison.tables())
     if json is not None:
         outputs.write_json(json, outputs.comparison_document(server, question, comparison))
     if plot is not None:
@@ -178,8 +193,13 @@ def status(
     options.check_outputs(json, None)
     if metrics_url is not None and len(urls) > 1:
         raise typer.BadParameter("expected one --url with it, got several", param_hint="--metrics-url")
-    with options.usage_errors("--url"):
-        statuses = [read_status(url, metrics_url=metrics_url, timeout_s=timeout, access=context.obj) for url in urls]
+    try:
+        with options.usage_errors("--url"):
+            statuses = [
+                read_status(url, metrics_url=metrics_url, timeout_s=timeout, access=context.obj) for url in urls
+            ]
+    except RewardError as error:
+        raise options.port_named(urls, error) from error
     if json != STANDARD_OUTPUT:
         print_tables(*(table for status in statuses for table in status_tables(status)))
     if json is not None:
@@ -199,6 +219,8 @@ def wait(
     with options.usage_errors("--url"):
         client = RewardClient(urls, model=model, **context.obj.options)
     with client:
+        if all(named := [wrong_port(url) for url in urls]):
+            raise ServerUnavailableError(named[0])  # which no wait will mend
         client.wait_ready(timeout)
 
 
@@ -277,6 +299,11 @@ app.command(cls=OneLineCommand, epilog=EXIT_CODES)(label)
 def _toy(kind: toy.SampleKind, num_samples: int, num_frames: str, use_frames: bool, seed: int) -> toy.Toy:
     with options.usage_errors("--num-frames"):
         return toy.Toy(kind, num_samples, toy.parse_lengths(num_frames), use_frames, seed)
+
+
+def _check_panels(plot: Path | None, videos: Sequence[str]) -> None:
+    if plot is not None and len(videos) > MAX_PANELS:
+        raise typer.BadParameter(f"expected at most {MAX_PANELS} videos, got {len(videos)}", param_hint="--plot")
 
 
 def _report_subsampled(name: str, num_scored: int, num_frames: int) -> None:

@@ -117,6 +117,15 @@ class LabelFlags:
     report: Annotated[bool, typer.Option("--report", help="Only show the summary of labels that are there.")] = False
     picture: Annotated[bool, typer.Option(help="Draw the summary: NAME_summary.png in the output.")] = True
 
+    rrd: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Record frames and scores of each labelled episode for Rerun's viewer: a .rrd file each.",
+            show_default=False,
+        ),
+    ] = None
+
     @property
     def ray(self) -> RayOptions:
         """Where and how many Ray actors label."""

@@ -20,9 +20,12 @@ from rfm_client.cli.show import print_tables, table
 from rfm_client.contract.errors import RewardError
 from rfm_client.data.datasets.opening import open_dataset
 from rfm_client.data.datasets.protocol import Dataset, Episode
+from rfm_client.integrations.episode_recordings import record_episodes
+from rfm_client.integrations.recording import load_rerun
 from rfm_client.labelling.episode_scores import episode_columns
 from rfm_client.labelling.label import Outputs, Report, label, label_with_ray, plan_labels
 from rfm_client.labelling.options import LabelOptions
+from rfm_client.labelling.parts import Parts
 from rfm_client.labelling.plan import Item, Plan
 from rfm_client.labelling.ray_engine import Connect
 from rfm_client.labelling.run import Watch
@@ -112,6 +115,8 @@ def run(source: str, flags: LabelFlags, connect: Connect, say: Say) -> ExitCode:
         return _report(source, flags, options, say)
     if flags.dry_run:
         return _dry_run(source, flags, connect, say)
+    if flags.rrd is not None:
+        load_rerun()  # or it would be found missing when all is labelled
     watch = ProgressBar(say)
     try:
         with watch:
@@ -125,7 +130,12 @@ def run(source: str, flags: LabelFlags, connect: Connect, say: Say) -> ExitCode:
         if watch.num_begun:
             say("what is finished stays: the same command goes on with the rest")
         raise
-    return _tell(report, flags, options, say)
+    status = _tell(report, flags, options, say)
+    if flags.rrd is not None:
+        dataset = open_dataset(source, task=flags.task)
+        for file in record_episodes(flags.rrd, dataset, report.plan, Parts(report.parts)):
+            typer.echo(f"{file}")
+    return status
 
 
 def _dry_run(source: str, flags: LabelFlags, connect: Connect, say: Say) -> ExitCode:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -18,11 +19,13 @@ from rfm_client.client import RewardClient
 from rfm_client.contract import errors
 from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_client.data.sampling import Rule, Sampling
+from rfm_client.ports import wrong_port
 from rfm_client.transport.access import Access
 
 DEFAULT_URL = "grpc://localhost:8001"
 STANDARD_OUTPUT = "-"
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.001, 86_400
+RECORDING = ".rrd"
 PICTURES = (".png", ".pdf", ".svg")
 
 
@@ -81,6 +84,10 @@ Json = Annotated[
 ]
 Plot = Annotated[
     Path | None, typer.Option("--plot", metavar="FILE", help="Draw frames and scores: .png, .pdf or .svg.")
+]
+Recorded = Annotated[
+    Path | None,
+    typer.Option("--rrd", metavar="FILE", help="Record frames and scores on one timeline for Rerun's viewer: .rrd."),
 ]
 Task = Annotated[str, typer.Option("--task", help="What is to be done, as a sentence.")]
 Fps = Annotated[float, typer.Option("--fps", min=0.001, help="Frames a second that are taken from a video.")]
@@ -147,7 +154,7 @@ class Server:
                     return
                 except errors.RewardError as error:
                     problems.append(error)
-        raise problems[0]
+        raise port_named(self.urls, problems[0])
 
 
 def read_access(ca_file: Path | None, certificate: Path | None, key: Path | None, key_file: Path | None) -> Access:
@@ -158,6 +165,14 @@ def read_access(ca_file: Path | None, certificate: Path | None, key: Path | None
         except (OSError, UnicodeDecodeError) as error:
             raise ValueError(f"expected a text file, got {error}") from None
         return Access(ca_file, certificate, key, api_key=api_key)
+
+
+def port_named(urls: Sequence[str], error: errors.RewardError) -> errors.RewardError:
+    """The error of servers that do not answer as servers do; if a port is to blame, one that names the right one."""
+    if isinstance(error, (errors.DeadlineExceededError, errors.AccessDeniedError, errors.InvalidSampleError)):
+        return error
+    named = next(filter(None, map(wrong_port, urls)), None)
+    return error if named is None else errors.ServerUnavailableError(named)
 
 
 def exit_code(error: BaseException) -> ExitCode:
@@ -175,7 +190,7 @@ def exit_code_of(failures: Sequence[Exception], *, some_succeeded: bool) -> Exit
 
 def report(message: str) -> None:
     """Writes the message as one line to standard error."""
-    typer.echo(f"rfm-client: {' '.join(message.split())}", err=True)
+    print(f"rfm-client: {' '.join(message.split())}", file=sys.stderr, flush=True)  # above a progress bar, if any
 
 
 def fail(message: str, code: ExitCode) -> NoReturn:
@@ -213,13 +228,15 @@ def missing_package(error: ImportError) -> str:
     return str(error) if "pip install" in str(error) else f'{error}: pip install "./client[cli]"'
 
 
-def check_outputs(json: str | None, plot: Path | None) -> None:
+def check_outputs(json: str | None, plot: Path | None, rrd: Path | None = None) -> None:
     """Checks, before the first request, that results can be written. Raises typer.BadParameter."""
     if json is not None and json != STANDARD_OUTPUT and Path(json).suffix != ".json":
         raise typer.BadParameter(f"expected a .json file or -, got {json}", param_hint="--json")
     if plot is not None and plot.suffix not in PICTURES:
         raise typer.BadParameter(f"expected a file that ends in {', '.join(PICTURES)}, got {plot}", param_hint="--plot")
-    for option, file in (("--json", json), ("--plot", plot)):
+    if rrd is not None and rrd.suffix != RECORDING:
+        raise typer.BadParameter(f"expected a file that ends in {RECORDING}, got {rrd}", param_hint="--rrd")
+    for option, file in (("--json", json), ("--plot", plot), ("--rrd", rrd)):
         if file is not None and not Path(file).parent.is_dir():
             raise typer.BadParameter(f"expected a folder at {Path(file).parent}, got none", param_hint=option)
 

@@ -6,8 +6,11 @@ A score that a checkpoint does not predict is null in JSON, never a number.
 
 from __future__ import annotations
 
+import itertools
 import json
-from collections.abc import Mapping, Sequence
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,11 +19,27 @@ import numpy as np
 import numpy.typing as npt
 import typer
 
+from rfm_client.cli.comparing import Comparison
 from rfm_client.cli.options import STANDARD_OUTPUT, Server
-from rfm_client.cli.scoring import Comparison, Outcome, Question, Scored, Times, times_of, unique_stems
+from rfm_client.cli.scoring import (
+    COLUMNS,
+    Outcome,
+    Question,
+    Record,
+    Scored,
+    Source,
+    Times,
+    times_of,
+    unique_stems,
+)
+from rfm_client.cli.show import FILE_WIDTH, shortened
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
 from rfm_client.status import ServerStatus
+
+GAP = "  "  # between columns
+MIN_NAME_WIDTH = 10
+SIDES = ("first", "second")  # of a comparison
 
 
 def write_json(target: str, document: Mapping[str, Any]) -> None:
@@ -45,12 +64,29 @@ def score_document(server: Server, question: Question, outcomes: Sequence[Outcom
 
 
 def comparison_document(server: Server, question: Question, comparison: Comparison) -> dict[str, Any]:
-    """What ``compare --json`` writes; ``preference`` is the probability that the first is preferred."""
-    document = result_document(comparison.result, [times_of(source, scores) for source, scores, _ in comparison.sides])
-    for name, (source, _, _) in zip(("first", "second"), comparison.sides, strict=True):
-        about = {"source": source.name, "num_frames": source.trajectory.num_frames}
-        document[name] = {**about, **document[name]}
-    return {**origin(server), "task": question.task, "fps": question.fps, **document}
+    """What ``compare --json`` writes; a ``preference`` is the probability that the first of an order is preferred.
+
+    Of two videos it also has the answer to the order given: ``preference``, and scores as ``first`` and ``second``.
+    """
+    document = {**origin(server), "task": question.task, "fps": question.fps}
+    document["model_version"] = comparison.model_version
+    scored = [
+        {
+            "source": source.name,
+            "num_frames": source.trajectory.num_frames,
+            **frame_document(scores, times_of(source, scores)),
+        }
+        for source, scores in zip(comparison.sources, comparison.scores, strict=True)
+    ]
+    if len(scored) == len(SIDES):
+        document |= {"preference": comparison.preferences[0, 1], **dict(zip(SIDES, scored, strict=True))}
+    names = [source.name for source in comparison.sources]
+    orders = [
+        {"first": names[first], "second": names[second], "preference": preference}
+        for (first, second), preference in comparison.preferences.items()
+    ]
+    ranking = [{**scored[index], "wins": comparison.wins(index)} for index in comparison.ranking]
+    return {**document, "orders": orders, "ranking": ranking}
 
 
 def samples_document(server: Server, kind: str, outcomes: Sequence[Result | RewardError]) -> dict[str, Any]:
@@ -68,7 +104,7 @@ def result_document(result: Result, times_s: Sequence[Times | None] = (None, Non
     if isinstance(result, ProgressResult):
         return {**version, **frame_document(result, times_s[0])}
     if isinstance(result, PreferenceResult):
-        answer, names = {"preference": result.preference}, ("first", "second")
+        answer, names = {"preference": result.preference}, SIDES
     else:
         answer, names = {"similarity": result.similarity}, ("reference", "other")
     scores = {name: frame_document(getattr(result, name), t) for name, t in zip(names, times_s, strict=True)}
@@ -103,19 +139,70 @@ def status_document(statuses: Sequence[ServerStatus]) -> dict[str, Any]:
     return {"servers": servers}
 
 
-def write_arrays(target: Path, outcomes: Sequence[Outcome]) -> None:
-    """Writes float32 [T, 2], progress and success (NaN: not predicted).
+class Arrays:
+    """Writes float32 [T, 2] for each source: progress and success (NaN: not predicted).
 
-    ``target`` is one .npy file, or a folder that gets one file for each source.
+    target: one .npy file, or a folder that gets one file for each source; None: nothing is written
     """
-    if target.suffix == ".npy":
-        files = [target] * len(outcomes)
-    else:
-        target.mkdir(exist_ok=True)
-        files = [target / f"{stem}.npy" for stem in unique_stems([outcome.name for outcome in outcomes])]
-    for file, outcome in zip(files, outcomes, strict=True):
-        if isinstance(outcome, Scored):
-            np.save(file, np.stack([outcome.result.progress, outcome.result.success], axis=1))
+
+    def __init__(self, target: Path | None, names: Sequence[str]) -> None:
+        if target is None or target.suffix == ".npy":
+            self._files = [target] * len(names)
+        else:
+            target.mkdir(exist_ok=True)
+            self._files = [target / f"{stem}.npy" for stem in unique_stems(names)]
+
+    def write(self, number: int, scored: Scored) -> None:
+        """Writes the scores of the source of this number."""
+        file = self._files[number]
+        if file is not None:
+            np.save(file, np.stack([scored.result.progress, scored.result.success], axis=1))
+
+
+@contextmanager
+def recorder(file: Path | None, names: Sequence[str]) -> Iterator[Record | None]:
+    """What records each source in a file of Rerun's, under its name without folder and ending; None: nothing is.
+
+    Raises ImportError if the package is missing.
+    """
+    if file is None:
+        yield None
+        return
+    from rfm_client.integrations.recording import Recording
+
+    stems = unique_stems(names)
+    with Recording(file) as recording:
+
+        def record(number: int, source: Source, scores: FrameScores) -> None:
+            frames = source.trajectory.frames
+            recording.add((stems[number],), scores, {} if frames is None else {"": frames}, source.times_s)
+
+        yield record
+
+
+class Rows:
+    """A table on standard output that is written row by row, as wide as the terminal. names: all that it will have."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        from rich.console import Console
+
+        console = Console()
+        self._headers = [header for header, _ in COLUMNS]
+        self._widths = [width for _, width in COLUMNS]
+        room = (console.width if console.is_terminal else FILE_WIDTH) - sum(self._widths) - len(GAP) * len(COLUMNS)
+        self._widths[0] = max(MIN_NAME_WIDTH, min(max(map(len, names)), room))
+        self._is_begun = False
+
+    def write(self, cells: Sequence[str]) -> None:
+        """Writes a row at once; before the first, the headers."""
+        lines: list[Sequence[str]] = [[shortened(cells[0], self._widths[0]), *cells[1:]]]
+        if not self._is_begun:
+            self._is_begun = True
+            headers = [textwrap.wrap(header, width) for header, width in zip(self._headers, self._widths, strict=True)]
+            lines = [*itertools.zip_longest(*headers, fillvalue=""), ["-" * width for width in self._widths], *lines]
+        for line in lines:
+            row = GAP.join(cell.ljust(width) for cell, width in zip(line, self._widths, strict=True))
+            print(f"{GAP}{row}".rstrip(), flush=True)
 
 
 def check_arrays(npy: Path | None, videos: Sequence[str]) -> None:

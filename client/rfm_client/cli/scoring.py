@@ -1,36 +1,45 @@
 # SPDX-License-Identifier: MIT
-"""``rfm-client score`` and ``compare``: trajectories from files, their scores from the server."""
+"""``rfm-client score``: trajectories from files, their scores from the server, each as soon as it is there."""
 
 from __future__ import annotations
 
 import itertools
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import PurePath
-from typing import TYPE_CHECKING, TypeAlias, cast
+from typing import TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from rfm_client.cli import options
 from rfm_client.cli.options import ExitCode, Server, missing_package
-from rfm_client.cli.show import Panel, number, table
+from rfm_client.cli.show import Panel, number
 from rfm_client.client import RewardClient
-from rfm_client.contract.errors import InvalidSampleError, RewardError
-from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
-from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, Trajectory
-from rfm_client.data.fitting import fitted, with_frame_indices
+from rfm_client.contract.errors import (
+    DeadlineExceededError,
+    InvalidSampleError,
+    ProcessEndedError,
+    RewardError,
+    ServerUnavailableError,
+)
+from rfm_client.contract.results import FrameScores, ProgressResult, Result
+from rfm_client.contract.samples import ProgressSample, Trajectory
+from rfm_client.data.fitting import FittedSample, fitted, with_frame_indices
 from rfm_client.data.prefixes import of_prefixes, prefix_samples
 from rfm_client.data.sampling import Rule, Sampling
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
 PREFIXES_AT_A_TIME = 64  # of one video: their frames lie in memory
 WORKERS = 8  # videos that are read, and lie in memory, at a time
+PROBE_S = 2.0  # within which a server that is there says so
+COLUMNS = (  # of ``Scored.row``, and how wide they are
+    *(("video", 0), ("last progress", 8), ("last success", 7), ("frames", 13)),
+    *(("last at s", 7), ("took s", 6), ("version", 7)),
+)
 
 Times = npt.NDArray[np.float64]
 
@@ -69,8 +78,8 @@ class Source:
         from rfm_client.data.video import frame_times_s, is_url
 
         if not is_url(name) and PurePath(name).suffix.lower() in ARRAY_SUFFIXES:
-            return cls(name, load_trajectory(name, task=question.task), None)
-        trajectory = load_trajectory(name, task=question.task, fps=question.fps)
+            return cls(name, _with_task(load_trajectory(name, task=question.task)), None)
+        trajectory = _with_task(load_trajectory(name, task=question.task, fps=question.fps))
         # What is behind a URL is gone once it is read.
         return cls(name, trajectory, None if is_url(name) else frame_times_s(name, trajectory.num_frames))
 
@@ -91,7 +100,7 @@ class Scored:
     took_s: float
 
     def row(self) -> tuple[str, ...]:
-        """The row of this source in ``scored_table``."""
+        """The cells of this source under ``COLUMNS``."""
         progress, success = self.result.progress, self.result.success
         frames = str(len(progress)) if len(progress) == self.num_frames else f"{len(progress)} of {self.num_frames}"
         seconds = "-" if self.times_s is None else f"{self.times_s[-1]:.1f}"
@@ -101,82 +110,105 @@ class Scored:
 
 @dataclass(frozen=True)
 class Failed:
-    """A source that has no scores."""
+    """A source that has no scores. is_server_gone: since no server answers any more."""
 
     name: str
     error: Exception
     message: str
+    is_server_gone: bool = False
 
 
 Outcome: TypeAlias = Scored | Failed
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """Two sources, and what the model says of them."""
-
-    first: Source
-    second: Source
-    result: PreferenceResult
-
-    @property
-    def sides(self) -> tuple[tuple[Source, FrameScores, float], ...]:
-        """Each source, its scores, and the probability that it is preferred."""
-        preference = self.result.preference
-        return (self.first, self.result.first, preference), (self.second, self.result.second, 1 - preference)
-
-    def table(self) -> Table:
-        """A table of the two sources, one row for each."""
-        rows = [
-            (
-                source.name,
-                number(share),
-                number(scores.progress[-1]),
-                number(scores.success[-1]),
-                str(len(scores.progress)),
-            )
-            for source, scores, share in self.sides
-        ]
-        return table("", ("video", "P(preferred)", "last progress", "last success", "frames"), rows)
-
-    def panels(self) -> list[Panel]:
-        """What a plot shows of it."""
-        titles = (f"{PurePath(source.name).name}: preferred with P = {share:.3f}" for source, _, share in self.sides)
-        return [source.panel(title, scores) for title, (source, scores, _) in zip(titles, self.sides, strict=True)]
+Tell = Callable[[int, Outcome], None]  # is called with the number of a source, and what came of it
+Record = Callable[[int, Source, FrameScores], None]  # with its frames, too, before they are forgotten; by any thread
 
 
-def score_all(server: Server, names: Sequence[str], question: Question) -> list[Outcome]:
-    """The outcome of each source, in order. Raises RewardError if the server gives no answer at all."""
+def score_all(
+    server: Server, names: Sequence[str], question: Question, tell: Tell, record: Record | None = None
+) -> list[Outcome]:
+    """The outcome of each source, in order; each is told when it is there. Raises RewardError if no server answers."""
     with ThreadPoolExecutor(WORKERS) as pool, server.connected() as client, _progress_bar(len(names)) as advance:
-        futures: list[Future[Outcome]] = []
+        asking = _Asking(client, question, record)
         try:
-            for name in names:
-                futures.append(pool.submit(_score, client, name, question))
-                futures[-1].add_done_callback(lambda _future: advance())
-            return [future.result() for future in futures]
-        except BaseException:  # an interrupt: what has not begun shall not
+            numbers: dict[Future[Outcome], int] = {
+                pool.submit(asking.outcome, number, name): number for number, name in enumerate(names)
+            }
+            for future in as_completed(numbers):
+                tell(numbers[future], future.result())
+                advance()
+        except BaseException:  # an interrupt, or a full disk: what has not begun shall not
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+    return [future.result() for future in numbers]
+
+
+class _Asking:
+    """Asks about one source after the other, until no server answers any more. For several threads."""
+
+    def __init__(self, client: RewardClient, question: Question, record: Record | None) -> None:
+        self._client = client
+        self._question = question
+        self._record = record
+        self._gone: RewardError | None = None
+
+    def outcome(self, number: int, name: str) -> Outcome:
+        """The scores of the source of this number, or why there are none."""
+        started_s = time.monotonic()
+        try:
+            self._go_on()
+            source = Source.read(name, self._question)
+            self._go_on()
+            result = _evaluate(self._client, ProgressSample(source.trajectory), self._question)
+        except _NotAskedError as error:
+            return Failed(name, error.cause, "not asked, since no server answers any more", is_server_gone=True)
+        except ImportError as error:
+            return Failed(name, error, missing_package(error))
+        except (RewardError, OSError) as error:
+            message = str(error).removesuffix(f" ({name})")  # the report names the source in any case
+            return Failed(name, error, message, is_server_gone=self._is_server_gone(error))
+        if self._record is not None:
+            self._record(number, source, result)
+        return Scored(
+            name=name,
+            result=result,
+            num_frames=source.trajectory.num_frames,
+            times_s=times_of(source, result),
+            panel=source.panel(f'{PurePath(name).name}: "{self._question.task}"', result),
+            took_s=time.monotonic() - started_s,
+        )
+
+    def _go_on(self) -> None:
+        if self._gone is not None:
+            raise _NotAskedError(self._gone)
+
+    def _is_server_gone(self, error: Exception) -> bool:
+        """Whether the error comes of servers that are gone, and not of what one of them was asked."""
+        if isinstance(error, ProcessEndedError) or not isinstance(
+            error, (ServerUnavailableError, DeadlineExceededError)
+        ):
+            return False
+        if self._gone is None and not self._client.is_ready(timeout_s=PROBE_S):
+            self._gone = error
+        return self._gone is not None
+
+
+class _NotAskedError(Exception):
+    """No server answers any more, as ``cause`` has told."""
+
+    def __init__(self, cause: RewardError) -> None:
+        super().__init__(cause)
+        self.cause = cause
 
 
 def exit_code_of(outcomes: Sequence[Outcome]) -> ExitCode:
     """The exit code of a command with these outcomes."""
-    failures = [outcome.error for outcome in outcomes if isinstance(outcome, Failed)]
-    return options.exit_code_of(failures, some_succeeded=len(failures) < len(outcomes))
-
-
-def compare(server: Server, names: tuple[str, str], question: Question) -> Comparison:
-    """Which source does the task of the first better. Raises RewardError."""
-    with server.connected() as client:
-        first, second = (Source.read(name, question) for name in names)
-        sample = PreferenceSample(first.trajectory, second.trajectory)
-        return Comparison(first, second, cast(PreferenceResult, _evaluate(client, sample, question)))
-
-
-def scored_table(scored: Sequence[Scored]) -> Table:
-    """A table of the scored sources, one row for each."""
-    columns = ("video", "last progress", "last success", "frames", "last at s", "took s", "version")
-    return table("", columns, [outcome.row() for outcome in scored])
+    failures = [outcome for outcome in outcomes if isinstance(outcome, Failed)]
+    codes = {options.exit_code(failure.error) for failure in failures if failure.is_server_gone}
+    if codes:
+        return min(codes)  # unavailable before out of time, which some may be of a server that is gone
+    return options.exit_code_of([failure.error for failure in failures], some_succeeded=len(failures) < len(outcomes))
 
 
 def times_of(source: Source, scores: FrameScores) -> Times | None:
@@ -196,42 +228,34 @@ def unique_stems(names: Sequence[str]) -> list[str]:
     return stems
 
 
-def _score(client: RewardClient, name: str, question: Question) -> Outcome:
-    started_s = time.monotonic()
-    try:
-        source = Source.read(name, question)
-        result = cast(ProgressResult, _evaluate(client, ProgressSample(source.trajectory), question))
-    except ImportError as error:
-        return Failed(name, error, missing_package(error))
-    except (RewardError, OSError) as error:
-        return Failed(name, error, str(error).removesuffix(f" ({name})"))  # the report names the source in any case
-    return Scored(
-        name=name,
-        result=result,
-        num_frames=source.trajectory.num_frames,
-        times_s=times_of(source, result),
-        panel=source.panel(f'{PurePath(name).name}: "{question.task}"', result),
-        took_s=time.monotonic() - started_s,
-    )
-
-
-def _evaluate(client: RewardClient, sample: Sample, question: Question) -> Result:
-    """The result of one sample, with frames left out as the question and the checkpoint require.
+def fitted_to(client: RewardClient, sample: ProgressSample, question: Question) -> FittedSample:
+    """The sample with frames left out as the question and the checkpoint require.
 
     The frames are left out here: the client knows of no other limit than the checkpoint's.
     """
-    info = client.model_info(frames=sample.trajectories[0].frames is not None)
+    info = client.model_info(frames=sample.trajectory.frames is not None)
     dense = question.frame_steps > 0 or question.sampling is not None  # then each prefix is sampled
     limits = (question.max_frames, info.max_frames if question.subsample and not dense else None)
     limit = min((frames for frames in limits if frames is not None), default=None)
-    fit = fitted(sample, replace(info, max_frames=limit), subsample=True, resize=question.resize)
-    sent = fit.sample
-    if isinstance(sent, ProgressSample) and question.sampling is not None:
-        sampling = _sampling(question, question.sampling, info.max_frames)
-        return with_frame_indices(_prefix_result(client, sent.trajectory, sampling), fit.frame_indices)
-    if isinstance(sent, ProgressSample):
-        sent = replace(sent, frame_steps=question.frame_steps)
-    return with_frame_indices(client.evaluate([sent])[0], fit.frame_indices)
+    return fitted(sample, replace(info, max_frames=limit), subsample=True, resize=question.resize)
+
+
+def _with_task(trajectory: Trajectory) -> Trajectory:
+    """The trajectory, if frames have a task. Raises InvalidSampleError."""
+    if trajectory.frames is not None and not trajectory.task.strip():
+        raise InvalidSampleError.at("task", "a sentence with frames", 'none: add --task "what is to be done"')
+    return trajectory
+
+
+def _evaluate(client: RewardClient, sample: ProgressSample, question: Question) -> ProgressResult:
+    fit = fitted_to(client, sample, question)
+    sent = cast(ProgressSample, fit.sample)
+    if question.sampling is None:
+        (result,) = client.evaluate([replace(sent, frame_steps=question.frame_steps)])
+    else:
+        trained_frames = client.model_info(frames=sent.trajectory.frames is not None).max_frames
+        result = _prefix_result(client, sent.trajectory, _sampling(question, question.sampling, trained_frames))
+    return cast(ProgressResult, with_frame_indices(result, fit.frame_indices))
 
 
 def _sampling(question: Question, rule: Rule, trained_frames: int | None) -> Sampling:
@@ -257,6 +281,7 @@ def _progress_bar(total: int) -> Iterator[Callable[[], None]]:
 
     console = Console(stderr=True)
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    is_hidden, shares_terminal = not console.is_terminal, sys.stdout.isatty()
+    with Progress(*columns, console=console, transient=True, disable=is_hidden, redirect_stdout=shares_terminal) as bar:
         task = bar.add_task("scoring", total=total)
         yield lambda: bar.advance(task)

@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 import math
+import textwrap
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -19,15 +20,26 @@ from rfm_client.status import DEVICE_METRICS, Device, ModelStatus, ServerStatus
 
 if TYPE_CHECKING:
     from matplotlib.figure import SubFigure
+    from rich.console import Console, ConsoleOptions, RenderResult
+    from rich.measure import Measurement
     from rich.table import Table
 
 FILE_WIDTH = 200
+SHORT_CELL = 16  # characters that a column of figures shows in any case
+SHORTEST_NAME = 12
+GAP = "..."
 STRIP_FRAMES = 8
 WIDTH_IN = 10.0
 COLUMN_WIDTH_IN = 7.0  # where panels stand side by side
 PANEL_HEIGHT_IN = 4.0
 DOTS_PER_IN = 200
 MAX_PANELS = 50  # one picture of more could not be looked at, nor drawn much further
+
+STATUS_LEGEND = (
+    "Since the model was loaded, warm-up included. requests: answered with scores; failed: answered with an error, "
+    "whoever is to blame; refused: samples that cannot be scored, the caller's fault; pending: waiting now. "
+    "batches: of callers' samples; queue ms: until a request's turn. The server's log has the reason of each."
+)
 
 _GIB = 2**30
 _CURVES = (("progress", "tab:blue", "-", "o"), ("success", "tab:green", "--", "s"))
@@ -38,24 +50,55 @@ def number(value: float | None, digits: int = 4) -> str:
     return "-" if value is None or math.isnan(value) else f"{value:.{digits}f}"
 
 
-def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, caption: str | None = None) -> Table:
-    """A table of texts. What is in square brackets is text too, not markup."""
+def shortened(name: str, width: int) -> str:
+    """The name in at most ``width`` characters: what is left out is in the middle, and no part of a file's own name."""
+    if len(name) <= width or width <= len(GAP):
+        return name[:width]
+    kept = width - len(GAP)
+    file_name = len(name) - max(name.rfind("/"), 0)  # with the slash before it
+    end = file_name if kept // 2 <= file_name <= kept else kept - kept // 2
+    return f"{name[: kept - end]}{GAP}{name[len(name) - end :]}"
+
+
+@dataclass(frozen=True)
+class Name:
+    """A name or a path in a table, shortened to the room that the table has."""
+
+    text: str
+
+    def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
+        """Its narrowest and its full width."""
+        from rich.measure import Measurement
+
+        return Measurement(min(len(self.text), SHORTEST_NAME), len(self.text))
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """The name, as much of it as fits."""
+        from rich.text import Text
+
+        yield Text(shortened(self.text, options.max_width), no_wrap=True, overflow="ellipsis")
+
+
+def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, names: int = 1) -> Table:
+    """A table of texts. What is in square brackets is text too, not markup.
+
+    names: so many columns, the first ones, hold names and paths, which are shortened where there is no room. Of the
+        others those with short cells are never broken, long ones wrap.
+    """
     from rich import box
     from rich.table import Table
     from rich.text import Text
 
     shown = Table(
-        box=box.SIMPLE_HEAD,
-        collapse_padding=True,
-        title=Text(title) if title else None,
-        caption=None if caption is None else Text(caption),
-        title_justify="left",
-        caption_justify="left",
+        box=box.SIMPLE_HEAD, collapse_padding=True, title=Text(title) if title else None, title_justify="left"
     )
-    for column in columns:
-        shown.add_column(column, overflow="fold")
+    for index, column in enumerate(columns):
+        widest = max((len(row[index]) for row in rows), default=0)
+        is_short = index >= names and widest <= SHORT_CELL
+        header = textwrap.fill(column, max(widest, *map(len, column.split()))) if is_short and column else column
+        shown.add_column(Text(header), overflow="fold", no_wrap=is_short)
     for row in rows:
-        shown.add_row(*map(Text, row))
+        shown.add_row(*map(Name, row[:names]), *map(Text, row[names:]))
     return shown
 
 
@@ -65,42 +108,48 @@ def print_tables(*tables: object) -> None:
 
     console = Console()
     console = console if console.is_terminal else Console(width=FILE_WIDTH)
-    console.print(*tables, sep="\n")
+    console.print(*tables, sep="\n", markup=False, highlight=False)
 
 
 def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> Table:
-    """One row a result: its question's answer, and the scores of its (first) trajectory's last frame."""
+    """One row a trajectory: its question's answer, and the scores of its last frame."""
     shown = []
     for name, result in rows:
-        frames: FrameScores
+        scored: tuple[tuple[str, FrameScores], ...]
         if isinstance(result, ProgressResult):
-            answer, frames = f"{len(result.progress)} frames", result
+            answer, scored = f"{len(result.progress)} frames", (("", result),)
         elif isinstance(result, PreferenceResult):
-            answer, frames = f"P(first) = {result.preference:.4f}", result.first
+            answer = f"P(first) = {result.preference:.4f}"
+            scored = (": first", result.first), (": second", result.second)
         else:
-            answer, frames = f"similarity = {result.similarity:.4f}", result.reference
-        shown.append((name, answer, number(frames.progress[-1]), number(frames.success[-1])))
+            answer = f"similarity = {result.similarity:.4f}"
+            scored = (": reference", result.reference), (": other", result.other)
+        for (role, frames), told in zip(scored, (answer, ""), strict=False):
+            shown.append((f"{name}{role}", told, number(frames.progress[-1]), number(frames.success[-1])))
     return table(title, ("sample", "answer", "progress at the end", "success at the end"), shown)
 
 
-def status_tables(status: ServerStatus) -> list[Table]:
-    """The server's models, and the machine if its metrics describe it."""
+def status_tables(status: ServerStatus) -> list[Table | str]:
+    """The server's models, their batches, what the figures mean, and the machine if its metrics describe it."""
     version = f" {status.version}" if status.version else ""
     title = f"{status.url}: Triton{version}, {'ready' if status.ready else 'not ready'}"
-    columns = (
-        "model", "v", "state", "requests", "failed", "pending", "queue ms", "batches", "samples each", "ms each",
-    )  # fmt: skip
-    caption = (
-        status.metrics_error
-        or "since the model was loaded, warm-up included; queue ms: until a request's turn; each: of a callers' batch"
-    )
-    tables = [table(title, columns, [_model_row(model) for model in status.models], caption=caption)]
+    requests = ("model", "v", "state", "requests", "failed", "refused", "pending")
+    batches = ("model", "v", "batches", "samples each", "ms each", "queue ms")
+    reasons = [f"{model.name} {model.version}: {model.reason}" for model in status.models if model.reason]
+    shown: list[Table | str] = [
+        table(title, requests, [_requests_row(model) for model in status.models]),
+        *reasons,
+        table("", batches, [_batches_row(model) for model in status.models]),
+        STATUS_LEGEND,
+        *filter(None, [status.metrics_error]),
+    ]
     if status.devices:
         rows = [_device_row(device) for device in status.devices]
-        tables.append(
-            table(f"machine, from {DEVICE_METRICS}", ("device", "utilization", "memory used", "memory"), rows)
-        )
-    return tables
+        shown += [
+            "",
+            table(f"machine, from {DEVICE_METRICS}", ("device", "utilization", "memory used", "memory"), rows),
+        ]
+    return shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,19 +239,29 @@ def _draw(part: SubFigure, panel: Panel) -> None:
     part.suptitle(panel.title, fontsize=10)
 
 
-def _model_row(model: ModelStatus) -> tuple[str, ...]:
-    state = f"{model.state}: {model.reason}" if model.reason else model.state
-    counts: tuple[Any, ...] = (model.requests_succeeded, model.requests_failed)
+def _requests_row(model: ModelStatus) -> tuple[str, ...]:
+    refused, pending = (
+        "-" if count is None else str(count) for count in (model.samples_refused, model.requests_pending)
+    )
     return (
         model.name,
         model.version,
-        state,
-        *map(str, counts),
-        "-" if model.requests_pending is None else str(model.requests_pending),
-        number(model.queue_ms_per_request, 2),
+        model.state,
+        str(model.requests_succeeded),
+        str(model.requests_failed),
+        refused,
+        pending,
+    )
+
+
+def _batches_row(model: ModelStatus) -> tuple[str, ...]:
+    return (
+        model.name,
+        model.version,
         str(model.batch_count),
         number(model.samples_per_batch, 1),
         number(model.compute_ms_per_batch, 2),
+        number(model.queue_ms_per_request, 2),
     )
 
 

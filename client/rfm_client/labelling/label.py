@@ -41,12 +41,14 @@ class Report:
     failures: episodes without labels
     parts: where the finished episodes are
     summary: None: no file was written
+    plan: which episodes were to be labelled, and how
     """
 
     files: Sequence[Path]
     failures: Sequence[Failure]
     parts: str
     summary: Summary | None
+    plan: Plan
 
 
 @dataclass(frozen=True)
@@ -171,10 +173,10 @@ def _begin(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch
 def put_together(plan: Plan, parts: Parts, outputs: Outputs, failures: Sequence[Failure]) -> Report:
     """Writes the files, unless an episode failed or only a shard was labelled."""
     if failures or outputs.options.shard is not None:
-        return Report([], failures, parts.url, None)
+        return Report([], failures, parts.url, None, plan)
     sidecars = outputs.sidecars(plan, part_columns(plan, parts))
     write_sidecars(plan, parts, sidecars)
     for file in outputs.hdf5:
         write_hdf5(file, plan, parts, outputs.options.name, in_place=outputs.options.in_place)
     files = [*(sidecar.path for sidecar in sidecars), *outputs.hdf5]
-    return Report(files, [], parts.url, summary_of_parts(plan, parts))
+    return Report(files, [], parts.url, summary_of_parts(plan, parts), plan)

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: MIT
+"""Frames and their scores as a recording of Rerun (.rrd): one timeline, on which the curves and the film move together.
+
+Needs ``rfm-client[rerun]``. T frames, S of them scored.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.contract.results import FrameScores
+from rfm_client.contract.samples import UInt8Array
+
+TIME, FRAME = (
+    "video_time",
+    "frame",
+)  # timelines: seconds of the film, or the number of the frame where they are not known
+IMAGE, PROGRESS, SUCCESS = "image", "progress", "success"
+JPEG_QUALITY = 90  # as good as the film, at a tenth of the size
+
+_APPLICATION = "rfm-client"
+_COLOURS = {PROGRESS: (31, 119, 180), SUCCESS: (44, 160, 44)}  # as in plots
+
+
+def load_rerun() -> Any:
+    """The package. Raises ImportError, which says how to install it."""
+    try:
+        import rerun
+    except ImportError as error:
+        raise ImportError('recordings need rerun-sdk: pip install "./client[rerun]"') from error
+    return rerun
+
+
+class Recording:
+    """A recording file to which trajectories are added, by any threads. The file is made with the first one.
+
+    Each is an entity, which holds ``image``, ``progress`` and ``success``. Scores that the checkpoint does
+    not predict are left out.
+    """
+
+    def __init__(self, file: Path) -> None:
+        """Raises ImportError if the package is missing."""
+        self._rerun = load_rerun()
+        self._file = file
+        self._stream: Any = None
+        self._lock = threading.Lock()
+
+    def add(
+        self,
+        entity: Sequence[str],
+        scores: FrameScores,
+        films: Mapping[str, Iterable[UInt8Array]],
+        times_s: npt.NDArray[np.float64] | None = None,
+    ) -> None:
+        """Adds a trajectory with its scores.
+
+        entity: its name, part by part; empty if it is the only one of the file
+        films: T frames, uint8 [H, W, 3], by the camera's name, which is empty if there is only one; none: it is of
+            embeddings
+        times_s: [T], when each frame is in the film; None: it is not known
+        """
+        scored = np.arange(len(scores.progress)) if scores.frame_indices is None else scores.frame_indices
+        curves = {curve: getattr(scores, curve) for curve in _COLOURS if not np.isnan(getattr(scores, curve)).all()}
+        with self._lock:
+            self._open()
+            self._stream.reset_time()  # of what this thread has added before
+            for curve in curves:
+                style = self._rerun.SeriesLines(names=curve, colors=_COLOURS[curve])
+                self._log((*entity, curve), style, static=True)
+            for camera, frames in films.items():
+                for index, frame in enumerate(frames):
+                    self._set_time(index, times_s)
+                    image = self._rerun.Image(frame).compress(jpeg_quality=JPEG_QUALITY)
+                    self._log((*entity, IMAGE, *filter(None, [camera])), image)
+            for position, index in enumerate(scored.tolist()):
+                self._set_time(index, times_s)
+                for curve, values in curves.items():
+                    self._log((*entity, curve), self._rerun.Scalars(float(values[position])))
+
+    def close(self) -> None:
+        """Writes what is left to the file."""
+        if self._stream is not None:
+            self._stream.disconnect()
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _open(self) -> None:
+        if self._stream is None:
+            self._stream = self._rerun.RecordingStream(_APPLICATION)
+            self._stream.save(self._file)
+
+    def _set_time(self, index: int, times_s: npt.NDArray[np.float64] | None) -> None:
+        if times_s is None:
+            self._stream.set_time(FRAME, sequence=index)
+        else:
+            self._stream.set_time(TIME, duration=float(times_s[index]))
+
+    def _log(self, parts: Sequence[str], what: Any, *, static: bool = False) -> None:
+        self._stream.log(list(parts), what, static=static, strict=True)  # or it would only warn of an error

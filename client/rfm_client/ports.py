@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: MIT
+"""What listens at a port that was given as a server's, since each of Triton's three ports speaks another language."""
+
+from __future__ import annotations
+
+import http.client
+import json
+from enum import Enum
+from typing import Any
+
+from rfm_client.contract.addresses import split_url
+
+LOOK_S = 2.0
+_READ_BYTES = 4096
+_HTTP2_FRAME = "\x00\x00"  # how a gRPC server begins to answer a request that it does not understand
+
+
+class Port(Enum):
+    """What a port is, as a message names it."""
+
+    GRPC = "its gRPC port"
+    HTTP = "its HTTP port"
+    METRICS = "its metrics port"
+    GATEWAY = "a gateway's"
+
+
+_EXPECTED = {"grpc": (Port.GRPC, "Triton's gRPC port", 8001), "http": (Port.HTTP, "Triton's HTTP port", 8000)}
+
+
+def wrong_port(url: str) -> str | None:
+    """What is wrong with the port of a server's URL, and the mend; None: nothing, or nobody knows.
+
+    With TLS it is not looked at.
+    """
+    scheme, address = split_url(url)
+    if scheme not in _EXPECTED:
+        return None
+    right, expected, usual = _EXPECTED[scheme]
+    found = _port_at(address)
+    if found is None or found is right:
+        return None
+    mend = {
+        Port.GRPC: f"use grpc://{address}",
+        Port.HTTP: f"use http://{address}",
+        Port.METRICS: f"use {scheme}://{address.rpartition(':')[0]}:{usual}, unless the server was given another",
+        Port.GATEWAY: f"use that of the Triton behind it, by default {usual}",
+    }[found]
+    return f"{url}: expected {expected}, got {found.value}: {mend}"
+
+
+def _port_at(address: str) -> Port | None:
+    """What listens there, if it is one that is known."""
+    try:
+        if _read(address, "/v2").startswith(b"{"):
+            return Port.HTTP
+        metrics = _read(address, "/metrics")
+        if b"rfm_gateway_" in metrics or _is_health_of_gateway(_read(address, "/health")):
+            return Port.GATEWAY
+        return Port.METRICS if b"nv_" in metrics else None
+    except http.client.BadStatusLine as error:
+        return Port.GRPC if str(error).startswith(_HTTP2_FRAME) else None
+    except (OSError, http.client.HTTPException):
+        return None
+
+
+def _read(address: str, path: str) -> bytes:
+    """The beginning of a page; nothing of one that is not there."""
+    connection = http.client.HTTPConnection(address, timeout=LOOK_S)
+    try:
+        connection.request("GET", path)
+        answer = connection.getresponse()
+        return answer.read(_READ_BYTES) if answer.status == http.client.OK else b""
+    finally:
+        connection.close()
+
+
+def _is_health_of_gateway(page: bytes) -> bool:
+    try:
+        health: Any = json.loads(page)
+    except ValueError:
+        return False
+    return isinstance(health, dict) and "available_gpus" in health

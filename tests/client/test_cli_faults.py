@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: MIT
+"""rfm-client and servers that go away while it asks, and ports that are not the one that its URL says."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from client_commands import RFM_CLIENT, invoke, rows, run, web_server
+from gateways import Gateway, running
+from one_model import OneModelServer
+from rfm.launch.process import Endpoints
+from rfm_client.cli.options import ExitCode
+from rfm_client.cli.scoring import WORKERS
+from rfm_client.ports import wrong_port
+from rfm_serve import wait_for
+
+pytestmark = pytest.mark.triton
+
+NUM_SOURCES = 2000  # more than are scored before the server is gone
+NOT_ASKED = "not asked, since no server answers any more"
+
+
+@pytest.fixture(scope="module")
+def gateway(demo_server: Endpoints, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
+    with running(demo_server, tmp_path_factory.mktemp("gateway")) as gateway:
+        yield gateway
+
+
+PORTS = {
+    "gRPC to HTTP": ("grpc", "http_port", "Triton's gRPC port, got its HTTP port: use http://{address}"),
+    "HTTP to gRPC": ("http", "grpc_port", "Triton's HTTP port, got its gRPC port: use grpc://{address}"),
+    "gRPC to metrics": (
+        *("grpc", "metrics_port"),
+        "Triton's gRPC port, got its metrics port: use grpc://127.0.0.1:8001, unless the server was given another",
+    ),
+    "HTTP to metrics": (
+        *("http", "metrics_port"),
+        "Triton's HTTP port, got its metrics port: use http://127.0.0.1:8000, unless the server was given another",
+    ),
+}
+
+
+@pytest.mark.parametrize("words", [["sample"], ["status"], ["wait"]], ids=lambda words: str(words[0]))
+@pytest.mark.parametrize(("scheme", "port", "told"), PORTS.values(), ids=PORTS)
+def test_a_wrong_port_is_told_with_the_right_one(
+    demo_server: Endpoints, words: list[str], scheme: str, port: str, told: str
+) -> None:
+    address = f"127.0.0.1:{getattr(demo_server, port)}"
+    result = invoke(*words, "--url", f"{scheme}://{address}")
+    assert result.exit_code == ExitCode.UNAVAILABLE
+    expected = f"{scheme}://{address}: expected {told.format(address=address)}"
+    assert result.stderr.splitlines()[-1] == f"rfm-client: {expected}"
+
+
+@pytest.mark.parametrize("scheme", ["grpc", "http"])
+@pytest.mark.parametrize("words", [["sample"], ["status"], ["wait"]], ids=lambda words: str(words[0]))
+def test_a_gateway_is_no_triton(gateway: Gateway, words: list[str], scheme: str) -> None:
+    result = invoke(*words, "--url", gateway.url.replace("http", scheme))
+    assert result.exit_code == ExitCode.UNAVAILABLE
+    assert "got a gateway's: use that of the Triton behind it, by default 800" in result.stderr
+
+
+def test_a_right_port_and_one_of_something_else_are_not_told_wrong(demo_server: Endpoints, tmp_path: Path) -> None:
+    assert wrong_port(demo_server.grpc_url) is None
+    assert wrong_port(demo_server.http_url) is None
+    assert wrong_port("grpcs://localhost:1") is None
+    with web_server(tmp_path) as url:
+        assert wrong_port(url) is None
+        result = run("sample", "--url", url)
+    assert result.returncode != ExitCode.OK
+    assert "expected Triton's" not in result.stderr
+
+
+ENDS = {"killed": (signal.SIGKILL, ExitCode.UNAVAILABLE), "hangs": (signal.SIGSTOP, ExitCode.DEADLINE)}
+
+
+@pytest.mark.parametrize(("number", "code"), ENDS.values(), ids=ENDS)
+def test_a_server_that_goes_away_is_not_asked_any_more(
+    repository: Path, tmp_path: Path, number: signal.Signals, code: ExitCode
+) -> None:
+    random = np.random.default_rng(0)
+    source, target = tmp_path / "episode.npz", tmp_path / "scores.json"
+    shown, told = tmp_path / "stdout", tmp_path / "stderr"
+    embeddings = {"video_embeddings": random.random((8, 64)), "text_embedding": random.random(32)}
+    np.savez(source, **{name: array.astype(np.float32) for name, array in embeddings.items()})
+    with OneModelServer(repository, Endpoints.free()) as server:
+        words = ("score", *[source] * NUM_SOURCES, "--timeout", 3, "--json", target, "--url", server.endpoints.grpc_url)
+        with shown.open("w") as out, told.open("w") as err:
+            process = subprocess.Popen([str(RFM_CLIENT), *map(str, words)], stdout=out, stderr=err)
+            wait_for(lambda: len(rows(shown.read_text(), str(source))) >= 5)  # they come while others are asked
+            server.signal(number)
+            try:
+                status = process.wait(timeout=60)
+            finally:
+                server.kill()
+    assert status == code, told.read_text()
+    scored = rows(shown.read_text(), str(source))
+    outcomes = json.loads(target.read_text())["videos"]
+    failures = [outcome for outcome in outcomes if "error" in outcome]
+    assert len(outcomes) == NUM_SOURCES
+    assert len(scored) == NUM_SOURCES - len(failures)
+    not_asked = [failure for failure in failures if failure["error"] == NOT_ASKED]
+    assert 0 < len(failures) - len(not_asked) <= WORKERS
+    assert len(re.findall(f"^rfm-client: {source}: {NOT_ASKED}$", told.read_text(), re.MULTILINE)) == len(not_asked) > 0

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: MIT
+"""What a person sees of rfm-client: tables on a terminal of 80 columns, and results as they come."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import io
+import subprocess
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+import clip
+from client_commands import RFM_CLIENT, TASK
+from rfm.launch.process import Endpoints
+from rfm_client.cli.options import ExitCode
+from rfm_client.cli.show import shortened, status_tables, table
+from rfm_client.status import ModelStatus, ServerStatus
+from terminals import WIDTH, on_terminal
+
+pytestmark = pytest.mark.triton
+
+NAMES = ("episode_a.mp4", "episode_b.mp4", "episode_c.mp4")
+
+
+@pytest.fixture(scope="module")
+def films(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("a_folder_of_which_the_name_is_long") / "observation.images.front" / "chunk-000"
+    folder.mkdir(parents=True)
+    for name in NAMES:
+        clip.write(folder / name)
+    return [folder / name for name in NAMES]
+
+
+def words(lines: list[str]) -> set[str]:
+    return {word for line in lines for word in line.split()}
+
+
+def assert_fits(lines: list[str]) -> None:
+    assert [line for line in lines if len(line) > WIDTH] == []
+
+
+def test_the_state_of_a_server_fits_a_terminal_and_says_what_its_words_mean(demo_server: Endpoints) -> None:
+    code, lines = on_terminal("status", "--url", demo_server.grpc_url, "--metrics-url", demo_server.metrics_url)
+    assert code == ExitCode.OK, lines
+    assert_fits(lines)
+    heads = {"model", "v", "state", "requests", "failed", "refused", "pending", "batches", "samples", "queue", "ms"}
+    assert heads | {"rfm", "rfm_encoder", "rfm_frames"} <= words(lines)
+    told = " ".join(" ".join(lines).split())
+    assert "failed: answered with an error, whoever is to blame" in told
+    assert "refused: samples that cannot be scored, the caller's fault" in told
+
+
+def test_scores_and_comparisons_fit_a_terminal_and_name_each_file(demo_server: Endpoints, films: list[Path]) -> None:
+    code, lines = on_terminal("score", *films, "missing.mp4", "--task", TASK, "--url", demo_server.grpc_url)
+    assert code == ExitCode.FAILED, lines
+    assert_fits(lines)
+    assert {"video", "progress", "success", "frames", "version"} <= words(lines)
+    assert sorted(word.rpartition("/")[2] for word in words(lines) if word.endswith(NAMES)) == sorted(NAMES)
+    code, lines = on_terminal("compare", *films, "--task", TASK, "--url", demo_server.grpc_url)
+    assert code == ExitCode.OK, lines
+    assert_fits(lines)
+    assert {"rank", "P(wins)", "progress", "success", "frames", "second", "mean", "orders"} <= words(lines)
+    assert {word.rpartition("/")[2] for word in words(lines) if word.endswith(".mp4")} == set(NAMES)
+    code, lines = on_terminal(
+        "sample", "--sample-type", "preference", "--num-samples", 1, "--url", demo_server.grpc_url
+    )
+    assert code == ExitCode.OK, lines
+    assert_fits(lines)
+    (first, second) = (
+        [line for line in lines if line.strip().startswith(f"0: {name}")] for name in ("first", "second")
+    )
+    assert "P(first) =" in first[0]
+    assert len(second) == 1
+
+
+@pytest.mark.parametrize("width", range(1, 40))
+def test_a_name_is_shortened_in_the_middle(width: int) -> None:
+    name = "/data/of/a/robot/episode_7.mp4"
+    short = shortened(name, width)
+    assert len(short) == min(width, len(name))
+    if width >= len(name):
+        assert short == name
+    elif width > 3:
+        start, end = short.split("...", 1) if short.count("...") == 1 else ("", "")
+        assert name.startswith(start)
+        assert name.endswith(end)
+        assert not width >= 20 or end.endswith("/episode_7.mp4")
+
+
+def test_long_texts_wrap_and_figures_stay_whole() -> None:
+    console = Console(file=io.StringIO(), width=60)
+    row = ("path/" * 20, "0.1234", "why it is not ready, in so many words that they need lines of their own")
+    console.print(table("", ("model", "progress", "reason"), [row]))
+    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    assert max(map(len, shown.splitlines())) <= 60
+    assert "0.1234" in shown
+    assert " ".join(row[2].split()[:3]) in shown
+
+
+def test_the_reason_of_a_model_that_is_not_ready_has_a_line_of_its_own() -> None:
+    model = ModelStatus("rfm_encoder", "1", "UNAVAILABLE", "a [reason]", 1, 2, None, 3, 4, 5.0, 6.0, samples_refused=7)
+    status = ServerStatus("grpc://localhost:8001", "2.51.0", False, (model,), "", "no metrics", ())
+    console = Console(file=io.StringIO(), width=WIDTH)
+    console.print(*status_tables(status), sep="\n", markup=False)
+    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    first, second = (line for line in shown.splitlines() if line.strip().startswith("rfm_encoder  1"))
+    assert first.split() == ["rfm_encoder", "1", "UNAVAILABLE", "1", "2", "7", "-"]
+    assert second.split() == ["rfm_encoder", "1", "4", "0.8", "1.50", "5.00"]
+    assert "rfm_encoder 1: a [reason]\n" in shown
+    assert shown.rstrip().endswith("no metrics")
+
+
+@pytest.mark.parametrize(("program", "distribution"), [("rfm", "rfm-triton"), ("rfm-client", "rfm-client")])
+def test_a_command_tells_its_version(program: str, distribution: str) -> None:
+    done = subprocess.run([RFM_CLIENT.parent / program, "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == f"{program} {importlib.metadata.version(distribution)}\n"

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: MIT
+"""Recordings for Rerun's viewer, read back with Rerun's own reader."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rerun
+from PIL import Image
+
+import clip
+from client_commands import TASK, invoke
+from rfm.launch.process import Endpoints
+from rfm_client import FrameScores
+from rfm_client.cli.options import ExitCode
+from rfm_client.data.inputs import load_trajectory
+from rfm_client.data.video import frame_times_s
+from rfm_client.integrations.recording import FRAME, TIME, Recording
+
+JPEG_ERROR = 30  # of a pixel, by which the compressed picture may differ
+NS_PER_S = 1e9
+
+
+def entities(file: Path) -> set[str]:
+    schema = rerun.dataframe.load_recording(file).schema()
+    return {column.entity_path for column in schema.component_columns()}
+
+
+def logged(file: Path, timeline: str, entity: str, component: str) -> tuple[list[Any], list[Any]]:
+    """Times and values of a component, in the order of time."""
+    view = rerun.dataframe.load_recording(file).view(index=timeline, contents=entity)
+    table = view.select(timeline, f"{entity}:{component}").read_all()
+    times, values = table.column(0).cast("int64").to_pylist(), table.column(1).to_pylist()
+    rows = [(time, value[0]) for time, value in zip(times, values, strict=True) if value is not None]
+    return [time for time, _ in rows], [value for _, value in rows]
+
+
+@pytest.mark.triton
+def test_score_records_frames_and_curves_on_one_timeline(demo_server: Endpoints, video: Path, tmp_path: Path) -> None:
+    other, seen = tmp_path / "other clip.mp4", tmp_path / "seen.npz"
+    clip.write(other)
+    random = np.random.default_rng(0)
+    embeddings = {"video_embeddings": random.random((5, 64)), "text_embedding": random.random(32)}
+    np.savez(seen, **{name: array.astype(np.float32) for name, array in embeddings.items()})
+    out, target = tmp_path / "out.rrd", tmp_path / "scores.json"
+    result = invoke(
+        *("score", video, other, "missing.mp4", seen, "--task", TASK, "--fps", 10, "--max-frames", 7),
+        *("--rrd", out, "--json", target, "--url", demo_server.grpc_url),
+    )
+    assert result.exit_code == ExitCode.FAILED  # of the missing one alone
+    of_film, of_seen = {"image", "progress", "success"}, {"progress", "success"}
+    stems = {"clip": of_film, r"other\ clip": of_film, "seen": of_seen}
+    assert {f"/{stem}/{name}" for stem, names in stems.items() for name in names} <= entities(out)
+    assert not any("missing" in entity for entity in entities(out))
+    scores = {Path(each["source"]).stem: each for each in json.loads(target.read_text())["videos"]}
+    frames = load_trajectory(video, fps=10).frames
+    assert frames is not None
+    expected_ns = np.rint(frame_times_s(video, len(frames)) * NS_PER_S)
+    times, images = logged(out, TIME, "/clip/image", "Blob")
+    np.testing.assert_allclose(times, expected_ns, atol=1)
+    for image, frame in zip(images, frames, strict=True):
+        shown = np.asarray(Image.open(io.BytesIO(bytes(image))))
+        assert np.abs(shown.astype(int) - frame).mean() < JPEG_ERROR
+    indices = scores["clip"]["frame_indices"]
+    assert len(indices) == 7
+    for name in ("progress", "success"):
+        curve_times, values = logged(out, TIME, f"/clip/{name}", "Scalar")
+        assert curve_times == [times[index] for index in indices]  # the film and its curves meet
+        np.testing.assert_array_equal(values, scores["clip"][name])
+        steps, values = logged(out, FRAME, f"/seen/{name}", "Scalar")
+        assert steps == scores["seen"]["frame_indices"]
+        np.testing.assert_array_equal(values, scores["seen"][name])
+
+
+def test_a_score_that_is_not_predicted_has_no_curve_and_nothing_makes_no_file(tmp_path: Path) -> None:
+    told = FrameScores(progress=np.float32([0.25, 0.5]), success=np.full(2, np.nan, np.float32))
+    with Recording(tmp_path / "one.rrd") as recording:
+        recording.add(("a/b",), told, {"front": np.zeros((2, 8, 8, 3), np.uint8)})
+        recording.add(("timed",), told, {}, np.array([0.5, 1.5]))
+        recording.add(("untimed",), told, {})
+    file = tmp_path / "one.rrd"
+    found = {entity for entity in entities(file) if "__" not in entity}
+    assert found == {r"/a\/b/progress", r"/a\/b/image/front", "/timed/progress", "/untimed/progress"}
+    assert logged(file, TIME, "/timed/progress", "Scalar") == ([500_000_000, 1_500_000_000], [0.25, 0.5])
+    assert logged(file, TIME, "/untimed/progress", "Scalar") == ([], [])
+    assert logged(file, FRAME, "/untimed/progress", "Scalar") == ([0, 1], [0.25, 0.5])
+    with Recording(tmp_path / "none.rrd"):
+        pass
+    assert not (tmp_path / "none.rrd").exists()
+
+
+def test_a_missing_package_is_told_with_the_command_that_installs_it(
+    demo_server: Endpoints, video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    words = ("score", video, "--task", TASK, "--url", demo_server.grpc_url)
+    result = invoke(*words, "--rrd", tmp_path / "out.rrd")
+    assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
+    assert result.stderr == 'rfm-client: recordings need rerun-sdk: pip install "./client[rerun]"\n'
+    assert invoke(*words).exit_code == ExitCode.OK
+
+
+def test_a_recording_has_the_ending_that_the_viewer_opens(video: Path, tmp_path: Path) -> None:
+    for target, told in (("out.mp4", "a file that ends in .rrd"), ("nowhere/out.rrd", "a folder at")):
+        result = invoke("score", video, "--rrd", tmp_path / target)
+        assert result.exit_code == ExitCode.USAGE
+        assert told in " ".join(result.stderr.split())
