@@ -25,6 +25,7 @@ from environments import (
     play,
     progress,
     scores,
+    two_cameras,
 )
 from reference_server import Served
 from rfm_client import (
@@ -157,6 +158,40 @@ def test_frames_may_come_from_the_observation(client: RewardClient, source: Any)
     assert_close(reward, progress(client, frames, [3]))
 
 
+@pytest.mark.parametrize("blocking", [True, False])
+@pytest.mark.parametrize("fuse", ["mean", "min", "max"])
+def test_several_cameras_are_scored_apart_and_fused(client: RewardClient, fuse: Any, blocking: bool) -> None:
+    options = RewardOptions(frames_from=two_cameras, cameras=["wrist", "front"], fuse=fuse, blocking=blocking)
+    env = RewardModelWrapper(cart_pole_with_pixels(), client, TASK, options)
+    observation, info = env.reset(seed=0)
+    film, ended, rewards = [two_cameras(observation)], False, []
+    while not ended:
+        observation, reward, ended, _, info = env.step(PUSH_RIGHT)
+        film.append(two_cameras(observation))
+        rewards.append(reward)
+    steps = list(range(1, len(film)))
+    of_cameras = [progress(client, [shown[name] for shown in film], steps) for name in ("front", "wrist")]
+    expected = getattr(np, fuse)(of_cameras, axis=0)
+    assert info["reward_model"]["step"] == steps[-1]  # the last is waited for
+    assert_close(rewards if blocking else rewards[-1], expected if blocking else expected[-1])
+
+
+def test_cameras_may_be_keys_of_the_observation(client: RewardClient) -> None:
+    env = RewardModelWrapper(cart_pole_with_pixels(), client, TASK, RewardOptions(cameras=["pixels"]))
+    observation, info = env.reset(seed=0)
+    assert_close(info["reward_model"]["progress"], progress(client, [observation["pixels"]], [0])[0])
+
+
+def test_a_camera_that_shows_nothing_is_told(client: RewardClient) -> None:
+    options = RewardOptions(frames_from=two_cameras, cameras=["front", "top"])
+    expected = r"^frames: expected a frame of each of the cameras \['front', 'top'\], got \['front', 'wrist'\]$"
+    with pytest.raises(InvalidSampleError, match=expected):
+        RewardModelWrapper(cart_pole_with_pixels(), client, TASK, options).reset()
+    options = RewardOptions(frames_from="pixels", cameras=["front"])
+    with pytest.raises(InvalidSampleError, match=r"the cameras \['front'\], got ndarray$"):
+        RewardModelWrapper(cart_pole_with_pixels(), client, TASK, options).reset()
+
+
 def test_frames_may_be_drawn_into_the_same_array(client: RewardClient) -> None:
     camera = Camera(cart_pole())
     canvas = np.empty((SIZE[1], SIZE[0], 3), np.uint8)
@@ -189,6 +224,9 @@ BAD_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
     "every": ({"every": 0}, "^every: expected at least 1, got 0$"),
     "max_pending": ({"max_pending": 0}, "^max_pending: expected at least 1, got 0$"),
     "max_frames": ({"max_frames": 0}, "^max_frames: expected at least 1, got 0$"),
+    "cameras": ({"cameras": ["front"]}, r"^cameras: expected keys of the observation \[\], got \['front'\]$"),
+    "a camera": ({"cameras": "front"}, "^cameras: expected a sequence of names, got 'front'$"),
+    "fuse": ({"fuse": "sum"}, "^fuse: expected one of mean, min, max, got 'sum'$"),
     "frames_from": ({"frames_from": "pixels"}, r"^frames_from: expected a key of the observation \[\], got 'pixels'$"),
 }
 

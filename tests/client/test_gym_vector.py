@@ -25,6 +25,7 @@ from environments import (
     cart_pole,
     cart_pole_with_pixels,
     progress,
+    two_cameras,
 )
 from reference_server import Served
 from rfm_client import (
@@ -76,10 +77,12 @@ def assert_same_steps(left: Any, right: Any, where: str = "") -> None:
 
 @pytest.mark.parametrize("reward_mode", ["absolute", "delta"])
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.name)
+@pytest.mark.parametrize("cameras", [(), ("front", "wrist")], ids=["one camera", "two cameras"])
 def test_a_vector_is_paid_as_its_environments_would_be(
-    client: RewardClient, mode: AutoresetMode, reward_mode: Any
+    client: RewardClient, mode: AutoresetMode, reward_mode: Any, cameras: tuple[str, ...]
 ) -> None:
-    options = RewardOptions(mode=reward_mode, every=2, frames_from="pixels")
+    source: Any = two_cameras if cameras else "pixels"
+    options = RewardOptions(mode=reward_mode, every=2, frames_from=source, cameras=cameras, fuse="min")
     tasks = [TASK, "let the pole fall"]
     singles = [
         partial(lambda task: RewardModelWrapper(cart_pole_with_pixels(), client, task, options), task) for task in tasks

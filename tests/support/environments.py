@@ -73,6 +73,12 @@ def cart_pole_with_pixels() -> gym.Env[Any, Any]:
     return AddRenderObservation(cart_pole(), render_only=False, render_key="pixels", obs_key="state")
 
 
+def two_cameras(observation: dict[str, Any]) -> dict[str, UInt8Array]:
+    """A frame of each of two cameras, of different sizes."""
+    front = np.asarray(observation["pixels"], np.uint8)
+    return {"front": front, "wrist": 255 - front[::2, ::2]}
+
+
 def scores(client: RewardClient, film: Film, step: int, max_frames: int | None = MAX_FRAMES) -> ProgressResult:
     """Of the frames up to a step as upstream's RL loop sends them, cut or padded to ``max_frames``; None: all frames.
 

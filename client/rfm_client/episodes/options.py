@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TypedDict
 
 from rfm_client.contract.results import SUCCESS_THRESHOLD
-from rfm_client.data.fusing import FUSES, Fuse
+from rfm_client.data.fusing import Fuse, check_fuse, checked_cameras
 from rfm_client.data.sampling import Rule, Sampling
 
 
@@ -61,11 +61,6 @@ class EpisodeOptions:
     success: SuccessRule = SuccessRule()
 
     def __post_init__(self) -> None:
-        if isinstance(self.cameras, str):
-            raise ValueError(f"cameras: expected a sequence of names, got {self.cameras!r}")
-        object.__setattr__(self, "cameras", tuple(self.cameras))
-        if len(set(self.cameras)) < len(self.cameras):
-            raise ValueError(f"cameras: expected names that differ, got {list(self.cameras)}")
-        if self.fuse not in FUSES:
-            raise ValueError(f"fuse: expected one of {', '.join(FUSES)}, got {self.fuse!r}")
+        object.__setattr__(self, "cameras", checked_cameras(self.cameras))
+        check_fuse(self.fuse)
         Sampling.of(self.sampling, self.frames, trained_frames=1)  # whether rule and number go together

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, TypeAlias, cast
 
@@ -15,6 +15,7 @@ from rfm_client.client import RewardClient
 from rfm_client.contract.errors import InvalidSampleError, RewardError
 from rfm_client.contract.results import ProgressResult, Result
 from rfm_client.contract.samples import UInt8Array
+from rfm_client.data.fusing import FUSES, Fuse, check_fuse, checked_cameras
 from rfm_client.data.prefixes import of_frames
 from rfm_client.data.resize import resize_frames
 from rfm_client.data.sampling import Prefix, Rule, Sampling
@@ -44,6 +45,9 @@ class RewardOptions:
     terminate_on_success: terminates the episode when an answer says success, except one about the frame of the reset
     frames_from: where frames, uint8 [H, W, 3], come from. None: ``render()``; or a key of the observation; or what
         takes one environment's observation and gives its frame
+    cameras: each is scored, and the scores fused: keys, of the observation or of what ``frames_from`` says, that hold a
+        frame of each; none: there is one camera, without a name
+    fuse: how the scores of several cameras become one
     sampling: which frames of the episode so far are sent: a rule of ``rfm_client.data.sampling``. ``rint_pad`` is that
         of upstream's own RL loop
     resize: frames are made as small as the checkpoint reads them before they are kept and sent (needs Pillow); ReWiND's
@@ -60,7 +64,9 @@ class RewardOptions:
     add_to_env_reward: bool = False
     every: int = 1
     terminate_on_success: SuccessRule | None = None
-    frames_from: str | Callable[[Any], UInt8Array] | None = None
+    frames_from: str | Callable[[Any], UInt8Array | Mapping[str, UInt8Array]] | None = None
+    cameras: Sequence[str] = ()
+    fuse: Fuse = "mean"
     sampling: Rule = "rint_pad"
     resize: bool = False
     max_frames: int | None = None
@@ -75,7 +81,30 @@ class RewardOptions:
         _check_at_least_one("max_pending", self.max_pending)
         if self.max_frames is not None:
             _check_at_least_one("max_frames", self.max_frames)
+        object.__setattr__(self, "cameras", checked_cameras(self.cameras))
+        check_fuse(self.fuse)
         Sampling.of(self.sampling, self.max_frames, trained_frames=1)  # whether rule and number go together
+
+    @property
+    def renders(self) -> bool:
+        """Whether frames come from ``render()``."""
+        return self.frames_from is None and not self.cameras
+
+    def frames_of(self, observation: Any) -> Any:
+        """The frame in one environment's observation; with cameras a tuple of theirs. Raises InvalidSampleError."""
+        source = self.frames_from
+        if source is None:
+            found = observation
+        elif callable(source):
+            found = source(observation)
+        else:
+            found = observation[source]
+        if not self.cameras:
+            return found
+        if not isinstance(found, Mapping) or not found.keys() >= set(self.cameras):
+            got = list(found) if isinstance(found, Mapping) else type(found).__name__
+            raise InvalidSampleError.at("frames", f"a frame of each of the cameras {list(self.cameras)}", str(got))
+        return tuple(found[camera] for camera in self.cameras)
 
 
 class Scorer:
@@ -117,11 +146,16 @@ class Scorer:
         if episode.num_pending >= self._options.max_pending:
             episode.num_skipped += 1
         else:
-            episode.expect(self._client.submit_window(episode.window(self._sampling)), self._sampling)
+            windows = episode.windows(self._sampling)
+            episode.expect([self._client.submit_window(window) for window in windows], self._sampling)
 
     def _await(self, episodes: Sequence[Episode]) -> None:
-        outcomes = self._client.score_windows([episode.window(self._sampling) for episode in episodes])
-        results = [episode.checked(outcome) for episode, outcome in zip(episodes, outcomes, strict=True)]
+        windows = [episode.windows(self._sampling) for episode in episodes]
+        outcomes = iter(self._client.score_windows([window for of_episode in windows for window in of_episode]))
+        results = [
+            episode.fused([episode.checked(next(outcomes)) for _ in of_episode])
+            for episode, of_episode in zip(episodes, windows, strict=True)
+        ]
         for episode, result in zip(episodes, results, strict=True):
             episode.learn(episode.step, result, self._sampling.prefix(episode.step))
 
@@ -157,10 +191,10 @@ class Episode:
         self._options = options
         self._task = task
         self._where = where
-        self._frames: list[NamedFrame] = []
-        self._size: tuple[int, ...] | None = None  # of the frames as they came
+        self._frames: list[tuple[NamedFrame, ...]] = []  # of each camera
+        self._sizes: list[tuple[int, ...]] | None = None  # of the cameras' frames as they came
         self._fit: Fit | None = None
-        self._pending: dict[int, tuple[Prefix, Future[ProgressResult]]] = {}  # by step
+        self._pending: dict[int, tuple[Prefix, Sequence[Future[ProgressResult]]]] = {}  # by step
         self._known_step = -1
         self._progress = self._success = self._paid_progress = np.nan
         self.num_skipped = 0
@@ -184,42 +218,51 @@ class Episode:
     def add(self, frame: Any, find_fit: Callable[[], Fit | None] = lambda: None) -> None:
         """Adds a copy of the frame: an environment may draw into the same array again.
 
+        frame: with cameras a tuple of theirs
         find_fit: gives what makes the episode's frames smaller; asked at its first
         """
+        frames = frame if self._options.cameras else (frame,)
         try:
-            kept = checked_frame(frame)
-            if self._size is not None and kept.shape != self._size:
-                first = f"uint8 {list(self._size)}, as the episode's first"
-                raise InvalidSampleError.at("frame", first, f"{kept.dtype} {list(kept.shape)}")
+            kept = [checked_frame(each) for each in frames]
+            self._check_sizes(kept)
         except InvalidSampleError as error:
             raise self._located(error) from None
-        if self._size is None:
+        if self._sizes is None:
             self._fit = find_fit()
-        self._size = kept.shape
-        self._frames.append(NamedFrame(kept if self._fit is None else self._fit(kept)))
+        self._sizes = [each.shape for each in kept]
+        self._frames.append(tuple(NamedFrame(each if self._fit is None else self._fit(each)) for each in kept))
 
-    def window(self, sampling: Sampling) -> Window:
-        """The question about the newest frame."""
-        return Window(tuple(self._frames[index] for index in sampling.prefix(self.step).indices), self._task)
+    def windows(self, sampling: Sampling) -> list[Window]:
+        """The question about the newest frame of each camera."""
+        shown = [self._frames[index] for index in sampling.prefix(self.step).indices]
+        return [Window(of_camera, self._task) for of_camera in zip(*shown, strict=True)]
 
-    def expect(self, answer: Future[ProgressResult], sampling: Sampling) -> None:
-        """Records that an answer about the newest frame, sampled so, is to come."""
-        self._pending[self.step] = sampling.prefix(self.step), answer
+    def expect(self, answers: Sequence[Future[ProgressResult]], sampling: Sampling) -> None:
+        """Records that an answer about each camera's newest frame, sampled so, is to come."""
+        self._pending[self.step] = sampling.prefix(self.step), answers
 
     def collect(self) -> None:
         """Takes over the answers that have come. Raises the RewardError of one that failed."""
-        for step in [step for step, (_, answer) in self._pending.items() if answer.done()]:
-            prefix, answer = self._pending.pop(step)
-            error = answer.exception()
-            if isinstance(error, RewardError):
-                raise self._located(error)
-            self.learn(step, answer.result(), prefix)
+        for step in [step for step, (_, answers) in self._pending.items() if all(each.done() for each in answers)]:
+            prefix, answers = self._pending.pop(step)
+            errors = [error for error in (answer.exception() for answer in answers) if isinstance(error, RewardError)]
+            if errors:
+                raise self._located(errors[0])
+            self.learn(step, self.fused([answer.result() for answer in answers]), prefix)
 
     def cancel(self) -> None:
         """Cancels the requests that have no answer yet."""
-        for _, answer in self._pending.values():
+        for answer in (answer for _, answers in self._pending.values() for answer in answers):
             answer.cancel()
         self._pending.clear()
+
+    def fused(self, results: Sequence[ProgressResult]) -> ProgressResult:
+        """One result of those of all cameras."""
+        if len(results) == 1:
+            return results[0]
+        fuse = FUSES[self._options.fuse]
+        progress, success = ([getattr(each, field) for each in results] for field in ("progress", "success"))
+        return replace(results[0], progress=fuse(progress, axis=0), success=fuse(success, axis=0), progress_logits=None)
 
     def checked(self, outcome: Result | RewardError) -> ProgressResult:
         """The answer; raises what came in its place."""
@@ -252,6 +295,12 @@ class Episode:
         known = {"progress": self._progress, "success": self._success, "step": self._known_step}
         known |= {"lag": self.step - self._known_step, "skipped": self.num_skipped}
         return known if self._options.terminate_on_success is None else known | {"succeeded": self.succeeded}
+
+    def _check_sizes(self, frames: Sequence[UInt8Array]) -> None:
+        for frame, size in zip(frames, self._sizes or [frame.shape for frame in frames], strict=True):
+            if frame.shape != size:
+                first = f"uint8 {list(size)}, as the episode's first"
+                raise InvalidSampleError.at("frame", first, f"{frame.dtype} {list(frame.shape)}")
 
     def _located(self, error: RewardError) -> RewardError:
         return error.inside(self._where) if self._where and isinstance(error, InvalidSampleError) else error

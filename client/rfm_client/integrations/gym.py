@@ -102,9 +102,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
         super().close()
 
     def _frame(self, observation: Any) -> Any:
-        if self._options.frames_from is None:
-            return self.env.render()
-        return _frame_of(self._options, observation)
+        return self.env.render() if self._options.renders else self._options.frames_of(observation)
 
 
 class RewardModelVectorWrapper(VectorWrapper):
@@ -195,10 +193,10 @@ class RewardModelVectorWrapper(VectorWrapper):
 
     def _frames(self, observations: Any) -> Sequence[Any]:
         """The frame of each environment."""
-        if self._options.frames_from is None:
+        if self._options.renders:
             frames = list(self.env.render() or ())
         else:
-            frames = [_frame_of(self._options, each) for each in iterate(self.env.observation_space, observations)]
+            frames = [self._options.frames_of(each) for each in iterate(self.env.observation_space, observations)]
         if len(frames) != self.num_envs:
             raise InvalidSampleError.at("frames", f"one of each of the {self.num_envs} environments", str(len(frames)))
         return frames
@@ -208,7 +206,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         indices = np.flatnonzero(ended).tolist()
         if indices and "final_obs" not in infos:
             raise InvalidSampleError.at("infos", "final_obs of the environments that were reset", str(list(infos)))
-        return {index: _frame_of(self._options, infos["final_obs"][index]) for index in indices}
+        return {index: self._options.frames_of(infos["final_obs"][index]) for index in indices}
 
     def _with_scores(self, infos: Info, fresh: Mapping[int, Episode]) -> Info:
         for index, episode in fresh.items():
@@ -216,20 +214,15 @@ class RewardModelVectorWrapper(VectorWrapper):
         return infos
 
 
-def _frame_of(options: RewardOptions, observation: Any) -> Any:
-    """The frame in one environment's observation."""
-    source = options.frames_from
-    return source(observation) if callable(source) else observation[source]
-
-
 def _check_frame_source(options: RewardOptions, render_mode: str | None, space: gymnasium.Space[Any]) -> None:
-    if options.frames_from is None and render_mode != "rgb_array":
-        expected = "'rgb_array', since frames come from render() unless frames_from says otherwise"
+    if options.renders and render_mode != "rgb_array":
+        expected = "'rgb_array', since frames come from render() unless frames_from or cameras say otherwise"
         raise ValueError(f"render_mode: expected {expected}, got {render_mode!r}")
-    if isinstance(options.frames_from, str):
-        keys = list(space.keys()) if isinstance(space, gymnasium.spaces.Dict) else []
-        if options.frames_from not in keys:
-            raise ValueError(f"frames_from: expected a key of the observation {keys}, got {options.frames_from!r}")
+    keys = list(space.keys()) if isinstance(space, gymnasium.spaces.Dict) else []
+    if isinstance(options.frames_from, str) and options.frames_from not in keys:
+        raise ValueError(f"frames_from: expected a key of the observation {keys}, got {options.frames_from!r}")
+    if options.frames_from is None and not set(options.cameras) <= set(keys):
+        raise ValueError(f"cameras: expected keys of the observation {keys}, got {list(options.cameras)}")
 
 
 def _checked_autoreset_mode(env: VectorEnv, options: RewardOptions) -> AutoresetMode:
@@ -237,7 +230,7 @@ def _checked_autoreset_mode(env: VectorEnv, options: RewardOptions) -> Autoreset
     instead = "; wrap each environment in RewardModelWrapper instead"
     if not isinstance(mode, AutoresetMode):
         raise ValueError(f"metadata['autoreset_mode']: expected an AutoresetMode, got {mode!r}")
-    if mode is AutoresetMode.SAME_STEP and options.frames_from is None:
+    if mode is AutoresetMode.SAME_STEP and options.renders:
         expected = "NEXT_STEP or DISABLED with frames from render(), which never shows an episode's last frame"
         raise ValueError(f"autoreset_mode: expected {expected}, got SAME_STEP{instead}")
     if mode is not AutoresetMode.DISABLED and options.terminate_on_success is not None:
