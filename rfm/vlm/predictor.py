@@ -86,7 +86,7 @@ class VlmPredictor:
         """The scores of each row of the batch, or why it has none, from one forward pass."""
         self._upload.wait_for([] if batch.pixels is None else batch.pixels.films)
         output = self.network(batch.to(self.device, self._dtype))
-        scores, preference, similarity = _read(output)
+        scores, preference, similarity, may_keep = _read(output)
         of_rows, read, num_queries = [], 0, 0
         for row in rows:
             frames = []
@@ -98,23 +98,20 @@ class VlmPredictor:
                 query = (similarity if row.is_similarity else preference)[num_queries]
                 num_queries += 1
             of_rows.append(RowScores(frames, query))
-        outcomes = checked(of_rows)
-        if self.cache is not None and batch.layout is not None:
-            good = [row for row, outcome in zip(rows, outcomes, strict=True) if isinstance(outcome, RowScores)]
-            self._keep(good, batch.layout, output.made)
-        return outcomes
+        if self.cache is not None and batch.layout is not None and may_keep:
+            self._keep(rows, batch.layout, output.made)
+        return checked(of_rows)
 
     def _completed(self, sample: NamedProgressSample) -> NamedProgressSample:
         """The sample with the pixels of frames that were kept."""
         named = sample.trajectory
         kept = {} if self.cache is None else self.cache.found(named.digests)
-        pixels = {
-            digest: known[digest] for known in (kept, named.pixels) for digest in named.digests if digest in known
-        }
+        found = {digest: named.pixels.get(digest, kept.get(digest)) for digest in named.digests}
+        pixels = {digest: frame for digest, frame in found.items() if frame is not None}
         return replace(sample, trajectory=replace(named, pixels=pixels))
 
     def _keep(self, rows: Sequence[VlmRow], layout: Layout, made: torch.Tensor | None) -> None:
-        """Keeps the frames and shots of rows whose scores are finite, as then the features are that they depend on."""
+        """Keeps the frames of the rows, and what was made of their shots."""
         assert self.cache is not None
         for film in dict.fromkeys(film for row in rows for film in row.films):
             frames = dict(zip(film.digests, film.frames, strict=True))
@@ -131,13 +128,17 @@ class VlmPredictor:
         return part_of(scores, np.arange(num_frames) // FRAMES_PER_GROUP)
 
 
-def _read(output: VlmOutput) -> tuple[FrameScores, list[float], list[float]]:
-    """The scores of all frames, and preference and similarity of all questions, read from the device at once."""
+def _read(output: VlmOutput) -> tuple[FrameScores, list[float], list[float], bool]:
+    """The scores of all frames, preference and similarity of all questions, and whether all that was made of shots is
+    finite, read from the device at once.
+    """
     made = [progress_from_logits(output.progress), output.success.sigmoid(), output.preference.sigmoid()]
     made += [output.progress] if output.progress.shape[-1] > 1 else []
     made += [] if output.similarity is None else [output.similarity]
+    made += [] if output.made is None else [output.made.isfinite().all()]
     read = torch.cat([each.float().flatten() for each in made]).cpu().split([each.numel() for each in made])
     progress, success, preference, *rest = (each.view(of.shape) for each, of in zip(read, made, strict=True))
     logits = rest.pop(0).numpy() if output.progress.shape[-1] > 1 else None
     scores = FrameScores(progress=progress.numpy(), success=success.numpy(), progress_logits=logits)
-    return scores, preference.tolist(), rest[0].tolist() if rest else []
+    is_finite = True if output.made is None else bool(rest.pop())
+    return scores, preference.tolist(), rest[0].tolist() if rest else [], is_finite

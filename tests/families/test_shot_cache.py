@@ -161,6 +161,21 @@ def test_what_is_not_finite_is_not_kept() -> None:
     assert isinstance(ask(cached, named(frames, frames)), ProgressResult)
 
 
+@pytest.mark.parametrize("name", MODELS)
+def test_what_is_not_finite_is_not_kept_even_if_no_score_shows_it(name: str) -> None:
+    """The last tokens of a video may stand behind all that is read."""
+    cache, frames = FeatureCache[Any](BYTES_PER_MB), frames_of(12, 4)
+    cached = engine(name, cache)
+    assert isinstance(cached.predictor, VlmPredictor)
+
+    def spoil(_module: Any, _inputs: Any, output: torch.Tensor) -> torch.Tensor:
+        return torch.cat([output[:-1], output[-1:] * torch.nan])
+
+    cached.predictor.network.model.visual.merger.register_forward_hook(spoil)
+    ask(cached, named(frames, frames))
+    assert len(cache) == 0
+
+
 def test_frames_of_two_sizes_are_no_film() -> None:
     frames = [*frames_of(8, 1), *frames_of(9, 1, (84, 56))]
     outcome = ask(engine(MODELS[0], FeatureCache(BYTES_PER_MB)), named(frames, frames))
