@@ -21,6 +21,7 @@ import goldens
 import rfm_export
 from engines import serve_config
 from reference_server import Served
+from repositories import configure
 from rfm.launch.installation import find_installation
 from rfm.launch.process import Endpoints, TritonServer
 from rfm_client import (
@@ -451,6 +452,26 @@ def test_an_episode_goes_on_when_the_process_that_knew_its_frames_was_killed(
         expected = offline(client, frames, Sampling("rint_pad", 4))
     assert [score.step for score in scores] == list(range(len(frames)))
     assert_same(([score.progress for score in scores], [score.success for score in scores]), expected, tolerance)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("checkpoint", "encoder", "tolerance"),
+    [(MODEL, f"{MODEL}_encoder", TOLERANCE), (IMAGES, f"{MODEL}_frames", VLM_TOLERANCE)],
+)
+def test_an_episode_goes_on_between_two_instances_that_know_different_frames(
+    tmp_path: Path, checkpoint: str, encoder: str, tolerance: float
+) -> None:
+    """As on two GPUs."""
+    repository, endpoints, frames = repository_of(tmp_path, checkpoint), Endpoints.free(), film(119, 12)
+    configure(repository / encoder, instances=2)
+    with (
+        TritonServer(repository, endpoints, find_installation()),
+        RewardClient(endpoints.grpc_url, model=MODEL) as client,
+    ):
+        for _ in range(3):
+            with client.episode(TASK, frames=4) as episode:
+                assert_same(online(episode, frames), offline(client, frames, Sampling("rint_pad", 4)), tolerance)
 
 
 @pytest.mark.slow
