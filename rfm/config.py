@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_TOKEN_BUDGET = 16_384
 DEFAULT_SAMPLE_TOKENS = 131_072
-DEFAULT_FEATURE_CACHE_MB = 256  # 80,000 embeddings of 768 numbers; 200 frames of 256x256 of a 4B Qwen3-VL in bfloat16
+DEFAULT_FEATURE_CACHE_MB = 256  # 80,000 embeddings of 768 numbers; of a 4B Qwen3-VL 170 frames of 256x256
 DEFAULT_QUEUE_SIZE = 1024  # as many as a gateway lets wait
 MAX_OF_A_MACHINE = 4096  # GPUs, instances, threads
 MAX_INT32 = 2**31 - 1

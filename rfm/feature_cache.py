@@ -46,6 +46,12 @@ class FeatureCache(Generic[Kept]):
     def __len__(self) -> int:
         return len(self._arrays)
 
+    def clear(self) -> None:
+        """Forgets all."""
+        with self._changing:
+            self._arrays.clear()
+            self.num_bytes = 0
+
     def found(self, keys: Iterable[Hashable]) -> dict[Hashable, Kept]:
         """The arrays of those keys that have some; they count as used now."""
         with self._changing:
@@ -74,14 +80,17 @@ def get_or_make(
     wanted: Iterable[bytes],
     sources: Mapping[bytes, Source],
     make: Callable[[Sequence[Source]], Sequence[Float32Array | RewardError]],
+    is_always_made: Callable[[Source], bool] = lambda _: False,
 ) -> tuple[dict[bytes, Float32Array | RewardError], int]:
     """The features of the wanted keys: those that are kept, and those that are made of their sources now, each once.
     A key that has neither is left out. And how many were made.
 
     What cannot be made, or is not finite, is not kept.
+
+    is_always_made: of which sources features are made although some are kept
     """
     wanted = list(dict.fromkeys(wanted))
-    kept = cache.found(wanted)
+    kept = cache.found(key for key in wanted if key not in sources or not is_always_made(sources[key]))
     found = {key: kept[key] for key in wanted if key in kept}
     missing = [key for key in wanted if key not in found and key in sources]
     made = dict(zip(missing, make([sources[key] for key in missing]) if missing else [], strict=True))

@@ -20,6 +20,7 @@ NO_DIGEST = bytes(DIGEST_BYTES)  # of what is no suspect whatever happens
 SHARED_MEMORY = Path("/dev/shm")
 
 _SUFFIX = "_batch"
+_BEFORE = "before-"  # of journals of a server in whose place this one was started
 
 _NUMBER = struct.Struct("<Q")
 _SINCE = struct.Struct("<d")  # when the work last got on; 0: there is none
@@ -52,7 +53,8 @@ def journals_of_the_dead(prefix: str) -> dict[str, bytes]:
 
 def all_wait(prefix: str) -> bool:
     """Whether all processes of the server whose regions begin with ``prefix`` have loaded, and have nothing to do."""
-    files = [file for file in SHARED_MEMORY.glob(f"{prefix}*") if not file.name.endswith("_lock")]
+    own = [file for file in SHARED_MEMORY.glob(f"{prefix}*") if not file.name.startswith(f"{prefix}{_BEFORE}")]
+    files = [file for file in own if not file.name.endswith("_lock")]
     journals = [Journal.open(file) for file in files if file.name.endswith(_SUFFIX)]
     regions = [file for file in files if not file.name.endswith(_SUFFIX)]
     return len(journals) == len(regions) > 0 and all(journal is not None and not journal.busy_s for journal in journals)
@@ -64,7 +66,7 @@ def restore_journals(prefix: str, journals: Mapping[str, bytes]) -> None:
     Its processes number their regions from the beginning; the part before the first underscore becomes another.
     """
     for number, (name, content) in enumerate(sorted(journals.items())):
-        (SHARED_MEMORY / f"{prefix}before-{number}_{name.partition('_')[2]}").write_bytes(content)
+        (SHARED_MEMORY / f"{prefix}{_BEFORE}{number}_{name.partition('_')[2]}").write_bytes(content)
 
 
 class Journal:

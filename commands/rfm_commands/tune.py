@@ -18,7 +18,7 @@ import yaml
 from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.launch.temporary import temporary_server
-from rfm.parameters import THREADS_PARAMETER
+from rfm.parameters import FEATURE_CACHE_PARAMETER, THREADS_PARAMETER
 from rfm_client import AsyncRewardClient, RewardClient, Sample
 from rfm_client.cli.toy import SampleKind, Toy
 from rfm_commands.config import File
@@ -170,6 +170,8 @@ def _apply(setting: Setting, repository: Path) -> None:
     for name, config in _configs(repository).items():
         config.max_batch_size = setting.max_batch_size
         for group in config.instance_group:
+            if FEATURE_CACHE_PARAMETER in config.parameters:  # the same samples are sent again and again
+                config.parameters[FEATURE_CACHE_PARAMETER].string_value = "0"
             group.count = setting.instances
             config.parameters[THREADS_PARAMETER].string_value = str(setting.torch_threads)
         file = repository / name / CONFIG_FILE

@@ -91,11 +91,11 @@ def generated_models(
     name, widths = version.settings.name, description.widths
     outputs = wire.score_outputs(description.progress_bins if description.progress_bins > 1 else None)
     cache_mb = version.settings.feature_cache_mb
-    keeps = description.keeps_features and cache_mb > 0
+    keeps = description.keeps_features and cache_mb > 0 and version.settings.instances == 1
     inputs = wire.frame_inputs(by_digest=keeps) if widths is None else wire.embedding_inputs(*widths)
     about = {**_limits(description, description.frame_size), **version.about}
     scorer = Interface(scorer_name(description, name), inputs, outputs, about)
-    models = [_python_model(scorer, "rfm", _with_one_cache(version) if keeps else version, _warmups(description))]
+    models = [_python_model(scorer, "rfm", version, _warmups(description))]
     if keeps:
         models[0].config.parameters[FEATURE_CACHE_PARAMETER].string_value = str(cache_mb)
     if encoders is None or widths is None:
@@ -114,7 +114,7 @@ def generated_models(
 
 
 def _with_one_cache(version: Version) -> Version:
-    """As a model that keeps features is served: by one instance a device, or each would have to see all frames."""
+    """As the encoder is served: with a cache by one instance on each device, or each would have to see all frames."""
     settings = version.settings
     return replace(version, settings=replace(settings, instances=1)) if settings.feature_cache_mb else version
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import signal
 import socket
@@ -30,7 +29,8 @@ from rfm.launch.triton_options import check_arguments, size_limits
 from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
 
 POLL_S = 0.1
-STALLED_S = 30.0  # within which Triton takes up processes that have loaded
+STALLED_S = 30.0  # within which Triton takes up processes that have loaded,
+PATIENT_S = 600.0  # or, where that was too short, has loaded models of other backends
 ANSWER_TIMEOUT_S = 10.0  # of one that starts
 NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # a `load` would load all versions anew: their folders have changed
 SECRETS = (VARIABLE, GATEWAY_KEY_VARIABLE)  # variables that neither Triton nor a model process needs
@@ -99,11 +99,14 @@ class Endpoints:
 
 
 class SpoiltStartError(ServerStartError):
-    """Triton has lost one of the processes that load: it was not heard of for a second.
+    """Triton has lost one of the processes that load: it was not heard of for a second, and Triton 2.51 has ended.
 
-    That happens where the machine stands still for a moment. Triton 2.51 then waits for ever for the process to end, or
-    ends itself.
+    That happens where a virtual machine stands still, or all processors are taken.
     """
+
+
+class StalledStartError(SpoiltStartError):
+    """The same, but Triton waits for ever for the process to end. Or models of other backends load for so long."""
 
 
 class TritonServer:
@@ -233,13 +236,12 @@ class TritonServer:
         except SpoiltStartError:
             self.stop()
             self.start(restored)
-            self.wait_ready()
+            self.wait_ready(PATIENT_S)
 
-    def wait_ready(self, stalled_s: float = math.inf) -> None:
+    def wait_ready(self, stalled_s: float = PATIENT_S) -> None:
         """Returns when every model is ready. Raises ServerStartError with the reason of one that is not.
 
-        stalled_s: Triton has spoilt its start if all model processes have loaded, and wait for so long. Models of
-            other backends may take longer, so that this is no proof
+        stalled_s: Triton has spoilt its start if all model processes have loaded, and wait for so long
         """
         assert self._process is not None  # started
         assert self._claim is not None
@@ -255,7 +257,7 @@ class TritonServer:
                     last_work_s = time.monotonic()
                 elif time.monotonic() - last_work_s > stalled_s:
                     self.kill()
-                    raise SpoiltStartError("tritonserver: expected to be ready, got processes that wait") from None
+                    raise StalledStartError("tritonserver: expected to be ready, got processes that wait") from None
                 time.sleep(POLL_S)
                 continue
             failed = [entry for entry in versions_of(index) if not entry.is_ready and entry.name in self._loading]

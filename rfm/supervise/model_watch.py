@@ -136,15 +136,14 @@ class ModelWatch:
 
     def _go_on(self) -> None:
         """Feeds the end of an attempt, or that the next one is due."""
+        assert self._reload is not None  # it makes the attempts
         if not self._attempts.is_under_way:
             if time.monotonic() >= self._due_s:
                 self._feed(Event.PAUSE_OVER)
         elif (attempt := self._attempts.ended()) is None:
-            assert self._reload is not None  # it makes the attempt
             self._reload.end_stalled(self._processes.of_model(self.name))
         else:
             error = attempt.exception()
-            assert self._reload is not None
             self._processes.forget(self._reload.ended)
             if error is not None:
                 self._trouble = str(error)

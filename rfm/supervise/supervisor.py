@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 import signal
 import threading
 from collections.abc import Callable, Sequence
@@ -14,7 +13,7 @@ from types import FrameType
 from rfm.launch import cleanup
 from rfm.launch.ending import stop_signals_to
 from rfm.launch.installation import ServerStartError
-from rfm.launch.process import POLL_S, STALLED_S, SpoiltStartError, TritonServer
+from rfm.launch.process import PATIENT_S, POLL_S, STALLED_S, SpoiltStartError, StalledStartError, TritonServer
 from rfm.supervise.back_off import BackOff
 from rfm.supervise.gateway_process import GatewayProcess
 from rfm.supervise.served_models import ServedModels
@@ -100,7 +99,9 @@ class Supervisor:
         try:
             self._start()
         except SpoiltStartError as error:
-            self._start_again(str(error))
+            self._count("triton", str(error))
+            self._server.stop()
+            self._start()
 
     def _start(self) -> None:
         """Starts Triton, and looks after its models from now on. Raises ServerStartError.
@@ -113,9 +114,8 @@ class Supervisor:
             return
         try:
             self._server.wait_ready(self._stalled_s)
-            self._stalled_s = STALLED_S
-        except SpoiltStartError:
-            self._stalled_s = math.inf  # if it was only slow, it has its time now
+        except StalledStartError:
+            self._stalled_s = PATIENT_S  # if models of other backends are slow, they have their time from now on
             raise
         ends = self._server.endpoints
         urls = f"{ends.grpc_url}, {ends.http_url}, metrics at {ends.metrics_url}"

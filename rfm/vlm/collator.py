@@ -241,11 +241,13 @@ class QwenCollator(VlmCollator):
         if cache is None:
             return super().to_size(film)
         keys = self.shot_keys(film)
-        kept = cache.found(keys.values())
-        needed = sorted({frame for shot, key in keys.items() if key not in kept for frame in shot})
+        found = cache.found(keys.values())
+        kept = {key: found[key] for shot, key in keys.items() if key in found and not film.is_blank(shot)}
+        alike = film.alike
+        needed = sorted({int(alike[frame]) for shot, key in keys.items() if key not in kept for frame in shot})
         places = np.full(len(film.frames), -1)
         places[needed] = np.arange(len(needed))
-        return SizedFrames(self._to_size(film, needed), places, keys, kept)
+        return SizedFrames(self._to_size(film, needed), places[alike], keys, kept)
 
     def shot_keys(self, film: Film) -> dict[Shot, Hashable]:
         """What is shown of each of a film's shots, in which size: all that the vision tower's answer depends on."""

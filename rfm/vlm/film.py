@@ -84,6 +84,18 @@ class Film:
         """The digest of each frame."""
         return self.named or tuple(map(frame_digest, self.frames))
 
+    @property
+    def alike(self) -> Indices:
+        """int64 [T]: of each frame the first one that shows the same."""
+        first: dict[bytes, int] = {}
+        return np.array([first.setdefault(digest, index) for index, digest in enumerate(self.digests)])
+
+    def is_blank(self, shot: Shot) -> bool:
+        """Whether a shot that came with its pixels is all black, as those are with which a server probes itself: what
+        was kept of such a one would tell nothing of how the network is.
+        """
+        return self.named is None and not any(self.frames[frame].any() for frame in shot)
+
     def stack(self, needed: Sequence[int]) -> UInt8Array:
         """uint8 [N, H, W, 3]: some of the frames, in order. A copy, unless all are wanted and lie side by side."""
         if isinstance(self.frames, np.ndarray) and len(needed) == len(self.frames):

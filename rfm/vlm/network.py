@@ -116,7 +116,8 @@ class VlmRewardModel(nn.Module):
                 made = features(self.model.visual, batch.inputs["pixel_values"], batch.plan)
             assert batch.layout is not None
             shots = [*([] if made is None else [made]), *batch.layout.kept.values()]
-            hidden = last_hidden_state(self.model.language_model, batch.inputs, torch.cat(shots))
+            merged = torch.cat(shots) if len(shots) > 1 else shots[0]
+            hidden = last_hidden_state(self.model.language_model, batch.inputs, merged)
         frames = self._frame_states(hidden, batch.spans, batch.num_span_tokens)
         queries = hidden[batch.query_rows, batch.query_tokens]
         return VlmOutput(

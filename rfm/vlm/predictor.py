@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 
-from rfm.execution import Execution
+from rfm.execution import Execution, memory_errors
 from rfm.feature_cache import FeatureCache
 from rfm.layers.heads import progress_from_logits
 from rfm.layers.linear import speed_up
@@ -73,8 +74,8 @@ class VlmPredictor:
         return batch.pinned() if self.device.type == "cuda" else batch
 
     def count(self, batch: VlmBatch, execution: Execution) -> None:
-        """Counts tokens, padding to the longest conversation, and frames that go through the vision tower: each once,
-        in whichever conversations it stands.
+        """Counts tokens, padding to the longest conversation, and the frames of the different shots that go through the
+        vision tower, and of those that are kept.
         """
         execution.add_tokens(batch.num_tokens, batch.inputs["input_ids"].numel())
         execution.num_encoded += 0 if batch.pixels is None else batch.pixels.num_shown
@@ -85,7 +86,7 @@ class VlmPredictor:
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch) -> list[RowScores | RewardError]:
         """The scores of each row of the batch, or why it has none, from one forward pass."""
         self._upload.wait_for([] if batch.pixels is None else batch.pixels.films)
-        output = self.network(batch.to(self.device, self._dtype))
+        output = self._output(batch)
         scores, preference, similarity, may_keep = _read(output)
         of_rows, read, num_queries = [], 0, 0
         for row in rows:
@@ -98,9 +99,21 @@ class VlmPredictor:
                 query = (similarity if row.is_similarity else preference)[num_queries]
                 num_queries += 1
             of_rows.append(RowScores(frames, query))
-        if self.cache is not None and batch.layout is not None and may_keep:
-            self._keep(rows, batch.layout, output.made)
+        if batch.layout is not None and may_keep:
+            with suppress(torch.OutOfMemoryError), memory_errors():  # the scores are there
+                self._keep(rows, batch.layout, output.made)
         return checked(of_rows)
+
+    def _output(self, batch: VlmBatch) -> VlmOutput:
+        """What the network gives. If its memory does not do, nothing stays in the cache: another attempt will come."""
+        try:
+            with memory_errors():
+                output: VlmOutput = self.network(batch.to(self.device, self._dtype))
+                return output
+        except torch.OutOfMemoryError:
+            if self.cache is not None:
+                self.cache.clear()
+            raise
 
     def _completed(self, sample: NamedProgressSample) -> NamedProgressSample:
         """The sample with the pixels of frames that were kept."""
@@ -111,15 +124,19 @@ class VlmPredictor:
         return replace(sample, trajectory=replace(named, pixels=pixels))
 
     def _keep(self, rows: Sequence[VlmRow], layout: Layout, made: torch.Tensor | None) -> None:
-        """Keeps the frames of the rows, and what was made of their shots."""
-        assert self.cache is not None
+        """Keeps the frames of the rows, and what was made of their shots; nothing of a film that alone is too large."""
+        if self.cache is None:
+            return
         for film in dict.fromkeys(film for row in rows for film in row.films):
             frames = dict(zip(film.digests, film.frames, strict=True))
-            missing = frames.keys() - self.cache.found(frames).keys()
-            self.cache.keep({digest: frames[digest].copy() for digest in missing})
-            if made is not None:
-                new = (key for key in film.ready.keys.values() if key in layout.made)
-                self.cache.keep({key: made[layout.made[key]].clone() for key in new})
+            if sum(frame.nbytes for frame in frames.values()) > self.cache.limit_bytes:
+                continue
+            known = self.cache.found(frames)
+            for digest in frames.keys() - known.keys():
+                self.cache.keep({digest: frames[digest].copy()})
+            for key in film.ready.keys.values():
+                if made is not None and key in layout.made:
+                    self.cache.keep({key: made[layout.made[key]].clone()})
 
     def _per_frame(self, scores: FrameScores, num_frames: int) -> FrameScores:
         """The scores of each frame: in video mode both frames of a temporal group carry its value."""

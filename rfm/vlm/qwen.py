@@ -27,16 +27,16 @@ def last_hidden_state(language: Any, inputs: dict[str, Tensor], features: Tensor
     visual_features: int64 [M], which of the shots' merged tokens each of them is
     features: [N, levels, D], the merged tokens of all shots
     """
-    at, of_tokens = inputs["visual_tokens"], features[inputs["visual_features"]]
+    at, picked = inputs["visual_tokens"], inputs["visual_features"]
+    merged, *deeper = features.unbind(1)
     hidden = language.embed_tokens(inputs["input_ids"])
-    merged, *deeper = of_tokens.to(hidden.dtype).unbind(1)
-    hidden.flatten(0, 1).index_copy_(0, at, merged)
+    hidden.flatten(0, 1).index_copy_(0, at, merged[picked].to(hidden.dtype))
     turned = language.rotary_emb(hidden, inputs["position_ids"])
     for number, layer in enumerate(language.layers):
         hidden = layer(hidden, position_embeddings=turned, attention_mask=None)
         hidden = hidden[0] if isinstance(hidden, tuple) else hidden  # transformers 4.57 of Qwen2.5-VL
         if number < len(deeper):
-            hidden.flatten(0, 1).index_add_(0, at, deeper[number])
+            hidden.flatten(0, 1).index_add_(0, at, deeper[number][picked].to(hidden.dtype))
     return language.norm(hidden)
 
 

@@ -10,15 +10,15 @@ import torch
 from torch import Tensor
 
 from rfm.vlm.batch import FramesOfOneSize, Layout
-from rfm.vlm.film import Film, Indices, Shot, shots_of
+from rfm.vlm.film import Film, Indices, Shot, SizedFrames, shots_of
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class SizedShots:
     """Shots of one size that the vision tower is to read.
 
     films: uint8 [N, H', W', 3] each
-    firsts: of each film, by its id, its first frame among those of all films
+    firsts: of each film, by the id of its sized frames, the first among those of all films
     shots: by key, its frames among those of all films
     """
 
@@ -26,14 +26,15 @@ class SizedShots:
     firsts: dict[int, int] = field(default_factory=dict)
     shots: dict[Hashable, Shot] = field(default_factory=dict)
 
-    def add(self, film: Film, key: Hashable, shot: Shot) -> None:
+    def add(self, sized: SizedFrames, key: Hashable, shot: Shot) -> None:
         """Adds a shot of a film."""
-        sized = film.ready
-        if id(film) not in self.firsts:
-            self.firsts[id(film)] = sum(map(len, self.films))
+        if id(sized) not in self.firsts:
+            self.firsts[id(sized)] = sum(map(len, self.films))
             self.films.append(sized.pixels)
-        first = self.firsts[id(film)]
-        self.shots[key] = tuple(first + int(sized.places[frame]) for frame in shot)
+        first = self.firsts[id(sized)]
+        places = [int(sized.places[frame]) for frame in shot]
+        assert min(places) >= 0  # it is not kept
+        self.shots[key] = tuple(first + place for place in places)
 
     def frames(self) -> FramesOfOneSize:
         """The films, and which of their frames each shot is made of."""
@@ -53,6 +54,7 @@ class Shots:
         self._of_size: dict[torch.Size, SizedShots] = {}
         self._kept: dict[Hashable, Tensor] = {}
         self._seen: set[Hashable] = set()
+        self._sized: list[SizedFrames] = []  # whose ids are taken
 
     @property
     def sizes(self) -> list[SizedShots]:
@@ -61,12 +63,13 @@ class Shots:
 
     def add(self, film: Film, shown: Indices) -> list[Hashable]:
         """The keys of the shots of a conversation that shows these frames of a film."""
-        keys = []
+        sized, keys = film.ready, []
+        self._sized.append(sized)
         for shot in shots_of(shown, are_images=self._are_images):
-            key = film.ready.keys[shot]
+            key = sized.keys[shot]
             if key not in self._seen:
                 self._seen.add(key)
-                self._place(film, key, shot)
+                self._place(sized, key, shot)
             keys.append(key)
         return keys
 
@@ -80,9 +83,8 @@ class Shots:
                 start += tokens
         return Layout(made, self._kept)
 
-    def _place(self, film: Film, key: Hashable, shot: Shot) -> None:
-        sized = film.ready
+    def _place(self, sized: SizedFrames, key: Hashable, shot: Shot) -> None:
         if key in sized.kept:
             self._kept[key] = sized.kept[key]
         else:
-            self._of_size.setdefault(sized.pixels.shape[1:3], SizedShots()).add(film, key, shot)
+            self._of_size.setdefault(sized.pixels.shape[1:3], SizedShots()).add(sized, key, shot)

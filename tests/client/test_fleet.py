@@ -85,7 +85,8 @@ def test_requests_that_end_their_process_at_one_time_end_two_each_at_most(
     urls = [server.endpoints.grpc_url for server in fleet]
     with RewardClient(urls, timeout_s=LONG_S) as client, Callers(client, references) as callers:
         callers.wait_for_all()
-        futures = [client.submit(ProgressSample(trajectory(seed, mark=MARK))) for seed in range(90, 93)]
+        # Of three, one server might end six processes in a row, which it takes for a crash loop.
+        futures = [client.submit(ProgressSample(trajectory(seed, mark=MARK))) for seed in range(90, 92)]
         for future in futures:
             assert isinstance(future.exception(LONG_S), (InvalidSampleError, ProcessEndedError))
         for server in fleet:

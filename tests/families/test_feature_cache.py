@@ -151,6 +151,16 @@ def test_what_is_kept_keeps_nothing_else() -> None:
     assert cache.found([b"one"])[b"one"].base is None
 
 
+def test_a_black_frame_with_pixels_is_always_encoded(encoders: FrameEncoders) -> None:
+    """A server probes itself with such: it is to see whether the encoder works."""
+    black, cache, execution = np.zeros((2, 40, 56, 3), np.uint8), FeatureCache(2**20), Execution()
+    expected = [embeddings(encoders.encode([footage(black)], execution, cache)[0])[0] for _ in range(2)]
+    assert execution.num_encoded == 2
+    (outcome,) = encoders.encode([named(black, black[:0])], execution, cache)
+    np.testing.assert_allclose(embeddings(outcome)[0], expected[0], atol=1e-5)
+    assert execution.num_encoded == 2
+
+
 def test_a_sliver_is_refused_though_only_another_request_names_it(encoders: FrameEncoders) -> None:
     """In one batch the second would bring what the first has sent to size."""
     sliver, cache, frames = np.zeros((1, 3000, 3), np.uint8), FeatureCache(2**20), film(5, 1)

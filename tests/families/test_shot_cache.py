@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -177,6 +178,63 @@ def test_what_is_not_finite_is_not_kept_even_if_no_score_shows_it(name: str) -> 
     cached.predictor.network.model.visual.merger.register_forward_hook(spoil)
     ask(cached, named(frames, frames))
     assert len(cache) == 0
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_frame_that_comes_many_times_is_brought_to_size_once(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Or one large frame, named thousands of times, would take all memory."""
+    cached, frames = engine(name, FeatureCache(64 * BYTES_PER_MB)), frames_of(13, 2)
+    (expected,) = engine(name).evaluate([whole(frames[[0, 1, 1, 0, 1, 1]])])
+    collator = cached.predictor.collator  # type: ignore[attr-defined]
+    sized: list[int] = []
+    to_size = collator._to_size
+    monkeypatch.setattr(collator, "_to_size", lambda film, needed: sized.append(len(needed)) or to_size(film, needed))
+    outcome = ask(cached, named([frames[index] for index in (0, 1, 1, 0, 1, 1)], frames))
+    assert sized == [2]
+    assert_close(outcome, expected, TOLERANCE)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_black_frames_with_pixels_are_always_encoded(name: str) -> None:
+    """A server probes itself with them: it is to see whether the vision tower works."""
+    cached, black, execution = engine(name, FeatureCache(BYTES_PER_MB)), np.zeros((2, 56, 84, 3), np.uint8), Execution()
+    for _ in range(2):
+        (expected,) = cached.evaluate([whole(black)], execution)
+    assert execution.num_encoded == 2 * frames_per_shot(cached)
+    assert_close(ask(cached, named(black, ()), execution), expected, TOLERANCE)
+    assert execution.num_encoded == 2 * frames_per_shot(cached)
+
+
+def test_a_film_that_the_cache_cannot_hold_leaves_it_as_it_is() -> None:
+    cache, frames = FeatureCache[Any](BYTES_PER_MB // 4), frames_of(14, 1)
+    cached = engine(MODELS[0], cache)
+    ask(cached, named(frames, frames))
+    before = len(cache)
+    assert isinstance(ask(cached, named(large := frames_of(15, 20), large)), ProgressResult)
+    assert len(cache) == before
+    assert cache.found([frame_digest(frames[0])])
+
+
+def test_a_pass_without_memory_empties_the_cache_and_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    cache, frames, execution = FeatureCache[Any](BYTES_PER_MB), frames_of(16, 4), Execution()
+    cached, plain = engine(MODELS[0], cache), engine(MODELS[0])
+    cached.evaluate([whole(frames[:2])])
+    network, sizes = cached.predictor.network, []  # type: ignore[attr-defined]
+    forward = network.forward
+
+    def refusing(batch: Any) -> Any:
+        sizes.append(len(cache))
+        if len(sizes) == 1:
+            raise torch.OutOfMemoryError("made up")
+        return forward(batch)
+
+    monkeypatch.setattr(network, "forward", refusing)
+    samples = [whole(frames[:3]), whole(frames[1:])]
+    for outcome, expected in zip(cached.evaluate(samples, execution), plain.evaluate(samples), strict=True):
+        assert_close(outcome, expected, TOLERANCE)
+    assert sizes[0] > 0
+    assert sizes[1] == 0
+    assert execution.out_of_memory_count == 1
 
 
 def test_frames_of_two_sizes_are_no_film() -> None:

@@ -14,7 +14,7 @@ import pytest
 from patients import make_repository
 from rfm.launch import process
 from rfm.launch.installation import ServerStartError, find_installation
-from rfm.launch.process import Endpoints, SpoiltStartError, TritonServer
+from rfm.launch.process import Endpoints, SpoiltStartError, StalledStartError, TritonServer
 from rfm.supervise.model_processes import ModelProcess, ProcessWatch
 from rfm_client import RewardClient
 from rfm_serve import MODEL, PATIENCE_S, children, serving, wait_for
@@ -72,7 +72,7 @@ def test_a_start_that_was_repeated_is_not_hurried(tmp_path: Path, trigger: Path)
     server = TritonServer(make_dawdling(tmp_path, trigger), Endpoints.free(), find_installation())
     server.start()
     try:
-        with pytest.raises(SpoiltStartError, match="tritonserver: expected to be ready, got processes that wait"):
+        with pytest.raises(StalledStartError, match="tritonserver: expected to be ready, got processes that wait"):
             server.wait_ready(1.0)
         wait_for(lambda: server.exit_status is not None)
         server.stop()

@@ -34,6 +34,7 @@ class Comparison:
 
     scores: of each source, as the model tells them when it compares the source with the first one, in the order given
     preferences: probability that the first of two does the task better, for every order of every two
+    model_version: that answered all; None: several did, or it is not known
     """
 
     sources: Sequence[Source]
@@ -111,7 +112,8 @@ def compare(server: Server, names: Sequence[str], question: Question) -> Compari
     }
     scores = [results[0, 1].first, *(results[0, other].second for other in range(1, len(sources)))]
     preferences = {order: result.preference for order, result in results.items()}
-    return Comparison(sources, scores, preferences, results[0, 1].model_version)
+    versions = {result.model_version for result in results.values()}
+    return Comparison(sources, scores, preferences, versions.pop() if len(versions) == 1 else None)
 
 
 def _of_one_task(first: Source, other: Source) -> Trajectory:

@@ -116,7 +116,6 @@ class LabelFlags:
     ] = False
     report: Annotated[bool, typer.Option("--report", help="Only show the summary of labels that are there.")] = False
     picture: Annotated[bool, typer.Option(help="Draw the summary: NAME_summary.png in the output.")] = True
-
     rrd: Annotated[
         Path | None,
         typer.Option(

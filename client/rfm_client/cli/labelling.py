@@ -117,6 +117,7 @@ def run(source: str, flags: LabelFlags, connect: Connect, say: Say) -> ExitCode:
         return _dry_run(source, flags, connect, say)
     if flags.rrd is not None:
         load_rerun()  # or it would be found missing when all is labelled
+        flags.rrd.mkdir(parents=True, exist_ok=True)
     watch = ProgressBar(say)
     try:
         with watch:

@@ -169,7 +169,7 @@ def read_access(ca_file: Path | None, certificate: Path | None, key: Path | None
 
 def port_named(urls: Sequence[str], error: errors.RewardError) -> errors.RewardError:
     """The error of servers that do not answer as servers do; if a port is to blame, one that names the right one."""
-    if isinstance(error, (errors.DeadlineExceededError, errors.AccessDeniedError, errors.InvalidSampleError)):
+    if not isinstance(error, errors.ServerUnavailableError | errors.ServerError):
         return error
     named = next(filter(None, map(wrong_port, urls)), None)
     return error if named is None else errors.ServerUnavailableError(named)

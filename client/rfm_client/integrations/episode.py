@@ -55,7 +55,7 @@ class RewardOptions:
     max_frames: the rule's number of frames; None: as many as the checkpoint was trained on. If it does not say, a rule
         that needs a number raises ValueError at the first reset
     blocking: a step waits for its score
-    max_pending: most open questions of one environment when not blocking
+    max_pending: most steps of one environment whose questions are open when not blocking
     await_last: the last step of an episode is waited for even when not blocking; otherwise what is open is dropped
     """
 
@@ -222,9 +222,10 @@ class Episode:
         find_fit: gives what makes the episode's frames smaller; asked at its first
         """
         frames = frame if self._options.cameras else (frame,)
+        names = [f"frame[{camera!r}]" for camera in self._options.cameras] or ["frame"]
         try:
-            kept = [checked_frame(each) for each in frames]
-            self._check_sizes(kept)
+            kept = [checked_frame(each, name) for each, name in zip(frames, names, strict=True)]
+            self._check_sizes(kept, names)
         except InvalidSampleError as error:
             raise self._located(error) from None
         if self._sizes is None:
@@ -262,7 +263,14 @@ class Episode:
             return results[0]
         fuse = FUSES[self._options.fuse]
         progress, success = ([getattr(each, field) for each in results] for field in ("progress", "success"))
-        return replace(results[0], progress=fuse(progress, axis=0), success=fuse(success, axis=0), progress_logits=None)
+        versions = {each.model_version for each in results}
+        return replace(
+            results[0],
+            progress=fuse(progress, axis=0),
+            success=fuse(success, axis=0),
+            progress_logits=None,
+            model_version=versions.pop() if len(versions) == 1 else None,
+        )
 
     def checked(self, outcome: Result | RewardError) -> ProgressResult:
         """The answer; raises what came in its place."""
@@ -296,11 +304,11 @@ class Episode:
         known |= {"lag": self.step - self._known_step, "skipped": self.num_skipped}
         return known if self._options.terminate_on_success is None else known | {"succeeded": self.succeeded}
 
-    def _check_sizes(self, frames: Sequence[UInt8Array]) -> None:
-        for frame, size in zip(frames, self._sizes or [frame.shape for frame in frames], strict=True):
+    def _check_sizes(self, frames: Sequence[UInt8Array], names: Sequence[str]) -> None:
+        for frame, size, name in zip(frames, self._sizes or [frame.shape for frame in frames], names, strict=True):
             if frame.shape != size:
                 first = f"uint8 {list(size)}, as the episode's first"
-                raise InvalidSampleError.at("frame", first, f"{frame.dtype} {list(frame.shape)}")
+                raise InvalidSampleError.at(name, first, f"{frame.dtype} {list(frame.shape)}")
 
     def _located(self, error: RewardError) -> RewardError:
         return error.inside(self._where) if self._where and isinstance(error, InvalidSampleError) else error

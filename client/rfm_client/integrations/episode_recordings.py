@@ -22,7 +22,7 @@ def record_episodes(folder: Path, dataset: Dataset, plan: Plan, parts: Parts) ->
 
     Of several cameras each has its frames and its own scores beside the fused ones.
     """
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     finished = parts.finished(plan.items)
     for item in plan.items:
         if item.key in finished:

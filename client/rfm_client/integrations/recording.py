@@ -18,10 +18,8 @@ import numpy.typing as npt
 from rfm_client.contract.results import FrameScores
 from rfm_client.contract.samples import UInt8Array
 
-TIME, FRAME = (
-    "video_time",
-    "frame",
-)  # timelines: seconds of the film, or the number of the frame where they are not known
+TIME = "video_time"  # a timeline: seconds of the video
+FRAME = "frame"  # or, where they are not known, the number of the frame
 IMAGE, PROGRESS, SUCCESS = "image", "progress", "success"
 JPEG_QUALITY = 90  # as good as the film, at a tenth of the size
 
