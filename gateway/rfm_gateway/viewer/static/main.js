@@ -4,7 +4,7 @@
 import { compare, KeyWanted, score, served, useKey } from "./api.js";
 import { Chart } from "./chart.js";
 import { Curve } from "./curves.js";
-import { Films } from "./films.js";
+import { Videos } from "./videos.js";
 import { Queue } from "./queue.js";
 import { showTable, shown } from "./table.js";
 import { commands, csv, json, save } from "./takeaway.js";
@@ -14,7 +14,7 @@ const CURVES_AT_A_TIME = 3;
 
 const page = Object.fromEntries([...document.querySelectorAll("[id]")].map((element) => [element.id, element]));
 const queue = new Queue(CURVES_AT_A_TIME);
-const films = new Films(page.films, (seconds, film) => moveTo(seconds, film));
+const videos = new Videos(page.videos, (seconds, video) => moveTo(seconds, video));
 const chart = new Chart(page.chart, pointedAt);
 let curves = [];
 let verdicts = [];
@@ -81,8 +81,8 @@ function form(fields, files) {
 
 /** Adds files, and scores them at once if a task is there. */
 function addFiles(files) {
-  for (const file of files) films.add(file);
-  page["no-films"].hidden = films.all.length > 0;
+  for (const file of files) videos.add(file);
+  page["no-videos"].hidden = videos.all.length > 0;
   update();
   if (tasks().length && page.model.value) scoreAll();
 }
@@ -91,7 +91,7 @@ function addFiles(files) {
 function scoreAll() {
   page.errors.replaceChildren();
   const missing = [
-    [!films.all.length, "video: expected a file, got none: drop one"],
+    [!videos.all.length, "video: expected a file, got none: drop one"],
     [!tasks().length, "task: expected what is to be done, as a sentence, got none"],
     [!page.model.value, "model: expected one that is served, got none"],
   ].find(([isMissing]) => isMissing);
@@ -100,9 +100,9 @@ function scoreAll() {
     return;
   }
   const known = new Set(curves.filter(({ error }) => !error).map(({ identity }) => identity));
-  for (const film of films.all) {
+  for (const video of videos.all) {
     for (const task of tasks()) {
-      const curve = new Curve(numCurves, film, { task, ...settings() });
+      const curve = new Curve(numCurves, video, { task, ...settings() });
       if (known.has(curve.identity)) continue;
       curves = curves.filter(({ identity }) => identity !== curve.identity); // one that failed is asked again
       curves.push(curve);
@@ -114,23 +114,23 @@ function scoreAll() {
 }
 
 async function ask(curve, signal) {
-  const { film, task, model, rule, frames, fps, resize } = curve;
+  const { video, task, model, rule, frames, fps, resize } = curve;
   const fields = { task, model, sampling: rule, frames, fps, resize };
   try {
-    await score(form(fields, { video: film.file }), signal, (name, document) => {
+    await score(form(fields, { video: video.file }), signal, (name, document) => {
       curve.take(name, document);
       update();
     });
   } catch (error) {
     curve.state = "failed";
     curve.error = signal.aborted ? "stopped" : error.message;
-    if (!signal.aborted) failed(error instanceof KeyWanted ? error : new Error(`${film.name}: ${error.message}`));
+    if (!signal.aborted) failed(error instanceof KeyWanted ? error : new Error(`${video.name}: ${error.message}`));
   }
   setTimeout(update); // when the queue knows, too
 }
 
 async function comparePair() {
-  const [first, second] = films.all;
+  const [first, second] = videos.all;
   const { model, fps, resize } = settings();
   page.errors.replaceChildren();
   page.compare.disabled = true;
@@ -138,7 +138,7 @@ async function comparePair() {
     if (!tasks().length) throw new Error("task: expected what is to be done, as a sentence, got none");
     for (const task of tasks()) {
       const data = form({ task, model, fps, resize }, { first: first.file, second: second.file });
-      const verdict = { films: [first, second], task, model, fps, resize, answer: await compare(data, stopping.signal) };
+      const verdict = { videos: [first, second], task, model, fps, resize, answer: await compare(data, stopping.signal) };
       verdicts.push(verdict);
       addVerdict(page.pairs, verdict);
       update();
@@ -161,14 +161,14 @@ function stop() {
 
 function clear() {
   stop();
-  films.clear();
+  videos.clear();
   curves = [];
   verdicts = [];
   numCurves = 0;
   page.pairs.replaceChildren();
   page.errors.replaceChildren();
   page.files.value = "";
-  page["no-films"].hidden = false;
+  page["no-videos"].hidden = false;
   moveTo(0);
   update();
 }
@@ -181,7 +181,7 @@ function update() {
   page.time.disabled = page.play.disabled = !scored.length;
   page.time.max = end || 1;
   page.stop.disabled = queue.isIdle;
-  page.compare.disabled = films.all.length !== 2 || !page.model.value;
+  page.compare.disabled = videos.all.length !== 2 || !page.model.value;
   page.take.hidden = !scored.length && !verdicts.length;
   page.verdicts.hidden = !verdicts.length;
   page.png.disabled = page.csv.disabled = !scored.length;
@@ -204,14 +204,14 @@ function showTime() {
 /** Moves everything to a time, but for the video that it comes from. */
 function moveTo(seconds, from = null) {
   time = Math.min(seconds, Number(page.time.max));
-  if (!films.isPlaying || !from) films.seek(time, from);
-  page.play.textContent = films.isPlaying ? "Pause" : "Play";
+  if (!videos.isPlaying || !from) videos.seek(time, from);
+  page.play.textContent = videos.isPlaying ? "Pause" : "Play";
   showTime();
 }
 
 function pointedAt(seconds, isDragged) {
-  if (isDragged) films.pause();
-  if (!films.isPlaying) moveTo(seconds);
+  if (isDragged) videos.pause();
+  if (!videos.isPlaying) moveTo(seconds);
 }
 
 /** Moves to the next point of any curve, or to the one before. */
@@ -222,9 +222,9 @@ function step(direction) {
 }
 
 function play() {
-  if (films.isPlaying) films.pause();
-  else films.play();
-  setTimeout(() => (page.play.textContent = films.isPlaying ? "Pause" : "Play"));
+  if (videos.isPlaying) videos.pause();
+  else videos.play();
+  setTimeout(() => (page.play.textContent = videos.isPlaying ? "Pause" : "Play"));
 }
 
 async function copy() {
@@ -251,12 +251,12 @@ listen(page.compare, { click: comparePair });
 listen(page.play, { click: play });
 listen(page.threshold, { input: () => { chart.setThreshold(Number(page.threshold.value)); showTime(); } });
 listen(page.time, {
-  input: () => { films.pause(); moveTo(Number(page.time.value)); },
+  input: () => { videos.pause(); moveTo(Number(page.time.value)); },
   keydown: (event) => {
     const direction = { ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1 }[event.key];
     if (!direction) return;
     event.preventDefault();
-    films.pause();
+    videos.pause();
     step(direction);
   },
 });

@@ -33,7 +33,7 @@ function named(curve) {
   const swatch = document.createElement("span");
   header.scope = "row";
   swatch.className = `swatch ${colourName(curve.index)}`;
-  header.append(swatch, curve.film.name);
+  header.append(swatch, curve.video.name);
   return header;
 }
 
