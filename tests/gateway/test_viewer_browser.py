@@ -17,7 +17,7 @@ from selenium.webdriver import ActionChains, Keys
 from selenium.webdriver.support.select import Select
 
 import clip
-from browsers import Browser, chromium
+from browsers import IMAGES_VARIABLE, Browser, chromium
 from gateway_requests import TOLERANCE
 from gateways import Gateway, poll, running
 from rfm.launch.process import Endpoints
@@ -26,8 +26,6 @@ from viewer_requests import by_command_line
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
-IMAGES_VARIABLE = "RFM_IMAGES"  # a folder for new pictures of the documents
-AXE = Path(__file__).parent / "vendored" / "axe-core" / "axe.min.js"
 TASK, OTHER_TASK = Task("red", "bowl").sentence(), Task("green", "plate").sentence()
 CLIPS = {"success": ("success", 2_000_000), "failure": ("dropped", 2_000_001), "rewound": ("rewound", 2_000_002)}
 FPS = 10
@@ -264,19 +262,11 @@ def test_a_curve_of_200_frames_stays_fluid(page: Stage) -> None:
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_axe_finds_nothing(page: Stage, theme: str) -> None:
-    feature = {"name": "prefers-color-scheme", "value": theme}
-    page.browser.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
-    try:
+    with page.browser.theme(theme):
         scored(page, "success", "failure")
         page.browser["compare"].click()
         page.browser.until("document.querySelector('#pairs p')")
-        page.browser.run(AXE.read_text())
-        found = page.browser.driver.execute_async_script(
-            "const done = arguments[0]; axe.run().then(({ violations }) => done(violations));"
-        )
-        assert [(each["id"], each["impact"], [node["html"] for node in each["nodes"]]) for each in found] == []
-    finally:
-        page.browser.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+        assert page.browser.violations() == []
 
 
 def test_a_wrong_key_is_refused_and_the_right_one_opens(stage: Stage, demo_server: Endpoints, tmp_path: Path) -> None:
@@ -311,13 +301,4 @@ def test_a_picture_of_the_page(page: Stage, tmp_path: Path) -> None:
     page.browser["compare"].click()
     page.browser.until("document.querySelector('#pairs p')")
     page.browser.run("document.activeElement.blur()")
-    folder = Path(os.environ.get(IMAGES_VARIABLE, tmp_path))
-    size = {"width": 1100, "height": 1000, "deviceScaleFactor": 1, "mobile": False}
-    try:
-        for _ in range(2):  # its height depends on its width
-            page.browser.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-            size["height"] = page.browser.run("return document.documentElement.scrollHeight")
-        assert page.browser.driver.save_screenshot(str(folder / "page.png"))
-    finally:
-        page.browser.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-    assert (folder / "page.png").read_bytes().startswith(b"\x89PNG\r\n")
+    page.browser.picture(Path(os.environ.get(IMAGES_VARIABLE, tmp_path)) / "page.png")

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rfm_client.contract.results import SUCCESS_THRESHOLD
 from rfm_client.contract.settings import ConfigError
@@ -23,7 +24,7 @@ from rfm_client.data.datasets.films import Span
 from rfm_client.data.datasets.lerobot import LeRobotDataset
 from rfm_client.data.datasets.lerobot_info import INFO_FILE
 from rfm_client.data.datasets.protocol import DatasetError, Episode
-from rfm_client.labelling.label_files import Curve, find_label_files, read_episode_labels
+from rfm_client.labelling.label_files import Curve, EpisodeLabels, find_label_files, read_episode_labels
 from rfm_client.labelling.summary import Summary, summarise
 
 NUM_BINS = 20  # of the final progress, from 0 to 1
@@ -95,12 +96,11 @@ class ShownDataset:
         found = None if file is None else read_episode_labels(file, number)
         if found is not None and (found.frames.min() < 0 or found.frames.max() >= len(times_s)):
             raise DatasetError.at(f"episode {number}: {file}", f"frames from 0 to {len(times_s) - 1}", "others")
-        curves = {} if found is None else {"": found.fused, **found.cameras}
         return {
             "episode": number,
             "task": episode.task,
-            "times_s": [] if found is None else times_s[found.frames].tolist(),
-            "curves": [{"camera": camera or None, **_scores(curve)} for camera, curve in curves.items()],
+            "times_s": times_s.tolist(),
+            "curves": [] if found is None else _curves(found, len(times_s)),
         }
 
     def span(self, number: int, camera: int) -> Span:
@@ -176,9 +176,22 @@ def _bins(summary: Summary) -> dict[str, list[float]]:
     return {"edges": edges.tolist(), "counts": counts.tolist()}
 
 
-def _scores(curve: Curve) -> dict[str, Any]:
-    success = None if curve.success is None else _numbers(curve.success.tolist())
-    return {"progress": _numbers(curve.progress.tolist()), "success": success}
+def _curves(labels: EpisodeLabels, num_frames: int) -> list[dict[str, Any]]:
+    """The curve that training reads, which is no camera's, and then each camera's."""
+    curves = [(None, labels.fused), *labels.cameras.items()]
+    return [{"camera": camera, **_scores(curve, labels.frames, num_frames)} for camera, curve in curves]
+
+
+def _scores(curve: Curve, frames: npt.NDArray[np.int64], num_frames: int) -> dict[str, Any]:
+    """A score of every frame, where some may have no label. frames: the numbers of those that have"""
+    scores: dict[str, Any] = {"progress": None, "success": None}
+    for name in scores:
+        labelled = getattr(curve, name)
+        if labelled is not None:
+            of_all = np.full(num_frames, np.nan)
+            of_all[frames] = labelled
+            scores[name] = _numbers(of_all.tolist())
+    return scores
 
 
 def _check_links(root: Path) -> None:

@@ -2,11 +2,12 @@
 // The page: what its controls do.
 
 import { compare, KeyWanted, score, served, useKey } from "./api.js";
-import { Chart } from "./chart.js";
 import { Curve } from "./curves.js";
-import { Videos } from "./videos.js";
+import { DatasetTab } from "./dataset.js";
 import { Queue } from "./queue.js";
 import { showTable, shown } from "./table.js";
+import { Tabs } from "./tabs.js";
+import { Timeline } from "./timeline.js";
 import { commands, csv, json, save } from "./takeaway.js";
 import { addVerdict } from "./verdicts.js";
 
@@ -14,16 +15,19 @@ const CURVES_AT_A_TIME = 3;
 
 const page = Object.fromEntries([...document.querySelectorAll("[id]")].map((element) => [element.id, element]));
 const queue = new Queue(CURVES_AT_A_TIME);
-const videos = new Videos(page.videos, (seconds, video) => moveTo(seconds, video));
-const chart = new Chart(page.chart, pointedAt);
+const timeline = new Timeline({ videos: page.videos, chart: page.chart, slider: page.time, button: page.play }, showTime);
+const { videos, chart } = timeline;
+const tabs = new Tabs([[page["score-tab"], page["score-panel"]], [page["dataset-tab"], page["dataset-panel"]]]);
+const datasetTab = new DatasetTab(page, { onScore: scoreEpisode, onError: failed });
 let curves = [];
 let verdicts = [];
 let gateway = { models: [], rules: [], url: "" };
 let stopping = new AbortController();
-let time = 0;
 let numCurves = 0;
 
 async function begin() {
+  page.errors.replaceChildren();
+  datasetTab.begin();
   try {
     gateway = await served();
   } catch (error) {
@@ -32,7 +36,6 @@ async function begin() {
     return;
   }
   page["key-form"].hidden = true;
-  page.errors.replaceChildren();
   page.model.replaceChildren(...gateway.models.map(({ name }) => new Option(name)));
   page.rule.replaceChildren(...gateway.rules.map(({ name }) => new Option(name)));
   page.rule.value = gateway.rule;
@@ -85,6 +88,15 @@ function addFiles(files) {
   page["no-videos"].hidden = videos.all.length > 0;
   update();
   if (tasks().length && page.model.value) scoreAll();
+}
+
+/** Scores an episode of a dataset in place of what was there. fps: frames a second of the dataset */
+function scoreEpisode({ files, task, fps }) {
+  clear();
+  page.tasks.value = task;
+  page.fps.value = fps;
+  tabs.select(0);
+  addFiles(files);
 }
 
 /** Asks about each video and task that was not yet asked about with these settings. */
@@ -169,17 +181,14 @@ function clear() {
   page.errors.replaceChildren();
   page.files.value = "";
   page["no-videos"].hidden = false;
-  moveTo(0);
+  timeline.moveTo(0);
   update();
 }
 
 /** Shows everything anew that depends on the curves. */
 function update() {
   const scored = curves.filter(({ times }) => times.length);
-  const end = Math.max(0, ...scored.map(({ allTimes }) => allTimes.at(-1)));
-  chart.show(curves);
-  page.time.disabled = page.play.disabled = !scored.length;
-  page.time.max = end || 1;
+  timeline.show(curves);
   page.stop.disabled = queue.isIdle;
   page.compare.disabled = videos.all.length !== 2 || !page.model.value;
   page.take.hidden = !scored.length && !verdicts.length;
@@ -191,40 +200,10 @@ function update() {
   page.chart.setAttribute("aria-label", scored.length
     ? scored.map((curve) => `${curve.label}: last progress ${shown(curve.progress.at(-1))}`).join("; ")
     : "No curves yet.");
-  showTime();
 }
 
-function showTime() {
-  page.time.value = time;
-  page.time.setAttribute("aria-valuetext", `${time.toFixed(2)} seconds`);
-  showTable(page.curves, curves, time, Number(page.threshold.value));
-  chart.moveTo(time);
-}
-
-/** Moves everything to a time, but for the video that it comes from. */
-function moveTo(seconds, from = null) {
-  time = Math.min(seconds, Number(page.time.max));
-  if (!videos.isPlaying || !from) videos.seek(time, from);
-  page.play.textContent = videos.isPlaying ? "Pause" : "Play";
-  showTime();
-}
-
-function pointedAt(seconds, isDragged) {
-  if (isDragged) videos.pause();
-  if (!videos.isPlaying) moveTo(seconds);
-}
-
-/** Moves to the next point of any curve, or to the one before. */
-function step(direction) {
-  const times = [...new Set(curves.flatMap((curve) => curve.times))].sort((one, other) => one - other);
-  const next = direction > 0 ? times.find((each) => each > time + 1e-3) : times.findLast((each) => each < time - 1e-3);
-  if (next !== undefined) moveTo(next);
-}
-
-function play() {
-  if (videos.isPlaying) videos.pause();
-  else videos.play();
-  setTimeout(() => (page.play.textContent = videos.isPlaying ? "Pause" : "Play"));
+function showTime(seconds) {
+  showTable(page.curves, curves, seconds, Number(page.threshold.value));
 }
 
 async function copy() {
@@ -248,18 +227,7 @@ listen(page.rule, { change: showLimits });
 listen(page.stop, { click: stop });
 listen(page.clear, { click: clear });
 listen(page.compare, { click: comparePair });
-listen(page.play, { click: play });
-listen(page.threshold, { input: () => { chart.setThreshold(Number(page.threshold.value)); showTime(); } });
-listen(page.time, {
-  input: () => { videos.pause(); moveTo(Number(page.time.value)); },
-  keydown: (event) => {
-    const direction = { ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1 }[event.key];
-    if (!direction) return;
-    event.preventDefault();
-    videos.pause();
-    step(direction);
-  },
-});
+listen(page.threshold, { input: () => { chart.setThreshold(Number(page.threshold.value)); showTime(timeline.time); } });
 listen(page.csv, { click: () => save("curves.csv", csv(curves), "text/csv") });
 listen(page.json, { click: () => save("curves.json", json(gateway.url, curves, verdicts), "application/json") });
 listen(page.png, { click: async () => save("curves.png", await chart.png(curves.filter(({ times }) => times.length))) });
@@ -270,6 +238,7 @@ listen(document, {
   drop: (event) => {
     event.preventDefault();
     page.drop.classList.remove("over");
+    tabs.select(0);
     addFiles(event.dataTransfer.files);
   },
 });

@@ -24,17 +24,17 @@ export class Videos {
     return this.#entries.some(({ player }) => !player.paused && !player.ended);
   }
 
-  /** Shows a file, and gives what is known of it. */
-  add(file) {
+  /** Shows a file under a name, and gives what is known of it. */
+  add(file, name = file.name) {
     const figure = document.createElement("figure");
     const player = document.createElement("video");
     const caption = document.createElement("figcaption");
-    const entry = { id: (this.#numAdded += 1), file, name: file.name, figure, player, wanted: null };
+    const entry = { id: (this.#numAdded += 1), file, name, figure, player, wanted: null };
     Object.assign(player, { src: URL.createObjectURL(file), muted: true, playsInline: true, preload: "auto" });
-    player.setAttribute("aria-label", `Video ${file.name}`);
-    caption.textContent = file.name;
+    player.setAttribute("aria-label", `Video ${name}`);
+    caption.textContent = name;
     player.addEventListener("error", () => {
-      caption.textContent = `${file.name}: this browser cannot show it; its curve counts all the same`;
+      caption.textContent = `${name}: this browser cannot show it; its curve counts all the same`;
     });
     player.addEventListener("play", () => this.#follow(entry));
     player.addEventListener("seeked", () => this.#arrived(entry));
