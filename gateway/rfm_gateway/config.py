@@ -6,12 +6,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rfm_client.contract.addresses import MAX_PORT, check_certificate, split_url
 from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
-from rfm_client.contract.settings import ConfigError, Settings, setting
+from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
 from rfm_client.transport.access import Access
+
+if TYPE_CHECKING:
+    from rfm_gateway.viewer.datasets import ShownDataset
 
 MIB = 2**20
 _SHORTEST_S = 0.001
@@ -41,7 +44,7 @@ class GatewayConfig(Settings):
     triton_ca_file: Path | None = setting(None, "Authorities (PEM) that Triton is trusted by; else the system's.")
     triton_certificate: Path | None = setting(None, "By which Triton knows the gateway (PEM).")
     triton_key: Path | None = setting(None, "That certificate's key (PEM).")
-    cors_origin: tuple[str, ...] = setting((), "Origin from which browsers may ask. Again for more.")
+    cors_origin: Texts = setting((), "Origin from which browsers may ask. Again for more.")
     allow_folder: Path | None = setting(None, "Folder whose files requests may name.")
     timeout: float = setting(
         120.0, "Seconds that a request may wait, then take to arrive, then to be scored.", least=_SHORTEST_S
@@ -51,6 +54,7 @@ class GatewayConfig(Settings):
     max_in_flight: int = setting(256, "Evaluations at a time; others wait.", least=1)
     max_waiting: int = setting(1024, "Evaluations that wait for their turn; more are refused with 503.", least=0)
     viewer: bool = setting(True, "Serve the page in the browser, at /.")
+    dataset: Texts = setting((), "Folder of a LeRobot dataset that the page shows. Again for more.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -89,9 +93,17 @@ class GatewayConfig(Settings):
             raise ConfigError("api_key_file", f"expected a key, here or in {GATEWAY_KEY_VARIABLE}, got no character")
         return None if key is None else key.strip()
 
+    def shown_datasets(self) -> list[ShownDataset]:
+        """The datasets that the page shows. Raises ConfigError for a folder that holds none that can be shown."""
+        if not (self.dataset and self.viewer):
+            return []
+        from rfm_gateway.viewer.datasets import ShownDataset
+
+        return [ShownDataset.open(folder) for folder in self.dataset]
+
     def check(self, environment: Mapping[str, str]) -> None:
         """Raises ValueError or OSError for what a gateway would not start with."""
         split_url(self.triton_url)
         if self.allow_folder is not None:
             self.allow_folder.resolve(strict=True)
-        _ = self.access, self.tls, self.api_key(environment)
+        _ = self.access, self.tls, self.api_key(environment), self.shown_datasets()

@@ -11,6 +11,7 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
+from labelling import LEROBOT
 from paths import ROOT
 from rfm.config import ExportConfig, ServeConfig
 from rfm.launch.process import Endpoints
@@ -287,6 +288,7 @@ def test_every_setting_of_a_gateway_is_an_option_of_serve(told: Any, tmp_path: P
         "max_memory_mib": "2",
         "max_in_flight": "3",
         "max_waiting": "0",
+        "dataset": str(LEROBOT / "toy_v21"),
     }
     files = {"certificate", "key", "triton_ca_file", "triton_certificate", "triton_key"}  # which a gateway would read
     assert given.keys() | files | {"viewer"} == settings_of(GatewayConfig).keys()
@@ -299,7 +301,7 @@ def test_every_setting_of_a_gateway_is_an_option_of_serve(told: Any, tmp_path: P
 
 
 @pytest.mark.parametrize(
-    "name", ["certificate", "triton-ca-file", "triton-certificate", "api-key-file", "allow-folder"]
+    "name", ["certificate", "triton-ca-file", "triton-certificate", "api-key-file", "allow-folder", "dataset"]
 )
 def test_a_gateway_that_would_not_start_is_refused_before_triton_starts(name: str) -> None:
     other = {"certificate": "key", "triton-certificate": "triton-key"}.get(name)

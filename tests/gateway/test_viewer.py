@@ -56,10 +56,10 @@ NO_FILES = [
 
 
 @pytest.fixture(scope="module")
-def films(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a clip, the clip backwards and files that are no videos."""
-    folder = tmp_path_factory.mktemp("films")
-    clip.write(folder / "film.mp4")
+    folder = tmp_path_factory.mktemp("videos")
+    clip.write(folder / "clip.mp4")
     clip.write(folder / "back.mp4", clip.render()[::-1])
     return folder
 
@@ -139,11 +139,21 @@ RULES_ASKED = {
 @pytest.mark.parametrize("fields", RULES_ASKED.values(), ids=RULES_ASKED)
 @pytest.mark.parametrize("model", [FILM, VIDEO])
 def test_the_curve_is_that_of_the_command_line(
-    tiny: Gateway, films: Path, tmp_path: Path, model: str, fields: dict[str, str]
+    tiny: Gateway, videos: Path, tmp_path: Path, model: str, fields: dict[str, str]
 ) -> None:
     asked = {**QUESTION, "model": model, **fields}
-    told = events(post(tiny.url, SCORE, {"video": films / "film.mp4"}, **asked))
-    words = ["rfm-client", "score", films / "film.mp4", "--url", tiny.triton_url, "--model", model, "--task", clip.TASK]
+    told = events(post(tiny.url, SCORE, {"video": videos / "clip.mp4"}, **asked))
+    words = [
+        "rfm-client",
+        "score",
+        videos / "clip.mp4",
+        "--url",
+        tiny.triton_url,
+        "--model",
+        model,
+        "--task",
+        clip.TASK,
+    ]
     words += ["--sampling", fields.get("sampling", "rint_pad"), "--fps", fields.get("fps", "3")]
     words += ["--frames", fields["frames"]] if "frames" in fields else []
     words += ["--resize"] if "resize" in fields else []
@@ -154,30 +164,30 @@ def test_the_curve_is_that_of_the_command_line(
         np.testing.assert_allclose(curve[name], video[name], rtol=0, atol=TOLERANCE, err_msg=name)
 
 
-def test_points_come_before_the_last_one_is_scored(film: Gateway, films: Path) -> None:
-    told = events(post(film.url, SCORE, {"video": films / "film.mp4"}, fps="10", frames="4", **QUESTION))
+def test_points_come_before_the_last_one_is_scored(film: Gateway, videos: Path) -> None:
+    told = events(post(film.url, SCORE, {"video": videos / "clip.mp4"}, fps="10", frames="4", **QUESTION))
     counts = [len(points["progress"]) for name, points in told if name == "scores"]
     assert len(curve_of(told)["progress"]) == clip.NUM_FRAMES
     assert counts == [1, 2, 4, 8, 16, 1]
 
 
-def test_a_caller_who_leaves_frees_what_the_curve_holds(film: Gateway, films: Path) -> None:
+def test_a_caller_who_leaves_frees_what_the_curve_holds(film: Gateway, videos: Path) -> None:
     answered = film.metric("samples_total", sample_type="progress")
-    with post(film.url, SCORE, {"video": films / "film.mp4"}, fps="10", frames="16", **QUESTION) as response:
-        assert next(response.iter_lines()) == b"event: film"
+    with post(film.url, SCORE, {"video": videos / "clip.mp4"}, fps="10", frames="16", **QUESTION) as response:
+        assert next(response.iter_lines()) == b"event: video"
     poll(lambda: film.metric("requests_in_flight") == 0)
     assert film.metric("samples_total", sample_type="progress") < answered + clip.NUM_FRAMES
 
 
-def test_a_preference_is_asked_in_both_orders(film: Gateway, films: Path, tmp_path: Path) -> None:
-    first, second = films / "film.mp4", films / "back.mp4"
+def test_a_preference_is_asked_in_both_orders(film: Gateway, videos: Path, tmp_path: Path) -> None:
+    first, second = videos / "clip.mp4", videos / "back.mp4"
     response = post(film.url, COMPARE, {"first": first, "second": second}, **QUESTION)
     assert response.status_code == 200, response.text
     answer = response.json()
     orders = {"first second": (first, second), "second first": (second, first)}
     assert [" ".join(order["asked"]) for order in answer["orders"]] == list(orders)
-    for order, films_ in zip(answer["orders"], orders.values(), strict=True):
-        words = ["rfm-client", "compare", *films_, "--url", film.triton_url, "--model", FILM, "--task", clip.TASK]
+    for order, videos_ in zip(answer["orders"], orders.values(), strict=True):
+        words = ["rfm-client", "compare", *videos_, "--url", film.triton_url, "--model", FILM, "--task", clip.TASK]
         by_command_line(tmp_path, f"{shlex.join(map(str, words))} --json pair.json")
         preference = json.loads((tmp_path / "pair.json").read_text())["preference"]
         assert order["preference"] == pytest.approx(preference, abs=TOLERANCE)
@@ -204,36 +214,36 @@ BROKEN: dict[str, tuple[bytes | None, dict[str, str], list[str], str]] = {
 
 @pytest.mark.parametrize(("content", "fields", "at", "message"), BROKEN.values(), ids=BROKEN)
 def test_what_cannot_be_scored_says_why(
-    film: Gateway, films: Path, content: bytes | None, fields: dict[str, str], at: list[str], message: str
+    film: Gateway, videos: Path, content: bytes | None, fields: dict[str, str], at: list[str], message: str
 ) -> None:
-    file = films / "film.mp4" if content is None else content
+    file = videos / "clip.mp4" if content is None else content
     check_refused(post(film.url, SCORE, {"video": file}, **{**QUESTION, **fields}), (at, message))
 
 
-def test_a_missing_video_and_a_missing_model_are_named(film: Gateway, films: Path) -> None:
-    response = post(film.url, COMPARE, {"first": films / "film.mp4"}, **QUESTION)
+def test_a_missing_video_and_a_missing_model_are_named(film: Gateway, videos: Path) -> None:
+    response = post(film.url, COMPARE, {"first": videos / "clip.mp4"}, **QUESTION)
     check_refused(response, (["second"], "expected a video file, got none"))
-    response = post(film.url, SCORE, {"video": films / "film.mp4"}, **{**QUESTION, "model": "nobody"})
+    response = post(film.url, SCORE, {"video": videos / "clip.mp4"}, **{**QUESTION, "model": "nobody"})
     assert "nobody_frames" in failure(response, 503)
 
 
-def test_a_task_that_the_model_refuses_fails_after_the_film(film: Gateway, films: Path) -> None:
+def test_a_task_that_the_model_refuses_fails_after_the_video_is_told(film: Gateway, videos: Path) -> None:
     response = post(
-        film.url, SCORE, {"video": films / "film.mp4"}, **{**QUESTION, "model": VIDEO, "task": "<|im_end|>"}
+        film.url, SCORE, {"video": videos / "clip.mp4"}, **{**QUESTION, "model": VIDEO, "task": "<|im_end|>"}
     )
     names, documents = zip(*events(response), strict=True)
-    assert names == ("film", "failed")
+    assert names == ("video", "failed")
     assert re.fullmatch(r"[\w.]+: expected .*, got .*", documents[-1]["detail"]), documents[-1]
 
 
-def test_a_video_that_needs_too_much_memory_is_refused(triton: Triton, films: Path, tmp_path: Path) -> None:
+def test_a_video_that_needs_too_much_memory_is_refused(triton: Triton, videos: Path, tmp_path: Path) -> None:
     with running(triton.endpoints, tmp_path, FILM, "--max-body-mib", "1", "--max-memory-mib", "1") as gateway:
-        response = post(gateway.url, SCORE, {"video": films / "film.mp4"}, fps="10", **QUESTION)
+        response = post(gateway.url, SCORE, {"video": videos / "clip.mp4"}, fps="10", **QUESTION)
         expected = "body: expected one that takes at most 1048576 bytes of memory, got more"
         assert failure(response, 413) == expected
         for fps in ("1", "1", "1"):  # what was held is free again
             curve_of(
-                events(post(gateway.url, SCORE, {"video": films / "film.mp4"}, fps=fps, sampling="all", **QUESTION))
+                events(post(gateway.url, SCORE, {"video": videos / "clip.mp4"}, fps=fps, sampling="all", **QUESTION))
             )
         assert gateway.metric("samples_total", sample_type="progress") == 9
         assert gateway.metric("rejections_total", reason="size") == 1
@@ -246,21 +256,21 @@ def keyed(triton: Triton, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 
 @pytest.mark.parametrize("headers", [{}, {"X-API-Key": "sesame"}], ids=["none", "another"])
-def test_nothing_is_answered_without_the_key(keyed: Gateway, films: Path, headers: dict[str, str]) -> None:
+def test_nothing_is_answered_without_the_key(keyed: Gateway, videos: Path, headers: dict[str, str]) -> None:
     refused = [
         requests.get(f"{keyed.url}/{SERVED}", headers=headers),
-        post(keyed.url, SCORE, {"video": films / "film.mp4"}, headers, **QUESTION),
-        post(keyed.url, COMPARE, {"first": films / "film.mp4"}, headers, **QUESTION),
+        post(keyed.url, SCORE, {"video": videos / "clip.mp4"}, headers, **QUESTION),
+        post(keyed.url, COMPARE, {"first": videos / "clip.mp4"}, headers, **QUESTION),
     ]
     for response in refused:
         assert failure(response, 401) == "key: expected X-API-Key or Authorization: Bearer, got another or none"
     assert requests.get(keyed.url).ok  # it holds nothing, and asks for the key
 
 
-def test_the_key_opens(keyed: Gateway, films: Path) -> None:
+def test_the_key_opens(keyed: Gateway, videos: Path) -> None:
     headers = {"X-API-Key": KEY}
     assert requests.get(f"{keyed.url}/{SERVED}", headers=headers).json()["model"] == FILM
-    curve_of(events(post(keyed.url, SCORE, {"video": films / "film.mp4"}, headers, **QUESTION)))
+    curve_of(events(post(keyed.url, SCORE, {"video": videos / "clip.mp4"}, headers, **QUESTION)))
 
 
 def test_no_viewer_turns_the_page_off(triton: Triton, tmp_path: Path, tiny: Gateway) -> None:

@@ -17,7 +17,7 @@ from selenium.webdriver import ActionChains, Keys
 from selenium.webdriver.support.select import Select
 
 import clip
-from browsers import Browser, chromium
+from browsers import IMAGES_VARIABLE, Browser, chromium
 from gateway_requests import TOLERANCE
 from gateways import Gateway, poll, running
 from rfm.launch.process import Endpoints
@@ -26,8 +26,6 @@ from viewer_requests import by_command_line
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
-IMAGES_VARIABLE = "RFM_IMAGES"  # a folder for new pictures of the documents
-AXE = Path(__file__).parent / "vendored" / "axe-core" / "axe.min.js"
 TASK, OTHER_TASK = Task("red", "bowl").sentence(), Task("green", "plate").sentence()
 CLIPS = {"success": ("success", 2_000_000), "failure": ("dropped", 2_000_001), "rewound": ("rewound", 2_000_002)}
 FPS = 10
@@ -39,15 +37,15 @@ KEY = "open sesame"
 
 @dataclass(frozen=True)
 class Stage:
-    """A gateway, a browser, and the folders of films and of what is downloaded."""
+    """A gateway, a browser, and the folders of videos and of what is downloaded."""
 
     gateway: Gateway
     browser: Browser
-    films: Path
+    videos: Path
     downloads: Path
 
-    def film(self, name: str) -> Path:
-        return self.films / f"{name}.mp4"
+    def video(self, name: str) -> Path:
+        return self.videos / f"{name}.mp4"
 
     def saved(self, name: str) -> bytes:
         """A file that the page has just let the browser save."""
@@ -61,15 +59,15 @@ class Stage:
 @pytest.fixture(scope="module")
 def stage(demo_server: Endpoints, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
     folder = tmp_path_factory.mktemp("stage")
-    films, downloads = folder / "films", folder / "downloads"
-    films.mkdir()
+    videos, downloads = folder / "videos", folder / "downloads"
+    videos.mkdir()
     for name, (kind, seed) in CLIPS.items():
-        clip.write(films / f"{name}.mp4", make_clip(kind, Task("red", "bowl"), seed).frames, FPS)
+        clip.write(videos / f"{name}.mp4", make_clip(kind, Task("red", "bowl"), seed).frames, FPS)
     long = make_clip("success", Task("red", "bowl"), 2_000_000, num_frames=200)
-    clip.write(films / "long.mp4", long.frames, FPS)
-    (films / "broken.mp4").write_text("no video")
+    clip.write(videos / "long.mp4", long.frames, FPS)
+    (videos / "broken.mp4").write_text("no video")
     with running(demo_server, folder) as gateway, chromium(downloads) as browser:
-        yield Stage(gateway, browser, films, downloads)
+        yield Stage(gateway, browser, videos, downloads)
         asked = browser.asked()
         assert f"{gateway.url}/viewer/score" in asked
         assert [url for url in asked if not url.startswith((gateway.url, "blob:", "data:"))] == []
@@ -89,8 +87,8 @@ def page(stage: Stage) -> Iterator[Stage]:
 
 
 def scored(page: Stage, *names: str) -> None:
-    """Drops films, and waits for their curves."""
-    page.browser.drop([page.film(name) for name in names])
+    """Drops videos, and waits for their curves."""
+    page.browser.drop([page.video(name) for name in names])
     is_done = "[...document.querySelectorAll('#curves td:last-child')].filter((cell) => cell.textContent === 'done')"
     page.browser.until(f"{is_done}.length === {len(names)}")
 
@@ -117,8 +115,8 @@ def test_dropped_clips_get_the_curves_of_the_command_line(page: Stage) -> None:
     scored(page, "success", "failure")
     document = taken_along(page)
     assert [video["source"] for video in document["videos"]] == ["success.mp4", "failure.mp4"]
-    by_command_line(page.films, page.browser["command"].text)
-    videos = json.loads((page.films / "scores.json").read_text())["videos"]
+    by_command_line(page.videos, page.browser["command"].text)
+    videos = json.loads((page.videos / "scores.json").read_text())["videos"]
     for shown, video, row in zip(document["videos"], videos, rows(page), strict=True):
         for name in ("progress", "success", "frame_times_s"):
             np.testing.assert_allclose(shown[name], video[name], rtol=0, atol=TOLERANCE, err_msg=name)
@@ -150,7 +148,7 @@ def test_tasks_are_overlaid_and_taken_along(page: Stage) -> None:
     page.browser.write("tasks", f"{TASK}\n{OTHER_TASK}\n{TASK}")
     Select(page.browser["rule"]).select_by_visible_text("linspace_trunc")
     page.browser.write("frames", "4")
-    page.browser.drop([page.film("success")])
+    page.browser.drop([page.video("success")])
     page.browser.until("document.getElementById('status').textContent === '2 of 2 curves are done.'")
     first, second = taken_along(page)["videos"]
     assert (first["task"], second["task"]) == (TASK, OTHER_TASK)
@@ -207,8 +205,8 @@ def test_a_pair_is_compared_in_both_orders(page: Stage) -> None:
     commands = [line for line in page.browser["command"].text.splitlines() if line.startswith("rfm-client compare")]
     shown = [item.text for item in page.browser.all("#pairs li")]
     for order, command, line in zip(answer["orders"], commands, shown, strict=True):
-        by_command_line(page.films, f"{command} --json pair.json")
-        preference = json.loads((page.films / "pair.json").read_text())["preference"]
+        by_command_line(page.videos, f"{command} --json pair.json")
+        preference = json.loads((page.videos / "pair.json").read_text())["preference"]
         assert order["preference"] == pytest.approx(preference, abs=TOLERANCE)
         assert float(line.rpartition(" ")[2]) == pytest.approx(preference, abs=SHOWN + TOLERANCE)
     assert page.browser.all("#pairs p")[0].text == "Both orders agree: success.mp4 is better."
@@ -224,7 +222,7 @@ def test_the_threshold_says_when_success_is_reached(page: Stage) -> None:
 
 
 def test_a_broken_video_says_why_and_the_others_are_scored(page: Stage) -> None:
-    page.browser.drop([page.film("broken"), page.film("success")])
+    page.browser.drop([page.video("broken"), page.video("success")])
     page.browser.until("document.getElementById('status').textContent === '1 of 2 curves are done.'")
     kinds = "MP4, MOV, WebM, Matroska, Ogg or AVI"
     told = f"video: expected a file of the kind {kinds}, got another kind (broken.mp4)"
@@ -238,7 +236,7 @@ def test_what_is_missing_is_named_before_anything_is_asked(page: Stage) -> None:
     submit.click()
     assert page.browser["errors"].text == "video: expected a file, got none: drop one"
     page.browser.write("tasks", " ")
-    page.browser.drop([page.film("success")])
+    page.browser.drop([page.video("success")])
     submit.click()
     assert page.browser["errors"].text == "task: expected what is to be done, as a sentence, got none"
     assert rows(page) == []
@@ -264,19 +262,11 @@ def test_a_curve_of_200_frames_stays_fluid(page: Stage) -> None:
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_axe_finds_nothing(page: Stage, theme: str) -> None:
-    feature = {"name": "prefers-color-scheme", "value": theme}
-    page.browser.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
-    try:
+    with page.browser.theme(theme):
         scored(page, "success", "failure")
         page.browser["compare"].click()
         page.browser.until("document.querySelector('#pairs p')")
-        page.browser.run(AXE.read_text())
-        found = page.browser.driver.execute_async_script(
-            "const done = arguments[0]; axe.run().then(({ violations }) => done(violations));"
-        )
-        assert [(each["id"], each["impact"], [node["html"] for node in each["nodes"]]) for each in found] == []
-    finally:
-        page.browser.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+        assert page.browser.violations() == []
 
 
 def test_a_wrong_key_is_refused_and_the_right_one_opens(stage: Stage, demo_server: Endpoints, tmp_path: Path) -> None:
@@ -294,7 +284,7 @@ def test_a_wrong_key_is_refused_and_the_right_one_opens(stage: Stage, demo_serve
         browser.until("document.getElementById('model').value")
         assert not browser["key-form"].is_displayed()
         browser.write("tasks", TASK)
-        browser.drop([stage.film("success")])
+        browser.drop([stage.video("success")])
         browser.until("document.getElementById('status').textContent === '1 of 1 curves are done.'")
 
 
@@ -311,13 +301,4 @@ def test_a_picture_of_the_page(page: Stage, tmp_path: Path) -> None:
     page.browser["compare"].click()
     page.browser.until("document.querySelector('#pairs p')")
     page.browser.run("document.activeElement.blur()")
-    folder = Path(os.environ.get(IMAGES_VARIABLE, tmp_path))
-    size = {"width": 1100, "height": 1000, "deviceScaleFactor": 1, "mobile": False}
-    try:
-        for _ in range(2):  # its height depends on its width
-            page.browser.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-            size["height"] = page.browser.run("return document.documentElement.scrollHeight")
-        assert page.browser.driver.save_screenshot(str(folder / "page.png"))
-    finally:
-        page.browser.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-    assert (folder / "page.png").read_bytes().startswith(b"\x89PNG\r\n")
+    page.browser.picture(Path(os.environ.get(IMAGES_VARIABLE, tmp_path)) / "page.png")

@@ -83,7 +83,7 @@ EXTRAS = {
     "typer": {"cli"},
     "rich": {"cli"},
     "matplotlib": {"cli"},
-    "pyarrow": {"lerobot_rows.py", "parts.py", "sidecars.py", "summary.py"},
+    "pyarrow": {"label_files.py", "lerobot_rows.py", "parts.py", "sidecars.py"},
     "fsspec": {"parts.py"},
     "huggingface_hub": {"opening.py"},
     "h5py": {"hdf5.py", "hdf5_labels.py"},

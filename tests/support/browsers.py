@@ -18,6 +18,8 @@ from selenium.webdriver.remote.webelement import WebElement
 
 from gateways import poll
 
+IMAGES_VARIABLE = "RFM_IMAGES"  # a folder for new pictures of the documents
+AXE = Path(__file__).parents[1] / "gateway" / "vendored" / "axe-core" / "axe.min.js"
 WINDOW_PX = (1280, 1400)
 QUIET = (  # nothing but the page asks for anything
     "--disable-background-networking", "--disable-component-update", "--disable-default-apps", "--disable-sync",
@@ -68,6 +70,36 @@ class Browser:
 
         poll(is_there)
         return found[0]
+
+    @contextmanager
+    def theme(self, name: str) -> Iterator[None]:
+        """The page as somebody sees it who prefers light or dark."""
+        feature = {"name": "prefers-color-scheme", "value": name}
+        self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
+        try:
+            yield
+        finally:
+            self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+
+    def violations(self) -> list[tuple[str, str, list[str]]]:
+        """What axe finds on the page: each rule, how grave that is, and the elements that break it."""
+        self.run(AXE.read_text())
+        found = self.driver.execute_async_script(
+            "const done = arguments[0]; axe.run().then(({ violations }) => done(violations));"
+        )
+        return [(each["id"], each["impact"], [node["html"] for node in each["nodes"]]) for each in found]
+
+    def picture(self, file: Path) -> None:
+        """Saves a picture of the whole page."""
+        size = {"width": 1100, "height": 1000, "deviceScaleFactor": 1, "mobile": False}
+        try:
+            for _ in range(2):  # its height depends on its width
+                self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+                size["height"] = self.run("return document.documentElement.scrollHeight")
+            assert self.driver.save_screenshot(str(file))
+        finally:
+            self.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+        assert file.read_bytes().startswith(b"\x89PNG\r\n")
 
     def complaints(self) -> list[str]:
         """What the console has shown since the last time: errors, and what the policy of the page forbids."""

@@ -45,16 +45,16 @@ def events(response: requests.Response) -> list[tuple[str, Json]]:
 
 def curve_of(told: Sequence[tuple[str, Json]]) -> Json:
     """The curve that the events tell, of which none is missing and none comes twice."""
-    (first, film), *others, (last, _) = told
-    assert (first, last) == ("film", "done"), told
+    (first, video), *others, (last, _) = told
+    assert (first, last) == ("video", "done"), told
     progress: list[Any] = []
     success: list[Any] = []
     for name, points in others:
         assert (name, points["first"]) == ("scores", len(progress))
         progress += points["progress"]
         success += points["success"]
-    assert film["num_frames"] == len(progress)
-    return {"progress": progress, "success": success, "frame_times_s": film["times_s"]}
+    assert video["num_frames"] == len(progress)
+    return {"progress": progress, "success": success, "frame_times_s": video["times_s"]}
 
 
 def by_command_line(folder: Path, command: str) -> None:

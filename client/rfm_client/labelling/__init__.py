@@ -10,6 +10,7 @@ with RewardClient("grpc://localhost:8001") as client:
 
 from rfm_client.data.datasets import Dataset, DatasetError, Episode, iter_episodes, open_dataset
 from rfm_client.labelling.label import Report, label, label_with_ray
+from rfm_client.labelling.label_files import EpisodeLabels, find_label_files, read_episode_labels
 from rfm_client.labelling.options import LabelOptions, parse_episodes
 from rfm_client.labelling.ray_engine import RayOptions
 from rfm_client.labelling.run import Watch
@@ -22,16 +23,19 @@ __all__ = [
     "Dataset",
     "DatasetError",
     "Episode",
+    "EpisodeLabels",
     "LabelOptions",
     "RayOptions",
     "Report",
     "Scorer",
     "Summary",
     "Watch",
+    "find_label_files",
     "iter_episodes",
     "label",
     "label_with_ray",
     "open_dataset",
     "parse_episodes",
+    "read_episode_labels",
     "summarise",
 ]

@@ -6,18 +6,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.results import SUCCESS_THRESHOLD
-from rfm_client.contract.samples import Float32Array
 from rfm_client.data.datasets.protocol import DatasetError
-from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS
+from rfm_client.labelling.label_files import LabelColumns, read_label_table
 from rfm_client.labelling.parts import Parts
 from rfm_client.labelling.plan import Plan
 
-_PROGRESS = ("progress_sparse", "progress")
 BACKWARDS_BY = 0.01  # the kappa of reward-aligned behaviour cloning: less is noise
 
 
@@ -29,6 +28,8 @@ class Summary:
     final_progress: float32 [E]
     best_success: float32 [E], the highest of each; None: the checkpoint does not predict success
     backwards: float64 [E], share of steps on which progress falls by more than 0.01
+    disagreement: float64 [E], how far the cameras' progress is apart, in the mean over its frames; None: there are no
+    scores of several cameras
     num_frames: of all episodes
     """
 
@@ -36,6 +37,7 @@ class Summary:
     final_progress: npt.NDArray[np.float32]
     best_success: npt.NDArray[np.float32] | None
     backwards: npt.NDArray[np.float64]
+    disagreement: npt.NDArray[np.float64] | None
     num_frames: int
 
     @property
@@ -59,63 +61,55 @@ class Summary:
 
 def summarise(file: Path) -> Summary:
     """The summary of a progress file or a file of frame signals. Raises DatasetError for another file."""
-    from pyarrow import ArrowException, parquet
-
-    try:
-        names = parquet.read_schema(file).names
-        progress, success = _columns(file, names)
-        table = parquet.read_table(file, columns=["episode_index", progress, *([success] if success else [])])
-    except (OSError, ArrowException) as error:
-        raise DatasetError.at(file, "a file of labels", str(error)) from error
+    table, columns = read_label_table(file)
+    if not len(table):
+        raise DatasetError.at(file, "labels", "none")
     episodes = table["episode_index"].to_numpy()
     starts = np.flatnonzero(np.diff(episodes, prepend=episodes[0] - 1))
-    values = np.split(table[progress].to_numpy(), starts[1:])
-    successes = np.split(table[success].to_numpy(), starts[1:]) if success else None
-    return _summary(episodes[starts].tolist(), values, successes)
+    return _joined(
+        [
+            _of_episode(int(episodes[start]), table.slice(start, end - start), columns)
+            for start, end in zip(starts, [*starts[1:], len(table)], strict=True)
+        ]
+    )
 
 
 def summary_of_parts(plan: Plan, parts: Parts) -> Summary:
     """The summary of the parts of a plan."""
-    rows = []
+    summaries = []
     for item in plan.items:
         table = parts.read(item)
-        success = table[SUCCESS].to_numpy() if SUCCESS in table.column_names else None
-        rows.append(
-            _summary([item.episode.index], [table[PROGRESS].to_numpy()], None if success is None else [success])
-        )
+        columns = LabelColumns.among(item.episode.name, table.column_names)
+        summaries.append(_of_episode(item.episode.index, table, columns))
+    return _joined(summaries)
+
+
+def _of_episode(index: int, table: Any, columns: LabelColumns) -> Summary:
+    progress = table[columns.progress].to_numpy()
+    success = None if columns.success is None else table[columns.success].to_numpy()
+    cameras = [table[name].to_numpy() for name in columns.progress_of.values()]
     return Summary(
-        episodes=np.concatenate([row.episodes for row in rows]),
-        final_progress=np.concatenate([row.final_progress for row in rows]),
-        best_success=None
-        if rows[0].best_success is None
-        else np.concatenate([row.best_success for row in rows if row.best_success is not None]),
-        backwards=np.concatenate([row.backwards for row in rows]),
-        num_frames=sum(row.num_frames for row in rows),
+        episodes=np.array([index], np.int64),
+        final_progress=progress[-1:],
+        best_success=None if success is None else success.max(keepdims=True),
+        backwards=np.array([np.mean(np.diff(progress) < -BACKWARDS_BY) if len(progress) > 1 else 0.0]),
+        disagreement=np.ptp(np.stack(cameras), axis=0).mean(dtype=np.float64, keepdims=True) if cameras else None,
+        num_frames=len(progress),
     )
 
 
-def _summary(
-    episodes: Sequence[int], progress: Sequence[Float32Array], success: Sequence[Float32Array] | None
-) -> Summary:
+def _joined(summaries: Sequence[Summary]) -> Summary:
+    """One summary of the episodes of several."""
+    success = [each.best_success for each in summaries if each.best_success is not None]
+    disagreement = [each.disagreement for each in summaries if each.disagreement is not None]
     return Summary(
-        episodes=np.array(episodes, np.int64),
-        final_progress=np.array([each[-1] for each in progress]),
-        best_success=None if success is None else np.array([each.max() for each in success]),
-        backwards=np.array([np.mean(np.diff(each) < -BACKWARDS_BY) if len(each) > 1 else 0.0 for each in progress]),
-        num_frames=sum(map(len, progress)),
+        episodes=np.concatenate([each.episodes for each in summaries]),
+        final_progress=np.concatenate([each.final_progress for each in summaries]),
+        best_success=np.concatenate(success) if success else None,
+        backwards=np.concatenate([each.backwards for each in summaries]),
+        disagreement=np.concatenate(disagreement) if disagreement else None,
+        num_frames=sum(each.num_frames for each in summaries),
     )
-
-
-def _columns(file: Path, names: Sequence[str]) -> tuple[str, str | None]:
-    """Names of the fused progress and success in either form of file."""
-    for name in _PROGRESS:
-        if name in names:
-            return name, "success" if "success" in names else None
-    for name in names:
-        if name.startswith("reward.") and name.endswith(".progress"):
-            success = name.removesuffix("progress") + "success_probability"
-            return name, success if success in names else None
-    raise DatasetError.at(file, "a column of progress", ", ".join(names))
 
 
 def _listed(numbers: Sequence[int], most: int = 12) -> str:

@@ -19,7 +19,7 @@ from rfm_client.data.prefixes import prefix_samples
 from rfm_client.data.sampling import Sampling
 from rfm_client.transport.off_loop import off_loop
 
-MOST_PREFIXES = 32  # of one film at a time
+MOST_PREFIXES = 32  # of one video at a time
 MOST_BYTES = 64 * 2**20  # of the frames of these
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What the page asks: which models are served, the curve of a video, which of two videos does a task better.
 
-A curve comes as server-sent events: ``film`` tells its frames, ``scores`` some points, ``done`` or ``failed`` the end.
+A curve comes as server-sent events: ``video`` tells its frames, ``scores`` some points, ``done`` or ``failed`` the end.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from rfm_gateway.leaving import while_connected
 from rfm_gateway.memory import Share
 from rfm_gateway.observe import Metrics
 from rfm_gateway.viewer.curves import Call, Parts, curve
-from rfm_gateway.viewer.films import Film, read_film
 from rfm_gateway.viewer.models import Models, names_of
 from rfm_gateway.viewer.question import DEFAULT_FPS, DEFAULT_RULE, Question
+from rfm_gateway.viewer.videos import Video, read_upload
 
 STATUS_TIMEOUT_S = 5.0
 _AS_THEY_COME = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}  # the second for proxies that gather answers
@@ -69,7 +69,7 @@ def viewer_routes(behind: Behind) -> APIRouter:
     async def score(request: Request) -> Response:
         with ExitStack() as stack:
             asked = await _asked(behind, request, stack, ("video",))
-            asked.share.take(Parts.of(asked.films[0].frames, asked.sampling).num_bytes)
+            asked.share.take(Parts.of(asked.videos[0].frames, asked.sampling).num_bytes)
             call = Call(asked.sampling, behind.config.timeout, request.state.request_id)
             return _Events(_score_events(behind, asked, call), stack.pop_all())
 
@@ -119,19 +119,19 @@ def _frames_of(rule: Rule) -> int | str | None:
 
 @dataclass(frozen=True)
 class _Asked:
-    """A question, the client that answers it, the films that it is about, and what it holds of the memory."""
+    """A question, the client that answers it, the videos that it is about, and what it holds of the memory."""
 
     question: Question
     sampling: Sampling
     client: AsyncRewardClient
     info: ModelInfo
-    films: tuple[Film, ...]
+    videos: tuple[Video, ...]
     share: Share
 
     @property
     def trajectories(self) -> list[Trajectory]:
-        """The films as the client takes them."""
-        return [Trajectory(frames=film.frames, task=self.question.task) for film in self.films]
+        """The videos as the client takes them."""
+        return [Trajectory(frames=video.frames, task=self.question.task) for video in self.videos]
 
 
 async def _asked(behind: Behind, request: Request, stack: ExitStack, names: tuple[str, ...]) -> _Asked:
@@ -148,27 +148,27 @@ async def _asked(behind: Behind, request: Request, stack: ExitStack, names: tupl
             question = Question.of(fields, behind.model)
             client, info = await behind.models.client(question.model, timeout_s)
             sampling = question.sampling(info.max_frames)
-            films = await while_connected(request, _films(admitted, uploads, names, question.fps, timeout_s))
-    return _Asked(question, sampling, client, info, films, admitted.share)
+            videos = await while_connected(request, _videos(admitted, uploads, names, question.fps, timeout_s))
+    return _Asked(question, sampling, client, info, videos, admitted.share)
 
 
-async def _films(
+async def _videos(
     admitted: Admitted, uploads: Mapping[str, UploadFile], names: Sequence[str], fps: float, timeout_s: float
-) -> tuple[Film, ...]:
-    """The films of these names. Raises RequestValidationError, also for one that takes too long to read.
+) -> tuple[Video, ...]:
+    """The videos of these names. Raises RequestValidationError, also for one that takes too long to read.
 
     A thread that reads one that nobody waits for ends at its next frame: the request's share of the memory is over.
     """
     with anyio.move_on_after(timeout_s):
-        return tuple([await _film(admitted, uploads, name, fps) for name in names])
+        return tuple([await _video(admitted, uploads, name, fps) for name in names])
     raise invalid((names[0],), f"expected videos that are read within {timeout_s:g} s, got longer ones")
 
 
-async def _film(admitted: Admitted, uploads: Mapping[str, UploadFile], name: str, fps: float) -> Film:
+async def _video(admitted: Admitted, uploads: Mapping[str, UploadFile], name: str, fps: float) -> Video:
     if name not in uploads:
         raise invalid((name,), "expected a video file, got none")
     try:
-        return await read_film(uploads[name], fps, admitted.share.take)
+        return await read_upload(uploads[name], fps, admitted.share.take)
     except InvalidSampleError as error:
         where, _, message = error.message.partition(": ")
         raise invalid((name if where == "video" else where,), message) from None
@@ -176,10 +176,10 @@ async def _film(admitted: Admitted, uploads: Mapping[str, UploadFile], name: str
 
 async def _score_events(behind: Behind, asked: _Asked, call: Call) -> AsyncIterator[str]:
     """The events of one curve. What goes wrong is the last of them: the status of the answer has been sent."""
-    (film,), (trajectory,) = asked.films, asked.trajectories
+    (video,), (trajectory,) = asked.videos, asked.trajectories
     began_s = time.monotonic()
-    times_s = None if film.times_s is None else film.times_s.tolist()
-    yield _event("film", {"num_frames": len(film.frames), "times_s": times_s, "sampled_frames": call.sampling.frames})
+    times_s = None if video.times_s is None else video.times_s.tolist()
+    yield _event("video", {"num_frames": len(video.frames), "times_s": times_s, "sampled_frames": call.sampling.frames})
     version = None
     try:
         sample = ProgressSample(trajectory)

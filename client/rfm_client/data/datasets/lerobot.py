@@ -16,7 +16,7 @@ import numpy as np
 
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.datasets import lerobot_v21, lerobot_v30
-from rfm_client.data.datasets.films import Packets, Span, decode
+from rfm_client.data.datasets.films import Packets, Span, Times, decode
 from rfm_client.data.datasets.lerobot_info import Info
 from rfm_client.data.datasets.lerobot_rows import Entry, RowReader, read_table
 from rfm_client.data.datasets.protocol import Contents, DatasetError, Episode, contents_of
@@ -59,26 +59,35 @@ class LeRobotDataset:
     def check(self, episode: Episode, camera: str) -> Contents:
         """What the episode's frames are made of; each is there. Raises DatasetError."""
         if camera in self.info.films:
-            span = self._span(episode, camera)
+            span = self.span(episode, camera)
             return self._packets(span.file).check(span)
         return contents_of(self._images(episode, camera))
 
     def frames(self, episode: Episode, camera: str) -> Iterator[UInt8Array]:
         """The episode's frames, uint8 [H, W, 3]. Raises DatasetError."""
         if camera in self.info.films:
-            return decode(self._span(episode, camera))
+            return decode(self.span(episode, camera))
         images = self._images(episode, camera)
         return (_decoded_image(self._where(episode, camera, t), image) for t, image in enumerate(images))
+
+    def times_s(self, episode: Episode) -> Times:
+        """float64 [T], when each frame was taken, from the start of the episode. Raises DatasetError."""
+        return self._rows.read(self._entries[episode.index]).times_s
+
+    def span(self, episode: Episode, camera: str) -> Span:
+        """Where the episode's frames are in the film of a camera, one of ``info.films``. Raises DatasetError."""
+        entry = self._entries[episode.index]
+        file, from_s = entry.films[camera]
+        return Span(file, from_s + self.times_s(episode), 0.5 / self.info.fps, f"{entry.where}: {camera}")
+
+    def files(self) -> set[Path]:
+        """The tables and films that the episodes are in."""
+        entries = self._entries.values()
+        return {entry.data_file for entry in entries} | {film for entry in entries for film, _ in entry.films.values()}
 
     def _episode(self, entry: Entry) -> Episode:
         rows = self._rows.read(entry)
         return Episode(entry.index, entry.where, rows.task, len(rows.times_s), rows.first_index)
-
-    def _span(self, episode: Episode, camera: str) -> Span:
-        entry = self._entries[episode.index]
-        file, from_s = entry.films[camera]
-        where = f"{entry.where}: {camera}"
-        return Span(file, from_s + self._rows.read(entry).times_s, 0.5 / self.info.fps, where)
 
     def _images(self, episode: Episode, camera: str) -> list[bytes]:
         """The episode's images as they are stored: encoded as PNG or JPEG."""

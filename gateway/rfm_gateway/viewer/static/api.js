@@ -33,6 +33,30 @@ export async function score(form, signal, onEvent) {
   if (!isOver) throw new Error("gateway: expected all points, got an answer that breaks off");
 }
 
+/** The datasets that the gateway shows. */
+export async function datasets() {
+  return (await (await answer("viewer/datasets")).json()).datasets;
+}
+
+/** Every episode of a dataset, with what these labels say of it; `labels` null: the first that are there. */
+export async function episodesOf(number, labels, signal) {
+  return (await answer(`viewer/datasets/${number}${chosen(labels)}`, { signal })).json();
+}
+
+/** The labelled curves of an episode. */
+export async function curvesOf(number, episode, labels, signal) {
+  return (await answer(`viewer/datasets/${number}/episodes/${episode}${chosen(labels)}`, { signal })).json();
+}
+
+/** The video of an episode by one camera, as a Blob: an address of its own could not show the key. */
+export async function videoOf(number, episode, camera, signal) {
+  return (await answer(`viewer/datasets/${number}/episodes/${episode}/videos/${camera}`, { signal })).blob();
+}
+
+function chosen(labels) {
+  return labels === null ? "" : `?labels=${encodeURIComponent(labels)}`;
+}
+
 async function answer(path, options = {}) {
   const headers = key ? { "X-API-Key": key } : {};
   let response;

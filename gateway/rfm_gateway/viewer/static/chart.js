@@ -16,7 +16,8 @@ function colour(index) {
   return themed(`--${colourName(index)}`);
 }
 
-function themed(name) {
+/** What the style sheet says for this theme. */
+export function themed(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 }
 
@@ -35,7 +36,7 @@ export class Chart {
     this.#host = host;
     this.#onTime = onTime;
     this.#playhead.className = "playhead";
-    new ResizeObserver(() => this.#plot?.setSize(this.#size())).observe(host);
+    new ResizeObserver(() => host.clientWidth && this.#plot?.setSize(this.#size())).observe(host);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.#plot?.redraw());
   }
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 // What is known of each curve: what was asked, the points that have come, and how it stands.
 
-/** One question about one film, and its points. */
+/** One question about one video, and its points. */
 export class Curve {
   times = [];
   progress = [];
@@ -13,15 +13,15 @@ export class Curve {
   sampledFrames = null;
 
   /** settings: task, model, rule, frames, fps, resize, as in the form */
-  constructor(index, film, settings) {
-    Object.assign(this, { index, film, ...settings, frames: settings.frames || null });
+  constructor(index, video, settings) {
+    Object.assign(this, { index, video, ...settings, frames: settings.frames || null });
     this.allTimes = null;
   }
 
   /** The same for two curves that ask the same. */
   get identity() {
-    const { film, task, model, rule, frames, fps, resize } = this;
-    return JSON.stringify([film.id, task, model, rule, frames, fps, resize]);
+    const { video, task, model, rule, frames, fps, resize } = this;
+    return JSON.stringify([video.id, task, model, rule, frames, fps, resize]);
   }
 
   get sampling() {
@@ -29,12 +29,12 @@ export class Curve {
   }
 
   get label() {
-    return `${this.film.name}: ${this.task} (${this.model}, ${this.sampling})`;
+    return `${this.video.name}: ${this.task} (${this.model}, ${this.sampling})`;
   }
 
   /** Takes an event of the gateway. */
   take(name, document) {
-    if (name === "film") {
+    if (name === "video") {
       this.numFrames = document.num_frames;
       this.sampledFrames = document.sampled_frames;
       this.allTimes = document.times_s ?? Array.from({ length: this.numFrames }, (_, index) => index / this.fps);

@@ -2,11 +2,12 @@
 // The page: what its controls do.
 
 import { compare, KeyWanted, score, served, useKey } from "./api.js";
-import { Chart } from "./chart.js";
 import { Curve } from "./curves.js";
-import { Films } from "./films.js";
+import { DatasetTab } from "./dataset.js";
 import { Queue } from "./queue.js";
 import { showTable, shown } from "./table.js";
+import { Tabs } from "./tabs.js";
+import { Timeline } from "./timeline.js";
 import { commands, csv, json, save } from "./takeaway.js";
 import { addVerdict } from "./verdicts.js";
 
@@ -14,16 +15,19 @@ const CURVES_AT_A_TIME = 3;
 
 const page = Object.fromEntries([...document.querySelectorAll("[id]")].map((element) => [element.id, element]));
 const queue = new Queue(CURVES_AT_A_TIME);
-const films = new Films(page.films, (seconds, film) => moveTo(seconds, film));
-const chart = new Chart(page.chart, pointedAt);
+const timeline = new Timeline({ videos: page.videos, chart: page.chart, slider: page.time, button: page.play }, showTime);
+const { videos, chart } = timeline;
+const tabs = new Tabs([[page["score-tab"], page["score-panel"]], [page["dataset-tab"], page["dataset-panel"]]]);
+const datasetTab = new DatasetTab(page, { onScore: scoreEpisode, onError: failed });
 let curves = [];
 let verdicts = [];
 let gateway = { models: [], rules: [], url: "" };
 let stopping = new AbortController();
-let time = 0;
 let numCurves = 0;
 
 async function begin() {
+  page.errors.replaceChildren();
+  datasetTab.begin();
   try {
     gateway = await served();
   } catch (error) {
@@ -32,7 +36,6 @@ async function begin() {
     return;
   }
   page["key-form"].hidden = true;
-  page.errors.replaceChildren();
   page.model.replaceChildren(...gateway.models.map(({ name }) => new Option(name)));
   page.rule.replaceChildren(...gateway.rules.map(({ name }) => new Option(name)));
   page.rule.value = gateway.rule;
@@ -81,17 +84,26 @@ function form(fields, files) {
 
 /** Adds files, and scores them at once if a task is there. */
 function addFiles(files) {
-  for (const file of files) films.add(file);
-  page["no-films"].hidden = films.all.length > 0;
+  for (const file of files) videos.add(file);
+  page["no-videos"].hidden = videos.all.length > 0;
   update();
   if (tasks().length && page.model.value) scoreAll();
+}
+
+/** Scores an episode of a dataset in place of what was there. fps: frames a second of the dataset */
+function scoreEpisode({ files, task, fps }) {
+  clear();
+  page.tasks.value = task;
+  page.fps.value = fps;
+  tabs.select(0);
+  addFiles(files);
 }
 
 /** Asks about each video and task that was not yet asked about with these settings. */
 function scoreAll() {
   page.errors.replaceChildren();
   const missing = [
-    [!films.all.length, "video: expected a file, got none: drop one"],
+    [!videos.all.length, "video: expected a file, got none: drop one"],
     [!tasks().length, "task: expected what is to be done, as a sentence, got none"],
     [!page.model.value, "model: expected one that is served, got none"],
   ].find(([isMissing]) => isMissing);
@@ -100,9 +112,9 @@ function scoreAll() {
     return;
   }
   const known = new Set(curves.filter(({ error }) => !error).map(({ identity }) => identity));
-  for (const film of films.all) {
+  for (const video of videos.all) {
     for (const task of tasks()) {
-      const curve = new Curve(numCurves, film, { task, ...settings() });
+      const curve = new Curve(numCurves, video, { task, ...settings() });
       if (known.has(curve.identity)) continue;
       curves = curves.filter(({ identity }) => identity !== curve.identity); // one that failed is asked again
       curves.push(curve);
@@ -114,23 +126,23 @@ function scoreAll() {
 }
 
 async function ask(curve, signal) {
-  const { film, task, model, rule, frames, fps, resize } = curve;
+  const { video, task, model, rule, frames, fps, resize } = curve;
   const fields = { task, model, sampling: rule, frames, fps, resize };
   try {
-    await score(form(fields, { video: film.file }), signal, (name, document) => {
+    await score(form(fields, { video: video.file }), signal, (name, document) => {
       curve.take(name, document);
       update();
     });
   } catch (error) {
     curve.state = "failed";
     curve.error = signal.aborted ? "stopped" : error.message;
-    if (!signal.aborted) failed(error instanceof KeyWanted ? error : new Error(`${film.name}: ${error.message}`));
+    if (!signal.aborted) failed(error instanceof KeyWanted ? error : new Error(`${video.name}: ${error.message}`));
   }
   setTimeout(update); // when the queue knows, too
 }
 
 async function comparePair() {
-  const [first, second] = films.all;
+  const [first, second] = videos.all;
   const { model, fps, resize } = settings();
   page.errors.replaceChildren();
   page.compare.disabled = true;
@@ -138,7 +150,7 @@ async function comparePair() {
     if (!tasks().length) throw new Error("task: expected what is to be done, as a sentence, got none");
     for (const task of tasks()) {
       const data = form({ task, model, fps, resize }, { first: first.file, second: second.file });
-      const verdict = { films: [first, second], task, model, fps, resize, answer: await compare(data, stopping.signal) };
+      const verdict = { videos: [first, second], task, model, fps, resize, answer: await compare(data, stopping.signal) };
       verdicts.push(verdict);
       addVerdict(page.pairs, verdict);
       update();
@@ -161,27 +173,24 @@ function stop() {
 
 function clear() {
   stop();
-  films.clear();
+  videos.clear();
   curves = [];
   verdicts = [];
   numCurves = 0;
   page.pairs.replaceChildren();
   page.errors.replaceChildren();
   page.files.value = "";
-  page["no-films"].hidden = false;
-  moveTo(0);
+  page["no-videos"].hidden = false;
+  timeline.moveTo(0);
   update();
 }
 
 /** Shows everything anew that depends on the curves. */
 function update() {
   const scored = curves.filter(({ times }) => times.length);
-  const end = Math.max(0, ...scored.map(({ allTimes }) => allTimes.at(-1)));
-  chart.show(curves);
-  page.time.disabled = page.play.disabled = !scored.length;
-  page.time.max = end || 1;
+  timeline.show(curves);
   page.stop.disabled = queue.isIdle;
-  page.compare.disabled = films.all.length !== 2 || !page.model.value;
+  page.compare.disabled = videos.all.length !== 2 || !page.model.value;
   page.take.hidden = !scored.length && !verdicts.length;
   page.verdicts.hidden = !verdicts.length;
   page.png.disabled = page.csv.disabled = !scored.length;
@@ -191,40 +200,10 @@ function update() {
   page.chart.setAttribute("aria-label", scored.length
     ? scored.map((curve) => `${curve.label}: last progress ${shown(curve.progress.at(-1))}`).join("; ")
     : "No curves yet.");
-  showTime();
 }
 
-function showTime() {
-  page.time.value = time;
-  page.time.setAttribute("aria-valuetext", `${time.toFixed(2)} seconds`);
-  showTable(page.curves, curves, time, Number(page.threshold.value));
-  chart.moveTo(time);
-}
-
-/** Moves everything to a time, but for the video that it comes from. */
-function moveTo(seconds, from = null) {
-  time = Math.min(seconds, Number(page.time.max));
-  if (!films.isPlaying || !from) films.seek(time, from);
-  page.play.textContent = films.isPlaying ? "Pause" : "Play";
-  showTime();
-}
-
-function pointedAt(seconds, isDragged) {
-  if (isDragged) films.pause();
-  if (!films.isPlaying) moveTo(seconds);
-}
-
-/** Moves to the next point of any curve, or to the one before. */
-function step(direction) {
-  const times = [...new Set(curves.flatMap((curve) => curve.times))].sort((one, other) => one - other);
-  const next = direction > 0 ? times.find((each) => each > time + 1e-3) : times.findLast((each) => each < time - 1e-3);
-  if (next !== undefined) moveTo(next);
-}
-
-function play() {
-  if (films.isPlaying) films.pause();
-  else films.play();
-  setTimeout(() => (page.play.textContent = films.isPlaying ? "Pause" : "Play"));
+function showTime(seconds) {
+  showTable(page.curves, curves, seconds, Number(page.threshold.value));
 }
 
 async function copy() {
@@ -248,18 +227,7 @@ listen(page.rule, { change: showLimits });
 listen(page.stop, { click: stop });
 listen(page.clear, { click: clear });
 listen(page.compare, { click: comparePair });
-listen(page.play, { click: play });
-listen(page.threshold, { input: () => { chart.setThreshold(Number(page.threshold.value)); showTime(); } });
-listen(page.time, {
-  input: () => { films.pause(); moveTo(Number(page.time.value)); },
-  keydown: (event) => {
-    const direction = { ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1 }[event.key];
-    if (!direction) return;
-    event.preventDefault();
-    films.pause();
-    step(direction);
-  },
-});
+listen(page.threshold, { input: () => { chart.setThreshold(Number(page.threshold.value)); showTime(timeline.time); } });
 listen(page.csv, { click: () => save("curves.csv", csv(curves), "text/csv") });
 listen(page.json, { click: () => save("curves.json", json(gateway.url, curves, verdicts), "application/json") });
 listen(page.png, { click: async () => save("curves.png", await chart.png(curves.filter(({ times }) => times.length))) });
@@ -270,6 +238,7 @@ listen(document, {
   drop: (event) => {
     event.preventDefault();
     page.drop.classList.remove("over");
+    tabs.select(0);
     addFiles(event.dataTransfer.files);
   },
 });

@@ -20,7 +20,7 @@ function row(curve, seconds, threshold) {
   const here = curve.at(seconds);
   const from = curve.succeedsAt(threshold);
   const frames = curve.numFrames === null ? NONE : `${curve.progress.length} of ${curve.numFrames}`;
-  element.append(named(curve), ...[curve.task, curve.model, curve.sampling, frames].map((text) => cell(text)));
+  element.append(named(curve.index, curve.video.name), ...[curve.task, curve.model, curve.sampling, frames].map((text) => cell(text)));
   const numbers = [curve.progress[here], curve.success[here], curve.progress.at(-1), curve.success.at(-1)];
   element.append(...numbers.map((value) => cell(shown(value), "number")));
   element.append(cell(from === null ? NONE : `${from.toFixed(2)} s`, "number"));
@@ -28,16 +28,18 @@ function row(curve, seconds, threshold) {
   return element;
 }
 
-function named(curve) {
+/** The head of a curve's row: its colour and a name. */
+export function named(index, name) {
   const header = document.createElement("th");
   const swatch = document.createElement("span");
   header.scope = "row";
-  swatch.className = `swatch ${colourName(curve.index)}`;
-  header.append(swatch, curve.film.name);
+  swatch.className = `swatch ${colourName(index)}`;
+  header.append(swatch, name);
   return header;
 }
 
-function cell(text, kind = "") {
+/** A cell of a table. */
+export function cell(text, kind = "") {
   const element = document.createElement("td");
   element.textContent = text;
   if (kind) element.className = kind;

@@ -6,7 +6,7 @@ export function csv(curves) {
   const columns = ["video", "task", "model", "version", "sampling", "frames", "fps", "frame", "time_s", "progress", "success"];
   const lines = curves.flatMap((curve) =>
     curve.times.map((time, index) => [
-      curve.film.name, curve.task, curve.model, curve.version, curve.rule, curve.sampledFrames, curve.fps,
+      curve.video.name, curve.task, curve.model, curve.version, curve.rule, curve.sampledFrames, curve.fps,
       index, time, curve.progress[index], curve.success[index],
     ]),
   );
@@ -21,7 +21,7 @@ function csvField(value) {
 /** The curves and verdicts as JSON, under the names that `rfm-client score --json` uses. */
 export function json(url, curves, verdicts) {
   const videos = curves.map((curve) => ({
-    source: curve.film.name,
+    source: curve.video.name,
     task: curve.task,
     model: curve.model,
     model_version: curve.version,
@@ -36,8 +36,8 @@ export function json(url, curves, verdicts) {
     frame_times_s: curve.times,
     ...(curve.error ? { error: curve.error } : {}),
   }));
-  const comparisons = verdicts.map(({ films, task, model, answer }) => ({
-    first: films[0].name, second: films[1].name, task, model, ...answer,
+  const comparisons = verdicts.map(({ videos, task, model, answer }) => ({
+    first: videos[0].name, second: videos[1].name, task, model, ...answer,
   }));
   return JSON.stringify({ servers: [url], videos, comparisons }, null, 2) + "\n";
 }
@@ -50,11 +50,11 @@ export function commands(url, curves, verdicts) {
     const [{ rule, sampledFrames }] = group;
     const sampling = ["--sampling", rule, ...(sampledFrames === null ? [] : ["--frames", sampledFrames])];
     const target = `scores${alike.size > 1 ? `_${index + 1}` : ""}.json`;
-    return line("score", group.map(({ film }) => film), group[0], url, [...sampling, "--json", target]);
+    return line("score", group.map(({ video }) => video), group[0], url, [...sampling, "--json", target]);
   });
   const comparisons = verdicts.flatMap((verdict) => [
-    line("compare", verdict.films, verdict, url, []),
-    line("compare", [...verdict.films].reverse(), verdict, url, []),
+    line("compare", verdict.videos, verdict, url, []),
+    line("compare", [...verdict.videos].reverse(), verdict, url, []),
   ]);
   return [...scores, ...comparisons].join("\n");
 }
@@ -63,8 +63,8 @@ function asked({ task, model, rule, sampledFrames, fps, resize }) {
   return JSON.stringify([task, model, rule, sampledFrames, fps, resize]);
 }
 
-function line(command, films, { task, model, fps, resize }, url, options) {
-  const files = films.map(({ name }) => (name.startsWith("-") ? `./${name}` : name));
+function line(command, videos, { task, model, fps, resize }, url, options) {
+  const files = videos.map(({ name }) => (name.startsWith("-") ? `./${name}` : name));
   const words = ["rfm-client", command, ...files, "--url", url, "--model", model, "--task", task, "--fps", fps];
   return [...words, ...(resize ? ["--resize"] : []), ...options].map(quoted).join(" ");
 }

@@ -5,9 +5,9 @@ import { shown } from "./table.js";
 
 const EVEN = 0.5;
 
-/** Writes what the model says of a pair into `host`. verdict: films, task, model, answer of the gateway */
-export function addVerdict(host, { films, task, model, answer }) {
-  const names = Object.fromEntries(["first", "second"].map((side, index) => [side, films[index].name]));
+/** Writes what the model says of a pair into `host`. verdict: videos, task, model, answer of the gateway */
+export function addVerdict(host, { videos, task, model, answer }) {
+  const names = Object.fromEntries(["first", "second"].map((side, index) => [side, videos[index].name]));
   const list = document.createElement("ul");
   for (const { asked, preference } of answer.orders) {
     const [one, other] = asked.map((side) => names[side]);

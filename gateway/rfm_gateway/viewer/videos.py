@@ -32,14 +32,14 @@ _EBML, _OGG, _RIFF, _AVI = b"\x1a\x45\xdf\xa3", b"OggS", b"RIFF", b"AVI "
 
 
 @dataclass(frozen=True, eq=False)
-class Film:
+class Video:
     """The frames of a video: uint8 [T, H, W, 3]. times_s: when each is shown; None: unknown."""
 
     frames: UInt8Array
     times_s: Times | None
 
 
-async def read_film(upload: UploadFile, fps: float, take: Callable[[int], object]) -> Film:
+async def read_upload(upload: UploadFile, fps: float, take: Callable[[int], object]) -> Video:
     """The frames at ``fps`` of an uploaded video. Raises InvalidSampleError, and what ``take`` raises.
 
     take: told how many bytes of memory are taken, before they are
@@ -47,7 +47,7 @@ async def read_film(upload: UploadFile, fps: float, take: Callable[[int], object
     return await asyncio.to_thread(_read, upload, fps, take)
 
 
-def _read(upload: UploadFile, fps: float, take: Callable[[int], object]) -> Film:
+def _read(upload: UploadFile, fps: float, take: Callable[[int], object]) -> Video:
     name = upload.filename or "the video"
     upload.file.seek(0)
     container = _container(upload.file.read(_BEGINNING_BYTES))
@@ -60,7 +60,7 @@ def _read(upload: UploadFile, fps: float, take: Callable[[int], object]) -> Film
             shutil.copyfileobj(upload.file, copy)
         try:
             frames = read_video(file, fps, take=take, container=container)
-            return Film(frames, frame_times_s(file, len(frames), container=container))
+            return Video(frames, frame_times_s(file, len(frames), container=container))
         except InvalidSampleError as error:
             raise InvalidSampleError(str(error).replace(str(file), name)) from None
 

@@ -1,0 +1,86 @@
+// SPDX-License-Identifier: MIT
+// One time for a chart, for videos and for the controls below them: whatever moves moves the others.
+
+import { Chart } from "./chart.js";
+import { Videos } from "./videos.js";
+
+const KEYS = { ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1 };
+const NEAR_S = 1e-3;
+
+/**
+ * elements: `videos` and `chart` hold what is shown, `slider` is an input, `button` plays and pauses
+ * `onMove(seconds)` is called with each new time
+ */
+export class Timeline {
+  #slider;
+  #button;
+  #onMove;
+  #curves = [];
+  time = 0;
+
+  constructor({ videos, chart, slider, button }, onMove) {
+    this.videos = new Videos(videos, (seconds, video) => this.moveTo(seconds, video));
+    this.chart = new Chart(chart, (seconds, isDragged) => this.#pointedAt(seconds, isDragged));
+    this.#slider = slider;
+    this.#button = button;
+    this.#onMove = onMove;
+    button.addEventListener("click", () => this.#play());
+    slider.addEventListener("input", () => {
+      this.videos.pause();
+      this.moveTo(Number(slider.value));
+    });
+    slider.addEventListener("keydown", (event) => this.#pressed(event));
+  }
+
+  /** Draws the curves, and lets the controls reach the end of them. */
+  show(curves) {
+    this.#curves = curves.filter(({ times }) => times.length);
+    this.chart.show(curves);
+    this.#slider.disabled = this.#button.disabled = !this.#curves.length;
+    this.#slider.max = Math.max(0, ...this.#curves.map(({ allTimes }) => allTimes.at(-1))) || 1;
+    this.#showTime();
+  }
+
+  /** Moves everything to a time, but for the video that it comes from. */
+  moveTo(seconds, from = null) {
+    this.time = Math.min(seconds, Number(this.#slider.max));
+    if (!this.videos.isPlaying || !from) this.videos.seek(this.time, from);
+    this.#showTime();
+  }
+
+  #showTime() {
+    this.#button.textContent = this.videos.isPlaying ? "Pause" : "Play";
+    this.#slider.value = this.time;
+    this.#slider.setAttribute("aria-valuetext", `${this.time.toFixed(2)} seconds`);
+    this.chart.moveTo(this.time);
+    this.#onMove(this.time);
+  }
+
+  #pointedAt(seconds, isDragged) {
+    if (isDragged) this.videos.pause();
+    if (!this.videos.isPlaying) this.moveTo(seconds);
+  }
+
+  #play() {
+    if (this.videos.isPlaying) this.videos.pause();
+    else this.videos.play();
+    setTimeout(() => this.#showTime());
+  }
+
+  #pressed(event) {
+    const direction = KEYS[event.key];
+    if (!direction) return;
+    event.preventDefault();
+    this.videos.pause();
+    this.#step(direction);
+  }
+
+  /** Moves to the next point of any curve, or to the one before. */
+  #step(direction) {
+    const times = [...new Set(this.#curves.flatMap((curve) => curve.times))].sort((one, other) => one - other);
+    const next = direction > 0
+      ? times.find((each) => each > this.time + NEAR_S)
+      : times.findLast((each) => each < this.time - NEAR_S);
+    if (next !== undefined) this.moveTo(next);
+  }
+}

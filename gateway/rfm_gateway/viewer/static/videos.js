@@ -1,0 +1,100 @@
+// SPDX-License-Identifier: MIT
+// The videos of the page, which move together: one time for all of them.
+
+const NEAR_S = 0.05; // a video that is so near to a time shows it
+const INSIDE_S = 0.001; // behind the begin of a frame, so that rounding does not show the one before
+
+/** Videos in `host`. `onTime(seconds, video)` is called as long as one plays. The page has the controls. */
+export class Videos {
+  #host;
+  #onTime;
+  #entries = [];
+  #numAdded = 0;
+
+  constructor(host, onTime) {
+    this.#host = host;
+    this.#onTime = onTime;
+  }
+
+  get all() {
+    return this.#entries;
+  }
+
+  get isPlaying() {
+    return this.#entries.some(({ player }) => !player.paused && !player.ended);
+  }
+
+  /** Shows a file under a name, and gives what is known of it. */
+  add(file, name = file.name) {
+    const figure = document.createElement("figure");
+    const player = document.createElement("video");
+    const caption = document.createElement("figcaption");
+    const entry = { id: (this.#numAdded += 1), file, name, figure, player, wanted: null };
+    Object.assign(player, { src: URL.createObjectURL(file), muted: true, playsInline: true, preload: "auto" });
+    player.setAttribute("aria-label", `Video ${name}`);
+    caption.textContent = name;
+    player.addEventListener("error", () => {
+      caption.textContent = `${name}: this browser cannot show it; its curve counts all the same`;
+    });
+    player.addEventListener("play", () => this.#follow(entry));
+    player.addEventListener("seeked", () => this.#arrived(entry));
+    figure.append(player, caption);
+    this.#host.append(figure);
+    this.#entries.push(entry);
+    return entry;
+  }
+
+  /** Moves all videos to a time, but for `but`. */
+  seek(seconds, but = null) {
+    for (const entry of this.#entries) {
+      if (entry !== but) this.#move(entry, seconds);
+    }
+  }
+
+  /** Plays all videos from the time at which they are; from the start where they have ended. */
+  play() {
+    for (const { player } of this.#entries) player.play().catch(() => {}); // one that cannot be shown says so itself
+  }
+
+  pause() {
+    for (const { player } of this.#entries) player.pause();
+  }
+
+  /** Removes all videos. */
+  clear() {
+    this.pause();
+    for (const { player } of this.#entries) URL.revokeObjectURL(player.src);
+    this.#entries = [];
+    this.#host.replaceChildren();
+  }
+
+  #move(entry, seconds) {
+    const { player } = entry;
+    const end = Number.isFinite(player.duration) ? player.duration : seconds;
+    entry.wanted = Math.min(seconds, end) + INSIDE_S;
+    if (!player.seeking) player.currentTime = entry.wanted; // else it goes there when it has arrived
+  }
+
+  #arrived(entry) {
+    const { player, wanted } = entry;
+    if (wanted !== null && Math.abs(player.currentTime - wanted) > NEAR_S && wanted < player.duration) {
+      player.currentTime = wanted;
+    } else {
+      entry.wanted = null;
+    }
+  }
+
+  /** Tells the time of a video as long as it plays; of several the first one leads. */
+  #follow(entry) {
+    const step = () => {
+      if (entry.player.paused || entry.player.ended) {
+        if (!this.isPlaying && entry.wanted === null) this.#onTime(entry.player.currentTime, entry); // where it stopped
+        return;
+      }
+      const leader = this.#entries.find(({ player }) => !player.paused && !player.ended);
+      if (leader === entry && entry.wanted === null) this.#onTime(entry.player.currentTime, entry);
+      requestAnimationFrame(step);
+    };
+    requestAnimationFrame(step);
+  }
+}
