@@ -27,7 +27,7 @@ from rfm.launch.process import Endpoints
 from rfm_client.contract.settings import ConfigError
 from rfm_client.labelling import LabelOptions, label, open_dataset, summarise
 from rfm_gateway.config import GatewayConfig
-from shown_datasets import CAMERAS, columns_of, copied, dataset, labelled
+from shown_datasets import CAMERAS, CODINGS, columns_of, copied, dataset, encoded_anew, labelled
 
 KEY = "open sesame"
 V21, V30, PLAIN = range(3)  # numbers of the datasets: two with labels, one without
@@ -148,30 +148,6 @@ def test_a_video_has_the_frames_of_its_episode(shelf: Shelf, tmp_path: Path, num
         assert (response.status_code, response.headers["content-type"]) == (200, "video/mp4")
         assert response.headers["x-content-type-options"] == "nosniff"
         check_frames(response.content, root, episode, camera, tmp_path)
-
-
-CODINGS = {
-    "far between": ("libx264", {"g": "60", "keyint_min": "60", "sc_threshold": "0", "bf": "0"}),
-    "frames that need later ones": (
-        "libx264", {"g": "60", "keyint_min": "60", "sc_threshold": "0", "bf": "3", "b_strategy": "0"},
-    ),
-    "AV1": ("libsvtav1", {"g": "2", "preset": "12"}),
-}  # fmt: skip
-
-
-def encoded_anew(root: Path, codec: str, options: dict[str, str], noise: np.random.Generator | None = None) -> None:
-    """Codes the films of a dataset in another way, or noise in their place."""
-    for file in sorted(root.rglob("*.mp4")):
-        with av.open(str(file)) as container:
-            frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-        if noise is not None:
-            frames = [noise.integers(0, 256, frame.shape, np.uint8) for frame in frames]
-        with av.open(str(file), "w") as container:
-            stream: Any = container.add_stream(codec, rate=10, options=options)
-            stream.height, stream.width, stream.pix_fmt = *frames[0].shape[:2], "yuv420p"
-            for frame in frames:
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-            container.mux(stream.encode())
 
 
 @pytest.mark.parametrize("coding", CODINGS.values(), ids=CODINGS)

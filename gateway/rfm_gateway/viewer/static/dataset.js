@@ -176,7 +176,7 @@ export class DatasetTab {
 function curvesIn({ times_s: times, curves }) {
   const none = times.map(() => null);
   const labelled = curves.map(({ camera, progress, success }, index) => {
-    const label = camera ? short(camera) : "training reads";
+    const label = camera ? short(camera) : curves.length > 1 ? "all cameras" : "labels";
     return { index, label, progress, success: success ?? none, times, allTimes: times, isLabelled: true };
   });
   return labelled.length ? labelled : [{ index: 0, label: "", progress: none, success: none, times, allTimes: times }];
