@@ -17,8 +17,10 @@ from typing import Any
 
 import av
 import numpy as np
+import pyarrow as pa
 import pytest
 import requests
+from pyarrow import parquet
 
 from gateway_requests import failure
 from gateways import Gateway, poll, running
@@ -320,6 +322,31 @@ def test_labels_that_come_or_change_are_shown_at_once(tmp_path: Path) -> None:
         by_name = told.get("/0/episodes/5?labels=reward_signals/later.parquet").json()["curves"]
         columns = columns_of(root, 5, "reward_signals/later.parquet")
         np.testing.assert_array_equal(np.float32(by_name[0]["progress"]), columns["reward.later.progress"])
+
+
+def test_labels_of_others_may_lack_success_and_rows(tmp_path: Path) -> None:
+    root = copied("toy_v21", tmp_path)
+    lengths = [episode.num_frames for episode in dataset(root).episodes[:2]]
+    progress = np.linspace(0, 1.5, sum(lengths), dtype=np.float32)
+    progress[[3, lengths[0] - 1]] = np.nan
+    identity = {
+        "index": np.arange(sum(lengths)),
+        "episode_index": np.repeat([0, 1], lengths),
+        "frame_index": np.concatenate([np.arange(length) for length in lengths]),
+    }
+    table = pa.table({**identity, "progress_sparse": progress})
+    is_kept = identity["frame_index"] != 5
+    parquet.write_table(table.filter(pa.array(is_kept)), root / "sarm_progress.parquet")
+    with serving(tmp_path, root) as gateway:
+        told = Shelf(gateway, (root,))
+        first, second, third, *_ = (rows := told.get("/0").json())["episodes"]
+        assert first["final_progress"] is None
+        assert second["final_progress"] == pytest.approx(1.5)
+        assert first.keys() == second.keys() == third.keys() | {"final_progress", "backwards"}
+        assert sum(rows["bins"]["counts"]) == rows["bins"]["counts"][-1] == 1
+        (curve,) = told.get("/0/episodes/0").json()["curves"]
+        missing = [t for t, value in enumerate(curve["progress"]) if value is None]
+        assert (missing, curve["success"]) == ([3, 5, lengths[0] - 1], None)
 
 
 def test_a_video_that_needs_too_much_memory_is_refused(tmp_path: Path) -> None:
