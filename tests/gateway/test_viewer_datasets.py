@@ -17,8 +17,10 @@ from typing import Any
 
 import av
 import numpy as np
+import pyarrow as pa
 import pytest
 import requests
+from pyarrow import parquet
 
 from gateway_requests import failure
 from gateways import Gateway, poll, running
@@ -27,7 +29,7 @@ from rfm.launch.process import Endpoints
 from rfm_client.contract.settings import ConfigError
 from rfm_client.labelling import LabelOptions, label, open_dataset, summarise
 from rfm_gateway.config import GatewayConfig
-from shown_datasets import CAMERAS, columns_of, copied, dataset, labelled
+from shown_datasets import CAMERAS, CODINGS, columns_of, copied, dataset, encoded_anew, labelled
 
 KEY = "open sesame"
 V21, V30, PLAIN = range(3)  # numbers of the datasets: two with labels, one without
@@ -148,30 +150,6 @@ def test_a_video_has_the_frames_of_its_episode(shelf: Shelf, tmp_path: Path, num
         assert (response.status_code, response.headers["content-type"]) == (200, "video/mp4")
         assert response.headers["x-content-type-options"] == "nosniff"
         check_frames(response.content, root, episode, camera, tmp_path)
-
-
-CODINGS = {
-    "far between": ("libx264", {"g": "60", "keyint_min": "60", "sc_threshold": "0", "bf": "0"}),
-    "frames that need later ones": (
-        "libx264", {"g": "60", "keyint_min": "60", "sc_threshold": "0", "bf": "3", "b_strategy": "0"},
-    ),
-    "AV1": ("libsvtav1", {"g": "2", "preset": "12"}),
-}  # fmt: skip
-
-
-def encoded_anew(root: Path, codec: str, options: dict[str, str], noise: np.random.Generator | None = None) -> None:
-    """Codes the films of a dataset in another way, or noise in their place."""
-    for file in sorted(root.rglob("*.mp4")):
-        with av.open(str(file)) as container:
-            frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-        if noise is not None:
-            frames = [noise.integers(0, 256, frame.shape, np.uint8) for frame in frames]
-        with av.open(str(file), "w") as container:
-            stream: Any = container.add_stream(codec, rate=10, options=options)
-            stream.height, stream.width, stream.pix_fmt = *frames[0].shape[:2], "yuv420p"
-            for frame in frames:
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-            container.mux(stream.encode())
 
 
 @pytest.mark.parametrize("coding", CODINGS.values(), ids=CODINGS)
@@ -344,6 +322,31 @@ def test_labels_that_come_or_change_are_shown_at_once(tmp_path: Path) -> None:
         by_name = told.get("/0/episodes/5?labels=reward_signals/later.parquet").json()["curves"]
         columns = columns_of(root, 5, "reward_signals/later.parquet")
         np.testing.assert_array_equal(np.float32(by_name[0]["progress"]), columns["reward.later.progress"])
+
+
+def test_labels_of_others_may_lack_success_and_rows(tmp_path: Path) -> None:
+    root = copied("toy_v21", tmp_path)
+    lengths = [episode.num_frames for episode in dataset(root).episodes[:2]]
+    progress = np.linspace(0, 1.5, sum(lengths), dtype=np.float32)
+    progress[[3, lengths[0] - 1]] = np.nan
+    identity = {
+        "index": np.arange(sum(lengths)),
+        "episode_index": np.repeat([0, 1], lengths),
+        "frame_index": np.concatenate([np.arange(length) for length in lengths]),
+    }
+    table = pa.table({**identity, "progress_sparse": progress})
+    is_kept = identity["frame_index"] != 5
+    parquet.write_table(table.filter(pa.array(is_kept)), root / "sarm_progress.parquet")
+    with serving(tmp_path, root) as gateway:
+        told = Shelf(gateway, (root,))
+        first, second, third, *_ = (rows := told.get("/0").json())["episodes"]
+        assert first["final_progress"] is None
+        assert second["final_progress"] == pytest.approx(1.5)
+        assert first.keys() == second.keys() == third.keys() | {"final_progress", "backwards"}
+        assert sum(rows["bins"]["counts"]) == rows["bins"]["counts"][-1] == 1
+        (curve,) = told.get("/0/episodes/0").json()["curves"]
+        missing = [t for t, value in enumerate(curve["progress"]) if value is None]
+        assert (missing, curve["success"]) == ([3, 5, lengths[0] - 1], None)
 
 
 def test_a_video_that_needs_too_much_memory_is_refused(tmp_path: Path) -> None:

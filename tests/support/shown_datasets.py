@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 from pyarrow import parquet
 
@@ -15,6 +16,13 @@ from rfm_client.data.datasets.lerobot import LeRobotDataset
 from rfm_client.labelling import LabelOptions, label, open_dataset
 
 CAMERAS = ("observation.images.front", "observation.images.wrist")
+CODINGS = {
+    "far between": ("libx264", {"g": "60", "keyint_min": "60", "sc_threshold": "0", "bf": "0"}),
+    "frames that need later ones": (
+        "libx264", {"g": "60", "keyint_min": "60", "sc_threshold": "0", "bf": "3", "b_strategy": "0"},
+    ),
+    "AV1": ("libsvtav1", {"g": "2", "preset": "12"}),
+}  # fmt: skip
 
 
 def copied(name: str, folder: Path) -> Path:
@@ -38,3 +46,18 @@ def columns_of(root: Path, episode: int, name: str = "rfm_progress.parquet") -> 
 
 def dataset(root: Path) -> LeRobotDataset:
     return LeRobotDataset(root)
+
+
+def encoded_anew(root: Path, codec: str, options: dict[str, str], noise: np.random.Generator | None = None) -> None:
+    """Codes the films of a dataset in another way, or noise in their place."""
+    for file in sorted(root.rglob("*.mp4")):
+        with av.open(str(file)) as container:
+            frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+        if noise is not None:
+            frames = [noise.integers(0, 256, frame.shape, np.uint8) for frame in frames]
+        with av.open(str(file), "w") as container:
+            stream: Any = container.add_stream(codec, rate=10, options=options)
+            stream.height, stream.width, stream.pix_fmt = *frames[0].shape[:2], "yuv420p"
+            for frame in frames:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+            container.mux(stream.encode())

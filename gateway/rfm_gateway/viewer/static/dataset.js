@@ -8,6 +8,7 @@ import { cell, named, shown } from "./table.js";
 import { Timeline } from "./timeline.js";
 
 const CAMERA_PREFIX = "observation.images.";
+const NOTHING = { episodes: [], cameras: [], bins: null, threshold: 0.5 };
 
 export class DatasetTab {
   #page;
@@ -17,7 +18,7 @@ export class DatasetTab {
   #table;
   #timeline;
   #datasets = [];
-  #told = { episodes: [], cameras: [] };
+  #told = NOTHING;
   #watched = null;
   #curves = [];
   #stopping = new AbortController();
@@ -34,7 +35,8 @@ export class DatasetTab {
     };
     this.#timeline = new Timeline(elements, (seconds) => this.#showNumbers(seconds));
     page.dataset.addEventListener("change", () => this.#choose());
-    page.labels.addEventListener("change", () => this.#load(page.labels.value));
+    page.labels.addEventListener("change", () => this.#load(this.#labels));
+    page.shelf.addEventListener("change", () => page.errors.replaceChildren());
     page.order.addEventListener("change", () => this.#showTable());
     page.shelf.addEventListener("submit", (event) => event.preventDefault());
     page["score-episode"].addEventListener("click", () => this.#score());
@@ -77,7 +79,7 @@ export class DatasetTab {
       this.#told = await episodesOf(this.#number, labels, signal);
     } catch (error) {
       if (signal.aborted) return;
-      this.#told = { episodes: [], cameras: [], bins: null };
+      this.#told = NOTHING;
       this.#onError(error);
     }
     this.#page.order.value = this.#told.bins ? ORDER_NAMES[0] : PLAIN_ORDER;
@@ -123,6 +125,7 @@ export class DatasetTab {
     this.#table.mark(episode.episode);
     const page = this.#page;
     const { signal } = this.#stopping;
+    page.errors.replaceChildren();
     page.episode.hidden = false;
     page["episode-title"].textContent = `Episode ${episode.episode}`;
     page["episode-told"].textContent = episode.task;
@@ -176,7 +179,7 @@ export class DatasetTab {
 function curvesIn({ times_s: times, curves }) {
   const none = times.map(() => null);
   const labelled = curves.map(({ camera, progress, success }, index) => {
-    const label = camera ? short(camera) : "training reads";
+    const label = camera ? short(camera) : curves.length > 1 ? "all cameras" : "labels";
     return { index, label, progress, success: success ?? none, times, allTimes: times, isLabelled: true };
   });
   return labelled.length ? labelled : [{ index: 0, label: "", progress: none, success: none, times, allTimes: times }];
