@@ -68,5 +68,5 @@ class NamedProgressSample:
 
     @property
     def trajectories(self) -> tuple[NamedTrajectory, ...]:
-        """The one trajectory."""
+        """The trajectory alone, as of any sample."""
         return (self.trajectory,)
