@@ -47,7 +47,7 @@ class FeatureCache(Generic[Kept]):
         return len(self._arrays)
 
     def clear(self) -> None:
-        """Forgets all."""
+        """Forgets all arrays."""
         with self._changing:
             self._arrays.clear()
             self.num_bytes = 0
