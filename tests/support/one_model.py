@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
 import tritonclient.grpc
 
@@ -29,10 +30,9 @@ class OneModelServer(TritonServer):
         self.signal(signal.SIGKILL)
         self.stop()
 
-    def stop(self) -> int:
-        status = super().stop()
-        self._own_log.close()
-        return status
+    def __exit__(self, *raised: Any) -> None:
+        super().__exit__(*raised)
+        self._own_log.close()  # not in `stop`: a start that Triton has spoilt is stopped and repeated
 
 
 def answered(endpoints: Endpoints) -> int:
