@@ -2,6 +2,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed
+WORKERS := --numprocesses 2 --dist loadgroup
 TOOL := PYTHONPATH=tests/support:tools/faults $(BIN)/python
 
 # `make help` shows the first line of the comment above each target.
@@ -19,11 +20,11 @@ demo: $(INSTALLED)
 
 # Lint, types, generated files, and the tests that take minutes.
 test: check
-	$(BIN)/pytest -m "not gpu and not slow"
+	$(BIN)/pytest $(WORKERS) -m "not gpu and not slow"
 
 # All that CI runs: also the tests that kill, wait or restart, or need programs of Debian.
 test-all: check ops-tools
-	$(BIN)/pytest
+	$(BIN)/pytest $(WORKERS)
 
 # Lint, format, types, generated files; no tests.
 check: $(INSTALLED)

@@ -13,12 +13,13 @@ import goldens
 import rfm_export
 from commands import RUN
 from engines import load_engine, serve_config
+from one_model import BriefServer
 from paths import ROOT
 from patients import references  # noqa: F401  a fixture
 from reference_server import Served
 from rfm.engine import Engine
 from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.process import Endpoints
 
 torch.set_num_threads(1)
 os.environ[RUN] = uuid.uuid4().hex  # by which tests know what this run has started
@@ -38,7 +39,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         rfm_export.export(config.checkpoint, repository, serve_config(config, config.name))
     with (
         (folder / "tritonserver.log").open("wb") as log,
-        TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
     ):
         yield Served(server)
 
@@ -50,7 +51,7 @@ def demo_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Endpoints]
     repository = shutil.copytree(ROOT / "model_repository", folder / "model_repository")
     with (
         (folder / "tritonserver.log").open("wb") as log,
-        TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
     ):
         yield server.endpoints
 
@@ -67,7 +68,12 @@ def protocol(request: pytest.FixtureRequest) -> str:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Whoever asks the reference server asks a Triton."""
+    """Whoever asks the reference server asks a Triton. Where two processes test, one of them has that server.
+
+    The tests of a file stay together, too, since they share what its fixtures start.
+    """
     for item in items:
-        if "served" in getattr(item, "fixturenames", ()):
+        is_served = "served" in getattr(item, "fixturenames", ())
+        if is_served:
             item.add_marker("triton")
+        item.add_marker(pytest.mark.xdist_group("served" if is_served else str(item.path)))

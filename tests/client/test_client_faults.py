@@ -101,6 +101,7 @@ def test_calls_that_share_requests_survive_that_one_of_two_servers_is_killed(
     tmp_path: Path, repository: Path, protocol: str
 ) -> None:
     both = [Endpoints.free(), Endpoints.free()]
+    configure(repository / "rfm", instances=2)
     other_repository = shutil.copytree(repository, tmp_path / "other" / "model_repository")
     urls = [url_of(endpoints, protocol) for endpoints in both]
     with ExitStack() as servers, RewardClient(urls, timeout_s=PATIENCE_S, join=True) as client:

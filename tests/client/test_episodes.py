@@ -20,10 +20,11 @@ from prometheus_client.parser import text_string_to_metric_families
 import goldens
 import rfm_export
 from engines import serve_config
+from one_model import BriefServer
 from reference_server import Served
 from repositories import configure
 from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.process import Endpoints
 from rfm_client import (
     AsyncRewardClient,
     InvalidSampleError,
@@ -422,9 +423,9 @@ def test_an_episode_goes_on_when_its_server_was_restarted(tmp_path: Path, protoc
     frames = film(111, 9)
     url = endpoints.grpc_url if protocol == "grpc" else endpoints.http_url
     with RewardClient(url, model=MODEL) as client, client.episode(TASK, frames=4) as episode:
-        with TritonServer(repository, endpoints, find_installation()):
+        with BriefServer(repository, endpoints, find_installation()):
             before = [episode.add(frame) for frame in frames[:4]]
-        with TritonServer(repository, endpoints, find_installation()):
+        with BriefServer(repository, endpoints, find_installation()):
             after = [episode.add(frame) for frame in frames[4:]]
             scores = [*before, *after]
             expected = offline(client, frames, Sampling("rint_pad", 4))
@@ -466,7 +467,7 @@ def test_an_episode_goes_on_between_two_instances_that_know_different_frames(
     repository, endpoints, frames = repository_of(tmp_path, checkpoint), Endpoints.free(), film(119, 12)
     configure(repository / encoder, instances=2)
     with (
-        TritonServer(repository, endpoints, find_installation()),
+        BriefServer(repository, endpoints, find_installation()),
         RewardClient(endpoints.grpc_url, model=MODEL) as client,
     ):
         for _ in range(3):
@@ -481,9 +482,9 @@ def test_two_servers_that_know_different_frames_and_one_without_a_cache_score_al
     plain = repository_of(tmp_path / "plain", feature_cache_mb=0)
     first, second, third = Endpoints.free(), Endpoints.free(), Endpoints.free()
     with (
-        TritonServer(caching, first, find_installation()),
-        TritonServer(caching, second, find_installation()),
-        TritonServer(plain, third, find_installation()),
+        BriefServer(caching, first, find_installation()),
+        BriefServer(caching, second, find_installation()),
+        BriefServer(plain, third, find_installation()),
         RewardClient([each.grpc_url for each in (first, second, third)], model=MODEL) as client,
     ):
         expected = offline(client, frames, Sampling("rint_pad", 4))

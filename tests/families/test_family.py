@@ -18,13 +18,14 @@ import torch
 
 import rfm_export
 import toy_family
+from one_model import BriefServer
 from paths import ROOT
 from rfm import families
 from rfm.checkpoint.content import CheckpointError
 from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.launch.installation import Installation, find_installation
-from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.process import Endpoints
 from rfm.parameters import FAMILY_PARAMETER
 from rfm.rewind.encoders import Encoders
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, RewardClient, SimilaritySample, Trajectory
@@ -88,7 +89,7 @@ def running(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Itera
     installation = with_family(find_installation(), folder / "environment")
     with (
         (folder / "tritonserver.log").open("wb") as log,
-        TritonServer(repository, Endpoints.free(), installation, log=log) as server,
+        BriefServer(repository, Endpoints.free(), installation, log=log) as server,
     ):
         yield Running(repository, server.endpoints.grpc_url)
 

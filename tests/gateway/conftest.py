@@ -23,11 +23,12 @@ from gateway_requests import (
     ask_npy,
     fixture_of,
 )
+from one_model import BriefServer
 from rfm.config import ExportConfig
 from rfm.journal import SHARED_MEMORY
 from rfm.launch.cleanup import REGION_PREFIX
 from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.process import Endpoints
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer
 
@@ -50,7 +51,7 @@ def triton(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransfo
     regions = set(SHARED_MEMORY.glob(ours))
     with (
         (folder / "tritonserver.log").open("wb") as log,
-        TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
     ):
         assert server._process is not None
         yield Triton(repository, server.endpoints, server._process.pid)

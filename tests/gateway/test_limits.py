@@ -41,9 +41,10 @@ from gateway_requests import (
     progress,
 )
 from gateways import Gateway, poll, running
+from one_model import BriefServer
 from rfm.config import ExportConfig
 from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.process import Endpoints
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer
 from rfm_client import (
@@ -207,7 +208,7 @@ def gated(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransfor
     model.write_text(model.read_text() + CLOSED_GATE.format(gate=str(gate)))
     with (
         (folder / "tritonserver.log").open("wb") as log,
-        TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
         running(server.endpoints, folder) as gateway,
     ):
         yield Gated(gateway, server.endpoints, gate)

@@ -21,6 +21,7 @@ from client_commands import RFM_CLIENT, invoke
 from commands import RFM
 from gateways import free_port
 from labelling import LEROBOT
+from one_model import BriefServer
 from paths import ROOT
 from rfm.launch.process import Endpoints
 from rfm_client.cli.options import ExitCode
@@ -226,7 +227,7 @@ def test_a_server_that_is_away_for_ten_seconds_costs_no_frame(tmp_path: Path, ou
             assert process.poll() is None, process.communicate()
             time.sleep(0.01)
     threading.Event().wait(10)
-    with TritonServer(repository, endpoints, find_installation()):
+    with BriefServer(repository, endpoints, find_installation()):
         _, told = process.communicate(timeout=300)
     assert process.returncode == 0, told.decode()
     assert len(parquet.read_table(output / FILES[0])) == 428

@@ -16,8 +16,9 @@ import rollout
 from administered import KEY, Running
 from commands import EXIT_S, command, wait_for_http
 from engines import serve_config
+from one_model import BriefServer
 from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.process import Endpoints
 from rfm.launch.tls import GrpcTls
 from rollout import WITH_ENCODERS
 from secured import (
@@ -105,7 +106,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     log = folder / "tritonserver.log"
     with (
         log.open("wb") as lines,
-        TritonServer(repository, Endpoints.free(), find_installation(), log=lines, admin_key=KEY) as server,
+        BriefServer(repository, Endpoints.free(), find_installation(), log=lines, admin_key=KEY) as server,
     ):
         yield Running(repository, server.endpoints, key_file, log)
     assert KEY not in log.read_text()

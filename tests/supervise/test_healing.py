@@ -21,12 +21,13 @@ import numpy as np
 import pytest
 
 from clock import Clock
+from one_model import BriefServer
 from patients import CALLERS, DEADLY, MARK, TOLERANCE, Callers, make_repository, trajectory
 from repositories import kill_model
 from rfm.journal import SHARED_MEMORY
 from rfm.launch import cleanup
 from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.process import Endpoints
 from rfm.proc import is_alive
 from rfm.supervise import back_off
 from rfm.supervise.back_off import BackOff, CrashLoopError
@@ -383,7 +384,7 @@ def test_a_full_queue_refuses_at_once_and_a_long_wait_is_cut_short(tmp_path: Pat
     repository = make_repository(tmp_path, more_code=SLOW, batch_size=2, max_queue_size=4, queue_timeout_ms=1500)
     with (
         (tmp_path / "log").open("wb") as log,
-        TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
         RewardClient(server.endpoints.grpc_url, retry=False) as client,
         RewardClient(server.endpoints.http_url, retry=False) as over_http,
         RewardClient(server.endpoints.grpc_url) as patient,

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from one_model import BriefServer
 from patients import make_repository
 from rfm.launch import process
 from rfm.launch.installation import ServerStartError, find_installation
@@ -61,7 +62,7 @@ def check_answers(server: TritonServer) -> None:
 def test_a_start_that_never_ends_is_repeated(tmp_path: Path, trigger: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process, "STALLED_S", 2.0)
     trigger.touch()
-    with TritonServer(make_dawdling(tmp_path, trigger), Endpoints.free(), find_installation()) as server:
+    with BriefServer(make_dawdling(tmp_path, trigger), Endpoints.free(), find_installation()) as server:
         assert not trigger.exists()
         check_answers(server)
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import tritonclient.grpc
 
+from commands import client_regions_of_others
 from rfm.launch.process import Endpoints
 from rfm_client import (
     Trajectory,
@@ -40,4 +41,4 @@ def regions(endpoints: Endpoints) -> set[str]:
 
 
 def ours_in_dev_shm() -> set[str]:
-    return {file.name for file in FOLDER.iterdir() if "rfm-client-" in file.name}
+    return {file.name for file in FOLDER.iterdir() if "rfm-client-" in file.name} - client_regions_of_others()

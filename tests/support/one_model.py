@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A server of one small model."""
+"""Servers whose end is not what a test is about, and servers of one small model."""
 
 from __future__ import annotations
 
@@ -14,8 +14,17 @@ from rfm.launch.installation import find_installation
 from rfm.launch.process import Endpoints, TritonServer
 
 
-class OneModelServer(TritonServer):
-    """A server of the demo's ``rfm`` alone, which loads in a second; with more arguments, and killed if asked."""
+class BriefServer(TritonServer):
+    """A server that is killed when its test is over: Triton takes a second for each model process to end in order."""
+
+    def __exit__(self, *raised: Any) -> None:
+        if self._process is not None and self.exit_status is None:
+            self.kill()
+        super().__exit__(*raised)
+
+
+class OneModelServer(BriefServer):
+    """A server of the demo's ``rfm`` alone; with more arguments, and killed if asked."""
 
     def __init__(self, repository: Path, endpoints: Endpoints, *arguments: str) -> None:
         log = (repository.parent / "tritonserver.log").open("ab")
@@ -27,7 +36,7 @@ class OneModelServer(TritonServer):
         os.killpg(self._process.pid, number)
 
     def kill(self) -> None:
-        self.signal(signal.SIGKILL)
+        super().kill()
         self.stop()
 
     def __exit__(self, *raised: Any) -> None:

@@ -15,10 +15,11 @@ import goldens
 import rfm_export
 from engines import load_engine, serve_config
 from mixtures import FRAMES_MODEL, assert_same, counts
+from one_model import BriefServer
 from reference_server import Served
 from repositories import forget_input
 from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.process import Endpoints
 from rfm_client import (
     InvalidSampleError,
     ModelNotFoundError,
@@ -150,7 +151,7 @@ def served_from_before(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ser
         forget_input(repository, model, wire.SECOND_FRAMES)
     with (
         (folder / "tritonserver.log").open("wb") as log,
-        TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
     ):
         yield Served(server)
 

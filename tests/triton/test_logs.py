@@ -26,9 +26,10 @@ import rfm_export
 from engines import serve_config
 from gateways import Gateway
 from gateways import running as running_gateway
+from one_model import BriefServer
 from paths import ROOT
 from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.process import Endpoints
 from rfm_client import (
     DeadlineExceededError,
     InferenceFailedError,
@@ -148,7 +149,7 @@ def running(tmp_path_factory: pytest.TempPathFactory, collector: Collector) -> I
     options = documented_options(f"http://127.0.0.1:{collector.server_address[1]}/v1/traces")
     with (
         log.open("wb") as lines,
-        TritonServer(repository, Endpoints.free(), find_installation(), log=lines, more_arguments=options) as server,
+        BriefServer(repository, Endpoints.free(), find_installation(), log=lines, more_arguments=options) as server,
     ):
         yield Running(server.endpoints, log, collector.traces)
 

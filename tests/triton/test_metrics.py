@@ -20,9 +20,10 @@ from prometheus_client.parser import text_string_to_metric_families
 import goldens
 import rfm_export
 from engines import load_engine, serve_config
+from one_model import BriefServer
 from rfm.execution import Execution
 from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.process import Endpoints
 from rfm.launch.repository_api import RepositoryApi
 from rfm.triton_model.metrics import BUCKETS_S, PADDING_BUCKETS, SAMPLES_BUCKETS
 from rfm.triton_model.request import OUTCOMES, UNKNOWN_TYPE
@@ -150,7 +151,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     append(repository / SLOW, SLOWED)
     with (
         log.open("wb") as lines,
-        TritonServer(repository, Endpoints.free(), find_installation(), log=lines, admin_key=KEY) as server,
+        BriefServer(repository, Endpoints.free(), find_installation(), log=lines, admin_key=KEY) as server,
     ):
         yield Running(repository, server.endpoints, log)
 
@@ -437,7 +438,7 @@ def test_a_model_without_its_metrics_serves_all_the_same_and_says_so_once(tmp_pa
     append(repository / MODEL, BROKEN)
     with (
         log.open("wb") as lines,
-        TritonServer(repository, Endpoints.free(), find_installation(), log=lines) as server,
+        BriefServer(repository, Endpoints.free(), find_installation(), log=lines) as server,
         RewardClient(server.endpoints.grpc_url, model=MODEL) as client,
     ):
         for _ in range(3):

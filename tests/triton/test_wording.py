@@ -16,10 +16,11 @@ import tritonclient.http
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
 from commands import REPOSITORY
+from one_model import BriefServer
 from patients import make_repository
 from repositories import bound_triton_s_queue, kill_model
 from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.process import Endpoints
 from rfm.launch.repository_api import RepositoryApi
 from rfm_client import (
     InvalidSampleError,
@@ -67,7 +68,7 @@ def endpoints_and_repository(tmp_path_factory: pytest.TempPathFactory) -> Iterat
     shutil.copytree(REPOSITORY, repository, ignore=shutil.ignore_patterns("__pycache__"))
     with (
         (folder / "tritonserver.log").open("wb") as log,
-        TritonServer(repository, Endpoints.free(), find_installation(), log=log, admin_key=KEY) as server,
+        BriefServer(repository, Endpoints.free(), find_installation(), log=log, admin_key=KEY) as server,
     ):
         yield server.endpoints, repository
 
@@ -157,7 +158,7 @@ def test_a_full_queue_says_so_in_these_words(tmp_path: Path, protocol: str, name
         bound_triton_s_queue(repository / "rfm", 1)
     with (
         (tmp_path / "tritonserver.log").open("wb") as log,
-        TritonServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
         ThreadPoolExecutor(12) as callers,
     ):
 
@@ -205,7 +206,7 @@ def test_a_dead_process_and_an_unloaded_model_are_told_apart(tmp_path: Path, pro
     shutil.copytree(REPOSITORY / "rfm", repository / "rfm", ignore=shutil.ignore_patterns("__pycache__"))
     with (
         (tmp_path / "tritonserver.log").open("wb") as log,
-        TritonServer(repository, Endpoints.free(), find_installation(), log=log, admin_key=KEY) as server,
+        BriefServer(repository, Endpoints.free(), find_installation(), log=log, admin_key=KEY) as server,
         RepositoryApi(server.endpoints.grpc_url, KEY) as api,
     ):
         asked = Triton(repository, server.endpoints, protocol)
