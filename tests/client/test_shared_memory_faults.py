@@ -44,9 +44,7 @@ def test_shared_memory_changes_no_answer_and_leaves_nothing(repository: Path, pr
 
 def test_memory_of_cancelled_calls_never_mixes_with_that_of_others(repository: Path) -> None:
     endpoints = Endpoints.free()
-    samples = [
-        ProgressSample(trajectory(seed, 6000), frame_steps=32) for seed in range(6)
-    ]  # 1.5 MB: copied in a thread
+    samples = [ProgressSample(trajectory(seed, 4200), frame_steps=2) for seed in range(4)]  # 1.1 MB: copied in a thread
     with OneModelServer(repository, endpoints):
         with RewardClient(endpoints.grpc_url) as client:
             expected = [client.evaluate([sample])[0] for sample in samples]
