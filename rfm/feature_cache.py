@@ -47,7 +47,7 @@ class FeatureCache(Generic[Kept]):
         return len(self._arrays)
 
     def clear(self) -> None:
-        """Forgets all arrays."""
+        """Forgets every array that it keeps."""
         with self._changing:
             self._arrays.clear()
             self.num_bytes = 0

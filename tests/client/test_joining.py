@@ -1,21 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Concurrent calls that share requests. Most ask a stand-in that answers when it is told to; the last ones a Triton."""
+"""Concurrent calls that share requests, at a server that stands in and answers when it is told to."""
 
 from __future__ import annotations
 
 import asyncio
-import time
-from collections.abc import Awaitable, Callable, Collection, Coroutine, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pytest
 
-from mixtures import MODEL, assert_same, counts, mixed_samples
-from reference_server import Served
 from rfm_client import (
     AsyncRewardClient,
     DeadlineExceededError,
@@ -24,10 +17,7 @@ from rfm_client import (
     ModelNotFoundError,
     PreferenceSample,
     ProcessEndedError,
-    ProgressResult,
     ProgressSample,
-    Result,
-    RewardClient,
     RewardError,
     Sample,
     ServerUnavailableError,
@@ -36,195 +26,9 @@ from rfm_client import (
 )
 from rfm_client.batching import MAX_REQUEST_BYTES, num_together
 from rfm_client.contract import wire
-from rfm_client.contract.model_info import ModelInfo
-from rfm_client.transport.calls import Answer
-from rfm_client.transport.deadline import Deadline, timeout
+from rfm_client.transport.deadline import Deadline
 from rfm_client.transport.in_flight import InFlight
-from trajectories import random_trajectory
-
-WITHIN_S = 10.0
-LIMIT = 2  # of one server of one instance
-BAD = -1.0  # in the embeddings of a sample that a stand-in refuses
-
-
-def sample_of(value: float, num_frames: int = 3) -> ProgressSample:
-    """One that a stand-in answers with this value."""
-    embeddings = np.full((num_frames, 4), value, np.float32)
-    return ProgressSample(Trajectory(video_embeddings=embeddings, text_embedding=np.ones(2, np.float32)))
-
-
-@dataclass
-class Asked:
-    """A request that has come, and when it is answered."""
-
-    inputs: wire.Tensors
-    outputs: Collection[str]
-    timeout_s: float
-    request_id: str
-    gate: asyncio.Future[None]
-    is_cancelled: bool = False
-
-    @property
-    def values(self) -> list[float]:
-        return [float(value) for value in self.inputs[wire.VIDEO_EMBEDDINGS][:, 0, 0]]
-
-    def answer(self) -> None:
-        self.gate.set_result(None)
-
-    def fail(self, error: Exception) -> None:
-        self.gate.set_exception(error)
-
-
-@dataclass
-class Stand:
-    """A server that answers each frame with its first number, when a request is answered. is_open: at once"""
-
-    url: str = "grpc://stand:1"
-    instances: int = 1
-    max_batch_size: int = 64
-    is_open: bool = False
-    info_error: RewardError | None = None
-    asked: list[Asked] = field(default_factory=list)
-    num_infos: int = 0
-
-    @property
-    def waiting(self) -> list[Asked]:
-        return [asked for asked in self.asked if not asked.gate.done()]
-
-    async def infer(
-        self, model: str, inputs: wire.Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
-    ) -> Answer:
-        asked = Asked(inputs, outputs, timeout_s, request_id, asyncio.get_running_loop().create_future())
-        self.asked.append(asked)
-        if self.is_open:
-            asked.answer()
-        try:
-            async with timeout(timeout_s):
-                await asked.gate
-        except (asyncio.TimeoutError, TimeoutError):  # in Python 3.10 two
-            raise DeadlineExceededError("no answer in time") from None
-        except asyncio.CancelledError:
-            asked.is_cancelled = True
-            raise
-        if BAD in asked.values:
-            raise InvalidSampleError("video_embeddings: expected good ones, got bad ones")
-        scores = inputs[wire.VIDEO_EMBEDDINGS][:, :, 0]
-        per_sample = {wire.PREFERENCE, wire.SIMILARITY}
-        return Answer({name: scores[:, :1] if name in per_sample else scores for name in outputs}, "1")
-
-    async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
-        self.num_infos += 1
-        if self.info_error is not None:
-            raise self.info_error
-        none = dict.fromkeys(("max_frames", "frame_size", "video_dim", "text_dim", "progress_bins"))
-        return ModelInfo(model, ("1",), self.max_batch_size, **none, instances=self.instances)  # type: ignore[arg-type]
-
-    async def is_ready(self, model: str, timeout_s: float) -> bool:
-        return True
-
-    async def close(self) -> None:
-        pass
-
-
-async def until(is_so: Callable[[], object]) -> None:
-    async def poll() -> None:
-        while not is_so():
-            await asyncio.sleep(0)
-
-    await asyncio.wait_for(poll(), WITHIN_S)
-
-
-class Calls:
-    """A client of stand-ins that knows their limits, and calls that are under way."""
-
-    def __init__(self, *stands: Stand, **options: Any) -> None:
-        self.stands = stands or (Stand(),)
-        self.client = AsyncRewardClient("", transports=self.stands, **{"join": True, **options})
-        self.tasks: list[asyncio.Task[Result]] = []
-
-    @property
-    def stand(self) -> Stand:
-        return self.stands[0]
-
-    @property
-    def asked(self) -> list[Asked]:
-        return [asked for stand in self.stands for asked in stand.asked]
-
-    async def begin(self, *samples: Sample, **options: Any) -> list[asyncio.Task[Result]]:
-        """Calls about these samples, which have come as far as they come by themselves."""
-        tasks = [asyncio.create_task(self.client.score(sample, **options)) for sample in samples]
-        self.tasks += tasks
-        for _ in range(20):
-            await asyncio.sleep(0)
-        return tasks
-
-    async def fill(self, limit: int = LIMIT) -> None:
-        """As many calls as go at once, so that the next ones wait."""
-        await self.begin(*(sample_of(100 + number) for number in range(limit)))
-        assert [asked.values for asked in self.asked] == [[100.0 + number] for number in range(limit)]
-
-    async def answer_all(self) -> list[Result | BaseException]:
-        """The outcomes of all calls; requests are answered as they come."""
-
-        async def answering() -> None:
-            while True:
-                for stand in self.stands:
-                    for asked in stand.waiting:
-                        asked.answer()
-                await asyncio.sleep(0)
-
-        answers = asyncio.create_task(answering())
-        try:
-            return await asyncio.wait_for(asyncio.gather(*self.tasks, return_exceptions=True), WITHIN_S)
-        finally:
-            answers.cancel()
-
-    async def __aenter__(self) -> Calls:
-        with suppress(RewardError):
-            await self.client.model_info()
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        for task in self.tasks:
-            task.cancel()
-        await asyncio.gather(*self.tasks, return_exceptions=True)
-        await self.client.close()
-
-
-def run(test: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    asyncio.run(asyncio.wait_for(test(), 3 * WITHIN_S))
-
-
-@pytest.fixture
-def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Samples wait until a request has ended, however long that takes."""
-    monkeypatch.setattr("rfm_client.joining.LONGEST_WAIT_S", 1e3)
-
-
-class Clock:
-    """Time that may leap."""
-
-    def __init__(self) -> None:
-        self.ahead_s = 0.0
-        self._real = time.monotonic
-
-    def monotonic(self) -> float:
-        return self._real() + self.ahead_s
-
-    def advance(self, seconds: float) -> None:
-        self.ahead_s += seconds
-
-
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    """That of event loops and deadlines."""
-    clock = Clock()
-    monkeypatch.setattr(time, "monotonic", clock.monotonic)
-    return clock
-
-
-def values_of(outcomes: Sequence[object]) -> list[float | None]:
-    return [float(o.progress[0]) if isinstance(o, ProgressResult) else None for o in outcomes]
+from stand_ins import BAD, LIMIT, WITHIN_S, Calls, Clock, Stand, run, sample_of, until, values_of
 
 
 @pytest.mark.usefixtures("patient")
@@ -601,78 +405,3 @@ def test_room_is_given_in_the_order_in_which_it_was_asked_for() -> None:
             pass
 
     run(ask)
-
-
-# A real server
-
-
-def asked_by_tasks(url: str, samples: Sequence[Sample], **options: Any) -> list[Result | BaseException]:
-    async def ask() -> list[Result | BaseException]:
-        async with AsyncRewardClient(url, model=MODEL, **{"join": True, **options}) as client:
-            await client.model_info()
-            calls: list[Awaitable[Result]] = [client.score(sample) for sample in samples]
-            return await asyncio.gather(*calls, return_exceptions=True)
-
-    return asyncio.run(ask())
-
-
-def asked_by_threads(url: str, samples: Sequence[Sample], **options: Any) -> list[Result | BaseException]:
-    with RewardClient(url, model=MODEL, **{"join": True, **options}) as client, ThreadPoolExecutor(32) as pool:
-        client.model_info()
-
-        def ask(sample: Sample) -> Result | BaseException:
-            return client.evaluate([sample], return_errors=True)[0]
-
-        return list(pool.map(ask, samples))
-
-
-def asked_by_futures(url: str, samples: Sequence[Sample], **options: Any) -> list[Result | BaseException]:
-    with RewardClient(url, model=MODEL, **{"join": True, **options}) as client:
-        client.model_info()
-        futures = [client.submit(sample) for sample in samples]  # type: ignore[call-overload]
-        return [future.exception() or future.result() for future in futures]
-
-
-STYLES = [asked_by_tasks, asked_by_threads, asked_by_futures]
-
-
-@pytest.mark.parametrize("style", STYLES, ids=lambda style: str(style.__name__))
-def test_joined_calls_give_the_answers_of_calls_apart_with_fewer_requests(
-    served: Served, protocol: str, style: Callable[..., list[Result | BaseException]]
-) -> None:
-    samples = mixed_samples(150)
-    samples[40:40] = [ProgressSample(random_trajectory(0, 20))]  # longer than the checkpoint takes
-    num_before = counts(served, MODEL)[0]
-    joined = style(served.url(protocol), samples)
-    num_joined = counts(served, MODEL)[0] - num_before
-    apart = style(served.url(protocol), samples, join=False)
-    # Triton counts the one that is refused as a success if it is refused later than ``execute`` returns.
-    assert counts(served, MODEL)[0] - num_before - num_joined in (150, 151)
-    assert num_joined < 120
-    for index, (one, other) in enumerate(zip(joined, apart, strict=True)):
-        if index == 40:
-            assert isinstance(one, InvalidSampleError)
-            assert isinstance(other, InvalidSampleError)
-            assert one.message == other.message
-            assert "num_frames: expected at most 16" in one.message
-        else:
-            assert_same(one, other)
-
-
-INSTANCE_GROUPS: dict[str, tuple[list[dict[str, Any]], int]] = {
-    "on the CPU": ([{"count": 3, "kind": "KIND_CPU", "gpus": []}], 3),
-    "on each of two GPUs": ([{"count": 2, "kind": "KIND_GPU", "gpus": [0, 1]}], 4),
-    "in two groups": ([{"count": 1, "gpus": [0]}, {"count": 2}], 3),
-    "an ensemble": ([], 0),
-}
-
-
-@pytest.mark.parametrize(("groups", "instances"), INSTANCE_GROUPS.values(), ids=INSTANCE_GROUPS)
-def test_instances_are_counted_on_every_device(groups: list[dict[str, Any]], instances: int) -> None:
-    config = {"name": "rfm", "max_batch_size": 8, "input": [], "output": [], "instance_group": groups}
-    assert ModelInfo.from_config(config).instances == instances
-
-
-def test_a_server_tells_how_many_instances_it_has(served: Served, protocol: str) -> None:
-    with served.client(protocol) as client:
-        assert client.model_info().instances == 1

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Checkpoints, settings and disks that are broken or lie: `rfm export` refuses them, soon, and changes nothing."""
+"""Checkpoints and settings that are broken or lie: `rfm export` refuses them, soon, and changes nothing."""
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import re
@@ -11,10 +10,7 @@ import resource
 import shutil
 import signal
 import struct
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,21 +25,17 @@ import rfm_export
 from engines import serve_config
 from rfm import families
 from rfm.checkpoint.content import MAX_HEADER_BYTES, MAX_JSON_BYTES, CheckpointError
-from rfm.launch.installation import ServerStartError, find_installation
-from rfm.launch.process import Endpoints, TritonServer
 from rfm.plain_yaml import MAX_YAML_BYTES
 from rfm_client.contract.settings import ConfigError
 from rfm_commands.cli import app
 from rfm_commands.config import Config
-from rfm_export import ExportError
+from spoilt import WEIGHTS, Spoil, copied, files_in, weights
 
 REWIND = goldens.config("legacy_keys_l2")
 VLM = goldens.config("q25_mean_l2")
-WEIGHTS, INDEX = "model.safetensors", "model.safetensors.index.json"
+INDEX = "model.safetensors.index.json"
 LONGEST_S = 30
 MOST_MEMORY_BYTES = 512 * 2**20  # beyond what the process had at its largest
-
-Spoil = Callable[[Path], object]
 
 
 @pytest.fixture(autouse=True)
@@ -58,17 +50,6 @@ def _soon() -> Iterator[None]:
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, previous)
-
-
-def copied(config: goldens.Config, folder: Path) -> Path:
-    shutil.copytree(config.checkpoint, folder)
-    for file in folder.rglob("*"):
-        file.chmod(0o644 if file.is_file() else 0o755)
-    return folder
-
-
-def files_in(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def text(name: str, content: str) -> Spoil:
@@ -104,15 +85,6 @@ def header(change: Callable[[dict[str, Any]], object]) -> Spoil:
         changed = change(told) or told
         raw = changed if isinstance(changed, bytes) else json.dumps(changed).encode()
         (folder / WEIGHTS).write_bytes(struct.pack("<Q", len(raw)) + raw + content[8 + length :])
-
-    return spoil
-
-
-def weights(change: Callable[[dict[str, torch.Tensor]], object]) -> Spoil:
-    def spoil(folder: Path) -> None:
-        tensors = load_file(folder / WEIGHTS)
-        change(tensors)
-        save_file(tensors, folder / WEIGHTS)
 
     return spoil
 
@@ -377,128 +349,3 @@ def test_hostile_settings_are_refused(tmp_path: Path, content: str, message: str
 @pytest.mark.parametrize("source", ["../nowhere", "org/..", "..@tag", "a" * 5000, "~nobody-here/x/y", "a\0b"])
 def test_what_is_no_id_is_not_asked_for(tmp_path: Path, source: str) -> None:
     refused(Path(source), tmp_path, "checkpoint: expected a folder that exists or a Hugging Face id")
-
-
-def test_a_file_that_may_not_be_read_is_told(tmp_path: Path) -> None:
-    folder = copied(REWIND, tmp_path / "checkpoint")
-    (folder / "config.json").chmod(0)
-    user = os.geteuid()
-    try:
-        if user == 0:  # who may read everything
-            tmp_path.parents[0].chmod(0o755)
-            os.seteuid(65534)
-        with pytest.raises(CheckpointError, match=r"Permission ?[dD]enied|PermissionError"):
-            families.load(folder)
-    finally:
-        os.seteuid(user)
-
-
-ROOMS = {"0": 0, "100": 100, "half": (REWIND.checkpoint / WEIGHTS).stat().st_size // 2}
-# One `rfm export` after the other, each under a limit of file sizes, in a process of their own.
-IN_LITTLE_ROOM = """
-import io, json, resource, sys
-from contextlib import redirect_stderr
-from rfm_commands.cli import main
-checkpoint, *exports = sys.argv[1:]
-for room, repository in map(json.loads, exports):
-    resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
-    sys.argv = ["rfm", "export", "--checkpoint", checkpoint, "--repository", repository]
-    status, errors = 0, io.StringIO()
-    try:
-        with redirect_stderr(errors):
-            main()
-    except SystemExit as ended:
-        status = ended.code
-    print(json.dumps([status, errors.getvalue()]))
-"""
-
-
-@dataclass(frozen=True)
-class FullDisk:
-    """What an export onto one said, and the files there before."""
-
-    folder: Path
-    before: dict[str, bytes]
-    status: int
-    errors: str
-
-
-@pytest.fixture(scope="module")
-def full_disks(tmp_path_factory: pytest.TempPathFactory) -> dict[str, FullDisk]:
-    folders = {name: tmp_path_factory.mktemp(f"room_{name}") for name in ROOMS}
-    before = {}
-    for name, folder in folders.items():
-        rfm_export.export(REWIND.checkpoint, folder / "model_repository", serve_config(REWIND))
-        before[name] = files_in(folder)
-    exports = [json.dumps([room, str(folders[name] / "model_repository")]) for name, room in ROOMS.items()]
-    ended = subprocess.run(
-        [sys.executable, "-c", IN_LITTLE_ROOM, str(REWIND.checkpoint), *exports],
-        check=True,
-        stdout=subprocess.PIPE,
-        text=True,
-        timeout=LONGEST_S,
-    )
-    said = map(json.loads, ended.stdout.splitlines())
-    return {name: FullDisk(folders[name], before[name], *told) for name, told in zip(ROOMS, said, strict=True)}
-
-
-@pytest.mark.parametrize("room", ROOMS)
-def test_a_full_disk_is_told_and_changes_nothing(full_disks: dict[str, FullDisk], room: str) -> None:
-    disk = full_disks[room]
-    assert disk.status == 1
-    assert files_in(disk.folder) == disk.before
-    assert not list(disk.folder.rglob(".*"))
-    told = (
-        r"rfm: .*/model_repository/rfm/\.export-\w+: expected room for the exported files, got: .*[Ff]ile too large.*\n"
-    )
-    assert re.fullmatch(told, disk.errors), disk.errors
-
-
-def test_two_exports_at_a_time_are_one_too_many(tmp_path: Path) -> None:
-    repository = tmp_path / "model_repository"
-    left = repository / ".export-killed"
-    left.mkdir(parents=True)
-    descriptor = os.open(repository, os.O_RDONLY)
-    fcntl.flock(descriptor, fcntl.LOCK_EX)
-    try:
-        with pytest.raises(ExportError, match="model_repository: expected no other export or rollout at work, got one"):
-            rfm_export.export(REWIND.checkpoint, repository, serve_config(REWIND))
-        assert left.exists()  # it may be the other's
-    finally:
-        os.close(descriptor)
-    assert rfm_export.export(REWIND.checkpoint, repository, serve_config(REWIND)) == 1
-    assert not left.exists()
-
-
-@pytest.mark.triton
-def test_weights_that_have_changed_since_their_export_are_not_served(tmp_path: Path) -> None:
-    repository = tmp_path / "model_repository"
-    rfm_export.export(REWIND.checkpoint, repository, serve_config(REWIND))
-    file = repository / "rfm" / "1" / "checkpoint" / WEIGHTS
-    content = bytearray(file.read_bytes())
-    content[-2] ^= 1  # of one number, a little
-    file.write_bytes(content)
-    log_file = tmp_path / "triton.log"
-    with log_file.open("wb") as log:
-        server = TritonServer(repository, Endpoints.free(), find_installation(), log=log)
-        with pytest.raises(ServerStartError), server:
-            pass
-    assert re.search(r"rfm/1: expected the weights that were exported \(\w{16}\), got others", log_file.read_text())
-
-
-def test_version_folders_keep_their_digests_side_by_side(tmp_path: Path) -> None:
-    """A configuration for all versions tells the newest one's; the older are checked against their own."""
-    from rfm.triton_model.weights import check_digest
-    from rfm_export.publish import read_config
-
-    repository = tmp_path / "model_repository"
-    other = copied(REWIND, tmp_path / "other")
-    weights(lambda tensors: tensors["video_proj.bias"].add_(1))(other)
-    for source in (REWIND.checkpoint, other):
-        rfm_export.export(source, repository, serve_config(REWIND))
-    told = read_config(repository, "rfm").parameters["weights_digest"].string_value
-    for version in ("1", "2"):
-        check_digest(repository / "rfm" / version, told)
-    shutil.copy(other / WEIGHTS, repository / "rfm" / "1" / "checkpoint" / WEIGHTS)
-    with pytest.raises(CheckpointError, match="rfm/1: expected the weights that were exported"):
-        check_digest(repository / "rfm" / "1", told)

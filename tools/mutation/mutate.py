@@ -61,13 +61,13 @@ TESTS: dict[str, tuple[str, ...]] = {
         "test_vlm_checkpoint",
     ),
     "client/rfm_client/contract/wire.py": ("test_wire", "test_samples", "test_properties"),
-    "rfm/triton_model/batch_model.py": ("test_batch_model", "test_poison", "test_logs"),
-    "rfm/triton_model/cancellation.py": ("test_batch_model",),
-    "rfm/triton_model/request.py": ("test_batch_model", "test_poison"),
+    "rfm/triton_model/batch_model.py": ("test_batch_model", "test_batches", "test_poison", "test_logs"),
+    "rfm/triton_model/cancellation.py": ("test_batch_model", "test_batches"),
+    "rfm/triton_model/request.py": ("test_batch_model", "test_batches", "test_poison"),
     "rfm/supervise/model_states.py": ("test_model_states",),
     "rfm/supervise/model_watch.py": ("test_model_watch",),
     "rfm/supervise/model_reload.py": ("test_model_watch",),
-    "rfm/supervise/model_probe.py": ("test_model_watch",),
+    "rfm/supervise/model_probe.py": ("test_model_probe",),
 }
 
 

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: MIT
+"""A model whose scores are plain to see, and requests that stand in for Triton's."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rfm.execution import Execution
+from rfm.triton_model.batch_model import BatchModel
+from rfm.triton_model.metrics import Counted
+from rfm.triton_model.quarantine import Quarantine
+from rfm.triton_model.request import Request as ModelRequest
+from rfm_client import (
+    InferenceFailedError,
+    InvalidSampleError,
+    ProgressResult,
+    ProgressSample,
+    Result,
+    RewardError,
+    Sample,
+)
+from rfm_client.contract import wire
+from rfm_serve import wait_for
+from trajectories import random_trajectory
+
+WIDTHS = (4, 3)
+CONFIG = {
+    "input": [
+        {"name": "sample_type", "dims": [1]},
+        {"name": "num_frames", "dims": [2]},
+        {"name": "frame_steps", "dims": [1]},
+        {"name": "video_embeddings", "dims": [-1, WIDTHS[0]]},
+        {"name": "text_embedding", "dims": [WIDTHS[1]]},
+    ],
+    "max_batch_size": 8,
+}
+FINAL = 1  # what Triton wants with the last response to a request
+REFUSED, BREAKS, FAILS = 2, 3, 4  # numbers of frames that the model below cannot bear
+
+
+@dataclass
+class Request:
+    """As Triton hands it over, and what is sent in answer."""
+
+    tensors: wire.Tensors
+    id: str = ""
+    is_given_up: bool = False
+    timeout_us: int = 0
+    responses: list[Response] = field(default_factory=list)
+
+    def request_id(self) -> str:
+        return self.id
+
+    def requested_output_names(self) -> list[str]:
+        return ["progress"]
+
+    def timeout(self) -> int:
+        return self.timeout_us
+
+    def get_response_sender(self) -> Request:
+        return self
+
+    def is_cancelled(self) -> bool:
+        return self.is_given_up
+
+    def send(self, response: Response, flags: int) -> None:
+        assert flags == FINAL
+        self.responses.append(response)
+
+
+@dataclass
+class Response:
+    output_tensors: Sequence[Any] = ()
+    error: Any = None
+
+
+class Model(BatchModel[Sample, Result]):
+    """Scores each frame with how many there are."""
+
+    def __init__(self, folder: Path, warmups: int = 0, settings: Mapping[str, str] = MappingProxyType({})) -> None:
+        self.counted: list[Counted] = []
+        self.at_work: list[int] = []
+        self.batches: list[int] = []
+        self.logged: list[str] = []
+        self._quarantine = Quarantine(folder / "1_batch", (), 8)
+        self._metrics = SimpleNamespace(at_work_on=self.working, add=self.counted.append, close=lambda: None)  # type: ignore[assignment]
+        self._log = SimpleNamespace(  # type: ignore[assignment]
+            report=lambda request: self.logged.append(str(request.error)),
+            report_batch=lambda batch, error: self.logged.append(f"{len(batch)}: {error}"),
+            report_end=lambda error: self.logged.append(f"ended: {error}"),
+        )
+        self.start(CONFIG | {"model_warmup": [{"count": 1}] * warmups}, settings)
+
+    def respond(self, requests: Sequence[Request]) -> list[Response]:
+        """What becomes of requests of which Triton hands over all at once."""
+        self.take(requests)
+        wait_for(lambda: all(request.responses for request in requests))
+        return [response for request in requests for response in request.responses]
+
+    def take(self, requests: Sequence[Request]) -> None:
+        """Hands the requests over, as Triton does, and keeps the responses that come at once."""
+        for request, response in zip(requests, self.execute(requests) or (), strict=False):
+            request.responses.append(response)
+
+    @contextmanager
+    def working(self, batch: Sequence[ModelRequest[Sample]]) -> Iterator[None]:
+        self.at_work.append(sum(request.is_counted for request in batch))
+        yield
+        self.at_work.append(0)
+
+    def decode(self, tensors: wire.Tensors) -> list[Sample]:
+        return wire.decode_samples(tensors)
+
+    def answer(self, questions: Sequence[Sample], execution: Execution) -> list[Result | RewardError]:
+        self.batches.append(len(questions))
+        counts = [question.trajectories[0].num_frames for question in questions]
+        if BREAKS in counts:
+            raise RuntimeError("made up")
+        errors = {
+            REFUSED: InvalidSampleError.at("num_frames", "others", "these"),
+            FAILS: InferenceFailedError("failed"),
+        }
+        scores = [np.full(count, count, np.float32) for count in counts]
+        return [
+            errors.get(count) or ProgressResult(progress=score, success=score)
+            for count, score in zip(counts, scores, strict=True)
+        ]
+
+    def encode(self, answers: Sequence[Result], tensors: wire.Tensors, outputs: Collection[str]) -> wire.Tensors:
+        return wire.encode_results(answers, wire.num_positions(tensors), outputs)
+
+    @property
+    def samples(self) -> Counter[tuple[str, str]]:
+        return sum((counted.samples for counted in self.counted), Counter())
+
+
+@pytest.fixture(autouse=True)
+def backend(monkeypatch: pytest.MonkeyPatch) -> None:
+    def tensor_of(request: Request, name: str) -> Any:
+        return SimpleNamespace(as_numpy=lambda: request.tensors[name])
+
+    def error_of(message: str, code: str) -> tuple[str, str]:
+        return code, message
+
+    codes = {"INVALID_ARG": "invalid", "INTERNAL": "internal", "CANCELLED": "cancelled", "UNAVAILABLE": "unavailable"}
+    for name, code in codes.items():
+        setattr(error_of, name, code)
+    module = SimpleNamespace(
+        get_input_tensor_by_name=tensor_of,
+        InferenceResponse=Response,
+        TritonError=error_of,
+        Tensor=lambda name, array: (name, array.tolist()),
+        TRITONSERVER_RESPONSE_COMPLETE_FINAL=FINAL,
+    )
+    monkeypatch.setitem(sys.modules, "triton_python_backend_utils", module)  # type: ignore[arg-type]
+
+
+def request(*num_frames: int, **more: Any) -> Request:
+    samples = [ProgressSample(random_trajectory(count, count, *WIDTHS)) for count in num_frames]
+    return Request(wire.encode_samples(samples), **more)
