@@ -187,7 +187,7 @@ def test_without_pillow_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> N
 def test_the_scores_that_add_returns_are_reported(served: Served, taker: Taker) -> None:
     film = [picture(seed) for seed in range(6)]
     with (
-        RewardClient(served.url(), model=MODEL) as client,
+        RewardClient(served.url("grpc"), model=MODEL) as client,
         LiveView(taker.url) as view,
         client.episode("stack the cups", live=view, success=SuccessRule(threshold=0.0)) as episode,
     ):
@@ -208,7 +208,7 @@ def test_the_scores_that_add_returns_are_reported(served: Served, taker: Taker) 
 @pytest.mark.triton
 def test_episodes_side_by_side_are_reported_by_environment(served: Served, taker: Taker) -> None:
     async def run() -> list[Any]:
-        async with AsyncRewardClient(served.url(), model=MODEL) as client:
+        async with AsyncRewardClient(served.url("grpc"), model=MODEL) as client:
             episodes = client.episodes(2, ["stack the cups", "open the drawer"], live=view)
             scores = [await episodes.add([picture(step), picture(step + 9)]) for step in range(3)]
             await episodes.reset([True, False])
@@ -228,7 +228,7 @@ def test_episodes_side_by_side_are_reported_by_environment(served: Served, taker
 @pytest.mark.triton
 @pytest.mark.parametrize("blocking", [True, False])
 def test_a_gymnasium_environment_is_reported(served: Served, taker: Taker, blocking: bool) -> None:
-    with RewardClient(served.url(), model=MODEL) as client, LiveView(taker.url, name="cart") as view:
+    with RewardClient(served.url("grpc"), model=MODEL) as client, LiveView(taker.url, name="cart") as view:
         env = RewardModelWrapper(cart_pole(), client, TASK, RewardOptions(live=view, blocking=blocking))
         _, infos = play(env)
         _, more = play(env, seed=1)
@@ -248,7 +248,7 @@ def test_a_gymnasium_environment_is_reported(served: Served, taker: Taker, block
 @pytest.mark.triton
 def test_a_vector_environment_is_reported_by_environment(served: Served, taker: Taker) -> None:
     envs = gymnasium.vector.SyncVectorEnv([cart_pole] * 2)
-    with RewardClient(served.url(), model=MODEL) as client, LiveView(taker.url) as view:
+    with RewardClient(served.url("grpc"), model=MODEL) as client, LiveView(taker.url) as view:
         wrapped = RewardModelVectorWrapper(envs, client, TASK, RewardOptions(live=view))
         wrapped.reset(seed=0)
         infos = [wrapped.step(np.array([0, 1]))[-1]["reward_model"] for _ in range(3)]
@@ -265,7 +265,7 @@ def test_an_episode_is_as_fast_and_the_same_without_the_gateway(
 ) -> None:
     film = [picture(seed, (480, 640)) for seed in range(20)]
     with (
-        RewardClient(served.url(), model=MODEL) as client,
+        RewardClient(served.url("grpc"), model=MODEL) as client,
         LiveView(f"http://127.0.0.1:{free_port()}") as away,
     ):
         client.episode("stack the cups").add(film[0])

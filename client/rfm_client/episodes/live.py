@@ -36,20 +36,16 @@ class LiveEpisode:
             "task": task,
             "threshold": threshold,
         }
-        self._has_begun = self._has_ended = False
 
     def add(self, frame: UInt8Array, score: StepScore) -> None:
         """Has a step reported. Returns at once, and raises nothing. frame: uint8 [H, W, 3], not written to any more"""
-        self._has_begun = True
         scores = {"progress": _or_none(score.progress), "success": _or_none(score.success)}
         step = {"step": score.step, **scores, "succeeded": score.succeeded, "ms": score.ms}
         self._view._reporter.add(self._about, step, frame)
 
     def end(self) -> None:
         """Has it reported that no step will follow. Returns at once, and raises nothing."""
-        if self._has_begun and not self._has_ended:
-            self._has_ended = True
-            self._view._reporter.end(self._about)
+        self._view._reporter.end(self._about)
 
 
 class LiveView:
@@ -72,7 +68,6 @@ class LiveView:
         self.name = name
         self._url, self._options = url, access
         self._reporter = Reporter(Address.of(url, Access.of(access)))
-        self._episodes: weakref.WeakSet[LiveEpisode] = weakref.WeakSet()
         weakref.finalize(self, self._reporter.stop).atexit = False  # a thread would else wait for ever
 
     def episode(self, task: str, env: int = 0, threshold: float = 0.5) -> LiveEpisode:
@@ -80,16 +75,12 @@ class LiveView:
 
         env: number of its environment; threshold: at which success counts
         """
-        episode = LiveEpisode(self, task, env, threshold)
-        self._episodes.add(episode)
-        return episode
+        return LiveEpisode(self, task, env, threshold)
 
     def close(self) -> None:
         """Ends the episodes, and returns when the last report has gone out, or after two seconds. What comes later is
         not reported.
         """
-        for episode in list(self._episodes):
-            episode.end()
         self._reporter.close(CLOSE_WITHIN_S)
 
     def __enter__(self) -> LiveView:

@@ -31,6 +31,7 @@ MOST_STEPS_KEPT = 10_000  # of all episodes together; the newest
 MOST_STEPS = 2_000  # of one report
 MOST_FRAMES = 16  # of one report
 MOST_FRAMES_KEPT = 256
+MOST_RUNNING = 1024  # of which it is known that they run; the newest
 MOST_ANSWER_BYTES = 300  # what a warning shows
 LONGEST_PX = 256  # the longer side of a frame that is reported
 
@@ -85,6 +86,7 @@ class Reporter:
         self._address = address
         self._steps: deque[Entry] = deque(maxlen=MOST_STEPS_KEPT)
         self._frames: dict[str, UInt8Array] = {}  # by episode; first the one that has waited longest
+        self._running: dict[str, About] = {}
         self._lock = threading.Lock()
         self._has_more, self._stopping = threading.Event(), threading.Event()
         self._is_away = False
@@ -95,19 +97,22 @@ class Reporter:
         """Has a step reported, and ``frame`` unless a newer one comes before."""
         with self._lock:
             self._steps.append((about, step))
-            self._frames[about["id"]] = frame
-            if len(self._frames) > MOST_FRAMES_KEPT:
-                del self._frames[next(iter(self._frames))]
+            self._frames[about["id"]], self._running[about["id"]] = frame, about
+            _bound(self._frames, MOST_FRAMES_KEPT)
+            _bound(self._running, MOST_RUNNING)
         self._has_more.set()
 
     def end(self, about: About) -> None:
-        """Has it reported that an episode has ended."""
+        """Has it reported that an episode has ended, if it runs."""
         with self._lock:
-            self._steps.append((about, None))
+            if self._running.pop(about["id"], None) is not None:
+                self._steps.append((about, None))
         self._has_more.set()
 
     def close(self, timeout_s: float) -> None:
-        """Reports what is left, within so many seconds, and ends."""
+        """Ends all episodes, and the thread, within so many seconds if that can be reported."""
+        for about in list(self._running.values()):
+            self.end(about)
         self.stop()
         self._thread.join(timeout_s)
 
@@ -161,6 +166,11 @@ class Reporter:
         with self._lock:
             self._steps = deque([*steps, *self._steps], MOST_STEPS_KEPT)
             self._frames = {**frames, **self._frames}
+
+
+def _bound(kept: dict[str, Any], most: int) -> None:
+    if len(kept) > most:
+        del kept[next(iter(kept))]
 
 
 def _body(steps: list[Entry], frames: Mapping[str, UInt8Array]) -> bytes:

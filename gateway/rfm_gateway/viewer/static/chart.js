@@ -23,7 +23,7 @@ export function themed(name) {
 
 /**
  * A chart in `host`. `onTime(seconds, isDragged)` is called when somebody points at it or drags in it.
- * label: of the axis to the right
+ * label: of the axis to the right; null: none
  */
 export class Chart {
   #host;

@@ -5,7 +5,7 @@ import { liveFrame } from "./api.js";
 import { Chart } from "./chart.js";
 import { shown } from "./table.js";
 
-const HEIGHT_PX = 180;
+const HEIGHT_PX = 160;
 const NUMBERS = ["Step", "Progress", "Success", "Lag", "Last step"];
 
 export class LiveCard {
@@ -20,7 +20,7 @@ export class LiveCard {
   #isFetching = false;
   #isNew = false;
   #image = document.createElement("img");
-  #heading = document.createElement("h3");
+  #heading = document.createElement("h2");
   #state = document.createElement("p");
   #task = document.createElement("p");
   #chartHost = document.createElement("div");
@@ -46,7 +46,7 @@ export class LiveCard {
       this.#numbers.set(name, value);
     }
     this.element.append(this.#heading, this.#state, this.#task, this.#image, this.#chartHost, list);
-    this.#chart = new Chart(this.#chartHost, () => {}, { heightPx: HEIGHT_PX, label: "steps" });
+    this.#chart = new Chart(this.#chartHost, () => {}, { heightPx: HEIGHT_PX, label: null });
     this.#chart.moveTo(NaN); // there is no time to mark
   }
 
@@ -106,7 +106,7 @@ export class LiveCard {
     for (const [name, text] of Object.entries(texts)) this.#numbers.get(name).textContent = text;
     const { times } = this.#curve;
     this.#chart.setThreshold(threshold);
-    this.#chart.show([{ ...this.#curve, begin: times[0], allTimes: times }]);
+    this.#chart.show([{ ...this.#curve, label: this.title, begin: times[0], allTimes: times }]);
     this.#chartHost.setAttribute("aria-label", `${times.length} steps: last progress ${shown(progress)}, last success ${shown(success)}`);
   }
 
