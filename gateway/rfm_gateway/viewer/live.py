@@ -6,6 +6,7 @@ What the page has seen is told by a cursor, so that it is told what is new. No r
 
 from __future__ import annotations
 
+import itertools
 import secrets
 import time
 from collections import deque
@@ -16,7 +17,7 @@ from typing import Any, TypeAlias
 MOST_EPISODES = 128  # the one that has been silent for longest goes
 MOST_POINTS = 1000  # of one curve: the newest
 FORGOTTEN_AFTER_S = 300.0  # of silence
-_COLUMNS = {"steps": "step", "progress": "progress", "success": "success"}  # of a curve, by what a point calls them
+_COLUMNS = {"steps": "step", "progress": "progress", "success": "success"}  # of a curve, and what a point calls them
 
 Point: TypeAlias = Mapping[str, Any]  # step, progress, success, succeeded, ms; as it was reported
 
@@ -36,21 +37,47 @@ class News:
 
 @dataclass
 class _Episode:
-    """What is known of an episode. changed, of each point and the frame, too: number of the report that brought it"""
+    """What is known of an episode.
+
+    changed, frame_changed: number of the report that brought the newest of it; changes: of each point
+    """
 
     about: Mapping[str, Any]
     heard_s: float
     changed: int = 0
     has_ended: bool = False
-    points: deque[tuple[int, Point]] = field(default_factory=lambda: deque(maxlen=MOST_POINTS))
+    newest: Point | None = None
+    changes: deque[int] = field(default_factory=lambda: deque(maxlen=MOST_POINTS))
+    columns: dict[str, deque[Any]] = field(
+        default_factory=lambda: {name: deque(maxlen=MOST_POINTS) for name in _COLUMNS}
+    )
     frame: bytes | None = None
     frame_changed: int = 0
 
     def take(self, news: News, changed: int) -> None:
+        """Takes over what a report says of it."""
+        self.changed = changed
         self.has_ended |= news.has_ended
         for point in news.points:
-            if not self.points or point["step"] > self.points[-1][1]["step"]:  # a report may come twice
-                self.points.append((changed, point))
+            if self.newest is None or point["step"] > self.newest["step"]:  # a report may come twice
+                self.newest = point
+                self.changes.append(changed)
+                for column, name in _COLUMNS.items():
+                    self.columns[column].append(point[name])
+
+    def since(self, known: int) -> dict[str, Any]:
+        """What is new since the report of a number."""
+        if self.changed <= known:
+            return {}
+        num_new = sum(1 for _ in itertools.takewhile(lambda changed: changed > known, reversed(self.changes)))
+        first = len(self.changes) - num_new
+        return {
+            **self.about,
+            "has_ended": self.has_ended,
+            "frame": self.frame_changed or None,
+            "newest": self.newest,
+            **{column: list(itertools.islice(values, first, None)) for column, values in self.columns.items()},
+        }
 
 
 class LiveEpisodes:
@@ -74,7 +101,7 @@ class LiveEpisodes:
         for each in news:
             episode = self._episodes.pop(each.id, None) or _Episode(each.about, self._clock_s())
             episode.take(each, self._changed)
-            episode.changed, episode.heard_s = self._changed, self._clock_s()
+            episode.heard_s = self._clock_s()
             self._episodes[each.id] = episode
         for key, frame in frames.items():
             if key in self._episodes:
@@ -95,7 +122,7 @@ class LiveEpisodes:
             "is_whole": known == 0,
             "most_points": MOST_POINTS,
             "episodes": [
-                {"id": key, "age_s": self._clock_s() - episode.heard_s, **_news(episode, known)}
+                {"id": key, "age_s": self._clock_s() - episode.heard_s, **episode.since(known)}
                 for key, episode in self._episodes.items()
             ],
         }
@@ -111,17 +138,3 @@ class LiveEpisodes:
             if self._episodes[key].heard_s >= oldest_s and len(self._episodes) <= MOST_EPISODES:
                 break
             del self._episodes[key]
-
-
-def _news(episode: _Episode, known: int) -> dict[str, Any]:
-    """What is new of an episode since the report of a number."""
-    if episode.changed <= known:
-        return {}
-    points = [point for changed, point in episode.points if changed > known]
-    return {
-        **episode.about,
-        "has_ended": episode.has_ended,
-        "frame": episode.frame_changed or None,
-        "newest": episode.points[-1][1] if episode.points else None,
-        **{column: [point[name] for point in points] for column, name in _COLUMNS.items()},
-    }
