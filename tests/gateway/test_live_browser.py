@@ -133,7 +133,7 @@ def number(value: float) -> str:
     return f"{value:.3f}"
 
 
-def test_without_episodes_the_page_tells_how_to_report_them(page: Stage, demo_server: Endpoints) -> None:
+def test_without_episodes_the_page_tells_how_to_report_them(page: Stage, client: RewardClient) -> None:
     assert page.browser["no-live"].is_displayed()
     origin = {"origin": page.gateway.url, "permission": {"name": "clipboard-write"}, "setting": "granted"}
     page.browser.driver.execute_cdp_cmd("Browser.setPermission", origin)
@@ -141,8 +141,8 @@ def test_without_episodes_the_page_tells_how_to_report_them(page: Stage, demo_se
     page.browser.until("document.getElementById('status').textContent === 'The lines are copied.'")
     code = page.browser["live-code"].text
     assert f'LiveView("{page.gateway.url}")' in code
-    names: dict[str, Any] = {}
-    exec(code.replace("grpc://localhost:8001", demo_server.grpc_url), names)
+    names: dict[str, Any] = {"client": client}
+    exec(code, names)
     score = names["episode"].add(film()[0])
     page.shows("Episode", {"Step": "0", "Progress": number(score.progress), "task": "stack the cups"})
     assert not page.browser["no-live"].is_displayed()

@@ -25,9 +25,9 @@ export class LiveTab {
   begin() {
     const key = hasKey() ? ', api_key="the key of this gateway"' : "";
     this.#page["live-code"].textContent = [
-      "from rfm_client import LiveView, RewardClient",
+      "from rfm_client import LiveView",
       `live = LiveView("${new URL(".", location.href).href.replace(/\/$/, "")}"${key})`,
-      'episode = RewardClient("grpc://localhost:8001").episode("stack the cups", live=live)',
+      'episode = client.episode("stack the cups", live=live)',
     ].join("\n");
     clearTimeout(this.#timer);
     this.#ask();
