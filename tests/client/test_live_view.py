@@ -11,15 +11,18 @@ import logging
 import math
 import pickle
 import socket
+import ssl
 import sys
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
+import trustme
 from PIL import Image
 
 from environments import TASK, cart_pole, play
@@ -161,12 +164,40 @@ def test_a_pickled_view_reports_by_itself(taker: Taker) -> None:
     assert episodes_of(taker)[0]["name"] == "run"
 
 
+def test_reports_go_by_tls_to_whom_the_authority_vouches_for(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    authority, context = trustme.CA(), ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    authority.issue_cert("127.0.0.1").configure_cert(context)
+    authority.cert_pem.write_to_path(str(tmp_path / "ca.pem"))
+    with taking(context) as taker:
+        with LiveView(taker.url) as view:
+            view.episode("stack the cups").add(picture(), score(0))
+        assert "CERTIFICATE_VERIFY_FAILED" in caplog.text
+        with LiveView(taker.url, ca_file=tmp_path / "ca.pem") as view:
+            view.episode("stack the cups").add(picture(), score(1))
+        assert [each["step"] for each in taker.steps()] == [1]
+
+
+def test_frames_of_past_episodes_do_not_pile_up_without_a_gateway() -> None:
+    with LiveView(f"http://127.0.0.1:{free_port()}") as view:
+        reporter = view._reporter
+        first = view.episode("stack the cups")
+        first.add(picture(), score(0))
+        poll(lambda: reporter._is_away)
+        for _ in range(300):
+            episode = view.episode("stack the cups")
+            episode.add(picture(), score(0))
+            episode.end()
+        assert set(reporter._frames) <= {first._about["id"]}
+        assert len(reporter._steps) >= 600
+
+
 @pytest.mark.parametrize(
     ("url", "options", "message"),
     [
         ("grpc://robot:8001", {}, r"url: expected http://host:port or https://host:port of a gateway, got 'grpc://"),
         ("robot:8100", {}, "url: expected http://host:port"),
         ("http://robot:8100/?a=b", {}, "url: expected http://host:port"),
+        ("http://me:key@robot:8100", {}, "url: expected http://host:port"),
         ("http://robot:99999", {}, "Port out of range"),
         ("http://robot:8100", {"ca_file": "nowhere.pem"}, "ca_file: expected certificates"),
         ("http://robot:8100", {"api_key": "two\nlines"}, "authorization: expected visible ASCII characters"),

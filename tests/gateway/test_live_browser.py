@@ -313,6 +313,7 @@ def test_a_page_goes_on_with_a_gateway_that_comes_back(
         with running(demo_server, tmp_path) as gateway, LiveView(gateway.url, name="again") as view:
             view.episode("wait").add(film()[0], StepScore(0.5, 0.25, False, 0, 3.0))
             Stage(gateway, browser).shows("again", {"Step": "0"})
+            browser.until("document.getElementById('errors').textContent === ''")
 
 
 def test_a_picture_of_the_page(demo_server: Endpoints, client: RewardClient, tmp_path: Path) -> None:

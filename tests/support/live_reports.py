@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import base64
 import json
+import ssl
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -59,8 +60,8 @@ class Taker:
 
 
 @contextmanager
-def taking() -> Iterator[Taker]:
-    """A server that takes every report; a gateway could not be made to refuse one."""
+def taking(context: ssl.SSLContext | None = None) -> Iterator[Taker]:
+    """A server that takes every report, or refuses them as the test wants. context: of HTTPS"""
     taker = Taker()
 
     class Handler(BaseHTTPRequestHandler):
@@ -76,7 +77,9 @@ def taking() -> Iterator[Taker]:
             """Says nothing of its requests."""
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
-        taker.url = f"http://127.0.0.1:{server.server_port}"
+        if context is not None:
+            server.socket = context.wrap_socket(server.socket, server_side=True)
+        taker.url = f"{'http' if context is None else 'https'}://127.0.0.1:{server.server_port}"
         thread = threading.Thread(target=server.serve_forever, args=(0.05,))
         thread.start()
         try:

@@ -30,7 +30,7 @@ ANSWER_WITHIN_S = 5.0
 MOST_STEPS_KEPT = 10_000  # of all episodes together; the newest
 MOST_STEPS = 2_000  # of one report
 MOST_FRAMES = 16  # of one report
-MOST_FRAMES_KEPT = 256
+MOST_FRAMES_KEPT = 128  # as many episodes as a gateway keeps
 MOST_RUNNING = 1024  # of which it is known that they run; the newest
 MOST_ANSWER_BYTES = 300  # what a warning shows
 LONGEST_PX = 256  # the longer side of a frame that is reported
@@ -56,7 +56,13 @@ class Address:
     def of(cls, url: str, access: Access) -> Address:
         """That of a gateway. Raises ValueError."""
         parts = urlsplit(url)
-        if parts.scheme not in ("http", "https") or not parts.hostname or parts.query or parts.fragment:
+        if (
+            parts.scheme not in ("http", "https")
+            or not parts.hostname
+            or "@" in parts.netloc
+            or parts.query
+            or parts.fragment
+        ):
             raise ValueError(f"url: expected http://host:port or https://host:port of a gateway, got {url!r}")
         if parts.scheme == "http" and access.uses_tls:
             raise ValueError(f"url: expected https://host:port with certificates, got {url!r}")
@@ -95,6 +101,8 @@ class Reporter:
 
     def add(self, about: About, step: Mapping[str, Any], frame: UInt8Array) -> None:
         """Has a step reported, and ``frame`` unless a newer one comes before."""
+        if self._stopping.is_set():
+            return
         with self._lock:
             self._steps.append((about, step))
             self._frames[about["id"]], self._running[about["id"]] = frame, about
@@ -107,11 +115,15 @@ class Reporter:
         with self._lock:
             if self._running.pop(about["id"], None) is not None:
                 self._steps.append((about, None))
+            if self._is_away:  # large frames of past episodes must not pile up
+                self._frames.pop(about["id"], None)
         self._has_more.set()
 
     def close(self, timeout_s: float) -> None:
         """Ends all episodes, and the thread, within so many seconds if that can be reported."""
-        for about in list(self._running.values()):
+        with self._lock:
+            running = list(self._running.values())
+        for about in running:
             self.end(about)
         self.stop()
         self._thread.join(timeout_s)
@@ -165,7 +177,7 @@ class Reporter:
     def _put_back(self, steps: list[Entry], frames: Mapping[str, UInt8Array]) -> None:
         with self._lock:
             self._steps = deque([*steps, *self._steps], MOST_STEPS_KEPT)
-            self._frames = {**frames, **self._frames}
+            self._frames = {key: frame for key, frame in frames.items() if key in self._running} | self._frames
 
 
 def _bound(kept: dict[str, Any], most: int) -> None:

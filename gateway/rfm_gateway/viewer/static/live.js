@@ -14,6 +14,7 @@ export class LiveTab {
   #cards = new Map();
   #cursor = "";
   #timer = null;
+  #isAway = false;
 
   /** onError(error): something went wrong */
   constructor(page, { onError }) {
@@ -36,8 +37,13 @@ export class LiveTab {
   async #ask() {
     let after = ASK_EVERY_MS;
     try {
-      if (!this.#page["live-panel"].hidden && !document.hidden) this.#take(await liveNews(this.#cursor));
+      if (!this.#page["live-panel"].hidden && !document.hidden) {
+        this.#take(await liveNews(this.#cursor));
+        if (this.#isAway) this.#page.errors.replaceChildren();
+        this.#isAway = false;
+      }
     } catch (error) {
+      this.#isAway = true;
       this.#onError(error);
       if (error instanceof KeyWanted) return; // it begins again with a key
       after = ASK_AGAIN_AFTER_MS;

@@ -114,13 +114,12 @@ export class LiveCard {
   async #showFrame() {
     const { top, bottom } = this.element.getBoundingClientRect();
     if (this.#frame === this.#shownFrame || this.#isFetching || bottom < 0 || top > innerHeight) return;
-    const number = this.#frame;
+    this.#shownFrame = this.#frame;
     this.#isFetching = true;
     try {
       const url = URL.createObjectURL(await liveFrame(this.#id));
       URL.revokeObjectURL(this.#image.src);
       Object.assign(this.#image, { src: url, hidden: false });
-      this.#shownFrame = number;
     } catch { // it has been forgotten meanwhile, or the next question tells what is wrong
     } finally {
       this.#isFetching = false;
