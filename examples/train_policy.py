@@ -2,6 +2,7 @@
 """A policy learns from pixels, in the toy world, with no other reward than the served demo checkpoint's.
 
     python examples/train_policy.py
+    python examples/train_policy.py --live http://localhost:8100    # a gateway's page shows its episodes
 
 The policy sees the first picture of a scene, and chooses where the gripper closes and where it opens: where the columns
 of the picture look most like two colours, which it has to find out. The cross-entropy method (CEM) tries colours, keeps
@@ -11,6 +12,9 @@ far, as the served model sees it. The truth of the world is used only to print h
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -18,7 +22,7 @@ import numpy as np
 import typer
 
 from rfm.launch.temporary import stopped_by_signals, temporary_server
-from rfm_client import RewardClient
+from rfm_client import LiveView, RewardClient
 from toy_world import Task, forward, pick_and_place, random_scene, render, resting
 
 TASK = Task("red", "plate")
@@ -26,6 +30,7 @@ REPOSITORY = Path(__file__).parents[1] / "model_repository"
 FRAMES, ELITES, LEAST_SPREAD = 16, 0.15, 8.0  # colours are 0..255
 TABLE_ROWS = slice(46, 62)  # of a picture, in which blocks, bowl and plate stand
 
+Rewards = Callable[[np.ndarray, range], tuple[np.ndarray, np.ndarray]]
 Policies = np.ndarray  # float64 [P, 2, 3]: RGB of what is grasped, and of where it is let go
 
 
@@ -38,7 +43,9 @@ def places(policies: Policies, picture: np.ndarray) -> np.ndarray:
     return (smooth.argmax(axis=2) + 4.5) / picture.shape[1]
 
 
-def rewards(client: RewardClient, policies: Policies, seeds: range) -> tuple[np.ndarray, np.ndarray]:
+def rewards(
+    client: RewardClient, live: LiveView | None, policies: Policies, seeds: range
+) -> tuple[np.ndarray, np.ndarray]:
     """float64 [P] each: the progress that a step is paid, on average, and the share of episodes that succeed."""
     films, successes = [], []
     for seed in seeds:
@@ -48,8 +55,9 @@ def rewards(client: RewardClient, policies: Policies, seeds: range) -> tuple[np.
             films.append(render(episode))
             successes.append(episode.success(TASK)[-1])
     steps = np.stack(films, axis=1)  # [T, N, H, W, 3]
-    episodes = client.episodes(len(films), TASK.sentence(), frames=FRAMES)
+    episodes = client.episodes(len(films), TASK.sentence(), frames=FRAMES, live=live)
     progress = np.mean([episodes.add(frames).progress for frames in steps], axis=0)
+    episodes.reset()
     shape = len(seeds), len(policies)
     return progress.reshape(shape).mean(axis=0), np.reshape(successes, shape).mean(axis=0)
 
@@ -59,12 +67,12 @@ def any_policies(count: int, random: np.random.Generator) -> Policies:
     return random.uniform(0, 255, (count, 2, 3))
 
 
-def train(client: RewardClient, rounds: int, population: int, scenes: int, seed: int) -> np.ndarray:
+def train(paid: Rewards, rounds: int, population: int, scenes: int, seed: int) -> np.ndarray:
     """The policy, float64 [2, 3], that CEM ends with."""
     random = np.random.default_rng(seed)
     policies = any_policies(population, random)
     for number in range(rounds):
-        reward, success = rewards(client, policies, range(1000 * number, 1000 * number + scenes))
+        reward, success = paid(policies, range(1000 * number, 1000 * number + scenes))
         best = policies[np.argsort(reward)[-max(2, int(ELITES * population)) :]]
         mean, spread = best.mean(axis=0), best.std(axis=0) + LEAST_SPREAD
         policies = np.clip(mean + spread * random.standard_normal(policies.shape), 0, 255)
@@ -79,18 +87,21 @@ def main(
     tests: Annotated[int, typer.Option(help="Scenes that training did not see, to tell success.")] = 50,
     seed: Annotated[int, typer.Option(help="Of the policies.")] = 0,
     log: Annotated[Path, typer.Option(help="File for Triton's log.")] = Path("tritonserver.log"),
+    live: Annotated[str | None, typer.Option(help="URL of a gateway, whose page shows the episodes.")] = None,
 ) -> None:
     """Prints success rates before and after training."""
     with (
         stopped_by_signals(),
         temporary_server(REPOSITORY, log) as endpoints,
         RewardClient(endpoints.grpc_url) as client,
+        LiveView(live, name="train_policy") if live else nullcontext() as view,
     ):
+        paid = partial(rewards, client, view)
         untrained = any_policies(20, np.random.default_rng(seed + 1))
-        trained = train(client, rounds, population, scenes, seed)
+        trained = train(paid, rounds, population, scenes, seed)
         held_out = range(10**6, 10**6 + tests)
-        _, before = rewards(client, untrained, held_out[: max(tests // 5, 1)])
-        _, after = rewards(client, trained[None], held_out)
+        _, before = paid(untrained, held_out[: max(tests // 5, 1)])
+        _, after = paid(trained[None], held_out)
         print(f"success of untrained policies: {before.mean():.2f}; of the trained one: {after.mean():.2f}")
 
 

@@ -36,6 +36,7 @@ from rfm_client.contract import (
     float_frames_to_uint8,
 )
 from rfm_client.data.inputs import as_trajectory, load_trajectory
+from rfm_client.episodes.live import LiveView
 
 __all__ = [
     "AccessDeniedError",
@@ -46,6 +47,7 @@ __all__ = [
     "FrameSize",
     "InferenceFailedError",
     "InvalidSampleError",
+    "LiveView",
     "ModelInfo",
     "ModelNotFoundError",
     "PreferenceResult",

@@ -35,6 +35,7 @@ from rfm_gateway.scoring import Scorer
 from rfm_gateway.state import State
 from rfm_gateway.viewer.dataset_routes import Shelf, dataset_routes
 from rfm_gateway.viewer.files import docs_files, viewer_files
+from rfm_gateway.viewer.live_routes import live_routes
 from rfm_gateway.viewer.models import Models
 from rfm_gateway.viewer.routes import Behind, viewer_routes
 
@@ -90,6 +91,7 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
         routers.append(viewer_files())
         guarded.include_router(viewer_routes(Behind(config, model, models, limits, metrics)))
         guarded.include_router(dataset_routes(Shelf(config.shown_datasets(), limits, config.timeout)))
+        guarded.include_router(live_routes(limits, config.timeout))
     for router in (*routers, guarded):
         app.include_router(router)
     _answer_errors(app)

@@ -190,7 +190,7 @@ class BodyLimits:
         self._memory = Memory(max_memory_bytes)
 
     @contextmanager
-    def admitted(self, request: Request) -> Iterator[Admitted]:
+    def admitted(self, request: Request, most_json_bytes: int = MAX_JSON_BYTES) -> Iterator[Admitted]:
         """The request, whose body counts as held as long as the context lasts.
 
         Reading it raises HTTPException: 413 as soon as too much is announced or has come, 503 if all requests together
@@ -198,11 +198,11 @@ class BodyLimits:
         multipart body is required and this is none.
         """
         with self._memory.share() as share:
-            yield Admitted(self._limited(request, share), share)
+            yield Admitted(self._limited(request, share, most_json_bytes), share)
 
-    def _limited(self, request: Request, share: Share) -> Request:
+    def _limited(self, request: Request, share: Share, most_json_bytes: int) -> Request:
         ending = _ending(request)
-        most = self._max_bytes if ending else min(self._max_bytes, MAX_JSON_BYTES)
+        most = self._max_bytes if ending else min(self._max_bytes, most_json_bytes)
         too_large = HTTPException(413, f"body: expected at most {most} bytes, got more")
         announced = request.headers.get("content-length", "")
         if announced.isdecimal() and int(announced) > most:

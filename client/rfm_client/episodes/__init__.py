@@ -3,6 +3,7 @@
 
 from rfm_client.episodes.async_episodes import AsyncEpisode, AsyncEpisodes
 from rfm_client.episodes.episodes import Episode, Episodes
+from rfm_client.episodes.live import LiveView
 from rfm_client.episodes.options import EpisodeOptions, SuccessRule
 from rfm_client.episodes.scores import StepScore, StepScores
 
@@ -12,6 +13,7 @@ __all__ = [
     "Episode",
     "EpisodeOptions",
     "Episodes",
+    "LiveView",
     "StepScore",
     "StepScores",
     "SuccessRule",

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Protocol, cast
@@ -21,6 +21,7 @@ from rfm_client.data.prefixes import of_frames
 from rfm_client.data.resize import resize_frames
 from rfm_client.data.sampling import Prefix, Sampling
 from rfm_client.episodes.frames import checked_frame, copied
+from rfm_client.episodes.live import LiveEpisode
 from rfm_client.episodes.options import EpisodeOptions
 from rfm_client.episodes.scores import StepScore, StepScores
 from rfm_client.transport.deadline import Deadline
@@ -64,6 +65,7 @@ class AsyncEpisodes:
         self._cameras = options.cameras or (ONLY_CAMERA,)
         self._tasks = list(tasks)
         self._frames: list[dict[str, list[NamedFrame]]] = [self._none() for _ in tasks]
+        self._live: dict[int, LiveEpisode] = {}  # of those that are watched
         self._sampling: Sampling | None = None
         self._info: ModelInfo | None = None
         self._adding = asyncio.Lock()
@@ -96,7 +98,9 @@ class AsyncEpisodes:
                     for kept in self._frames[index].values():
                         kept.pop()
                 raise
-            return self._scores(added, results, (time.perf_counter() - started_s) * 1e3)
+            scores = self._scores(added, results, (time.perf_counter() - started_s) * 1e3)
+            self._report(added, scores)
+            return scores
 
     async def reset(self, mask: npt.ArrayLike | None = None, task: str | Sequence[str] | None = None) -> None:
         """Begins new episodes, when no step is open.
@@ -107,11 +111,28 @@ class AsyncEpisodes:
         async with self._adding:
             self._begin(mask, task)
 
+    def end_live(self, indices: Iterable[int] | None = None) -> None:
+        """Tells who watches that these episodes, or all, are over."""
+        for index in list(self._live) if indices is None else indices:
+            if index in self._live:
+                self._live.pop(index).end()
+
+    def _report(self, indices: Sequence[int], scores: StepScores) -> None:
+        view = self._options.live
+        if view is None:
+            return
+        for index in indices:
+            if index not in self._live:
+                self._live[index] = view.episode(self._tasks[index], index, self._options.success.threshold)
+            newest = next(iter(self._frames[index].values()))[-1]
+            self._live[index].add(newest.pixels, scores.of(index))
+
     def _begin(self, mask: npt.ArrayLike | None, task: str | Sequence[str] | None) -> None:
         indices = _indices(mask, len(self))
         tasks = [task] * len(indices) if task is None or isinstance(task, str) else list(task)
         if len(tasks) != len(indices):
             raise ValueError(f"task: expected one for each of {len(indices)} episodes, got {len(tasks)}")
+        self.end_live(indices)
         for index, new in zip(indices, tasks, strict=True):
             self._frames[index] = self._none()
             if new is not None:
@@ -222,7 +243,7 @@ class AsyncEpisode:
 
         Raises RewardError. Then the episode has not grown: the step may be tried again.
         """
-        await self.close()
+        await self._settle()
         return await self._add(frame)
 
     def add_nowait(self, frame: Any) -> asyncio.Future[StepScore]:
@@ -241,11 +262,15 @@ class AsyncEpisode:
 
     async def reset(self, task: str | None = None) -> None:
         """Begins a new episode, when no question is open; a frame that waits is dropped. ``task``: None: as before."""
-        await self.close()
+        await self._settle()
         await self._episodes.reset(task=task)
 
     async def close(self) -> None:
-        """Returns when no question is open; a frame that waits is dropped."""
+        """Returns when no question is open; a frame that waits is dropped. Who watches is told that it has ended."""
+        await self._settle()
+        self._episodes.end_live()
+
+    async def _settle(self) -> None:
         self._drop_waiting()
         if self._asking is not None and not self._asking.done():
             await asyncio.wait({self._asking})  # who stops to wait does not stop the question

@@ -10,6 +10,7 @@ from typing import TypedDict
 from rfm_client.contract.results import SUCCESS_THRESHOLD
 from rfm_client.data.fusing import Fuse, check_fuse, checked_cameras
 from rfm_client.data.sampling import Rule, Sampling
+from rfm_client.episodes.live import LiveView
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class EpisodeSettings(TypedDict, total=False):
     fuse: Fuse
     resize: bool
     success: SuccessRule
+    live: LiveView | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +53,7 @@ class EpisodeOptions:
     resize: frames are made as small as the checkpoint reads them before they are kept and sent (needs Pillow);
         ReWiND's scores differ slightly from those of the frames as they are
     success: when a step counts as a success
+    live: where each step is reported to, of several cameras the first one's frame; it delays nothing
     """
 
     sampling: Rule = "rint_pad"
@@ -59,6 +62,7 @@ class EpisodeOptions:
     fuse: Fuse = "mean"
     resize: bool = False
     success: SuccessRule = SuccessRule()
+    live: LiveView | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cameras", checked_cameras(self.cameras))

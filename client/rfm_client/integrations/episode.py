@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
@@ -20,7 +21,9 @@ from rfm_client.data.prefixes import of_frames
 from rfm_client.data.resize import resize_frames
 from rfm_client.data.sampling import Prefix, Rule, Sampling
 from rfm_client.episodes.frames import checked_frame
+from rfm_client.episodes.live import LiveEpisode, LiveView
 from rfm_client.episodes.options import SuccessRule
+from rfm_client.episodes.scores import StepScore
 from rfm_client.windows import NamedFrame, Window
 
 Info: TypeAlias = dict[str, Any]
@@ -57,6 +60,7 @@ class RewardOptions:
     blocking: a step waits for its score
     max_pending: most steps of one environment whose questions are open when not blocking
     await_last: the last step of an episode is waited for even when not blocking; otherwise what is open is dropped
+    live: where each scored step is reported to, of several cameras the first one's frame; it delays nothing
     """
 
     mode: Literal["absolute", "delta"] = "absolute"
@@ -73,6 +77,7 @@ class RewardOptions:
     blocking: bool = True
     max_pending: int = 4
     await_last: bool = True
+    live: LiveView | None = None
 
     def __post_init__(self) -> None:
         if self.mode not in ("absolute", "delta"):
@@ -150,6 +155,7 @@ class Scorer:
             episode.expect([self._client.submit_window(window) for window in windows], self._sampling)
 
     def _await(self, episodes: Sequence[Episode]) -> None:
+        asked_s = time.perf_counter()
         windows = [episode.windows(self._sampling) for episode in episodes]
         outcomes = iter(self._client.score_windows([window for of_episode in windows for window in of_episode]))
         results = [
@@ -157,7 +163,7 @@ class Scorer:
             for episode, of_episode in zip(episodes, windows, strict=True)
         ]
         for episode, result in zip(episodes, results, strict=True):
-            episode.learn(episode.step, result, self._sampling.prefix(episode.step))
+            episode.learn(episode.step, result, self._sampling.prefix(episode.step), asked_s)
 
     @property
     def _client(self) -> RewardClient:
@@ -184,17 +190,18 @@ class Scorer:
 class Episode:
     """The frames of one episode, what is known of it, and the requests that have no answer yet.
 
-    where: names its environment in messages; empty if there is only one
+    env: number of its environment; None: there is only one
     """
 
-    def __init__(self, options: RewardOptions, task: str, where: str = "") -> None:
+    def __init__(self, options: RewardOptions, task: str, env: int | None = None) -> None:
         self._options = options
         self._task = task
-        self._where = where
+        self._where = "" if env is None else f"envs[{env}]"
+        self._live = _watched(options, task, env or 0)
         self._frames: list[tuple[NamedFrame, ...]] = []  # of each camera
         self._sizes: list[tuple[int, ...]] | None = None  # of the cameras' frames as they came
         self._fit: Fit | None = None
-        self._pending: dict[int, tuple[Prefix, Sequence[Future[ProgressResult]]]] = {}  # by step
+        self._pending: dict[int, tuple[Prefix, Sequence[Future[ProgressResult]], float]] = {}  # by step, since when
         self._known_step = -1
         self._progress = self._success = self._paid_progress = np.nan
         self.num_skipped = 0
@@ -240,22 +247,24 @@ class Episode:
 
     def expect(self, answers: Sequence[Future[ProgressResult]], sampling: Sampling) -> None:
         """Records that an answer about each camera's newest frame, sampled so, is to come."""
-        self._pending[self.step] = sampling.prefix(self.step), answers
+        self._pending[self.step] = sampling.prefix(self.step), answers, time.perf_counter()
 
     def collect(self) -> None:
         """Takes over the answers that have come. Raises the RewardError of one that failed."""
-        for step in [step for step, (_, answers) in self._pending.items() if all(each.done() for each in answers)]:
-            prefix, answers = self._pending.pop(step)
+        for step in [step for step, (_, answers, _) in self._pending.items() if all(each.done() for each in answers)]:
+            prefix, answers, asked_s = self._pending.pop(step)
             errors = [error for error in (answer.exception() for answer in answers) if isinstance(error, RewardError)]
             if errors:
                 raise self._located(errors[0])
-            self.learn(step, self.fused([answer.result() for answer in answers]), prefix)
+            self.learn(step, self.fused([answer.result() for answer in answers]), prefix, asked_s)
 
     def cancel(self) -> None:
-        """Cancels the requests that have no answer yet."""
-        for answer in (answer for _, answers in self._pending.values() for answer in answers):
+        """Cancels the requests that have no answer yet: the episode is over."""
+        for answer in (answer for _, answers, _ in self._pending.values() for answer in answers):
             answer.cancel()
         self._pending.clear()
+        if self._live is not None:
+            self._live.end()
 
     def fused(self, results: Sequence[ProgressResult]) -> ProgressResult:
         """One result of those of all cameras."""
@@ -278,8 +287,8 @@ class Episode:
             raise self._located(outcome)
         return cast(ProgressResult, outcome)
 
-    def learn(self, step: int, result: ProgressResult, prefix: Prefix) -> None:
-        """Takes over an answer about what ``prefix`` shows, unless a newer one is known."""
+    def learn(self, step: int, result: ProgressResult, prefix: Prefix, asked_s: float) -> None:
+        """Takes over an answer about what ``prefix`` shows, asked at ``asked_s``, unless a newer one is known."""
         if step <= self._known_step:
             return
         frames = of_frames(result, prefix)
@@ -289,6 +298,12 @@ class Episode:
         self._known_step = step
         self._progress, self._success = progress, float(frames.success[-1])
         rule = self._options.terminate_on_success
+        if self._live is not None:
+            shown = rule or SuccessRule()
+            has_succeeded = frames.succeeded(last=shown.last, threshold=shown.threshold)
+            ms = (time.perf_counter() - asked_s) * 1e3
+            score = StepScore(self._progress, self._success, has_succeeded, step, ms)
+            self._live.add(self._frames[step][0].pixels, score)
         if rule is not None and step > 0:
             self.succeeded |= frames.succeeded(last=rule.last, threshold=rule.threshold)
 
@@ -312,3 +327,8 @@ class Episode:
 
     def _located(self, error: RewardError) -> RewardError:
         return error.inside(self._where) if self._where and isinstance(error, InvalidSampleError) else error
+
+
+def _watched(options: RewardOptions, task: str, env: int) -> LiveEpisode | None:
+    rule = options.terminate_on_success or SuccessRule()
+    return None if options.live is None else options.live.episode(task, env, rule.threshold)

@@ -187,7 +187,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         super().close(**kwargs)
 
     def _begin(self, index: int, frame: Any) -> Episode:
-        self._episodes[index] = Episode(self._options, self._tasks[index], f"envs[{index}]")
+        self._episodes[index] = Episode(self._options, self._tasks[index], index)
         self._episodes[index].add(frame, self._scorer.fit)
         return self._episodes[index]
 

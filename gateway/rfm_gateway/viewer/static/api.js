@@ -11,6 +11,11 @@ export function useKey(text) {
   key = text;
 }
 
+/** Whether requests show a key. */
+export function hasKey() {
+  return key !== "";
+}
+
 /** Which models are served, and what may be asked of them. */
 export async function served() {
   return (await answer("viewer/served")).json();
@@ -51,6 +56,16 @@ export async function curvesOf(number, episode, labels, signal) {
 /** The video of an episode by one camera, as a Blob: an address of its own could not show the key. */
 export async function videoOf(number, episode, camera, signal) {
   return (await answer(`viewer/datasets/${number}/episodes/${episode}/videos/${camera}`, { signal })).blob();
+}
+
+/** The running episodes, and what is new of them since a cursor. */
+export async function liveNews(cursor) {
+  return (await answer(`viewer/live?after=${encodeURIComponent(cursor)}`)).json();
+}
+
+/** The newest frame of a running episode, as a Blob. */
+export async function liveFrame(id) {
+  return (await answer(`viewer/live/${encodeURIComponent(id)}/frame`)).blob();
 }
 
 function chosen(labels) {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-// The chart: progress and success of each curve over the time in its video, drawn by uPlot.
+// The chart: progress and success of each curve over the time in its video or over its steps, drawn by uPlot.
 
 import uPlot from "./uplot/uPlot.esm.js";
 
@@ -21,28 +21,46 @@ export function themed(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 }
 
-/** A chart in `host`. `onTime(seconds, isDragged)` is called when somebody points at it or drags in it. */
+/**
+ * A chart in `host`. `onTime(seconds, isDragged)` is called when somebody points at it or drags in it.
+ * label: of the axis to the right; null: none
+ */
 export class Chart {
   #host;
   #onTime;
   #plot = null;
   #numCurves = 0;
+  #heightPx;
+  #label;
+  #begin = 0;
   #end = 1;
   #threshold = 0.5;
   #time = 0;
   #playhead = document.createElement("div");
+  #leaving = new AbortController();
+  #resizing = new ResizeObserver(() => this.#host.clientWidth && this.#plot?.setSize(this.#size()));
 
-  constructor(host, onTime) {
+  constructor(host, onTime, { heightPx = HEIGHT_PX, label = "seconds" } = {}) {
     this.#host = host;
+    this.#heightPx = heightPx;
+    this.#label = label;
     this.#onTime = onTime;
     this.#playhead.className = "playhead";
-    new ResizeObserver(() => host.clientWidth && this.#plot?.setSize(this.#size())).observe(host);
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.#plot?.redraw());
+    this.#resizing.observe(host);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.#plot?.redraw(), this.#leaving);
   }
 
-  /** Draws the curves: each has `times`, `progress` and `success`, of one length, and `allTimes`. */
+  /** Frees what it holds. */
+  remove() {
+    this.#resizing.disconnect();
+    this.#leaving.abort();
+    this.#plot?.destroy();
+  }
+
+  /** Draws the curves: each has `times`, `progress` and `success`, of one length, and `allTimes`; some have a `begin`. */
   show(curves) {
     const drawn = curves.filter(({ times }) => times.length);
+    this.#begin = Math.min(...drawn.map(({ begin }) => begin ?? 0), Infinity);
     this.#end = Math.max(0, ...drawn.map(({ allTimes }) => allTimes.at(-1))) || 1; // so that the axis does not grow
     const tables = drawn.map(({ times, progress, success }) => [times, progress, success]);
     const data = tables.length ? uPlot.join(tables) : [[], []];
@@ -91,7 +109,7 @@ export class Chart {
   }
 
   #size() {
-    return { width: this.#host.clientWidth, height: HEIGHT_PX };
+    return { width: this.#host.clientWidth, height: this.#heightPx };
   }
 
   #newPlot(indices, data) {
@@ -104,8 +122,8 @@ export class Chart {
       ...this.#size(),
       legend: { show: false },
       cursor: { x: false, y: false, drag: { x: false, y: false } },
-      scales: { x: { time: false, range: () => [0, this.#end] }, y: { range: [-0.02, 1.02] } },
-      axes: [{ ...axis, label: "seconds" }, axis],
+      scales: { x: { time: false, range: () => [this.#begin, this.#end] }, y: { range: [-0.02, 1.02] } },
+      axes: [{ ...axis, label: this.#label }, axis],
       series: [{}, ...series],
       hooks: { draw: [(plot) => this.#drawThreshold(plot)], setSize: [() => this.moveTo(this.#time)] },
     };

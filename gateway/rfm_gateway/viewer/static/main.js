@@ -4,6 +4,7 @@
 import { compare, KeyWanted, score, served, useKey } from "./api.js";
 import { Curve } from "./curves.js";
 import { DatasetTab } from "./dataset.js";
+import { LiveTab } from "./live.js";
 import { Queue } from "./queue.js";
 import { showTable, shown } from "./table.js";
 import { Tabs } from "./tabs.js";
@@ -17,8 +18,9 @@ const page = Object.fromEntries([...document.querySelectorAll("[id]")].map((elem
 const queue = new Queue(CURVES_AT_A_TIME);
 const timeline = new Timeline({ videos: page.videos, chart: page.chart, slider: page.time, button: page.play }, showTime);
 const { videos, chart } = timeline;
-const tabs = new Tabs([[page["score-tab"], page["score-panel"]], [page["dataset-tab"], page["dataset-panel"]]]);
+const tabs = new Tabs(["score", "dataset", "live"].map((name) => [page[`${name}-tab`], page[`${name}-panel`]]));
 const datasetTab = new DatasetTab(page, { onScore: scoreEpisode, onError: failed });
+const liveTab = new LiveTab(page, { onError: failed });
 let curves = [];
 let verdicts = [];
 let gateway = { models: [], rules: [], url: "" };
@@ -28,6 +30,7 @@ let numCurves = 0;
 async function begin() {
   page.errors.replaceChildren();
   datasetTab.begin();
+  liveTab.begin();
   try {
     gateway = await served();
   } catch (error) {
@@ -206,12 +209,12 @@ function showTime(seconds) {
   showTable(page.curves, curves, seconds, Number(page.threshold.value));
 }
 
-async function copy() {
+async function copy(element, name) {
   try {
-    await navigator.clipboard.writeText(page.command.textContent);
-    page.status.textContent = "The command line is copied.";
+    await navigator.clipboard.writeText(element.textContent);
+    page.status.textContent = `The ${name} copied.`;
   } catch { // there is none where the page comes over plain HTTP from another machine
-    failed(new Error("clipboard: expected leave to write to it, got none: mark the command line and copy it"));
+    failed(new Error("clipboard: expected leave to write to it, got none: mark the text and copy it"));
   }
 }
 
@@ -231,7 +234,8 @@ listen(page.threshold, { input: () => { chart.setThreshold(Number(page.threshold
 listen(page.csv, { click: () => save("curves.csv", csv(curves), "text/csv") });
 listen(page.json, { click: () => save("curves.json", json(gateway.url, curves, verdicts), "application/json") });
 listen(page.png, { click: async () => save("curves.png", await chart.png(curves.filter(({ times }) => times.length))) });
-listen(page.copy, { click: copy });
+listen(page.copy, { click: () => copy(page.command, "command line is") });
+listen(page["live-copy"], { click: () => copy(page["live-code"], "lines are") });
 listen(document, {
   dragover: (event) => { event.preventDefault(); page.drop.classList.add("over"); },
   dragleave: () => page.drop.classList.remove("over"),

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: MIT
+"""Episodes that somebody watches while they run: their newest frames and scores go to the page of a gateway.
+
+Whoever adds a step never waits for that: a thread reports, a few times a second, what has come since.
+"""
+
+from __future__ import annotations
+
+import math
+import uuid
+import weakref
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.data.resize import load_pillow
+from rfm_client.episodes.live_reports import Address, Reporter
+from rfm_client.episodes.scores import StepScore
+from rfm_client.transport.access import Access, AccessOptions
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+CLOSE_WITHIN_S = 2.0
+
+
+class LiveEpisode:
+    """One episode that is watched. Built by ``LiveView.episode``."""
+
+    def __init__(self, view: LiveView, task: str, env: int, threshold: float) -> None:
+        self._view = view
+        self._about = {
+            "id": uuid.uuid4().hex,
+            "name": view.name,
+            "env": env,
+            "task": task,
+            "threshold": threshold,
+        }
+
+    def add(self, frame: UInt8Array, score: StepScore) -> None:
+        """Has a step reported. Returns at once, and raises nothing. frame: uint8 [H, W, 3], not written to any more"""
+        scores = {"progress": _or_none(score.progress), "success": _or_none(score.success)}
+        step = {"step": score.step, **scores, "succeeded": score.succeeded, "ms": score.ms}
+        self._view._reporter.add(self._about, step, frame)
+
+    def end(self) -> None:
+        """Has it reported that no step will follow. Returns at once, and raises nothing."""
+        self._view._reporter.end(self._about)
+
+
+class LiveView:
+    """The tab Live of a gateway's page, for episodes: ``client.episode(task, live=LiveView("http://robot:8100"))``.
+
+    One view serves any number of episodes and clients. It reports at most four times a second, for all together: the
+    scores of every step, and of each episode the newest frame, with at most 256 pixels on its longer side. If the
+    gateway cannot be reached, the episodes go on; a warning is logged, and the newest 10 000 steps are kept.
+
+    url: ``http://host:port`` or ``https://host:port`` of the gateway
+    name: what the page calls the run
+    access: as of AccessOptions; ``api_key`` is the gateway's key
+
+    A context manager that closes it. It may be pickled: each process then reports by itself.
+    Raises ValueError for what cannot be used, ImportError without Pillow (``rfm-client[resize]``).
+    """
+
+    def __init__(self, url: str, *, name: str = "", **access: Unpack[AccessOptions]) -> None:
+        load_pillow()
+        self.name = name
+        self._url, self._options = url, access
+        self._reporter = Reporter(Address.of(url, Access.of(access)))
+        weakref.finalize(self, self._reporter.stop).atexit = False  # a thread would else wait for ever
+
+    def episode(self, task: str, env: int = 0, threshold: float = 0.5) -> LiveEpisode:
+        """An episode that appears with its first step.
+
+        env: number of its environment; threshold: at which success counts
+        """
+        return LiveEpisode(self, task, env, threshold)
+
+    def close(self) -> None:
+        """Ends the episodes, and returns when the last report has gone out, or after two seconds. What comes later is
+        not reported.
+        """
+        self._reporter.close(CLOSE_WITHIN_S)
+
+    def __enter__(self) -> LiveView:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return _rebuilt, (self._url, self.name, self._options)
+
+
+def _rebuilt(url: str, name: str, access: AccessOptions) -> LiveView:
+    return LiveView(url, name=name, **access)
+
+
+def _or_none(score: float) -> float | None:
+    """A score as JSON has it: null for one that the checkpoint does not predict."""
+    return score if math.isfinite(score) else None

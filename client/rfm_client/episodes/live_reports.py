@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: MIT
+"""What is reported of episodes that are watched, and the thread that reports it.
+
+A report holds every step since the last one that arrived, and the newest frames of the episodes that have waited
+longest for one. So what a report costs does not grow with the number of environments.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import logging
+import ssl
+import threading
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from http.client import HTTPConnection, HTTPException, HTTPSConnection
+from typing import Any, TypeAlias
+from urllib.parse import urlsplit
+
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.data.resize import as_jpeg
+from rfm_client.transport.access import Access
+
+PATH = "/live/reports"
+REPORT_EVERY_S = 0.25
+TRY_AGAIN_AFTER_S = 5.0
+ANSWER_WITHIN_S = 5.0
+MOST_STEPS_KEPT = 10_000  # of all episodes together; the newest
+MOST_STEPS = 2_000  # of one report
+MOST_FRAMES = 16  # of one report
+MOST_FRAMES_KEPT = 128  # as many episodes as a gateway keeps
+MOST_RUNNING = 1024  # of which it is known that they run; the newest
+MOST_ANSWER_BYTES = 300  # what a warning shows
+LONGEST_PX = 256  # the longer side of a frame that is reported
+
+About: TypeAlias = Mapping[str, Any]  # which episode it is
+Entry: TypeAlias = tuple[About, Mapping[str, Any] | None]  # one of its steps; None: it has ended
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where reports go. headers: shown with each of them; context: of HTTPS, None without"""
+
+    url: str
+    host: str
+    port: int | None
+    path: str
+    headers: Mapping[str, str]
+    context: ssl.SSLContext | None
+
+    @classmethod
+    def of(cls, url: str, access: Access) -> Address:
+        """That of a gateway. Raises ValueError."""
+        parts = urlsplit(url)
+        if (
+            parts.scheme not in ("http", "https")
+            or not parts.hostname
+            or "@" in parts.netloc
+            or parts.query
+            or parts.fragment
+        ):
+            raise ValueError(f"url: expected http://host:port or https://host:port of a gateway, got {url!r}")
+        if parts.scheme == "http" and access.uses_tls:
+            raise ValueError(f"url: expected https://host:port with certificates, got {url!r}")
+        context = access.ssl_context if parts.scheme == "https" else None
+        headers = {**access.shown, "content-type": "application/json"}
+        return cls(url, parts.hostname, parts.port, parts.path.rstrip("/") + PATH, headers, context)
+
+    def post(self, body: bytes) -> tuple[int, str]:
+        """Status and text of the answer. Raises OSError, HTTPException."""
+        connection = (
+            HTTPConnection(self.host, self.port, timeout=ANSWER_WITHIN_S)
+            if self.context is None
+            else HTTPSConnection(self.host, self.port, timeout=ANSWER_WITHIN_S, context=self.context)
+        )
+        try:
+            connection.request("POST", self.path, body, dict(self.headers))
+            answer = connection.getresponse()
+            return answer.status, answer.read(MOST_ANSWER_BYTES).decode(errors="replace")
+        finally:
+            connection.close()
+
+
+class Reporter:
+    """Reports to one address, in a thread of its own."""
+
+    def __init__(self, address: Address) -> None:
+        self._address = address
+        self._steps: deque[Entry] = deque(maxlen=MOST_STEPS_KEPT)
+        self._frames: dict[str, UInt8Array] = {}  # by episode; first the one that has waited longest
+        self._running: dict[str, About] = {}
+        self._lock = threading.Lock()
+        self._has_more, self._stopping = threading.Event(), threading.Event()
+        self._is_away = False
+        self._thread = threading.Thread(target=self._run, name="rfm-live-view", daemon=True)
+        self._thread.start()
+
+    def add(self, about: About, step: Mapping[str, Any], frame: UInt8Array) -> None:
+        """Has a step reported, and ``frame`` unless a newer one comes before."""
+        if self._stopping.is_set():
+            return
+        with self._lock:
+            self._steps.append((about, step))
+            self._frames[about["id"]], self._running[about["id"]] = frame, about
+            _bound(self._frames, MOST_FRAMES_KEPT)
+            _bound(self._running, MOST_RUNNING)
+        self._has_more.set()
+
+    def end(self, about: About) -> None:
+        """Has it reported that an episode has ended, if it runs."""
+        with self._lock:
+            if self._running.pop(about["id"], None) is not None:
+                self._steps.append((about, None))
+            if self._is_away:  # large frames of past episodes must not pile up
+                self._frames.pop(about["id"], None)
+        self._has_more.set()
+
+    def close(self, timeout_s: float) -> None:
+        """Ends all episodes, and the thread, within so many seconds if that can be reported."""
+        with self._lock:
+            running = list(self._running.values())
+        for about in running:
+            self.end(about)
+        self.stop()
+        self._thread.join(timeout_s)
+
+    def stop(self) -> None:
+        """Ends the thread as soon as what is left has been reported, or cannot be."""
+        self._stopping.set()
+        self._has_more.set()
+
+    @property
+    def _has_any(self) -> bool:
+        return bool(self._steps or self._frames)
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            self._has_more.wait()
+            self._has_more.clear()
+            has_arrived = self._report()
+            if self._has_any:
+                self._has_more.set()
+            self._stopping.wait(REPORT_EVERY_S if has_arrived else TRY_AGAIN_AFTER_S)
+        while self._has_any and self._report():
+            continue
+
+    def _report(self) -> bool:
+        """Reports what there is, and says whether it has arrived. What has not is kept."""
+        with self._lock:
+            steps = [self._steps.popleft() for _ in range(min(len(self._steps), MOST_STEPS))]
+            frames = {key: self._frames.pop(key) for key in list(self._frames)[:MOST_FRAMES]}
+        if not steps and not frames:
+            return True
+        try:
+            status, text = self._address.post(_body(steps, frames))
+        except (OSError, HTTPException) as error:
+            status, text = None, str(error) or type(error).__name__
+        if status is not None and status < 300:
+            self._is_away = False
+            return True
+        self._warn(text if status is None else f"{status} {text}")
+        if status is None or status >= 500:  # others would be refused again
+            self._put_back(steps, frames)
+        return False
+
+    def _warn(self, reason: str) -> None:
+        """Logs why reports do not arrive, once until they do."""
+        if not self._is_away:
+            expected = "%s: expected a gateway that takes live reports, got %s; episodes go on, and are not shown"
+            logger.warning(expected, self._address.url, reason)
+        self._is_away = True
+
+    def _put_back(self, steps: list[Entry], frames: Mapping[str, UInt8Array]) -> None:
+        with self._lock:
+            self._steps = deque([*steps, *self._steps], MOST_STEPS_KEPT)
+            self._frames = {key: frame for key, frame in frames.items() if key in self._running} | self._frames
+
+
+def _bound(kept: dict[str, Any], most: int) -> None:
+    if len(kept) > most:
+        del kept[next(iter(kept))]
+
+
+def _body(steps: list[Entry], frames: Mapping[str, UInt8Array]) -> bytes:
+    episodes: dict[str, dict[str, Any]] = {}
+    for about, step in steps:
+        told = episodes.setdefault(about["id"], {**about, "ended": False, "steps": []})
+        if step is None:
+            told["ended"] = True
+        else:
+            told["steps"].append(step)
+    pictures = {key: base64.b64encode(as_jpeg(frame, LONGEST_PX)).decode() for key, frame in frames.items()}
+    return json.dumps({"episodes": list(episodes.values()), "frames": pictures}, allow_nan=False).encode()

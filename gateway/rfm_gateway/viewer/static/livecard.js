@@ -1,0 +1,128 @@
+// SPDX-License-Identifier: MIT
+// One running episode: its newest frame, its curve and its numbers.
+
+import { liveFrame } from "./api.js";
+import { Chart } from "./chart.js";
+import { shown } from "./table.js";
+
+const HEIGHT_PX = 160;
+const NUMBERS = ["Step", "Progress", "Success", "Lag", "Last step"];
+
+export class LiveCard {
+  #id;
+  #mostPoints;
+  #about = {};
+  #curve = { index: 0, times: [], progress: [], success: [] };
+  #newest = null;
+  #heardMs = 0;
+  #frame = null;
+  #shownFrame = null;
+  #isFetching = false;
+  #isNew = false;
+  #image = document.createElement("img");
+  #heading = document.createElement("h2");
+  #state = document.createElement("p");
+  #task = document.createElement("p");
+  #chartHost = document.createElement("div");
+  #numbers = new Map();
+  #chart;
+  element = document.createElement("article");
+
+  constructor(id, mostPoints) {
+    this.#id = id;
+    this.#mostPoints = mostPoints;
+    this.#heading.id = `live-${id}`;
+    this.element.setAttribute("aria-labelledby", this.#heading.id);
+    this.#state.className = "state";
+    this.#image.hidden = true;
+    this.#chartHost.className = "chart";
+    this.#chartHost.setAttribute("role", "img");
+    const list = document.createElement("dl");
+    for (const name of NUMBERS) {
+      const [group, term, value] = ["div", "dt", "dd"].map((tag) => document.createElement(tag));
+      term.textContent = name;
+      group.append(term, value);
+      list.append(group);
+      this.#numbers.set(name, value);
+    }
+    this.element.append(this.#heading, this.#state, this.#task, this.#image, this.#chartHost, list);
+    this.#chart = new Chart(this.#chartHost, () => {}, { heightPx: HEIGHT_PX, label: null });
+    this.#chart.moveTo(NaN); // there is no time to mark
+  }
+
+  get title() {
+    return `${this.#about.name || "Episode"}, environment ${this.#about.env}`;
+  }
+
+  get hasEnded() {
+    return this.#about.has_ended;
+  }
+
+  /** Seconds since its last step came. */
+  get ageS() {
+    return (performance.now() - this.#heardMs) / 1000;
+  }
+
+  /** Takes over what is new. */
+  take({ id: _id, age_s: ageS, steps, progress, success, newest, frame, ...about }) {
+    this.#heardMs = performance.now() - 1000 * ageS;
+    if (!steps) return; // nothing
+    const most = (values) => values.slice(-this.#mostPoints);
+    const { times, progress: oldProgress, success: oldSuccess } = this.#curve;
+    this.#curve = {
+      index: 0, times: most([...times, ...steps]),
+      progress: most([...oldProgress, ...progress]), success: most([...oldSuccess, ...success]),
+    };
+    this.#about = about;
+    this.#newest = newest;
+    this.#frame = frame;
+    this.#isNew = true;
+  }
+
+  /** Shows what is known. */
+  show() {
+    this.#numbers.get("Last step").textContent = `${this.ageS.toFixed(0)} s ago`;
+    if (this.#isNew) this.#showNews();
+    this.#isNew = false;
+    this.#showFrame();
+  }
+
+  /** Frees what it holds. */
+  remove() {
+    this.element.remove();
+    this.#chart.remove();
+    URL.revokeObjectURL(this.#image.src);
+  }
+
+  #showNews() {
+    const { task, has_ended: hasEnded, threshold } = this.#about;
+    const { step, progress, success, succeeded, ms } = this.#newest ?? {};
+    this.#heading.textContent = this.title;
+    this.#state.textContent = `${hasEnded ? "ended" : "running"}${succeeded ? ", succeeded" : ""}`;
+    this.#task.textContent = task;
+    this.element.classList.toggle("ended", hasEnded);
+    this.#image.alt = `Newest frame of ${this.title}: ${task}`;
+    const texts = { Step: `${step ?? "-"}`, Progress: shown(progress), Success: shown(success), Lag: ms === undefined ? "-" : `${ms.toFixed(0)} ms` };
+    for (const [name, text] of Object.entries(texts)) this.#numbers.get(name).textContent = text;
+    const { times } = this.#curve;
+    this.#chart.setThreshold(threshold);
+    this.#chart.show([{ ...this.#curve, label: this.title, begin: times[0], allTimes: times }]);
+    this.#chartHost.setAttribute("aria-label", `${times.length} steps: last progress ${shown(progress)}, last success ${shown(success)}`);
+  }
+
+  /** Fetches the newest frame if somebody can see it. */
+  async #showFrame() {
+    const { top, bottom } = this.element.getBoundingClientRect();
+    if (this.#frame === this.#shownFrame || this.#isFetching || bottom < 0 || top > innerHeight) return;
+    this.#shownFrame = this.#frame;
+    this.#isFetching = true;
+    try {
+      const url = URL.createObjectURL(await liveFrame(this.#id));
+      URL.revokeObjectURL(this.#image.src);
+      Object.assign(this.#image, { src: url, hidden: false });
+    } catch { // it has been forgotten meanwhile, or the next question tells what is wrong
+    } finally {
+      this.#isFetching = false;
+    }
+  }
+}

@@ -1,0 +1,322 @@
+# SPDX-License-Identifier: MIT
+"""Episodes that are watched: what is reported of them, and that reporting never delays or changes them."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import gc
+import io
+import logging
+import math
+import pickle
+import socket
+import ssl
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import trustme
+from PIL import Image
+
+from environments import TASK, cart_pole, play
+from gateways import free_port, poll
+from live_reports import Taker, picture, taking
+from reference_server import Served
+from rfm_client import AsyncRewardClient, LiveView, RewardClient
+from rfm_client.episodes import StepScore, SuccessRule, live_reports
+from rfm_client.gym import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions
+
+MODEL = "enc_c1_t1_disc10"
+
+
+@pytest.fixture
+def taker() -> Iterator[Taker]:
+    with taking() as started:
+        yield started
+
+
+@pytest.fixture(autouse=True)
+def _no_thread_stays() -> Iterator[None]:
+    yield
+    gc.collect()
+    poll(lambda: not [each for each in threading.enumerate() if each.name == "rfm-live-view"])
+
+
+def score(step: int, progress: float = 0.5, success: float = 0.25) -> StepScore:
+    return StepScore(progress, success, False, step, 7.5)
+
+
+def episodes_of(taker: Taker) -> list[dict[str, Any]]:
+    """What was reported of each episode, in the order in which they began."""
+    found: dict[str, dict[str, Any]] = {}
+    for body in taker.bodies:
+        for told in body["episodes"]:
+            known = found.setdefault(told["id"], {**told, "ended": False, "steps": []})
+            known["steps"] += told["steps"]
+            known["ended"] |= told["ended"]
+    return list(found.values())
+
+
+def test_every_step_arrives_in_order_and_exactly(taker: Taker) -> None:
+    numbers = np.random.default_rng(0).random((500, 2), np.float32)
+    with LiveView(taker.url, name="run 3", api_key="open") as view:
+        episode = view.episode("stack the cups", env=2, threshold=0.75)
+        for step, (progress, success) in enumerate(numbers.tolist()):
+            episode.add(picture(), score(step, progress, success))
+    (told,) = episodes_of(taker)
+    assert [(each["progress"], each["success"]) for each in told["steps"]] == [tuple(row) for row in numbers.tolist()]
+    assert [each["step"] for each in told["steps"]] == list(range(500))
+    about = {name: told[name] for name in ("name", "env", "task", "threshold", "ended")}
+    assert about == {"name": "run 3", "env": 2, "task": "stack the cups", "threshold": 0.75, "ended": True}
+    assert {body["path"] for body in taker.bodies} == {"/live/reports"}
+    assert {headers["authorization"] for headers in taker.headers} == {"Bearer open"}
+
+
+def test_there_are_few_reports_and_the_newest_frame_wins(taker: Taker) -> None:
+    began_s = time.monotonic()
+    with LiveView(taker.url) as view:
+        episodes = [view.episode("stack the cups", env) for env in range(40)]
+        for step in range(10):
+            for env, episode in enumerate(episodes):
+                episode.add(picture(100 * env + step, (600, 800)), score(step))
+            time.sleep(0.05)
+    took_s = time.monotonic() - began_s
+    at_the_end = math.ceil(40 / live_reports.MOST_FRAMES) + 1  # when nobody waits any more
+    assert len(taker.bodies) <= took_s / live_reports.REPORT_EVERY_S + 1 + at_the_end
+    assert max(len(body["frames"]) for body in taker.bodies) == live_reports.MOST_FRAMES
+    newest = {key: frame for body in taker.bodies for key, frame in body["frames"].items()}
+    assert len(newest) == 40
+    for env, told in enumerate(episodes_of(taker)):
+        image = np.array(Image.open(io.BytesIO(base64.b64decode(newest[told["id"]]))))
+        assert image.shape == (192, 256, 3)
+        assert np.abs(image.astype(int) - picture(100 * env + 9)[0, 0]).max() < 6
+
+
+def test_scores_that_are_not_predicted_are_null(taker: Taker) -> None:
+    with LiveView(taker.url) as view:
+        view.episode("stack the cups").add(picture(), score(0, success=math.nan))
+    assert [each["success"] for each in taker.steps()] == [None]
+
+
+def test_without_a_gateway_a_warning_is_logged_once_and_steps_are_kept(
+    taker: Taker, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(live_reports, "TRY_AGAIN_AFTER_S", 0.05)
+    monkeypatch.setattr(live_reports, "MOST_STEPS_KEPT", 100)
+    taker.status = 503
+    with caplog.at_level(logging.WARNING), LiveView(taker.url) as view:
+        episode = view.episode("stack the cups")
+        for step in range(150):
+            episode.add(picture(), score(step))
+        poll(lambda: len(taker.headers) > 3)
+        (record,) = caplog.records
+        assert record.getMessage() == (
+            f"{taker.url}: expected a gateway that takes live reports, got 503 ; episodes go on, and are not shown"
+        )
+        taker.status = 204
+        poll(lambda: len(taker.steps()) == 100)
+    assert [each["step"] for each in taker.steps()] == list(range(50, 150))
+
+
+def test_a_report_that_is_refused_is_not_sent_again(
+    taker: Taker, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(live_reports, "TRY_AGAIN_AFTER_S", 0.05)
+    taker.status = 422
+    with LiveView(taker.url) as view:
+        episode = view.episode("stack the cups")
+        episode.add(picture(), score(0))
+        poll(lambda: "422" in caplog.text)
+        taker.status = 204
+        episode.add(picture(), score(1))
+        poll(lambda: bool(taker.bodies))
+    assert [each["step"] for each in taker.steps()] == [1]
+
+
+def test_closing_does_not_wait_for_a_gateway_that_hangs(caplog: pytest.LogCaptureFixture) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        view = LiveView(f"http://127.0.0.1:{silent.getsockname()[1]}")
+        view.episode("stack the cups").add(picture(), score(0))
+        began_s = time.monotonic()
+        view.close()
+        assert time.monotonic() - began_s < live_reports.ANSWER_WITHIN_S - 1
+    poll(lambda: "expected a gateway" in caplog.text)
+
+
+def test_a_view_that_nobody_holds_ends_its_thread(taker: Taker) -> None:
+    LiveView(taker.url).episode("stack the cups").add(picture(), score(0))
+    poll(lambda: len(taker.steps()) == 1)
+
+
+def test_a_pickled_view_reports_by_itself(taker: Taker) -> None:
+    with LiveView(taker.url, name="run", api_key="open") as view:
+        again = pickle.loads(pickle.dumps(RewardOptions(live=view))).live
+        with again:
+            again.episode("stack the cups").add(picture(), score(0))
+    assert taker.headers[0]["authorization"] == "Bearer open"
+    assert episodes_of(taker)[0]["name"] == "run"
+
+
+def test_reports_go_by_tls_to_whom_the_authority_vouches_for(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    authority, context = trustme.CA(), ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    authority.issue_cert("127.0.0.1").configure_cert(context)
+    authority.cert_pem.write_to_path(str(tmp_path / "ca.pem"))
+    with taking(context) as taker:
+        with LiveView(taker.url) as view:
+            view.episode("stack the cups").add(picture(), score(0))
+        assert "CERTIFICATE_VERIFY_FAILED" in caplog.text
+        with LiveView(taker.url, ca_file=tmp_path / "ca.pem") as view:
+            view.episode("stack the cups").add(picture(), score(1))
+        assert [each["step"] for each in taker.steps()] == [1]
+
+
+def test_frames_of_past_episodes_do_not_pile_up_without_a_gateway() -> None:
+    with LiveView(f"http://127.0.0.1:{free_port()}") as view:
+        reporter = view._reporter
+        first = view.episode("stack the cups")
+        first.add(picture(), score(0))
+        poll(lambda: reporter._is_away)
+        for _ in range(300):
+            episode = view.episode("stack the cups")
+            episode.add(picture(), score(0))
+            episode.end()
+        assert set(reporter._frames) <= {first._about["id"]}
+        assert len(reporter._steps) >= 600
+
+
+@pytest.mark.parametrize(
+    ("url", "options", "message"),
+    [
+        ("grpc://robot:8001", {}, r"url: expected http://host:port or https://host:port of a gateway, got 'grpc://"),
+        ("robot:8100", {}, "url: expected http://host:port"),
+        ("http://robot:8100/?a=b", {}, "url: expected http://host:port"),
+        ("http://me:key@robot:8100", {}, "url: expected http://host:port"),
+        ("http://robot:99999", {}, "Port out of range"),
+        ("http://robot:8100", {"ca_file": "nowhere.pem"}, "ca_file: expected certificates"),
+        ("http://robot:8100", {"api_key": "two\nlines"}, "authorization: expected visible ASCII characters"),
+    ],
+)
+def test_what_cannot_be_used_is_refused(url: str, options: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        LiveView(url, **options)
+
+
+def test_without_pillow_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    with pytest.raises(ImportError, match=r"client\[resize\]"):
+        LiveView("http://127.0.0.1:1")
+
+
+@pytest.mark.triton
+def test_the_scores_that_add_returns_are_reported(served: Served, taker: Taker) -> None:
+    film = [picture(seed) for seed in range(6)]
+    with (
+        RewardClient(served.url("grpc"), model=MODEL) as client,
+        LiveView(taker.url) as view,
+        client.episode("stack the cups", live=view, success=SuccessRule(threshold=0.0)) as episode,
+    ):
+        first = [episode.add(frame) for frame in film]
+        episode.reset(task="open the drawer")
+        second = [episode.add_nowait(frame).result() for frame in film[:3]]
+    told = episodes_of(taker)
+    assert [each["task"] for each in told] == ["stack the cups", "open the drawer"]
+    assert [each["ended"] for each in told] == [True, True]
+    for each, scores in zip(told, (first, second), strict=True):
+        assert each["threshold"] == 0.0
+        assert each["steps"] == [
+            {"step": s.step, "progress": s.progress, "success": s.success, "succeeded": s.succeeded, "ms": s.ms}
+            for s in scores
+        ]
+
+
+@pytest.mark.triton
+def test_episodes_side_by_side_are_reported_by_environment(served: Served, taker: Taker) -> None:
+    async def run() -> list[Any]:
+        async with AsyncRewardClient(served.url("grpc"), model=MODEL) as client:
+            episodes = client.episodes(2, ["stack the cups", "open the drawer"], live=view)
+            scores = [await episodes.add([picture(step), picture(step + 9)]) for step in range(3)]
+            await episodes.reset([True, False])
+            return [*scores, await episodes.add([picture(4), picture(5)], [True, False])]
+
+    with LiveView(taker.url) as view:
+        scores = asyncio.run(run())
+    told = episodes_of(taker)
+    assert [(each["env"], each["task"], len(each["steps"])) for each in told] == [
+        (0, "stack the cups", 3), (1, "open the drawer", 3), (0, "stack the cups", 1),
+    ]  # fmt: skip
+    for env in range(2):
+        assert [each["progress"] for each in told[env]["steps"]] == [float(s.progress[env]) for s in scores[:3]]
+    assert told[2]["steps"][0]["success"] == float(scores[3].success[0])
+
+
+@pytest.mark.triton
+@pytest.mark.parametrize("blocking", [True, False])
+def test_a_gymnasium_environment_is_reported(served: Served, taker: Taker, blocking: bool) -> None:
+    with RewardClient(served.url("grpc"), model=MODEL) as client, LiveView(taker.url, name="cart") as view:
+        env = RewardModelWrapper(cart_pole(), client, TASK, RewardOptions(live=view, blocking=blocking))
+        _, infos = play(env)
+        _, more = play(env, seed=1)
+        env.close()
+    told = episodes_of(taker)
+    assert [each["ended"] for each in told] == [True, True]
+    for each, seen in zip(told, (infos, more), strict=True):
+        known = {info["reward_model"]["step"]: info["reward_model"] for info in seen}
+        reported = {step["step"]: step for step in each["steps"]}
+        assert known.keys() <= reported.keys()
+        assert {key: (step["progress"], step["success"]) for key, step in reported.items() if key in known} == {
+            key: (info["progress"], info["success"]) for key, info in known.items()
+        }
+        assert max(known) == len(seen) - 1
+
+
+@pytest.mark.triton
+def test_a_vector_environment_is_reported_by_environment(served: Served, taker: Taker) -> None:
+    envs = gymnasium.vector.SyncVectorEnv([cart_pole] * 2)
+    with RewardClient(served.url("grpc"), model=MODEL) as client, LiveView(taker.url) as view:
+        wrapped = RewardModelVectorWrapper(envs, client, TASK, RewardOptions(live=view))
+        wrapped.reset(seed=0)
+        infos = [wrapped.step(np.array([0, 1]))[-1]["reward_model"] for _ in range(3)]
+        wrapped.close()
+    told = episodes_of(taker)
+    assert [(each["env"], each["ended"]) for each in told] == [(0, True), (1, True)]
+    for env, each in enumerate(told):
+        assert [step["progress"] for step in each["steps"][1:]] == [info["progress"][env] for info in infos]
+
+
+@pytest.mark.triton
+def test_an_episode_is_as_fast_and_the_same_without_the_gateway(
+    served: Served, caplog: pytest.LogCaptureFixture
+) -> None:
+    film = [picture(seed, (480, 640)) for seed in range(20)]
+    with (
+        RewardClient(served.url("grpc"), model=MODEL) as client,
+        LiveView(f"http://127.0.0.1:{free_port()}") as away,
+    ):
+        client.episode("stack the cups").add(film[0])
+        scores = {}
+        for view in (None, away):
+            with client.episode("stack the cups", live=view) as episode:
+                scores[view] = [episode.add(frame) for frame in film]
+        assert [(s.progress, s.success) for s in scores[None]] == [(s.progress, s.success) for s in scores[away]]
+        poll(lambda: "expected a gateway that takes live reports" in caplog.text)
+    medians = [float(np.median([s.ms for s in each])) for each in scores.values()]
+    assert medians[1] < 1.5 * medians[0] + 5
+    assert len([record for record in caplog.records if record.levelno == logging.WARNING]) == 1
+
+
+def test_adding_a_step_takes_next_to_nothing() -> None:
+    with LiveView(f"http://127.0.0.1:{free_port()}") as view:
+        episode, frame = view.episode("stack the cups"), picture(0, (1080, 1920))
+        took_s = []
+        for step in range(2000):
+            began_s = time.perf_counter()
+            episode.add(frame, score(step))
+            took_s.append(time.perf_counter() - began_s)
+        assert float(np.median(took_s)) < 1e-3

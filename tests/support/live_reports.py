@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: MIT
+"""Reports of running episodes as clients write them, and a place that takes reports and keeps them."""
+
+from __future__ import annotations
+
+import base64
+import json
+import ssl
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+import numpy as np
+
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.data.resize import as_jpeg
+
+Json = dict[str, Any]
+
+
+def picture(seed: int = 0, size: tuple[int, int] = (48, 64)) -> UInt8Array:
+    """A frame of one colour, which survives JPEG."""
+    return np.full((*size, 3), np.random.default_rng(seed).integers(0, 256, 3), np.uint8)
+
+
+def identity(number: int) -> str:
+    return f"{number:032x}"
+
+
+def step(number: int, progress: float | None = 0.25, success: float | None = 0.5, **fields: Any) -> Json:
+    return {"step": number, "progress": progress, "success": success, "succeeded": False, "ms": 12.5, **fields}
+
+
+def episode(number: int = 1, *steps: Json, **fields: Any) -> Json:
+    about = {"id": identity(number), "name": "run", "env": 0, "task": "stack the cups", "threshold": 0.5}
+    return {**about, "ended": False, "steps": list(steps), **fields}
+
+
+def report(*episodes: Json, **frames: str) -> Json:
+    return {"episodes": list(episodes), "frames": frames}
+
+
+def jpeg(frame: UInt8Array) -> str:
+    return base64.b64encode(as_jpeg(frame, max(frame.shape))).decode()
+
+
+class Taker:
+    """What has come. status: what is answered"""
+
+    def __init__(self) -> None:
+        self.bodies: list[Json] = []
+        self.headers: list[dict[str, str]] = []
+        self.status = 204
+        self.url = ""
+
+    def steps(self) -> list[Json]:
+        return [each for body in self.bodies for told in body["episodes"] for each in told["steps"]]
+
+
+@contextmanager
+def taking(context: ssl.SSLContext | None = None) -> Iterator[Taker]:
+    """A server that takes every report, or refuses them as the test wants. context: of HTTPS"""
+    taker = Taker()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            body = self.rfile.read(int(self.headers["content-length"]))
+            taker.headers.append({name.lower(): value for name, value in self.headers.items()})
+            if taker.status == 204:
+                taker.bodies.append({**json.loads(body), "path": self.path})
+            self.send_response(taker.status)
+            self.end_headers()
+
+        def log_message(self, *_: Any) -> None:
+            """Says nothing of its requests."""
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        if context is not None:
+            server.socket = context.wrap_socket(server.socket, server_side=True)
+        taker.url = f"{'http' if context is None else 'https'}://127.0.0.1:{server.server_port}"
+        thread = threading.Thread(target=server.serve_forever, args=(0.05,))
+        thread.start()
+        try:
+            yield taker
+        finally:
+            server.shutdown()
+            thread.join()
