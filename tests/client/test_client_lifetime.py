@@ -303,21 +303,15 @@ def test_what_a_checkpoint_does_not_tell_becomes_no_number(name: str) -> None:
         getattr(scores, name)() if name == "succeeded" else getattr(scores, name)
 
 
-def test_the_client_is_light_and_quick_to_import() -> None:
+def test_the_client_imports_no_heavy_package() -> None:
     code = """
-import sys, time
-started = time.perf_counter()
+import sys
 import rfm_client
-seconds = time.perf_counter() - started
 heavy = {"torch", "pandas", "av", "PIL", "gymnasium", "typer", "rich", "matplotlib", "grpc", "gevent", "aiohttp"}
-print(seconds, *sorted(heavy & set(sys.modules)))
+print(*sorted(heavy & set(sys.modules)))
 """
-    outputs = [
-        subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
-        for _ in range(5)
-    ]
-    assert min(float(seconds) for seconds, *_ in outputs) < 0.3
-    assert all(len(output) == 1 for output in outputs), outputs[0]
+    heavy = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
+    assert heavy == []
 
 
 USER_FILE = """
