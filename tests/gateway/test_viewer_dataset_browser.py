@@ -91,6 +91,10 @@ class Stage:
             seconds,
         )
         poll(lambda: self.times_s == pytest.approx([seconds] * 3, abs=0.02))
+        self.browser.until(  # a video that still seeks tells where it is going, and shows where it was
+            "[...document.querySelectorAll('#episode-videos video')]"
+            ".every((video) => !video.seeking && video.readyState >= 2)"
+        )
 
 
 @pytest.fixture(scope="module")
