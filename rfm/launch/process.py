@@ -272,6 +272,7 @@ class TritonServer:
     def stop(self) -> int:
         """Ends the server gracefully, by force after KILL_AFTER_S, and gives its exit status (0 if it never ran)."""
         if self._process is None:
+            self._release()  # of a start that a signal has interrupted
             return 0
         end(self._process)
         return self._wait()
