@@ -31,6 +31,7 @@ from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
 POLL_S = 0.1
 STALLED_S = 30.0  # within which Triton takes up processes that have loaded,
 PATIENT_S = 600.0  # or, where that was too short, has loaded models of other backends
+MAX_REPEATS = 3  # of a start that Triton spoils: a machine that stands still for a second may do so again
 ANSWER_TIMEOUT_S = 10.0  # of one that starts
 NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # a `load` would load all versions anew: their folders have changed
 SECRETS = (VARIABLE, GATEWAY_KEY_VARIABLE)  # variables that neither Triton nor a model process needs
@@ -227,16 +228,21 @@ class TritonServer:
             raise ServerStartError(f"tritonserver: expected a program at {program}, got: {error.strerror}") from error
 
     def start_ready(self, restored: Collection[str] | None = None) -> None:
-        """Starts the process, and returns when every model is ready; a start that Triton has spoilt is repeated once.
+        """Starts the process, and returns when every model is ready. Repeats a start that Triton has spoilt.
         Raises ServerStartError. Arguments as of ``start``.
         """
-        try:
-            self.start(restored)
-            self.wait_ready(STALLED_S)
-        except SpoiltStartError:
-            self.stop()
-            self.start(restored)
-            self.wait_ready(PATIENT_S)
+        stalled_s = STALLED_S
+        for _ in range(MAX_REPEATS):
+            try:
+                self.start(restored)
+                self.wait_ready(stalled_s)
+                return
+            except SpoiltStartError as error:
+                self.stop()
+                if isinstance(error, StalledStartError):
+                    stalled_s = PATIENT_S
+        self.start(restored)
+        self.wait_ready(stalled_s)
 
     def wait_ready(self, stalled_s: float = PATIENT_S) -> None:
         """Returns when every model is ready. Raises ServerStartError with the reason of one that is not.

@@ -13,7 +13,15 @@ from types import FrameType
 from rfm.launch import cleanup
 from rfm.launch.ending import stop_signals_to
 from rfm.launch.installation import ServerStartError
-from rfm.launch.process import PATIENT_S, POLL_S, STALLED_S, SpoiltStartError, StalledStartError, TritonServer
+from rfm.launch.process import (
+    MAX_REPEATS,
+    PATIENT_S,
+    POLL_S,
+    STALLED_S,
+    SpoiltStartError,
+    StalledStartError,
+    TritonServer,
+)
 from rfm.supervise.back_off import BackOff
 from rfm.supervise.gateway_process import GatewayProcess
 from rfm.supervise.served_models import ServedModels
@@ -96,12 +104,14 @@ class Supervisor:
         return status
 
     def _start_first(self) -> None:
-        try:
-            self._start()
-        except SpoiltStartError as error:
-            self._count("triton", str(error))
-            self._server.stop()
-            self._start()
+        for _ in range(MAX_REPEATS):
+            try:
+                self._start()
+                return
+            except SpoiltStartError as error:
+                self._count("triton", str(error))
+                self._server.stop()
+        self._start()
 
     def _start(self) -> None:
         """Starts Triton, and looks after its models from now on. Raises ServerStartError.

@@ -7,6 +7,7 @@ import os
 import signal
 import threading
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ import pytest
 from one_model import BriefServer
 from patients import make_repository
 from rfm.launch import process
-from rfm.launch.installation import ServerStartError, find_installation
+from rfm.launch.installation import Installation, ServerStartError, find_installation
 from rfm.launch.process import Endpoints, SpoiltStartError, StalledStartError, TritonServer
 from rfm.supervise.model_processes import ModelProcess, ProcessWatch
 from rfm_client import RewardClient
@@ -107,6 +108,30 @@ def test_a_start_at_which_triton_ends_is_repeated(tmp_path: Path) -> None:
         check_answers(server)
         (now,) = ProcessWatch(server.pid, PATIENCE_S).of_model(MODEL)
         assert now.pid != stopped[0].pid
+
+
+class Spoilt(TritonServer):
+    """One whose first starts Triton spoils. Triton itself cannot be made to spoil several in a row."""
+
+    def __init__(self, repository: Path, endpoints: Endpoints, installation: Installation, num_spoilt: int) -> None:
+        super().__init__(repository, endpoints, installation)
+        self.num_spoilt = num_spoilt
+        self.num_starts = 0
+
+    def wait_ready(self, stalled_s: float = process.PATIENT_S) -> None:
+        self.num_starts += 1
+        if self.num_starts <= self.num_spoilt:
+            raise SpoiltStartError("tritonserver: expected to run, got exit status -6")
+        super().wait_ready(stalled_s)
+
+
+@pytest.mark.parametrize("num_spoilt", [process.MAX_REPEATS, process.MAX_REPEATS + 1])
+def test_a_start_is_not_repeated_for_ever(tmp_path: Path, num_spoilt: int) -> None:
+    server = Spoilt(make_repository(tmp_path), Endpoints.free(), find_installation(), num_spoilt)
+    is_spoilt = num_spoilt > process.MAX_REPEATS
+    with pytest.raises(SpoiltStartError) if is_spoilt else nullcontext(), server:
+        check_answers(server)
+    assert server.num_starts == process.MAX_REPEATS + 1
 
 
 def test_a_server_that_cannot_start_is_started_once(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ import pytest
 import goldens
 import rfm.journal
 import rfm_export
+from batch_models import CONFIG, WIDTHS
 from engines import load_engine, serve_config
 from rfm.execution import Execution
 from rfm.journal import Journal, journal_file, journal_files
@@ -41,17 +42,6 @@ from trajectories import random_trajectory
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
 PLAIN = goldens.config("c1_t1_disc10")
-WIDTHS = (4, 3)
-CONFIG = {  # as Triton tells it to a model
-    "input": [
-        {"name": "sample_type", "dims": [1]},
-        {"name": "num_frames", "dims": [2]},
-        {"name": "frame_steps", "dims": [1]},
-        {"name": "video_embeddings", "dims": [-1, WIDTHS[0]]},
-        {"name": "text_embedding", "dims": [WIDTHS[1]]},
-    ],
-    "max_batch_size": 4,
-}
 HANG_S = 2
 DENSE_FRAMES = 8
 # Each forward pass takes a quarter of HANG_S, and all of them twice as long as HANG_S.
@@ -234,7 +224,7 @@ class Model(BatchModel[Sample, Result]):
         self._quarantine = deadly
         self._metrics = SimpleNamespace(at_work_on=lambda batch: nullcontext(), add=self.counted.append)  # type: ignore[assignment]
         self._log = SimpleNamespace(report=lambda request: None, report_end=lambda error: None)  # type: ignore[assignment]
-        self.start(CONFIG, {}, num_preparing=num_preparing)
+        self.start({**CONFIG, "max_batch_size": 4}, {}, num_preparing=num_preparing)
 
     def decode(self, tensors: wire.Tensors) -> list[Sample]:
         return wire.decode_samples(tensors)
