@@ -62,6 +62,13 @@ def _served_lives(request: pytest.FixtureRequest) -> None:
         request.getfixturevalue("served").revive()
 
 
+@pytest.fixture(autouse=True)
+def _priority_stays() -> Iterator[None]:
+    """A test that left this process a real-time priority would keep all later servers from the processors."""
+    yield
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
+
+
 @pytest.fixture(params=["grpc", "http"])
 def protocol(request: pytest.FixtureRequest) -> str:
     return str(request.param)

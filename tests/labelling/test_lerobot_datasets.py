@@ -18,9 +18,9 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-import av1_video
 import goldens
 import local_hub
+from encoding import encode
 from labelling import LEROBOT
 from rfm_client.labelling import DatasetError, iter_episodes, open_dataset
 
@@ -111,9 +111,7 @@ def test_av1_and_images_in_tables_are_read(tmp_path: Path) -> None:
     root = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "mixed")
     film = root / "videos" / "chunk-000" / FRONT / "episode_000000.mp4"
     frames = whole_film(film)
-    np.save(tmp_path / "frames.npy", frames)
-    subprocess.run([sys.executable, av1_video.__file__, film, tmp_path / "frames.npy"], check=True)
-    assert os.sched_getscheduler(0) == os.SCHED_OTHER
+    encode(film, frames, "libsvtav1", {"crf": "20", "g": "2", "svtav1-params": "lp=1"})
     stored = store_as_images(root, WRIST)
     dataset = open_dataset(root)
     assert list(dataset.cameras) == [FRONT, WRIST]

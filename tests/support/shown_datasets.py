@@ -11,6 +11,7 @@ import av
 import numpy as np
 from pyarrow import parquet
 
+from encoding import encode
 from labelling import LEROBOT, BrightnessScorer
 from rfm_client.data.datasets.lerobot import LeRobotDataset
 from rfm_client.labelling import LabelOptions, label, open_dataset
@@ -55,9 +56,4 @@ def encoded_anew(root: Path, codec: str, options: dict[str, str], noise: np.rand
             frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
         if noise is not None:
             frames = [noise.integers(0, 256, frame.shape, np.uint8) for frame in frames]
-        with av.open(str(file), "w") as container:
-            stream: Any = container.add_stream(codec, rate=10, options=options)
-            stream.height, stream.width, stream.pix_fmt = *frames[0].shape[:2], "yuv420p"
-            for frame in frames:
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-            container.mux(stream.encode())
+        encode(file, frames, codec, options)

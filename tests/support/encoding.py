@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: MIT
+"""Writes videos: ``python encoding.py FILE FRAMES.npy CODEC OPTIONS.json``, frames uint8 [T, H, W, 3] at 10 a second.
+
+A program of its own, since the encoder SVT-AV1, where root runs it, gives the thread that calls it a real-time priority
+for good: whatever that thread did or started later would keep all else from the processors.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+
+FPS = 10
+
+
+def encode(file: Path, frames: Sequence[np.ndarray[Any, Any]], codec: str, options: Mapping[str, str]) -> None:
+    """Writes a video of frames uint8 [H, W, 3] with this program."""
+    with tempfile.TemporaryDirectory() as folder:
+        array = Path(folder, "frames.npy")
+        np.save(array, np.stack(frames))
+        subprocess.run([sys.executable, __file__, file, array, codec, json.dumps(options)], check=True)
+
+
+def main(file: str, array: str, codec: str, options: str) -> None:
+    frames = np.load(array)
+    with av.open(file, "w") as container:
+        stream: Any = container.add_stream(codec, rate=FPS, options=json.loads(options))
+        stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], "yuv420p"
+        for image in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
