@@ -55,9 +55,8 @@ def rewards(
             films.append(render(episode))
             successes.append(episode.success(TASK)[-1])
     steps = np.stack(films, axis=1)  # [T, N, H, W, 3]
-    episodes = client.episodes(len(films), TASK.sentence(), frames=FRAMES, live=live)
-    progress = np.mean([episodes.add(frames).progress for frames in steps], axis=0)
-    episodes.reset()
+    with client.episodes(len(films), TASK.sentence(), frames=FRAMES, live=live) as episodes:
+        progress = np.mean([episodes.add(frames).progress for frames in steps], axis=0)
     shape = len(seeds), len(policies)
     return progress.reshape(shape).mean(axis=0), np.reshape(successes, shape).mean(axis=0)
 

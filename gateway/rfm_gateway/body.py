@@ -37,7 +37,7 @@ READ_JSON_GROWTH = 5  # times as large as its text is JSON usually when it is re
 CHARSETS = ("utf-8", "utf8", "us-ascii", "ascii", "iso-8859-1", "iso8859-1", "latin-1", "latin1")
 
 _NUMBER_BYTES, _LIST_BYTES, _TEXT_BYTES, _OBJECT_BYTES = 48, 88, 96, 208  # what Python takes for one, at the most
-_ERROR_BYTES = 2048  # of a field, as the error shows it
+ERROR_BYTES = 2048  # of a field, as the error shows it
 _PART_BYTES, _HEADER_BYTES = 2560, 384  # what a part of a multipart body takes besides its content, and a header of it
 
 _ANY_SAMPLE_FIELD = re.compile(r"sample_[0-9]+")
@@ -313,7 +313,7 @@ def _checked(
     try:
         return schema.SAMPLES.validate_python(samples, context=arrays)
     except ValidationError as error:
-        share.take(error.error_count() * _ERROR_BYTES)
+        share.take(error.error_count() * ERROR_BYTES)
         raise RequestValidationError(
             [_field_error(each) for each in error.errors(include_url=False, include_context=False)]
         ) from None

@@ -247,7 +247,8 @@ class TritonServer:
     def wait_ready(self, stalled_s: float = PATIENT_S) -> None:
         """Returns when every model is ready. Raises ServerStartError with the reason of one that is not.
 
-        stalled_s: Triton has spoilt its start if all model processes have loaded, and wait for so long
+        stalled_s: Triton has spoilt its start if all model processes have loaded, and wait for so long. After PATIENT_S
+            that is no StalledStartError any more: another start would end the same
         """
         assert self._process is not None  # started
         assert self._claim is not None
@@ -263,7 +264,8 @@ class TritonServer:
                     last_work_s = time.monotonic()
                 elif time.monotonic() - last_work_s > stalled_s:
                     self.kill()
-                    raise StalledStartError("tritonserver: expected to be ready, got processes that wait") from None
+                    why = "tritonserver: expected to be ready, got processes that wait"
+                    raise (StalledStartError(why) if stalled_s < PATIENT_S else ServerStartError(why)) from None
                 time.sleep(POLL_S)
                 continue
             failed = [entry for entry in versions_of(index) if not entry.is_ready and entry.name in self._loading]

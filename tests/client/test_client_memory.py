@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from tritonclient.utils import InferenceServerException
 
+from commands import in_shared_memory
 from rfm_client.transport.off_loop import MIN_BYTES
 from rfm_client.transport.shared_memory import FOLDER, MIN_REGION_BYTES, MIN_SHARED_BYTES, Region, SharedMemory
 
@@ -69,9 +70,9 @@ def run(test: Callable[[Server, SharedMemory], Coroutine[Any, Any, None]]) -> No
             await memory.close()
         assert server.mapped == []
 
-    before = set(FOLDER.glob("rfm-client-*"))
+    before = in_shared_memory()
     asyncio.run(asyncio.wait_for(within(), WITHIN_S))
-    assert set(FOLDER.glob("rfm-client-*")) <= before
+    assert {name for name in in_shared_memory() - before if name.startswith("rfm-client-")} == set()
 
 
 async def lend(memory: SharedMemory, array: np.ndarray[Any, Any] = SMALL) -> str:

@@ -258,6 +258,16 @@ def test_a_page_that_is_loaded_later_shows_the_same(page: Stage) -> None:
         assert first["times"] == list(range(300, 1300))
 
 
+@pytest.mark.parametrize("first", [1, 5, 10**9])
+def test_an_episode_that_is_first_heard_of_late_is_shown(page: Stage, first: int) -> None:
+    """Its one point leaves the axis of the chart no length of its own."""
+    with LiveView(page.gateway.url, name=f"late {first}") as view:
+        view.episode("wait").add(film()[0], StepScore(0.5, 0.25, False, first, 3.0))
+        page.shows(f"late {first}", {"Step": f"{first}", "state": "running"})
+        assert page.drawn(f"late {first}, environment 0")["times"] == [first]
+    page.shows(f"late {first}", {"Step": f"{first}", "state": "ended"})
+
+
 def test_text_of_others_is_text(page: Stage) -> None:
     with LiveView(page.gateway.url, name=ATTACK) as view:
         view.episode(ATTACK).add(film()[0], StepScore(0.5, 0.25, False, 0, 3.0))

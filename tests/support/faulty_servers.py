@@ -6,12 +6,12 @@ from __future__ import annotations
 import numpy as np
 import tritonclient.grpc
 
-from commands import client_regions_of_others
+from commands import in_shared_memory
 from rfm.launch.process import Endpoints
 from rfm_client import (
     Trajectory,
 )
-from rfm_client.transport.shared_memory import FOLDER, MIN_SHARED_BYTES
+from rfm_client.transport.shared_memory import MIN_SHARED_BYTES
 
 
 def url_of(endpoints: Endpoints, protocol: str) -> str:
@@ -41,4 +41,4 @@ def regions(endpoints: Endpoints) -> set[str]:
 
 
 def ours_in_dev_shm() -> set[str]:
-    return {file.name for file in FOLDER.iterdir() if "rfm-client-" in file.name} - client_regions_of_others()
+    return {name for name in in_shared_memory() if "rfm-client-" in name}

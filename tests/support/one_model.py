@@ -39,6 +39,13 @@ class OneModelServer(BriefServer):
         super().kill()
         self.stop()
 
+    def __enter__(self) -> TritonServer:
+        try:
+            return super().__enter__()
+        except BaseException:
+            self._own_log.close()
+            raise
+
     def __exit__(self, *raised: Any) -> None:
         super().__exit__(*raised)
         self._own_log.close()  # not in `stop`: a start that Triton has spoilt is stopped and repeated

@@ -19,7 +19,7 @@ def load_pillow() -> Any:
     try:
         from PIL import Image
     except ImportError as error:
-        raise ImportError('resizing frames needs Pillow: pip install "./client[resize]"') from error
+        raise ImportError('making frames smaller needs Pillow: pip install "./client[resize]"') from error
     return Image
 
 

@@ -46,7 +46,8 @@ class Windows(Protocol):
 
 
 class AsyncEpisodes:
-    """N episodes that grow side by side, as those of vectorised environments; as few requests a step as fit.
+    """N episodes that grow side by side, as those of vectorised environments; as few requests a step as fit. An async
+    context manager that closes it.
 
     All frames of the running episodes are kept, as later ones are shown with them.
 
@@ -111,9 +112,21 @@ class AsyncEpisodes:
         async with self._adding:
             self._begin(mask, task)
 
-    def end_live(self, indices: Iterable[int] | None = None) -> None:
-        """Tells who watches that these episodes, or all, are over."""
-        for index in list(self._live) if indices is None else indices:
+    async def close(self) -> None:
+        """Returns when no step is open. Who watches is told that the episodes have ended."""
+        async with self._adding:
+            self._end_live(range(len(self)))
+
+    async def __aenter__(self) -> AsyncEpisodes:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    def _end_live(self, indices: Iterable[int]) -> None:
+        for index in indices:
             if index in self._live:
                 self._live.pop(index).end()
 
@@ -132,7 +145,7 @@ class AsyncEpisodes:
         tasks = [task] * len(indices) if task is None or isinstance(task, str) else list(task)
         if len(tasks) != len(indices):
             raise ValueError(f"task: expected one for each of {len(indices)} episodes, got {len(tasks)}")
-        self.end_live(indices)
+        self._end_live(indices)
         for index, new in zip(indices, tasks, strict=True):
             self._frames[index] = self._none()
             if new is not None:
@@ -268,7 +281,7 @@ class AsyncEpisode:
     async def close(self) -> None:
         """Returns when no question is open; a frame that waits is dropped. Who watches is told that it has ended."""
         await self._settle()
-        self._episodes.end_live()
+        await self._episodes.close()
 
     async def _settle(self) -> None:
         self._drop_waiting()

@@ -29,7 +29,10 @@ class Loop(Protocol):
 
 
 class Episodes:
-    """AsyncEpisodes without ``await``. Built by ``RewardClient.episodes``, whose client lives as long as this."""
+    """AsyncEpisodes without ``await``. Built by ``RewardClient.episodes``, whose client lives as long as this.
+
+    A context manager that closes it.
+    """
 
     def __init__(self, episodes: AsyncEpisodes, loop: Loop, client: object) -> None:
         self._episodes, self._loop, self._client = episodes, loop, client
@@ -50,6 +53,18 @@ class Episodes:
     def reset(self, mask: npt.ArrayLike | None = None, task: str | Sequence[str] | None = None) -> None:
         """Begins new episodes: those in ``mask``, bool [N], or all. ``task``: of all of these, or of each."""
         self._loop.wait(self._episodes.reset(mask, task))
+
+    def close(self) -> None:
+        """Returns when no step is open. Who watches is told that the episodes have ended."""
+        self._loop.wait(self._episodes.close())
+
+    def __enter__(self) -> Episodes:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
 
 
 class Episode:
@@ -86,7 +101,7 @@ class Episode:
         self._loop.wait(self._episode.reset(task))
 
     def close(self) -> None:
-        """Returns when no question is open; a frame that waits is dropped."""
+        """Returns when no question is open; a frame that waits is dropped. Who watches is told that it has ended."""
         self._loop.wait(self._episode.close())
 
     def __enter__(self) -> Episode:

@@ -7,6 +7,7 @@ Whoever adds a step never waits for that: a thread reports, a few times a second
 from __future__ import annotations
 
 import math
+import operator
 import uuid
 import weakref
 from types import TracebackType
@@ -21,7 +22,7 @@ from rfm_client.transport.access import Access, AccessOptions
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-CLOSE_WITHIN_S = 2.0
+MOST_LETTERS = 2000  # that a gateway takes
 
 
 class LiveEpisode:
@@ -31,20 +32,27 @@ class LiveEpisode:
         self._view = view
         self._about = {
             "id": uuid.uuid4().hex,
-            "name": view.name,
-            "env": env,
-            "task": task,
-            "threshold": threshold,
+            "name": _shown(view.name),
+            "env": operator.index(env),
+            "task": _shown(task),
+            "threshold": _or_none(threshold),
         }
+        self._has_ended = False
 
     def add(self, frame: UInt8Array, score: StepScore) -> None:
-        """Has a step reported. Returns at once, and raises nothing. frame: uint8 [H, W, 3], not written to any more"""
+        """Has a step reported, unless the episode has ended. Returns at once, and raises nothing.
+
+        frame: uint8 [H, W, 3], not written to any more
+        """
+        if self._has_ended:
+            return
         scores = {"progress": _or_none(score.progress), "success": _or_none(score.success)}
         step = {"step": score.step, **scores, "succeeded": score.succeeded, "ms": score.ms}
         self._view._reporter.add(self._about, step, frame)
 
     def end(self) -> None:
         """Has it reported that no step will follow. Returns at once, and raises nothing."""
+        self._has_ended = True
         self._view._reporter.end(self._about)
 
 
@@ -59,7 +67,8 @@ class LiveView:
     name: what the page calls the run
     access: as of AccessOptions; ``api_key`` is the gateway's key
 
-    A context manager that closes it. It may be pickled: each process then reports by itself.
+    A context manager that closes it. It may be pickled: each process then reports by itself. A process that was forked
+    reports nothing, and logs a warning.
     Raises ValueError for what cannot be used, ImportError without Pillow (``rfm-client[resize]``).
     """
 
@@ -68,12 +77,12 @@ class LiveView:
         self.name = name
         self._url, self._options = url, access
         self._reporter = Reporter(Address.of(url, Access.of(access)))
-        weakref.finalize(self, self._reporter.stop).atexit = False  # a thread would else wait for ever
+        weakref.finalize(self, self._reporter.stop).atexit = False  # the reporter closes itself then
 
     def episode(self, task: str, env: int = 0, threshold: float = 0.5) -> LiveEpisode:
         """An episode that appears with its first step.
 
-        env: number of its environment; threshold: at which success counts
+        env: number of its environment; threshold: at which success counts; inf: never
         """
         return LiveEpisode(self, task, env, threshold)
 
@@ -81,7 +90,7 @@ class LiveView:
         """Ends the episodes, and returns when the last report has gone out, or after two seconds. What comes later is
         not reported.
         """
-        self._reporter.close(CLOSE_WITHIN_S)
+        self._reporter.close()
 
     def __enter__(self) -> LiveView:
         return self
@@ -100,5 +109,10 @@ def _rebuilt(url: str, name: str, access: AccessOptions) -> LiveView:
 
 
 def _or_none(score: float) -> float | None:
-    """A score as JSON has it: null for one that the checkpoint does not predict."""
-    return score if math.isfinite(score) else None
+    """A score or threshold as JSON has it: null for one that there is not."""
+    return float(score) if math.isfinite(score) else None
+
+
+def _shown(text: str) -> str:
+    """A text as a gateway takes it."""
+    return text[:MOST_LETTERS].encode(errors="replace").decode()

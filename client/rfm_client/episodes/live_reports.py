@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: MIT
 """What is reported of episodes that are watched, and the thread that reports it.
 
-A report holds every step since the last one that arrived, and the newest frames of the episodes that have waited
-longest for one. So what a report costs does not grow with the number of environments.
+A report holds the steps that have come, 2000 at most, and the newest frame of each of the 16 episodes whose picture is
+oldest. So what a report costs has a bound, however many environments there are.
 """
 
 from __future__ import annotations
 
+import atexit
 import base64
 import json
 import logging
+import os
 import ssl
 import threading
+import weakref
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,6 +30,7 @@ PATH = "/live/reports"
 REPORT_EVERY_S = 0.25
 TRY_AGAIN_AFTER_S = 5.0
 ANSWER_WITHIN_S = 5.0
+CLOSE_WITHIN_S = 2.0
 MOST_STEPS_KEPT = 10_000  # of all episodes together; the newest
 MOST_STEPS = 2_000  # of one report
 MOST_FRAMES = 16  # of one report
@@ -64,6 +68,10 @@ class Address:
             or parts.fragment
         ):
             raise ValueError(f"url: expected http://host:port or https://host:port of a gateway, got {url!r}")
+        try:
+            parts.hostname.encode("idna")
+        except UnicodeError:
+            raise ValueError(f"url: expected the name of a host, got {parts.hostname!r}") from None
         if parts.scheme == "http" and access.uses_tls:
             raise ValueError(f"url: expected https://host:port with certificates, got {url!r}")
         context = access.ssl_context if parts.scheme == "https" else None
@@ -96,12 +104,14 @@ class Reporter:
         self._lock = threading.Lock()
         self._has_more, self._stopping = threading.Event(), threading.Event()
         self._is_away = False
+        self._process_id = os.getpid()
         self._thread = threading.Thread(target=self._run, name="rfm-live-view", daemon=True)
         self._thread.start()
+        _open.add(self)
 
     def add(self, about: About, step: Mapping[str, Any], frame: UInt8Array) -> None:
         """Has a step reported, and ``frame`` unless a newer one comes before."""
-        if self._stopping.is_set():
+        if self._stopping.is_set() or self._was_forked():
             return
         with self._lock:
             self._steps.append((about, step))
@@ -112,6 +122,8 @@ class Reporter:
 
     def end(self, about: About) -> None:
         """Has it reported that an episode has ended, if it runs."""
+        if self._was_forked():
+            return
         with self._lock:
             if self._running.pop(about["id"], None) is not None:
                 self._steps.append((about, None))
@@ -119,14 +131,16 @@ class Reporter:
                 self._frames.pop(about["id"], None)
         self._has_more.set()
 
-    def close(self, timeout_s: float) -> None:
-        """Ends all episodes, and the thread, within so many seconds if that can be reported."""
+    def close(self) -> None:
+        """Ends all episodes, and the thread. Returns when that has been reported, or after CLOSE_WITHIN_S."""
+        if self._was_forked():
+            return
         with self._lock:
             running = list(self._running.values())
         for about in running:
             self.end(about)
         self.stop()
-        self._thread.join(timeout_s)
+        self._thread.join(CLOSE_WITHIN_S)
 
     def stop(self) -> None:
         """Ends the thread as soon as what is left has been reported, or cannot be."""
@@ -149,7 +163,7 @@ class Reporter:
             continue
 
     def _report(self) -> bool:
-        """Reports what there is, and says whether it has arrived. What has not is kept."""
+        """Reports what there is, and says whether it has arrived. What has not is kept, unless it cannot arrive."""
         with self._lock:
             steps = [self._steps.popleft() for _ in range(min(len(self._steps), MOST_STEPS))]
             frames = {key: self._frames.pop(key) for key in list(self._frames)[:MOST_FRAMES]}
@@ -159,6 +173,9 @@ class Reporter:
             status, text = self._address.post(_body(steps, frames))
         except (OSError, HTTPException) as error:
             status, text = None, str(error) or type(error).__name__
+        except Exception:  # which must not keep later steps from being reported
+            logger.exception("%s: a live report has failed, and is dropped", self._address.url)
+            return False
         if status is not None and status < 300:
             self._is_away = False
             return True
@@ -166,6 +183,15 @@ class Reporter:
         if status is None or status >= 500:  # others would be refused again
             self._put_back(steps, frames)
         return False
+
+    def _was_forked(self) -> bool:
+        """Whether this process has no thread that reports, since it was forked. It is told once."""
+        if self._process_id == os.getpid() or self._stopping.is_set():
+            return self._process_id != os.getpid()
+        self._stopping.set()
+        told = "%s: this LiveView was made in process %d, which forked this one: make one in each process"
+        logger.warning(told, self._address.url, self._process_id)
+        return True
 
     def _warn(self, reason: str) -> None:
         """Logs why reports do not arrive, once until they do."""
@@ -178,6 +204,16 @@ class Reporter:
         with self._lock:
             self._steps = deque([*steps, *self._steps], MOST_STEPS_KEPT)
             self._frames = {key: frame for key, frame in frames.items() if key in self._running} | self._frames
+
+
+_open: weakref.WeakSet[Reporter] = weakref.WeakSet()
+
+
+@atexit.register
+def _close_all() -> None:
+    """Has the last steps reported before the process ends, and the threads with it."""
+    for reporter in list(_open):
+        reporter.close()
 
 
 def _bound(kept: dict[str, Any], most: int) -> None:

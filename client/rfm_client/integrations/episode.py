@@ -21,9 +21,9 @@ from rfm_client.data.prefixes import of_frames
 from rfm_client.data.resize import resize_frames
 from rfm_client.data.sampling import Prefix, Rule, Sampling
 from rfm_client.episodes.frames import checked_frame
-from rfm_client.episodes.live import LiveEpisode, LiveView
+from rfm_client.episodes.live import LiveView
 from rfm_client.episodes.options import SuccessRule
-from rfm_client.episodes.scores import StepScore
+from rfm_client.integrations.watching import Watching
 from rfm_client.windows import NamedFrame, Window
 
 Info: TypeAlias = dict[str, Any]
@@ -127,7 +127,7 @@ class Scorer:
 
         episodes: with whether their newest frame is their last
         """
-        awaited = []
+        awaited, ended = [], []
         for episode, ends in episodes.items():
             episode.collect()
             ends = ends or episode.succeeded
@@ -135,12 +135,15 @@ class Scorer:
             waits = self._options.blocking or not episode.is_known or (ends and self._options.await_last)
             if ends:
                 episode.cancel()
+                ended.append(episode)
             if due and waits:
                 awaited.append(episode)
             elif due and not ends:
                 self._submit(episode)
         if awaited:
             self._await(awaited)
+        for episode in ended:
+            episode.end()
 
     def close(self) -> None:
         """Closes the client if it was made here."""
@@ -197,7 +200,7 @@ class Episode:
         self._options = options
         self._task = task
         self._where = "" if env is None else f"envs[{env}]"
-        self._live = _watched(options, task, env or 0)
+        self._watching = Watching(options.live, task, options.terminate_on_success, env or 0)
         self._frames: list[tuple[NamedFrame, ...]] = []  # of each camera
         self._sizes: list[tuple[int, ...]] | None = None  # of the cameras' frames as they came
         self._fit: Fit | None = None
@@ -259,12 +262,15 @@ class Episode:
             self.learn(step, self.fused([answer.result() for answer in answers]), prefix, asked_s)
 
     def cancel(self) -> None:
-        """Cancels the requests that have no answer yet: the episode is over."""
+        """Cancels the requests that have no answer yet."""
         for answer in (answer for _, answers, _ in self._pending.values() for answer in answers):
             answer.cancel()
         self._pending.clear()
-        if self._live is not None:
-            self._live.end()
+
+    def end(self) -> None:
+        """Cancels the requests that have no answer yet, and tells who watches that the episode is over."""
+        self.cancel()
+        self._watching.end()
 
     def fused(self, results: Sequence[ProgressResult]) -> ProgressResult:
         """One result of those of all cameras."""
@@ -298,14 +304,9 @@ class Episode:
         self._known_step = step
         self._progress, self._success = progress, float(frames.success[-1])
         rule = self._options.terminate_on_success
-        if self._live is not None:
-            shown = rule or SuccessRule()
-            has_succeeded = frames.succeeded(last=shown.last, threshold=shown.threshold)
-            ms = (time.perf_counter() - asked_s) * 1e3
-            score = StepScore(self._progress, self._success, has_succeeded, step, ms)
-            self._live.add(self._frames[step][0].pixels, score)
         if rule is not None and step > 0:
             self.succeeded |= frames.succeeded(last=rule.last, threshold=rule.threshold)
+        self._watching.add(step, self._frames[step][0].pixels, frames, asked_s)
 
     def reward(self, env_reward: float) -> float:
         """The reward of the step."""
@@ -327,8 +328,3 @@ class Episode:
 
     def _located(self, error: RewardError) -> RewardError:
         return error.inside(self._where) if self._where and isinstance(error, InvalidSampleError) else error
-
-
-def _watched(options: RewardOptions, task: str, env: int) -> LiveEpisode | None:
-    rule = options.terminate_on_success or SuccessRule()
-    return None if options.live is None else options.live.episode(task, env, rule.threshold)

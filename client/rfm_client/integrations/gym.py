@@ -76,7 +76,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
         """Resets the environment and scores its first frame. Open requests are cancelled. Raises RewardError."""
         observation, info = self.env.reset(seed=seed, options=options)
         if self._episode is not None:
-            self._episode.cancel()
+            self._episode.end()
         task = self._task if isinstance(self._task, str) else self._task(info)
         self._episode = Episode(self._options, task)
         self._episode.add(self._frame(observation), self._scorer.fit)
@@ -97,7 +97,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
     def close(self) -> None:
         """Cancels what is open, and closes the environment, and the client if it was made here."""
         if self._episode is not None:
-            self._episode.cancel()
+            self._episode.end()
         self._scorer.close()
         super().close()
 
@@ -149,7 +149,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         self._ended = self._ended & ~reset_mask
         indices = np.flatnonzero(reset_mask).tolist()
         for episode in [self._episodes[index] for index in indices if index in self._episodes]:
-            episode.cancel()
+            episode.end()
         fresh = {index: self._begin(index, frames[index]) for index in indices}
         self._scorer.score(dict.fromkeys(fresh.values(), False))
         return observations, self._with_scores(infos, fresh)
@@ -163,6 +163,8 @@ class RewardModelVectorWrapper(VectorWrapper):
         ended = terminations | truncations
         final = self._final_frames(infos, ended) if self._autoreset_mode is AutoresetMode.SAME_STEP else {}
         reset_alone = self._ended if self._autoreset_mode is AutoresetMode.NEXT_STEP else np.zeros_like(ended)
+        for index in np.flatnonzero(reset_alone).tolist():
+            self._episodes[index].end()  # in case the step that ended it has failed
         stepped = {index: self._episodes[index] for index in np.flatnonzero(~reset_alone).tolist()}
         for index, episode in stepped.items():
             episode.add(final.get(index, frames[index]), self._scorer.fit)
@@ -182,7 +184,7 @@ class RewardModelVectorWrapper(VectorWrapper):
     def close(self, **kwargs: Any) -> None:
         """Cancels what is open, and closes the environments, and the client if it was made here."""
         for episode in self._episodes.values():
-            episode.cancel()
+            episode.end()
         self._scorer.close()
         super().close(**kwargs)
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The episodes that clients report while they run, as the page shows them. They are in memory alone, and few.
 
-What the page has seen is told by a cursor, so that it is told what is new. No route is known here.
+Each answer has a cursor. Asked with it, the next answer has only what is new. No route is known here.
 """
 
 from __future__ import annotations
@@ -10,13 +10,14 @@ import itertools
 import secrets
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
-MOST_EPISODES = 128  # the one that has been silent for longest goes
+MOST_EPISODES = 128  # first those go that have ended, then those that have been silent for longest
 MOST_POINTS = 1000  # of one curve: the newest
 FORGOTTEN_AFTER_S = 300.0  # of silence
+_MOST_DIGITS = 15  # of a cursor's number
 _COLUMNS = {"steps": "step", "progress": "progress", "success": "success"}  # of a curve, and what a point calls them
 
 Point: TypeAlias = Mapping[str, Any]  # step, progress, success, succeeded, ms; as it was reported
@@ -32,7 +33,7 @@ class News:
     id: str
     about: Mapping[str, Any]
     has_ended: bool
-    points: Iterable[Point]
+    points: Sequence[Point]
 
 
 @dataclass
@@ -93,12 +94,14 @@ class LiveEpisodes:
         self._life = secrets.token_hex(8)  # a cursor of an earlier gateway is none of this one
 
     def take(self, news: Iterable[News], frames: Mapping[str, bytes]) -> None:
-        """Takes a report over. A frame of an episode that is not known is left out.
+        """Takes a report over. Of an episode that is not known, an end or a frame alone is left out.
 
         frames: JPEG files by the episode's id
         """
         self._changed += 1
         for each in news:
+            if not each.points and each.id not in self._episodes:
+                continue
             episode = self._episodes.pop(each.id, None) or _Episode(each.about, self._clock_s())
             episode.take(each, self._changed)
             episode.heard_s = self._clock_s()
@@ -116,7 +119,8 @@ class LiveEpisodes:
         """
         self._forget()
         life, _, number = cursor.partition(".")
-        known = int(number) if life == self._life and number.isascii() and number.isdecimal() else 0
+        is_number = number.isascii() and number.isdecimal() and len(number) <= _MOST_DIGITS
+        known = int(number) if life == self._life and is_number else 0
         return {
             "cursor": f"{self._life}.{self._changed}",
             "is_whole": known == 0,
@@ -127,14 +131,16 @@ class LiveEpisodes:
             ],
         }
 
-    def frame(self, key: str) -> tuple[bytes, int] | None:
-        """The newest frame of an episode, a JPEG file, and its number; None: there is none."""
+    def frame(self, key: str) -> bytes | None:
+        """The newest frame of an episode, a JPEG file; None: there is none."""
         episode = self._episodes.get(key)
-        return None if episode is None or episode.frame is None else (episode.frame, episode.frame_changed)
+        return None if episode is None else episode.frame
 
     def _forget(self) -> None:
         oldest_s = self._clock_s() - FORGOTTEN_AFTER_S
-        for key in list(self._episodes):
-            if self._episodes[key].heard_s >= oldest_s and len(self._episodes) <= MOST_EPISODES:
-                break
+        silent = [key for key, episode in self._episodes.items() if episode.heard_s < oldest_s]
+        for key in silent:
+            del self._episodes[key]
+        ended_first = sorted(self._episodes, key=lambda key: not self._episodes[key].has_ended)
+        for key in ended_first[: max(0, len(ended_first) - MOST_EPISODES)]:
             del self._episodes[key]

@@ -12,18 +12,20 @@ from typing import Annotated, Any
 
 from fastapi.exceptions import RequestValidationError
 from PIL import Image, UnidentifiedImageError
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, FailFast, Field, StringConstraints, ValidationError
 
+from rfm_gateway.body import ERROR_BYTES
+from rfm_gateway.memory import Share
 from rfm_gateway.viewer.live import News
 
 MOST_BODY_BYTES = 4 * 2**20
 MOST_FRAME_BYTES = 128 * 2**10
 MOST_FRAME_PX = 1024  # on each side
 _MOST_FRAMES = 64
-_MOST_STEPS = 2000  # of one episode in one report
+_MOST_STEPS = 2000  # of one report of our client; so each of its episodes has so many at most, too
 _MOST_LETTERS = 2000
 _MOST_ERRORS = 20  # that one answer tells
-_MOST_NUMBER = 2**53  # which JavaScript still knows exactly
+_MOST_NUMBER = 10**9  # a chart's axis goes further than to whole numbers
 _PREFIXES = ("should be ", "should have ", "should match ")  # of what pydantic expects
 _KINDS = {"missing": "a value", "extra_forbidden": "no such field"}
 
@@ -71,9 +73,9 @@ class _Episode(_Strict):
     name: _Text
     env: _Count
     task: _Text
-    threshold: float
+    threshold: float | None
     ended: bool
-    steps: Annotated[list[_Step], Field(max_length=_MOST_STEPS)]
+    steps: Annotated[list[_Step], FailFast(), Field(max_length=_MOST_STEPS)]
 
     @property
     def news(self) -> News:
@@ -82,15 +84,19 @@ class _Episode(_Strict):
 
 
 class _Report(_Strict):
-    episodes: list[_Episode]
+    episodes: Annotated[list[_Episode], FailFast(), Field(max_length=_MOST_STEPS)]
     frames: Annotated[dict[_Id, Annotated[bytes, BeforeValidator(_jpeg)]], Field(max_length=_MOST_FRAMES)]
 
 
-def read_report(body: bytes) -> tuple[list[News], Mapping[str, bytes]]:
-    """What a report says, and the frames in it. Raises RequestValidationError for a field that is not allowed."""
+def read_report(body: bytes, share: Share) -> tuple[list[News], Mapping[str, bytes]]:
+    """What a report says, and the frames in it. Raises RequestValidationError for a field that is not allowed.
+
+    share: takes what errors hold
+    """
     try:
         report = _Report.model_validate_json(body)
     except ValidationError as error:
+        share.take(error.error_count() * ERROR_BYTES)
         found = error.errors(include_url=False, include_context=False)
         raise RequestValidationError([_field_error(each) for each in found[:_MOST_ERRORS]]) from None
     return [episode.news for episode in report.episodes], report.frames

@@ -36,7 +36,7 @@ def live_routes(limits: BodyLimits, timeout_s: float) -> APIRouter:
             with anyio.fail_after(timeout_s):
                 body = await admitted.request.body()
             admitted.share.take(parsed_bytes(body))
-            episodes.take(*await off_loop(len(body), read_report, body))
+            episodes.take(*await off_loop(len(body), read_report, body, admitted.share))
 
     @router.get("/viewer/live")
     async def news(after: str = "") -> Response:
@@ -44,14 +44,10 @@ def live_routes(limits: BodyLimits, timeout_s: float) -> APIRouter:
         return Response(text, media_type="application/json", headers=_HEADERS)
 
     @router.get("/viewer/live/{episode}/frame")
-    async def frame(request: Request, episode: str) -> Response:
+    async def frame(episode: str) -> Response:
         found = episodes.frame(episode)
         if found is None:
             raise HTTPException(404, "episode: expected one that runs and has a frame, got another")
-        content, number = found
-        headers = {**_HEADERS, "ETag": f'"{number}"'}
-        if request.headers.get("if-none-match") == headers["ETag"]:
-            return Response(status_code=304, headers=headers)
-        return Response(content, media_type="image/jpeg", headers=headers)
+        return Response(found, media_type="image/jpeg", headers=_HEADERS)
 
     return router

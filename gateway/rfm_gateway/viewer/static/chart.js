@@ -61,7 +61,8 @@ export class Chart {
   show(curves) {
     const drawn = curves.filter(({ times }) => times.length);
     this.#begin = Math.min(...drawn.map(({ begin }) => begin ?? 0), Infinity);
-    this.#end = Math.max(0, ...drawn.map(({ allTimes }) => allTimes.at(-1))) || 1; // so that the axis does not grow
+    this.#end = Math.max(0, ...drawn.map(({ allTimes }) => allTimes.at(-1))); // so that the axis does not grow
+    if (this.#end <= this.#begin) this.#end = this.#begin + 1; // uPlot divides an axis of no length for ever
     const tables = drawn.map(({ times, progress, success }) => [times, progress, success]);
     const data = tables.length ? uPlot.join(tables) : [[], []];
     if (drawn.length !== this.#numCurves || !this.#plot) {
@@ -74,7 +75,7 @@ export class Chart {
     this.moveTo(this.#time);
   }
 
-  /** Draws the line at which success counts. */
+  /** Draws the line at which success counts; null: none. */
   setThreshold(value) {
     this.#threshold = value;
     this.#plot?.redraw(false);
@@ -147,6 +148,7 @@ export class Chart {
   }
 
   #drawThreshold({ ctx, bbox, valToPos }) {
+    if (this.#threshold === null) return;
     const y = valToPos(this.#threshold, "y", true);
     ctx.save();
     ctx.strokeStyle = themed("--faint");

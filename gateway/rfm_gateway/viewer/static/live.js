@@ -15,6 +15,7 @@ export class LiveTab {
   #cursor = "";
   #timer = null;
   #isAway = false;
+  #asking = 0; // number of the loop that asks
 
   /** onError(error): something went wrong */
   constructor(page, { onError }) {
@@ -31,34 +32,39 @@ export class LiveTab {
       'episode = client.episode("stack the cups", live=live)',
     ].join("\n");
     clearTimeout(this.#timer);
-    this.#ask();
+    this.#asking += 1;
+    this.#ask(this.#asking);
   }
 
-  async #ask() {
+  /** Asks again and again, until another loop has begun. */
+  async #ask(asking) {
     let after = ASK_EVERY_MS;
     try {
       if (!this.#page["live-panel"].hidden && !document.hidden) {
-        this.#take(await liveNews(this.#cursor));
+        const news = await liveNews(this.#cursor);
+        if (asking !== this.#asking) return;
+        this.#take(news);
         if (this.#isAway) this.#page.errors.replaceChildren();
         this.#isAway = false;
       }
     } catch (error) {
+      if (asking !== this.#asking) return;
       this.#isAway = true;
       this.#onError(error);
       if (error instanceof KeyWanted) return; // it begins again with a key
       after = ASK_AGAIN_AFTER_MS;
     }
-    this.#timer = setTimeout(() => this.#ask(), after);
+    this.#timer = setTimeout(() => this.#ask(asking), after);
   }
 
   #take({ cursor, is_whole: isWhole, most_points: mostPoints, episodes }) {
     this.#cursor = cursor;
     const there = new Set(episodes.map(({ id }) => id));
     for (const id of [...this.#cards.keys()].filter((each) => isWhole || !there.has(each))) this.#remove(id);
-    for (const news of episodes) {
+    episodes.forEach((news, rank) => { // first the one that has been silent for longest
       if (!this.#cards.has(news.id)) this.#cards.set(news.id, new LiveCard(news.id, mostPoints));
-      this.#cards.get(news.id).take(news);
-    }
+      this.#cards.get(news.id).take(news, rank);
+    });
     this.#show();
   }
 
@@ -71,7 +77,7 @@ export class LiveTab {
   #show() {
     const cards = [...this.#cards.values()];
     const running = cards.filter(({ hasEnded }) => !hasEnded);
-    const ended = cards.filter(({ hasEnded }) => hasEnded).sort((one, other) => one.ageS - other.ageS);
+    const ended = cards.filter(({ hasEnded }) => hasEnded).sort((one, other) => other.rank - one.rank);
     running.sort((one, other) => one.title.localeCompare(other.title, "en", { numeric: true }));
     const shown = [...running, ...ended.slice(0, ENDED_SHOWN)];
     const { children } = this.#page["live-episodes"];

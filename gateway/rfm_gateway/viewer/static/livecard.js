@@ -19,6 +19,7 @@ export class LiveCard {
   #shownFrame = null;
   #isFetching = false;
   #isNew = false;
+  #rank = 0;
   #image = document.createElement("img");
   #heading = document.createElement("h2");
   #state = document.createElement("p");
@@ -58,13 +59,14 @@ export class LiveCard {
     return this.#about.has_ended;
   }
 
-  /** Seconds since its last step came. */
-  get ageS() {
-    return (performance.now() - this.#heardMs) / 1000;
+  /** Its place among all episodes: the higher, the later it was heard of. */
+  get rank() {
+    return this.#rank;
   }
 
-  /** Takes over what is new. */
-  take({ id: _id, age_s: ageS, steps, progress, success, newest, frame, ...about }) {
+  /** Takes over what is new, and its rank. */
+  take({ id: _id, age_s: ageS, steps, progress, success, newest, frame, ...about }, rank) {
+    this.#rank = rank;
     this.#heardMs = performance.now() - 1000 * ageS;
     if (!steps) return; // nothing
     const most = (values) => values.slice(-this.#mostPoints);
@@ -81,7 +83,8 @@ export class LiveCard {
 
   /** Shows what is known. */
   show() {
-    this.#numbers.get("Last step").textContent = `${this.ageS.toFixed(0)} s ago`;
+    const ageS = (performance.now() - this.#heardMs) / 1000;
+    this.#numbers.get("Last step").textContent = `${ageS.toFixed(0)} s ago`;
     if (this.#isNew) this.#showNews();
     this.#isNew = false;
     this.#showFrame();
