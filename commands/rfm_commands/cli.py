@@ -88,6 +88,13 @@ def export(
     other_machine: Annotated[
         bool, typer.Option("--other-machine", help="It is served elsewhere: num_gpus may be more than there are here.")
     ] = False,
+    device: Annotated[
+        str | None,
+        typer.Option(
+            help="Where the scores of export and checkpoint are compared: cpu, cuda, cuda:1. Else the CPU, and for a "
+            "vision-language checkpoint a GPU with room for it."
+        ),
+    ] = None,
     check: Annotated[bool, typer.Option("--check", help="Write nothing; compare with what would be written.")] = False,
     *,
     given: Given,
@@ -108,7 +115,14 @@ def export(
             return
         if settings.checkpoint is None:
             _fail("--checkpoint: expected a checkpoint, here or as export.checkpoint in --config, got none")
-        version = rfm_export.export(settings.checkpoint, repository, settings, other_machine=other_machine)
+        version = rfm_export.export(
+            settings.checkpoint,
+            repository,
+            settings,
+            other_machine=other_machine,
+            device=device,
+            say=_say,
+        )
     except (CheckpointError, rfm_export.ExportError, OSError) as error:
         _fail(str(error))
     typer.echo(f"{repository}: {settings.name} version {version}, scores equal to the checkpoint's")

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,7 @@ from rfm.version_folder import CHECKPOINT_FOLDER
 from rfm_client.contract import wire
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_export.about import Origin, about, record_weights
+from rfm_export.device import device_for, device_named, needing_room
 from rfm_export.errors import ExportError
 from rfm_export.layout import GeneratedModel, Version, generated_models, scorer_name
 from rfm_export.publish import alone, next_version, publish, read_config, staging
@@ -48,16 +49,21 @@ def export(
     *,
     other_machine: bool = False,
     family: str | None = None,
+    device: str | None = None,
+    say: Callable[[str], object] | None = None,
 ) -> int:
     """Writes the checkpoint at ``source`` into ``repository`` and gives its version number.
 
     The staged files are loaded and compared with the original before anything in the repository changes.
     other_machine: it is to be served elsewhere, so that ``num_gpus`` may be more than there are here
     family: package of the checkpoint's family, which the server must be able to import too; None: one of ours
+    device: where the scores are compared; None: on the CPU, and those of a large network on a GPU with room for it
+    say: takes a line for the user: where the scores of a large network are compared
     Raises CheckpointError, ExportError.
     """
     if not other_machine:
         _check_gpus(settings.num_gpus)
+    named = None if device is None else device_named(device)
     loaded = _load(source, settings, family)
     described = loaded.encoders.description if loaded.encoders is not None else None
     names = [settings.name, encoder_name(settings.name), frames_name(settings.name)]
@@ -66,7 +72,7 @@ def export(
         models = generated_models(loaded.checkpoint.description, described, version)
         _check_replaceable(repository, models, settings)
         _stage(loaded, models, version, staged)
-        _verify(loaded, version, staged)
+        _verify(loaded, version, staged, named, say)
         publish(repository, staged, models)
     return version.number
 
@@ -103,13 +109,16 @@ def _stage(source: _Source, models: Sequence[GeneratedModel], version: Version, 
         raise ExportError(f"{staged}: expected room for the exported files, got: {error}") from error
 
 
-def _verify(source: _Source, version: Version, staged: Path) -> None:
+def _verify(
+    source: _Source, version: Version, staged: Path, named: torch.device | None, say: Callable[[str], object] | None
+) -> None:
     """Raises ExportDiffersError unless what was staged gives the checkpoint's numbers."""
     description, settings = source.checkpoint.description, version.settings
-    engine = partial(Engine.of, device="cpu", dtype=None)
-    if description.is_large:
-        on_gpu = torch.cuda.is_available() and settings.num_gpus != 0
-        engine = partial(Engine.of, device="cuda" if on_gpu else "cpu", dtype=settings.torch_dtype)
+    dtype = settings.torch_dtype if description.is_large else None
+    device = named or device_for(source.checkpoint, dtype, may_use_gpu=settings.num_gpus != 0)
+    engine = partial(Engine.of, device=device, dtype=dtype)
+    if description.is_large and say is not None:
+        say(f"the export's scores are compared with the checkpoint's on {device} (--device names another one)")
 
     def exported() -> Engine:
         checkpoint = families.named(source.family.name).load(
@@ -121,7 +130,8 @@ def _verify(source: _Source, version: Version, staged: Path) -> None:
         return engine(checkpoint, encoders=served_by.load(_encoders_folder(version, staged)))
 
     samples = probes(description, with_encoders=source.encoders is not None)
-    verify(lambda: engine(source.checkpoint, encoders=source.encoders), exported, samples)
+    with needing_room(device):
+        verify(lambda: engine(source.checkpoint, encoders=source.encoders), exported, samples)
 
 
 def _checkpoint_folder(description: Description, version: Version, repository: Path) -> Path:

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: MIT
+"""Where an export is compared with its checkpoint. GPUs that this machine has not are made up."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+import goldens
+import rfm_export
+from engines import serve_config
+from rfm import families
+from rfm.family import NETWORK
+from rfm_commands.cli import app
+from rfm_export.device import WORKING_ROOM, device_for, device_named, needing_room
+
+SMALL = goldens.config("c1_t1_disc10")
+LARGE = next(iter(goldens.VLM))
+
+
+def num_bytes(checkpoint: object, itemsize: int) -> float:
+    return WORKING_ROOM * sum(each.numel() * itemsize for each in checkpoint.parts[NETWORK].values())  # type: ignore[attr-defined]
+
+
+@pytest.fixture
+def free_bytes(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """What is free on each GPU."""
+    free: list[float] = []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: bool(free))
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: len(free))
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda index: (free[index], 2 * free[index]))
+    return free
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_a_large_network_goes_where_most_room_is(free_bytes: list[float], dtype: torch.dtype) -> None:
+    checkpoint = families.load(LARGE.checkpoint, base_model=str(LARGE.base_model))
+    needed = num_bytes(checkpoint, dtype.itemsize)
+    free_bytes[:] = [needed / 2, needed + 2, needed + 1]
+    assert device_for(checkpoint, dtype, may_use_gpu=True) == torch.device("cuda", 1)
+    assert device_for(checkpoint, dtype, may_use_gpu=False) == torch.device("cpu")
+    free_bytes[:] = [needed / 2, needed - 1]
+    assert device_for(checkpoint, dtype, may_use_gpu=True) == torch.device("cpu")
+    free_bytes.clear()
+    assert device_for(checkpoint, dtype, may_use_gpu=True) == torch.device("cpu")
+
+
+def test_a_small_network_stays_on_the_cpu(free_bytes: list[float]) -> None:
+    free_bytes.append(2.0**40)
+    assert device_for(families.load(SMALL.checkpoint), None, may_use_gpu=True) == torch.device("cpu")
+
+
+def test_a_device_that_is_not_there_is_refused(free_bytes: list[float]) -> None:
+    with pytest.raises(rfm_export.ExportError, match="device: expected one of cpu, got cuda"):
+        device_named("cuda")
+    free_bytes[:] = [1.0, 1.0]
+    assert device_named("cuda:1") == torch.device("cuda", 1)
+    with pytest.raises(rfm_export.ExportError, match="device: expected one of cpu, cuda, cuda:0, cuda:1, got cuda:2"):
+        device_named("cuda:2")
+
+
+def test_a_lack_of_room_is_told_in_a_line() -> None:
+    reason = "CUDA out of memory. Tried to allocate 8 GiB.\nMore"
+    with pytest.raises(rfm_export.ExportError) as error, needing_room(torch.device("cuda", 0)):
+        raise torch.OutOfMemoryError(reason)
+    assert str(error.value) == (
+        "device: expected room on cuda:0 to compare the export with the checkpoint, got: CUDA out of memory; "
+        "--device names another one"
+    )
+
+
+def test_the_command_says_where_it_compares(tmp_path: Path) -> None:
+    words = ["export", "--repository", str(tmp_path / "models"), "--checkpoint", str(LARGE.checkpoint)]
+    words += ["--base-model", str(LARGE.base_model)]
+    done = CliRunner().invoke(app, [*words, "--num-gpus", "0", "--device", "cpu"])
+    assert done.exit_code == 0, done.output
+    assert "the export's scores are compared with the checkpoint's on cpu (--device names another one)" in done.output
+    assert CliRunner().invoke(app, [*words, "--device", "tpu"]).exit_code == 1
+
+
+@pytest.mark.gpu
+def test_a_gpu_compares(tmp_path: Path) -> None:
+    said: list[str] = []
+    settings = replace(serve_config(LARGE), num_gpus=1, dtype="float32")
+    assert rfm_export.export(LARGE.checkpoint, tmp_path, settings, say=said.append) == 1
+    assert "on cuda:0" in said[0]
