@@ -357,6 +357,7 @@ def test_a_video_that_needs_too_much_memory_is_refused(tmp_path: Path) -> None:
     with serving(tmp_path, root, options=limits, TMPDIR=str(left)) as gateway:
         told = Shelf(gateway, (root,))
         for _ in range(3):  # what was held is free again
+            poll(lambda: told.video(0, 2, 0).status_code != 503)  # an answer is held until the last of it is sent
             expected = "body: expected one that takes at most 1048576 bytes of memory, got more"
             assert failure(told.video(0, 2, 0), 413) == expected
             assert told.video(0, 3, 1).ok

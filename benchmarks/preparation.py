@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: MIT
+"""What it costs the CPU to prepare a sample of frames for a vision-language checkpoint, all threads together.
+
+    python benchmarks/preparation.py            # a minute
+
+Prepared is what the device is sent: checked, brought to size, laid out. Beside it the image processor of transformers,
+which also normalises and cuts into patches; here the device does that. Measured in turn, round after round. The weights
+play no part, so the checkpoint of the tests serves. Writes preparation.json and preparation.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from bench import RESULTS, ROOT, machine
+from rich.console import Console
+from transformers import AutoImageProcessor
+
+from rfm import families
+from rfm.engine import Engine
+from rfm_client import ProgressSample, Trajectory
+
+CASE = ROOT / "tests" / "golden" / "vlm"
+CHECKPOINT, BASE = CASE / "q3_tok_disc10" / "checkpoint", CASE / "bases" / "q3"
+SIZES = ((256, 256), (480, 640), (720, 1280))
+FRAMES = 8
+OURS, THEIRS = "this server", "transformers' processor"
+
+
+def main() -> None:
+    """Measures, writes and shows."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=31)
+    parser.add_argument("--output", type=Path, default=RESULTS, help="folder for the results")
+    arguments = parser.parse_args()
+    predictor = Engine.of(families.load(CHECKPOINT, base_model=str(BASE))).predictor
+    processor = AutoImageProcessor.from_pretrained(BASE, use_fast=False)
+    rows = []
+    for height, width in SIZES:
+        frames = np.random.default_rng(0).integers(0, 256, (FRAMES, height, width, 3), np.uint8)
+        sample = ProgressSample(Trajectory(frames=frames, task="stack the cups"))
+        rows.append(_measured(f"{height}x{width}", arguments.rounds, {
+            OURS: lambda sample=sample: predictor.collate(predictor.rows(sample)),
+            THEIRS: lambda frames=frames: processor(images=list(frames), return_tensors="pt"),
+        }))  # fmt: skip
+    results = {
+        "machine": machine(),
+        "frames": FRAMES,
+        "rounds": arguments.rounds,
+        "processor": type(processor).__name__,
+    }
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    (arguments.output / "preparation.json").write_text(json.dumps(results, indent=1) + "\n")
+    text = _markdown(rows, arguments.rounds)
+    (arguments.output / "preparation.md").write_text(text)
+    Console().print(text, highlight=False)
+
+
+def _measured(size: str, rounds: int, ways: dict[str, Callable[[], object]]) -> dict[str, object]:
+    """Milliseconds of the CPU that each way takes, threads included."""
+    took_ms: dict[str, list[float]] = {name: [] for name in ways}
+    for number in range(rounds + 1):
+        for name, prepare in ways.items():
+            began_s = time.process_time()
+            prepare()
+            if number:  # the first one warms up
+                took_ms[name].append((time.process_time() - began_s) * 1e3)
+    ratio = statistics.median(ours / theirs for ours, theirs in zip(*took_ms.values(), strict=True))
+    return {"size": size, "cpu_ms": took_ms, "ratio": ratio}
+
+
+def _markdown(rows: list[dict[str, object]], rounds: int) -> str:
+    lines = [
+        "# Preparing a sample for a vision-language checkpoint",
+        "",
+        f"Milliseconds of CPU time for {FRAMES} frames, all threads together: medians of {rounds} interleaved rounds, "
+        "with the smallest and largest. Ratio: median of those within a round.",
+        "",
+        f"| frames | {OURS} | {THEIRS} | ratio |",
+        "|---|---|---|---|",
+    ]
+    for row in rows:
+        cells = [_spread(times) for times in row["cpu_ms"].values()]  # type: ignore[attr-defined]
+        lines.append(f"| {row['size']} | {' | '.join(cells)} | {row['ratio']:.2f} |")
+    return "\n".join(lines) + "\n"
+
+
+def _spread(values: list[float]) -> str:
+    return f"{statistics.median(values):.1f} ({min(values):.1f}..{max(values):.1f})"
+
+
+if __name__ == "__main__":
+    main()
