@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import asyncio
+import math
+import os
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -88,7 +90,7 @@ class AsyncEpisodes:
         async with self._adding:
             added = _indices(mask, len(self))
             await self._prepare(deadline)
-            new = await asyncio.to_thread(lambda: [self._named(self._given(frames, index), index) for index in added])
+            new = await self._all_named(frames, added)
             for index, of_cameras in zip(added, new, strict=True):
                 for camera, frame in of_cameras.items():
                     self._frames[index][camera].append(frame)
@@ -182,6 +184,18 @@ class AsyncEpisodes:
             raise InvalidSampleError.at(where, f"a frame of each of {len(self)} episodes", got)
         return frames[index]
 
+    async def _all_named(self, frames: Any, added: Sequence[int]) -> list[dict[str, NamedFrame]]:
+        """The new frame of each camera of these episodes, in as many threads as there are processors."""
+
+        def named(indices: Sequence[int]) -> list[dict[str, NamedFrame]]:
+            return [self._named(self._given(frames, index), index) for index in indices]
+
+        size = max(1, math.ceil(len(added) / (os.cpu_count() or 1)))
+        parts = [added[first : first + size] for first in range(0, len(added), size)]
+        making = [asyncio.create_task(asyncio.to_thread(named, part)) for part in parts]
+        await asyncio.gather(*making, return_exceptions=True)  # then the first error is raised, not the quickest
+        return [of_cameras for part in making for of_cameras in part.result()]
+
     def _named(self, frames: Mapping[str, Any], index: int) -> dict[str, NamedFrame]:
         """The new frames of one episode, checked, and resized if that is asked. Raises InvalidSampleError."""
         named = {}
@@ -195,7 +209,7 @@ class AsyncEpisodes:
                     raise InvalidSampleError.at(where, expected, f"uint8 {list(pixels.shape)}")
             except InvalidSampleError as error:
                 raise self._located(error, index) from None
-            named[camera] = NamedFrame(pixels)
+            named[camera] = NamedFrame.of(pixels)
         return named
 
     def _sized(self, frame: UInt8Array) -> UInt8Array:

@@ -241,7 +241,7 @@ class Episode:
         if self._sizes is None:
             self._fit = find_fit()
         self._sizes = [each.shape for each in kept]
-        self._frames.append(tuple(NamedFrame(each if self._fit is None else self._fit(each)) for each in kept))
+        self._frames.append(tuple(NamedFrame.of(each if self._fit is None else self._fit(each)) for each in kept))
 
     def windows(self, sampling: Sampling) -> list[Window]:
         """The question about the newest frame of each camera."""
