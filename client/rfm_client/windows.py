@@ -16,7 +16,6 @@ from itertools import groupby
 
 import numpy as np
 
-from rfm_client.batching import MAX_REQUEST_BYTES
 from rfm_client.call import Call
 from rfm_client.contract import wire
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, RewardError
@@ -27,6 +26,7 @@ from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array, 
 from rfm_client.scorer import Scorer, for_each
 from rfm_client.transport.off_loop import off_loop
 
+MAX_REQUEST_BYTES = 3 * 2**20  # so that the server prepares one while another is sent
 MAX_REMEMBERED = 2**17  # digests of frames that have been sent; the oldest are forgotten
 _OUTPUTS = (wire.PROGRESS, wire.SUCCESS)
 
