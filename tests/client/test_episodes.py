@@ -360,15 +360,15 @@ def test_an_episode_keeps_its_client(served: Served) -> None:
 
 def test_large_frames_go_in_several_requests(recorded: tuple[Recording, RewardClient]) -> None:
     transport, client = recorded
-    large = film(116, 5, (1000, 1000))  # 3 MB each
+    large = film(116, 5, (700, 700))  # 1.5 MB each
     episodes = client.episodes(5, TASK, frames=2)
     scores = episodes.add(large)
     assert sorted(len(inputs[wire.NUM_FRAMES]) for inputs in transport.requests) == [1, 2, 2]
     expected = [offline(client, large[[index]], Sampling("rint_pad", 2)).progress[0] for index in range(5)]
     np.testing.assert_allclose(scores.progress, expected, atol=TOLERANCE)
     alike = client.episodes(5, TASK, frames=2)
-    alike.add(np.repeat(film(117, 1, (1000, 1000)), 5, axis=0))  # each row of a request is as long as its longest
-    assert max(transport.num_bytes) < 9 * 2**20
+    alike.add(np.repeat(film(117, 1, (700, 700)), 5, axis=0))  # each row of a request is as long as its longest
+    assert max(transport.num_bytes) < 4 * 2**20
 
 
 def test_a_request_of_very_many_frames_is_refused_before_memory_is_taken(served: Served) -> None:
