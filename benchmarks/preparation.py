@@ -3,9 +3,10 @@
 
     python benchmarks/preparation.py            # a minute
 
-Prepared is what the device is sent: checked, brought to size, laid out. Beside it the image processor of transformers,
-which also normalises and cuts into patches; here the device does that. Measured in turn, round after round. The weights
-play no part, so the checkpoint of the tests serves. Writes preparation.json and preparation.md.
+Prepared is what the device is sent: checked, named by digests (for the cache of features), brought to size, laid out.
+Frames are new in each round. Beside it the image processor of transformers in numpy and Pillow, as upstream uses it. It
+also normalises and cuts into patches; here the device does that. Measured in turn, round after round. The weights play
+no part, so the checkpoint of the tests serves. Writes preparation.json and preparation.md.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from bench import RESULTS, ROOT, machine
@@ -23,6 +25,7 @@ from rich.console import Console
 from transformers import AutoImageProcessor
 
 from rfm import families
+from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm_client import ProgressSample, Trajectory
 
@@ -32,6 +35,8 @@ SIZES = ((256, 256), (480, 640), (720, 1280))
 FRAMES = 8
 OURS, THEIRS = "this server", "transformers' processor"
 
+Prepare: TypeAlias = Callable[[np.ndarray], object]
+
 
 def main() -> None:
     """Measures, writes and shows."""
@@ -39,22 +44,17 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=31)
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder for the results")
     arguments = parser.parse_args()
-    predictor = Engine.of(families.load(CHECKPOINT, base_model=str(BASE))).predictor
+    checkpoint = families.load(CHECKPOINT, base_model=str(BASE))
+    predictor = Engine.of(checkpoint, feature_cache_mb=ExportConfig().feature_cache_mb).predictor
     processor = AutoImageProcessor.from_pretrained(BASE, use_fast=False)
-    rows = []
-    for height, width in SIZES:
-        frames = np.random.default_rng(0).integers(0, 256, (FRAMES, height, width, 3), np.uint8)
-        sample = ProgressSample(Trajectory(frames=frames, task="stack the cups"))
-        rows.append(_measured(f"{height}x{width}", arguments.rounds, {
-            OURS: lambda sample=sample: predictor.collate(predictor.rows(sample)),
-            THEIRS: lambda frames=frames: processor(images=list(frames), return_tensors="pt"),
-        }))  # fmt: skip
-    results = {
-        "machine": machine(),
-        "frames": FRAMES,
-        "rounds": arguments.rounds,
-        "processor": type(processor).__name__,
+    ways: dict[str, Prepare] = {
+        OURS: lambda frames: predictor.collate(
+            predictor.rows(ProgressSample(Trajectory(frames=frames, task="stack the cups")))
+        ),
+        THEIRS: lambda frames: processor(images=list(frames), return_tensors="pt"),
     }
+    rows = [_measured(size, arguments.rounds, ways) for size in SIZES]
+    results = {"machine": machine(), "frames": FRAMES, "rounds": arguments.rounds, "measurements": rows}
     arguments.output.mkdir(parents=True, exist_ok=True)
     (arguments.output / "preparation.json").write_text(json.dumps(results, indent=1) + "\n")
     text = _markdown(rows, arguments.rounds)
@@ -62,17 +62,19 @@ def main() -> None:
     Console().print(text, highlight=False)
 
 
-def _measured(size: str, rounds: int, ways: dict[str, Callable[[], object]]) -> dict[str, object]:
-    """Milliseconds of the CPU that each way takes, threads included."""
+def _measured(size: tuple[int, int], rounds: int, ways: dict[str, Prepare]) -> dict[str, object]:
+    """Milliseconds of the CPU that each way takes for frames of a size, threads included."""
+    random = np.random.default_rng(0)
     took_ms: dict[str, list[float]] = {name: [] for name in ways}
     for number in range(rounds + 1):
+        frames = random.integers(0, 256, (FRAMES, *size, 3), np.uint8)
         for name, prepare in ways.items():
             began_s = time.process_time()
-            prepare()
+            prepare(frames)
             if number:  # the first one warms up
                 took_ms[name].append((time.process_time() - began_s) * 1e3)
     ratio = statistics.median(ours / theirs for ours, theirs in zip(*took_ms.values(), strict=True))
-    return {"size": size, "cpu_ms": took_ms, "ratio": ratio}
+    return {"size": f"{size[0]}x{size[1]}", "cpu_ms": took_ms, "ratio": ratio}
 
 
 def _markdown(rows: list[dict[str, object]], rounds: int) -> str:

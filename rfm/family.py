@@ -52,7 +52,8 @@ class Description:
     frame_size: to what it brings each raw frame; None: that depends on the frame
     frames_per_value: frames that share their scores
     keeps_features: it can keep what it makes of frames, and takes samples with named frames then
-    is_large: its exports are verified on the device and in the type that serve it, since float32 on the CPU takes long
+    is_large: its exports are verified in the type that serves it, and on a GPU with room for it, since float32 on the
+        CPU takes long
     """
 
     network_class: str

@@ -11,7 +11,7 @@ import asyncio
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from itertools import groupby
 
 import numpy as np
@@ -26,22 +26,21 @@ from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array, 
 from rfm_client.scorer import Scorer, for_each
 from rfm_client.transport.off_loop import off_loop
 
-MAX_REQUEST_BYTES = 3 * 2**20  # so that the server prepares one while another is sent
+MAX_NEW_BYTES = 3 * 2**20  # of frames in a request, so that the server prepares one while another is sent
 MAX_REMEMBERED = 2**17  # digests of frames that have been sent; the oldest are forgotten
 _OUTPUTS = (wire.PROGRESS, wire.SUCCESS)
 
 
 @dataclass(frozen=True, eq=False)
 class NamedFrame:
-    """A frame, uint8 [H, W, 3], which nobody changes any more, and the digest that a server knows it by."""
+    """A frame, uint8 [H, W, 3], which nobody changes any more."""
 
     pixels: UInt8Array
-    digest: bytes
 
-    @classmethod
-    def of(cls, pixels: UInt8Array) -> NamedFrame:
-        """A frame with its digest, which takes about 2 ms a megabyte."""
-        return cls(pixels, frame_digest(pixels))
+    @cached_property
+    def digest(self) -> bytes:
+        """What a server knows it by. Takes about 2 ms a megabyte the first time."""
+        return frame_digest(self.pixels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +113,8 @@ class WindowScorer:
             return for_each(error, len(windows))
         if not info.by_digest:
             return await self._whole(windows, call)
+        num_new = sum(w.num_bytes // len(w.frames) for w in windows)  # about one frame of each is new
+        await off_loop(num_new, lambda: [frame.digest for window in windows for frame in window.frames])
         parts = list(self._parts(windows, info.max_batch_size))
         asked = [self._outcomes([windows[index] for index in part], call) for part in parts]
         answered = await asyncio.gather(*asked)
@@ -125,7 +126,7 @@ class WindowScorer:
         return [found[index] for index in range(len(windows))]
 
     def _parts(self, windows: Sequence[Window], limit: int) -> Iterator[list[int]]:
-        """Indices of the windows of each request: frames of one size, at most ``limit`` windows, and MAX_REQUEST_BYTES
+        """Indices of the windows of each request: frames of one size, at most ``limit`` windows, and MAX_NEW_BYTES
         unless one has more.
         """
 
@@ -139,7 +140,7 @@ class WindowScorer:
                 frames = windows[index].frames
                 own = {frame.digest for frame in frames if frame.digest not in self._remembered}
                 num_bytes = _padded_bytes(len(part) + 1, len(sent | own), frames[0].pixels.nbytes)
-                if part and (len(part) == limit or num_bytes > MAX_REQUEST_BYTES):
+                if part and (len(part) == limit or num_bytes > MAX_NEW_BYTES):
                     yield part
                     part, sent = [], set()
                 part.append(index)

@@ -22,11 +22,18 @@ def device_for(checkpoint: Checkpoint, dtype: torch.dtype | None, *, may_use_gpu
     """
     if not (checkpoint.description.is_large and may_use_gpu and torch.cuda.is_available()):
         return CPU
-    free_bytes = [torch.cuda.mem_get_info(index)[0] for index in range(torch.cuda.device_count())]
+    free_bytes = [_free_bytes(index) for index in range(torch.cuda.device_count())]
     weights = checkpoint.parts[NETWORK].values()
     needed = WORKING_ROOM * sum(each.numel() * (dtype or each.dtype).itemsize for each in weights)
     roomiest = max(range(len(free_bytes)), key=free_bytes.__getitem__)
     return torch.device("cuda", roomiest) if free_bytes[roomiest] >= needed else CPU
+
+
+def _free_bytes(index: int) -> int:
+    try:
+        return torch.cuda.mem_get_info(index)[0]
+    except RuntimeError:  # it is too full to be asked, or belongs to another process alone
+        return 0
 
 
 def device_named(name: str) -> torch.device:

@@ -242,7 +242,7 @@ class TritonServer:
                 if isinstance(error, StalledStartError):
                     stalled_s = PATIENT_S
         self.start(restored)
-        self.wait_ready(stalled_s)
+        self.wait_ready(PATIENT_S)
 
     def wait_ready(self, stalled_s: float = PATIENT_S) -> None:
         """Returns when every model is ready. Raises ServerStartError with the reason of one that is not.

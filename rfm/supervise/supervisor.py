@@ -111,6 +111,7 @@ class Supervisor:
             except SpoiltStartError as error:
                 self._count("triton", str(error))
                 self._server.stop()
+        self._stalled_s = PATIENT_S
         self._start()
 
     def _start(self) -> None:

@@ -209,7 +209,7 @@ class AsyncEpisodes:
                     raise InvalidSampleError.at(where, expected, f"uint8 {list(pixels.shape)}")
             except InvalidSampleError as error:
                 raise self._located(error, index) from None
-            named[camera] = NamedFrame.of(pixels)
+            named[camera] = NamedFrame(pixels)
         return named
 
     def _sized(self, frame: UInt8Array) -> UInt8Array:

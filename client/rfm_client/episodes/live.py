@@ -13,6 +13,8 @@ import weakref
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.resize import load_pillow
 from rfm_client.episodes.live_reports import Address, Reporter
@@ -48,7 +50,7 @@ class LiveEpisode:
             return
         scores = {"progress": _or_none(score.progress), "success": _or_none(score.success)}
         step = {"step": score.step, **scores, "succeeded": score.succeeded, "ms": score.ms}
-        self._view._reporter.add(self._about, step, frame)
+        self._view._reporter.add(self._about, step, np.asarray(frame))
 
     def end(self) -> None:
         """Has it reported that no step will follow. Returns at once, and raises nothing."""
@@ -82,8 +84,10 @@ class LiveView:
     def episode(self, task: str, env: int = 0, threshold: float = 0.5) -> LiveEpisode:
         """An episode that appears with its first step.
 
-        env: number of its environment; threshold: at which success counts; inf: never
+        env: number of its environment, from 0; threshold: at which success counts; inf: never
         """
+        if env < 0:
+            raise ValueError(f"env: expected at least 0, got {env}")
         return LiveEpisode(self, task, env, threshold)
 
     def close(self) -> None:

@@ -14,6 +14,7 @@ import logging
 import os
 import ssl
 import threading
+import time
 import weakref
 from collections import deque
 from collections.abc import Mapping
@@ -133,6 +134,11 @@ class Reporter:
 
     def close(self) -> None:
         """Ends all episodes, and the thread. Returns when that has been reported, or after CLOSE_WITHIN_S."""
+        self.finish()
+        self.join(CLOSE_WITHIN_S)
+
+    def finish(self) -> None:
+        """Has it reported that all episodes have ended, and then ends the thread. Returns at once."""
         if self._was_forked():
             return
         with self._lock:
@@ -140,7 +146,11 @@ class Reporter:
         for about in running:
             self.end(about)
         self.stop()
-        self._thread.join(CLOSE_WITHIN_S)
+
+    def join(self, timeout_s: float) -> None:
+        """Returns when the thread has ended, or after so long."""
+        if self._process_id == os.getpid():
+            self._thread.join(timeout_s)
 
     def stop(self) -> None:
         """Ends the thread as soon as what is left has been reported, or cannot be."""
@@ -170,12 +180,14 @@ class Reporter:
         if not steps and not frames:
             return True
         try:
-            status, text = self._address.post(_body(steps, frames))
+            body = _body(steps, frames)
+        except (TypeError, ValueError):  # which must not keep later steps from being reported
+            logger.exception("%s: a live report has failed, and is dropped", self._address.url)
+            return True
+        try:
+            status, text = self._address.post(body)
         except (OSError, HTTPException) as error:
             status, text = None, str(error) or type(error).__name__
-        except Exception:  # which must not keep later steps from being reported
-            logger.exception("%s: a live report has failed, and is dropped", self._address.url)
-            return False
         if status is not None and status < 300:
             self._is_away = False
             return True
@@ -211,9 +223,13 @@ _open: weakref.WeakSet[Reporter] = weakref.WeakSet()
 
 @atexit.register
 def _close_all() -> None:
-    """Has the last steps reported before the process ends, and the threads with it."""
-    for reporter in list(_open):
-        reporter.close()
+    """Has the last steps reported before the process ends. A worker of multiprocessing ends without this."""
+    reporters = list(_open)
+    for reporter in reporters:
+        reporter.finish()
+    deadline_s = time.monotonic() + CLOSE_WITHIN_S
+    for reporter in reporters:
+        reporter.join(max(0.0, deadline_s - time.monotonic()))
 
 
 def _bound(kept: dict[str, Any], most: int) -> None:
@@ -229,5 +245,10 @@ def _body(steps: list[Entry], frames: Mapping[str, UInt8Array]) -> bytes:
             told["ended"] = True
         else:
             told["steps"].append(step)
-    pictures = {key: base64.b64encode(as_jpeg(frame, LONGEST_PX)).decode() for key, frame in frames.items()}
+    pictures = {}
+    for key, frame in frames.items():
+        try:
+            pictures[key] = base64.b64encode(as_jpeg(frame, LONGEST_PX)).decode()
+        except (OSError, TypeError, ValueError):  # which must not keep the steps from being reported
+            logger.exception("a live view: expected a frame uint8 [H, W, 3], got %s %s", frame.dtype, frame.shape)
     return json.dumps({"episodes": list(episodes.values()), "frames": pictures}, allow_nan=False).encode()

@@ -127,7 +127,14 @@ class Scorer:
 
         episodes: with whether their newest frame is their last
         """
-        awaited, ended = [], []
+        try:
+            self._score(episodes)
+        finally:
+            for episode in (episode for episode, ends in episodes.items() if ends or episode.succeeded):
+                episode.end()
+
+    def _score(self, episodes: Mapping[Episode, bool]) -> None:
+        awaited = []
         for episode, ends in episodes.items():
             episode.collect()
             ends = ends or episode.succeeded
@@ -135,15 +142,12 @@ class Scorer:
             waits = self._options.blocking or not episode.is_known or (ends and self._options.await_last)
             if ends:
                 episode.cancel()
-                ended.append(episode)
             if due and waits:
                 awaited.append(episode)
             elif due and not ends:
                 self._submit(episode)
         if awaited:
             self._await(awaited)
-        for episode in ended:
-            episode.end()
 
     def close(self) -> None:
         """Closes the client if it was made here."""
@@ -241,7 +245,7 @@ class Episode:
         if self._sizes is None:
             self._fit = find_fit()
         self._sizes = [each.shape for each in kept]
-        self._frames.append(tuple(NamedFrame.of(each if self._fit is None else self._fit(each)) for each in kept))
+        self._frames.append(tuple(NamedFrame(each if self._fit is None else self._fit(each)) for each in kept))
 
     def windows(self, sampling: Sampling) -> list[Window]:
         """The question about the newest frame of each camera."""

@@ -163,8 +163,6 @@ class RewardModelVectorWrapper(VectorWrapper):
         ended = terminations | truncations
         final = self._final_frames(infos, ended) if self._autoreset_mode is AutoresetMode.SAME_STEP else {}
         reset_alone = self._ended if self._autoreset_mode is AutoresetMode.NEXT_STEP else np.zeros_like(ended)
-        for index in np.flatnonzero(reset_alone).tolist():
-            self._episodes[index].end()  # in case the step that ended it has failed
         stepped = {index: self._episodes[index] for index in np.flatnonzero(~reset_alone).tolist()}
         for index, episode in stepped.items():
             episode.add(final.get(index, frames[index]), self._scorer.fit)
