@@ -31,7 +31,7 @@ from environments import TASK, cart_pole, play
 from gateways import free_port, poll
 from live_reports import Taker, picture, taking
 from reference_server import Served
-from rfm_client import AsyncRewardClient, LiveView, RewardClient
+from rfm_client import AsyncRewardClient, InferenceFailedError, LiveView, RewardClient
 from rfm_client.episodes import StepScore, SuccessRule, live_reports
 from rfm_client.gym import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions
 
@@ -138,6 +138,16 @@ def test_a_mistake_does_not_end_the_reports(
         episode.add(picture(), score(1))
         poll(lambda: bool(taker.bodies))
     assert [each["step"] for each in taker.steps()] == [1]
+
+
+def test_a_frame_that_is_no_picture_loses_no_step(taker: Taker, caplog: pytest.LogCaptureFixture) -> None:
+    with LiveView(taker.url) as view:
+        view.episode("stack the cups").add(np.zeros((4, 4, 4), np.uint8), score(0))
+        other = view.episode("open the drawer")
+        other.add(picture(), score(1))
+    assert "a live view: expected a frame uint8 [H, W, 3], got uint8 (4, 4, 4)" in caplog.text
+    assert [each["step"] for each in taker.steps()] == [0, 1]
+    assert [key for body in taker.bodies for key in body["frames"]] == [other._about["id"]]
 
 
 def test_the_last_steps_are_reported_before_the_process_ends(taker: Taker) -> None:
@@ -370,9 +380,9 @@ def test_episodes_of_a_vector_environment_end_when_their_last_step_is_reported(
         return gymnasium.wrappers.AddRenderObservation(gymnasium.wrappers.TimeLimit(cart_pole(), 3))
 
     envs = gymnasium.vector.SyncVectorEnv([pixels] * 2, autoreset_mode=mode)
-    options = {"frames_from": lambda observation: observation}
     with RewardClient(served.url("grpc"), model=MODEL) as client, LiveView(taker.url) as view:
-        wrapped = RewardModelVectorWrapper(envs, client, TASK, RewardOptions(live=view, **options))  # type: ignore[arg-type]
+        options = RewardOptions(live=view, frames_from=lambda observation: observation)
+        wrapped = RewardModelVectorWrapper(envs, client, TASK, options)
         wrapped.reset(seed=0)
         for number in range(8):
             *_, terminations, truncations, _infos = wrapped.step(np.array([0, 1]))
@@ -385,6 +395,32 @@ def test_episodes_of_a_vector_environment_end_when_their_last_step_is_reported(
     told = episodes_of(taker)
     assert all(each["ended"] for each in told)
     assert [step["step"] for step in told[0]["steps"]] == [0, 1, 2, 3]
+
+
+@pytest.mark.triton
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_an_episode_whose_last_step_fails_has_ended(
+    served: Served, taker: Taker, mode: AutoresetMode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_words: object, **_options: object) -> None:
+        raise InferenceFailedError("no answer")
+
+    def pixels() -> gymnasium.Env[Any, Any]:
+        return gymnasium.wrappers.AddRenderObservation(gymnasium.wrappers.TimeLimit(cart_pole(), 3))
+
+    envs = gymnasium.vector.SyncVectorEnv([pixels] * 2, autoreset_mode=mode)
+    with RewardClient(served.url("grpc"), model=MODEL) as client, LiveView(taker.url) as view:
+        options = RewardOptions(live=view, frames_from=lambda observation: observation)
+        wrapped = RewardModelVectorWrapper(envs, client, TASK, options)
+        wrapped.reset(seed=0)
+        for _ in range(2):
+            wrapped.step(np.array([0, 1]))
+        assert len(view._reporter._running) == 2
+        monkeypatch.setattr(client, "score_windows", fails)
+        with pytest.raises(InferenceFailedError):
+            wrapped.step(np.array([0, 1]))
+        assert view._reporter._running == {}
+        wrapped.close()
 
 
 @pytest.mark.triton
