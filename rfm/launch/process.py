@@ -23,6 +23,7 @@ from rfm.launch.ending import EXIT_TIMEOUT_S, end, ending_with_parent
 from rfm.launch.http import NO_ANSWER, Http
 from rfm.launch.installation import Installation, ServerStartError
 from rfm.launch.listen_address import check_before_start, check_version
+from rfm.launch.ports import free_ports
 from rfm.launch.repository_api import INDEX_PATH, RepositoryApi, versions_of
 from rfm.launch.tls import GrpcTls, OwnTls
 from rfm.launch.triton_options import check_arguments, size_limits
@@ -56,11 +57,8 @@ class Endpoints:
     @classmethod
     def free(cls) -> Endpoints:
         """Loopback endpoints on ports that are free now."""
-        sockets = [socket.create_server((DEFAULT_HOST, 0)) for _ in range(3)]
-        ports = [bound.getsockname()[1] for bound in sockets]
-        for bound in sockets:
-            bound.close()
-        return cls(DEFAULT_HOST, *ports)
+        http_port, grpc_port, metrics_port = free_ports(3)
+        return cls(DEFAULT_HOST, http_port, grpc_port, metrics_port)
 
     @property
     def http_url(self) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import http.client
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -17,6 +16,7 @@ from pathlib import Path
 import requests
 from prometheus_client.parser import text_string_to_metric_families
 
+from rfm.launch.ports import free_ports
 from rfm.launch.process import Endpoints
 from rfm_client import (
     RewardClient,
@@ -54,8 +54,8 @@ class Gateway:
 
 
 def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as bound:
-        return int(bound.getsockname()[1])
+    (port,) = free_ports(1)
+    return port
 
 
 def poll(is_so: Callable[[], bool]) -> None:
