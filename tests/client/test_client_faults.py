@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -18,6 +18,7 @@ import pytest
 from faulty_servers import heavy, ours_in_dev_shm, regions, trajectory, url_of
 from mixtures import assert_same
 from one_model import OneModelServer, answered
+from proxies import Proxy
 from repositories import configure
 from rfm.launch.process import Endpoints
 from rfm_client import (
@@ -164,71 +165,6 @@ def test_a_server_that_hangs_costs_one_call_and_is_left_out(repository: Path, pr
     assert [type(outcome) for outcome in outcomes if isinstance(outcome, Exception)] == [DeadlineExceededError]
 
 
-class Proxy:
-    """Forwards TCP connections to a port, until it goes silent: connections stay open, and nothing comes over them.
-
-    It stands in for a network that drops packets, which needs a privilege to be had. ``reads``: what a client sends
-    over a silent connection is still acknowledged, and dropped; otherwise nothing more is taken from it.
-    """
-
-    def __init__(self, port: int, *, reads: bool = True) -> None:
-        self._port = port
-        self._reads = reads
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self.port = self._listener.getsockname()[1]
-        self._is_closed = threading.Event()
-        self._pairs: list[tuple[socket.socket, socket.socket, threading.Event]] = []
-        threading.Thread(target=self._accept, daemon=True).start()
-
-    @property
-    def num_connections(self) -> int:
-        return len(self._pairs)
-
-    def go_silent(self) -> None:
-        """All connections that there are; a new one is forwarded."""
-        for *_, is_silent in self._pairs:
-            is_silent.set()
-
-    def _accept(self) -> None:
-        while True:
-            try:
-                near, _ = self._listener.accept()
-            except OSError:  # closed: the test is over
-                return
-            if not self._reads and not self._pairs:
-                near.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-            far = socket.create_connection(("127.0.0.1", self._port))
-            is_silent = threading.Event()
-            self._pairs.append((near, far, is_silent))
-            for source, target in ((near, far), (far, near)):
-                threading.Thread(target=self._forward, args=(source, target, is_silent), daemon=True).start()
-
-    def _forward(self, source: socket.socket, target: socket.socket, is_silent: threading.Event) -> None:
-        while True:
-            if is_silent.is_set() and not self._reads:
-                self._is_closed.wait()
-            try:
-                content = source.recv(65536)
-                if not is_silent.is_set():
-                    target.sendall(content)
-            except OSError:  # one side has ended it
-                return
-            if not content:
-                with suppress(OSError):
-                    target.shutdown(socket.SHUT_WR)
-                return
-
-    def __enter__(self) -> Proxy:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._is_closed.set()
-        self._listener.close()
-        for near, far, _ in self._pairs:
-            near.close()
-            far.close()
-
-
 def test_a_connection_that_dies_in_silence_costs_one_deadline(repository: Path, protocol: str) -> None:
     endpoints = Endpoints.free()
     port = endpoints.grpc_port if protocol == "grpc" else endpoints.http_port
@@ -263,16 +199,18 @@ def test_a_request_that_nobody_takes_goes_over_a_new_connection_within_its_time(
 def test_calls_that_share_a_connection_with_one_that_hits_its_deadline_go_on(repository: Path) -> None:
     """Over a connection that is alive and slow: a call that has more time keeps it."""
     endpoints = Endpoints.free()
-    with OneModelServer(repository, endpoints) as server, RewardClient(endpoints.grpc_url) as client:
+    with (
+        OneModelServer(repository, endpoints),
+        Proxy(endpoints.grpc_port) as proxy,
+        RewardClient(f"grpc://127.0.0.1:{proxy.port}") as client,
+    ):
         expected = client.progress(trajectory(0))
-        server.signal(signal.SIGSTOP)
-        try:
+        with proxy.held():
             patient = client.submit(ProgressSample(trajectory(0)), timeout_s=PATIENCE_S)
             with pytest.raises(DeadlineExceededError):
                 client.progress(trajectory(0), timeout_s=2)
-        finally:
-            server.signal(signal.SIGCONT)
         assert_same(expected, patient.result())
+        assert proxy.num_connections == 1
 
 
 def test_a_server_that_hangs_does_not_hold_what_shares_memory_with_it(repository: Path) -> None:

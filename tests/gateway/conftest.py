@@ -24,6 +24,7 @@ from gateway_requests import (
     fixture_of,
 )
 from one_model import BriefServer
+from proxies import Proxy
 from rfm.config import ExportConfig
 from rfm.journal import SHARED_MEMORY
 from rfm.launch.cleanup import REGION_PREFIX
@@ -52,9 +53,12 @@ def triton(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransfo
     with (
         (folder / "tritonserver.log").open("wb") as log,
         BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+        Proxy(server.endpoints.http_port) as http,
+        Proxy(server.endpoints.grpc_port) as grpc,
+        Proxy(server.endpoints.metrics_port) as metrics,
     ):
-        assert server._process is not None
-        yield Triton(repository, server.endpoints, server._process.pid)
+        endpoints = Endpoints(http_port=http.port, grpc_port=grpc.port, metrics_port=metrics.port)
+        yield Triton(repository, endpoints, (http, grpc, metrics))
     assert set(SHARED_MEMORY.glob(ours)) <= regions
 
 

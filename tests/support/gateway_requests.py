@@ -5,11 +5,9 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import re
-import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -20,6 +18,7 @@ import pytest
 import requests
 
 from gateways import Gateway, running
+from proxies import Proxy
 from rfm.launch.process import Endpoints
 from rfm_client import (
     PreferenceSample,
@@ -72,7 +71,7 @@ SIDES = {
 class Triton:
     repository: Path
     endpoints: Endpoints
-    process_id: int
+    proxies: Sequence[Proxy]  # in front of its ports
 
 
 def fixture_of(model: str, *options: str) -> Any:
@@ -295,8 +294,8 @@ def begun(gateway: Gateway, headers: Mapping[str, str], *parts: bytes, path: str
 
 @contextmanager
 def paused(triton: Triton) -> Iterator[None]:
-    os.killpg(triton.process_id, signal.SIGSTOP)
-    try:
+    """Within it nothing comes through to Triton, and nothing from it."""
+    with ExitStack() as held:
+        for proxy in triton.proxies:
+            held.enter_context(proxy.held())
         yield
-    finally:
-        os.killpg(triton.process_id, signal.SIGCONT)
