@@ -23,6 +23,7 @@ from rfm.launch.process import Endpoints
 
 torch.set_num_threads(1)
 os.environ[RUN] = uuid.uuid4().hex  # by which tests know what this run has started
+os.environ["HF_HUB_OFFLINE"] = "1"  # no test asks the network
 os.environ["ONEDNN_MAX_CPU_ISA"] = "AVX512_CORE"  # as the references were computed: AMX rounds bfloat16 elsewhere
 
 

@@ -117,6 +117,9 @@ class LoadsAll(TritonServer):
 class Polls(LoadsAll):
     mode = "poll"
 
+    def _arguments(self, models: Sequence[str]) -> list[str]:
+        return [*super()._arguments(models), "--repository-poll-secs=1"]  # it ends only when it has slept for so long
+
 
 @pytest.mark.parametrize("kind", [LoadsAll, Polls, TritonServer])
 def test_triton_does_not_see_what_is_staged(kind: type[TritonServer], tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def ask(served: Engine, sample: NamedProgressSample, execution: Execution | None
 def test_an_episode_has_the_scores_of_the_whole_and_each_shot_is_encoded_once(name: str, rule: Rule) -> None:
     cached, plain = engine(name, FeatureCache(64 * BYTES_PER_MB)), engine(name)
     sampling = Sampling(rule, 4 if rule in TAKE_A_NUMBER else None)
-    frames, execution = frames_of(0, 16 if rule == "all" else 40), Execution()
+    frames, execution = frames_of(0, 16 if rule == "all" else 20), Execution()
     per_shot, shown, num_shown = frames_per_shot(cached), set(), 0
     for step in range(len(frames)):
         window = frames[sampling.prefix(step).indices]

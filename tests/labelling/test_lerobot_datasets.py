@@ -323,7 +323,7 @@ def test_a_dataset_of_the_hub_is_fetched_at_its_revision(tmp_path: Path) -> None
     )
     revisions = {"main": LEROBOT / "toy_v30_many", "v1": LEROBOT / "toy_v21"}
     with local_hub.hub({HUB_ID: revisions}, "datasets") as endpoint:
-        environment = {**os.environ, "HF_ENDPOINT": endpoint, "HF_HOME": str(tmp_path)}
+        environment = {**os.environ, "HF_ENDPOINT": endpoint, "HF_HOME": str(tmp_path), "HF_HUB_OFFLINE": "0"}
         for revision, expected in (("", "main"), ("@v1", "v1"), ("@v2", None)):
             words = [sys.executable, "-c", ask, HUB_ID + revision]
             done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=100, check=False)

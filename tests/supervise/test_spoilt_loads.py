@@ -18,6 +18,7 @@ from rfm.launch import process
 from rfm.launch.installation import Installation, ServerStartError, find_installation
 from rfm.launch.process import Endpoints, SpoiltStartError, StalledStartError, TritonServer
 from rfm.supervise.model_processes import ModelProcess, ProcessWatch
+from rfm.supervise.supervisor import Supervisor
 from rfm_client import RewardClient
 from rfm_serve import MODEL, PATIENCE_S, children, serving, wait_for
 
@@ -132,6 +133,26 @@ def test_a_start_is_not_repeated_for_ever(tmp_path: Path, num_spoilt: int) -> No
     with pytest.raises(SpoiltStartError) if is_spoilt else nullcontext(), server:
         check_answers(server)
     assert server.num_starts == process.MAX_REPEATS + 1
+
+
+@pytest.mark.parametrize("num_spoilt", [process.MAX_REPEATS, process.MAX_REPEATS + 1])
+def test_rfm_serve_does_not_repeat_a_first_start_for_ever(tmp_path: Path, num_spoilt: int) -> None:
+    server = Spoilt(make_repository(tmp_path), Endpoints.free(), find_installation(), num_spoilt)
+    said: list[str] = []
+
+    def say(line: str) -> None:
+        said.append(line)
+        if line.startswith("ready: "):
+            signal.raise_signal(signal.SIGTERM)
+
+    supervisor = Supervisor(server, canary_s=10.0, hang_s=60.0, triton_silent_s=60.0, say=say)
+    if num_spoilt > process.MAX_REPEATS:
+        with pytest.raises(SpoiltStartError):
+            supervisor.run()
+    else:
+        assert supervisor.run() == 0
+    assert server.num_starts == process.MAX_REPEATS + 1
+    assert len([line for line in said if "is started again" in line]) == process.MAX_REPEATS
 
 
 def test_a_server_that_cannot_start_is_started_once(tmp_path: Path) -> None:
