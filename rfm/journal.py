@@ -173,6 +173,11 @@ class Journal:
             if self._memory[at : at + DIGEST_BYTES] == unsuspected:
                 self._memory[at : at + DIGEST_BYTES] = NO_DIGEST
 
+    def acquit(self) -> None:
+        """Takes all requests out of the work: if the process ends now, it is for another reason."""
+        for at in self._places_of_digests:
+            self._memory[at : at + DIGEST_BYTES] = NO_DIGEST
+
     def close(self) -> None:
         """Unmaps the journal and removes its file."""
         self._memory.close()

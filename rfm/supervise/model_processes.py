@@ -142,6 +142,10 @@ class ProcessWatch:
         now_s = time.monotonic()
         states = {process: process.state for process in self._watched}
         seen = {(process, state) for process, state in states.items() if state in (ZOMBIE, STOPPED)}
+        for process, state in seen - self._since.keys():
+            journal = process.journal if state == STOPPED else None
+            if journal is not None:
+                journal.acquit()  # what it is working on is not why it was stopped
         self._since = {key: self._since.get(key, now_s) for key in seen}
 
     def _has_been(self, process: ModelProcess, state: str, duration_s: float) -> bool:

@@ -15,6 +15,10 @@ DRAIN_S = 2.0  # for what the model's other processes are working on
 POLL_S = 0.1
 
 
+class OwedAnswersError(RuntimeError):
+    """Processes have ended that owed answers. Triton 2.51 never tells who waits for them; they know when it ends."""
+
+
 class Reload:
     """The reload of one model, in attempts. One attempt runs at a time, and takes as long as Triton does.
 
@@ -39,7 +43,9 @@ class Reload:
         self._is_closed = True
 
     def load(self, processes: Sequence[ModelProcess]) -> None:
-        """Loads the model anew, unless somebody has loaded or unloaded it. Raises RepositoryApiError.
+        """Loads the model anew, unless somebody has loaded or unloaded it.
+
+        Raises RepositoryApiError, and OwedAnswersError when the model is unloaded and its processes have ended.
 
         Ensembles that the model is a part of are unloaded and loaded with it, as they were.
 
@@ -54,9 +60,7 @@ class Reload:
                 api.load(self._model, self._to_load)
 
     def unload(self, processes: Sequence[ModelProcess]) -> None:
-        """Unloads the model, so that callers get an error at once, and a load by others is seen. Raises
-        RepositoryApiError.
-        """
+        """Unloads the model, so that callers get an error at once, and a load by others is seen. Raises as ``load``."""
         with self._server.repository_api() as api:
             self._take_out(api, processes)
 
@@ -94,13 +98,21 @@ class Reload:
         return serving_just(api.config(self._model, max(ready)), ready)
 
     def _end(self, processes: Sequence[ModelProcess]) -> None:
-        """Returns when none of the processes lives, not even one that Triton keeps with its share of a GPU's memory."""
+        """Returns when none of the processes lives, not even one that Triton keeps with its share of a GPU's memory.
+
+        Raises OwedAnswersError. Triton has reaped them, so nobody else sees that they are dead.
+        """
         deadline_s = time.monotonic() + DRAIN_S
         while any(process.is_alive for process in processes) and time.monotonic() < deadline_s:
             time.sleep(POLL_S)
+        num_owed = 0
         for process in processes:
-            if process.is_alive:
-                process.kill()
-                if not self._was_hung and process.journal is not None:
-                    process.journal.close()  # what it was working on is not why it ends
+            was_alive, journal = process.is_alive, process.journal
+            process.kill()
+            if journal is not None:
+                num_owed += journal.num_owed
+                if was_alive and not self._was_hung:
+                    journal.close()  # what it was working on is not why it ends
         self.ended = [*self.ended, *processes]
+        if num_owed:
+            raise OwedAnswersError(f"processes of {self._model} have ended, and owe {num_owed} answers")

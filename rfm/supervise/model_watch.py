@@ -13,7 +13,7 @@ from rfm.supervise.back_off import BackOff, CrashLoopError
 from rfm.supervise.background import Calls
 from rfm.supervise.model_probe import ModelProbe
 from rfm.supervise.model_processes import ProcessWatch
-from rfm.supervise.model_reload import Reload
+from rfm.supervise.model_reload import OwedAnswersError, Reload
 from rfm.supervise.model_states import CRASH_LOOPING, FAULTS, HEALING, Action, Event, Lifecycle, State
 from rfm.supervise.status import NO_REASON, Status
 from rfm.supervise.triton_watch import Config
@@ -49,10 +49,11 @@ class ModelWatch:
         self._back_off = BackOff(f"model {name}")
         self._back_off.started()
         self._reload: Reload | None = None
-        self._attempts: Calls[None] = Calls(f"rfm-heal-{name}", (RepositoryApiError, OSError))
+        self._attempts: Calls[None] = Calls(f"rfm-heal-{name}", (RepositoryApiError, OSError, OwedAnswersError))
         self._due_s = 0.0  # the next attempt
         self._why = ""  # it is healed
         self._trouble = ""  # why its last load failed
+        self.owing: str | None = None  # processes that this ended while they owed answers
 
     @property
     def state(self) -> State:
@@ -145,6 +146,8 @@ class ModelWatch:
         else:
             error = attempt.exception()
             self._processes.forget(self._reload.ended)
+            if isinstance(error, OwedAnswersError):
+                self.owing = str(error)
             if error is not None:
                 self._trouble = str(error)
             self._feed(Event.DONE if error is None else Event.FAILED)

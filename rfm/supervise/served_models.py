@@ -93,7 +93,7 @@ class ServedModels:
             journal = process.journal
             if journal is not None and journal.num_owed:
                 return f"a process of {process.model} is dead, and owes {journal.num_owed} answers"
-        return None
+        return next((model.owing for model in self._models.values() if model.owing), None)
 
     @property
     def configs(self) -> dict[str, Config] | None:

@@ -21,9 +21,8 @@ import numpy as np
 import pytest
 
 from clock import Clock
-from one_model import BriefServer
+from one_model import BriefServer, OneModelServer
 from patients import CALLERS, DEADLY, MARK, TOLERANCE, Callers, make_repository, trajectory
-from repositories import kill_model
 from rfm.journal import SHARED_MEMORY
 from rfm.launch import cleanup
 from rfm.launch.installation import find_installation
@@ -31,6 +30,8 @@ from rfm.launch.process import Endpoints
 from rfm.proc import is_alive
 from rfm.supervise import back_off
 from rfm.supervise.back_off import BackOff, CrashLoopError
+from rfm.supervise.model_processes import ProcessWatch
+from rfm.supervise.model_reload import OwedAnswersError, Reload
 from rfm.triton_model.quarantine import Quarantine
 from rfm.triton_model.request_digest import digest
 from rfm.triton_model.self_check import FAILED_BATCHES
@@ -247,25 +248,51 @@ def test_a_request_that_kills_the_model_twice_is_refused_and_its_neighbours_are_
         wait_for(lambda: served.metric("rfm_serve_poison_refused_total") == 2)
 
 
-def test_who_waits_for_a_process_that_dies_is_answered_by_the_next(
-    tmp_path: Path, references: list[np.ndarray[Any, Any]]
+@pytest.mark.parametrize(("number", "times"), [(signal.SIGKILL, 1), (signal.SIGSTOP, 2)])
+def test_who_waits_for_a_process_that_dies_or_stops_is_answered_by_the_next(
+    tmp_path: Path, references: list[np.ndarray[Any, Any]], number: signal.Signals, times: int
 ) -> None:
-    """Answers that take long are sent later. Triton never tells those who wait for them that they will not come."""
-    repository = make_repository(tmp_path, more_code=STICKY)
+    """Answers that take long are sent later. Triton never tells those who wait for them that they will not come.
+
+    What a stopped process works on is no suspect: it may be stopped as often as you like.
+    """
     with (
-        serving(repository) as served,
+        serving(make_repository(tmp_path, more_code=STICKY)) as served,
         served.client(timeout_s=PATIENCE_S) as client,
         ThreadPoolExecutor(8) as pool,
     ):
-        served.wait_ready()
-        client.progress(trajectory(0))  # from now on it is known how long answers take
+        for _ in range(times):
+            served.wait_ready()
+            client.progress(trajectory(0))  # from now on it is known how long answers take
+            waiting = [pool.submit(client.progress, trajectory(seed)) for seed in range(6)]
+            time.sleep(0.5)
+            os.kill(served.model_processes[0].pid, number)
+            for future, expected in zip(waiting, references, strict=False):
+                np.testing.assert_allclose(future.result().progress, expected, rtol=0, atol=TOLERANCE)
+        assert served.metric("rfm_serve_restarts_total", what="triton") == times
+        if number == signal.SIGKILL:  # that a process is stopped, a probe may notice first: then it counts twice
+            assert served.metric("rfm_serve_restarts_total", what=MODEL) == 0
+
+
+def test_a_reload_that_ends_a_process_says_what_it_owed(tmp_path: Path) -> None:
+    """A stopped process that Triton takes for dead is ended by the unload, so nobody finds it dead later."""
+    with (
+        OneModelServer(make_repository(tmp_path, more_code=STICKY), Endpoints.free()) as server,
+        ThreadPoolExecutor(6) as pool,
+        RewardClient(server.endpoints.grpc_url, retry=False) as client,
+    ):
+        (process,) = ProcessWatch(server.pid, PATIENCE_S).of_model(MODEL)
+        client.progress(trajectory(0))
         waiting = [pool.submit(client.progress, trajectory(seed)) for seed in range(6)]
-        time.sleep(0.5)
-        kill_model(repository)
-        for future, expected in zip(waiting, references, strict=False):
-            np.testing.assert_allclose(future.result().progress, expected, rtol=0, atol=TOLERANCE)
-        assert served.metric("rfm_serve_restarts_total", what="triton") == 1
-        assert served.metric("rfm_serve_restarts_total", what=MODEL) == 0
+        wait_for(lambda: process.journal is not None and process.journal.num_owed > 1)
+        os.kill(process.pid, signal.SIGSTOP)
+        with server.repository_api() as api:
+            config = api.config(MODEL, 1)
+        with pytest.raises(OwedAnswersError, match=r"processes of rfm have ended, and owe [2-6] answers"):
+            Reload(MODEL, server, config, is_out=False, was_hung=False).load([process])
+        assert not process.is_alive
+        server.kill()
+        assert any(isinstance(future.exception(), ServerUnavailableError) for future in waiting)
 
 
 def test_a_suspect_is_remembered_when_triton_is_started_again(tmp_path: Path) -> None:
