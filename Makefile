@@ -25,8 +25,7 @@ test: check
 # All that CI runs: also the tests that kill, wait or restart, or need programs of Debian.
 test-all: check ops-tools
 	$(BIN)/pytest $(WORKERS) -m "not gpu and not slow"
-	$(BIN)/pytest $(WORKERS) -m "slow and not gpu" --ignore tests/supervise
-	$(BIN)/pytest -m "slow and not gpu" tests/supervise
+	$(BIN)/pytest -m "slow and not gpu"
 
 # Lint, format, types, generated files; no tests.
 check: $(INSTALLED)
