@@ -13,6 +13,7 @@ import pytest
 from clock import Clock
 from rfm.launch.repository_api import ModelVersion, RepositoryApiError
 from rfm.supervise import back_off, background, model_reload, model_watch
+from rfm.supervise.model_reload import OwedAnswersError
 from rfm.supervise.model_states import Event, State
 from rfm.supervise.model_watch import RETRY_S, ModelWatch
 from rfm.supervise.status import NO_REASON, Status
@@ -56,11 +57,11 @@ class Triton:
 
 
 class Process:
-    """A process of the model that ends when it is killed."""
+    """A process of the model that ends when it is killed. num_owed: answers that it still owes then"""
 
-    def __init__(self) -> None:
+    def __init__(self, num_owed: int = 0) -> None:
         self.is_alive, self.is_blamed = True, True
-        self.journal = SimpleNamespace(close=lambda: setattr(self, "is_blamed", False))
+        self.journal = SimpleNamespace(close=lambda: setattr(self, "is_blamed", False), num_owed=num_owed)
 
     def kill(self) -> None:
         self.is_alive = False
@@ -113,7 +114,7 @@ def at_once(_: str, call: Callable[[], None]) -> Future[None]:
     future: Future[None] = Future()
     try:
         future.set_result(call())
-    except (RepositoryApiError, LookupError) as error:
+    except (RepositoryApiError, OwedAnswersError, LookupError) as error:
         future.set_exception(error)
     return future
 
@@ -162,6 +163,17 @@ def test_a_fault_is_healed_at_once(bench: Bench, fault: Event) -> None:
     assert bench.clock.now_s == pytest.approx(2.0)  # they had this time
     # What a process worked on is to blame if it hung, and not if it was killed for another's fault.
     assert bench.processes[0].is_blamed is (fault is Event.HUNG)
+
+
+@pytest.mark.parametrize("event", [Event.HUNG, Event.BROKEN])
+def test_processes_that_end_owing_answers_are_told_of_and_the_model_stays_out(bench: Bench, event: Event) -> None:
+    bench.processes = [Process(num_owed=2), Process(), Process(num_owed=3)]
+    bench.look(event)
+    bench.look()
+    assert bench.model.owing == f"processes of {MODEL} have ended, and owe 5 answers"
+    assert [process.is_alive for process in bench.processes] == [False, False, False]
+    assert (bench.triton.asked, bench.forgotten) == (["unload"], bench.processes)
+    assert bench.model.reason == f"it is loaded anew, after: {bench.model.owing}"
 
 
 def test_a_process_that_has_died_says_how(bench: Bench) -> None:
