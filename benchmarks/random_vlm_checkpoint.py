@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors.torch import save_file
@@ -19,7 +20,7 @@ from torch import Tensor, nn
 
 SPECIAL_TOKENS = ("<|split_token|>", "<|reward_token|>", "<|pref_token|>", "<|sim_token|>", "<|prog_token|>")
 BINS = 10
-TEXT = {  # Qwen3-VL-4B-Instruct
+TEXT: dict[str, Any] = {  # Qwen3-VL-4B-Instruct
     "hidden_size": 2560, "intermediate_size": 9728, "num_hidden_layers": 36, "num_attention_heads": 32,
     "num_key_value_heads": 8, "head_dim": 128, "max_position_embeddings": 262144, "rope_theta": 5000000,
     "rope_scaling": {"rope_type": "default", "mrope_interleaved": True, "mrope_section": [24, 20, 20]},
@@ -43,14 +44,24 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--base-model", required=True, help="folder or id whose tokenizer is used")
     options = parser.parse_args()
-    options.folder.mkdir(parents=True)
+    write(options.folder, options.base_model)
+
+
+def write(folder: Path, base_model: str, layers: int = TEXT["num_hidden_layers"]) -> None:
+    """Writes the files into a new ``folder``.
+
+    base_model: folder or id whose tokenizer is used
+    layers: of the language model; 36: 4B parameters, 3: 0.6B
+    """
+    folder.mkdir(parents=True)
 
     from transformers import AutoTokenizer, Qwen3VLConfig, Qwen3VLModel
 
-    tokenizer = AutoTokenizer.from_pretrained(options.base_model)
+    tokenizer = AutoTokenizer.from_pretrained(base_model)
     tokenizer.add_tokens(list(SPECIAL_TOKENS), special_tokens=True)
     ids = {name: tokenizer.convert_tokens_to_ids(token) for name, token in _TOKEN_IDS.items()}
-    config = Qwen3VLConfig(text_config={**TEXT, "vocab_size": len(tokenizer)}, vision_config=VISION, **ids)
+    text = {**TEXT, "num_hidden_layers": layers, "vocab_size": len(tokenizer)}
+    config = Qwen3VLConfig(text_config=text, vision_config=VISION, **ids)
     torch.manual_seed(0)
     backbone = Qwen3VLModel._from_config(config, dtype=torch.bfloat16)
     width = TEXT["hidden_size"]
@@ -60,10 +71,10 @@ def main() -> None:
     )
     weights["frame_pool_attn.weight"] = torch.randn(1, width)
     tensors = {name: tensor.to(torch.bfloat16).contiguous() for name, tensor in weights.items()}
-    save_file(tensors, options.folder / "model.safetensors", metadata={"format": "pt"})
-    (options.folder / "config.json").write_text(json.dumps(config.to_dict(), indent=2))
-    run = {**RUN, "model": {**RUN["model"], "base_model_id": options.base_model}}
-    (options.folder / "config.yaml").write_text(json.dumps(run))  # JSON is YAML
+    save_file(tensors, folder / "model.safetensors", metadata={"format": "pt"})
+    (folder / "config.json").write_text(json.dumps(config.to_dict(), indent=2))
+    run = {**RUN, "model": {**RUN["model"], "base_model_id": base_model}}
+    (folder / "config.yaml").write_text(json.dumps(run))  # JSON is YAML
 
 
 _TOKEN_IDS = {

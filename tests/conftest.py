@@ -21,6 +21,8 @@ from rfm.engine import Engine
 from rfm.launch.installation import find_installation
 from rfm.launch.process import Endpoints
 
+SHARED_SERVERS = ("served", "demo_server")  # fixtures that start a server for all who only ask
+
 torch.set_num_threads(1)
 os.environ[RUN] = uuid.uuid4().hex  # by which tests know what this run has started
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test asks the network
@@ -45,7 +47,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         yield Served(server)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def demo_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Endpoints]:
     """A server of the demo's repository, whose checkpoint has the default name."""
     folder = tmp_path_factory.mktemp("demo")
@@ -77,12 +79,13 @@ def protocol(request: pytest.FixtureRequest) -> str:
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Whoever asks the reference server asks a Triton. Where two processes test, one of them has that server.
+    """Whoever asks a server of the whole run asks a Triton. Where two processes test, one of them has that server.
 
     The tests of a file stay together, too, since they share what its fixtures start.
     """
     for item in items:
-        is_served = "served" in getattr(item, "fixturenames", ())
-        if is_served:
+        names = getattr(item, "fixturenames", ())
+        shared = next((server for server in SHARED_SERVERS if server in names), None)
+        if shared:
             item.add_marker("triton")
-        item.add_marker(pytest.mark.xdist_group("served" if is_served else str(item.path)))
+        item.add_marker(pytest.mark.xdist_group(shared or str(item.path)))

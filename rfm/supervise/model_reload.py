@@ -12,6 +12,7 @@ from rfm.supervise.model_processes import ModelProcess
 from rfm.supervise.triton_watch import Config, serving_just
 
 DRAIN_S = 2.0  # for what the model's other processes are working on
+KILLED_S = 5.0  # for the kernel to take back what a killed process held
 POLL_S = 0.1
 
 
@@ -102,17 +103,24 @@ class Reload:
 
         Raises OwedAnswersError. Triton has reaped them, so nobody else sees that they are dead.
         """
-        deadline_s = time.monotonic() + DRAIN_S
-        while any(process.is_alive for process in processes) and time.monotonic() < deadline_s:
-            time.sleep(POLL_S)
+        _wait_for_end(processes, DRAIN_S)
+        killed = [process for process in processes if process.is_alive]
+        for process in killed:
+            process.kill()
+        _wait_for_end(killed, KILLED_S)
         num_owed = 0
         for process in processes:
-            was_alive, journal = process.is_alive, process.journal
-            process.kill()
+            journal = process.journal
             if journal is not None:
                 num_owed += journal.num_owed
-                if was_alive and not self._was_hung:
+                if process in killed and not self._was_hung:
                     journal.close()  # what it was working on is not why it ends
         self.ended = [*self.ended, *processes]
         if num_owed:
             raise OwedAnswersError(f"processes of {self._model} have ended, and owe {num_owed} answers")
+
+
+def _wait_for_end(processes: Sequence[ModelProcess], most_s: float) -> None:
+    deadline_s = time.monotonic() + most_s
+    while any(process.is_alive for process in processes) and time.monotonic() < deadline_s:
+        time.sleep(POLL_S)

@@ -82,6 +82,7 @@ def test_a_right_port_and_one_of_something_else_are_not_told_wrong(demo_server: 
 ENDS = {"killed": (signal.SIGKILL, ExitCode.UNAVAILABLE), "hangs": (signal.SIGSTOP, ExitCode.DEADLINE)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "code"), ENDS.values(), ids=ENDS)
 def test_a_server_that_goes_away_is_not_asked_any_more(
     repository: Path, tmp_path: Path, number: signal.Signals, code: ExitCode

@@ -203,10 +203,12 @@ def test_an_export_that_dies_at_any_moment_leaves_a_repository_that_loads(
 ) -> None:
     died = True
     survived = 0
+    exported = tmp_path / "exported"
+    exported.mkdir()
+    for _ in range(before):
+        export(FRAMES, exported)
     while died:
-        repository = tmp_path / str(survived) / "model_repository"
-        for _ in range(before):
-            export(FRAMES, repository)
+        repository = shutil.copytree(exported, tmp_path / str(survived) / "model_repository")
         remaining = survived
 
         def counted(original: Any, repository: Path = repository) -> Any:

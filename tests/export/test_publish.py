@@ -17,6 +17,7 @@ import pytest
 import goldens
 import rfm_export
 from engines import serve_config
+from one_model import BriefServer
 from rfm.launch.installation import find_installation
 from rfm.launch.process import Endpoints, TritonServer
 from rfm.launch.repository_api import RepositoryApi
@@ -40,7 +41,7 @@ def export(repository: Path, name: str = "rfm", checkpoint: Path = PLAIN.checkpo
 
 
 @contextmanager
-def served(repository: Path, log: Path, kind: type[TritonServer] = TritonServer) -> Iterator[TritonServer]:
+def served(repository: Path, log: Path, kind: type[TritonServer] = BriefServer) -> Iterator[TritonServer]:
     with (
         log.open("wb") as lines,
         kind(repository, Endpoints.free(), find_installation(), log=lines, admin_key=KEY) as server,
@@ -84,6 +85,7 @@ def mounted() -> Iterator[Mounted]:
         shutil.rmtree(folder)
 
 
+@pytest.mark.slow
 def test_only_the_repository_must_be_writable(mounted: Mounted, tmp_path: Path) -> None:
     repository, checkpoint = mounted.repository, mounted.checkpoint
     export(tmp_path / "other")  # imports what nobody need be allowed to read
@@ -104,7 +106,7 @@ def test_only_the_repository_must_be_writable(mounted: Mounted, tmp_path: Path) 
     assert sorted(path.name for path in (repository / "rfm").iterdir()) == ["1", "2", "config.pbtxt", "warmup"]
 
 
-class LoadsAll(TritonServer):
+class LoadsAll(BriefServer):
     """As an operator may run Triton without ``rfm serve``: each folder of the repository is a model."""
 
     mode = "none"
@@ -121,7 +123,7 @@ class Polls(LoadsAll):
         return [*super()._arguments(models), "--repository-poll-secs=1"]  # it ends only when it has slept for so long
 
 
-@pytest.mark.parametrize("kind", [LoadsAll, Polls, TritonServer])
+@pytest.mark.parametrize("kind", [LoadsAll, Polls, BriefServer])
 def test_triton_does_not_see_what_is_staged(kind: type[TritonServer], tmp_path: Path) -> None:
     """Nor what an export left that was killed."""
     repository = tmp_path / "repository"

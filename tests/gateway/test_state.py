@@ -199,6 +199,7 @@ def children(process_id: int) -> dict[int, str]:
     return found
 
 
+@pytest.mark.slow
 def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed(triton: Triton, tmp_path: Path) -> None:
     repository, endpoints, port = tmp_path / "model_repository", Endpoints.free(), free_port()
     shutil.copytree(triton.repository / TINY, repository / TINY)

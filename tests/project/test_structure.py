@@ -67,6 +67,7 @@ EXCEPTIONS = {
     "benchmarks/peers/simulated.py": {"rfm"},
     "benchmarks/contestants.py": {"rfm"},
     "benchmarks/forward.py": {"rfm"},
+    "benchmarks/loading.py": {"rfm", "rfm_export"},
     "benchmarks/preparation.py": {"rfm"},
     "benchmarks/perf_analyzer.py": {"rfm"},
     "benchmarks/peers/litserve_server.py": {"rfm"},  # the peers score with our engine, or weights
