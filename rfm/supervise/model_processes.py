@@ -121,6 +121,11 @@ class ProcessWatch:
         journals = [process.journal for process in self._watched if process.model == model and process.is_alive]
         return any(journal is not None and 0 < journal.busy_s <= self._hang_s for journal in journals)
 
+    def num_owed(self, model: str) -> int:
+        """How many answers the model's processes owe that are dead or stopped."""
+        idle = [process for process in self.of_model(model) if process.state in (None, ZOMBIE, STOPPED)]
+        return sum(journal.num_owed for process in idle if (journal := process.journal) is not None)
+
     def of_model(self, model: str) -> list[ModelProcess]:
         """The model's processes, dead or alive."""
         self._scan()

@@ -53,7 +53,7 @@ class ModelWatch:
         self._due_s = 0.0  # the next attempt
         self._why = ""  # it is healed
         self._trouble = ""  # why its last load failed
-        self.owing: str | None = None  # processes that this ended while they owed answers
+        self.owing: str | None = None  # its processes, dead or stopped, owe answers, or did when a reload ended them
 
     @property
     def state(self) -> State:
@@ -112,6 +112,9 @@ class ModelWatch:
         if event in FAULTS:
             why = died or event.value
             self._status.record_probe(self.name, is_ok=False)
+            if num_owed := self._processes.num_owed(self.name):  # then Triton is restarted, and the model with it
+                self.owing = f"processes of {self.name} do not run, and owe {num_owed} answers"
+                return None
             self._heal(event, why, config)
             return why
         if event is not None:

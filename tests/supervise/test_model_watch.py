@@ -74,6 +74,7 @@ class Bench:
         self.clock, self.triton, self.status = Clock(), Triton(), Status()
         self.said: list[str] = []
         self.processes: list[Process] = []
+        self.num_owed = 0  # by processes that do not run
         self.forgotten: list[Process] = []
         self.probed: Event | None = None
         self.is_getting_on = False
@@ -84,6 +85,7 @@ class Bench:
         probe = SimpleNamespace(look=lambda: self.probed, renew=self.renew)
         processes = SimpleNamespace(
             of_model=lambda _: list(self.processes),
+            num_owed=lambda _: self.num_owed,
             forget=self.forgotten.extend,
             is_getting_on=lambda _: self.is_getting_on,
         )
@@ -174,6 +176,14 @@ def test_processes_that_end_owing_answers_are_told_of_and_the_model_stays_out(be
     assert [process.is_alive for process in bench.processes] == [False, False, False]
     assert (bench.triton.asked, bench.forgotten) == (["unload"], bench.processes)
     assert bench.model.reason == f"it is loaded anew, after: {bench.model.owing}"
+
+
+def test_who_owes_answers_and_does_not_run_is_left_to_the_restart_of_triton(bench: Bench) -> None:
+    bench.look(Event.ANSWERED)
+    bench.num_owed = 3
+    assert bench.look(Event.BROKEN) is None  # one fault is one restart
+    assert (bench.model.owing, bench.triton.asked) == (f"processes of {MODEL} do not run, and owe 3 answers", [])
+    assert not bench.is_probe_ok
 
 
 def test_a_process_that_has_died_says_how(bench: Bench) -> None:
