@@ -122,9 +122,8 @@ class Engine:
         dtype: of the network; None: float32, and a vision-language checkpoint's own on a GPU
         feature_cache_mb: MiB of what a network that reads raw frames makes of each; 0: nothing is kept
         """
+        keep_float32()
         on = torch.device(device)
-        if on.type == "cuda":
-            keep_float32()
         cache = FeatureCache[Any](feature_cache_mb * BYTES_PER_MB) if feature_cache_mb else None
         predictor = checkpoint.predictor(on, dtype, cache)
         encoders = None if encoders is None else encoders.to(on)

@@ -36,9 +36,9 @@ class Placement:
     def apply(self) -> None:
         """To be called in each thread that computes: both settings are a thread's own."""
         torch.set_num_threads(self.num_threads)
+        keep_float32()
         if self.device.type == "cuda":
             torch.cuda.set_device(self.device)  # some kernels launch on the current device, whatever their tensors'
-            keep_float32()
 
 
 def num_instances(config: Mapping[str, Any]) -> int:
