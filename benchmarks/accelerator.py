@@ -5,6 +5,9 @@
 
 What it shows depends little on the machine: the share of the time in which the accelerator is busy, and what a request
 costs of the CPU, in the server and in its callers. Rounds are interleaved, so a machine that drifts hits all alike.
+
+All servers get embeddings. This one gets raw frames, too, for a tiny checkpoint on a Qwen3-VL backbone: preparing them
+is as real as ever.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import psutil
-from bench import DEMO, RESULTS, machine
+from bench import DEMO, RESULTS, ROOT, machine
 from contestants import PEER_SCRIPTS, Callers, running_peer
 from load import Load
 from rich.console import Console
@@ -35,9 +38,12 @@ from simulated import SIMULATION, Ledger
 
 CHECKPOINT = DEMO / "rfm" / "1" / "checkpoint"
 BATCH_S, ROW_S = 4e-3, 0.5e-3
+VLM = ROOT / "tests" / "golden" / "vlm"
+VLM_CHECKPOINT, VLM_BASE = VLM / "q3_tok_disc10" / "checkpoint", VLM / "bases" / "q3"
+VLM_BATCH_S, VLM_ROW_S = 0.0, 30e-3
 CHEAP_ANSWER_S = 0.2e-3  # as on a GPU: the CPU is free while it computes
 FRAMES = (16, 16)
-OURS = "this server"
+OURS, OURS_VLM = "this server", "this server, frames"
 SIMULATED = """
 
 import sys
@@ -87,15 +93,18 @@ def main() -> None:
     parser.add_argument("--peers", nargs="*", default=["LitServe", "mosec"], choices=["LitServe", "mosec"])
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder for the results")
     arguments = parser.parse_args()
+    names = [OURS, *arguments.peers]
+    loads = [(name, Load(callers, arguments.seconds, FRAMES)) for callers in arguments.callers for name in names]
+    loads.append((OURS_VLM, Load(callers=16, seconds=2 * arguments.seconds, frames=(8, 8), frame_px=256)))
     rows = []
     with TemporaryDirectory(prefix="rfm-accelerator-") as folder, contestants(Path(folder), arguments.peers) as of_name:
         for number in range(arguments.rounds):
-            for callers in arguments.callers:
-                for name, contestant in of_name.items():
-                    row = {"way": name, "callers": callers, "round": number}
-                    rows.append(row | measure(contestant, Load(callers, arguments.seconds, FRAMES)))
-                    Console().print(rows[-1], highlight=False)
-    results = {"machine": machine(), "batch_s": BATCH_S, "row_s": ROW_S, "measurements": rows}
+            for name, load in loads:
+                row = {"way": name, "callers": load.callers, "round": number}
+                rows.append(row | measure(of_name[name], load))
+                Console().print(rows[-1], highlight=False)
+    times_s = {"batch_s": BATCH_S, "row_s": ROW_S, "vlm_batch_s": VLM_BATCH_S, "vlm_row_s": VLM_ROW_S}
+    results = {"machine": machine(), **times_s, "measurements": rows}
     arguments.output.mkdir(parents=True, exist_ok=True)
     (arguments.output / "accelerator.json").write_text(json.dumps(results, indent=1) + "\n")
     (arguments.output / "accelerator.md").write_text(table(rows))
@@ -124,37 +133,53 @@ def measure(contestant: Contestant, load: Load) -> dict[str, float]:
 @contextmanager
 def contestants(folder: Path, peers: list[str]) -> Iterator[Mapping[str, Contestant]]:
     """All servers, each before an accelerator of its own."""
-    config = Engine.from_checkpoint(CHECKPOINT).predictor.network.config
-    widths = config.video_feature_dim, config.text_feature_dim
+    network = Engine.from_checkpoint(CHECKPOINT).predictor.network.config
+    widths = network.video_feature_dim, network.text_feature_dim
+    config = ExportConfig(num_gpus=0, torch_threads=1)
+    of_vlm = ExportConfig(num_gpus=0, torch_threads=1, base_model=str(VLM_BASE))
+    servers = {
+        OURS: ours(folder / "embeddings", CHECKPOINT, config, BATCH_S, ROW_S),
+        OURS_VLM: ours(folder / "frames", VLM_CHECKPOINT, of_vlm, VLM_BATCH_S, VLM_ROW_S),
+        **{peer: theirs(folder / peer, peer) for peer in peers},
+    }
     with ExitStack() as stack:
-        urls = {}
-        repository, file = folder / "repository", folder / OURS
-        rfm_export.export(CHECKPOINT, repository, ExportConfig(num_gpus=0, torch_threads=1))
-        model = repository / "rfm" / "1" / "model.py"
-        peers_folder = str(Path(__file__).parent / "peers")
-        times_s = {"batch_s": BATCH_S, "row_s": ROW_S, "cheap_answer_s": CHEAP_ANSWER_S}
-        code = SIMULATED.format(peers=peers_folder, file=str(file), **times_s)
-        model.write_text(model.read_text() + code)
-        before = set(psutil.Process().children(recursive=True))
-        urls[OURS] = stack.enter_context(temporary_server(repository, folder / "triton.log")).grpc_url
-        processes = {OURS: list(set(psutil.Process().children(recursive=True)) - before)}
-        for peer in peers:
-            checkpoint = folder / f"checkpoint_{peer}"
-            checkpoint.mkdir()
-            for source in CHECKPOINT.iterdir():
-                (checkpoint / source.name).symlink_to(source)
-            (checkpoint / SIMULATION).write_text(json.dumps([str(folder / peer), BATCH_S, ROW_S]))
-            before = set(psutil.Process().children(recursive=True))
-            words = {"checkpoint": checkpoint, "threads": 1, "workers": 1}
-            port = stack.enter_context(running_peer(PEER_SCRIPTS[peer], words, folder / f"{peer}.log"))
-            urls[peer] = f"http://127.0.0.1:{port}"
-            processes[peer] = list(set(psutil.Process().children(recursive=True)) - before)
         made = {}
-        for name, url in urls.items():
-            callers = Callers("gRPC" if name == OURS else name, url, widths)
+        for name, server in servers.items():
+            before = set(psutil.Process().children(recursive=True))
+            url, ledger = stack.enter_context(server)
+            processes = list(set(psutil.Process().children(recursive=True)) - before)
+            callers = Callers(name if name in peers else "gRPC", url, widths)
             stack.callback(callers.close)
-            made[name] = Contestant(callers, Ledger(folder / name), processes[name])
+            made[name] = Contestant(callers, ledger, processes)
         yield made
+
+
+@contextmanager
+def ours(
+    folder: Path, checkpoint: Path, config: ExportConfig, batch_s: float, row_s: float
+) -> Iterator[tuple[str, Ledger]]:
+    """URL and accelerator of this server."""
+    repository, file = folder / "repository", folder / "ledger"
+    folder.mkdir()
+    rfm_export.export(checkpoint, repository, config)
+    (model,) = repository.glob("*/1/model.py")
+    times_s = {"batch_s": batch_s, "row_s": row_s, "cheap_answer_s": CHEAP_ANSWER_S}
+    model.write_text(model.read_text() + SIMULATED.format(peers=sys.path[0], file=str(file), **times_s))
+    with temporary_server(repository, folder / "triton.log") as endpoints:
+        yield endpoints.grpc_url, Ledger(file)
+
+
+@contextmanager
+def theirs(folder: Path, peer: str) -> Iterator[tuple[str, Ledger]]:
+    """URL and accelerator of a peer."""
+    checkpoint, file = folder / "checkpoint", folder / "ledger"
+    checkpoint.mkdir(parents=True)
+    for source in CHECKPOINT.iterdir():
+        (checkpoint / source.name).symlink_to(source)
+    (checkpoint / SIMULATION).write_text(json.dumps([str(file), BATCH_S, ROW_S]))
+    words = {"checkpoint": checkpoint, "threads": 1, "workers": 1}
+    with running_peer(PEER_SCRIPTS[peer], words, folder / "log") as port:
+        yield f"http://127.0.0.1:{port}", Ledger(file)
 
 
 def table(rows: list[dict[str, object]]) -> str:
@@ -164,7 +189,8 @@ def table(rows: list[dict[str, object]]) -> str:
         f"# A simulated accelerator: {1e3 * BATCH_S:g} ms a batch and {1e3 * ROW_S:g} ms a sample, asleep",
         "",
         "Medians of the rounds. busy: share of the time; us: CPU microseconds a sample, of all of the server's",
-        "processes, and of its callers' process.",
+        f"processes, and of its callers' process. {OURS_VLM}: 8 of 256 x 256 a sample, a tiny checkpoint on a Qwen3-VL",
+        f"backbone, {1e3 * VLM_ROW_S:g} ms a sample, preparation included.",
         "",
         "| callers | server | busy | samples/s | p50 ms | p99 ms | server us | client us |",
         "|---|---|---|---|---|---|---|---|",
