@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from rfm_client.batching import groups, model_of, padded_bytes, parts
 from rfm_client.call import Call, new_request_ids
 from rfm_client.contract import wire
-from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, ProcessEndedError, RewardError
+from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, RewardError, ServerUnavailableError
 from rfm_client.contract.names import encoder_name
 from rfm_client.contract.results import Result
 from rfm_client.contract.samples import Sample, Trajectory
@@ -131,7 +131,7 @@ class Scorer:
             if isinstance(error, InvalidSampleError) and error.is_deadly and not is_joint:
                 return for_each(error, len(samples))  # alone, the one that is would end two more processes
         except RewardError as error:
-            if not (is_joint and isinstance(error, ProcessEndedError)):
+            if not (is_joint and isinstance(error, ServerUnavailableError) and error.ended_under_way):
                 return for_each(error, len(samples))
             self._joining.stay_apart()
         alone = await asyncio.gather(*(self._request(model, [sample], call) for sample in samples))

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections import Counter
 from collections.abc import Collection
 
@@ -14,6 +15,7 @@ from rfm_client import (
     AsyncRewardClient,
     InferenceFailedError,
     ModelNotFoundError,
+    ProcessEndedError,
     RewardError,
     ServerUnavailableError,
     Trajectory,
@@ -41,6 +43,9 @@ class Stand:
     def __init__(self, url: str = "grpc://stand:1", error: RewardError | None = None) -> None:
         self.url = url
         self.error = error
+        self.num_ends = 0  # of its next requests, under which its connection ends
+        self.down_s = 0.0  # for so long after each of them it is not ready
+        self._up_s = 0.0
         self.version, self.frames_per_value = 1, 1
         self.asked: Counter[str] = Counter()
 
@@ -49,6 +54,12 @@ class Stand:
     ) -> Answer:
         self.asked["infer"] += 1
         await asyncio.sleep(0)
+        if self.num_ends:
+            self.num_ends -= 1
+            self._up_s = time.monotonic() + self.down_s
+            lost = ServerUnavailableError("Socket closed")
+            lost.ended_under_way = True
+            raise lost
         if self.error is not None:
             raise self.error
         shape = inputs[wire.NUM_FRAMES].shape[0], wire.num_positions(inputs)
@@ -64,7 +75,7 @@ class Stand:
         return ModelInfo(model, (str(self.version),), **limits, **widths, frames_per_value=self.frames_per_value)  # type: ignore[arg-type]
 
     async def is_ready(self, model: str, timeout_s: float) -> bool:
-        return self.error is None
+        return self.error is None and time.monotonic() >= self._up_s
 
     async def close(self) -> None:
         pass
@@ -145,5 +156,35 @@ def test_a_model_is_not_served_only_if_every_server_says_so(others: list[RewardE
                 await client.progress(SEEN)
             if kind is ModelNotFoundError:  # and which of them is asked next is as it was
                 assert not any(server.is_left_out for server in client._servers._servers)
+
+    asyncio.run(asyncio.wait_for(ask(), WITHIN_S))
+
+
+@pytest.mark.parametrize("down_s", [0.0, 0.5])
+def test_a_call_under_which_its_connection_ends_stays_with_that_server(down_s: float) -> None:
+    """The request may be why the server ended. It alone knows which request that was, once it is back."""
+
+    async def ask() -> None:
+        stands = [Stand("grpc://one:1"), Stand("grpc://other:1")]
+        async with AsyncRewardClient("", transports=stands) as client:
+            await client.progress(SEEN)
+            (asked,) = [stand for stand in stands if stand.asked["infer"]]
+            (next_one,) = [stand for stand in stands if stand is not asked]
+            next_one.num_ends, next_one.down_s = 2, down_s
+            await client.progress(SEEN)
+        assert (asked.asked["infer"], next_one.asked["infer"]) == (1, 3)
+
+    asyncio.run(asyncio.wait_for(ask(), WITHIN_S))
+
+
+def test_a_call_under_which_two_connections_end_is_sent_to_no_third_server() -> None:
+    async def ask() -> None:
+        stands = [Stand(f"grpc://{number}:1") for number in range(3)]
+        for stand in stands:
+            stand.num_ends, stand.down_s = 1, 60.0
+        async with AsyncRewardClient("", transports=stands, timeout_s=1.0) as client:
+            with pytest.raises(ProcessEndedError, match=r"grpc://0:1 and grpc://1:1: its process or connection ended"):
+                await client.progress(SEEN)
+            assert [stand.asked["infer"] for stand in stands] == [1, 1, 0]
 
     asyncio.run(asyncio.wait_for(ask(), WITHIN_S))

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from faulty_servers import url_of
 from one_model import OneModelServer, answered
 from patients import DEADLY, MARK, Callers, make_repository, references, trajectory
 from rfm.launch.process import Endpoints
@@ -53,14 +54,16 @@ def fleet(tmp_path: Path) -> Iterator[list[Serving]]:
 
 
 def num_ended(fleet: list[Serving]) -> int:
-    """Model processes that have ended and were replaced."""
-    return int(sum(server.metric("rfm_serve_restarts_total", what=MODEL) for server in fleet))
+    """Model processes that have ended and were replaced: Triton with them, if they owed answers."""
+    return int(
+        sum(server.metric("rfm_serve_restarts_total", what=what) for server in fleet for what in (MODEL, "triton"))
+    )
 
 
 def test_a_request_that_ends_its_process_ends_two_of_a_fleet_and_those_beside_it_are_answered(
-    fleet: list[Serving], references: list[np.ndarray[Any, Any]]
+    fleet: list[Serving], references: list[np.ndarray[Any, Any]], protocol: str
 ) -> None:
-    urls = [server.endpoints.grpc_url for server in fleet]
+    urls = [url_of(server.endpoints, protocol) for server in fleet]
     with (
         RewardClient(urls, timeout_s=LONG_S) as client,
         RewardClient(urls, timeout_s=LONG_S) as other,
@@ -121,7 +124,7 @@ def test_where_nobody_heals_a_request_ends_two_processes_and_says_so(tmp_path: P
     with ExitStack() as stack:
         servers = [stack.enter_context(unhealed(tmp_path / f"server-{number}")) for number in range(NUM_SERVERS)]
         client = stack.enter_context(RewardClient([one.server.endpoints.grpc_url for one in servers]))
-        told = r"grpc://.* and grpc://.*: a process of the model ended at each while it had this request, so no other"
+        told = r"grpc://.* and grpc://.*: its process or connection ended at each under this request, so no other"
         with pytest.raises(ProcessEndedError, match=told):
             client.progress(POISON, timeout_s=8)
         assert [one.is_dead for one in servers].count(True) == 2

@@ -16,21 +16,25 @@ import tritonclient.http
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
 from commands import REPOSITORY
-from one_model import BriefServer
+from faulty_servers import url_of
+from one_model import BriefServer, OneModelServer
 from patients import make_repository
 from repositories import bound_triton_s_queue, kill_model
 from rfm.launch.installation import find_installation
 from rfm.launch.process import Endpoints
 from rfm.launch.repository_api import RepositoryApi
+from rfm.supervise.model_processes import ProcessWatch
 from rfm_client import (
     InvalidSampleError,
     ModelNotFoundError,
     ProcessEndedError,
     ProgressSample,
+    RewardClient,
     RewardError,
     ServerUnavailableError,
 )
 from rfm_client.contract import triton, wire
+from rfm_serve import MODEL, PATIENCE_S, wait_for
 from trajectories import random_trajectory
 
 pytestmark = pytest.mark.triton
@@ -178,6 +182,26 @@ def test_a_full_queue_says_so_in_these_words(tmp_path: Path, protocol: str, name
         assert triton.is_full(message)
         assert status in triton.UNAVAILABLE
         assert type(triton.error_of(status, message, InvalidSampleError)) is ServerUnavailableError
+
+
+@pytest.mark.slow
+def test_a_connection_that_ends_under_a_request_is_told_from_one_that_is_refused(tmp_path: Path, protocol: str) -> None:
+    repository = make_repository(tmp_path, more_code=SLOW)
+    with (
+        OneModelServer(repository, Endpoints.free()) as server,
+        RewardClient(url_of(server.endpoints, protocol), retry=False) as client,
+    ):
+        sample = ProgressSample(random_trajectory(0, 2, *DIMS))
+        client.evaluate([sample])
+        (process,) = ProcessWatch(server.pid, PATIENCE_S).of_model(MODEL)
+        future = client.submit(sample)
+        wait_for(lambda: process.journal is not None and process.journal.busy_s > 0)
+        server.kill()
+        under_way = future.exception()
+        (refused,) = client.evaluate([sample], return_errors=True)
+    for error in (under_way, refused):
+        assert type(error) is ServerUnavailableError
+    assert [error.ended_under_way for error in (under_way, refused)] == [True, False], (under_way, refused)
 
 
 def test_what_waited_for_too_long_did_not_meet_a_full_queue() -> None:

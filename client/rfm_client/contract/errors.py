@@ -61,11 +61,19 @@ class ServerError(RewardError):
 
 
 class ServerUnavailableError(ServerError):
-    """The server cannot be reached, is not ready, or refuses more work for now."""
+    """The server cannot be reached, is not ready, or refuses more work for now.
+
+    ended_under_way: a process of the model, or the connection, ended while the request was under way, perhaps because
+        of it
+    """
+
+    ended_under_way = False
 
 
 class ProcessEndedError(ServerUnavailableError):
     """A process of the model had ended when the request reached it, or while it worked on the request."""
+
+    ended_under_way = True
 
 
 class DeadlineExceededError(ServerError, TimeoutError):

@@ -35,6 +35,8 @@ RESTRICTED = "is restricted, expecting header"  # of an API that wants a key
 QUEUE_FULL = "the queue is full"  # of a model, in which as many requests wait as may
 TRITON_QUEUE_FULL = "Exceeds maximum queue size"  # of Triton, in which requests for a model of several instances wait
 
+_NO_CONNECTION = "failed to connect"  # of gRPC itself: nothing was sent
+_LOST_CONNECTION = re.compile("Socket closed|Connection reset|Broken pipe")  # of gRPC itself
 _NO_TRUST = re.compile(f"CERTIFICATE|certificate|[Vv]erification [Cc]heck failed|WRONG_VERSION_NUMBER|{RESTRICTED}")
 _WRONG_SHAPE = re.compile(  # behind the batch axis, which the caller did not make
     r"unexpected shape for input '(?P<name>\w+)'.*?Expected \[-1,(?P<expected>[^\]]*)\], got \[\d+,(?P<got>[^\]]*)\]"
@@ -76,4 +78,7 @@ def error_of(status: str, message: str, bad_request: type[errors.RewardError]) -
     if LOST_REGION in text or f"has {NO_VERSIONS}" in text:  # the sample is not at fault: another try may succeed
         return errors.ServerUnavailableError(text)
     kind = _ERROR_OF.get(status, errors.InferenceFailedError)
-    return (bad_request if kind is errors.InvalidSampleError else kind)(text)
+    error = (bad_request if kind is errors.InvalidSampleError else kind)(text)
+    if isinstance(error, errors.ServerUnavailableError):
+        error.ended_under_way = _LOST_CONNECTION.search(text) is not None and _NO_CONNECTION not in text
+    return error

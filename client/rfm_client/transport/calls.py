@@ -210,9 +210,9 @@ class _TritonTransport:
         except self.access_errors as error:
             raise errors.AccessDeniedError(f"{self.url}: access denied: {error}") from error
         except self.connection_errors as error:
-            raise errors.ServerUnavailableError(
-                f"{self.url}: no connection: {error or type(error).__name__}"
-            ) from error
+            unavailable = errors.ServerUnavailableError(f"{self.url}: no connection: {error or type(error).__name__}")
+            unavailable.ended_under_way = not isinstance(error, self.refused_connection)
+            raise unavailable from error
         except (ValueError, LookupError, TypeError) as error:  # the answer is not that of a KServe server
             raise errors.InferenceFailedError(f"{self.url}: the answer cannot be read: {error!r}") from error
 
@@ -257,6 +257,11 @@ class _TritonTransport:
     @property
     def connection_errors(self) -> tuple[type[Exception], ...]:
         return (OSError, EOFError)
+
+    @property
+    def refused_connection(self) -> tuple[type[Exception], ...]:
+        """Of the connection errors those that come before anything is sent."""
+        return ()
 
     @property
     def protocol_errors(self) -> tuple[type[Exception], ...]:
@@ -353,6 +358,12 @@ class HttpTransport(_TritonTransport):
         import aiohttp
 
         return (aiohttp.ClientError, OSError, EOFError)
+
+    @property
+    def refused_connection(self) -> tuple[type[Exception], ...]:
+        import aiohttp
+
+        return (aiohttp.ClientConnectorError,)
 
     @property
     def protocol_errors(self) -> tuple[type[Exception], ...]:

@@ -78,7 +78,7 @@ class Server:
             self.comeback = asyncio.create_task(self._heal(model))
 
     async def is_healed(self, within_s: float) -> bool:
-        """Whether it has been loaded anew, as soon as it has."""
+        """Whether it has been loaded anew, or says that it is ready after its connection ended, as soon as it has."""
         if self.comeback is None:
             return False
         comeback = self.comeback
@@ -111,12 +111,13 @@ class Server:
             self._closing = asyncio.create_task(self.transport.close())
 
     async def _rest(self, model: str) -> bool:
+        """True, as soon as the server says that it is ready."""
         await asyncio.sleep(pause_s(self.failures - 1, LONGEST_REST_S))
         for attempt in itertools.count():
             if await self.transport.is_ready(model, PROBE_TIMEOUT_S):
-                break
+                return True
             await asyncio.sleep(pause_s(attempt, LONGEST_RETRY_PAUSE_S))
-        return False
+        raise AssertionError("it counts for ever")
 
     async def _heal(self, model: str) -> bool:
         """Whether the server was seen to be healed.

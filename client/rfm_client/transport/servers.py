@@ -7,7 +7,8 @@ its journal lets the others through and refuses a request that has ended its pro
 request stays with S. If nobody heals S within half of the time that is left, and HEALED_WITHIN_S at most, the request
 goes to a server that is not known to be dead. If a process ends there too, the request fails. Either way it ends two
 processes at most: two of S, or one of S and one of another. Requests that were with S beside it wait as long, and are
-answered. No request is sent to a server that is known to be dead, where others are.
+answered. No request is sent to a server that is known to be dead, where others are. A connection that ends under a
+request means the same: ``rfm serve`` restarts Triton when a process has died that owed answers.
 
 A client of one server sends the request to that server again, after pauses, and its journal bounds it. A URL behind
 which a load balancer picks the server counts as one server: there the bound holds for each server, not for all
@@ -141,7 +142,7 @@ class Servers:
             return await self._request_among(None, model, request, deadline)
         except _EndedAtError as ended:
             where = f"{first.transport.url} and {ended.server.transport.url}"
-            message = f"{where}: a process of the model ended at each while it had this request, so no other is asked"
+            message = f"{where}: its process or connection ended at each under this request, so no other is asked"
             raise ProcessEndedError(f"{message}: {ended.error.message}") from ended.error
 
     async def _request_among(
@@ -156,7 +157,7 @@ class Servers:
         """The answer of the server ``only`` or, if that is None, of any.
 
         With several servers, or if the first end is to be the last, it raises _EndedAtError where a process of the
-        model has ended.
+        model has ended, or the connection.
         """
         refusals: dict[Server, RewardError] = {}
         for attempt in itertools.count():
@@ -184,7 +185,7 @@ class Servers:
             except ServerUnavailableError as error:
                 self._record_failure(server, model, error)
                 is_told_apart = is_last_end or (only is None and len(self._servers) > 1)
-                if is_told_apart and isinstance(error, ProcessEndedError):
+                if is_told_apart and error.ended_under_way:
                     raise _EndedAtError(server, error) from error
                 has_other = only is None and self._has_other({server, *refusals})
                 await self._pause(0.0 if has_other else pause_s(attempt, LONGEST_RETRY_PAUSE_S), deadline, error)
@@ -258,9 +259,9 @@ class Servers:
 
 
 class _EndedAtError(Exception):
-    """A process of the model ended at ``server`` when it had the request, or before."""
+    """A process of the model, or the connection, ended at ``server`` when it had the request, or before."""
 
-    def __init__(self, server: Server, error: ProcessEndedError) -> None:
+    def __init__(self, server: Server, error: ServerUnavailableError) -> None:
         super().__init__(server, error)
         self.server = server
         self.error = error
