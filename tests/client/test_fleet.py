@@ -51,6 +51,8 @@ def fleet(tmp_path: Path) -> Iterator[list[Serving]]:
         for server in served:
             server.wait_ready(True, LONG_S)
         yield served
+        for server in served:
+            server.process.terminate()  # side by side: each takes seconds
 
 
 def num_ended(fleet: list[Serving]) -> int:
