@@ -15,9 +15,9 @@ from rfm_client.episodes.live import LiveView
 
 @dataclass(frozen=True)
 class SuccessRule:
-    """A scored step succeeds when most of the ``last`` frames sent for it have a success of ``threshold`` or more.
+    """A scored step succeeds when most of the last frames shown to the model have a success of ``threshold`` or more.
 
-    Padding and repeated frames count once.
+    last: how many frames vote. Padding and repeated frames count once.
     """
 
     threshold: float = SUCCESS_THRESHOLD
