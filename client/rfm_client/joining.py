@@ -8,8 +8,8 @@ fewer requests are under way: a call is then sent at once, by itself.
 Calls of one kind share requests: the same model, widths and outputs, and time limits within a factor of two, so that
 a server that hangs is noticed nearly as soon. Each call keeps its own deadline, cancellation and error.
 
-Where a process of the model ends while it has a joint request, nothing is joined for APART_S. Asked about alone, the
-sample that did it is known to the server by itself, and refused; no other is blamed.
+Where a process of the model, or the connection, ends under a joint request, nothing is joined for APART_S. Asked about
+alone, the sample that did it is known to the server by itself, and refused; no other is blamed.
 """
 
 from __future__ import annotations
@@ -72,9 +72,7 @@ class Joining:
 
     def stay_apart(self) -> None:
         """Joins nothing for APART_S."""
-        logger.warning(
-            "a process of the model ended while it had samples of several calls: none are joined for a while"
-        )
+        logger.warning("a process or the connection ended under samples of several calls: none are joined for a while")
         self._apart_until_s = time.monotonic() + APART_S
 
     def _limit(self, model: str) -> float:

@@ -115,7 +115,7 @@ class Scorer:
         """One request. It fails whole if one sample cannot be scored; then each sample is sent alone.
 
         A request that is refused because it has ended its process is not taken apart: all its samples fail. But samples
-        of several calls are asked about alone as soon as a process ends that has them.
+        of several calls are asked about alone as soon as a process, or the connection, ends under them.
         """
         request_id = next(call.request_ids)
         is_joint = call.is_joint and len(samples) > 1
@@ -131,7 +131,7 @@ class Scorer:
             if isinstance(error, InvalidSampleError) and error.is_deadly and not is_joint:
                 return for_each(error, len(samples))  # alone, the one that is would end two more processes
         except RewardError as error:
-            if not (is_joint and isinstance(error, ServerUnavailableError) and error.ended_under_way):
+            if not (is_joint and isinstance(error, ServerUnavailableError) and error.may_have_ended_server):
                 return for_each(error, len(samples))
             self._joining.stay_apart()
         alone = await asyncio.gather(*(self._request(model, [sample], call) for sample in samples))

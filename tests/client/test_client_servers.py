@@ -15,7 +15,6 @@ from rfm_client import (
     AsyncRewardClient,
     InferenceFailedError,
     ModelNotFoundError,
-    ProcessEndedError,
     RewardError,
     ServerUnavailableError,
     Trajectory,
@@ -43,8 +42,9 @@ class Stand:
     def __init__(self, url: str = "grpc://stand:1", error: RewardError | None = None) -> None:
         self.url = url
         self.error = error
-        self.num_ends = 0  # of its next requests, under which its connection ends
-        self.down_s = 0.0  # for so long after each of them it is not ready
+        self.refusal: RewardError | None = None  # of each request, though it says that it is ready
+        self.num_ends = 0  # of its next requests: under each its connection ends
+        self.down_s = 0.0  # for so long after each end it takes no connection
         self._up_s = 0.0
         self.version, self.frames_per_value = 1, 1
         self.asked: Counter[str] = Counter()
@@ -53,15 +53,17 @@ class Stand:
         self, model: str, inputs: wire.Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
     ) -> Answer:
         self.asked["infer"] += 1
-        await asyncio.sleep(0)
-        if self.num_ends:
-            self.num_ends -= 1
+        if self.is_down:
+            self.asked["while down"] += 1
+            raise ServerUnavailableError("Connection refused")
+        is_end = self.num_ends > 0
+        self.num_ends -= is_end
+        await asyncio.sleep(0.01)  # all come before one of them ends
+        if is_end:
             self._up_s = time.monotonic() + self.down_s
-            lost = ServerUnavailableError("Socket closed")
-            lost.ended_under_way = True
-            raise lost
-        if self.error is not None:
-            raise self.error
+            raise lost()
+        if self.error is not None or self.refusal is not None:
+            raise self.error or self.refusal
         shape = inputs[wire.NUM_FRAMES].shape[0], wire.num_positions(inputs)
         tensors = {name: np.full(shape, 0.5, np.float32) for name in outputs}
         return Answer(tensors, str(self.version))
@@ -75,10 +77,21 @@ class Stand:
         return ModelInfo(model, (str(self.version),), **limits, **widths, frames_per_value=self.frames_per_value)  # type: ignore[arg-type]
 
     async def is_ready(self, model: str, timeout_s: float) -> bool:
-        return self.error is None and time.monotonic() >= self._up_s
+        return self.error is None and not self.is_down
 
     async def close(self) -> None:
         pass
+
+    @property
+    def is_down(self) -> bool:
+        return time.monotonic() < self._up_s
+
+
+def lost() -> ServerUnavailableError:
+    """What a call gets under which its connection ends."""
+    error = ServerUnavailableError("Socket closed")
+    error.may_have_ended_server = True
+    return error
 
 
 def test_what_is_known_of_a_model_is_forgotten_when_another_version_answers() -> None:
@@ -161,30 +174,78 @@ def test_a_model_is_not_served_only_if_every_server_says_so(others: list[RewardE
 
 
 @pytest.mark.parametrize("down_s", [0.0, 0.5])
-def test_a_call_under_which_its_connection_ends_stays_with_that_server(down_s: float) -> None:
-    """The request may be why the server ended. It alone knows which request that was, once it is back."""
+def test_calls_under_which_a_connection_ends_stay_with_that_server(down_s: float) -> None:
+    """One of the requests may be why it ended. It alone knows which, once it is back."""
 
     async def ask() -> None:
-        stands = [Stand("grpc://one:1"), Stand("grpc://other:1")]
-        async with AsyncRewardClient("", transports=stands) as client:
-            await client.progress(SEEN)
-            (asked,) = [stand for stand in stands if stand.asked["infer"]]
-            (next_one,) = [stand for stand in stands if stand is not asked]
-            next_one.num_ends, next_one.down_s = 2, down_s
-            await client.progress(SEEN)
-        assert (asked.asked["infer"], next_one.asked["infer"]) == (1, 3)
+        one, other = Stand("grpc://one:1"), Stand("grpc://other:1")
+        async with AsyncRewardClient("", transports=[one, other], timeout_s=4.0) as client:
+            one.num_ends, one.down_s = 16, down_s
+            await asyncio.gather(*(client.progress(SEEN) for _ in range(32)))
+        assert other.asked["infer"] == 16
+        assert one.asked["infer"] == 32
+        assert one.asked["while down"] == 0
 
     asyncio.run(asyncio.wait_for(ask(), WITHIN_S))
 
 
-def test_a_call_under_which_two_connections_end_is_sent_to_no_third_server() -> None:
+def test_a_call_under_which_two_servers_end_is_sent_to_no_third() -> None:
     async def ask() -> None:
         stands = [Stand(f"grpc://{number}:1") for number in range(3)]
         for stand in stands:
             stand.num_ends, stand.down_s = 1, 60.0
         async with AsyncRewardClient("", transports=stands, timeout_s=1.0) as client:
-            with pytest.raises(ProcessEndedError, match=r"grpc://0:1 and grpc://1:1: its process or connection ended"):
+            with pytest.raises(
+                ServerUnavailableError, match=r"grpc://0:1 and grpc://1:1: each lost its process or the"
+            ):
                 await client.progress(SEEN)
-            assert [stand.asked["infer"] for stand in stands] == [1, 1, 0]
+        assert [stand.asked["infer"] for stand in stands] == [1, 1, 0]
 
     asyncio.run(asyncio.wait_for(ask(), WITHIN_S))
+
+
+def test_a_second_end_is_the_last_also_where_one_server_is_left() -> None:
+    """The name of the first server does not stand for it any more."""
+
+    async def ask() -> None:
+        gone, left = Stand("grpc://gone:1"), Stand("grpc://left:1")
+        for stand in (gone, left):
+            stand.num_ends, stand.down_s = 10, 0.2
+        async with AsyncRewardClient("", transports=[gone, left], timeout_s=2.0) as client:
+            task = asyncio.create_task(client.progress(SEEN))
+            while gone.num_ends + left.num_ends == 20:
+                await asyncio.sleep(0.01)
+            servers = client._servers._servers
+            for server in list(servers):
+                if server.transport is gone:
+                    servers.remove(server)
+                    server.remove()
+            with pytest.raises(ServerUnavailableError, match="each lost its process or the connection"):
+                await task
+        assert (gone.asked["infer"], left.asked["infer"]) == (1, 1)
+
+    asyncio.run(asyncio.wait_for(ask(), WITHIN_S))
+
+
+def test_a_call_leaves_a_server_that_is_back_and_lacks_the_model() -> None:
+    async def ask() -> None:
+        one, other = Stand("grpc://one:1"), Stand("grpc://other:1")
+        one.num_ends = 1
+        async with AsyncRewardClient("", transports=[one, other], timeout_s=4.0) as client:
+            task = asyncio.create_task(client.progress(SEEN))
+            while one.num_ends:
+                await asyncio.sleep(0)
+            one.refusal = LACKING
+            await task
+        assert (one.asked["infer"], other.asked["infer"]) == (2, 1)
+
+    asyncio.run(asyncio.wait_for(ask(), WITHIN_S))
+
+
+def test_what_a_server_says_of_a_model_is_asked_of_another_at_once() -> None:
+    async def ask() -> None:
+        one, other = Stand("grpc://one:1", lost()), Stand("grpc://other:1")
+        async with AsyncRewardClient("", transports=[one, other], timeout_s=60.0) as client:
+            assert (await client.model_info()).versions == ("1",)
+
+    asyncio.run(asyncio.wait_for(ask(), 2.0))

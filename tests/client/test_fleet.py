@@ -126,7 +126,7 @@ def test_where_nobody_heals_a_request_ends_two_processes_and_says_so(tmp_path: P
     with ExitStack() as stack:
         servers = [stack.enter_context(unhealed(tmp_path / f"server-{number}")) for number in range(NUM_SERVERS)]
         client = stack.enter_context(RewardClient([one.server.endpoints.grpc_url for one in servers]))
-        told = r"grpc://.* and grpc://.*: its process or connection ended at each under this request, so no other"
+        told = r"grpc://.* and grpc://.*: each lost its process or the connection under this request, so no other"
         with pytest.raises(ProcessEndedError, match=told):
             client.progress(POISON, timeout_s=8)
         assert [one.is_dead for one in servers].count(True) == 2

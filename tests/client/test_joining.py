@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -341,9 +342,15 @@ def test_a_server_that_hangs_is_left_out_after_a_joint_request(clock: Clock) -> 
     asyncio.run(ask())
 
 
+LOST = ServerUnavailableError("Stream removed (Socket closed)")
+LOST.may_have_ended_server = True
+ENDED = [ProcessEndedError("Stub process 'rfm_0_0' is not healthy."), LOST]
+
+
+@pytest.mark.parametrize("ended", ENDED, ids=["process", "connection"])
 @pytest.mark.parametrize("num_servers", [1, 2])
 @pytest.mark.usefixtures("patient")
-def test_where_a_process_ends_samples_are_asked_about_apart(num_servers: int) -> None:
+def test_where_a_process_ends_samples_are_asked_about_apart(num_servers: int, ended: ServerUnavailableError) -> None:
     async def ask() -> None:
         stands = [Stand(f"grpc://{number}:1") for number in range(num_servers)]
         async with Calls(*stands) as calls:
@@ -354,7 +361,7 @@ def test_where_a_process_ends_samples_are_asked_about_apart(num_servers: int) ->
             await until(lambda: len(calls.asked) == limit + 1)
             joint = next(asked for asked in calls.asked if len(asked.values) > 1)
             before = len(calls.asked)
-            joint.fail(ProcessEndedError("Stub process 'rfm_0_0' is not healthy."))
+            joint.fail(copy(ended))
             await until(lambda: len(calls.asked) > before)
             await calls.answer_all()
             assert values_of([task.result() for task in tasks]) == list(range(8))

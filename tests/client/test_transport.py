@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import socket
+import struct
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,15 +14,20 @@ import pytest
 from rfm_client import (
     DeadlineExceededError,
     InferenceFailedError,
+    InvalidSampleError,
     RewardClient,
     RewardError,
     ServerUnavailableError,
 )
+from rfm_client.contract.triton import error_of
 from trajectories import random_trajectory
 
 TIMEOUT_S = 1.0
 NO_JSON = b"HTTP/1.1 200 OK\r\nContent-Type: text/html\r\nContent-Length: 9\r\n\r\n<html></>"
 NO_ANSWER = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: 2\r\n\r\n{}"
+BAD_GATEWAY = (
+    b"HTTP/1.1 502 Bad Gateway\r\nContent-Type: text/html\r\nContent-Length: 24\r\n\r\n<h1>502 Bad Gateway</h1>"
+)
 NO_HTTP = b"220 smtp ready\r\n"
 
 
@@ -53,6 +59,12 @@ def dying(connection: socket.socket) -> None:
     connection.close()
 
 
+def resetting(connection: socket.socket) -> None:
+    connection.recv(65536)
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    connection.close()
+
+
 def saying(content: bytes) -> Callable[[socket.socket], None]:
     def answer(connection: socket.socket) -> None:
         connection.recv(65536)
@@ -67,6 +79,7 @@ MISBEHAVING: dict[str, tuple[str, Callable[[socket.socket], None], type[RewardEr
     "grpc, no answer": ("grpc", silent, DeadlineExceededError),
     "http, dies": ("http", dying, ServerUnavailableError),
     "grpc, dies": ("grpc", dying, ServerUnavailableError),
+    "http, a proxy without its server": ("http", saying(BAD_GATEWAY), ServerUnavailableError),
     "http, no HTTP": ("http", saying(NO_HTTP), InferenceFailedError),
     "http, no JSON": ("http", saying(NO_JSON), InferenceFailedError),
     "http, no KServe answer": ("http", saying(NO_ANSWER), InferenceFailedError),
@@ -79,7 +92,8 @@ def test_whatever_answers_the_error_is_ours(
 ) -> None:
     with (
         listening(answer) as port,
-        RewardClient(f"{protocol}://127.0.0.1:{port}", timeout_s=TIMEOUT_S) as client,
+        # With retries the last try may be under way when its time is up, which is another error.
+        RewardClient(f"{protocol}://127.0.0.1:{port}", timeout_s=TIMEOUT_S, retry=False) as client,
         pytest.raises(error),
     ):
         client.progress(random_trajectory(0, 2))
@@ -90,3 +104,48 @@ def test_whatever_answers_the_error_is_ours(
 def test_a_server_that_does_not_answer_is_not_ready(protocol: str, answer: Callable[[socket.socket], None]) -> None:
     with listening(answer) as port, RewardClient(f"{protocol}://127.0.0.1:{port}", timeout_s=TIMEOUT_S) as client:
         assert not client.is_ready()
+
+
+@pytest.mark.parametrize("answer", [dying, resetting, saying(BAD_GATEWAY)])
+def test_a_server_may_have_ended_under_a_request_over_http(answer: Callable[[socket.socket], None]) -> None:
+    """Over gRPC tests/triton/test_wording.py asks a real Triton, which is killed."""
+    with listening(answer) as port:
+        assert failure(f"http://127.0.0.1:{port}").may_have_ended_server
+
+
+def test_a_server_that_takes_no_connection_has_not_ended_under_the_request(protocol: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        url = f"{protocol}://127.0.0.1:{server.getsockname()[1]}"
+    assert not failure(url).may_have_ended_server
+
+
+def failure(url: str) -> ServerUnavailableError:
+    with (
+        RewardClient(url, timeout_s=TIMEOUT_S, retry=False) as client,
+        pytest.raises(ServerUnavailableError) as caught,
+    ):
+        client.progress(random_trajectory(0, 2))
+    return caught.value
+
+
+@pytest.mark.parametrize(
+    ("message", "may_have_ended"),
+    [
+        ("Stream removed (Socket closed)", True),
+        ("Stream removed (recvmsg:Connection reset by peer (104))", True),
+        ("Stream removed (sendmsg: Broken pipe (32))", True),
+        ("upstream connect error or disconnect/reset before headers. reset reason: connection termination", True),
+        ("upstream connect error or disconnect/reset before headers. reset reason: remote connection failure", False),
+        (
+            "failed to connect to all addresses; last error: UNKNOWN: ipv4:10.0.0.1:8001: Connection reset by peer",
+            False,
+        ),
+        ("failed to connect to all addresses; last error: UNKNOWN: ipv4:10.0.0.1:8001: Connection refused", False),
+        ("the queue is full: 8 requests wait already", False),
+        ("Stub process 'rfm_0_0' is not healthy.", True),
+    ],
+)
+def test_which_errors_a_request_may_have_caused(message: str, may_have_ended: bool) -> None:
+    error = error_of("StatusCode.UNAVAILABLE", message, InvalidSampleError)
+    assert isinstance(error, ServerUnavailableError)
+    assert error.may_have_ended_server is may_have_ended

@@ -14,7 +14,7 @@ import tritonclient.grpc
 import goldens
 import rfm_export
 from engines import load_engine, serve_config
-from mixtures import FRAMES_MODEL, assert_same, counts
+from mixtures import FRAMES_MODEL, assert_same, counts, wait_until_at_work
 from one_model import BriefServer
 from reference_server import Served
 from repositories import forget_input
@@ -101,6 +101,7 @@ def test_pairs_of_frames_share_batches(served: Served, protocol: str, two_sizes:
             return client.evaluate([sample])[0]
 
         busy = pool.submit(client.encode, sized_film(0, 3000, 30, 30))
+        wait_until_at_work(f"{FRAMES_MODEL}_encoder")
         answers = list(pool.map(ask, samples))
         busy.result()
         requests, executions = (

@@ -201,7 +201,7 @@ def test_a_connection_that_ends_under_a_request_is_told_from_one_that_is_refused
         (refused,) = client.evaluate([sample], return_errors=True)
     for error in (under_way, refused):
         assert type(error) is ServerUnavailableError
-    assert [error.ended_under_way for error in (under_way, refused)] == [True, False], (under_way, refused)
+    assert [error.may_have_ended_server for error in (under_way, refused)] == [True, False], (under_way, refused)
 
 
 def test_what_waited_for_too_long_did_not_meet_a_full_queue() -> None:

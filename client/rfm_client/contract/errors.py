@@ -63,17 +63,17 @@ class ServerError(RewardError):
 class ServerUnavailableError(ServerError):
     """The server cannot be reached, is not ready, or refuses more work for now.
 
-    ended_under_way: a process of the model, or the connection, ended while the request was under way, perhaps because
-        of it
+    may_have_ended_server: a process of the model had ended, or the connection ended under the request, which may be
+        why
     """
 
-    ended_under_way = False
+    may_have_ended_server = False
 
 
 class ProcessEndedError(ServerUnavailableError):
     """A process of the model had ended when the request reached it, or while it worked on the request."""
 
-    ended_under_way = True
+    may_have_ended_server = True
 
 
 class DeadlineExceededError(ServerError, TimeoutError):

@@ -2,7 +2,7 @@
 """How a server says what went wrong: the status of an answer, and its wording where the status does not say enough.
 
 Statuses are as tritonclient gives them: gRPC's by name, HTTP's by number. tests/triton/test_wording.py asks a real
-Triton for each phrase.
+Triton for each of its phrases.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from rfm_client.contract.wire import SECOND_FRAMES
 UNAVAILABLE = ("StatusCode.UNAVAILABLE", "503")
 OUT_OF_TIME = ("StatusCode.DEADLINE_EXCEEDED", "504")
 CANCELLED = ("StatusCode.CANCELLED", "499")
+BAD_GATEWAY = ("502",)  # of a proxy whose connection to the server ended, or was refused
 DENIED = ("StatusCode.UNAUTHENTICATED", "StatusCode.PERMISSION_DENIED", "401", "403")
 
 _ERRORS: dict[tuple[str, ...], type[errors.RewardError]] = {
@@ -22,6 +23,7 @@ _ERRORS: dict[tuple[str, ...], type[errors.RewardError]] = {
     ("StatusCode.NOT_FOUND", "404"): errors.ModelNotFoundError,
     UNAVAILABLE: errors.ServerUnavailableError,
     CANCELLED: errors.ServerUnavailableError,  # not by the client: the server is stopping
+    BAD_GATEWAY: errors.ServerUnavailableError,
     OUT_OF_TIME: errors.DeadlineExceededError,
 }
 _ERROR_OF = {status: error for statuses, error in _ERRORS.items() for status in statuses}
@@ -36,7 +38,7 @@ QUEUE_FULL = "the queue is full"  # of a model, in which as many requests wait a
 TRITON_QUEUE_FULL = "Exceeds maximum queue size"  # of Triton, in which requests for a model of several instances wait
 
 _NO_CONNECTION = "failed to connect"  # of gRPC itself: nothing was sent
-_LOST_CONNECTION = re.compile("Socket closed|Connection reset|Broken pipe")  # of gRPC itself
+_LOST_CONNECTION = re.compile("Socket closed|Connection reset|Broken pipe|connection termination")  # or of a proxy
 _NO_TRUST = re.compile(f"CERTIFICATE|certificate|[Vv]erification [Cc]heck failed|WRONG_VERSION_NUMBER|{RESTRICTED}")
 _WRONG_SHAPE = re.compile(  # behind the batch axis, which the caller did not make
     r"unexpected shape for input '(?P<name>\w+)'.*?Expected \[-1,(?P<expected>[^\]]*)\], got \[\d+,(?P<got>[^\]]*)\]"
@@ -80,5 +82,6 @@ def error_of(status: str, message: str, bad_request: type[errors.RewardError]) -
     kind = _ERROR_OF.get(status, errors.InferenceFailedError)
     error = (bad_request if kind is errors.InvalidSampleError else kind)(text)
     if isinstance(error, errors.ServerUnavailableError):
-        error.ended_under_way = _LOST_CONNECTION.search(text) is not None and _NO_CONNECTION not in text
+        is_lost = _LOST_CONNECTION.search(text) is not None and _NO_CONNECTION not in text
+        error.may_have_ended_server = is_lost or status in BAD_GATEWAY
     return error

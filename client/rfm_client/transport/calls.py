@@ -211,7 +211,7 @@ class _TritonTransport:
             raise errors.AccessDeniedError(f"{self.url}: access denied: {error}") from error
         except self.connection_errors as error:
             unavailable = errors.ServerUnavailableError(f"{self.url}: no connection: {error or type(error).__name__}")
-            unavailable.ended_under_way = not isinstance(error, self.refused_connection)
+            unavailable.may_have_ended_server = self._was_under_way(error)
             raise unavailable from error
         except (ValueError, LookupError, TypeError) as error:  # the answer is not that of a KServe server
             raise errors.InferenceFailedError(f"{self.url}: the answer cannot be read: {error!r}") from error
@@ -258,10 +258,9 @@ class _TritonTransport:
     def connection_errors(self) -> tuple[type[Exception], ...]:
         return (OSError, EOFError)
 
-    @property
-    def refused_connection(self) -> tuple[type[Exception], ...]:
-        """Of the connection errors those that come before anything is sent."""
-        return ()
+    def _was_under_way(self, error: Exception) -> bool:
+        """Whether a connection error may have come after the request was sent. gRPC says so otherwise (error_of)."""
+        return False
 
     @property
     def protocol_errors(self) -> tuple[type[Exception], ...]:
@@ -359,11 +358,10 @@ class HttpTransport(_TritonTransport):
 
         return (aiohttp.ClientError, OSError, EOFError)
 
-    @property
-    def refused_connection(self) -> tuple[type[Exception], ...]:
+    def _was_under_way(self, error: Exception) -> bool:
         import aiohttp
 
-        return (aiohttp.ClientConnectorError,)
+        return isinstance(error, aiohttp.ClientError) and not isinstance(error, aiohttp.ClientConnectorError)
 
     @property
     def protocol_errors(self) -> tuple[type[Exception], ...]:

@@ -16,14 +16,14 @@ FIRST_PAUSE_S = 0.1
 LONGEST_RETRY_PAUSE_S = 2.0
 LONGEST_REST_S = 30.0  # of a server that says that it is ready and fails again and again
 PROBE_TIMEOUT_S = 2.0
-HEALED_WITHIN_S = 60.0  # the longest that a call waits for the server that it was with when a process ended
+HEALED_WITHIN_S = 60.0  # the longest that a call waits for the server that it was with when that one ended
 _HEAL_POLL_S = 0.2  # while it loads its model anew, which takes seconds, it is not ready
 
 
 class Server:
     """One server of several: its transport, its load and its failures.
 
-    failures: number of requests that failed since the last success
+    failures: how often it was left out since the last success
     is_gone: it gets no more requests, and is closed as soon as nobody uses it
     """
 
@@ -36,6 +36,7 @@ class Server:
         self.failures = 0
         self.comeback: asyncio.Task[bool] | None = None  # whether it was seen to be healed
         self._has_ended_process = False
+        self._is_to_heal = False  # it is left out since a process or a connection has ended
         self.is_gone = False
         self._closing: asyncio.Task[None] | None = None
 
@@ -63,27 +64,40 @@ class Server:
     def leave_out(self, model: str) -> None:
         """Leaves the server out until it says that it is ready. The more often it failed, the later it is probed."""
         if not self.is_left_out and not self.is_gone:
-            self._has_ended_process = False
+            self._has_ended_process = self._is_to_heal = False
             self.comeback = asyncio.create_task(self._rest(model))
 
     def leave_out_dead(self, model: str) -> None:
-        """Leaves the server out until it is healed.
+        """Leaves the server, of which a process has ended, out until it is healed.
 
         Triton 2.51 says that a dead model is ready, so it must have said the opposite before.
         """
         if not self.is_dead and not self.is_gone:
-            if self.comeback is not None:
-                self.comeback.cancel()
             self._has_ended_process = True
-            self.comeback = asyncio.create_task(self._heal(model))
+            self._wait_for_healing(model, was_unready=False)
+
+    def leave_out_lost(self, model: str) -> None:
+        """Leaves the server, to which a connection has ended, out until it says that it is ready."""
+        if not (self._is_to_heal and self.is_left_out) and not self.is_gone:
+            self._has_ended_process = False
+            self._wait_for_healing(model, was_unready=True)
+
+    def _wait_for_healing(self, model: str, *, was_unready: bool) -> None:
+        if self.comeback is not None:
+            self.comeback.cancel()
+        self._is_to_heal = True
+        self.comeback = asyncio.create_task(self._heal(model, was_unready=was_unready))
 
     async def is_healed(self, within_s: float) -> bool:
-        """Whether it has been loaded anew, or says that it is ready after its connection ended, as soon as it has."""
-        if self.comeback is None:
-            return False
-        comeback = self.comeback
-        await asyncio.wait({comeback}, timeout=within_s)
-        return not self.is_gone and comeback.done() and not comeback.cancelled() and comeback.result()
+        """True as soon as it serves again after a process or a connection ended; False if it does not ``within_s``."""
+        until_s = time.monotonic() + within_s
+        while (comeback := self.comeback) is not None and not self.is_gone:
+            await asyncio.wait({comeback}, timeout=max(until_s - time.monotonic(), 0.0))
+            if not comeback.done():
+                return False
+            if not comeback.cancelled():
+                return comeback.result() and not self.is_gone
+        return False
 
     def remove(self) -> None:
         """No request that begins now will be sent to it."""
@@ -111,20 +125,18 @@ class Server:
             self._closing = asyncio.create_task(self.transport.close())
 
     async def _rest(self, model: str) -> bool:
-        """True, as soon as the server says that it is ready."""
         await asyncio.sleep(pause_s(self.failures - 1, LONGEST_REST_S))
         for attempt in itertools.count():
             if await self.transport.is_ready(model, PROBE_TIMEOUT_S):
-                return True
+                break
             await asyncio.sleep(pause_s(attempt, LONGEST_RETRY_PAUSE_S))
-        raise AssertionError("it counts for ever")
+        return False
 
-    async def _heal(self, model: str) -> bool:
+    async def _heal(self, model: str, *, was_unready: bool) -> bool:
         """Whether the server was seen to be healed.
 
         It may never heal, or load too quickly to be seen; then it is tried again after LONGEST_REST_S.
         """
-        was_unready = False
         tried_at_s = time.monotonic() + LONGEST_REST_S
         while True:
             is_ready = await self.transport.is_ready(model, PROBE_TIMEOUT_S)

@@ -7,8 +7,10 @@ its journal lets the others through and refuses a request that has ended its pro
 request stays with S. If nobody heals S within half of the time that is left, and HEALED_WITHIN_S at most, the request
 goes to a server that is not known to be dead. If a process ends there too, the request fails. Either way it ends two
 processes at most: two of S, or one of S and one of another. Requests that were with S beside it wait as long, and are
-answered. No request is sent to a server that is known to be dead, where others are. A connection that ends under a
-request means the same: ``rfm serve`` restarts Triton when a process has died that owed answers.
+answered if S is healed in that time. No request is sent to a server that is known to be dead, where others are.
+
+A request under which the connection to S ends is treated likewise, for ``rfm serve`` restarts Triton when a process has
+died that owed answers. A request that ends Triton itself is in no journal: it ends S again and again, but no other.
 
 A client of one server sends the request to that server again, after pauses, and its journal bounds it. A URL behind
 which a load balancer picks the server counts as one server: there the bound holds for each server, not for all
@@ -50,7 +52,8 @@ class Servers:
     """Sends each request to one of several servers, for one event loop.
 
     retry: a request that fails because a server is down, restarting or full is sent again until the deadline: at once
-        to another server or, when there is none, after pauses that grow. A request that a server denies or fails
+        to another server or, when there is none, after pauses that grow. (One under which a server has ended waits for
+        that one, see above.) A request that a server denies or fails
         at, or whose model it lacks, is sent once to each other one. A score depends on the request alone, so
         sending it twice is safe.
     names: whose addresses are servers, too
@@ -99,7 +102,12 @@ class Servers:
 
     async def model_info(self, model: str, deadline: Deadline) -> ModelInfo:
         """What a server says of ``model``. Raises RewardError."""
-        return await self._request(model, lambda server, left_s: server.model_info(model, left_s), deadline)
+        self._keep_up()
+
+        def request(server: Transport, left_s: float) -> Awaitable[ModelInfo]:
+            return server.model_info(model, left_s)
+
+        return await self._request_among(None, model, request, deadline)
 
     async def is_ready(self, models: Sequence[str], timeout_s: float) -> bool:
         """Whether at least one server has one of the models ready. The first that has is enough."""
@@ -131,19 +139,28 @@ class Servers:
         """The answer to a request, retried as the module's docstring says."""
         self._keep_up()
         try:
-            return await self._request_among(None, model, request, deadline, is_last_end=not retry_ended)
+            is_told = not retry_ended or len(self._servers) > 1
+            return await self._request_among(None, model, request, deadline, raise_ended=is_told)
         except _EndedAtError as ended:
             first, error = ended.server, ended.error
         if not self._retry or not retry_ended or deadline.ends_within(0):
             raise error
         if await first.is_healed(min(HEALED_WITHIN_S, deadline.remaining_s() / 2)):
-            return await self._request_among(first, model, request, deadline)
+            try:
+                return await self._request_among(first, model, request, deadline)
+            except (AccessDeniedError, InferenceFailedError, ModelNotFoundError):
+                pass  # another server may do better
+            except ServerUnavailableError:
+                if not first.is_gone:
+                    raise
         try:
-            return await self._request_among(None, model, request, deadline)
+            return await self._request_among(None, model, request, deadline, raise_ended=True)
         except _EndedAtError as ended:
             where = f"{first.transport.url} and {ended.server.transport.url}"
-            message = f"{where}: its process or connection ended at each under this request, so no other is asked"
-            raise ProcessEndedError(f"{message}: {ended.error.message}") from ended.error
+            message = f"{where}: each lost its process or the connection under this request, so no other is asked"
+            is_process = isinstance(error, ProcessEndedError) or isinstance(ended.error, ProcessEndedError)
+            kind = ProcessEndedError if is_process else ServerUnavailableError
+            raise kind(f"{message}: {ended.error.message}") from ended.error
 
     async def _request_among(
         self,
@@ -152,12 +169,12 @@ class Servers:
         request: Request[Answered],
         deadline: Deadline,
         *,
-        is_last_end: bool = False,
+        raise_ended: bool = False,
     ) -> Answered:
         """The answer of the server ``only`` or, if that is None, of any.
 
-        With several servers, or if the first end is to be the last, it raises _EndedAtError where a process of the
-        model has ended, or the connection.
+        raise_ended: raise _EndedAtError where a process of the model, or the connection, has ended; else send the
+            request again
         """
         refusals: dict[Server, RewardError] = {}
         for attempt in itertools.count():
@@ -169,23 +186,22 @@ class Servers:
                 with server.request_under_way():
                     answer = await request(server.transport, left_s)
                 server.failures = 0
-                for other in refusals:  # not before: a request that all refuse is not one server's fault
-                    self._leave_out(other, model)
+                for other, refusal in refusals.items():  # not before: what all refuse is not one server's fault
+                    self._leave_out(other, model, refusal)
                 return answer
             except DeadlineExceededError as error:  # perhaps it hangs
-                self._leave_out(server, model)
+                self._leave_out(server, model, error)
                 raise deadline.exceeded(server.transport.url) from error
             except (AccessDeniedError, InferenceFailedError, ModelNotFoundError) as error:
                 refusals[server] = error
                 if not self._retry:
-                    self._leave_out(server, model)
+                    self._leave_out(server, model, error)
                     raise
                 if only or refusals.keys() >= set(self._servers):
                     break
             except ServerUnavailableError as error:
                 self._record_failure(server, model, error)
-                is_told_apart = is_last_end or (only is None and len(self._servers) > 1)
-                if is_told_apart and error.ended_under_way:
+                if raise_ended and error.may_have_ended_server:
                     raise _EndedAtError(server, error) from error
                 has_other = only is None and self._has_other({server, *refusals})
                 await self._pause(0.0 if has_other else pause_s(attempt, LONGEST_RETRY_PAUSE_S), deadline, error)
@@ -223,13 +239,20 @@ class Servers:
         """Records that a server does not answer, and leaves it out."""
         if not server.failures and self._retry:
             logger.warning("%s: trying again: %s", server.transport.url, error)
-        self._leave_out(server, model, is_dead=isinstance(error, ProcessEndedError))
+        self._leave_out(server, model, error)
 
-    def _leave_out(self, server: Server, model: str, *, is_dead: bool = False) -> None:
+    def _leave_out(self, server: Server, model: str, error: RewardError) -> None:
         """Leaves a server out until it is ready, or healed. The only server stays in."""
-        server.failures += 1
-        if len(self._servers) > 1:
-            (server.leave_out_dead if is_dead else server.leave_out)(model)
+        if not server.is_left_out:  # else it is the same failure
+            server.failures += 1
+        if len(self._servers) == 1:
+            return
+        if isinstance(error, ProcessEndedError):
+            server.leave_out_dead(model)
+        elif isinstance(error, ServerUnavailableError) and error.may_have_ended_server:
+            server.leave_out_lost(model)
+        else:
+            server.leave_out(model)
 
     # Names
 
