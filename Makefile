@@ -24,8 +24,8 @@ test: check
 
 # All that CI runs: also the tests that kill, wait or restart, or need programs of Debian.
 test-all: check ops-tools
-	$(BIN)/pytest $(WORKERS) -m "not gpu and not slow"
-	$(BIN)/pytest -m "slow and not gpu"
+	$(BIN)/pytest $(WORKERS) -m "not gpu and not alone"
+	$(BIN)/pytest -m alone
 
 # Lint, format, types, generated files; no tests.
 check: $(INSTALLED)

@@ -159,6 +159,7 @@ def test_dead_and_hung_processes_are_healed_and_no_call_is_lost(
     assert len(served.said) == 3, served.said
 
 
+@pytest.mark.alone
 def test_a_server_that_is_killed_leaves_nothing_running_and_the_next_removes_the_rest(tmp_path: Path) -> None:
     endpoints, port = Endpoints.free(), Endpoints.free().http_port
     ports = {
@@ -194,6 +195,7 @@ def test_a_server_that_is_killed_leaves_nothing_running_and_the_next_removes_the
     assert not list(Path(tempfile.gettempdir()).glob(f"rfm-backends-{killed.pid}-*"))
 
 
+@pytest.mark.alone
 def test_what_a_killed_container_left_is_removed_and_what_a_living_one_has_is_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
