@@ -6,8 +6,8 @@
 What it shows depends little on the machine: the share of the time in which the accelerator is busy, and what a request
 costs of the CPU, in the server and in its callers. Rounds are interleaved, so a machine that drifts hits all alike.
 
-All servers get embeddings. This one gets raw frames, too, for a tiny checkpoint on a Qwen3-VL backbone: preparing them
-is as real as ever.
+All servers get embeddings. This one gets them from callers of one program, too, whose calls share requests, and raw
+frames for a tiny checkpoint on a Qwen3-VL backbone: preparing them is as real as ever.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tempfile import TemporaryDirectory
 import psutil
 from bench import DEMO, RESULTS, ROOT, machine
 from contestants import PEER_SCRIPTS, Callers, running_peer
-from load import Load
+from load import JOINED, Load
 from rich.console import Console
 
 import rfm_export
@@ -43,7 +43,8 @@ VLM_CHECKPOINT, VLM_BASE = VLM / "q3_tok_disc10" / "checkpoint", VLM / "bases" /
 VLM_BATCH_S, VLM_ROW_S = 0.0, 30e-3
 CHEAP_ANSWER_S = 0.2e-3  # as on a GPU: the CPU is free while it computes
 FRAMES = (16, 16)
-OURS, OURS_VLM = "this server", "this server, frames"
+OURS, OURS_JOINED, OURS_VLM = "this server", "this server, joined", "this server, frames"
+WAYS = {OURS: "gRPC", OURS_JOINED: JOINED, OURS_VLM: "gRPC"}
 SIMULATED = """
 
 import sys
@@ -93,7 +94,7 @@ def main() -> None:
     parser.add_argument("--peers", nargs="*", default=["LitServe", "mosec"], choices=["LitServe", "mosec"])
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder for the results")
     arguments = parser.parse_args()
-    names = [OURS, *arguments.peers]
+    names = [OURS, OURS_JOINED, *arguments.peers]
     loads = [(name, Load(callers, arguments.seconds, FRAMES)) for callers in arguments.callers for name in names]
     loads.append((OURS_VLM, Load(callers=16, seconds=2 * arguments.seconds, frames=(8, 8), frame_px=256)))
     rows = []
@@ -143,14 +144,15 @@ def contestants(folder: Path, peers: list[str]) -> Iterator[Mapping[str, Contest
         **{peer: theirs(folder / peer, peer) for peer in peers},
     }
     with ExitStack() as stack:
-        made = {}
+        made: dict[str, Contestant] = {}
         for name, server in servers.items():
             before = set(psutil.Process().children(recursive=True))
             url, ledger = stack.enter_context(server)
             processes = list(set(psutil.Process().children(recursive=True)) - before)
-            callers = Callers(name if name in peers else "gRPC", url, widths)
-            stack.callback(callers.close)
-            made[name] = Contestant(callers, ledger, processes)
+            for way in (OURS, OURS_JOINED) if name == OURS else (name,):
+                callers = Callers(WAYS.get(way, way), url, widths)
+                stack.callback(callers.close)
+                made[way] = Contestant(callers, ledger, processes)
         yield made
 
 
@@ -189,8 +191,9 @@ def table(rows: list[dict[str, object]]) -> str:
         f"# A simulated accelerator: {1e3 * BATCH_S:g} ms a batch and {1e3 * ROW_S:g} ms a sample, asleep",
         "",
         "Medians of the rounds. busy: share of the time; us: CPU microseconds a sample, of all of the server's",
-        f"processes, and of its callers' process. {OURS_VLM}: 8 of 256 x 256 a sample, a tiny checkpoint on a Qwen3-VL",
-        f"backbone, {1e3 * VLM_ROW_S:g} ms a sample, preparation included.",
+        f"processes, and of its callers' process. {OURS_JOINED}: of callers of one program, which share requests.",
+        f"{OURS_VLM}: 8 of 256 x 256 a sample, a tiny checkpoint on a Qwen3-VL backbone, {1e3 * VLM_ROW_S:g} ms a",
+        "sample, preparation included.",
         "",
         "| callers | server | busy | samples/s | p50 ms | p99 ms | server us | client us |",
         "|---|---|---|---|---|---|---|---|",

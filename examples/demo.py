@@ -18,6 +18,7 @@ from rfm_client import PreferenceSample, ProgressSample, RewardClient, Sample, S
 from rfm_client.cli.show import Panel, plot, scores_table
 from rfm_commands.demo import show_metrics
 from toy_world import Clip, Task, make_clip
+from toy_world.video import write_video
 
 TASK, OTHER_TASK = Task("red", "bowl"), Task("green", "plate")
 REPOSITORY = Path(__file__).parents[1] / "model_repository"
@@ -48,17 +49,21 @@ def demo(
     url: Annotated[str | None, typer.Option(help="A server that runs, instead of the repository's.")] = None,
     repository: Annotated[Path, typer.Option(help="Triton model repository.")] = REPOSITORY,
     seed: Annotated[int, typer.Option(help="Of the clips.")] = 2_000_000,
-    output: Annotated[Path, typer.Option(help="Folder for the picture and Triton's log.")] = Path("demo_output"),
+    output: Annotated[Path, typer.Option(help="Folder for picture, clips and log.")] = Path("demo_output"),
 ) -> None:
-    """Progress, success, preference and similarity of toy-world clips: a table and a picture."""
+    """Progress, success, preference and similarity of toy-world clips: a table and a picture. The clips are kept."""
     output.mkdir(parents=True, exist_ok=True)
     console = Console()
+    clips = Clips.of(seed)
     if url is not None:
-        show_clips(url, Clips.of(seed), output / "rewards.png", console)
-        return
-    with stopped_by_signals(), temporary_server(repository, output / "tritonserver.log") as endpoints:
-        show_clips(endpoints.grpc_url, Clips.of(seed), output / "rewards.png", console)
-        show_metrics(endpoints, console)
+        show_clips(url, clips, output / "rewards.png", console)
+    else:
+        with stopped_by_signals(), temporary_server(repository, output / "tritonserver.log") as endpoints:
+            show_clips(endpoints.grpc_url, clips, output / "rewards.png", console)
+            show_metrics(endpoints, console)
+    for name, clip in clips._asdict().items():
+        write_video(output / f"{name}.mp4", clip.frames)
+    console.print(f"the clips as videos: {output}/*.mp4")
 
 
 def show_clips(url: str, clips: Clips, picture: Path, console: Console) -> None:

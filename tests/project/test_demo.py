@@ -20,9 +20,10 @@ import rfm_export
 from commands import nothing_left_behind
 from paths import ROOT, VIDEOS
 from rfm.config import ExportConfig
-from rfm_client import InvalidSampleError
+from rfm_client import InvalidSampleError, load_trajectory
 from rfm_client.data.video import frame_indices, read_video
 from rfm_commands.cli import app
+from toy_world import Task, make_clip
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
@@ -51,6 +52,11 @@ def test_the_demo_shows_what_it_promises(tmp_path: Path) -> None:
     for text in ("put the red block in the bowl", "a success", "rewound", "P(first) = ", "similarity = ", "batches"):
         assert text in shown
     assert (tmp_path / "rewards.png").read_bytes().startswith(PNG)
+    kept = load_trajectory(tmp_path / "success.mp4", task="put the red block in the bowl", fps=3).frames
+    assert kept is not None
+    scored = make_clip("success", Task("red", "bowl"), 2_000_000).frames
+    assert kept.shape == scored.shape
+    assert np.abs(kept.astype(int) - scored).mean() < 8  # a video halves the resolution of colours
 
 
 def test_a_policy_is_paid_by_the_served_checkpoint(tmp_path: Path) -> None:

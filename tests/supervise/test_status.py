@@ -58,8 +58,8 @@ def test_many_slow_connections_keep_nobody_out(monkeypatch: pytest.MonkeyPatch, 
         slow = [stack.enter_context(socket.create_connection((HOST, port))) for _ in range(3 * MOST_CONNECTIONS)]
         assert httpx.get(f"http://{HOST}:{port}/live").status_code == 200
         wait_for(lambda: sum(not is_cut(connection) for connection in slow) <= MOST_CONNECTIONS)
-        handlers = [thread for thread in threading.enumerate() if "process_request_thread" in thread.name]
-        assert len(handlers) <= MOST_CONNECTIONS
+        # a handler whose connection has just been cut may still be on its way out
+        wait_for(lambda: sum("process_request_thread" in t.name for t in threading.enumerate()) <= MOST_CONNECTIONS)
 
 
 def told(about: Status) -> dict[str, float]:
