@@ -17,6 +17,7 @@ from rfm_client.contract.results import PreferenceResult, ProgressResult, Result
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.episodes.async_episodes import AsyncEpisode, AsyncEpisodes
 from rfm_client.episodes.options import EpisodeOptions, EpisodeSettings
+from rfm_client.episodes.windows import Window, WindowScorer
 from rfm_client.scorer import Scorer
 from rfm_client.transport.access import Access, AccessOptions
 from rfm_client.transport.calls import Transport, connect
@@ -25,7 +26,6 @@ from rfm_client.transport.host_names import of_urls
 from rfm_client.transport.in_flight import InFlight
 from rfm_client.transport.server import PROBE_TIMEOUT_S
 from rfm_client.transport.servers import Servers
-from rfm_client.windows import Window, WindowScorer
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

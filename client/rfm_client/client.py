@@ -18,9 +18,9 @@ from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample
 from rfm_client.data.fitting import snapshot
 from rfm_client.episodes.episodes import Episode, Episodes
 from rfm_client.episodes.options import EpisodeSettings
+from rfm_client.episodes.windows import Window
 from rfm_client.transport.calls import Transport
 from rfm_client.transport.loop_thread import LoopThread
-from rfm_client.windows import Window
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -20,9 +20,9 @@ from rfm_client import (
 )
 from rfm_client.contract import wire
 from rfm_client.contract.samples import UInt8Array
+from rfm_client.episodes.windows import Window
 from rfm_client.transport.access import Access
 from rfm_client.transport.calls import Answer, GrpcTransport
-from rfm_client.windows import Window
 
 MODEL = "enc_c1_t1_disc10"
 

@@ -17,13 +17,13 @@ from rfm_client.async_client import DEFAULT_TIMEOUT_S
 from rfm_client.cli import comparing, options, outputs, scoring, toy
 from rfm_client.cli.label import label
 from rfm_client.cli.options import EXIT_CODES, STANDARD_OUTPUT, OneLineCommand, Server
+from rfm_client.cli.ports import wrong_port
 from rfm_client.cli.scoring import Failed, Outcome, Question, Scored
 from rfm_client.cli.show import MAX_PANELS, print_tables
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import RewardError, ServerUnavailableError
 from rfm_client.contract.names import DEFAULT_MODEL, frames_name
 from rfm_client.contract.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS
-from rfm_client.ports import wrong_port
 
 MIN_COMPARED = 2
 

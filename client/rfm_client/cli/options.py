@@ -15,11 +15,11 @@ import typer
 from typer.core import TyperCommand
 
 from rfm_client.async_client import DEFAULT_TIMEOUT_S
+from rfm_client.cli.ports import wrong_port
 from rfm_client.client import RewardClient
 from rfm_client.contract import errors
 from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_client.data.sampling import Rule, Sampling
-from rfm_client.ports import wrong_port
 from rfm_client.transport.access import Access
 
 DEFAULT_URL = "grpc://localhost:8001"

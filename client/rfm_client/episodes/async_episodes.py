@@ -26,8 +26,8 @@ from rfm_client.episodes.frames import checked_frame, copied
 from rfm_client.episodes.live import LiveEpisode
 from rfm_client.episodes.options import EpisodeOptions
 from rfm_client.episodes.scores import StepScore, StepScores
+from rfm_client.episodes.windows import NamedFrame, Window
 from rfm_client.transport.deadline import Deadline
-from rfm_client.windows import NamedFrame, Window
 
 if TYPE_CHECKING:
     import numpy.typing as npt

@@ -23,8 +23,8 @@ from rfm_client.data.sampling import Prefix, Rule, Sampling
 from rfm_client.episodes.frames import checked_frame
 from rfm_client.episodes.live import LiveView
 from rfm_client.episodes.options import SuccessRule
+from rfm_client.episodes.windows import NamedFrame, Window
 from rfm_client.integrations.watching import Watching
-from rfm_client.windows import NamedFrame, Window
 
 Info: TypeAlias = dict[str, Any]
 Fit: TypeAlias = Callable[[UInt8Array], UInt8Array]
