@@ -100,7 +100,8 @@ def test_pairs_of_frames_share_batches(served: Served, protocol: str, two_sizes:
             start.wait()
             return client.evaluate([sample])[0]
 
-        busy = pool.submit(client.encode, sized_film(0, 3000, 30, 30))
+        film = sized_film(1000 + 2 * two_sizes + (protocol == "grpc"), 12_000, 30, 30)  # new, so that no cache has it
+        busy = pool.submit(client.encode, film)
         wait_until_at_work(f"{FRAMES_MODEL}_encoder")
         answers = list(pool.map(ask, samples))
         busy.result()
