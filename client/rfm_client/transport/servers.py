@@ -177,6 +177,7 @@ class Servers:
             request again
         """
         refusals: dict[Server, RewardError] = {}
+        failures: dict[Server, ServerUnavailableError] = {}
         for attempt in itertools.count():
             server = only or await self._living(refusals, deadline)
             if server.is_gone:
@@ -191,7 +192,11 @@ class Servers:
                 return answer
             except DeadlineExceededError as error:  # perhaps it hangs
                 self._leave_out(server, model, error)
-                raise deadline.exceeded(server.transport.url) from error
+                exceeded = deadline.exceeded(server.transport.url)
+                failed = failures.get(server)
+                if failed is not None:  # which says more than that the time was up when it was tried again
+                    raise type(failed)(f"{failed.message}; then {exceeded.message}") from error
+                raise exceeded from error
             except (AccessDeniedError, InferenceFailedError, ModelNotFoundError) as error:
                 refusals[server] = error
                 if not self._retry:
@@ -201,6 +206,7 @@ class Servers:
                     break
             except ServerUnavailableError as error:
                 self._record_failure(server, model, error)
+                failures[server] = error
                 if raise_ended and error.may_have_ended_server:
                     raise _EndedAtError(server, error) from error
                 has_other = only is None and self._has_other({server, *refusals})
