@@ -101,7 +101,7 @@ def export(
 ) -> None:
     """Write a checkpoint into a model repository as the next version of its models."""
     import rfm_export
-    from rfm_commands.notes import notes_at_export
+    from rfm_commands.unused_settings import notes_at_export
 
     config = _config(config_file, export=given)
     _tell(config, notes_at_export(config))
@@ -146,7 +146,7 @@ def serve(
 
     Only requests with the admin key can change its models, logging and tracing. Without an admin key, nobody can.
     """
-    from rfm_commands.notes import notes_at_serve
+    from rfm_commands.unused_settings import notes_at_serve
 
     config = _config(config_file, serve=given, gateway=gateway_given)
     _tell(config, notes_at_serve(config, repository))
@@ -212,8 +212,8 @@ def tune(
     tritonserver: TritonPath = None,
 ) -> None:
     """Try how many instances and threads, and what batches, serve a repository best on this machine."""
-    from rfm_commands.notes import notes_at_tuning
     from rfm_commands.tune import Sweep, write_setting
+    from rfm_commands.unused_settings import notes_at_tuning
     from rfm_export import ExportError
 
     config = _config(config_file)

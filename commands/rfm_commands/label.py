@@ -95,7 +95,7 @@ def label(
         yield EngineScorer(checkpoint, device=device, **options)
 
     with _errors_on_one_line(_say):
-        from rfm_client.cli.labelling import run
+        from rfm_client.cli.label_display import run
 
         status = run(dataset, flags, connect, _say)
     raise typer.Exit(status)

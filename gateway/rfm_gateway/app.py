@@ -26,9 +26,9 @@ from rfm_client.contract import errors
 from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_gateway import schema
 from rfm_gateway.body import Admitted, Batch, BodyLimits, read_json, read_multipart
+from rfm_gateway.cancellation import CallerLeftError, while_connected
 from rfm_gateway.config import MIB, GatewayConfig
 from rfm_gateway.folder import AllowedFolder
-from rfm_gateway.leaving import CallerLeftError, while_connected
 from rfm_gateway.memory import RETRY_AFTER
 from rfm_gateway.observe import CALLER_LEFT, REQUEST_ID_HEADER, Metrics, Observed
 from rfm_gateway.scoring import Scorer

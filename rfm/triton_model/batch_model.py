@@ -20,7 +20,7 @@ from rfm.probe import blank_question
 from rfm.triton_model.cancellation import Cancellation
 from rfm.triton_model.exit import exit_with_triton
 from rfm.triton_model.metrics import Counted, Metrics
-from rfm.triton_model.neighbours import Neighbours
+from rfm.triton_model.other_instances import OtherInstances
 from rfm.triton_model.pipeline import Bounds, Pipeline, Stages
 from rfm.triton_model.placement import Placement, num_instances
 from rfm.triton_model.quarantine import Quarantine
@@ -72,15 +72,15 @@ class BatchModel(Generic[Question, Answer]):
         num_preparing = placement.num_preparing if self.works_ahead else 0
         capacity = max(config["max_batch_size"], 1)
         self._quarantine = Quarantine.of_this_process(args["model_name"], capacity, num_preparing)
-        neighbours = Neighbours.of_this_process(args["model_name"]) if num_instances(config) > 1 else None
+        other_instances = OtherInstances.of_this_process(args["model_name"]) if num_instances(config) > 1 else None
         cheap_answer_s = CHEAP_ANSWER_S[placement.device.type]
-        self.start(config, settings, neighbours, placement.apply, cheap_answer_s, num_preparing)
+        self.start(config, settings, other_instances, placement.apply, cheap_answer_s, num_preparing)
 
     def start(
         self,
         config: Mapping[str, Any],
         settings: Mapping[str, str],
-        neighbours: Neighbours | None = None,
+        other_instances: OtherInstances | None = None,
         begin: Callable[[], None] = lambda: None,
         cheap_answer_s: float = CHEAP_ANSWER_S["cpu"],
         num_preparing: int = 0,
@@ -102,7 +102,7 @@ class BatchModel(Generic[Question, Answer]):
         self._blank_tensors = blank_question(config)
         warmups = config.get("model_warmup", [])
         self._origins = Origins(sum(max(warmup.get("count", 0), 1) for warmup in warmups), digest(self._blank_tensors))
-        self._neighbours = neighbours
+        self._other_instances = other_instances
         stages = Stages(
             self._score,
             self._send,
@@ -162,8 +162,8 @@ class BatchModel(Generic[Question, Answer]):
         failed += self._put([request for request in batch if request.error is None])
         if failed:
             self._send(failed, [(failed, Execution())])
-        if self._neighbours is not None:
-            self._neighbours.wait_for_turn(self._pipeline, self._max_batch)
+        if self._other_instances is not None:
+            self._other_instances.wait_for_turn(self._pipeline, self._max_batch)
         return None
 
     def _is_better_at_once(self, requests: Sequence[Any]) -> bool:

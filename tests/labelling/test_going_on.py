@@ -24,7 +24,7 @@ from labelling import LEROBOT, BrightnessScorer, PickyScorer
 from rfm_client import ProgressResult, ProgressSample, ServerUnavailableError
 from rfm_client.labelling import DatasetError, LabelOptions, Watch, label, open_dataset
 from rfm_client.labelling.claims import Claims
-from rfm_client.labelling.parts import Parts
+from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.plan import Item
 
 ROOT = LEROBOT / "toy_v30_many"

@@ -37,7 +37,7 @@ def label(
     flags: LabelFlags,
 ) -> None:
     """A reward for every frame of a dataset, where training reads it. Go on with what is missing: the same command."""
-    from rfm_client.cli.labelling import run
+    from rfm_client.cli.label_display import run
 
     access: Access = context.obj  # the context itself cannot travel to other machines
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 import typer
 
 from rfm_client.cli.options import usage_errors
-from rfm_client.data.fusing import Fuse
+from rfm_client.data.camera_fusion import Fuse
 from rfm_client.data.sampling import Rule
 from rfm_client.labelling.options import (
     DEFAULT_RULE,

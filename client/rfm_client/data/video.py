@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.lerobot import check_film_behind, check_local_film
+from rfm_client.data.lerobot_videos import check_film_behind, check_local_film
 
 DOWNLOAD_TIMEOUT_S = 60.0
 

@@ -18,7 +18,7 @@ from rfm_client.contract.errors import InvalidSampleError, RewardError
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import ProgressResult, Result
 from rfm_client.contract.samples import UInt8Array, as_array
-from rfm_client.data.fusing import FUSES
+from rfm_client.data.camera_fusion import FUSES
 from rfm_client.data.prefixes import of_frames
 from rfm_client.data.resize import resize_frames
 from rfm_client.data.sampling import Prefix, Sampling

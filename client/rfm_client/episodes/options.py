@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TypedDict
 
 from rfm_client.contract.results import SUCCESS_THRESHOLD
-from rfm_client.data.fusing import Fuse, check_fuse, checked_cameras
+from rfm_client.data.camera_fusion import Fuse, check_fuse, checked_cameras
 from rfm_client.data.sampling import Rule, Sampling
 from rfm_client.episodes.live import LiveView
 

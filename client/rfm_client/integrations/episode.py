@@ -16,7 +16,7 @@ from rfm_client.client import RewardClient
 from rfm_client.contract.errors import InvalidSampleError, RewardError
 from rfm_client.contract.results import ProgressResult, Result
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.fusing import FUSES, Fuse, check_fuse, checked_cameras
+from rfm_client.data.camera_fusion import FUSES, Fuse, check_fuse, checked_cameras
 from rfm_client.data.prefixes import of_frames
 from rfm_client.data.resize import resize_frames
 from rfm_client.data.sampling import Prefix, Rule, Sampling

@@ -13,7 +13,7 @@ from rfm_client.contract.results import FrameScores
 from rfm_client.data.datasets.protocol import Dataset
 from rfm_client.integrations.recording import Recording
 from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS
-from rfm_client.labelling.parts import Parts
+from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.plan import Item, Plan
 
 

@@ -16,7 +16,7 @@ from contextlib import suppress
 from datetime import datetime, timezone
 from types import TracebackType
 
-from rfm_client.labelling.parts import Parts
+from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.plan import Item
 
 EXPIRY_S = 60.0

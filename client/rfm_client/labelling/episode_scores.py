@@ -12,8 +12,8 @@ import numpy as np
 from rfm_client.contract.errors import InferenceFailedError
 from rfm_client.contract.results import ProgressResult
 from rfm_client.contract.samples import Float32Array, ProgressSample, Trajectory, UInt8Array
+from rfm_client.data.camera_fusion import FUSES
 from rfm_client.data.datasets.protocol import Dataset, DatasetError, Episode
-from rfm_client.data.fusing import FUSES
 from rfm_client.data.prefixes import of_prefixes, prefix_samples
 from rfm_client.data.resize import resize_frames
 from rfm_client.labelling.recipe import Recipe

@@ -12,7 +12,7 @@ from typing import Any
 
 from rfm_client.data.datasets.hdf5 import Hdf5Dataset
 from rfm_client.data.datasets.protocol import DatasetError
-from rfm_client.labelling.parts import Parts
+from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.plan import Plan
 from rfm_client.labelling.sidecars import IDENTITY, canonical_json
 

@@ -10,9 +10,9 @@ from pathlib import Path
 from rfm_client.data.datasets.hdf5 import Hdf5Dataset
 from rfm_client.data.datasets.opening import open_dataset
 from rfm_client.data.datasets.protocol import Dataset, DatasetError
+from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.hdf5_labels import check_hdf5_replaceable, sibling, write_hdf5
 from rfm_client.labelling.options import Format, LabelOptions
-from rfm_client.labelling.parts import Parts
 from rfm_client.labelling.plan import Plan, make_plan, selected
 from rfm_client.labelling.ray_engine import Connect, Job, RayOptions, finish_all_with_ray
 from rfm_client.labelling.recipe import Recipe

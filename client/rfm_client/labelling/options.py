@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias, get_args
 
-from rfm_client.data.fusing import FUSES, Fuse
+from rfm_client.data.camera_fusion import FUSES, Fuse
 from rfm_client.data.sampling import Rule
 
 Mode: TypeAlias = Literal["prefix", "whole"]

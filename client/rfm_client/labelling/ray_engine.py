@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 
 from rfm_client.contract.errors import RewardError
 from rfm_client.data.datasets.opening import open_dataset
-from rfm_client.labelling.parts import Parts
+from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.plan import Plan
 from rfm_client.labelling.run import Failure, Run, Watch
 from rfm_client.labelling.scorer import Scorer

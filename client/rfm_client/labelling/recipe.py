@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from rfm_client.data.camera_fusion import Fuse
 from rfm_client.data.datasets.protocol import Dataset, DatasetError, Episode, chosen_cameras
-from rfm_client.data.fusing import Fuse
 from rfm_client.data.sampling import Sampling
 from rfm_client.labelling.options import DEFAULT_RULE, LabelOptions, Mode
 from rfm_client.labelling.scorer import CheckpointFacts

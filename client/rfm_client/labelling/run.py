@@ -20,7 +20,7 @@ from rfm_client.contract.errors import (
 from rfm_client.data.datasets.protocol import Dataset, Episode
 from rfm_client.labelling.claims import Claims
 from rfm_client.labelling.episode_scores import episode_columns
-from rfm_client.labelling.parts import Parts
+from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.plan import Item, Plan
 from rfm_client.labelling.scorer import Scorer
 

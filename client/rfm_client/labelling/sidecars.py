@@ -20,7 +20,7 @@ from typing import Any
 
 from rfm_client.data.datasets.protocol import DatasetError
 from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS
-from rfm_client.labelling.parts import Parts
+from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.plan import Plan
 
 IDENTITY = ("index", "episode_index", "frame_index")

@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from rfm_client.contract.results import SUCCESS_THRESHOLD
 from rfm_client.data.datasets.protocol import DatasetError
+from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.label_files import LabelColumns, read_label_table
-from rfm_client.labelling.parts import Parts
 from rfm_client.labelling.plan import Plan
 
 BACKWARDS_BY = 0.01  # the kappa of reward-aligned behaviour cloning: less is noise

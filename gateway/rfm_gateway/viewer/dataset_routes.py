@@ -21,7 +21,7 @@ from starlette.types import Receive, Scope, Send
 
 from rfm_client.data.datasets.protocol import DatasetError
 from rfm_gateway.body import BodyLimits
-from rfm_gateway.leaving import while_connected
+from rfm_gateway.cancellation import while_connected
 from rfm_gateway.viewer.cuts import MEDIA_TYPE, cut
 from rfm_gateway.viewer.datasets import ShownDataset, UnknownError
 

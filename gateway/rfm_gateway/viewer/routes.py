@@ -31,8 +31,8 @@ from rfm_client.data.fitting import fitted
 from rfm_client.data.sampling import RULES, Rule, Sampling
 from rfm_client.status import read_status
 from rfm_gateway.body import COMPARE_ENDPOINT, SCORE_ENDPOINT, Admitted, BodyLimits, invalid, parts_of
+from rfm_gateway.cancellation import while_connected
 from rfm_gateway.config import GatewayConfig
-from rfm_gateway.leaving import while_connected
 from rfm_gateway.memory import Share
 from rfm_gateway.observe import Metrics
 from rfm_gateway.viewer.curves import Call, Parts, curve

@@ -16,7 +16,7 @@ from pathlib import Path
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.datasets.films import Packets, Span, decode
 from rfm_client.data.datasets.protocol import Contents, DatasetError, Episode, checked_task, chosen_cameras, digest_of
-from rfm_client.data.lerobot import check_local_film
+from rfm_client.data.lerobot_videos import check_local_film
 
 TABLES = ("tasks.csv", "tasks.json")
 CAMERA = "video"

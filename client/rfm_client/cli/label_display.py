@@ -23,9 +23,9 @@ from rfm_client.data.datasets.protocol import Dataset, Episode
 from rfm_client.integrations.episode_recordings import record_episodes
 from rfm_client.integrations.recording import load_rerun
 from rfm_client.labelling.episode_scores import episode_columns
+from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.label import Outputs, Report, label, label_with_ray, plan_labels
 from rfm_client.labelling.options import LabelOptions
-from rfm_client.labelling.parts import Parts
 from rfm_client.labelling.plan import Item, Plan
 from rfm_client.labelling.ray_engine import Connect
 from rfm_client.labelling.run import Watch

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from rfm.journal import NO_DIGEST, Journal
-from rfm.triton_model.neighbours import Neighbours
+from rfm.triton_model.other_instances import OtherInstances
 from rfm.triton_model.pipeline import Bounds, Pipeline, Stages
 from rfm_serve import PATIENCE_S, wait_for
 
@@ -31,12 +31,12 @@ class Instance:
     """This one, which scores its first job until ``may_score`` is set, and the journal of another."""
 
     pipeline: Pipeline[Job, None]
-    neighbours: Neighbours
+    other_instances: OtherInstances
     other: Journal
     may_score: threading.Event
 
     def wait(self) -> None:
-        self.neighbours.wait_for_turn(self.pipeline, MAX_WAITING)
+        self.other_instances.wait_for_turn(self.pipeline, MAX_WAITING)
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def busy(tmp_path: Path) -> Iterator[Instance]:
     own, other = tmp_path / "own", Journal.create(tmp_path / "other", 1)
     pipeline.put([Job()])
     wait_for(lambda: pipeline.num_waiting == 0)
-    yield Instance(pipeline, Neighbours(lambda: [own, tmp_path / "other"], own), other, may_score)
+    yield Instance(pipeline, OtherInstances(lambda: [own, tmp_path / "other"], own), other, may_score)
     may_score.set()
     pipeline.close()
 

@@ -15,10 +15,10 @@ from rfm.triton_model.pipeline import Pipeline
 from rfm.triton_model.quarantine import all_journals, own_journal
 
 POLL_S = 2e-3  # between two questions whether a neighbour is idle, while this instance computes
-LOOK_S = 1.0  # between two looks for neighbours: they come and go with a load
+LOOK_S = 1.0  # between two looks for other instances: they come and go with a load
 
 
-class Neighbours:
+class OtherInstances:
     """The other instances of a model, as their journals show them.
 
     files: finds the journals of all instances, this one's included
@@ -32,7 +32,7 @@ class Neighbours:
         self._looked_s = -math.inf
 
     @classmethod
-    def of_this_process(cls, model: str) -> Neighbours:
+    def of_this_process(cls, model: str) -> OtherInstances:
         """Those of the running process, which Triton has started for ``model``."""
         return cls(partial(all_journals, model), own_journal(model))
 
