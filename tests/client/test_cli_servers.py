@@ -56,6 +56,7 @@ from rfm_client.contract.wire import encode_samples
 from rfm_client.status import read_status
 from rfm_serve import wait_for
 from trajectories import random_trajectory
+from vlm import PLAIN as VLM
 
 COMMANDS = get_command(app).commands  # type: ignore[attr-defined]
 
@@ -195,6 +196,20 @@ def test_sample_shows_what_the_client_gives(served: Served, kind: str, use_frame
             assert answer[kind] == pytest.approx(getattr(scores, kind), abs=1e-4)
             for name in ("first", "second") if kind == "preference" else ("reference", "other"):
                 assert_scores(answer[name], getattr(scores, name))
+
+
+def test_made_up_samples_are_frames_where_embeddings_are_not_read(served: Served, tmp_path: Path) -> None:
+    result = ask(served, "sample", "--num-samples", 2, model=VLM)
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert "progress of random frames" in result.stdout
+    written = ask(served, "bench-input", "--num-samples", 1, "--output", tmp_path / "input.json", model=VLM)
+    assert written.stdout.startswith(f"perf_analyzer -m {VLM}_frames ")
+
+
+def test_made_up_samples_for_an_unknown_model_name_it(served: Served) -> None:
+    result = ask(served, "sample", model="not_served")
+    assert result.exit_code == ExitCode.NO_MODEL
+    assert "not_served_frames" not in result.stderr
 
 
 def test_sample_shows_a_table_and_tells_of_each_that_fails(served: Served) -> None:

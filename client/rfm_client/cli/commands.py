@@ -41,7 +41,7 @@ NumSamples = Annotated[int, typer.Option(min=1, max=10_000, help="Samples to mak
 NumFrames = Annotated[
     str, typer.Option(metavar="N|N,M,...|N-M", help="Frames of a trajectory: one length, several or a range, in turn.")
 ]
-UseFrames = Annotated[bool, typer.Option("--use-frames", help="Random frames instead of embeddings.")]
+UseFrames = Annotated[bool, typer.Option("--use-frames", help="Random frames, also where embeddings would do.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")]
 
 
@@ -252,7 +252,8 @@ def sample(
             options.report(f"samples[{index}]: {outcome}")
     rows = [(f"{index}", outcome) for index, outcome in enumerate(outcomes) if not isinstance(outcome, RewardError)]
     if json != STANDARD_OUTPUT and rows:
-        print_tables(scores_table(f"{kind.value} of random {'frames' if use_frames else 'embeddings'}", rows))
+        of = "frames" if toy.are_frames(samples) else "embeddings"
+        print_tables(scores_table(f"{kind.value} of random {of}", rows))
     if json is not None:
         outputs.write_json(json, outputs.samples_document(server, kind.value, outcomes))
     raise typer.Exit(options.exit_code_of(failures, some_succeeded=len(failures) < len(outcomes)))
@@ -276,9 +277,10 @@ def bench_input(
 
     made_up = _toy(kind, num_samples, num_frames, use_frames, seed)
     with Server(urls, model, timeout, context.obj).connected() as client:
-        write_perf_analyzer_input(output, made_up.samples(client))
+        samples = made_up.samples(client)
+        write_perf_analyzer_input(output, samples)
     protocol, address = split_url(urls[0])
-    name = frames_name(model) if use_frames else model
+    name = frames_name(model) if toy.are_frames(samples) else model
     arguments = [
         "perf_analyzer",
         "-m",

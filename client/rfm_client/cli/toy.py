@@ -12,6 +12,7 @@ from enum import Enum
 import numpy as np
 
 from rfm_client.client import RewardClient
+from rfm_client.contract.errors import ModelNotFoundError
 from rfm_client.contract.made_up import random_trajectory
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
@@ -34,6 +35,7 @@ class Toy:
     """A recipe for made-up samples.
 
     lengths: frames of the trajectories, taken in turn, in an order that the seed gives
+    use_frames: raw frames; else embeddings, unless the served checkpoint reads frames alone
     """
 
     kind: SampleKind
@@ -44,7 +46,7 @@ class Toy:
 
     def samples(self, client: RewardClient) -> list[Sample]:
         """The samples, in the widths of the served checkpoint. Raises ModelNotFoundError if it does not take them."""
-        info = client.model_info(frames=self.use_frames)
+        info = self._model_info(client)
         random = np.random.default_rng(self.seed)
         trajectories = self._trajectories(random, info)
         if self.kind is SampleKind.progress:
@@ -52,9 +54,25 @@ class Toy:
         pair = PreferenceSample if self.kind is SampleKind.preference else SimilaritySample
         return [pair(next(trajectories), next(trajectories)) for _ in range(self.num_samples)]
 
+    def _model_info(self, client: RewardClient) -> ModelInfo:
+        if self.use_frames:
+            return client.model_info(frames=True)
+        try:
+            return client.model_info()
+        except ModelNotFoundError as of_embeddings:
+            try:
+                return client.model_info(frames=True)
+            except ModelNotFoundError:
+                raise of_embeddings from None
+
     def _trajectories(self, random: np.random.Generator, info: ModelInfo) -> Iterator[Trajectory]:
         for length in itertools.cycle(random.permutation(self.lengths).tolist()):
             yield random_trajectory(random, length, info.widths, task=TASK)
+
+
+def are_frames(samples: Sequence[Sample]) -> bool:
+    """Whether made-up samples are of raw frames."""
+    return samples[0].trajectories[0].frames is not None
 
 
 def parse_lengths(text: str) -> list[int]:
