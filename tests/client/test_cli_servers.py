@@ -206,12 +206,6 @@ def test_made_up_samples_are_frames_where_embeddings_are_not_read(served: Served
     assert written.stdout.startswith(f"perf_analyzer -m {VLM}_frames ")
 
 
-def test_made_up_samples_for_an_unknown_model_name_it(served: Served) -> None:
-    result = ask(served, "sample", model="not_served")
-    assert result.exit_code == ExitCode.NO_MODEL
-    assert "not_served_frames" not in result.stderr
-
-
 def test_sample_shows_a_table_and_tells_of_each_that_fails(served: Served) -> None:
     result = ask(served, "sample", "--sample-type", "preference", "--num-samples", 2, "--num-frames", "3,17")
     assert result.exit_code == ExitCode.FAILED

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from faulty_servers import heavy, ours_in_dev_shm, regions, trajectory, url_of
-from mixtures import assert_same
+from mixtures import assert_same, wait_until_at_work
 from one_model import OneModelServer
 from rfm.launch.process import Endpoints
 from rfm_client import (
@@ -19,6 +19,7 @@ from rfm_client import (
     ProgressSample,
     RewardClient,
 )
+from rfm_serve import MODEL
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
@@ -67,6 +68,18 @@ def test_shared_memory_serves_many_callers(repository: Path) -> None:
             futures = [client.submit(sample) for sample in heavies]
             for future, plain in zip(futures, expected, strict=True):
                 assert_same(future.result(), plain)
+        assert regions(endpoints) == set()
+
+
+def test_memory_is_given_back_when_a_request_no_longer_uses_it(repository: Path, protocol: str) -> None:
+    """Triton refuses to unmap it earlier, and does not do so later by itself."""
+    endpoints = Endpoints.free()
+    with OneModelServer(repository, endpoints):
+        with RewardClient(url_of(endpoints, protocol), shared_memory=True) as client:
+            client.progress(heavy(), frame_steps=2)
+            scored = client.submit(ProgressSample(heavy(), frame_steps=16))
+            wait_until_at_work(MODEL)
+            scored.cancel()
         assert regions(endpoints) == set()
 
 

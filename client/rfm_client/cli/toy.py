@@ -6,6 +6,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 
@@ -55,15 +56,10 @@ class Toy:
         return [pair(next(trajectories), next(trajectories)) for _ in range(self.num_samples)]
 
     def _model_info(self, client: RewardClient) -> ModelInfo:
-        if self.use_frames:
-            return client.model_info(frames=True)
-        try:
-            return client.model_info()
-        except ModelNotFoundError as of_embeddings:
-            try:
-                return client.model_info(frames=True)
-            except ModelNotFoundError:
-                raise of_embeddings from None
+        if not self.use_frames:
+            with suppress(ModelNotFoundError):
+                return client.model_info()
+        return client.model_info(frames=True)
 
     def _trajectories(self, random: np.random.Generator, info: ModelInfo) -> Iterator[Trajectory]:
         for length in itertools.cycle(random.permutation(self.lengths).tolist()):

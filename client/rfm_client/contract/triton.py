@@ -33,6 +33,7 @@ UNKNOWN_MODEL = "unknown model"
 NO_VERSIONS = "no available versions"  # of a model that is being loaded again, or failed
 NOT_READY = "is not ready"  # of a version
 LOST_REGION = "Unable to find shared memory region"  # of a server that was started again
+REGION_IN_USE = "it is currently in use"  # of a region that is to be unmapped
 RESTRICTED = "is restricted, expecting header"  # of an API that wants a key
 QUEUE_FULL = "the queue is full"  # of a model, in which as many requests wait as may
 TRITON_QUEUE_FULL = "Exceeds maximum queue size"  # of Triton, in which requests for a model of several instances wait

@@ -19,6 +19,7 @@ import logging
 import mmap
 import os
 import re
+import time
 import uuid
 from collections.abc import AsyncIterator, Coroutine
 from contextlib import asynccontextmanager, suppress
@@ -37,6 +38,7 @@ FOLDER = Path("/dev/shm")
 MIN_SHARED_BYTES = 64 * 2**10  # smaller inputs are quicker in the request itself
 MIN_REGION_BYTES = 2**20
 ANSWER_TIMEOUT_S = 2.0  # of a server that is to unmap a region, or to list those that it maps
+IN_USE_PAUSE_S = 0.02  # between two tries to have a region unmapped that a request still uses
 _PREFIX = "rfm-client-"
 _LOCK_SUFFIX = ".lock"
 _REGION_NAME = re.compile(rf"{_PREFIX}(?P<owner>[0-9a-f]{{32}})-\d+")
@@ -127,10 +129,10 @@ class SharedMemory:
         self._free = [free for free in self._free if free in self._known]
 
     async def close(self) -> None:
-        """Gives all regions back. One that a cancelled request still uses is left to the next client."""
+        """Gives all regions back. One that a cancelled request uses for longer is left to the next client."""
         try:
             await asyncio.gather(*self._tasks, return_exceptions=True)
-            await asyncio.gather(*map(self._unregister, set(self._known)))
+            await asyncio.gather(*map(self._unregister_when_unused, set(self._known)))
         finally:
             self._known.clear()
             self._free.clear()
@@ -186,7 +188,7 @@ class SharedMemory:
     async def _fill(self, region: Region, array: npt.NDArray[Any]) -> None:
         if not self._has_reclaimed:  # not before it is known that the server has the same /dev/shm
             self._has_reclaimed = True
-            with self._unanswered():
+            with suppress(InferenceServerException, asyncio.TimeoutError, *self._server.connection_errors):
                 await self._reclaim()
         await off_loop(array.nbytes, region.write, array)
 
@@ -207,17 +209,29 @@ class SharedMemory:
         await self._unregister(region)
         self._known.discard(region)
 
-    async def _unregister(self, region: Region) -> None:
-        """Has the server unmap a region. It stays known if a cancelled request still uses it, or the server does not
-        answer.
+    async def _unregister_when_unused(self, region: Region) -> None:
+        """Triton uses a region until it has dropped the request, which is a moment after the answer, or after a
+        cancelled request has been scored.
         """
-        with self._unanswered():
+        ends_s = time.monotonic() + ANSWER_TIMEOUT_S
+        while await self._unregister(region) and time.monotonic() < ends_s:
+            await asyncio.sleep(IN_USE_PAUSE_S)
+
+    async def _unregister(self, region: Region) -> bool:
+        """Has the server unmap a region. Returns whether it refuses, since a request still uses the region. That stays
+        known then, and if the server does not answer.
+        """
+        try:
             async with timeout(ANSWER_TIMEOUT_S):
                 await self._server.unregister_region(region.name)
-            self._known.discard(region)
-
-    def _unanswered(self) -> suppress:
-        return suppress(InferenceServerException, asyncio.TimeoutError, *self._server.connection_errors)
+        except InferenceServerException as error:
+            return triton.REGION_IN_USE in (error.message() or "")
+        except asyncio.TimeoutError:
+            return False
+        except self._server.connection_errors:
+            return False
+        self._known.discard(region)
+        return False
 
     async def _reclaim(self) -> None:
         """Takes back what clients left that were killed."""
