@@ -4,16 +4,4 @@
 # RFM_URL names a server that is not on this host's default port, RFM_MODEL a checkpoint not exported as rfm.
 set -u
 
-NOT_SERVED=5 # exit code of rfm-client for a model that is not there
-
-ask() {
-    rfm-client sample --model "${RFM_MODEL:-rfm}" --num-samples 1 --num-frames 2 --timeout 15 --json - "$@"
-}
-
-ask
-status=$?
-if [ "$status" -eq "$NOT_SERVED" ]; then
-    ask --use-frames
-    status=$?
-fi
-exit "$status"
+rfm-client sample --model "${RFM_MODEL:-rfm}" --num-samples 1 --num-frames 2 --timeout 15 --json -

@@ -14,7 +14,7 @@ from rfm.journal import Journal
 from rfm.triton_model.pipeline import Pipeline
 from rfm.triton_model.quarantine import all_journals, own_journal
 
-POLL_S = 2e-3  # between two questions whether a neighbour is idle, while this instance computes
+POLL_S = 2e-3  # between two questions whether another instance is idle, while this instance computes
 LOOK_S = 1.0  # between two looks for other instances: they come and go with a load
 
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import asyncio
-import socket
 import time
 import urllib.request
 from collections.abc import Callable, Sequence
@@ -37,7 +36,6 @@ from rfm_client import (
 from rfm_client.batching import MAX_REQUEST_BYTES
 from rfm_client.transport.deadline import Deadline
 from rfm_client.transport.in_flight import MAX_BYTES, InFlight
-from rfm_serve import wait_for
 from trajectories import random_trajectory
 
 
@@ -380,21 +378,9 @@ def test_nobody_there_is_an_error_at_once_without_retries() -> None:
 
 
 def test_nobody_there_is_an_error_when_the_time_is_up(caplog: pytest.LogCaptureFixture) -> None:
-    with RewardClient(NOBODY, timeout_s=0.5) as client, pytest.raises(ServerUnavailableError, match="refused"):
+    with RewardClient(NOBODY, timeout_s=2) as client, pytest.raises(ServerUnavailableError, match="refused"):
         client.progress(random_trajectory(0, 2))
     assert [record.message.partition(": trying again")[0] for record in caplog.records] == [NOBODY]
-
-
-def test_a_try_that_failed_is_told_though_the_next_gets_no_answer(caplog: pytest.LogCaptureFixture) -> None:
-    """At first nobody listens, then somebody who says nothing."""
-    with socket.socket() as port:
-        port.bind(("127.0.0.1", 0))
-        with RewardClient(f"http://127.0.0.1:{port.getsockname()[1]}", timeout_s=3) as client:
-            scored = client.submit(ProgressSample(random_trajectory(0, 2)))
-            wait_for(lambda: "trying again" in caplog.text)
-            port.listen()
-            with pytest.raises(ServerUnavailableError, match=r"(?i)connect.*; then .*: no answer within 3 s"):
-                scored.result()
 
 
 def test_wait_ready_returns_or_says_what_is_not_ready(served: Served, protocol: str) -> None:

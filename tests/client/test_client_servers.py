@@ -13,6 +13,7 @@ import pytest
 
 from rfm_client import (
     AsyncRewardClient,
+    DeadlineExceededError,
     InferenceFailedError,
     ModelNotFoundError,
     RewardError,
@@ -45,6 +46,7 @@ class Stand:
         self.refusal: RewardError | None = None  # of each request, though it says that it is ready
         self.num_ends = 0  # of its next requests: under each its connection ends
         self.down_s = 0.0  # for so long after each end it takes no connection
+        self.is_silent = False  # it takes connections, and answers nobody
         self._up_s = 0.0
         self.version, self.frames_per_value = 1, 1
         self.asked: Counter[str] = Counter()
@@ -56,11 +58,14 @@ class Stand:
         if self.is_down:
             self.asked["while down"] += 1
             raise ServerUnavailableError("Connection refused")
+        if self.is_silent:
+            await asyncio.sleep(timeout_s)
+            raise DeadlineExceededError("no answer in time")
         is_end = self.num_ends > 0
         self.num_ends -= is_end
         await asyncio.sleep(0.01)  # all come before one of them ends
         if is_end:
-            self._up_s = time.monotonic() + self.down_s
+            self.go_down(self.down_s)
             raise lost()
         if self.error is not None or self.refusal is not None:
             raise self.error or self.refusal
@@ -81,6 +86,9 @@ class Stand:
 
     async def close(self) -> None:
         pass
+
+    def go_down(self, down_s: float) -> None:
+        self._up_s = time.monotonic() + down_s
 
     @property
     def is_down(self) -> bool:
@@ -169,6 +177,21 @@ def test_a_model_is_not_served_only_if_every_server_says_so(others: list[RewardE
                 await client.progress(SEEN)
             if kind is ModelNotFoundError:  # and which of them is asked next is as it was
                 assert not any(server.is_left_out for server in client._servers._servers)
+
+    asyncio.run(asyncio.wait_for(ask(), WITHIN_S))
+
+
+@pytest.mark.parametrize(("down_s", "kind"), [(0.05, DeadlineExceededError), (1.2, ServerUnavailableError)])
+def test_a_call_ends_with_what_took_most_of_its_time(down_s: float, kind: type[RewardError]) -> None:
+    """The server takes no connection at first, and then answers nobody."""
+
+    async def ask() -> None:
+        stand = Stand()
+        stand.is_silent = True
+        async with AsyncRewardClient("", transports=[stand], timeout_s=2.0) as client:
+            stand.go_down(down_s)
+            with pytest.raises(kind):
+                await client.progress(SEEN)
 
     asyncio.run(asyncio.wait_for(ask(), WITHIN_S))
 

@@ -61,8 +61,7 @@ class ServerError(RewardError):
 
 
 class ServerUnavailableError(ServerError):
-    """The server cannot be reached, is not ready, or refuses more work for now. Tried again, it was so until the time
-    limit.
+    """The server cannot be reached, is not ready, or refuses more work for now.
 
     may_have_ended_server: a process of the model had ended, or the connection ended under the request, which may be
         why

@@ -66,7 +66,7 @@ def read_video(
         name other files or addresses, which are then opened; None: whatever it looks like
 
     Raises InvalidSampleError for what is no video, or cannot be had, and for a file of several LeRobot episodes
-    (``lerobot``) unless ``start_s`` and ``end_s`` name a part of it.
+    (``lerobot_videos``) unless ``start_s`` and ``end_s`` name a part of it.
     """
     try:
         import av

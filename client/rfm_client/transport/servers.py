@@ -151,7 +151,7 @@ class Servers:
             except (AccessDeniedError, InferenceFailedError, ModelNotFoundError):
                 pass  # another server may do better
             except ServerUnavailableError:
-                if not first.is_gone:
+                if not first.is_gone or deadline.ends_within(0):
                     raise
         try:
             return await self._request_among(None, model, request, deadline, raise_ended=True)
@@ -192,11 +192,10 @@ class Servers:
                 return answer
             except DeadlineExceededError as error:  # perhaps it hangs
                 self._leave_out(server, model, error)
-                exceeded = deadline.exceeded(server.transport.url)
                 failed = failures.get(server)
-                if failed is not None:  # which says more than that the time was up when it was tried again
-                    raise type(failed)(f"{failed.message}; then {exceeded.message}") from error
-                raise exceeded from error
+                if failed is not None and left_s < deadline.timeout_s / 2:
+                    raise failed from failed.__cause__  # for most of the time; that the last try had no answer says less
+                raise deadline.exceeded(server.transport.url) from error
             except (AccessDeniedError, InferenceFailedError, ModelNotFoundError) as error:
                 refusals[server] = error
                 if not self._retry:

@@ -19,7 +19,6 @@ import logging
 import mmap
 import os
 import re
-import time
 import uuid
 from collections.abc import AsyncIterator, Coroutine
 from contextlib import asynccontextmanager, suppress
@@ -37,7 +36,7 @@ from rfm_client.transport.off_loop import off_loop
 FOLDER = Path("/dev/shm")
 MIN_SHARED_BYTES = 64 * 2**10  # smaller inputs are quicker in the request itself
 MIN_REGION_BYTES = 2**20
-ANSWER_TIMEOUT_S = 2.0  # of a server that is to unmap a region, or to list those that it maps
+ANSWER_TIMEOUT_S = 2.0  # of a server that is to unmap a region, perhaps one in use, or to list those that it maps
 IN_USE_PAUSE_S = 0.02  # between two tries to have a region unmapped that a request still uses
 _PREFIX = "rfm-client-"
 _LOCK_SUFFIX = ".lock"
@@ -213,9 +212,10 @@ class SharedMemory:
         """Triton uses a region until it has dropped the request, which is a moment after the answer, or after a
         cancelled request has been scored.
         """
-        ends_s = time.monotonic() + ANSWER_TIMEOUT_S
-        while await self._unregister(region) and time.monotonic() < ends_s:
-            await asyncio.sleep(IN_USE_PAUSE_S)
+        with suppress(asyncio.TimeoutError):
+            async with timeout(ANSWER_TIMEOUT_S):
+                while await self._unregister(region):
+                    await asyncio.sleep(IN_USE_PAUSE_S)
 
     async def _unregister(self, region: Region) -> bool:
         """Has the server unmap a region. Returns whether it refuses, since a request still uses the region. That stays
