@@ -181,9 +181,12 @@ def test_a_model_is_not_served_only_if_every_server_says_so(others: list[RewardE
     asyncio.run(asyncio.wait_for(ask(), WITHIN_S))
 
 
-@pytest.mark.parametrize(("down_s", "kind"), [(0.05, DeadlineExceededError), (1.2, ServerUnavailableError)])
-def test_a_call_ends_with_what_took_most_of_its_time(down_s: float, kind: type[RewardError]) -> None:
-    """The server takes no connection at first, and then answers nobody."""
+@pytest.mark.parametrize(("down_s", "kind"), [(0.1, DeadlineExceededError), (1.0, ServerUnavailableError)])
+def test_a_call_ends_with_what_took_most_of_its_time(
+    monkeypatch: pytest.MonkeyPatch, down_s: float, kind: type[RewardError]
+) -> None:
+    """The server takes no connection at first, and then answers nobody. It is tried again every 0.3 s."""
+    monkeypatch.setattr("rfm_client.transport.servers.pause_s", lambda attempt, longest_s: 0.3)
 
     async def ask() -> None:
         stand = Stand()

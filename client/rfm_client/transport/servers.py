@@ -194,7 +194,7 @@ class Servers:
                 self._leave_out(server, model, error)
                 failed = failures.get(server)
                 if failed is not None and left_s < deadline.timeout_s / 2:
-                    raise failed from failed.__cause__  # for most of the time; that the last try had no answer says less
+                    raise failed from failed.__cause__  # the reason for most of the time
                 raise deadline.exceeded(server.transport.url) from error
             except (AccessDeniedError, InferenceFailedError, ModelNotFoundError) as error:
                 refusals[server] = error
