@@ -15,7 +15,7 @@ from tritonclient.utils import InferenceServerException
 from faulty_servers import heavy, ours_in_dev_shm, regions, trajectory, url_of
 from mixtures import assert_same
 from one_model import OneModelServer
-from patients import make_repository
+from patients import answering_after, make_repository
 from rfm.launch.process import Endpoints
 from rfm.supervise.model_processes import ProcessWatch
 from rfm_client import (
@@ -76,26 +76,10 @@ def test_shared_memory_serves_many_callers(repository: Path) -> None:
         assert regions(endpoints) == set()
 
 
-SLOW = """
-
-_answer = TritonPythonModel.answer
-
-
-def slow(self, questions, execution):
-    import time
-
-    time.sleep(0.7)
-    return _answer(self, questions, execution)
-
-
-TritonPythonModel.answer = slow
-"""
-
-
 def test_memory_is_given_back_as_soon_as_no_request_uses_it(tmp_path: Path, protocol: str) -> None:
     """Triton refuses to unmap it earlier, and does not do so later by itself."""
     endpoints = Endpoints.free()
-    with OneModelServer(make_repository(tmp_path, more_code=SLOW), endpoints) as server:
+    with OneModelServer(make_repository(tmp_path, more_code=answering_after(0.7)), endpoints) as server:
         with RewardClient(url_of(endpoints, protocol), shared_memory=True) as client:
             client.progress(heavy(), frame_steps=2)
             (region,) = regions(endpoints)

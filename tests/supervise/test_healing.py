@@ -22,7 +22,7 @@ import pytest
 
 from clock import Clock
 from one_model import BriefServer, OneModelServer
-from patients import CALLERS, DEADLY, MARK, TOLERANCE, Callers, make_repository, trajectory
+from patients import CALLERS, DEADLY, MARK, TOLERANCE, Callers, answering_after, make_repository, trajectory
 from rfm.journal import SHARED_MEMORY
 from rfm.launch import cleanup
 from rfm.launch.installation import find_installation
@@ -82,20 +82,7 @@ def breaking(self, questions, execution):
 
 TritonPythonModel.answer = breaking
 """
-STICKY = """
-
-_quick = TritonPythonModel.answer
-
-
-def sticky(self, questions, execution):
-    import time
-
-    time.sleep(0.3)
-    return _quick(self, questions, execution)
-
-
-TritonPythonModel.answer = sticky
-"""
+STICKY = answering_after(0.3)
 FAILS = f"""
 
 _answer = TritonPythonModel.answer

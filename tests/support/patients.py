@@ -47,6 +47,24 @@ TritonPythonModel.answer = deadly
 """
 
 
+def answering_after(seconds: float) -> str:
+    """Code for a model.py whose answers take so much longer."""
+    return f"""
+
+_prompt_answer = TritonPythonModel.answer
+
+
+def late(self, questions, execution):
+    import time
+
+    time.sleep({seconds})
+    return _prompt_answer(self, questions, execution)
+
+
+TritonPythonModel.answer = late
+"""
+
+
 def make_repository(
     folder: Path, *, more_code: str = "", instances: int = 1, batch_size: int = 64, **settings: int
 ) -> Path:

@@ -18,7 +18,7 @@ from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 from commands import REPOSITORY
 from faulty_servers import url_of
 from one_model import BriefServer, OneModelServer
-from patients import make_repository
+from patients import answering_after, make_repository
 from repositories import bound_triton_s_queue, kill_model
 from rfm.launch.installation import find_installation
 from rfm.launch.process import Endpoints
@@ -136,20 +136,7 @@ def test_triton_says_so_in_these_words(asked: Triton, name: str) -> None:
         raise error
 
 
-SLOW = """
-
-_answer = TritonPythonModel.answer
-
-
-def slow(self, questions, execution):
-    import time
-
-    time.sleep(0.3)
-    return _answer(self, questions, execution)
-
-
-TritonPythonModel.answer = slow
-"""
+SLOW = answering_after(0.3)
 FULL = {"the model": (1, triton.QUEUE_FULL), "Triton, of several instances": (2, triton.TRITON_QUEUE_FULL)}
 
 
