@@ -43,6 +43,7 @@ app = typer.Typer(
     help="Reward models for robot learning, served by Triton.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # whose tables cut the names of options off where a terminal has 80 columns
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
@@ -99,7 +100,7 @@ def export(
     *,
     given: Given,
 ) -> None:
-    """Write a checkpoint into a model repository as the next version of its models."""
+    """Write a checkpoint into a model repository, as a new version."""
     import rfm_export
     from rfm_commands.unused_settings import notes_at_export
 
@@ -211,7 +212,10 @@ def tune(
     rounds: Annotated[int, typer.Option(min=1, help="How often each setting is measured.")] = 3,
     tritonserver: TritonPath = None,
 ) -> None:
-    """Try how many instances and threads, and what batches, serve a repository best on this machine."""
+    """Find the settings that serve a repository best on this machine.
+
+    It tries how many instances and threads, and what batches.
+    """
     from rfm_commands.tune import Sweep, write_setting
     from rfm_commands.unused_settings import notes_at_tuning
     from rfm_export import ExportError

@@ -82,7 +82,7 @@ def label(
     *,
     flags: LabelFlags,
 ) -> None:
-    """A reward for every frame of a dataset, by a checkpoint in this process, without Triton."""
+    """Label every frame of a dataset in this process, without Triton."""
     options = {
         "image_encoder": image_encoder,
         "text_encoder": text_encoder,

@@ -49,7 +49,7 @@ def models(
         Path | None, typer.Option(envvar="RFM_CLIENT_KEY", help="The certificate's key (PEM).")
     ] = None,
 ) -> None:
-    """List, load and unload the models of a running server; serve another version of them without losing a request."""
+    """List, load, unload and replace the models of a running server."""
     try:
         context.obj = Access(ca_file, client_certificate, client_key)
     except ValueError as error:
@@ -74,7 +74,7 @@ def load(
     url: Url = DEFAULT_URL,
     admin_key_file: AdminKeyFile = None,
 ) -> None:
-    """Serve what the configurations of NAME say: a new name, or one that was unloaded."""
+    """Serve NAME as its configurations say. It is new, or was unloaded."""
     with _server(context, url, admin_key_file) as server:
         for model in models_of(repository, name):
             server.load(model)
@@ -106,7 +106,10 @@ def rollout(
     url: Url = DEFAULT_URL,
     admin_key_file: AdminKeyFile = None,
 ) -> None:
-    """Serve another version of NAME: loaded beside the old one, probed, then alone. If it fails the old one stays."""
+    """Serve another version of NAME without losing a request.
+
+    It is loaded beside the old one, probed, then alone. If it fails the old one stays.
+    """
     with _server(context, url, admin_key_file) as server:
         Rollout(repository, name, server, typer.echo).to(version)
         typer.echo(f"{name}: version {version} is served")
@@ -120,7 +123,7 @@ def rollback(
     url: Url = DEFAULT_URL,
     admin_key_file: AdminKeyFile = None,
 ) -> None:
-    """Serve the version before the one that is served, as rollout does."""
+    """Serve the version before this one, as rollout does."""
     with _server(context, url, admin_key_file) as server:
         version = previous_version(repository, name, server)
         Rollout(repository, name, server, typer.echo).to(version)

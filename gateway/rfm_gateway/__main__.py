@@ -8,4 +8,6 @@ import typer
 from rfm_gateway.command import gateway
 
 if __name__ == "__main__":
-    typer.run(gateway)
+    app = typer.Typer(add_completion=False, rich_markup_mode=None)  # without tables that cut the names of options off
+    app.command()(gateway)
+    app()

@@ -24,7 +24,7 @@ logger = logging.getLogger("rfm_gateway")
 
 @with_options(GatewayConfig, into="given", required=("triton",))
 def gateway(*, given: Given) -> None:
-    """Serve the FastAPI evaluation server's endpoints before a Triton server."""
+    """Serve the FastAPI server's endpoints before a Triton server."""
     try:
         import uvicorn
 

@@ -33,6 +33,7 @@ app = typer.Typer(
     epilog=EXIT_CODES,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # whose tables cut the names of options off where a terminal has 80 columns
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
@@ -153,9 +154,10 @@ def compare(
     json: options.Json = None,
     timeout: options.TimeoutS = DEFAULT_TIMEOUT_S,
 ) -> None:
-    """Which of two or more videos does the task best, and the progress in each.
+    """Which of several videos does the task best.
 
     Every two are compared in both orders. They are ranked by the mean probability of winning against the others.
+    The progress in each is shown, too.
     """
     from rfm_client.cli import show
 
@@ -186,7 +188,7 @@ def status(
     json: options.Json = None,
     timeout: options.TimeoutS = 10.0,
 ) -> None:
-    """The server: its models, their requests, how well they share batches; GPUs and memory."""
+    """The server's models, requests, batches, GPUs and memory."""
     from rfm_client.cli.show import status_tables
     from rfm_client.status import read_status
 
@@ -213,7 +215,7 @@ def wait(
     model: options.Model = DEFAULT_MODEL,
     timeout: Annotated[float, typer.Option(min=options.MIN_TIMEOUT_S, help="Seconds to wait at most.")] = 120.0,
 ) -> None:
-    """Return as soon as the model is ready (of several servers: on one of them)."""
+    """Return as soon as the model is ready. Of several servers, one is enough."""
     from rfm_client.client import RewardClient
 
     with options.usage_errors("--url"):
@@ -272,7 +274,10 @@ def bench_input(
     seed: Seed = 0,
     timeout: options.TimeoutS = DEFAULT_TIMEOUT_S,
 ) -> None:
-    """Write made-up samples as input of Triton's perf_analyzer, and print the command that measures with them."""
+    """Write made-up samples as input of Triton's perf_analyzer.
+
+    It prints the command that measures with them.
+    """
     from rfm_client.cli.perf_input import write_perf_analyzer_input
 
     made_up = _toy(kind, num_samples, num_frames, use_frames, seed)

@@ -36,7 +36,10 @@ def label(
     *,
     flags: LabelFlags,
 ) -> None:
-    """A reward for every frame of a dataset, where training reads it. Go on with what is missing: the same command."""
+    """Write a reward for every frame where training reads it.
+
+    The same command goes on with what is missing.
+    """
     from rfm_client.cli.label_display import run
 
     access: Access = context.obj  # the context itself cannot travel to other machines
