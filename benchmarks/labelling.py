@@ -61,7 +61,7 @@ class SimulatedScorer:
 
     def checkpoint(self) -> CheckpointFacts:
         """The facts of a checkpoint that does not exist."""
-        return CheckpointFacts("simulated", None, "simulated", FRAMES, None, self._encodes, False)
+        return CheckpointFacts("simulated", None, "simulated", "simulated", FRAMES, None, self._encodes, False)
 
     def encode(self, frames: UInt8Array, task: str) -> Trajectory:
         """The brightness of each frame."""

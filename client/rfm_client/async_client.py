@@ -5,14 +5,15 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from functools import partial
 from types import TracebackType
 from typing import TYPE_CHECKING, Literal, cast, overload
 
 from rfm_client.call import Call, CallOptions, check_known
-from rfm_client.contract.errors import DeadlineExceededError, InvalidSampleError, RewardError
+from rfm_client.contract.errors import DeadlineExceededError, InvalidSampleError, ModelNotFoundError, RewardError
 from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.names import DEFAULT_MODEL, frames_name
+from rfm_client.contract.names import DEFAULT_MODEL, Part, encoder_name, frames_name
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.episodes.async_episodes import AsyncEpisode, AsyncEpisodes
@@ -204,6 +205,22 @@ class AsyncRewardClient:
         """
         name = frames_name(self._model) if frames else self._model
         return await self._scorer.model_infos.get(name, self._deadline(timeout_s), refresh=refresh)
+
+    async def model_infos(self, *, timeout_s: float | None = None) -> dict[Part, list[ModelInfo]]:
+        """What every server that answers says now of the checkpoint's models, as far as it serves them: the one for
+        embeddings, the encoder, the one for raw frames. Raises RewardError if no server answers.
+        """
+        deadline = self._deadline(timeout_s)
+        names: dict[Part, str] = {
+            "embeddings": self._model,
+            "encoder": encoder_name(self._model),
+            "frames": frames_name(self._model),
+        }
+        told: dict[Part, list[ModelInfo]] = {}
+        for part, name in names.items():
+            with suppress(ModelNotFoundError):
+                told[part] = await self._servers.model_infos(name, deadline)
+        return told
 
     async def close(self) -> None:
         """Closes the connections and gives shared memory back."""

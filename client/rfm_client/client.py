@@ -13,6 +13,7 @@ from rfm_client.async_client import AsyncRewardClient, ClientOptions
 from rfm_client.call import CallOptions
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.names import Part
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.data.fitting import snapshot
@@ -145,6 +146,12 @@ class RewardClient:
         Raises ModelNotFoundError if it is not served.
         """
         return self._loop.wait(self._client.model_info(frames=frames, refresh=refresh, timeout_s=timeout_s))
+
+    def model_infos(self, *, timeout_s: float | None = None) -> dict[Part, list[ModelInfo]]:
+        """What every server that answers says now of the checkpoint's models, as far as it serves them: the one for
+        embeddings, the encoder, the one for raw frames. Raises RewardError if no server answers.
+        """
+        return self._loop.wait(self._client.model_infos(timeout_s=timeout_s))
 
     def close(self) -> None:
         """Cancels what is under way, closes the connections and gives shared memory back."""

@@ -4,19 +4,22 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any, cast
 
+import torch
 import typer
 
 from rfm import families
-from rfm.checkpoint.digest import weights_digest
+from rfm.checkpoint.digest import settings_digest, weights_digest
 from rfm.engine import Engine
 from rfm.execution import Execution
-from rfm.family import Checkpoint
+from rfm.family import Checkpoint, FrameEncoders
 from rfm_client import ProgressResult, ProgressSample, RewardError, Trajectory
 from rfm_client.cli.label import Source
 from rfm_client.cli.label_flags import LabelFlags, with_label_flags
@@ -40,7 +43,8 @@ class EngineScorer:
         """
         self._checkpoint = families.load(source, **options)
         self._encoders = self._checkpoint.encoders()
-        self._facts = _facts(source, self._checkpoint, self._encoders is not None, _folders(source, options))
+        told = {"device": torch.device(device).type, **{name: _named(value) for name, value in options.items()}}
+        self._facts = _facts(source, self._checkpoint, self._encoders, _folders(source, options), told)
         self._device = device
         self._lock = threading.Lock()
 
@@ -101,7 +105,13 @@ def label(
     raise typer.Exit(status)
 
 
-def _facts(source: str, checkpoint: Checkpoint, has_encoders: bool, folders: Sequence[Path]) -> CheckpointFacts:
+def _facts(
+    source: str,
+    checkpoint: Checkpoint,
+    encoders: FrameEncoders | None,
+    folders: Sequence[Path],
+    told: Mapping[str, Any],
+) -> CheckpointFacts:
     description = checkpoint.description
     limits = [limit for limit in (description.trained_frames, description.max_frames) if limit is not None]
     name, _, tag = source.partition("@")
@@ -110,11 +120,30 @@ def _facts(source: str, checkpoint: Checkpoint, has_encoders: bool, folders: Seq
         source="/".join(Path(source).resolve().parts[-2:]) if is_local else name,
         revision=None if is_local else tag or None,
         weights_digest=weights_digest(folders),
+        settings_digest=_settings_digest(checkpoint, encoders, folders, told),
         max_frames=min(limits, default=None),
         frame_size=description.frame_size,
-        encodes=has_encoders,
+        encodes=encoders is not None,
         is_causal=getattr(checkpoint.config, "causal_mask", None) is True,
     )
+
+
+def _settings_digest(
+    checkpoint: Checkpoint, encoders: FrameEncoders | None, folders: Sequence[Path], told: Mapping[str, Any]
+) -> str:
+    """Of all that decides the scores beside the folders' weights, encoders of the Hub with their weights."""
+    told = {**told, "network": asdict(checkpoint.config)}
+    if encoders is None:
+        return settings_digest(folders, told)
+    with TemporaryDirectory(prefix="rfm-label-") as written:
+        encoders.save(Path(written))
+        told["encoders"] = weights_digest([Path(written)])
+        return settings_digest([*folders, Path(written)], told)
+
+
+def _named(value: Any) -> Any:
+    """An option; of one that names a local folder nothing, since its files are looked at."""
+    return None if isinstance(value, str) and Path(value).is_dir() else value
 
 
 def _folders(source: str, options: dict[str, Any]) -> list[Path]:

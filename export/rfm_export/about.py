@@ -15,14 +15,16 @@ from typing import Any
 from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.checkpoint.content import read_run_config
-from rfm.checkpoint.digest import weights_digest
+from rfm.checkpoint.digest import settings_digest, weights_digest
 from rfm.checkpoint.files import find_run_config
 from rfm.family import NETWORK, Checkpoint, EncodersDescription
+from rfm.parameters import DTYPE_PARAMETER
 from rfm_client.contract.model_info import (
     DIGEST_PARAMETER,
     NETWORK_PARAMETER,
     REVISION_PARAMETER,
     RUN_CONFIG_PARAMETER,
+    SETTINGS_DIGEST_PARAMETER,
     SOURCE_PARAMETER,
 )
 
@@ -72,7 +74,7 @@ def source_name(source: str | Path) -> str:
 
 
 def about(checkpoint: Checkpoint, origin: Origin) -> dict[str, str]:
-    """Parameters by name, without the digest of the weights: those are not written yet."""
+    """Parameters by name, without the digests of weights and settings: those are not written yet."""
     return {**origin.parameters, NETWORK_PARAMETER: json.dumps(_network(checkpoint))}
 
 
@@ -84,11 +86,14 @@ def about_encoders(encoders: EncodersDescription, of_scorer: Mapping[str, str]) 
     }
 
 
-def record_weights(config: pb.ModelConfig, version: int, repository: Path) -> None:
-    """Sets the digest of a version's weights in ``repository``; an ensemble has one of all its parts."""
+def record_digests(config: pb.ModelConfig, version: int, repository: Path) -> None:
+    """Sets the digests of a version's weights and settings in ``repository``; an ensemble has those of its parts."""
     parts = [step.model_name for step in config.ensemble_scheduling.step] or [config.name]
-    digest = weights_digest(repository / part / str(version) for part in parts)
-    config.parameters[DIGEST_PARAMETER].string_value = digest
+    folders = [repository / part / str(version) for part in parts]
+    kinds = [pb.ModelInstanceGroup.Kind.Name(group.kind) for group in config.instance_group]
+    told = {"dtype": config.parameters[DTYPE_PARAMETER].string_value, "kinds": kinds} if kinds else {}
+    config.parameters[DIGEST_PARAMETER].string_value = weights_digest(folders)
+    config.parameters[SETTINGS_DIGEST_PARAMETER].string_value = settings_digest(folders, told)
 
 
 def _is_folder(source: str | Path) -> bool:

@@ -21,7 +21,7 @@ from rfm.parameters import FAMILY_PARAMETER
 from rfm.version_folder import CHECKPOINT_FOLDER
 from rfm_client.contract import wire
 from rfm_client.contract.names import encoder_name, frames_name
-from rfm_export.about import Origin, about, record_weights
+from rfm_export.about import Origin, about, record_digests
 from rfm_export.device import device_for, device_named, needing_room
 from rfm_export.errors import ExportError
 from rfm_export.layout import GeneratedModel, Version, generated_models, scorer_name
@@ -169,7 +169,7 @@ def check(repository: Path, settings: ExportConfig) -> list[str]:
 def _generated(models: Sequence[GeneratedModel], repository: Path) -> dict[str, bytes]:
     """Contents of the generated files by path in the repository, where the models' weights lie."""
     for model in models:
-        record_weights(model.config, model.version, repository)
+        record_digests(model.config, model.version, repository)
     return {path: content for model in models for path, content in model.files().items()}
 
 

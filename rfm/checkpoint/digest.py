@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""A digest of weights, which identifies a checkpoint."""
+"""Digests of weights and of settings, which together identify a checkpoint."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 DIGEST_DIGITS = 16  # of 64: enough to identify a checkpoint, and to find damage
+
+# Of files beside the weights that decide scores: configuration, tokenizer, image processor.
+SETTINGS_SUFFIXES = (".json", ".jinja", ".model", ".txt", ".yaml")
 
 _CHUNK_BYTES = 2**22
 
@@ -19,4 +24,18 @@ def weights_digest(folders: Iterable[Path]) -> str:
         with file.open("rb") as content:
             while chunk := content.read(_CHUNK_BYTES):
                 digest.update(chunk)
+    return digest.hexdigest()[:DIGEST_DIGITS]
+
+
+def settings_digest(folders: Iterable[Path], told: Mapping[str, Any]) -> str:
+    """The first digits of the SHA-256 of what decides scores beside the weights. Raises OSError.
+
+    folders: whose files of SETTINGS_SUFFIXES count, with their paths
+    told: what no file says, as JSON can hold it
+    """
+    digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
+    for folder in folders:
+        for file in sorted(file for file in folder.rglob("*") if file.suffix in SETTINGS_SUFFIXES and file.is_file()):
+            content = file.read_bytes()
+            digest.update(f"{file.relative_to(folder).as_posix()} {len(content)}\n".encode() + content)
     return digest.hexdigest()[:DIGEST_DIGITS]

@@ -419,6 +419,28 @@ def test_check_notices_other_weights(exported: Path, tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize("file", ["image_encoder/preprocessor_config.json", "text_encoder/tokenizer_config.json"])
+def test_the_digest_of_settings_is_of_the_files_beside_the_weights(exported: Path, tmp_path: Path, file: str) -> None:
+    repository = shutil.copytree(exported, tmp_path / "repository")
+    assert len(parameter(repository, "film_encoder", "settings_digest")) == 16
+    changed = repository / "film_encoder" / "1" / file
+    changed.write_text(changed.read_text() + "\n")
+    assert rfm_export.check(repository, serve_config(FRAMES, "film")) == [
+        f"{repository}/film_encoder/config.pbtxt: differs from what `rfm export` generates",
+        f"{repository}/film_frames/config.pbtxt: differs from what `rfm export` generates",
+    ]
+
+
+def test_the_digest_of_settings_is_of_the_dtype_too(tmp_path: Path) -> None:
+    told = set()
+    for dtype in ("float32", "bfloat16", "float32"):
+        settings = replace(serve_config(FRAMES), dtype=dtype)
+        rfm_export.export(FRAMES.checkpoint, tmp_path / dtype, settings)
+        told.add((parameter(tmp_path / dtype, "rfm", "settings_digest"), dtype))
+    assert len(told) == 2
+    assert len({digest for digest, _ in told}) == 2
+
+
 def test_a_checkpoint_of_the_hub_tells_its_commit(tmp_path: Path) -> None:
     snapshot = tmp_path / "models--org--name" / "snapshots" / "0123abcd"
     assert Origin.of("org/name@best", snapshot) == Origin("org/name@best", "0123abcd")

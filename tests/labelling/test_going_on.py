@@ -198,9 +198,9 @@ def test_parts_of_something_else_are_never_used(output: Path) -> None:
         scorer = BrightnessScorer()
         label(open_dataset(ROOT), scorer, LabelOptions(output=output, episodes=[0], overwrite=True, **options))  # type: ignore[arg-type]
         assert scorer.num_samples > 0
-    other = BrightnessScorer(digest="other")
-    label(open_dataset(ROOT), other, LabelOptions(output=output, episodes=[0], overwrite=True))
-    assert other.num_samples == first.num_samples
+    for other in (BrightnessScorer(digest="other"), BrightnessScorer(settings="other")):
+        label(open_dataset(ROOT), other, LabelOptions(output=output, episodes=[0], overwrite=True))
+        assert other.num_samples == first.num_samples
 
 
 def test_labels_of_something_else_are_replaced_only_when_asked(output: Path) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from paths import ROOT
 from rfm_client import ProgressSample, RewardClient, Trajectory
 from rfm_client.data.sampling import RULES, Sampling
 from rfm_client.labelling import (
+    CheckpointFacts,
     ClientScorer,
     DatasetError,
     LabelOptions,
@@ -53,6 +55,35 @@ def engine_scorer() -> EngineScorer:
         image_encoder=str(encoders / "image_encoder"),
         text_encoder=str(encoders / "text_encoder"),
     )
+
+
+@pytest.mark.parametrize(
+    "file", ["checkpoint/config.json", "image_encoder/preprocessor_config.json", "text_encoder/tokenizer_config.json"]
+)
+def test_a_checkpoint_is_another_with_other_settings(tmp_path: Path, file: str) -> None:
+    encoders = MODELS / "rfm_encoder" / "1"
+    for folder in (MODELS / "rfm" / "1" / "checkpoint", encoders / "image_encoder", encoders / "text_encoder"):
+        shutil.copytree(folder, tmp_path / folder.name)
+
+    def facts() -> CheckpointFacts:
+        options = {name: str(tmp_path / name) for name in ("image_encoder", "text_encoder")}
+        return EngineScorer(str(tmp_path / "checkpoint"), **options).checkpoint()
+
+    before = facts()
+    assert before == facts()
+    changed = tmp_path / file
+    changed.write_text(changed.read_text() + "\n")
+    assert facts().weights_digest == before.weights_digest
+    assert facts().settings_digest != before.settings_digest
+
+
+def test_a_checkpoint_is_another_where_frames_are_resized_otherwise() -> None:
+    golden = goldens.config("q25_video_last_l2")
+    scorers = [
+        EngineScorer(str(golden.checkpoint), base_model=str(golden.base_model), resize_images=resizes)
+        for resizes in (True, False)
+    ]
+    assert len({scorer.checkpoint().settings_digest for scorer in scorers}) == 2
 
 
 def columns(file: Path) -> dict[str, np.ndarray[Any, Any]]:
@@ -205,7 +236,12 @@ def test_the_files_have_the_documented_form(output: Path) -> None:
         "allow_nan": False,
     }
     provenance = json.loads(own["provenance"])
-    assert provenance["checkpoint"] == {"source": "toy/brightness", "revision": None, "weights_digest": "brightness"}
+    assert provenance["checkpoint"] == {
+        "source": "toy/brightness",
+        "revision": None,
+        "weights_digest": "brightness",
+        "settings_digest": "settings",
+    }
     assert provenance["sampling"] == {"rule": "rint_pad", "frames": 16}
     assert provenance["cameras"] == [FRONT, WRIST]
     assert (provenance["dataset"]["kind"], provenance["dataset"]["source"]) == ("LeRobot v3.0", "toy_v30_many")

@@ -26,16 +26,23 @@ LEROBOT = Path(__file__).parents[1] / "lerobot"
 class BrightnessScorer:
     """Progress is how bright the slot's frame is, success how red: what is read can be recomputed by hand."""
 
-    def __init__(self, seconds: float = 0.0, digest: str = "brightness", max_frames: int | None = 16) -> None:
+    def __init__(
+        self,
+        seconds: float = 0.0,
+        digest: str = "brightness",
+        max_frames: int | None = 16,
+        settings: str = "settings",
+    ) -> None:
         self.seconds = seconds
         self.digest = digest
+        self.settings = settings
         self.max_frames = max_frames
         self.num_samples = 0
         self.tasks: set[str] = set()
         self._lock = threading.Lock()
 
     def checkpoint(self) -> CheckpointFacts:
-        return CheckpointFacts("toy/brightness", None, self.digest, self.max_frames, None, False, False)
+        return CheckpointFacts("toy/brightness", None, self.digest, self.settings, self.max_frames, None, False, False)
 
     def encode(self, frames: UInt8Array, task: str) -> Trajectory:
         raise AssertionError("it does not encode")

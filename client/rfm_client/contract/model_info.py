@@ -17,6 +17,7 @@ FRAMES_PER_VALUE_PARAMETER = "frames_per_value"
 SOURCE_PARAMETER = "source"
 REVISION_PARAMETER = "revision"
 DIGEST_PARAMETER = "weights_digest"
+SETTINGS_DIGEST_PARAMETER = "settings_digest"
 NETWORK_PARAMETER = "network"
 RUN_CONFIG_PARAMETER = "run_config"
 
@@ -37,6 +38,8 @@ class ModelInfo:
     source: which checkpoint was exported: its Hub id, or the end of its path; None: it does not say
     revision: the commit of the Hub that was exported; None: it was a folder
     weights_digest: 16 hex digits, a digest of the exported weights; None: the server does not say
+    settings_digest: 16 hex digits, a digest of what else decides scores: the files beside the weights (configuration,
+        tokenizer, image processor), the dtype and the kind of device; None: the server does not say
     network: its class, its configuration (config), and how many numbers each part of it has (parameters)
     run_config: config.yaml of the training run, without secrets; empty: the checkpoint had none
     """
@@ -55,6 +58,7 @@ class ModelInfo:
     source: str | None = None
     revision: str | None = None
     weights_digest: str | None = None
+    settings_digest: str | None = None
     network: Mapping[str, Any] = field(default_factory=dict)
     run_config: Mapping[str, Any] = field(default_factory=dict)
 
@@ -89,6 +93,7 @@ class ModelInfo:
             source=parameters.get(SOURCE_PARAMETER) or None,
             revision=parameters.get(REVISION_PARAMETER) or None,
             weights_digest=parameters.get(DIGEST_PARAMETER) or None,
+            settings_digest=parameters.get(SETTINGS_DIGEST_PARAMETER) or None,
             network=json.loads(parameters.get(NETWORK_PARAMETER) or "{}"),
             run_config=json.loads(parameters.get(RUN_CONFIG_PARAMETER) or "{}"),
         )

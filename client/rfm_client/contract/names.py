@@ -3,6 +3,10 @@
 
 from __future__ import annotations
 
+from typing import Literal, TypeAlias
+
+Part: TypeAlias = Literal["embeddings", "encoder", "frames"]  # of a served checkpoint: a model each
+
 DEFAULT_MODEL = "rfm"  # scores embeddings; the names of the others are made from it
 
 PROBE_PREFIX = "rfm-canary"  # of the request ids of health probes; a model does not count those for a blank sample

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from rfm_client.contract.errors import InferenceFailedError
 from rfm_client.contract.results import ProgressResult
 from rfm_client.contract.samples import ProgressSample, Trajectory
 from rfm_client.data.sampling import FrameIndices, Prefix, Sampling
@@ -34,7 +35,12 @@ def of_prefixes(results: Sequence[ProgressResult], sampling: Sampling) -> Progre
     """The result of the episode: frame t's score is the one of the prefix 0..t at the slot that the rule reads.
 
     results: [T], of the samples of ``prefix_samples``
+
+    Raises InferenceFailedError if several versions of the checkpoint gave them.
     """
+    versions = sorted({str(result.model_version) for result in results})
+    if len(versions) > 1:
+        raise InferenceFailedError(f"model_version: expected one for all frames, got {', '.join(versions)}: ask again")
     reads = [sampling.prefix(t).read for t in range(len(results))]
     return ProgressResult(
         progress=np.array([result.progress[read] for result, read in zip(results, reads, strict=True)], np.float32),

@@ -157,14 +157,12 @@ class AsyncEpisodes:
         return {camera: [] for camera in self._cameras}
 
     async def _prepare(self, deadline: Deadline | None) -> None:
-        """Finds out what the checkpoint reads, if that is not known."""
+        """Finds out what the checkpoint reads. The client knows it, until another version of the checkpoint answers."""
         asked = self._options
-        needs_number = asked.frames is None and self._sampling is None
-        if self._info is None and (asked.resize or needs_number):
+        if asked.resize or asked.frames is None:
             self._info = await self._client.model_info(frames=True, timeout_s=_left_s(deadline))
-        if self._sampling is None:
-            trained_frames = None if self._info is None else self._info.max_frames
-            self._sampling = Sampling.of(asked.sampling, asked.frames, trained_frames)
+        trained_frames = None if self._info is None else self._info.max_frames
+        self._sampling = Sampling.of(asked.sampling, asked.frames, trained_frames)
 
     def _given(self, frames: Any, index: int) -> Mapping[str, Any]:
         """The new frame of one episode, by camera."""
@@ -206,6 +204,8 @@ class AsyncEpisodes:
                 before = self._frames[index][camera]
                 if before and before[0].pixels.shape != pixels.shape:
                     expected = f"uint8 {list(before[0].pixels.shape)}, as the episode's first"
+                    if self._options.resize:  # by now another checkpoint may be served
+                        expected += ", or a reset"
                     raise InvalidSampleError.at(where, expected, f"uint8 {list(pixels.shape)}")
             except InvalidSampleError as error:
                 raise self._located(error, index) from None

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, Literal, TypeAlias, cast
 
 import numpy as np
@@ -158,19 +157,20 @@ class Scorer:
         if episode.num_pending >= self._options.max_pending:
             episode.num_skipped += 1
         else:
-            windows = episode.windows(self._sampling)
-            episode.expect([self._client.submit_window(window) for window in windows], self._sampling)
+            sampling = self._sampling()
+            windows = episode.windows(sampling)
+            episode.expect([self._client.submit_window(window) for window in windows], sampling)
 
     def _await(self, episodes: Sequence[Episode]) -> None:
-        asked_s = time.perf_counter()
-        windows = [episode.windows(self._sampling) for episode in episodes]
+        asked_s, sampling = time.perf_counter(), self._sampling()
+        windows = [episode.windows(sampling) for episode in episodes]
         outcomes = iter(self._client.score_windows([window for of_episode in windows for window in of_episode]))
         results = [
             episode.fused([episode.checked(next(outcomes)) for _ in of_episode])
             for episode, of_episode in zip(episodes, windows, strict=True)
         ]
         for episode, result in zip(episodes, results, strict=True):
-            episode.learn(episode.step, result, self._sampling.prefix(episode.step), asked_s)
+            episode.learn(episode.step, result, sampling.prefix(episode.step), asked_s)
 
     @property
     def _client(self) -> RewardClient:
@@ -185,8 +185,8 @@ class Scorer:
         size = self._client.model_info(frames=True).frame_size if self._options.resize else None
         return None if size is None else lambda frame: resize_frames(frame[np.newaxis], size)[0]
 
-    @cached_property
     def _sampling(self) -> Sampling:
+        """The rule with its number of frames, if nobody has said it that of the checkpoint that is served."""
         asked = self._options
         try:
             return Sampling(asked.sampling, asked.max_frames)

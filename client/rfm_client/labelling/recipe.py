@@ -13,7 +13,7 @@ from rfm_client.data.sampling import Sampling
 from rfm_client.labelling.options import DEFAULT_RULE, LabelOptions, Mode
 from rfm_client.labelling.scorer import CheckpointFacts
 
-RECIPE_FORMAT = 1  # another one wherever the same recipe would give other scores
+RECIPE_FORMAT = 2  # another one wherever the same recipe would give other scores
 
 
 @dataclass(frozen=True)

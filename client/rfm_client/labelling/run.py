@@ -12,6 +12,7 @@ from enum import Enum, auto
 from rfm_client.contract.errors import (
     AccessDeniedError,
     DeadlineExceededError,
+    InferenceFailedError,
     InvalidSampleError,
     ModelNotFoundError,
     RewardError,
@@ -136,12 +137,24 @@ class Run:
     def _score(self, item: Item) -> None:
         if self._parts.has(item):  # another process has finished it meanwhile
             return
-        columns = episode_columns(self._dataset, item.episode, self._scorer, self._plan.recipe, self._go_on)
-        planned, now = self._plan.recipe.checkpoint, self._scorer.checkpoint()
-        if now.weights_digest != planned.weights_digest:
-            self._stop(InvalidSampleError.at("weights_digest", planned.weights_digest, now.weights_digest))
-            raise _StoppedError
+        try:
+            columns = episode_columns(self._dataset, item.episode, self._scorer, self._plan.recipe, self._go_on)
+        except InferenceFailedError:  # perhaps of a checkpoint that came meanwhile
+            self._check_checkpoint()
+            raise
+        self._check_checkpoint()
         self._parts.write(item, columns)
+
+    def _check_checkpoint(self) -> None:
+        """Raises _StoppedError, and stops the run, where another checkpoint is served by now."""
+        try:
+            planned, now = self._plan.recipe.checkpoint, self._scorer.checkpoint()
+            for name in ("weights_digest", "settings_digest"):
+                if getattr(now, name) != getattr(planned, name):
+                    raise InvalidSampleError.at(name, getattr(planned, name), getattr(now, name))
+        except InvalidSampleError as error:
+            self._stop(error)
+            raise _StoppedError from error
 
     def _stop(self, cause: Exception) -> _Fate:
         with self._lock:

@@ -10,11 +10,12 @@ from typing import Any, Protocol, cast
 import numpy as np
 
 from rfm_client.client import RewardClient
-from rfm_client.contract.errors import InvalidSampleError, ModelNotFoundError
+from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import ProgressResult
 from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array
+from rfm_client.data.datasets.protocol import digest_of
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,7 @@ class CheckpointFacts:
 
     source, revision: where it came from; None: not known
     weights_digest: of its weights
+    settings_digest: of what else decides its scores: configuration, encoders, dtype, device
     max_frames: frames of a trajectory that it was trained on, at most; None: it does not say
     frame_size: to what it brings each frame; None: that depends on the frame
     encodes: frames can be encoded by themselves, and prefixes scored from their embeddings
@@ -32,6 +34,7 @@ class CheckpointFacts:
     source: str | None
     revision: str | None
     weights_digest: str
+    settings_digest: str
     max_frames: int | None
     frame_size: FrameSize | None
     encodes: bool
@@ -39,7 +42,7 @@ class CheckpointFacts:
 
     def document(self) -> dict[str, Any]:
         """What provenance says of it."""
-        told = ("source", "revision", "weights_digest")
+        told = ("source", "revision", "weights_digest", "settings_digest")
         return {name: value for name, value in asdict(self).items() if name in told}
 
 
@@ -63,18 +66,21 @@ class ClientScorer:
         self._client = client
 
     def checkpoint(self) -> CheckpointFacts:
-        """The facts that the server tells. Raises RewardError."""
-        info = self._client.model_info(frames=True)
-        embedded = self._of_embeddings()
+        """The facts that the servers tell. Raises RewardError, and so where they serve different checkpoints."""
+        infos = self._client.model_infos()
+        digests = [_digests(told) for told in infos.values()]
+        info = infos["frames"][0] if "frames" in infos else self._client.model_info(frames=True)
         if info.weights_digest is None:
             raise InvalidSampleError.at(
                 f"model {info.name}", "a weights_digest, as exports have since version 0.1.0", "none: export it again"
             )
+        embedded = infos["embeddings"][0] if "embeddings" in infos else None
         network = info.network if embedded is None else embedded.network
         return CheckpointFacts(
             source=info.source,
             revision=info.revision,
             weights_digest=info.weights_digest,
+            settings_digest=digest_of(str(each).encode() for each in digests),
             max_frames=info.max_frames,
             frame_size=info.frame_size,
             encodes=embedded is not None,
@@ -89,13 +95,16 @@ class ClientScorer:
         """The result of each sample. Raises RewardError for the first that fails."""
         return cast("list[ProgressResult]", self._client.evaluate(samples))
 
-    def _of_embeddings(self) -> ModelInfo | None:
-        """The model that scores embeddings; None: only frames are scored."""
-        try:
-            info = self._client.model_info()
-        except ModelNotFoundError:
-            return None
-        return None if info.widths is None else info
+
+def _digests(infos: Sequence[ModelInfo]) -> tuple[str, str | None, str | None]:
+    """A model's name and digests. Raises InvalidSampleError if the servers serve different ones."""
+    digests = {(info.name, info.weights_digest, info.settings_digest) for info in infos}
+    if len(digests) > 1:
+        told = " and ".join(sorted(f"{weights}, {settings}" for _, weights, settings in digests))
+        raise InvalidSampleError.at(
+            f"model {infos[0].name}", "the same weights_digest, settings_digest at every server", told
+        )
+    return digests.pop()
 
 
 def joined_embeddings(parts: Sequence[Trajectory]) -> Trajectory:

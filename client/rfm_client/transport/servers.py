@@ -109,6 +109,23 @@ class Servers:
 
         return await self._request_among(None, model, request, deadline)
 
+    async def model_infos(self, model: str, deadline: Deadline) -> list[ModelInfo]:
+        """What each server says of ``model``. Left out are those that do not answer, for they score nothing either.
+
+        Raises RewardError if none answers.
+        """
+        infos = [await self.model_info(model, deadline)]  # as soon as one is there
+        if len(self._servers) > 1:
+            others = [server.transport for server in self._servers if not server.is_left_out]
+            left_s = deadline.remaining_s()
+            told = await asyncio.gather(*(each.model_info(model, left_s) for each in others), return_exceptions=True)
+            for outcome in told:
+                if isinstance(outcome, ModelInfo):
+                    infos.append(outcome)
+                elif not isinstance(outcome, RewardError):
+                    raise outcome
+        return infos
+
     async def is_ready(self, models: Sequence[str], timeout_s: float) -> bool:
         """Whether at least one server has one of the models ready. The first that has is enough."""
         self._keep_up()

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: MIT
+"""Another checkpoint is served while episodes grow. The server is a stand-in, whose checkpoint tests replace."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from rfm_client import InvalidSampleError, RewardClient
+from rfm_client.contract import FrameSize
+from rfm_client.gym import RewardModelWrapper, RewardOptions
+from shelves import V1, V2, Shelf
+
+SHORT, LONG = replace(V1, max_frames=4), replace(V2, max_frames=8)
+TASK = "put the block in the bowl"
+FRAME = np.zeros((32, 32, 3), np.uint8)
+
+
+def test_an_episode_shows_as_many_frames_as_the_checkpoint_was_trained_on_by_now() -> None:
+    shelf = Shelf(SHORT, LONG, after=3, has_encoder=False)
+    with RewardClient("", transports=[shelf]) as client, client.episode(TASK) as episode:
+        for _ in range(3):
+            episode.add(FRAME)
+        assert {shape[1] for shape in shelf.shapes} == {4}
+        episode.add(FRAME)  # its answer tells that another checkpoint is served
+        episode.add(FRAME)
+    assert shelf.shapes[-1][1] == 8
+
+
+def test_frames_are_resized_as_the_checkpoint_reads_them_by_now() -> None:
+    small, large = replace(SHORT, frame_size=FrameSize("exact", (8, 8))), replace(LONG, frame_size=FrameSize("exact", (16, 16)))
+    shelf = Shelf(small, large, after=1, has_encoder=False)
+    with RewardClient("", transports=[shelf]) as client, client.episode(TASK, resize=True) as episode:
+        for _ in range(2):
+            episode.add(FRAME)
+        with pytest.raises(InvalidSampleError, match=r"as the episode's first, or a reset, got uint8 \[16, 16, 3\]"):
+            episode.add(FRAME)
+        episode.reset()
+        episode.add(FRAME)
+    assert shelf.shapes[-1] == (1, 8, 16, 16, 3)
+    assert {shape[2:4] for shape in shelf.shapes[:-1]} == {(8, 8)}
+
+
+class Still(gymnasium.Env[Any, Any]):
+    """One whose picture never changes."""
+
+    observation_space = gymnasium.spaces.Box(0, 255, FRAME.shape, np.uint8)
+    action_space = gymnasium.spaces.Discrete(1)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return FRAME, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return FRAME, 0.0, False, False, {}
+
+
+def test_a_wrapper_shows_as_many_frames_as_the_checkpoint_was_trained_on_by_now() -> None:
+    shelf = Shelf(SHORT, LONG, after=2, has_encoder=False)
+    with RewardClient("", transports=[shelf]) as client:
+        env = RewardModelWrapper(Still(), client, TASK, RewardOptions(frames_from=lambda seen: seen))
+        env.reset()
+        for _ in range(3):
+            env.step(0)
+        assert shelf.shapes[0][1] == 4
+        assert shelf.shapes[-1][1] == 8

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: MIT
+"""Servers that stand in for real ones, whose checkpoint is replaced by another while callers ask."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Collection
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rfm_client import ModelNotFoundError
+from rfm_client.contract import FrameSize, wire
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.transport.calls import Answer
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A checkpoint: every frame's progress is ``score``. max_frames, frame_size: that it was trained on"""
+
+    score: float
+    version: str = "1"
+    weights: str = "weights-of-v1"
+    settings: str = "settings-of-v1"
+    max_frames: int = 16
+    frame_size: FrameSize | None = None
+
+
+V1 = Kept(0.1)
+V2 = Kept(0.9, "2", "weights-of-v2")
+
+
+@dataclass
+class Shelf:
+    """A server with a checkpoint, and another one as soon as it has answered so many requests about samples.
+
+    parts: models that then are of the other one
+    """
+
+    kept: Kept = V1
+    other: Kept = V2
+    after: int = sys.maxsize
+    parts: Collection[str] = ("rfm", "rfm_encoder", "rfm_frames")
+    has_encoder: bool = True
+    url: str = "grpc://shelf:1"
+    count: int = 0
+    shapes: list[tuple[int, ...]] = field(default_factory=list)  # of the arrays that it was asked to score
+
+    def of(self, model: str) -> Kept:
+        return self.other if self.count >= self.after and model in self.parts else self.kept
+
+    async def infer(
+        self, model: str, inputs: wire.Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
+    ) -> Answer:
+        now = self.of(model)
+        if model == "rfm_encoder":
+            num_frames = int(inputs[wire.NUM_FRAMES][0, 0])
+            tensors = {wire.VIDEO_EMBEDDINGS: np.ones((1, num_frames, 4)), wire.TEXT_EMBEDDING: np.ones((1, 2))}
+            return Answer({name: array.astype(np.float32) for name, array in tensors.items()}, now.version)
+        self.count += 1
+        self.shapes.append(inputs[wire.FRAMES if model == "rfm_frames" else wire.VIDEO_EMBEDDINGS].shape)
+        scores = np.full(self.shapes[-1][:2], now.score)
+        return Answer(dict.fromkeys(outputs, scores.astype(np.float32)), now.version)
+
+    async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
+        if model != "rfm_frames" and not self.has_encoder:
+            raise ModelNotFoundError(model)
+        now, widths = self.of(model), (None, None) if model == "rfm_frames" else (4, 2)
+        return ModelInfo(
+            model,
+            (now.version,),
+            64,
+            now.max_frames,
+            now.frame_size,
+            *widths,
+            None,
+            weights_digest=now.weights,
+            settings_digest=now.settings,
+        )
+
+    async def is_ready(self, model: str, timeout_s: float) -> bool:
+        return True
+
+    async def close(self) -> None:
+        pass
