@@ -122,7 +122,7 @@ def _facts(
         weights_digest=weights_digest(folders),
         settings_digest=_settings_digest(checkpoint, encoders, folders, told),
         max_frames=min(limits, default=None),
-        frame_size=description.frame_size,
+        frame_size=description.frame_size if encoders is None else encoders.description.frame_size,
         encodes=encoders is not None,
         is_causal=getattr(checkpoint.config, "causal_mask", None) is True,
     )

@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import math
 import os
 import shutil
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,18 +19,19 @@ import yaml
 from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.launch.temporary import temporary_server
-from rfm.parameters import FEATURE_CACHE_PARAMETER, THREADS_PARAMETER
-from rfm_client import AsyncRewardClient, RewardClient, Sample
+from rfm.parameters import THREADS_PARAMETER
+from rfm_client import AsyncRewardClient, ProgressSample, RewardClient, Sample
 from rfm_client.cli.toy import SampleKind, Toy
 from rfm_commands.config import File
 from rfm_export.errors import ExportError
-from rfm_export.layout import CONFIG_FILE
+from rfm_export.layout import CONFIG_FILE, lay_out
 from rfm_export.pbtxt import parse, render
 
 AS_FAST = 0.95  # of the highest rate: closer than that, rates do not separate settings
 INSTANCES_PER_GPU = (1, 2, 3)
 BATCH_SIZES = (8, 32, 128)
 NUM_SAMPLES = 64
+NUMBER_BYTES = 8  # of a frame's first pixels, which hold how many samples were sent before it
 NUM_FRAMES = 16  # of a sample, where the checkpoint does not say on how many it was trained
 
 
@@ -115,8 +117,9 @@ class Sweep:
                 with RewardClient(url, model=self.name) as client:
                     frames = client.model_info(frames=self.use_frames).max_frames or NUM_FRAMES
                     toy = Toy(SampleKind.progress, NUM_SAMPLES, [min(frames, NUM_FRAMES)], self.use_frames, seed=0)
-                    samples = toy.samples(client)
-                    client.evaluate(samples)  # whatever is made at first use
+                    made_up = toy.samples(client)
+                    client.evaluate(made_up)  # whatever is made at first use
+                samples = _unseen(made_up)
                 alone = asyncio.run(_measure_latencies(url, self.name, samples, 1, self.seconds))
                 together = asyncio.run(_measure_latencies(url, self.name, samples, self.callers, self.seconds))
         return len(together) / self.seconds, statistics.median(alone) * 1e3 if alone else math.inf
@@ -140,8 +143,21 @@ def write_setting(setting: Setting, output: Path, given: File) -> None:
     output.write_text("# Measured by `rfm tune`.\n" + yaml.safe_dump(sections, sort_keys=False))
 
 
+def _unseen(samples: Sequence[Sample]) -> Iterator[Sample]:
+    """The samples in turn, for ever. Frames are numbered, so that no feature cache has seen one of them before."""
+    for number in itertools.count():
+        sample = samples[number % len(samples)]
+        (trajectory,) = sample.trajectories
+        if trajectory.frames is None:
+            yield sample
+            continue
+        frames = trajectory.frames.copy()
+        frames.reshape(len(frames), -1)[:, :NUMBER_BYTES] = list(number.to_bytes(NUMBER_BYTES, "little"))
+        yield ProgressSample(replace(trajectory, frames=frames))
+
+
 async def _measure_latencies(
-    url: str, model: str, samples: Sequence[Sample], callers: int, seconds: float
+    url: str, model: str, samples: Iterator[Sample], callers: int, seconds: float
 ) -> list[float]:
     """Latencies in seconds of what is answered within ``seconds``, once the client is connected.
 
@@ -149,31 +165,27 @@ async def _measure_latencies(
     """
     latencies_s: list[float] = []
 
-    async def call(first: int, end_s: float) -> None:
-        index = first
-        while (sent_s := time.perf_counter()) < end_s:
-            await client.score(samples[index % len(samples)])
+    async def call(end_s: float) -> None:
+        for sample in samples:
+            sent_s = time.perf_counter()
+            if sent_s >= end_s:
+                return
+            await client.score(sample)
             answered_s = time.perf_counter()
             if answered_s <= end_s:
                 latencies_s.append(answered_s - sent_s)
-            index += callers
 
     async with AsyncRewardClient(url, model=model, max_in_flight=2 * callers, join=False) as client:
-        await client.score(samples[0])
+        await client.score(next(samples))
         end_s = time.perf_counter() + seconds
-        await asyncio.gather(*(call(first, end_s) for first in range(callers)))
+        await asyncio.gather(*(call(end_s) for _ in range(callers)))
     return latencies_s
 
 
 def _apply(setting: Setting, repository: Path) -> None:
-    """Rewrites the configurations, which are links until then."""
+    """Rewrites the configurations, which are links until then, as an export of the setting would have them."""
     for name, config in _configs(repository).items():
-        config.max_batch_size = setting.max_batch_size
-        for group in config.instance_group:
-            if FEATURE_CACHE_PARAMETER in config.parameters:  # the same samples are sent again and again
-                config.parameters[FEATURE_CACHE_PARAMETER].string_value = "0"
-            group.count = setting.instances
-            config.parameters[THREADS_PARAMETER].string_value = str(setting.torch_threads)
+        lay_out(config, **asdict(setting))
         file = repository / name / CONFIG_FILE
         file.unlink()
         file.write_text(render(config))

@@ -22,7 +22,7 @@ from rfm_client.contract.made_up import blank_trajectory
 from rfm_client.contract.model_info import FRAME_SIZE_PARAMETER, FRAMES_PER_VALUE_PARAMETER, MAX_FRAMES_PARAMETER
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_export.about import about_encoders
-from rfm_export.pbtxt import Interface, Warmup, ensemble_config, python_config, render
+from rfm_export.pbtxt import Interface, Warmup, ensemble_config, exported_settings, python_config, render
 
 CONFIG_FILE = "config.pbtxt"
 MODEL_FILE = "model.py"
@@ -91,7 +91,7 @@ def generated_models(
     name, widths = version.settings.name, description.widths
     outputs = wire.score_outputs(description.progress_bins if description.progress_bins > 1 else None)
     cache_mb = version.settings.feature_cache_mb
-    keeps = description.keeps_features and cache_mb > 0 and version.settings.instances == 1
+    keeps = description.keeps_features and _scorer_has_cache(version.settings)
     inputs = wire.frame_inputs(by_digest=keeps) if widths is None else wire.embedding_inputs(*widths)
     about = {**_limits(description, description.frame_size), **version.about}
     scorer = Interface(scorer_name(description, name), inputs, outputs, about)
@@ -105,7 +105,8 @@ def generated_models(
     encoder = Interface(encoder_name(name), inputs, wire.encoder_outputs(*widths), about)
     about = {**_limits(description, encoders.frame_size), **version.about}
     frames = Interface(frames_name(name), wire.frame_inputs(by_digest=cache_mb > 0), outputs, about)
-    models.append(_python_model(encoder, "rfm_encoder", _with_one_cache(version), [_encoder_warmup()]))
+    of_encoder = replace(version, settings=_of_encoder(version.settings))
+    models.append(_python_model(encoder, "rfm_encoder", of_encoder, [_encoder_warmup()]))
     models[-1].config.parameters[FEATURE_CACHE_PARAMETER].string_value = str(cache_mb)
     models.append(
         GeneratedModel(ensemble_config(frames, version.settings, version.number, encoder, scorer), version.number)
@@ -113,10 +114,43 @@ def generated_models(
     return models
 
 
-def _with_one_cache(version: Version) -> Version:
+def lay_out(config: pb.ModelConfig, **changed: int) -> None:
+    """Makes of an exported model's configuration what an export with other settings would write.
+
+    changed: ``instances``, ``torch_threads``, ``max_batch_size`` of ExportConfig
+
+    A scorer that was exported without a feature cache gets none: its configuration does not tell whether it could have
+    one.
+    """
+    told, cache = exported_settings(config), FEATURE_CACHE_PARAMETER in config.parameters
+    cache_mb = int(config.parameters[FEATURE_CACHE_PARAMETER].string_value) if cache else 0
+    settings = ExportConfig(**{**told, "feature_cache_mb": cache_mb, **changed})
+    config.max_batch_size = settings.max_batch_size
+    if not config.instance_group:  # an ensemble
+        return
+    if any(output.name == wire.VIDEO_EMBEDDINGS for output in config.output):
+        settings = _of_encoder(settings)
+    elif cache and not _scorer_has_cache(settings):
+        del config.parameters[FEATURE_CACHE_PARAMETER]
+        kept = [tensor for tensor in config.input if tensor.name != wire.FRAME_DIGESTS]
+        del config.input[:]
+        config.input.extend(kept)
+    num_gpus = len(config.instance_group[0].gpus)
+    new = python_config(Interface(config.name, (), ()), settings, num_gpus, version=0, warmups=[])
+    config.instance_group[0].CopyFrom(new.instance_group[0])
+    config.dynamic_batching.CopyFrom(new.dynamic_batching)
+    for name, parameter in new.parameters.items():
+        config.parameters[name].CopyFrom(parameter)
+
+
+def _scorer_has_cache(settings: ExportConfig) -> bool:
+    """Whether a scorer that can keep features does: several instances would each have to see all frames."""
+    return settings.feature_cache_mb > 0 and settings.instances == 1
+
+
+def _of_encoder(settings: ExportConfig) -> ExportConfig:
     """As the encoder is served: with a cache by one instance on each device, or each would have to see all frames."""
-    settings = version.settings
-    return replace(version, settings=replace(settings, instances=1)) if settings.feature_cache_mb else version
+    return replace(settings, instances=1) if settings.feature_cache_mb else settings
 
 
 def _limits(description: Description, frame_size: FrameSize | None) -> dict[str, str]:

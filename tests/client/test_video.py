@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import re
 import socket
-import struct
 import tracemalloc
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,7 +18,7 @@ import pytest
 
 import clip
 from paths import VIDEOS
-from pictures import numbered, numbers, write_video
+from pictures import TURNS, numbered, numbers, turn, write_video
 from rfm_client import InvalidSampleError
 from rfm_client.data.inputs import load_trajectory
 from rfm_client.data.video import read_video
@@ -74,24 +73,12 @@ def test_packets_without_a_frame_do_not_count(tmp_path: Path) -> None:
     assert numbers(read_video(tmp_path / "film.mp4", 5), 10) == [4, 6, 9]
 
 
-# The display matrix of a track: (a, b, c, d) of x' = a x + c y, y' = b x + d y, y downwards (ISO 14496-12).
-TURNS: dict[str, tuple[tuple[int, int, int, int], int]] = {
-    "clockwise": ((0, 1, -1, 0), -1),
-    "upside down": ((-1, 0, 0, -1), 2),
-    "counter-clockwise": ((0, -1, 1, 0), 1),
-}
-
-
 @pytest.mark.parametrize(("matrix", "quarter_turns"), TURNS.values(), ids=TURNS)
 def test_a_turned_video_is_read_upright(tmp_path: Path, matrix: tuple[int, int, int, int], quarter_turns: int) -> None:
     picture = np.zeros((1, 32, 64, 3), np.uint8)
     picture[:, :16, :32], picture[:, :16, 32:], picture[:, 16:, :32] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
     write_video(tmp_path / "film.mp4", picture)
-    content = (tmp_path / "film.mp4").read_bytes()
-    a, b, c, d = (value << 16 for value in matrix)
-    start = content.index(b"tkhd") + 4 + 40  # version 0: the matrix follows 40 bytes of other fields
-    turned = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
-    (tmp_path / "film.mp4").write_bytes(content[:start] + turned + content[start + len(turned) :])
+    turn(tmp_path / "film.mp4", matrix)
     upright = np.rot90(picture[0], quarter_turns)
     read = read_video(tmp_path / "film.mp4")[0]
     assert read.shape == upright.shape

@@ -5,6 +5,7 @@ import asyncio
 import math
 import os
 from dataclasses import replace
+from itertools import repeat
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -85,13 +86,17 @@ class Lagging:
 @pytest.mark.parametrize(("seconds", "count"), [(1.0, 2), (0.4, 1), (4.2, 10)])
 def test_only_what_is_answered_in_time_is_counted(monkeypatch: pytest.MonkeyPatch, seconds: float, count: int) -> None:
     Lagging(monkeypatch)
-    latencies_s = asyncio.run(tune._measure_latencies("", "rfm", [ProgressSample(random_trajectory(0, 1))], 1, seconds))
+    latencies_s = asyncio.run(
+        tune._measure_latencies("", "rfm", repeat(ProgressSample(random_trajectory(0, 1))), 1, seconds)
+    )
     assert latencies_s == pytest.approx([0.4] * count)
 
 
 def test_a_setting_that_answers_nobody_in_time_is_the_slowest(monkeypatch: pytest.MonkeyPatch) -> None:
     Lagging(monkeypatch)
-    assert asyncio.run(tune._measure_latencies("", "rfm", [ProgressSample(random_trajectory(0, 1))], 1, 0.3)) == []
+    assert (
+        asyncio.run(tune._measure_latencies("", "rfm", repeat(ProgressSample(random_trajectory(0, 1))), 1, 0.3)) == []
+    )
     slow, slower = Trial(ONE, 0.5, 2000.0), Trial(TWO, 0.0, math.inf)
     assert quickest([slower, slow]) == slow
     with pytest.raises(ExportError, match=r"--seconds: expected time for an answer, got none in time with any setting"):

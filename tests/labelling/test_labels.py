@@ -280,7 +280,7 @@ def test_the_run_tells_what_was_decided_and_by_whom(output: Path) -> None:
     notes = Notes()
     label(open_dataset(LEROBOT / "toy_v21"), BrightnessScorer(), LabelOptions(output=output, limit=1), notes)
     assert notes.lines == [
-        f"cameras: {FRONT}, {WRIST} (all of the dataset)",
+        f"cameras: {FRONT}, {WRIST} (all but depth cameras)",
         "sampling: rint_pad (the rule of upstream's training and RL loop)",
         "frames: 16 (as many as the checkpoint was trained on)",
         "fuse: mean of 2 cameras",

@@ -21,8 +21,9 @@ from pyarrow import parquet
 import goldens
 import local_hub
 from encoding import encode
-from labelling import LEROBOT
-from rfm_client.labelling import DatasetError, iter_episodes, open_dataset
+from labelling import LEROBOT, BrightnessScorer
+from rfm_client.data.datasets.protocol import chosen_cameras
+from rfm_client.labelling import DatasetError, LabelOptions, iter_episodes, label, open_dataset
 
 HUB_ID = "org/name"
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
@@ -121,6 +122,29 @@ def test_av1_and_images_in_tables_are_read(tmp_path: Path) -> None:
     for frame, expected in zip(dataset.frames(first, WRIST), stored, strict=True):
         np.testing.assert_array_equal(frame, expected)
     assert dataset.check(first, WRIST).num_bytes > 0
+
+
+DEPTH_MARKS: dict[str, dict[str, Any]] = {
+    "info": {"info": {"video.is_depth_map": True}},
+    "video_info": {"video_info": {"video.is_depth_map": True}},
+    "without a prefix": {"info": {"is_depth_map": True}},
+}
+
+
+@pytest.mark.parametrize("mark", DEPTH_MARKS.values(), ids=DEPTH_MARKS)
+@pytest.mark.parametrize("name", ["toy_v21", "toy_v30_many"])
+def test_a_depth_camera_counts_only_where_it_is_named(tmp_path: Path, name: str, mark: dict[str, Any]) -> None:
+    root = shutil.copytree(LEROBOT / name, tmp_path / name)
+    change_info(root, lambda info: info["features"][WRIST].update(mark))
+    dataset = open_dataset(root)
+    assert chosen_cameras(dataset, ()) == (FRONT,)
+    assert (list(dataset.cameras), list(dataset.depth_cameras)) == ([FRONT, WRIST], [WRIST])
+    assert chosen_cameras(dataset, ["front", "wrist"]) == (FRONT, WRIST)
+    report = label(dataset, BrightnessScorer(), LabelOptions(output=tmp_path, limit=1, frames=2, formats=("progress",)))
+    assert "progress.wrist" not in parquet.read_schema(report.files[0]).names
+    change_info(root, lambda info: info["features"][FRONT].update(mark))
+    with pytest.raises(DatasetError, match=r"^cameras: expected .* named: all are depth cameras, got none$"):
+        chosen_cameras(open_dataset(root), ())
 
 
 def store_as_images(root: Path, camera: str) -> list[np.ndarray[Any, Any]]:

@@ -184,11 +184,34 @@ def test_a_folder_of_videos_is_read_in_the_order_of_its_table(
     assert parquet.read_table(report.files[0])["episode_index"].to_pylist() == [0] * 6 + [1] * 4
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("tasks.csv", 'video,task\nb.mp4," put the block in the bowl, then close the lid "\n'),
+        ("tasks.json", '{"b.mp4": "put the block in the bowl, then close the lid\\n"}'),
+    ],
+)
+def test_a_task_may_have_commas_and_loses_the_blanks_around_it(videos: Path, name: str, text: str) -> None:
+    (videos / name).write_text(text)
+    assert [e.task for e in open_dataset(videos).episodes] == ["put the block in the bowl, then close the lid"]
+
+
 REFUSED = {
     "no table": (None, "", "expected one of tasks.csv and tasks.json with the task of each video, got none"),
     "no column of tasks": ("tasks.csv", "video\nb.mp4\n", "expected the columns video and task, got video"),
     "a video twice": ("tasks.csv", "video,task\nb.mp4,a\nb.mp4,b\n", "line 3: expected each video once, got b.mp4"),
     "no task": ("tasks.csv", "video,task\nb.mp4,\n", "b.mp4: expected a task as a sentence, got none"),
+    "a task of blanks": ("tasks.csv", "video,task\nb.mp4,  \n", "b.mp4: expected a task as a sentence, got '  '"),
+    "a comma without quotes": (
+        "tasks.csv",
+        "video,task\nday/a.mp4,a\nb.mp4,put the block in the bowl, then close the lid\n",
+        "tasks.csv: line 3: expected 2 cells (text with a comma in quotes), got 3",
+    ),
+    "a row that ends early": (
+        "tasks.csv",
+        "video,note,task\nb.mp4,blue\n",
+        "tasks.csv: line 2: expected 3 cells (text with a comma in quotes), got 2",
+    ),
     "a video that is missing": ("tasks.json", '{"c.mp4": "a"}', "c.mp4: expected a video file, got none"),
     "no JSON": ("tasks.json", "{", "tasks.json: expected JSON, got "),
 }

@@ -4,18 +4,33 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from pyarrow import parquet
 
 from labelling import LEROBOT, BrightnessScorer, absent, picky, slow
-from rfm_client.labelling import LabelOptions, RayOptions, Watch, label, label_with_ray, open_dataset
+from rfm.launch.process import Endpoints
+from rfm_client import ProgressResult, RewardClient, RewardError
+from rfm_client.labelling import (
+    ClientScorer,
+    LabelOptions,
+    RayOptions,
+    Scorer,
+    Watch,
+    label,
+    label_with_ray,
+    open_dataset,
+)
+from rfm_client.labelling.label import plan_labels
+from rfm_client.labelling.ray_engine import EpisodeActor, Job
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning", "ignore::ResourceWarning"),
-]
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::FutureWarning", "ignore::DeprecationWarning", "ignore::ResourceWarning"
+)
 
 ROOT = LEROBOT / "toy_v30_many"
 FILES = ("rfm_progress.parquet", "reward_signals/rfm.parquet")
@@ -24,6 +39,36 @@ SUPPORT = Path(__file__).parents[1] / "support"
 
 def contents(output: Path) -> list[bytes]:
     return [(output / name).read_bytes() for name in FILES]
+
+
+class ClosingScorer(BrightnessScorer):
+    """Refuses as soon as it is closed, as a client does."""
+
+    is_open = True
+
+    def evaluate(self, samples: Any) -> list[ProgressResult]:
+        if not self.is_open:
+            raise RewardError("this scorer is closed")
+        return super().evaluate(samples)
+
+
+def test_a_scorer_is_open_as_long_as_its_actor_lives(output: Path) -> None:
+    scorer = ClosingScorer()
+
+    @contextmanager
+    def connect() -> Iterator[Scorer]:
+        try:
+            yield scorer
+        finally:
+            scorer.is_open = False
+
+    plan = plan_labels(open_dataset(ROOT), scorer, LabelOptions(output=output, limit=3))
+    actor = EpisodeActor(Job(str(ROOT), None, connect, plan, str(output / "parts"), workers=1))
+    assert actor({"places": [[0, 2]]}) == {"place": [0, 2], "reason": ["", ""]}
+    assert actor({"places": [[1]]}) == {"place": [1], "reason": [""]}
+    assert scorer.is_open
+    del actor
+    assert not scorer.is_open
 
 
 @pytest.fixture
@@ -51,6 +96,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     cluster.shutdown()
 
 
+@pytest.mark.slow
 def test_a_cluster_writes_the_files_that_one_process_writes(
     cluster: Any, output: Path, undisturbed: list[bytes]
 ) -> None:
@@ -61,6 +107,7 @@ def test_a_cluster_writes_the_files_that_one_process_writes(
     assert contents(output) == undisturbed
 
 
+@pytest.mark.slow
 def test_a_cluster_goes_on_without_a_node_that_is_killed(cluster: Any, output: Path, undisturbed: list[bytes]) -> None:
     node = cluster.add_node(num_cpus=2, object_store_memory=10**8)
 
@@ -79,6 +126,7 @@ def test_a_cluster_goes_on_without_a_node_that_is_killed(cluster: Any, output: P
     assert contents(output) == undisturbed
 
 
+@pytest.mark.slow
 def test_one_machine_goes_on_with_what_a_cluster_has_left(cluster: Any, output: Path, undisturbed: list[bytes]) -> None:
     options = LabelOptions(output=output)
     report = label_with_ray(str(ROOT), picky, options, ray=RayOptions(cluster.address, actors=2))
@@ -90,6 +138,27 @@ def test_one_machine_goes_on_with_what_a_cluster_has_left(cluster: Any, output: 
     assert contents(output) == undisturbed
 
 
+@pytest.mark.slow
 def test_what_no_actor_can_label_is_told(cluster: Any, output: Path) -> None:
     report = label_with_ray(str(ROOT), absent, LabelOptions(output=output), ray=RayOptions(cluster.address))
     assert [str(failure.error) for failure in report.failures] == ["no server"] * 10
+
+
+@pytest.mark.triton
+@pytest.mark.slow
+def test_actors_ask_a_server_for_all_of_their_episodes(cluster: Any, output: Path, demo_server: Endpoints) -> None:
+    url = demo_server.grpc_url
+
+    @contextmanager
+    def connect() -> Iterator[Scorer]:
+        with RewardClient(url) as client:
+            yield ClientScorer(client)
+
+    (output / "one").mkdir()
+    options = LabelOptions(output=output, limit=4, frames=4, workers=1)
+    report = label_with_ray(str(ROOT), connect, options, ray=RayOptions(cluster.address, actors=2))
+    assert report.failures == []
+    with connect() as scorer:
+        label(open_dataset(ROOT), scorer, LabelOptions(output=output / "one", limit=4, frames=4))
+    of_cluster, of_one = (parquet.read_table(folder / FILES[0]) for folder in (output, output / "one"))
+    np.testing.assert_allclose(of_cluster["progress_sparse"], of_one["progress_sparse"], rtol=0, atol=1e-5)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import struct
 from fractions import Fraction
 from pathlib import Path
 
@@ -12,6 +13,14 @@ import numpy as np
 from rfm_client.contract.samples import UInt8Array
 
 TOP, WRIST = "observation.images.top", "observation.images.wrist"
+
+# The display matrix of a track: (a, b, c, d) of x' = a x + c y, y' = b x + d y, y downwards (ISO 14496-12), and the
+# quarter turns, counter-clockwise, that it asks for.
+TURNS: dict[str, tuple[tuple[int, int, int, int], int]] = {
+    "clockwise": ((0, 1, -1, 0), -1),
+    "upside down": ((-1, 0, 0, -1), 2),
+    "counter-clockwise": ((0, -1, 1, 0), 1),
+}
 
 
 def write_video(file: Path, frames: UInt8Array, times: list[int] | None = None, *, shown_from: int = 0) -> None:
@@ -41,3 +50,12 @@ def numbers(frames: UInt8Array, count: int) -> list[int]:
     """Which of ``numbered(count)`` the frames are."""
     means = frames.mean(axis=(1, 2, 3))
     return np.abs(means[:, None] - numbered(count)[:, 0, 0, 0]).argmin(axis=1).tolist()
+
+
+def turn(file: Path, matrix: tuple[int, int, int, int]) -> None:
+    """Gives the track of an MP4 file one of the matrices of TURNS."""
+    content = file.read_bytes()
+    a, b, c, d = (value << 16 for value in matrix)
+    start = content.index(b"tkhd") + 4 + 40  # version 0: the matrix follows 40 bytes of other fields
+    turned = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    file.write_bytes(content[:start] + turned + content[start + len(turned) :])

@@ -19,11 +19,13 @@ import numpy.typing as npt
 
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import UInt8Array
+from rfm_client.data.film_files import DAMAGED, UNDAMAGED, broken_off, judged, upright
 from rfm_client.data.lerobot_videos import check_film_behind, check_local_film
 
 DOWNLOAD_TIMEOUT_S = 60.0
 
 _EXPECTED = "a file with a video stream"
+_WHOLE = "a whole file"
 _RGB_BYTES = 3  # of a pixel
 
 
@@ -65,8 +67,9 @@ def read_video(
     container: FFmpeg's name of the format that the file is read as, for files that nobody vouches for: some formats
         name other files or addresses, which are then opened; None: whatever it looks like
 
-    Raises InvalidSampleError for what is no video, or cannot be had, and for a file of several LeRobot episodes
-    (``lerobot_videos``) unless ``start_s`` and ``end_s`` name a part of it.
+    Raises InvalidSampleError for what is no video, breaks off, or cannot be had, for a damaged frame among those that
+    are returned, and for a file of several LeRobot episodes (``lerobot_videos``) unless ``start_s`` and ``end_s`` name
+    a part of it.
     """
     try:
         import av
@@ -181,12 +184,21 @@ class _Decoder:
         self._container = container
 
     def length(self) -> tuple[int, float]:
-        """Packets, which are counted since what the container says may be wrong, and frames a second (0: unknown)."""
+        """Packets, which are counted since what the container says may be wrong, and frames a second (0: unknown).
+
+        Raises InvalidSampleError for a file that breaks off.
+        """
+        missing = broken_off(self._file)
+        if missing is not None:
+            raise InvalidSampleError.at("video", _WHOLE, missing)
         with self._opened() as container:
             if not container.streams.video:
                 raise InvalidSampleError.at("video", _EXPECTED, "none")
             stream = container.streams.video[0]
-            return sum(1 for packet in container.demux(stream) if packet.size), float(stream.average_rate or 0)
+            are_broken = [packet.is_corrupt for packet in container.demux(stream) if packet.size]
+            if are_broken and are_broken[-1]:
+                raise InvalidSampleError.at("video", _WHOLE, f"one that breaks off in frame {len(are_broken) - 1}")
+            return len(are_broken), float(stream.average_rate or 0)
 
     def times_s(self) -> npt.NDArray[np.float64]:
         """float64 [T], the time stamps of the packets that have one, in order."""
@@ -195,14 +207,15 @@ class _Decoder:
             return np.sort([float(packet.pts * packet.time_base) for packet in packets])
 
     def frames(self, indices: Collection[int]) -> tuple[list[UInt8Array], int]:
-        """The frames of these indices, and how many there are in all."""
+        """The frames of these indices, and how many there are in all. Raises InvalidSampleError for a damaged one."""
         wanted, picked, total = set(indices), [], 0
         with self._opened() as container:
-            for frame in container.decode(video=0):
+            for frame, is_damaged in judged(container.decode(video=0)):
                 self._take(frame.width * frame.height * _RGB_BYTES if total in wanted else 0)
                 if total in wanted:
-                    image = frame.to_ndarray(format="rgb24")
-                    picked.append(np.rot90(image, round(frame.rotation / 90)))  # both count counter-clockwise
+                    if is_damaged:
+                        raise InvalidSampleError.at(f"video: frame {total}", UNDAMAGED, DAMAGED)
+                    picked.append(upright(frame))
                 total += 1
         return picked, total
 

@@ -32,7 +32,7 @@ class LabelOptions:
     name: of the reward; the files are ``<name>_progress.parquet`` and ``reward_signals/<name>.parquet``
     alias: the progress file is written under this name, too: ``sarm_progress`` is what LeRobot's training reads
     formats: which files; empty: ``progress`` and ``signals``, of an HDF5 dataset ``hdf5``
-    cameras: each is scored, and the scores fused; empty: all of the dataset
+    cameras: each is scored, and the scores fused; empty: all but depth cameras
     sampling, frames: the rule by which frame t's prefix is sampled, and to how many frames; None: ``rint_pad`` and what
         the checkpoint was trained on
     mode: ``prefix``: frame t is scored on the frames up to t; ``whole``: all frames of an episode are scored together

@@ -64,10 +64,15 @@ class EpisodeActor:
     """Labels batches of episodes: while one is scored, the next is decoded."""
 
     def __init__(self, job: Job) -> None:
+        self._held = ExitStack()  # what it holds is closed as soon as nothing refers to it
         self._job = job
         self._parts = Parts(job.parts)
         self._dataset = open_dataset(job.source, task=job.task)
-        self._scorer = ExitStack().enter_context(job.connect())  # open as long as the actor lives
+        self._scorer = self._held.enter_context(job.connect())  # open as long as the actor lives
+
+    def __del__(self) -> None:
+        """Closes the scorer: Ray lets go of an actor's object before the actor ends."""
+        self._held.close()
 
     def __call__(self, batch: Mapping[str, Any]) -> dict[str, list[Any]]:
         """Labels the episodes of these places in the plan. Gives for each the reason if it failed, else nothing."""

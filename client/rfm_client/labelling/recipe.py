@@ -62,7 +62,8 @@ class Recipe:
         of_rule = "asked for" if options.sampling else "the rule of upstream's training and RL loop"
         of_frames = "asked for" if options.frames else "as many as the checkpoint was trained on"
         one = len(self.cameras) == 1
-        lines = [f"cameras: {', '.join(self.cameras)} ({'asked for' if options.cameras else 'all of the dataset'})"]
+        of_cameras = "asked for" if options.cameras else "all but depth cameras"
+        lines = [f"cameras: {', '.join(self.cameras)} ({of_cameras})"]
         if self.mode == "whole":
             lines.append("mode: whole: the score of frame t may depend on later frames, unless the network is causal")
         else:

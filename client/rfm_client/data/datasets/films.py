@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.datasets.protocol import DIGEST_BYTES, Contents, DatasetError, digest_of
+from rfm_client.data.film_files import DAMAGED, UNDAMAGED, broken_off, judged, upright
 
 Times = npt.NDArray[np.float64]
 
@@ -61,6 +62,10 @@ class Packets:
         av = import_av()
         found: list[tuple[float, bytes, int]] = []
         try:
+            with file.open("rb") as opened:
+                missing = broken_off(opened)
+            if missing is not None:
+                raise DatasetError.at(file, "a whole video file", missing)
             with av.open(str(file)) as container:
                 if not container.streams.video:
                     raise DatasetError.at(file, "a video stream", "none")
@@ -101,13 +106,15 @@ class Packets:
 
 
 def decode(span: Span) -> Iterator[UInt8Array]:
-    """The T frames, uint8 [H, W, 3], the nearest to each time. Raises DatasetError."""
+    """The T frames, uint8 [H, W, 3], upright, the nearest to each time. Raises DatasetError, also for a damaged one."""
     av = import_av()
     num_given = 0
     try:
         with av.open(str(span.file)) as container:
-            for frame in _nearest(span, _decoded(container, span)):
-                yield frame.to_ndarray(format="rgb24")
+            for frame, is_damaged in _nearest(span, judged(_decoded(container, span))):
+                if is_damaged:
+                    raise DatasetError.at(f"{span.where}: {span.file}: frame {num_given}", UNDAMAGED, DAMAGED)
+                yield upright(frame)
                 num_given += 1
     except (av.FFmpegError, OSError) as error:
         raise span.error(f"frame {num_given} to be decoded", error.strerror or str(error)) from error
@@ -141,16 +148,17 @@ def _decoded(container: Any, span: Span) -> Iterator[Any]:
     yield from frames
 
 
-def _nearest(span: Span, frames: Iterator[Any]) -> Iterator[Any]:
-    """Of the frames the one that is nearest to each time. Raises DatasetError if it is not within the tolerance."""
+def _nearest(span: Span, frames: Iterator[tuple[Any, bool]]) -> Iterator[tuple[Any, bool]]:
+    """Of the judged frames the nearest to each time. Raises DatasetError if that is not within the tolerance."""
     t = 0
     held = next(frames, None)
     while held is not None and t < len(span.times_s):
         following = next(frames, None)
         target_s = float(span.times_s[t])
-        if following is None or abs(held.time - target_s) <= abs(following.time - target_s):
-            if abs(held.time - target_s) > span.tolerance_s:
-                raise span.error(f"frame {t} at {target_s:.4f} s", f"the nearest at {held.time:.4f} s")
+        held_s = held[0].time
+        if following is None or abs(held_s - target_s) <= abs(following[0].time - target_s):
+            if abs(held_s - target_s) > span.tolerance_s:
+                raise span.error(f"frame {t} at {target_s:.4f} s", f"the nearest at {held_s:.4f} s")
             yield held
             t += 1
         held = following

@@ -34,6 +34,7 @@ class Hdf5Dataset:
 
     kind = "HDF5"
     revision = None
+    depth_cameras: Sequence[str] = ()  # depth maps are not uint8 [T, H, W, 3]
 
     def __init__(self, file: Path, *, task: str | None = None) -> None:
         self.file = file

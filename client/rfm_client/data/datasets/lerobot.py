@@ -51,6 +51,11 @@ class LeRobotDataset:
         """Keys of the features that are video or images."""
         return (*self.info.films, *self.info.images)
 
+    @property
+    def depth_cameras(self) -> Sequence[str]:
+        """Those whose pictures are depth maps."""
+        return self.info.depth
+
     @cached_property
     def episodes(self) -> Sequence[Episode]:
         """All episodes. Reads and checks the rows of all of them; raises DatasetError."""

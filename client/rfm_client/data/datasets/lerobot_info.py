@@ -15,12 +15,16 @@ from rfm_client.data.datasets.protocol import DatasetError
 INFO_FILE = Path("meta", "info.json")
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 
+_OF_PICTURES = ("info", "video_info")  # what a feature says of its pictures, by the version of the writer
+_DEPTH_MARKS = ("video.is_depth_map", "is_depth_map")
+
 
 @dataclass(frozen=True)
 class Info:
     """What a LeRobot dataset says of itself.
 
     films, images: keys of its cameras whose frames are in video files, and of those whose frames are in its tables
+    depth: keys of those of both whose pictures are depth maps
     total_frames: of all episodes
     data_path, video_path: templates of the paths of its files
     """
@@ -29,6 +33,7 @@ class Info:
     fps: float
     films: tuple[str, ...]
     images: tuple[str, ...]
+    depth: tuple[str, ...]
     total_episodes: int
     total_frames: int
     chunks_size: int
@@ -54,6 +59,7 @@ class Info:
             fps=fps,
             films=films,
             images=tuple(key for key, kind in kinds.items() if kind == "image"),
+            depth=tuple(key for key, kind in kinds.items() if kind in ("video", "image") and _is_depth(features[key])),
             total_episodes=_field(file, document, "total_episodes", int),
             total_frames=_field(file, document, "total_frames", int),
             chunks_size=_field(file, document, "chunks_size", int),
@@ -70,6 +76,11 @@ class Info:
         if not path or Path(path).is_absolute() or ".." in Path(path).parts:
             raise DatasetError.at(INFO_FILE, "a path inside the dataset", repr(path))
         return root / path
+
+
+def _is_depth(feature: Mapping[str, Any]) -> bool:
+    told = [feature[name] for name in _OF_PICTURES if isinstance(feature.get(name), dict)]
+    return any(each.get(mark) is True for each in told for mark in _DEPTH_MARKS)
 
 
 def _read_json(file: Path) -> Mapping[str, Any]:

@@ -79,6 +79,10 @@ class Dataset(Protocol):
         """Names of the cameras, in the dataset's order."""
 
     @property
+    def depth_cameras(self) -> Sequence[str]:
+        """Those of the cameras whose pictures are distances, not colours: left out unless they are named."""
+
+    @property
     def episodes(self) -> Sequence[Episode]:
         """All episodes, by index."""
 
@@ -94,9 +98,10 @@ class Dataset(Protocol):
 
 
 def chosen_cameras(dataset: Dataset, names: Iterable[str]) -> tuple[str, ...]:
-    """The dataset's cameras of these names, which may leave LeRobot's ``observation.images.`` out; none: all.
+    """The dataset's cameras of these names, which may leave LeRobot's ``observation.images.`` out; none: all but depth
+    cameras.
 
-    Raises DatasetError for a camera that the dataset does not have.
+    Raises DatasetError for a camera that the dataset does not have, and if only depth cameras could be meant.
     """
     chosen = []
     for name in names:
@@ -104,7 +109,10 @@ def chosen_cameras(dataset: Dataset, names: Iterable[str]) -> tuple[str, ...]:
         if camera is None:
             raise DatasetError.at("cameras", f"some of {', '.join(dataset.cameras)}", repr(name))
         chosen.append(camera)
-    return tuple(chosen or dataset.cameras)
+    chosen = chosen or [camera for camera in dataset.cameras if camera not in dataset.depth_cameras]
+    if dataset.cameras and not chosen:
+        raise DatasetError.at("cameras", f"some of {', '.join(dataset.cameras)} named: all are depth cameras", "none")
+    return tuple(chosen)
 
 
 def iter_episodes(
@@ -112,7 +120,7 @@ def iter_episodes(
 ) -> Iterator[tuple[Episode, Mapping[str, Trajectory]]]:
     """Each episode with its trajectory as each camera filmed it, for loops of one's own. Raises DatasetError.
 
-    cameras: some of the dataset's; None: all. The frames of one episode are in memory at a time.
+    cameras: some of the dataset's; None: all but depth cameras. The frames of one episode are in memory at a time.
     """
     names = chosen_cameras(dataset, cameras or ())
     for episode in dataset.episodes:

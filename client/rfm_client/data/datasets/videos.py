@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
 """A folder of videos, one an episode, with a table of their tasks: ``tasks.csv`` or ``tasks.json``. Needs PyAV.
 
-The CSV file has the columns ``video`` and ``task``; the JSON file is ``{"film.mp4": "put the block in the bowl"}``.
-Paths are relative to the table. The table's order is the order of the episodes. Every frame of a video counts.
+The CSV file has the columns ``video`` and ``task``, where a task with a comma is in quotes; the JSON file is
+``{"film.mp4": "put the block in the bowl"}``. Paths are relative to the table. The table's order is the order of the
+episodes. Every frame of a video counts.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ class VideoFolder:
     kind = "videos"
     revision = None
     cameras: Sequence[str] = (CAMERA,)
+    depth_cameras: Sequence[str] = ()
 
     def __init__(self, table: Path) -> None:
         self._table = _table_in(table) if table.is_dir() else table
@@ -51,7 +53,9 @@ class VideoFolder:
             num_frames = len(self._packets(self.root / name).times_s)
             if not num_frames:
                 raise DatasetError.at(self.root / name, "frames", "none")
-            episodes.append(Episode(index, name, checked_task(f"{self._table}: {name}", task), num_frames, first))
+            episodes.append(
+                Episode(index, name, checked_task(f"{self._table}: {name}", task).strip(), num_frames, first)
+            )
             first += num_frames
         return episodes
 
@@ -103,7 +107,13 @@ def _from_csv(table: Path, text: str) -> Mapping[str, str]:
     if missing:
         raise DatasetError.at(table, "the columns video and task", ", ".join(rows.fieldnames or ()) or "none")
     tasks: dict[str, str] = {}
+    num_columns = len(rows.fieldnames or ())
     for row in rows:
+        cells = [cell for cell in row.values() if isinstance(cell, str)]
+        num_cells = len(cells) + len(row.get(None, ()))  # the reader's key of what has no column
+        if num_cells != num_columns:
+            expected = f"{num_columns} cells (text with a comma in quotes)"
+            raise DatasetError.at(f"{table}: line {rows.line_num}", expected, str(num_cells))
         if row["video"] in tasks:
             raise DatasetError.at(f"{table}: line {rows.line_num}", "each video once", row["video"])
         tasks[row["video"]] = row["task"]
