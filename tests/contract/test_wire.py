@@ -24,6 +24,7 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract import wire
+from rfm_client.contract.named_frames import NamedFootage, NamedProgressSample, NamedTrajectory, frame_digest
 from rfm_client.contract.samples import Footage
 
 OUTPUTS = [spec.name for spec in wire.score_outputs(4)]
@@ -200,6 +201,28 @@ def test_embeddings_of_another_shape_are_an_error(video: tuple[int, ...], text: 
     tensors = {"video_embeddings": np.ones(video, np.float32), "text_embedding": np.ones(text, np.float32)}
     with pytest.raises(InferenceFailedError, match=r"embeddings: expected \[1, 3, D\] and \[1, Dt\]"):
         wire.decode_embeddings(tensors, filmed(0, 3))
+
+
+@pytest.mark.parametrize(
+    ("num_sent", "shape"),
+    [(0, (2, 1, 1, 1, 3)), (1, (2, 1, 6, 4, 3)), (2, (2, 1, 6, 4, 3)), (3, (2, 2, 6, 4, 3))],
+    ids=["all are known", "one is new", "one of each is new", "one of them has no place beside the others"],
+)
+def test_named_frames_arrive_with_those_that_are_sent(num_sent: int, shape: tuple[int, ...]) -> None:
+    films = filmed(0, 2), filmed(1, 3)
+    named = [NamedTrajectory.of(film.positions, film.task) for film in films]
+    sent = [*films[0].positions, *films[1].positions][:num_sent]
+    tensors = wire.encode_named(named, sent)
+    assert tensors[wire.FRAMES].shape == shape
+    assert wire.num_positions(tensors) == 3
+    samples, footage = wire.decode_samples(tensors), wire.decode_trajectories(tensors)
+    for sample, film, wanted in zip(samples, footage, named, strict=True):
+        assert isinstance(sample, NamedProgressSample)
+        assert isinstance(film, NamedFootage)
+        for trajectory in (*sample.trajectories, *film.trajectories):
+            assert (trajectory.digests, trajectory.task) == (wanted.digests, wanted.task)
+            for frame in sent:
+                np.testing.assert_array_equal(trajectory.pixels[frame_digest(frame)], frame)
 
 
 def request(lengths: tuple[int, int], kind: int, steps: int = 0, positions: int = 4) -> wire.Tensors:

@@ -237,6 +237,21 @@ def test_a_pass_without_memory_empties_the_cache_and_is_tried_again(monkeypatch:
     assert execution.out_of_memory_count == 1
 
 
+@pytest.mark.parametrize("name", MODELS)
+def test_frames_that_were_evicted_are_kept_again_though_all_their_shots_are_kept(name: str) -> None:
+    cache, frames, execution = FeatureCache[Any](BYTES_PER_MB), frames_of(17, 4), Execution()
+    cached = engine(name, cache)
+    (expected,) = cached.evaluate([whole(frames)])
+    (row,) = cached.predictor.rows(whole(frames))
+    shots = cache.found(cached.predictor.collator.shot_keys(row.films[0]).values())  # type: ignore[attr-defined]
+    cache.clear()
+    cache.keep(shots)
+    for sample in (whole(frames), named(frames, ())):
+        (outcome,) = cached.score([cached.prepare(sample)], execution)
+        assert_close(outcome, expected, TOLERANCE)
+    assert execution.num_encoded == 0
+
+
 def test_frames_of_two_sizes_are_no_film() -> None:
     frames = [*frames_of(8, 1), *frames_of(9, 1, (84, 56))]
     outcome = ask(engine(MODELS[0], FeatureCache(BYTES_PER_MB)), named(frames, frames))

@@ -7,18 +7,23 @@ import inspect
 import warnings
 from contextlib import nullcontext
 from copy import deepcopy
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from tokenizers.processors import TemplateProcessing
 from torch.utils._python_dispatch import TorchDispatchMode
+from transformers.models.qwen2_5_vl.configuration_qwen2_5_vl import Qwen2_5_VLVisionConfig
 
 import goldens
 from engines import load_engine
 from rfm.engine import Engine
 from rfm.execution import Execution
+from rfm.vlm.collator import QwenCollator
+from rfm.vlm.film import Film
 from rfm.vlm.images import Normalisation, QwenImages, fitted_size
 from rfm_client import PreferenceSample, ProgressSample, Sample
 from vlm import BFLOAT16, PLAIN, assert_close, film, predictor_of, upstream_inputs
@@ -245,6 +250,48 @@ def test_tokens_stand_where_transformers_puts_them(name: str) -> None:
     expected, _ = find(**{key: inputs[key] for key in inspect.signature(find).parameters if key in inputs})
     for index, row in enumerate(rows):
         np.testing.assert_array_equal(row.position_ids, expected[:, index, : row.num_tokens])
+
+
+def test_a_configuration_without_the_tokens_of_a_second_has_those_of_transformers() -> None:
+    collator = predictor_of("q25_video_last_l2").collator
+    backbone = collator.config.backbone
+    silent = {name: value for name, value in backbone["vision_config"].items() if name != "tokens_per_second"}
+    usual = Qwen2_5_VLVisionConfig().tokens_per_second
+    told, untold = (
+        QwenCollator(
+            replace(collator.config, backbone={**backbone, "vision_config": vision}),
+            collator.tokenizer,
+            collator.images,
+        )
+        for vision in (silent | {"tokens_per_second": usual}, silent)
+    )
+    sample = ProgressSample(film(0, 7, 64, 64))
+    np.testing.assert_array_equal(untold.rows(sample)[0].position_ids, told.rows(sample)[0].position_ids)
+    assert usual != backbone["vision_config"]["tokens_per_second"]
+
+
+@pytest.mark.parametrize("name", [PLAIN, "smol_mean_disc10"])
+def test_a_tokenizer_adds_nothing_to_what_the_chat_template_says(name: str) -> None:
+    """It writes all there is to be; the tokenizers of the references have nothing to add."""
+    collator, sample = predictor_of(name).collator, ProgressSample(film(0, 2, 64, 64))
+    (expected,) = collator.rows(sample)
+    tokenizer = deepcopy(collator.tokenizer)
+    end = tokenizer.eos_token
+    tokenizer.backend_tokenizer.post_processor = TemplateProcessing(
+        single=f"{end} $A {end}", special_tokens=[(end, tokenizer.eos_token_id)]
+    )
+    assert len(tokenizer(end)["input_ids"]) == 3
+    (row,) = type(collator)(collator.config, tokenizer, collator.images).rows(sample)
+    np.testing.assert_array_equal(row.input_ids, expected.input_ids)
+
+
+@pytest.mark.parametrize("make", [np.asarray, list], ids=["an array", "named frames"])
+@pytest.mark.parametrize("needed", [[], [1], [0, 2], [0, 1, 2]])
+def test_a_film_gives_the_frames_that_are_needed(make: Any, needed: list[int]) -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (3, 6, 4, 3), np.uint8)
+    given = Film.of(make(frames), 0).stack(needed)
+    assert given.dtype == np.uint8
+    np.testing.assert_array_equal(given, frames[np.array(needed, int)])
 
 
 def test_a_shot_that_many_conversations_show_is_there_once() -> None:
