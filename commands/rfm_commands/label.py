@@ -16,6 +16,7 @@ import torch
 import typer
 
 from rfm import families
+from rfm.checkpoint import training
 from rfm.checkpoint.digest import settings_digest, weights_digest
 from rfm.engine import Engine
 from rfm.execution import Execution
@@ -34,6 +35,8 @@ class EngineScorer:
     """Scores with an engine, one call at a time: while one thread scores, the others decode.
 
     The engine is on its device as soon as it scores; until then only the checkpoint is in memory.
+
+    notes: lines for the user on what the checkpoint's training run left untrained
     """
 
     def __init__(self, source: str, *, device: str = "cpu", **options: Any) -> None:
@@ -44,7 +47,9 @@ class EngineScorer:
         self._checkpoint = families.load(source, **options)
         self._encoders = self._checkpoint.encoders()
         told = {"device": torch.device(device).type, **{name: _named(value) for name, value in options.items()}}
-        self._facts = _facts(source, self._checkpoint, self._encoders, _folders(source, options), told)
+        folders = _folders(source, options)
+        self._facts = _facts(source, self._checkpoint, self._encoders, folders, told)
+        self.notes = training.notes(folders[0], (training.PROGRESS, training.SUCCESS))
         self._device = device
         self._lock = threading.Lock()
 
@@ -96,7 +101,10 @@ def label(
 
     @contextmanager
     def connect() -> Iterator[Scorer]:
-        yield EngineScorer(checkpoint, device=device, **options)
+        scorer = EngineScorer(checkpoint, device=device, **options)
+        for note in scorer.notes:
+            _say(note)
+        yield scorer
 
     with _errors_on_one_line(_say):
         from rfm_client.cli.label_display import run
@@ -147,7 +155,7 @@ def _named(value: Any) -> Any:
 
 
 def _folders(source: str, options: dict[str, Any]) -> list[Path]:
-    """The local folders whose weights decide the scores."""
+    """The local folders whose weights decide the scores, the checkpoint's first."""
     named = [options.get(name) for name in ("image_encoder", "text_encoder", "base_model")]
     return [families.find(source), *(Path(folder) for folder in named if folder and Path(folder).is_dir())]
 

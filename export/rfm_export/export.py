@@ -14,6 +14,7 @@ from google.protobuf.text_format import ParseError
 from safetensors import SafetensorError
 
 from rfm import families
+from rfm.checkpoint import training
 from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.family import Checkpoint, Description, Family, FrameEncoders, Options
@@ -58,13 +59,14 @@ def export(
     other_machine: it is to be served elsewhere, so that ``num_gpus`` may be more than there are here
     family: package of the checkpoint's family, which the server must be able to import too; None: one of ours
     device: where the scores are compared; None: on the CPU, and those of a large network on a GPU with room for it
-    say: takes a line for the user: where the scores of a large network are compared
+    say: takes a line for the user: what the training run left untrained, and where the scores of a large network are
+        compared
     Raises CheckpointError, ExportError.
     """
     if not other_machine:
         _check_gpus(settings.num_gpus)
     named = None if device is None else device_named(device)
-    loaded = _load(source, settings, family)
+    loaded = _load(source, settings, family, say)
     described = loaded.encoders.description if loaded.encoders is not None else None
     names = [settings.name, encoder_name(settings.name), frames_name(settings.name)]
     with alone(repository), staging(repository, names) as staged:
@@ -77,13 +79,20 @@ def export(
     return version.number
 
 
-def _load(source: str | Path, settings: ExportConfig, family: str | None) -> _Source:
-    """What is at ``source``, checked."""
+def _load(
+    source: str | Path, settings: ExportConfig, family: str | None, say: Callable[[str], object] | None
+) -> _Source:
+    """What is at ``source``, checked. Says what its training run left untrained."""
     folder = families.find(source)
     kind = families.choose(folder, family)
     options = Options(settings.base_model, settings.resize_images, settings.image_encoder, settings.text_encoder)
     checkpoint = kind.load(folder, options)
     families.check(folder, checkpoint)
+    if say is not None:
+        has_similarity = checkpoint.description.has_similarity
+        answered = [head for head in training.HEADS if head != training.SIMILARITY or has_similarity]
+        for note in training.notes(folder, answered):
+            say(note)
     return _Source(kind, checkpoint, checkpoint.encoders(), Origin.of(source, folder))
 
 

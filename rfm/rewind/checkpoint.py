@@ -29,6 +29,7 @@ from rfm.checkpoint.files import (
     take_prefix,
     trained_frames,
 )
+from rfm.checkpoint.training import check_progress
 from rfm.family import NETWORK, Description, Options
 from rfm.feature_cache import FeatureCache
 from rfm.rewind.encoders import Encoders
@@ -229,7 +230,9 @@ def _stated(folder: Path) -> dict[str, Any]:
         sources[NETWORK_CONFIG] = read_json(folder / NETWORK_CONFIG)
     run_config = find_run_config(folder)
     if run_config is not None:
-        model = read_run_config(run_config).get("model") or {}
+        run = read_run_config(run_config)
+        check_progress(run, run_config)
+        model = run.get("model") or {}
         network = model.get("rewind") or {} if isinstance(model, dict) else model
         if not isinstance(network, dict):
             raise CheckpointError(f"{run_config}: model.rewind: expected a mapping, got {shown(network)}")

@@ -35,6 +35,7 @@ from rfm.checkpoint.files import (
     check_shapes,
     read_weights,
 )
+from rfm.checkpoint.training import check_progress
 from rfm.family import NETWORK, Description, Options
 from rfm.feature_cache import FeatureCache
 from rfm.version_folder import PROCESSOR_FOLDER
@@ -59,6 +60,8 @@ _SMOL: _Renames = ((r"^model\.model\.", "model."),)
 _LORA_INSIDE: _Renames = ((r"^(model\.\w+)\.base_model\.model\.", r"\1."),)
 _ADAPTER: _Renames = ((r"^base_model\.model\.", "model."),)
 _UNUSED = ("lm_head.weight", "model.lm_head.weight")  # makes text, which no reward head reads
+
+_VARIANT = re.compile(r"(-unsloth)?(-bnb-\dbit)?$")  # of one model, which Unsloth puts in the place of a base model
 
 _LAYER_COUNTS = ("num_hidden_layers", "num_layers", "depth")
 MAX_LAYERS = 1024
@@ -169,8 +172,9 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
         else:
             run = RunConfig.of(folder)
             run.check_model_type()
+            check_progress(run.sections, run.file)
             if is_adapter:
-                backbone, weights = _adapted(folder, options.base_model or _base_model_id(run))
+                backbone, weights = _adapted(folder, options.base_model or _base_of_adapter(folder, run))
             else:
                 weights = _whole(folder, backbone, run)
             config = _trained_config(folder, backbone, run, weights, options.resize_images)
@@ -181,11 +185,23 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
     return checkpoint
 
 
-def _base_model_id(run: RunConfig) -> str:
+def _base_of_adapter(folder: Path, run: RunConfig) -> str:
+    """The base model that the run names. Raises CheckpointError if the adapter names another."""
     base = run.get("model.base_model_id", "")
     if not base:
         raise CheckpointError(f"{run.file}: expected model.base_model_id (or --base-model), got none")
+    named = read_json(folder / ADAPTER_CONFIG).get("base_model_name_or_path")
+    if named and _model_name(str(named)) != _model_name(base):
+        raise CheckpointError(
+            f"{folder / ADAPTER_CONFIG}: base_model_name_or_path: expected {cut(base)}, the model.base_model_id of "
+            f"{run.file}, got {shown(named)}; name the one that the adapter was trained on with --base-model"
+        )
     return base
+
+
+def _model_name(base: str) -> str:
+    """What is left of a base model's id or path where the same model may have several."""
+    return _VARIANT.sub("", base.rstrip("/").rpartition("/")[2].lower())
 
 
 def _saved_config(content: Mapping[str, Any]) -> VlmConfig:

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+import yaml
 from click.testing import Result
 from google.protobuf import text_format
 from safetensors.torch import load_file, save_file
@@ -352,6 +353,56 @@ batch_size: 4
 server_url: "0.0.0.0"
 server_port: 8000
 """
+HEADS = ("progress", "preference", "success", "similarity")
+
+
+def untrained(head: str) -> str:
+    return (
+        f"config.yaml: model.train_{head}_head is false: the run did not train the head of {head}, so {head} means "
+        "something only if the run started from a checkpoint that did"
+    )
+
+
+LAST_FRAME = (
+    "config.yaml: loss.predict_last_frame_progress is true: the run trained progress of the last frame alone, so "
+    "progress of the frames before it means something only if the run started from a checkpoint that trained it"
+)
+ALL_TRAINED: dict[str, object] = {f"train_{head}_head": True for head in HEADS}
+RUNS: dict[str, tuple[str, dict[str, object], list[str]]] = {
+    "no head is trained": ("c1_t1_disc10", {}, [untrained(head) for head in HEADS]),
+    "one head is not trained": ("c1_t1_disc10", {"model": ALL_TRAINED | {"train_success_head": False}}, [untrained("success")]),
+    "a head that the network lacks": ("robometer_c1_t1_disc10", {"model": ALL_TRAINED | {"train_similarity_head": False}}, []),
+    "no word of heads": ("c1_t1_disc10", {"model": dict.fromkeys(ALL_TRAINED)}, []),
+    "only the last frame": ("c1_t1_disc10", {"model": ALL_TRAINED, "loss": {"predict_last_frame_progress": True}}, [LAST_FRAME]),
+    "a loss that is no mapping": ("c1_t1_disc10", {"model": ALL_TRAINED, "loss": "discrete"}, []),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "changes", "expected"), RUNS.values(), ids=RUNS)
+def test_an_export_says_what_the_run_did_not_train(
+    tmp_path: Path, name: str, changes: dict[str, object], expected: list[str]
+) -> None:
+    config = goldens.config(name)
+    checkpoint = shutil.copytree(config.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
+    file = next(
+        file for folder in (config.checkpoint, config.checkpoint.parent) if (file := folder / "config.yaml").exists()
+    )
+    run = read_run_config(file)
+    for section, values in changes.items():
+        run[section] = run[section] | values if isinstance(values, dict) else values
+    (checkpoint / "config.yaml").write_text(yaml.safe_dump(run))
+    said: list[str] = []
+    rfm_export.export(checkpoint, tmp_path / "repository", serve_config(config), say=said.append)
+    assert said == expected
+
+
+def test_an_export_of_an_export_says_nothing_of_a_run(exported: Path, tmp_path: Path) -> None:
+    said: list[str] = []
+    checkpoint = exported / "rfm" / "1" / "checkpoint"
+    rfm_export.export(checkpoint, tmp_path / "repository", serve_config(EMBEDDINGS), say=said.append)
+    assert said == []
+
+
 NOTE = "batch_size has no effect, as in the FastAPI server; max_batch_size bounds a batch"
 
 
@@ -367,7 +418,8 @@ def test_upstream_s_batch_size_bounds_nothing_and_says_so(tmp_path: Path) -> Non
     assert result.exit_code == 0, result.output
     file = f"rfm: {tmp_path}/eval_config_server.yaml"
     later = "max_workers, server_url, server_port: of no effect at export, only at serve"
-    assert result.stderr == f"{file}: {later}\n{file}: {NOTE}\n"
+    of_run = "".join(f"rfm: {note}\n" for note in map(untrained, HEADS))
+    assert result.stderr == f"{file}: {later}\n{file}: {NOTE}\n{of_run}"
     assert read(tmp_path / "repository", "rfm").max_batch_size == ExportConfig().max_batch_size
 
 

@@ -236,6 +236,20 @@ def test_a_spoiled_checkpoint_is_refused(folder: Path, spoil: Callable[[Path], N
         families.load(folder).build()
 
 
+@pytest.mark.parametrize("kind", ["relative", "relative_first_frame"])
+@pytest.mark.parametrize("name", [CONTINUOUS, WITH_IMAGES])
+def test_progress_since_the_frame_before_is_refused(tmp_path: Path, name: str, kind: str) -> None:
+    golden = goldens.config(name)
+    folder = shutil.copytree(golden.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
+    text = (folder / "config.yaml").read_text()
+    (folder / "config.yaml").write_text(text.replace("absolute_wrt_total_frames", kind))
+    expected = f"{folder}/config.yaml: data.progress_pred_type: expected absolute progress, got '{kind}': such a head"
+    with pytest.raises(CheckpointError, match=re.escape(expected)):
+        families.load(folder, base_model=str(golden.base_model))
+    (folder / "config.yaml").write_text(text.replace("absolute_wrt_total_frames", "absolute_first_frame"))
+    families.load(folder, base_model=str(golden.base_model))
+
+
 def test_the_conversion_that_the_refusal_of_a_pickle_names_works(folder: Path) -> None:
     before = families.load(folder)
     as_pickle(folder)

@@ -99,6 +99,13 @@ def change_adapter(**changes: object) -> Callable[[Path], None]:
     return spoil
 
 
+def change_layers(folder: Path) -> None:
+    file = folder / "config.json"
+    backbone = json.loads(file.read_text())
+    backbone["text_config"]["layer_types"][0] = "sliding_attention"
+    file.write_text(json.dumps(backbone))
+
+
 def drop_first(part: str) -> Callable[[dict[str, Any]], object]:
     return lambda weights: weights.pop(next(name for name in weights if part in name))
 
@@ -135,6 +142,11 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
         r"model\.model_type: expected default, got 'vqa': .* upstream's successor dropped the type",
     ),
     "another model type": (PLAIN, change_yaml("model_type: default", "model_type: dpo"), r"model_type: expected default, got 'dpo'$"),
+    "layers that see few tokens": (
+        "q25_mean_l2",
+        change_layers,
+        r"text_config\.layer_types: expected full_attention alone, got \['full_attention', 'sliding_attention'\]",
+    ),
     "LoRA without alpha": (LORA_INSIDE, change_yaml("lora_alpha: 8", "lora_beta: 8"), r"expected lora_alpha and r of the LoRA weights"),
     "half a LoRA pair": (LORA_INSIDE, change_tensors("model.safetensors", drop_first("lora_B")), r"expected a weight and LoRA factors A and B, got \['A'\]"),
     "LoRA of another kind": (ADAPTER, change_adapter(use_dora=True), r"expected plain LoRA, got use_dora"),
@@ -341,3 +353,41 @@ def test_the_processor_s_chat_template_wins_over_the_tokenizer_s(tmp_path: Path)
     assert prompt() == other["chat_template"]
     (base / "chat_template.jinja").write_text("of the processor, in its newer file")
     assert prompt() == "of the processor, in its newer file"
+
+
+def name_base(folder: Path, base: object) -> None:
+    """Changes the base model that the adapter in the folder names."""
+    file = folder / "adapter_config.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"base_model_name_or_path": base}))
+
+
+OTHER_BASES = (
+    "Qwen/Qwen2.5-VL-7B-Instruct",
+    "Qwen/Qwen2.5-VL-3B",
+    "/scratch/snapshots/66285546d2b821cf421d4f5eb2576359d3770cd3",
+)
+SAME_BASES = (
+    "/scratch/models/Qwen2.5-VL-3B-Instruct/",
+    "unsloth/qwen2.5-vl-3b-instruct-unsloth-bnb-4bit",
+    "unsloth/Qwen2.5-VL-3B-Instruct-bnb-4bit",
+    None,
+    "",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("base", OTHER_BASES)
+def test_an_adapter_on_another_base_model_is_asked_about(copied: Callable[[str], Path], base: str) -> None:
+    folder = copied(ADAPTER)
+    name_base(folder, base)
+    expected = f"{folder}/adapter_config.json: base_model_name_or_path: expected Qwen/Qwen2.5-VL-3B-Instruct"
+    with pytest.raises(CheckpointError, match=rf"{re.escape(expected)}, .*, got '{re.escape(base)}'; .* --base-model"):
+        families.load(folder)
+    assert load(ADAPTER, folder).config == load(ADAPTER).config  # which names --base-model
+
+
+@pytest.mark.parametrize("base", SAME_BASES)
+def test_an_adapter_s_base_model_under_another_name_is_taken(copied: Callable[[str], Path], base: str | None) -> None:
+    folder = copied(ADAPTER)
+    name_base(folder, base)
+    with pytest.raises(CheckpointError, match=r"^base model Qwen/Qwen2\.5-VL-3B-Instruct: cannot be had"):
+        families.load(folder)

@@ -148,6 +148,21 @@ def test_no_frame_is_scored_where_the_package_for_recordings_is_missing(
     assert list(output.iterdir()) == []
 
 
+def test_what_the_run_did_not_train_is_told(output: Path) -> None:
+    """Of what is labelled: neither of preference nor of similarity."""
+    checkpoint = shutil.copytree(MODELS / "rfm" / "1" / "checkpoint", output / "checkpoint")
+    heads = "".join(f"train_{head}_head: false, " for head in ("progress", "preference", "success", "similarity"))
+    (checkpoint / "config.yaml").write_text(f"model: {{{heads}}}\nloss: {{predict_last_frame_progress: true}}\n")
+    result = own(DATASET, *ENGINE, "--checkpoint", checkpoint, "--dry-run", "--output", output)
+    assert result.exit_code == 0, result.stderr
+    of_run = [line.partition(" is ")[0] for line in result.stderr.splitlines() if line.startswith("rfm: config.yaml: ")]
+    assert of_run == [
+        "rfm: config.yaml: model.train_progress_head",
+        "rfm: config.yaml: model.train_success_head",
+        "rfm: config.yaml: loss.predict_last_frame_progress",
+    ]
+
+
 def test_what_cannot_be_labelled_ends_with_one_line(output: Path) -> None:
     broken = shutil.copytree(DATASET, output / "broken")
     film = broken / "videos" / FRONT / "chunk-000" / "file-001.mp4"

@@ -68,6 +68,15 @@ def test_refused_and_failed_requests_fail_alone(tmp_path: Path) -> None:
     assert len(model.logged) == 4
 
 
+def test_a_request_whose_tensors_cannot_be_had_is_one_that_failed(tmp_path: Path) -> None:
+    model = Model(tmp_path)
+    lost, other = model.respond([Request({}), request(1)])
+    assert lost.error == ("internal", "scoring failed; the server's log has the reason")
+    assert other.error is None
+    assert model.batches == [1]
+    assert model.samples == {("unknown", "failed"): 1, ("progress", "scored"): 1}
+
+
 def test_a_request_that_breaks_a_batch_is_found(tmp_path: Path) -> None:
     model = Model(tmp_path)
     responses = model.respond([request(1), request(BREAKS), request(5)])
