@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -218,7 +219,8 @@ class Engine:
             return
         with ThreadPoolExecutor(1) as collating:
             for part, following in zip(parts, [*parts[1:], None], strict=True):
-                coming = collating.submit(self._collate, [rows[i] for i in following]) if following else None
+                steps = copy_context()  # whoever is told of steps is told of those of the other thread
+                coming = collating.submit(steps.run, self._collate, [rows[i] for i in following]) if following else None
                 yield part, batch
                 batch = coming.result() if coming is not None else None
 

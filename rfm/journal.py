@@ -72,7 +72,7 @@ def restore_journals(prefix: str, journals: Mapping[str, bytes]) -> None:
 class Journal:
     """A model process' record, in ``file``, of the batch it is working on and of the requests that it prepares beside.
 
-    Each field is written by one thread at a time, and alone: no thread's work hides another's.
+    Each field is written alone, and what is prepared has one of its own: no thread's work hides another's.
     """
 
     def __init__(self, file: Path) -> None:
@@ -80,6 +80,7 @@ class Journal:
         with file.open("r+b") as content:
             self._memory = mmap.mmap(content.fileno(), 0)
         self._owing = threading.Lock()
+        self._going_on = threading.Lock()  # work is not renewed that has just ended
 
     @classmethod
     def create(cls, file: Path, capacity: int, num_places: int = 0) -> Journal:
@@ -155,8 +156,12 @@ class Journal:
             self._set_since(at, 0.0)
 
     def renew(self) -> None:
-        """Records that the batch has made progress."""
-        self._set_since(_BATCH, time.monotonic())
+        """Records that the batch has made progress, if there still is one."""
+        self._renew(_BATCH)
+
+    def renew_preparing(self, place: int) -> None:
+        """Records that what is prepared in this place has made progress."""
+        self._renew(self._places[place])
 
     def count_refused(self) -> None:
         """Counts one more request that was refused."""
@@ -203,4 +208,10 @@ class Journal:
         return float(_SINCE.unpack_from(self._memory, at)[0])
 
     def _set_since(self, at: int, since_s: float) -> None:
-        _SINCE.pack_into(self._memory, at, since_s)
+        with self._going_on:
+            _SINCE.pack_into(self._memory, at, since_s)
+
+    def _renew(self, at: int) -> None:
+        with self._going_on:
+            if self._since_s(at):
+                _SINCE.pack_into(self._memory, at, time.monotonic())

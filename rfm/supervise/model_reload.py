@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 
 from rfm.launch.process import STALLED_S, TritonServer
-from rfm.launch.repository_api import RepositoryApi
+from rfm.launch.repository_api import LOADING, READY, RepositoryApi
 from rfm.supervise.model_processes import ModelProcess
 from rfm.supervise.triton_watch import Config, serving_just
 
@@ -56,7 +56,9 @@ class Reload:
             if self.out_since_s is not None and any(e.is_ready for e in api.index() if e.name == self._model):
                 return  # another client has loaded it meanwhile
             self._take_out(api, processes)
-            if self._to_load is not None and not self._is_closed:  # else Triton may be another
+            if self._to_load is None or self._is_loaded_by_another(api):
+                return
+            if not self._is_closed:  # else Triton may be another
                 # Triton 2.51 never finishes an unload after a request met a dead process of the model. A load goes on.
                 api.load(self._model, self._to_load)
 
@@ -79,6 +81,15 @@ class Reload:
         elif time.monotonic() - self._stalled_since_s > STALLED_S:
             for process in new:
                 process.kill()
+
+    def _is_loaded_by_another(self, api: RepositoryApi) -> bool:
+        """Whether somebody has loaded the model since it was unloaded. A load under way is waited for: it may fail."""
+        while not self._is_closed:
+            states = {entry.state for entry in api.index() if entry.name == self._model}
+            if LOADING not in states:
+                return READY in states
+            time.sleep(POLL_S)
+        return False
 
     def _take_out(self, api: RepositoryApi, processes: Sequence[ModelProcess]) -> None:
         """Unloads the model, unless somebody has done so: then it is to stay unloaded."""

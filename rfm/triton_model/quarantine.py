@@ -17,11 +17,13 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
 from rfm.journal import NO_DIGEST, Journal, journal_file, journal_files
+from rfm.steps import telling
 from rfm.triton_model.request import Request
 from rfm_client.contract.errors import DEADLY, InvalidSampleError
 
@@ -79,9 +81,12 @@ class Quarantine:
 
     @contextmanager
     def at_work_on(self, digests: Sequence[bytes]) -> Iterator[None]:
-        """A context in which these requests are worked on. When it ends, none of them is a suspect any more."""
+        """A context in which these requests are worked on. When it ends, none of them is a suspect any more.
+
+        Each step (``rfm.steps``) renews it, as it does ``preparing``.
+        """
         try:
-            with self._journal.at_work_on(digests):
+            with self._journal.at_work_on(digests), telling(self._journal.renew):
                 yield
         finally:
             for digest in digests if self._deaths else ():
@@ -98,7 +103,7 @@ class Quarantine:
         """A context in which this request is prepared, in one of ``num_preparing`` threads."""
         place = self._free_places.get()
         try:
-            with self._journal.preparing(place, digest):
+            with self._journal.preparing(place, digest), telling(partial(self._journal.renew_preparing, place)):
                 yield
         finally:
             self._free_places.put(place)

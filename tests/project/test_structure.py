@@ -22,6 +22,7 @@ SHARED = {  # what a family may import beside itself
     "rfm.layers",
     "rfm.predictor",
     "rfm.dense_mode",
+    "rfm.steps",
     "rfm.version_folder",
     "rfm_client.contract",
 }

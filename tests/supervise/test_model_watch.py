@@ -276,6 +276,35 @@ def test_what_somebody_has_loaded_meanwhile_stays(bench: Bench) -> None:
     assert (bench.triton.asked, bench.model.state) == (["unload", "load 1"], State.NEW)
 
 
+def test_what_somebody_loads_while_processes_end_stays(bench: Bench) -> None:
+    bench.processes = [Process()]
+    sleep = bench.clock.sleep
+
+    def somebody_loads(duration_s: float) -> None:
+        sleep(duration_s)
+        state = "READY" if bench.clock.now_s > 60.0 else "LOADING"  # it takes longer than the processes
+        bench.triton.be(state, version=2)
+
+    bench.clock.sleep = somebody_loads  # type: ignore[method-assign]
+    bench.look(died="its process is dead")
+    bench.wait(0.0)
+    assert (bench.triton.asked, bench.triton.entry.version, bench.model.state) == (["unload"], 2, State.NEW)
+    assert not bench.processes[0].is_alive
+
+
+def test_what_was_served_is_loaded_where_the_load_of_somebody_fails(bench: Bench) -> None:
+    bench.processes = [Process()]
+    sleep = bench.clock.sleep
+
+    def somebody_loads(duration_s: float) -> None:
+        sleep(duration_s)
+        bench.triton.be(*(("UNAVAILABLE", "its weights are damaged") if bench.clock.now_s > 60.0 else ("LOADING", "")))
+
+    bench.clock.sleep = somebody_loads  # type: ignore[method-assign]
+    bench.look(died="its process is dead")
+    assert bench.triton.asked == ["unload", "load 1"]
+
+
 def test_what_is_closed_changes_nothing_more(bench: Bench) -> None:
     unload = bench.triton.unload
     bench.triton.unload = lambda model: (unload(model), bench.model.close())  # type: ignore[method-assign,assignment,func-returns-value]

@@ -15,9 +15,12 @@ import numpy as np
 import pytest
 
 from batch_models import BREAKS, CONFIG, REFUSED, Model, Request, backend, request  # noqa: F401  a fixture
+from clock import Clock
+from rfm import journal
 from rfm.execution import Execution
 from rfm.journal import Journal
 from rfm.probe import blank_question
+from rfm.steps import one_step_further
 from rfm.triton_model import self_check
 from rfm.triton_model.quarantine import Quarantine
 from rfm.triton_model.request_digest import digest
@@ -238,3 +241,44 @@ def test_a_probe_is_not_rejected_however_long_it_waits(tmp_path: Path) -> None:
     model.open(first, probe)
     ((code, _),) = (response.error for response in probe.responses)
     assert code == "invalid"  # it was scored: the model above refuses two frames, which the blank question has
+
+
+class Stepwise(Ahead):
+    """Prepares, ahead or in its turn, in steps of a second of a made-up time, and then stops in the midst of one."""
+
+    def __init__(self, folder: Path, clock: Clock, *, is_ahead: bool) -> None:
+        self.clock, self.is_ahead = clock, is_ahead
+        self.busy_s: list[float] = []
+        super().__init__(folder)
+        self.may_answer.set()
+
+    def work_ahead(self, prepared: Sample) -> None:
+        if self.is_ahead:
+            self.go_on()
+
+    def answer(self, questions: Sequence[Sample], execution: Execution) -> list[Result | RewardError]:
+        if not self.is_ahead:
+            self.go_on()
+        return super().answer(questions, execution)
+
+    def go_on(self) -> None:
+        for step_s in [1.0] * 100 + [50.0]:
+            self.clock.now_s += step_s
+            self.busy_s.append(self._quarantine._journal.busy_s)
+            one_step_further()
+
+
+@pytest.mark.parametrize("is_ahead", [True, False], ids=["ahead", "in its turn"])
+def test_what_is_prepared_step_by_step_gets_on_until_it_stops(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_ahead: bool
+) -> None:
+    clock = Clock()
+    clock.now_s = 1.0
+    monkeypatch.setattr(journal, "time", clock)
+    model = Stepwise(tmp_path, clock, is_ahead=is_ahead)
+    model._request_s = 1.0  # long enough that requests are answered later
+    model.respond([request(1)])
+    assert model.busy_s == [1.0] * 100 + [50.0]
+    one_step_further()  # of a thread that is late: the work has ended
+    model._quarantine.renew()
+    assert model._quarantine._journal.busy_s == 0
