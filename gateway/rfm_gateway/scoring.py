@@ -12,7 +12,7 @@ from rfm_client.async_client import AsyncRewardClient
 from rfm_client.contract.errors import DeadlineExceededError, InvalidSampleError, ModelNotFoundError, RewardError
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
-from rfm_client.contract.samples import Float32Array, Trajectory
+from rfm_client.contract.samples import Float32Array, Sample, Trajectory
 from rfm_client.transport.deadline import Deadline
 from rfm_client.transport.off_loop import off_loop
 from rfm_gateway import schema
@@ -20,6 +20,7 @@ from rfm_gateway.body import Batch
 from rfm_gateway.conversion import Conversion, Served, Texts, converted_bytes, has_embeddings, num_bytes, refused
 from rfm_gateway.folder import AllowedFolder, NamedFiles
 from rfm_gateway.memory import Share
+from rfm_gateway.versions import check_one, of_one_version
 
 FRAME_STEPS = 4  # frames to which the evaluation server samples each prefix
 PREFERRED = 0.5
@@ -35,6 +36,7 @@ class Scorer:
         self._client = client
         self._folder = folder
         self._timeout_s = timeout_s
+        self._frames_per_value: dict[str, int] = {}  # of each version that was served alone
 
     async def evaluate(self, batch: Batch, share: Share, request_id: str) -> schema.EvaluateBatchAnswer:
         """The answer to a batch, whole: one that lacked a sample would shift the others', or be read as a reward of 0.
@@ -57,23 +59,47 @@ class Scorer:
         share.take(sum(map(converted_bytes, batch.samples)))
         conversion = Conversion(served, texts, NamedFiles(self._folder, share), steps)
         samples = await off_loop(sum(map(num_bytes, batch.samples)), conversion.samples, batch.samples)
-        results = await self._client.evaluate(
-            samples, return_errors=True, timeout_s=deadline.remaining_s(), request_id=request_id
+        scored = await self._results(samples, deadline, request_id, may_repeat=not texts)
+        group = 1
+        if served.frames is not None and not steps:
+            group = await self._group(served.frames, str(scored[0].model_version), deadline)
+        return _answer(batch.samples, scored, group)
+
+    async def _results(
+        self, samples: Sequence[Sample], deadline: Deadline, request_id: str, *, may_repeat: bool
+    ) -> list[Result]:
+        """The results of all samples, of one version.
+
+        may_repeat: they can be sent as they are to another version: none has embeddings that the server made
+        """
+        outcomes = await of_one_version(
+            lambda: self._client.evaluate(
+                samples, return_errors=True, timeout_s=deadline.remaining_s(), request_id=request_id
+            ),
+            may_repeat=may_repeat,
         )
-        failed = {index: result for index, result in enumerate(results) if isinstance(result, RewardError)}
+        failed = {index: outcome for index, outcome in enumerate(outcomes) if isinstance(outcome, RewardError)}
         unfit = {i: error for i, error in failed.items() if isinstance(error, InvalidSampleError)}
         if unfit:
             raise refused(unfit)
         for error in failed.values():
             raise error
-        scored = [result for result in results if not isinstance(result, RewardError)]  # all of them
-        group = 1
-        if served.frames is not None and not steps:
-            info = served.frames
-            if any(str(result.model_version) not in info.versions for result in scored):  # perhaps another has answered
-                info = await self._client.model_info(frames=True, timeout_s=deadline.remaining_s())
-            group = info.frames_per_value
-        return _answer(batch.samples, scored, group)
+        return [outcome for outcome in outcomes if not isinstance(outcome, RewardError)]  # all of them
+
+    async def _group(self, info: ModelInfo, version: str, deadline: Deadline) -> int:
+        """How many frames share a value of the version that answered.
+
+        ``info`` may be of another one. While a checkpoint is replaced, one configuration names both versions; what an
+        earlier one said of a version alone holds.
+        """
+        known = self._frames_per_value
+        if info.versions not in ((), (version,)) and version not in known:
+            info = await self._client.model_info(frames=True, refresh=True, timeout_s=deadline.remaining_s())
+        if len(info.versions) == 1:
+            known[info.versions[0]] = info.frames_per_value
+        if version not in known and info.versions and version not in info.versions:
+            check_one({version, *info.versions})
+        return known.get(version, info.frames_per_value)
 
     async def _served(self, samples: Sequence[schema.Sample], deadline: Deadline) -> Served:
         """The models that may score the samples.

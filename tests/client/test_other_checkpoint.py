@@ -32,7 +32,10 @@ def test_an_episode_shows_as_many_frames_as_the_checkpoint_was_trained_on_by_now
 
 
 def test_frames_are_resized_as_the_checkpoint_reads_them_by_now() -> None:
-    small, large = replace(SHORT, frame_size=FrameSize("exact", (8, 8))), replace(LONG, frame_size=FrameSize("exact", (16, 16)))
+    small, large = (
+        replace(SHORT, frame_size=FrameSize("exact", (8, 8))),
+        replace(LONG, frame_size=FrameSize("exact", (16, 16))),
+    )
     shelf = Shelf(small, large, after=1, has_encoder=False)
     with RewardClient("", transports=[shelf]) as client, client.episode(TASK, resize=True) as episode:
         for _ in range(2):

@@ -53,7 +53,7 @@ class LabelFlags:
         ),
     ] = None
     cameras: Annotated[
-        str | None, typer.Option(metavar=_LISTED, help="Cameras to score; else all but depth cameras.", show_default=False)
+        str | None, typer.Option(metavar=_LISTED, help="Cameras to score; else all but depth ones.", show_default=False)
     ] = None
     fuse: Annotated[Fuse, typer.Option(help="How the scores of several cameras become one.")] = "mean"
     sampling: Annotated[

@@ -18,6 +18,7 @@ from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array
 from rfm_client.data.prefixes import prefix_samples
 from rfm_client.data.sampling import Sampling
 from rfm_client.transport.off_loop import off_loop
+from rfm_gateway.versions import check_one, versions_of
 
 MOST_PREFIXES = 32  # of one video at a time
 MOST_BYTES = 64 * 2**20  # of the frames of these
@@ -68,14 +69,18 @@ class Parts:
 async def curve(client: AsyncRewardClient, trajectory: Trajectory, call: Call) -> AsyncIterator[Points]:
     """The points of an episode of frames, in order. The first come alone, then twice as many, so that none waits long.
 
-    Raises RewardError.
+    Raises RewardError, also if one version of the checkpoint did not give all points.
     """
     assert trajectory.frames is not None
     parts = Parts.of(trajectory.frames, call.sampling)
     samples, first, count = prefix_samples(trajectory, call.sampling), 0, 1
+    versions: set[str | None] = set()
     while part := await off_loop(count * parts.sample_bytes, _next, samples, count):
         outcomes = await client.evaluate(part, return_errors=True, timeout_s=call.timeout_s, request_id=call.request_id)
-        yield _points(first, outcomes, call.sampling)
+        points = _points(first, outcomes, call.sampling)
+        versions |= versions_of(outcomes)
+        check_one(versions)
+        yield points
         first, count = first + len(part), min(2 * count, parts.most)
 
 

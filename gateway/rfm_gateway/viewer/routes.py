@@ -35,6 +35,7 @@ from rfm_gateway.cancellation import while_connected
 from rfm_gateway.config import GatewayConfig
 from rfm_gateway.memory import Share
 from rfm_gateway.observe import Metrics
+from rfm_gateway.versions import of_one_version
 from rfm_gateway.viewer.curves import Call, Parts, curve
 from rfm_gateway.viewer.models import Models, names_of
 from rfm_gateway.viewer.question import DEFAULT_FPS, DEFAULT_RULE, Question
@@ -198,7 +199,7 @@ async def _score_events(behind: Behind, asked: _Asked, call: Call) -> AsyncItera
 
 
 async def _preferences(asked: _Asked, timeout_s: float, request_id: str) -> dict[str, Any]:
-    """What the model prefers when it is asked in one order and in the other. Raises RewardError."""
+    """What one version of the model prefers when it is asked in one order and in the other. Raises RewardError."""
     first, second = asked.trajectories
 
     async def preferred(one: Trajectory, other: Trajectory) -> PreferenceResult:
@@ -206,8 +207,11 @@ async def _preferences(asked: _Asked, timeout_s: float, request_id: str) -> dict
             one, other, subsample=True, resize=asked.question.resize, timeout_s=timeout_s, request_id=request_id
         )
 
+    async def both() -> Sequence[PreferenceResult]:
+        return await asyncio.gather(preferred(first, second), preferred(second, first))
+
     try:
-        results = await asyncio.gather(preferred(first, second), preferred(second, first))
+        results = await of_one_version(both)
     except InvalidSampleError as error:
         where, _, message = error.message.partition(": ")
         raise invalid((where,), message) from None
