@@ -181,10 +181,18 @@ def slow_loris(site: Site) -> list[Row]:
 
 @contextmanager
 def _dripping(host: str, port: int, head: bytes) -> Iterator[list[float]]:
-    """Within it, connections send a byte a second each: half of them of the head, half of the body. Gives when."""
+    """Within it, connections send a byte a second each: half of them of the head, half of the body. Gives when.
+
+    A connection that the server resets is opened anew: of so many at once, Triton drops some now and then.
+    """
     sent: list[float] = []
 
     async def drip(number: int) -> None:
+        while True:
+            with suppress(ConnectionError):
+                await drip_once(number)
+
+    async def drip_once(number: int) -> None:
         begun, rest = (head, b"{" * 99) if number % 2 else (head[:5], head[5:])
         _, writer = await asyncio.open_connection(host, port)
         try:
