@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Vision-language checkpoints: full weights, or LoRA weights that are merged into their base here.
+"""Vision-language checkpoints: full weights, or LoRA factors beside them or beside those of a base model.
 
 Names of weights become those of VlmRewardModel, by one rename table per form.
 """
@@ -32,6 +32,7 @@ from rfm.checkpoint.content import (
 from rfm.checkpoint.files import (
     NETWORK_CONFIG,
     WEIGHTS,
+    WEIGHTS_INDEX,
     check_shapes,
     read_weights,
 )
@@ -41,7 +42,7 @@ from rfm.feature_cache import FeatureCache
 from rfm.version_folder import PROCESSOR_FOLDER
 from rfm.vlm.collator import VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP
-from rfm.vlm.lora import LORA_NAME, merged, scaling
+from rfm.vlm.lora import LORA_NAME, changed_by, merged, scaling, split
 from rfm.vlm.network import BACKBONES, SMOL, VlmConfig, VlmRewardModel, build_backbone
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.processor import frame_size, load_collator, save_processor
@@ -71,12 +72,14 @@ MAX_LAYERS = 1024
 class VlmCheckpoint:
     """A vision-language checkpoint in memory.
 
-    weights: of VlmRewardModel
+    weights: of VlmRewardModel, without LoRA
+    factors: of LoRA, as ``rfm.vlm.lora.split`` names them; none: the weights are whole
     processor: folder or id with its tokenizer and image preprocessing; None: those of the base model that it names
     """
 
     config: VlmConfig
     weights: dict[str, Tensor]
+    factors: dict[str, Tensor]
     processor: str | Path | None = None
 
     @property
@@ -96,8 +99,8 @@ class VlmCheckpoint:
 
     @property
     def parts(self) -> dict[str, dict[str, Tensor]]:
-        """All weights, which are the network's."""
-        return {NETWORK: self.weights}
+        """All weights: the network's, and the LoRA factors that change them."""
+        return {NETWORK: self.weights, "lora": self.factors}
 
     @cached_property
     def collator(self) -> VlmCollator:
@@ -123,13 +126,13 @@ class VlmCheckpoint:
         return VlmPredictor(self.build(dtype), collator, device, kept)
 
     def save(self, folder: Path) -> None:
-        """Writes merged weights, one config.json that says all, and the processor."""
+        """Writes weights and LoRA factors, one config.json that says all, and the processor."""
         collator = self.collator  # first: what is missing is reported before the weights are written
         folder.mkdir(parents=True)
         settings = {name: value for name, value in asdict(self.config).items() if name != "backbone"}
         config = {**self.config.backbone, SETTINGS: settings}
         (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
-        tensors = {name: tensor.contiguous() for name, tensor in self.weights.items()}
+        tensors = {name: tensor.contiguous() for name, tensor in (self.weights | self.factors).items()}
         save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
         save_processor(collator, folder / PROCESSOR_FOLDER)
 
@@ -139,7 +142,7 @@ class VlmCheckpoint:
         _check_transformers(self.config)
         network = self._network(wanted)
         # Parameters only: rotary frequencies stay float32, as in the original.
-        network.load_state_dict({k: v.to(wanted) for k, v in self.weights.items()}, strict=True, assign=True)
+        network.load_state_dict(merged(self.weights, self.factors, wanted), strict=True, assign=True)
         return network.eval().requires_grad_(False)
 
     def check(self) -> None:
@@ -164,25 +167,37 @@ def reads(folder: Path) -> bool:
 def load(folder: Path, options: Options) -> VlmCheckpoint:
     """The checkpoint in a local folder. Raises CheckpointError."""
     with expecting("a vision-language checkpoint", folder):
-        is_adapter = is_there(folder / ADAPTER_CONFIG)
+        is_adapter = _has_adapter(folder)
         backbone = {} if is_adapter else read_json(folder / NETWORK_CONFIG)
         if SETTINGS in backbone:  # written by VlmCheckpoint.save, with every setting
             config = _saved_config(backbone)
-            weights = _renamed(read_weights(folder), _renames(config.family))
+            tensors, scale = _renamed(read_weights(folder), _renames(config.family)), 1.0
         else:
             run = RunConfig.of(folder)
             run.check_model_type()
             check_progress(run.sections, run.file)
             if is_adapter:
-                backbone, weights = _adapted(folder, options.base_model or _base_of_adapter(folder, run))
+                backbone, tensors, scale = _adapted(folder, options.base_model or _base_of_adapter(folder, run))
             else:
-                weights = _whole(folder, backbone, run)
-            config = _trained_config(folder, backbone, run, weights, options.resize_images)
-        weights = {name: tensor for name, tensor in weights.items() if name not in _UNUSED}
+                tensors, scale = _whole(folder, backbone, run)
+            config = _trained_config(folder, backbone, run, tensors, options.resize_images)
+        weights, factors = _used(*split(tensors, scale))
     own = folder / PROCESSOR_FOLDER
-    checkpoint = VlmCheckpoint(config, weights, options.base_model or (own if own.is_dir() else None))
+    checkpoint = VlmCheckpoint(config, weights, factors, options.base_model or (own if own.is_dir() else None))
     checkpoint.check()
     return checkpoint
+
+
+def _has_adapter(folder: Path) -> bool:
+    """Whether the folder's weights are an adapter. Raises CheckpointError if there are whole weights, too."""
+    has_adapter = is_there(folder / ADAPTER_CONFIG)
+    whole = [name for name in (WEIGHTS, WEIGHTS_INDEX) if is_there(folder / name)]
+    if has_adapter and whole:
+        raise CheckpointError(
+            f"{folder}: expected {ADAPTER_WEIGHTS} or whole weights, got both; move {ADAPTER_CONFIG} away to take "
+            f"{whole[0]}, or the other way round"
+        )
+    return has_adapter
 
 
 def _base_of_adapter(folder: Path, run: RunConfig) -> str:
@@ -263,12 +278,18 @@ def _renamed(weights: Mapping[str, Tensor], renames: _Renames) -> dict[str, Tens
     return {rename(name): tensor for name, tensor in weights.items()}
 
 
-def _whole(folder: Path, backbone: Mapping[str, Any], run: RunConfig) -> dict[str, Tensor]:
-    """All weights of the network by name; those of a LoRA adapter are merged into them."""
-    weights = read_weights(folder)
-    if any(LORA_NAME.fullmatch(name) for name in weights):
-        weights = merged(_renamed(weights, _LORA_INSIDE), scaling(run.file, run.sections["peft"]))
-    return _renamed(weights, _renames(backbone["model_type"]))
+def _whole(folder: Path, backbone: Mapping[str, Any], run: RunConfig) -> tuple[dict[str, Tensor], float]:
+    """The weights of the network by name, with LoRA factors if it has some; the scale of these."""
+    tensors, scale = read_weights(folder), 1.0
+    if any(LORA_NAME.fullmatch(name) for name in tensors):
+        tensors, scale = _renamed(tensors, _LORA_INSIDE), scaling(run.file, run.sections["peft"])
+    return _renamed(tensors, _renames(backbone["model_type"])), scale
+
+
+def _used(weights: dict[str, Tensor], factors: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """The weights that a reward is made with, and their LoRA factors."""
+    weights = {name: tensor for name, tensor in weights.items() if name not in _UNUSED}
+    return weights, {name: tensor for name, tensor in factors.items() if changed_by(name) in weights}
 
 
 def _check_layers(config: Any) -> None:
@@ -282,8 +303,8 @@ def _check_layers(config: Any) -> None:
             raise CheckpointError(f"{NETWORK_CONFIG}: {name}: expected at most {MAX_LAYERS}, got {shown(count)}")
 
 
-def _adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Configuration of the base model's backbone, and its weights with the adapter merged into them."""
+def _adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Tensor], float]:
+    """Configuration of the base model's backbone; its weights with those of the adapter; the scale of LoRA factors."""
     adapter_config = read_json(folder / ADAPTER_CONFIG)
     adapter = _renamed(read_tensors(folder / ADAPTER_WEIGHTS), _ADAPTER)
     config, base = _read_base(base_model)
@@ -297,8 +318,8 @@ def _adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, T
             f"{folder / ADAPTER_WEIGHTS}: expected weights of {base_model}, got also {listed(unknown)}"
         )
     config["text_config"]["vocab_size"] = len(replaced[EMBEDDING])
-    whole = merged(base | replaced | factors, scaling(folder / ADAPTER_CONFIG, adapter_config))
-    return config, whole | read_tensors(folder / CUSTOM_HEADS)
+    tensors = base | replaced | factors | read_tensors(folder / CUSTOM_HEADS)
+    return config, tensors, scaling(folder / ADAPTER_CONFIG, adapter_config)
 
 
 def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:

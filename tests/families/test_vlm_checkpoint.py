@@ -63,6 +63,41 @@ def test_saving_and_loading_changes_nothing(tmp_path: Path) -> None:
     assert isinstance(copy, VlmCheckpoint)
     assert copy.config == original.config
     assert all(torch.equal(copy.weights[name], original.weights[name]) for name in original.weights)
+    assert original.factors
+    assert copy.factors.keys() == original.factors.keys()
+    assert all(torch.equal(copy.factors[name], original.factors[name]) for name in original.factors)
+
+
+def test_updates_too_small_for_bfloat16_are_not_lost(copied: Callable[[str], Path], tmp_path: Path) -> None:
+    folder = copied(LORA_INSIDE)
+    tensors = {}
+    for name, tensor in load_file(folder / "model.safetensors").items():
+        is_of_lora = ".lora_" in name
+        tensors[name.replace(".base_model.model.", ".")] = tensor * 3e-3 if is_of_lora else tensor.bfloat16()
+    save_file(tensors, folder / "model.safetensors")
+    load(LORA_INSIDE, folder).save(tmp_path / "saved")
+    exported = families.load(tmp_path / "saved")
+    assert isinstance(exported, VlmCheckpoint)
+    built = exported.build(torch.float32).state_dict()
+    modules = [name.removesuffix(".base_layer.weight") for name in tensors if ".base_layer." in name]
+    for module in modules:
+        base = tensors[f"{module}.base_layer.weight"].double()
+        factor_a, factor_b = (tensors[f"{module}.lora_{side}.default.weight"].double() for side in "AB")
+        update = 8 / 4 * factor_b @ factor_a  # lora_alpha / r of the run
+        assert ((base + update).bfloat16() == base).double().mean() > 0.9  # a sum in bfloat16 is the base alone
+        torch.testing.assert_close(built[f"{module}.weight"].double() - base, update, rtol=1e-2, atol=1e-7)
+    assert len(modules) == 14
+
+
+def test_lora_of_weights_that_make_text_is_not_needed(copied: Callable[[str], Path]) -> None:
+    folder = copied(LORA_INSIDE)
+    tensors = load_file(folder / "model.safetensors")
+    of_head = {"base_layer": (32, 32), "lora_A.default": (4, 32), "lora_B.default": (32, 4)}
+    tensors |= {f"model.lm_head.{name}.weight": torch.ones(shape) for name, shape in of_head.items()}
+    save_file(tensors, folder / "model.safetensors")
+    with_head, original = load(LORA_INSIDE, folder), load(LORA_INSIDE)
+    assert with_head.weights.keys() == original.weights.keys()
+    assert with_head.factors.keys() == original.factors.keys()
 
 
 def test_settings_are_read_from_the_training_run() -> None:
@@ -110,6 +145,16 @@ def drop_first(part: str) -> Callable[[dict[str, Any]], object]:
     return lambda weights: weights.pop(next(name for name in weights if part in name))
 
 
+def cut_first(part: str) -> Callable[[dict[str, Any]], object]:
+    """Takes the last column of the first tensor whose name has ``part``."""
+
+    def cut(weights: dict[str, Any]) -> None:
+        name = next(name for name in weights if part in name)
+        weights[name] = weights[name][:, :-1].contiguous()
+
+    return cut
+
+
 SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "missing and unexpected keys": (
         PLAIN,
@@ -149,7 +194,17 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
     ),
     "LoRA without alpha": (LORA_INSIDE, change_yaml("lora_alpha: 8", "lora_beta: 8"), r"expected lora_alpha and r of the LoRA weights"),
     "half a LoRA pair": (LORA_INSIDE, change_tensors("model.safetensors", drop_first("lora_B")), r"expected a weight and LoRA factors A and B, got \['A'\]"),
+    "LoRA factors of two ranks": (
+        LORA_INSIDE,
+        change_tensors("model.safetensors", cut_first("lora_B")),
+        r"expected LoRA factors of one rank, got \[\d+, 3\] and \[4, \d+\]",
+    ),
     "LoRA of another kind": (ADAPTER, change_adapter(use_dora=True), r"expected plain LoRA, got use_dora"),
+    "an adapter and whole weights": (
+        ADAPTER,
+        lambda folder: save_file({"any": torch.zeros(1)}, folder / "model.safetensors"),
+        r"expected adapter_model\.safetensors or whole weights, got both",
+    ),
     "an adapter without its embedding": (
         ADAPTER,
         change_tensors("adapter_model.safetensors", drop_first("embed_tokens")),
