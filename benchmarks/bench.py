@@ -154,7 +154,6 @@ def checkpoint(size: str, folder: Path, threads: int) -> Checkpoint:
         source, encoders = versions[0] / "checkpoint", (versions[1] / "image_encoder", versions[1] / "text_encoder")
         images, texts = map(str, encoders)
         settings = replace(Config.from_yaml(DEMO / "serve.yaml").export, image_encoder=images, text_encoder=texts)
-        settings = replace(settings, torch_threads=max(1, threads // settings.instances))
     else:
         torch.manual_seed(0)
         source, encoders = folder / size, None

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
@@ -39,7 +40,7 @@ from rfm_client.contract.wire import Tensors
 MS_PER_S = 1e3
 MAX_INT32 = 2**31 - 1
 LONE_ANSWER_S = 50e-3  # an answer that takes longer is worth another thread, so that meanwhile others can be rejected
-CHEAP_ANSWER_S = {"cpu": 2e-3, "cuda": 0.2e-3}  # one that takes less is not worth the time that sending it takes
+CHEAP_ANSWER_S = {"cpu": 5e-3, "cuda": 0.2e-3}  # one that takes less is not worth the time that sending it takes
 
 Question = TypeVar("Question")
 Answer = TypeVar("Answer")
@@ -93,7 +94,6 @@ class BatchModel(Generic[Question, Answer]):
         """
         self._cheap_answer_s = cheap_answer_s
         self._request_s: float | None = None  # what each request of the last group took; None: there was none
-        self.input_names = [spec["name"] for spec in config["input"]]
         bounds = _bounds(config, settings)
         self._max_batch = bounds.batch_samples
         self._patience_s = (int(settings.get(QUEUE_TIMEOUT_PARAMETER) or 0) / MS_PER_S) or None
@@ -154,6 +154,8 @@ class BatchModel(Generic[Question, Answer]):
     def execute(self, requests: Sequence[Any]) -> list[Any] | None:
         """Called by Triton with requests. Gives their responses; None: they are sent as they come."""
         self._self_check.wait_if_ending()
+        if self._are_cheap(requests):  # what is under way is probably cheap, too
+            self._pipeline.wait_for(lambda: self._pipeline.is_idle, LONE_ANSWER_S)
         if self._pipeline.is_idle and self._is_better_at_once(requests):
             return self._responses_of([self._read(inference, later=False) for inference in requests])
         self._quarantine.owe(len(requests))
@@ -170,17 +172,22 @@ class BatchModel(Generic[Question, Answer]):
         """Whether requests are better scored here, while nothing else is, and answered together.
 
         To send a response takes a tenth of a millisecond longer than to give it back, and a lone caller waits for the
-        change of threads. But what is scored here keeps Triton from handing over more. A full batch says that more
-        wait; some of them may have to be rejected.
+        change of threads. But what is scored here keeps Triton from handing over more, and an accelerator waits until
+        it does. A full batch says that more wait; some of them may have to be rejected.
 
         Where the process dies, Triton 2.51 fails the requests of ``execute``, and never those that are to be answered
         later. So all are answered at once while a suspect may kill the process.
         """
         if self._quarantine.has_suspects or self._request_s is None:
             return True
-        if len(requests) >= self._max_batch:
+        is_lone = len(requests) == 1 < self._max_batch and self._request_s < LONE_ANSWER_S
+        return is_lone or self._are_cheap(requests)
+
+    def _are_cheap(self, requests: Sequence[Any]) -> bool:
+        """Whether the answers to requests that are no full batch take little time, each and all together."""
+        if self._request_s is None or len(requests) >= self._max_batch:
             return False
-        return self._request_s < (LONE_ANSWER_S if len(requests) == 1 else self._cheap_answer_s)
+        return self._request_s < self._cheap_answer_s and self._request_s * len(requests) < LONE_ANSWER_S
 
     def _responses_of(self, batch: Sequence[Request[Question]]) -> list[Any]:
         """Scores and encodes the requests here and now."""
@@ -205,7 +212,7 @@ class BatchModel(Generic[Question, Answer]):
         """The first stage: a request whose questions are prepared, or that has an error."""
         request: Request[Question] = Request.of(inference, later=later)
         try:
-            request.read(inference, self.input_names)
+            request.read(inference)
             self._origins.find(request)
             request.questions = self.decode(request.tensors)
             self._quarantine.check(request.digest)
@@ -329,7 +336,8 @@ def _bounds(config: Mapping[str, Any], settings: Mapping[str, str]) -> Bounds:
     batch_samples = max(config["max_batch_size"], 1)
     batch_tokens = int(settings.get(BUDGET_PARAMETER) or MAX_INT32)
     waiting = int(settings.get(QUEUE_SIZE_PARAMETER) or 0) or None
-    return Bounds(batch_samples, batch_tokens, batch_samples, waiting)
+    share = None if waiting is None else math.ceil(waiting / num_instances(config))
+    return Bounds(batch_samples, batch_tokens, batch_samples, share)
 
 
 def _sample_types(input_names: Sequence[str]) -> list[str]:

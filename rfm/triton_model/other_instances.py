@@ -39,15 +39,20 @@ class OtherInstances:
     def wait_for_turn(self, pipeline: Pipeline[Any, Any], max_waiting: int) -> None:
         """Returns when the pipeline should take more requests from Triton.
 
-        That is when it has nothing to do; or when nobody has, and fewer than ``max_waiting`` wait here.
+        That is when it has nothing to do; or when no other has, and fewer than ``max_waiting`` wait here or every other
+        owes as many answers. Then all have enough to do, and what comes is taken, so that it can be rejected.
         """
-        while not pipeline.is_idle and (pipeline.num_waiting >= max_waiting or self._is_one_idle()):
+        while not (pipeline.is_idle or self._are_busy(0 if pipeline.num_waiting < max_waiting else max_waiting)):
             pipeline.wait_for(lambda: pipeline.is_idle, POLL_S)
 
-    def _is_one_idle(self) -> bool:
+    def _are_busy(self, num_owed: int) -> bool:
+        """Whether each of the others is at work, and owes ``num_owed`` answers or more, or is dead."""
         if time.monotonic() - self._looked_s >= LOOK_S:
             self._look()
-        return any(not journal.busy_s and journal.is_alive for journal in self._journals.values())
+        return all(
+            (journal.busy_s and journal.num_owed >= num_owed) or not journal.is_alive
+            for journal in self._journals.values()
+        )
 
     def _look(self) -> None:
         """Finds the journals of instances that were started since, and forgets those that are gone."""

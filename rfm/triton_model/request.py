@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Generic, TypeVar
@@ -107,12 +107,9 @@ class Request(Generic[Question]):
             request.patience_s = timeout_us / US_PER_S
         return request
 
-    def read(self, inference: Any, input_names: Iterable[str]) -> None:
+    def read(self, inference: Any) -> None:
         """Takes the tensors. A request that outlives ``execute`` needs copies: Triton's memory of them need not."""
-        import triton_python_backend_utils as pb_utils
-
-        given = {name: pb_utils.get_input_tensor_by_name(inference, name) for name in input_names}
-        arrays = {name: tensor.as_numpy() for name, tensor in given.items() if tensor is not None}
+        arrays = {tensor.name(): tensor.as_numpy() for tensor in inference.inputs()}
         self.tensors = arrays if self.sender is None else {name: array.copy() for name, array in arrays.items()}
         self.num_samples = len(self.tensors[wire.NUM_FRAMES])
 

@@ -33,9 +33,10 @@ def _sampled(array: npt.NDArray[Any]) -> bytes | memoryview:
     """The content, or blocks of it at even distances."""
     if array.dtype == np.object_:
         return b"\0".join(bytes(item) for item in array.ravel())
-    content = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
-    if content.nbytes <= _SAMPLED_BYTES:
-        return content.data
+    flat = array.ravel()
+    if flat.nbytes <= _SAMPLED_BYTES:
+        return flat.data
+    content = flat.view(np.uint8)
     blocks = content[-(content.nbytes // _BLOCK_BYTES) * _BLOCK_BYTES :].reshape(-1, _BLOCK_BYTES)
     step = -(-len(blocks) * _BLOCK_BYTES // _SAMPLED_BYTES)
     return np.ascontiguousarray(blocks[::step]).data

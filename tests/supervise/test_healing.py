@@ -19,6 +19,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from prometheus_client.parser import text_string_to_metric_families
 
 from clock import Clock
 from one_model import BriefServer, OneModelServer
@@ -396,8 +397,10 @@ def test_starts_that_fail_are_a_crash_loop_however_long_it_ran_before(
         ends.pause_s("it does not start")
 
 
-def test_a_full_queue_refuses_at_once_and_a_long_wait_is_cut_short(tmp_path: Path) -> None:
-    repository = make_repository(tmp_path, more_code=SLOW, batch_size=2, max_queue_size=4, queue_timeout_ms=1500)
+@pytest.mark.parametrize("instances", [1, 2])
+def test_a_full_queue_refuses_at_once_and_a_long_wait_is_cut_short(tmp_path: Path, instances: int) -> None:
+    bounds = {"max_queue_size": 4, "queue_timeout_ms": 1500}
+    repository = make_repository(tmp_path, more_code=SLOW, instances=instances, batch_size=2, **bounds)
     with (
         (tmp_path / "log").open("wb") as log,
         BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
@@ -422,12 +425,21 @@ def test_a_full_queue_refuses_at_once_and_a_long_wait_is_cut_short(tmp_path: Pat
         late = [took_s for took_s, error in outcomes if error is not None and "has waited for longer" in str(error)]
         served = [took_s for took_s, error in outcomes if error is None]
         assert len(full) + len(late) + len(served) == len(outcomes)
-        assert len(full) >= len(outcomes) - 2 - 4 - 2  # one batch is worked on, four wait, and one more batch may begin
+        # Each instance works on a batch, four requests wait, and each instance may begin another batch.
+        assert len(full) >= len(outcomes) - 2 * instances - 4 - 2 * instances
+        wait_for(lambda: rejected(server.endpoints.metrics_url) == len(full) + len(late))
         assert served
         assert max(served) < PATIENCE_S / 4
         assert sorted(full)[len(full) // 2] < max(served)  # they did not wait for anybody
         # Who tries again is served in the end.
         assert [future.result()[1] for future in [pool.submit(ask, patient) for _ in range(12)]] == [None] * 12
+
+
+def rejected(metrics_url: str) -> float:
+    """Samples that a model has counted as rejected."""
+    families = text_string_to_metric_families(httpx.get(metrics_url).text)
+    counted = (sample for family in families if family.name == "rfm_samples" for sample in family.samples)
+    return sum(sample.value for sample in counted if sample.labels.get("outcome") == "rejected")
 
 
 def test_a_journal_outlives_its_process_and_tells_what_it_was_working_on(tmp_path: Path) -> None:

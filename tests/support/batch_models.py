@@ -13,6 +13,7 @@ from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from rfm.execution import Execution
@@ -43,9 +44,24 @@ CONFIG = {
         {"name": "text_embedding", "dims": [WIDTHS[1]]},
     ],
     "max_batch_size": 8,
+    "instance_group": [{"count": 1}],
 }
 FINAL = 1  # what Triton wants with the last response to a request
 REFUSED, BREAKS, FAILS = 2, 3, 4  # numbers of frames that the model below cannot bear
+
+
+@dataclass
+class Tensor:
+    """An input, as Triton hands it over."""
+
+    its_name: str
+    array: npt.NDArray[Any]
+
+    def name(self) -> str:
+        return self.its_name
+
+    def as_numpy(self) -> npt.NDArray[Any]:
+        return self.array
 
 
 @dataclass
@@ -60,6 +76,9 @@ class Request:
 
     def request_id(self) -> str:
         return self.id
+
+    def inputs(self) -> list[Tensor]:
+        return [Tensor(name, array) for name, array in self.tensors.items()]
 
     def requested_output_names(self) -> list[str]:
         return ["progress"]
@@ -87,7 +106,13 @@ class Response:
 class Model(BatchModel[Sample, Result]):
     """Scores each frame with how many there are."""
 
-    def __init__(self, folder: Path, warmups: int = 0, settings: Mapping[str, str] = MappingProxyType({})) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        warmups: int = 0,
+        settings: Mapping[str, str] = MappingProxyType({}),
+        num_instances: int = 1,
+    ) -> None:
         self.counted: list[Counted] = []
         self.at_work: list[int] = []
         self.batches: list[int] = []
@@ -99,7 +124,8 @@ class Model(BatchModel[Sample, Result]):
             report_batch=lambda batch, error: self.logged.append(f"{len(batch)}: {error}"),
             report_end=lambda error: self.logged.append(f"ended: {error}"),
         )
-        self.start(CONFIG | {"model_warmup": [{"count": 1}] * warmups}, settings)
+        instances = {"instance_group": [{"count": num_instances}]}
+        self.start(CONFIG | instances | {"model_warmup": [{"count": 1}] * warmups}, settings)
 
     def respond(self, requests: Sequence[Request]) -> list[Response]:
         """What becomes of requests of which Triton hands over all at once."""
@@ -146,9 +172,6 @@ class Model(BatchModel[Sample, Result]):
 
 @pytest.fixture(autouse=True)
 def backend(monkeypatch: pytest.MonkeyPatch) -> None:
-    def tensor_of(request: Request, name: str) -> Any:
-        return SimpleNamespace(as_numpy=lambda: request.tensors[name])
-
     def error_of(message: str, code: str) -> tuple[str, str]:
         return code, message
 
@@ -156,7 +179,6 @@ def backend(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, code in codes.items():
         setattr(error_of, name, code)
     module = SimpleNamespace(
-        get_input_tensor_by_name=tensor_of,
         InferenceResponse=Response,
         TritonError=error_of,
         Tensor=lambda name, array: (name, array.tolist()),

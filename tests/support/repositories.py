@@ -26,11 +26,10 @@ def forget_input(repository: Path, model: str, name: str) -> None:
 
 
 def configure(model: Path, *, instances: int = 1, batch_size: int = 64, **parameters: int) -> None:
-    """Changes an exported model's configuration: one instance, or ``instances``, whose queue Triton does not bound."""
+    """Changes an exported model's configuration: the number of ``instances``, and parameters."""
     file = model / CONFIG_FILE
     config = parse(file.read_text())
     config.instance_group[0].count, config.max_batch_size = instances, batch_size
-    config.dynamic_batching.ClearField("default_queue_policy")
     for name, value in parameters.items():
         assert name in config.parameters
         config.parameters[name].string_value = str(value)
@@ -38,7 +37,7 @@ def configure(model: Path, *, instances: int = 1, batch_size: int = 64, **parame
 
 
 def bound_triton_s_queue(model: Path, size: int) -> None:
-    """Changes an exported model's configuration: Triton lets so many requests wait, as for several instances."""
+    """Changes an exported model's configuration: Triton lets so many requests wait, as in older exports."""
     file = model / CONFIG_FILE
     config = parse(file.read_text())
     config.dynamic_batching.default_queue_policy.max_queue_size = size

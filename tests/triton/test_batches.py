@@ -21,7 +21,7 @@ from rfm.execution import Execution
 from rfm.journal import Journal
 from rfm.probe import blank_question
 from rfm.steps import one_step_further
-from rfm.triton_model import self_check
+from rfm.triton_model import batch_model, self_check
 from rfm.triton_model.quarantine import Quarantine
 from rfm.triton_model.request_digest import digest
 from rfm_client import (
@@ -65,9 +65,11 @@ def test_cheap_answers_are_given_together_unless_more_wait(tmp_path: Path) -> No
 class Gate(Model):
     """Answers when it may."""
 
-    def __init__(self, folder: Path, settings: Mapping[str, str] = MappingProxyType({})) -> None:
+    def __init__(
+        self, folder: Path, settings: Mapping[str, str] = MappingProxyType({}), num_instances: int = 1
+    ) -> None:
         self.may_answer = threading.Event()
-        super().__init__(folder, settings=settings)
+        super().__init__(folder, settings=settings, num_instances=num_instances)
         self._request_s = 1.0  # so long that others are taken in meanwhile
 
     def answer(self, questions: Sequence[Sample], execution: Execution) -> list[Result | RewardError]:
@@ -103,6 +105,41 @@ def test_what_finds_no_room_is_rejected_at_once_and_counted(tmp_path: Path) -> N
     assert probe.responses == []  # it waits like those that were in time
     model.open(*first, probe)
     assert model.samples == {("progress", "scored"): 3, ("progress", "rejected"): 1}
+
+
+def test_several_instances_share_the_bound_of_what_may_wait(tmp_path: Path) -> None:
+    model = Gate(tmp_path, {"max_queue_size": "3"}, num_instances=2)
+    scored, *waiting = requests = [request(count) for count in (1, 5, 6, 7)]
+    model.take([scored])
+    wait_for(lambda: model._pipeline.num_waiting == 0)
+    model.take(waiting)
+    assert [len(each.responses) for each in waiting] == [0, 0, 1]
+    model.open(*requests)
+
+
+def test_cheap_requests_wait_for_what_is_under_way_and_are_answered_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else they would be sent one by one for as long as there is always something under way."""
+    model = Gate(tmp_path)
+    first, cheap = request(1), [request(5), request(6)]
+    model.take([first])
+    wait_for(lambda: model._pipeline._is_scoring)
+    monkeypatch.setattr(batch_model, "LONE_ANSWER_S", PATIENCE_S)
+    model._cheap_answer_s = PATIENCE_S
+    with ThreadPoolExecutor(1) as pool:
+        answered = pool.submit(model.execute, cheap)
+        assert not answered.done()
+        model.may_answer.set()
+        responses = answered.result(PATIENCE_S)
+    assert responses is not None and len(responses) == 2
+    assert model.batches == [1, 2]
+
+
+def test_cheap_requests_that_take_long_together_are_sent_as_they_come(tmp_path: Path) -> None:
+    model = Model(tmp_path)
+    model._request_s = batch_model.LONE_ANSWER_S / 7
+    assert model.execute([request(5) for _ in range(7)]) is None
 
 
 @pytest.mark.parametrize(("settings", "timeout_us"), [({"queue_timeout_ms": "20"}, 0), ({}, 20_000)])

@@ -72,6 +72,17 @@ def test_where_all_are_busy_a_batch_is_taken_ahead_and_no_more(busy: Instance) -
         waiting.result(PATIENCE_S)
 
 
+def test_where_all_have_enough_to_do_more_is_taken(busy: Instance) -> None:
+    """So that what is too much can be rejected."""
+    busy.pipeline.put([Job(), Job()])
+    with busy.other.at_work_on([NO_DIGEST]), ThreadPoolExecutor(1) as pool:
+        busy.other.owe(MAX_WAITING - 1)
+        waiting = pool.submit(busy.wait)
+        assert not busy.pipeline.wait_for(waiting.done, 0.1)
+        busy.other.owe(1)
+        waiting.result(PATIENCE_S)
+
+
 def test_an_idle_instance_waits_for_nobody(busy: Instance) -> None:
     busy.may_score.set()
     assert busy.pipeline.wait_for(lambda: busy.pipeline.is_idle, PATIENCE_S)

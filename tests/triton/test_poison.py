@@ -22,7 +22,7 @@ import pytest
 import goldens
 import rfm.journal
 import rfm_export
-from batch_models import CONFIG, WIDTHS
+from batch_models import CONFIG, WIDTHS, Tensor
 from engines import load_engine, serve_config
 from rfm.execution import Execution
 from rfm.journal import Journal, journal_file, journal_files
@@ -194,6 +194,9 @@ class Request:
     def request_id(self) -> str:
         return self.id
 
+    def inputs(self) -> list[Tensor]:
+        return [Tensor(name, array) for name, array in self.tensors.items()]
+
     def requested_output_names(self) -> list[str]:
         return []
 
@@ -242,13 +245,8 @@ class Model(BatchModel[Sample, Result]):
 
 @pytest.fixture
 def backend(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What of Triton's module a model needs to read a request and to refuse it."""
-
-    def tensor_of(request: Request, name: str) -> Any:
-        return SimpleNamespace(as_numpy=lambda: request.tensors[name])
-
+    """What of Triton's module a model needs to refuse a request."""
     module = SimpleNamespace(
-        get_input_tensor_by_name=tensor_of,
         InferenceResponse=lambda error: error,
         TritonError=TritonError,
         TRITONSERVER_RESPONSE_COMPLETE_FINAL=1,

@@ -137,15 +137,22 @@ def test_triton_says_so_in_these_words(asked: Triton, name: str) -> None:
 
 
 SLOW = answering_after(0.3)
-FULL = {"the model": (1, triton.QUEUE_FULL), "Triton, of several instances": (2, triton.TRITON_QUEUE_FULL)}
+SCORED_IN_EXECUTE = "\nTritonPythonModel._is_better_at_once = lambda self, requests: True\n"  # so Triton's queue fills
+FULL = {
+    "the model": (1, triton.QUEUE_FULL),
+    "the model, of several instances": (2, triton.QUEUE_FULL),
+    "Triton, as of older exports": (2, triton.TRITON_QUEUE_FULL),
+}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FULL)
 def test_a_full_queue_says_so_in_these_words(tmp_path: Path, protocol: str, name: str) -> None:
     instances, phrase = FULL[name]
-    repository = make_repository(tmp_path, more_code=SLOW, instances=instances, batch_size=1, max_queue_size=1)
-    if instances > 1:
+    of_triton = phrase == triton.TRITON_QUEUE_FULL
+    code = SLOW + (SCORED_IN_EXECUTE if of_triton else "")
+    repository = make_repository(tmp_path, more_code=code, instances=instances, batch_size=1, max_queue_size=1)
+    if of_triton:
         bound_triton_s_queue(repository / "rfm", 1)
     with (
         (tmp_path / "tritonserver.log").open("wb") as log,

@@ -423,7 +423,7 @@ def _unpadded(tensors: Mapping[str, npt.NDArray[Any]], name: str, row: int, tota
     positions: npt.NDArray[Any] = tensors[name][row]
     if total > len(positions):
         raise InvalidSampleError.at(NUM_FRAMES, f"at most the {len(positions)} frames in {name}", str(total))
-    if positions[total:].any():
+    if total < len(positions) and positions[total:].any():
         raise InvalidSampleError.at(name, f"zeros behind the {total} frames that num_frames tells", "other values")
     return positions[:total]
 
