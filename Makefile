@@ -56,7 +56,7 @@ bench-full: $(INSTALLED)
 
 # Measure with Triton's own perf_analyzer, checkpoints of both sizes.
 perf: $(INSTALLED)
-	$(BIN)/python benchmarks/perf_analyzer.py --size small
+	$(BIN)/python benchmarks/perf_analyzer.py --size small --poisson 0.2
 	$(BIN)/python benchmarks/perf_analyzer.py --size default
 
 # Cause faults while callers ask, ten minutes.

@@ -80,8 +80,11 @@ class BareEngine:
         config = self.engine.predictor.network.config
         self.widths = config.video_feature_dim, config.text_feature_dim
 
-    def measure(self, load: Load, batch_size: int) -> Measured:
-        """One batch after the other, of the load's samples."""
+    def measure(self, load: Load, batch_size: int, pause_s: float = 0.0) -> Measured:
+        """One batch after the other, of the load's samples.
+
+        pause_s: between two batches, as a server has them while a lone caller's requests and answers are on their way
+        """
         asked = samples(load, *self.widths)
         for _ in range(WARM_UPS):
             self.engine.evaluate([asked[i % len(asked)] for i in range(batch_size)])
@@ -93,6 +96,7 @@ class BareEngine:
             before_s = time.perf_counter()
             self.engine.evaluate(batch)
             latencies_s.append(time.perf_counter() - before_s)
+            time.sleep(pause_s)
         took_s = time.perf_counter() - started_s
         rate = len(latencies_s) * batch_size / took_s
         in_order = sorted(latencies_s)

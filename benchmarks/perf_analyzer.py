@@ -42,6 +42,7 @@ KINDS = {
     "all types, 1 to 16 frames": Load(1, SECONDS, (1, 16), mixed=True),
 }
 US_PER_MS = 1e3
+US_PER_S = 1e6
 
 
 def main() -> None:
@@ -74,7 +75,8 @@ def main() -> None:
                     ceiling = max(bare.measure(load, size).samples_per_s for size in (8, 32))
                     file = output / f"{_file_name(kind)}_{_file_name(name)}.csv"
                     of_run = _run([*command, *options], file, environment)
-                    rows.append((kind, name, *_cells(of_run, ceiling, callers.measure(asked).samples_per_s)))
+                    cells = _cells(of_run, ceiling, callers.measure(asked).samples_per_s)
+                    rows.append((kind, name, *cells, _over_bare(of_run, bare, asked)))
     columns = (
         "requests",
         "load",
@@ -82,6 +84,7 @@ def main() -> None:
         "of the bare engine",
         "of our generator",
         *("p50 ms", "p99 ms", "queue ms", "compute ms"),
+        "p50 over the bare engine's, ms",
     )
     console = Console(width=150, record=True)
     console.print(table(f"perf_analyzer, {arguments.size} checkpoint", columns, rows))
@@ -120,6 +123,15 @@ def _cells(measured: Mapping[str, str], ceiling: float, by_our_generator: float)
     times_us = [float(measured[name]) for name in ("p50 latency", "p99 latency", "Server Queue")]
     ratios = (rate / ceiling, rate / by_our_generator)
     return (f"{rate:.0f}", *(f"{r:.2f}" for r in ratios), *(f"{us / US_PER_MS:.1f}" for us in (*times_us, compute_us)))
+
+
+def _over_bare(measured: Mapping[str, str], bare: BareEngine, load: Load) -> str:
+    """Of a lone caller: how much longer it waits than the bare engine takes, with the same pauses between samples."""
+    if load.callers != 1:
+        return ""
+    p50_us = float(measured["p50 latency"])
+    pause_us = max(p50_us - float(measured["Server Compute Infer"]), 0.0)
+    return f"{p50_us / US_PER_MS - bare.measure(load, 1, pause_us / US_PER_S).p50_ms:.1f}"
 
 
 def _program(given: Path | None, folder: Path) -> tuple[Path, dict[str, str]]:
