@@ -83,7 +83,10 @@ class Sweep:
         return fastest.setting if best.samples_per_s < AS_FAST * fastest.samples_per_s else best.setting
 
     def _instances(self) -> list[Setting]:
-        """The settings to try: on a GPU a few instances; on the CPU as many as share its cores evenly."""
+        """The settings to try: on a GPU a few instances; on the CPU as many as share its cores evenly, and one thread.
+
+        One thread scores a small network as fast as several do, and leaves the other cores to Triton and the callers.
+        """
         batched = [config for config in _configs(self.repository).values() if config.instance_group]
         if not batched:
             raise ExportError(f"{self.repository}: expected an exported repository, got no model of one")
@@ -92,7 +95,8 @@ class Sweep:
             threads = int(batched[0].parameters[THREADS_PARAMETER].string_value)
             return [Setting(count, threads, batch_size) for count in INSTANCES_PER_GPU]
         cores = len(os.sched_getaffinity(0))
-        return [Setting(count, cores // count, batch_size) for count in (1 << n for n in range(cores.bit_length()))]
+        shares = [Setting(count, cores // count, batch_size) for count in (1 << n for n in range(cores.bit_length()))]
+        return list(dict.fromkeys([*shares, Setting(1, 1, batch_size)]))
 
     def _trials(self, settings: Sequence[Setting]) -> list[Trial]:
         """What each setting gave. They are measured in rounds, so that a machine that drifts affects all alike."""

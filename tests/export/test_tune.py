@@ -60,6 +60,7 @@ def test_every_setting_is_served_and_measured(repository: Path, monkeypatch: pyt
     best = Sweep(repository, "rfm", callers=4, seconds=0.3, rounds=1, report=told.append).best()
     cores = len(os.sched_getaffinity(0))
     settings = [Setting(count, cores // count, 64) for count in (1, 2, 4, 8, 16, 32, 64) if count <= cores]
+    settings += [Setting(1, 1, 64)] if cores > 1 else []
     assert best in [*settings, *(Setting(s.instances, s.torch_threads, 8) for s in settings)]
     assert len(told) == len(settings) + 1  # of the two batch sizes one is the repository's
     assert {file: file.read_bytes() for file in repository.rglob("*") if file.is_file()} == before

@@ -56,6 +56,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "rfm/families.py": ("test_checkpoint", "test_family", "test_vlm", "test_vlm_checkpoint"),
     "rfm/predictor.py": ("test_rewind", "test_vlm"),
     "rfm/embedding.py": ("test_encoders",),
+    "rfm/feature_cache.py": ("test_feature_cache", "test_shot_cache"),
     "rfm/checkpoint/digest.py": ("test_export",),
     "rfm/checkpoint/*.py": (
         "test_checkpoint",
@@ -66,6 +67,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     ),
     "client/rfm_client/contract/wire.py": ("test_wire", "test_samples", "test_properties"),
     "rfm/triton_model/batch_model.py": ("test_batch_model", "test_batches", "test_poison", "test_logs"),
+    "rfm/triton_model/other_instances.py": ("test_other_instances",),
     "rfm/triton_model/cancellation.py": ("test_batch_model", "test_batches"),
     "rfm/triton_model/request.py": ("test_batch_model", "test_batches", "test_poison"),
     "rfm/supervise/model_states.py": ("test_model_states",),
