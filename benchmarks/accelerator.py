@@ -64,7 +64,7 @@ def load(self, version, device, settings):
 
 def start(self, *arguments, **options):
     _start(self, *arguments, **options)
-    self._cheap_answer_s = {cheap_answer_s}  # an accelerator's: while it computes, the CPU is free
+    self._cheap_answer_s, self._is_on_cpu = {cheap_answer_s}, False  # while an accelerator computes, the CPU is free
 
 
 TritonPythonModel.load, TritonPythonModel.start = load, start

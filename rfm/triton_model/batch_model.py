@@ -39,7 +39,7 @@ from rfm_client.contract.wire import Tensors
 
 MS_PER_S = 1e3
 MAX_INT32 = 2**31 - 1
-LONE_ANSWER_S = 50e-3  # an answer that takes longer is worth another thread, so that meanwhile others can be rejected
+AT_ONCE_S = 50e-3  # what takes longer is done by another thread, so that meanwhile others can be rejected
 CHEAP_ANSWER_S = {"cpu": 5e-3, "cuda": 0.2e-3}  # one that takes less is not worth the time that sending it takes
 
 Question = TypeVar("Question")
@@ -74,8 +74,7 @@ class BatchModel(Generic[Question, Answer]):
         capacity = max(config["max_batch_size"], 1)
         self._quarantine = Quarantine.of_this_process(args["model_name"], capacity, num_preparing)
         other_instances = OtherInstances.of_this_process(args["model_name"]) if num_instances(config) > 1 else None
-        cheap_answer_s = CHEAP_ANSWER_S[placement.device.type]
-        self.start(config, settings, other_instances, placement.apply, cheap_answer_s, num_preparing)
+        self.start(config, settings, other_instances, placement.apply, placement.device.type, num_preparing)
 
     def start(
         self,
@@ -83,19 +82,20 @@ class BatchModel(Generic[Question, Answer]):
         settings: Mapping[str, str],
         other_instances: OtherInstances | None = None,
         begin: Callable[[], None] = lambda: None,
-        cheap_answer_s: float = CHEAP_ANSWER_S["cpu"],
+        device: str = "cpu",
         num_preparing: int = 0,
     ) -> None:
         """Begins to take requests. Weights, log, metrics and quarantine are there.
 
         begin: called in the thread that scores
-        cheap_answer_s: answers that take less are given together
+        device: type of the one that computes; answers that are cheap there are given together
         num_preparing: threads that work ahead
         """
-        self._cheap_answer_s = cheap_answer_s
-        self._request_s: float | None = None  # what each request of the last group took; None: there was none
+        self._cheap_answer_s, self._is_on_cpu = CHEAP_ANSWER_S[device], device == "cpu"
+        self._sample_s: float | None = None  # what each sample of the last group took; None: there was none
         bounds = _bounds(config, settings)
         self._max_batch = bounds.batch_samples
+        self._max_ahead = min(self._max_batch, bounds.waiting_jobs or self._max_batch)
         self._patience_s = (int(settings.get(QUEUE_TIMEOUT_PARAMETER) or 0) / MS_PER_S) or None
         self._cancellation = Cancellation()
         self._self_check = SelfCheck(self._score_blank, self._log.report_end)
@@ -154,21 +154,26 @@ class BatchModel(Generic[Question, Answer]):
     def execute(self, requests: Sequence[Any]) -> list[Any] | None:
         """Called by Triton with requests. Gives their responses; None: they are sent as they come."""
         self._self_check.wait_if_ending()
-        if self._are_cheap(requests):  # what is under way is probably cheap, too
-            self._pipeline.wait_for(lambda: self._pipeline.is_idle, LONE_ANSWER_S)
-        if self._pipeline.is_idle and self._is_better_at_once(requests):
-            return self._responses_of([self._read(inference, later=False) for inference in requests])
-        self._quarantine.owe(len(requests))
-        batch = [self._read(inference, later=True) for inference in requests]
+        batch = [self._received(inference) for inference in requests]
+        if self._is_on_cpu and self._are_cheap(batch, self._pipeline.num_waiting):
+            self._pipeline.wait_for(lambda: self._pipeline.is_idle, AT_ONCE_S)
+        if self._pipeline.is_idle and self._is_better_at_once(batch):
+            for request in batch:
+                self._read(request)
+            return self._responses_of(batch)
+        self._quarantine.owe(len(batch))
+        for request, inference in zip(batch, requests, strict=True):
+            request.outlive(inference)
+            self._read(request)
         failed = [request for request in batch if request.error is not None]
         failed += self._put([request for request in batch if request.error is None])
         if failed:
             self._send(failed, [(failed, Execution())])
         if self._other_instances is not None:
-            self._other_instances.wait_for_turn(self._pipeline, self._max_batch)
+            self._other_instances.wait_for_turn(self._pipeline, self._max_ahead)
         return None
 
-    def _is_better_at_once(self, requests: Sequence[Any]) -> bool:
+    def _is_better_at_once(self, batch: Sequence[Request[Question]]) -> bool:
         """Whether requests are better scored here, while nothing else is, and answered together.
 
         To send a response takes a tenth of a millisecond longer than to give it back, and a lone caller waits for the
@@ -178,16 +183,20 @@ class BatchModel(Generic[Question, Answer]):
         Where the process dies, Triton 2.51 fails the requests of ``execute``, and never those that are to be answered
         later. So all are answered at once while a suspect may kill the process.
         """
-        if self._quarantine.has_suspects or self._request_s is None:
+        if self._quarantine.has_suspects or self._sample_s is None:
             return True
-        is_lone = len(requests) == 1 < self._max_batch and self._request_s < LONE_ANSWER_S
-        return is_lone or self._are_cheap(requests)
+        return self._take_less(batch, AT_ONCE_S) if len(batch) == 1 else self._are_cheap(batch)
 
-    def _are_cheap(self, requests: Sequence[Any]) -> bool:
-        """Whether the answers to requests that are no full batch take little time, each and all together."""
-        if self._request_s is None or len(requests) >= self._max_batch:
+    def _are_cheap(self, batch: Sequence[Request[Question]], num_waiting: int = 0) -> bool:
+        """Whether the answers take little time, each, and all together with those to ``num_waiting`` other requests."""
+        return self._take_less(batch, min(AT_ONCE_S, self._cheap_answer_s * len(batch)), num_waiting)
+
+    def _take_less(self, batch: Sequence[Request[Question]], limit_s: float, num_waiting: int = 0) -> bool:
+        """Whether requests that are no full batch probably take less than ``limit_s``, and with others AT_ONCE_S."""
+        num_samples, most = sum(each.num_samples for each in batch), max(each.num_samples for each in batch)
+        if self._sample_s is None or num_samples + most > self._max_batch:  # one more like them would not fit
             return False
-        return self._request_s < self._cheap_answer_s and self._request_s * len(requests) < LONE_ANSWER_S
+        return self._sample_s * num_samples < limit_s and self._sample_s * (num_samples + num_waiting) < AT_ONCE_S
 
     def _responses_of(self, batch: Sequence[Request[Question]]) -> list[Any]:
         """Scores and encodes the requests here and now."""
@@ -208,11 +217,20 @@ class BatchModel(Generic[Question, Answer]):
             request.error = RejectedError(f"{QUEUE_FULL}: {self._pipeline.num_waiting} requests wait already")
         return rejected
 
-    def _read(self, inference: Any, *, later: bool) -> Request[Question]:
-        """The first stage: a request whose questions are prepared, or that has an error."""
-        request: Request[Question] = Request.of(inference, later=later)
+    def _received(self, inference: Any) -> Request[Question]:
+        """A request with its tensors, or with an error."""
+        request: Request[Question] = Request.of(inference)
         try:
-            request.read(inference)
+            request.receive(inference)
+        except Exception as error:  # noqa: BLE001  whatever went wrong with it costs no other its answer
+            request.fail(error)
+        return request
+
+    def _read(self, request: Request[Question]) -> None:
+        """The first stage: the request's questions are prepared, or it has an error."""
+        if request.error is not None:
+            return
+        try:
             self._origins.find(request)
             request.questions = self.decode(request.tensors)
             self._quarantine.check(request.digest)
@@ -221,7 +239,6 @@ class BatchModel(Generic[Question, Answer]):
             request.error = error
         except Exception as error:  # noqa: BLE001  whatever went wrong with it costs no other its answer
             request.fail(error)
-        return request
 
     def _prepare(self, request: Request[Question]) -> None:
         """Prepares the questions of a request, or notes the first error, located in it."""
@@ -279,7 +296,7 @@ class BatchModel(Generic[Question, Answer]):
             with self._quarantine.at_work_on([request.digest for request in group]):
                 answers = iter(self.answer(questions, execution))
             took_s = time.perf_counter() - started_s
-            self._request_s, self._cancellation.answer_s = took_s / len(group), took_s / len(questions)
+            self._sample_s = self._cancellation.answer_s = took_s / len(questions)
             for request in group:
                 request.answers = [next(answers) for _ in request.prepared]
                 request.error = _first_error(request.answers)
@@ -336,7 +353,8 @@ def _bounds(config: Mapping[str, Any], settings: Mapping[str, str]) -> Bounds:
     batch_samples = max(config["max_batch_size"], 1)
     batch_tokens = int(settings.get(BUDGET_PARAMETER) or MAX_INT32)
     waiting = int(settings.get(QUEUE_SIZE_PARAMETER) or 0) or None
-    share = None if waiting is None else math.ceil(waiting / num_instances(config))
+    # An idle instance, to which Triton hands a full batch, has room for it.
+    share = None if waiting is None else max(math.ceil(waiting / num_instances(config)), min(waiting, batch_samples))
     return Bounds(batch_samples, batch_tokens, batch_samples, share)
 
 

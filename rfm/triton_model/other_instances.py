@@ -15,6 +15,7 @@ from rfm.triton_model.pipeline import Pipeline
 from rfm.triton_model.quarantine import all_journals, own_journal
 
 POLL_S = 2e-3  # between two questions whether another instance is idle, while this instance computes
+LONG_S = 0.1  # one that has worked on a batch for so long takes nothing from Triton soon, whatever it owes
 LOOK_S = 1.0  # between two looks for other instances: they come and go with a load
 
 
@@ -39,20 +40,18 @@ class OtherInstances:
     def wait_for_turn(self, pipeline: Pipeline[Any, Any], max_waiting: int) -> None:
         """Returns when the pipeline should take more requests from Triton.
 
-        That is when it has nothing to do; or when no other has, and fewer than ``max_waiting`` wait here or every other
-        owes as many answers. Then all have enough to do, and what comes is taken, so that it can be rejected.
+        That is when it has nothing to do; or when no other has, and fewer than ``max_waiting`` requests wait here or
+        none of the others has less to do. Then somebody must take what comes, so that it can be rejected.
         """
-        while not (pipeline.is_idle or self._are_busy(0 if pipeline.num_waiting < max_waiting else max_waiting)):
+        while not (pipeline.is_idle or self._are_busy(pipeline.num_waiting, max_waiting)):
             pipeline.wait_for(lambda: pipeline.is_idle, POLL_S)
 
-    def _are_busy(self, num_owed: int) -> bool:
-        """Whether each of the others is at work, and owes ``num_owed`` answers or more, or is dead."""
+    def _are_busy(self, num_waiting: int, max_waiting: int) -> bool:
+        """Whether each of the others is at work, with as much to do as ``num_waiting`` from ``max_waiting`` on."""
         if time.monotonic() - self._looked_s >= LOOK_S:
             self._look()
-        return all(
-            (journal.busy_s and journal.num_owed >= num_owed) or not journal.is_alive
-            for journal in self._journals.values()
-        )
+        enough = 0 if num_waiting < max_waiting else num_waiting
+        return all(_has(journal, enough) or not journal.is_alive for journal in self._journals.values())
 
     def _look(self) -> None:
         """Finds the journals of instances that were started since, and forgets those that are gone."""
@@ -63,3 +62,9 @@ class OtherInstances:
         for file in files - self._journals.keys():
             if (journal := Journal.open(file)) is not None:
                 self._journals[file] = journal
+
+
+def _has(journal: Journal, num_owed: int) -> bool:
+    """Whether an instance is at work, and owes so many answers or has worked for long."""
+    busy_s = journal.busy_s
+    return busy_s > 0 and (journal.num_owed >= num_owed or busy_s >= LONG_S)

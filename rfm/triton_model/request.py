@@ -66,8 +66,8 @@ class Request(Generic[Question]):
 
     request_id: the id that the client chose; empty if it chose none
     outputs: names of the outputs that the client wants
-    sender: Triton's, which takes the response; None: ``execute`` gives it back
     is_cancelled: asks Triton whether the client has cancelled
+    sender: Triton's, which takes the response; None: ``execute`` gives it back
     arrived_s: by time.monotonic, when the model got it
     waited_s: seconds from then until its turn
     patience_s: seconds that it may wait for its turn; None: any time
@@ -82,8 +82,8 @@ class Request(Generic[Question]):
 
     request_id: str
     outputs: Collection[str]
-    sender: Any
     is_cancelled: Callable[[], bool]
+    sender: Any = None
     arrived_s: float = field(default_factory=time.monotonic)
     waited_s: float = 0.0
     patience_s: float | None = None
@@ -98,20 +98,23 @@ class Request(Generic[Question]):
     error: Exception | None = None
 
     @classmethod
-    def of(cls, inference: Any, *, later: bool) -> Request[Question]:
-        """What Triton hands over as ``inference``, without its tensors. ``later``: it is answered after ``execute``."""
-        sender = inference.get_response_sender() if later else None
-        asked = sender or inference
-        request = cls(inference.request_id(), inference.requested_output_names(), sender, asked.is_cancelled)
+    def of(cls, inference: Any) -> Request[Question]:
+        """What Triton hands over as ``inference``, without its tensors."""
+        request = cls(inference.request_id(), inference.requested_output_names(), inference.is_cancelled)
         if timeout_us := inference.timeout():
             request.patience_s = timeout_us / US_PER_S
         return request
 
-    def read(self, inference: Any) -> None:
-        """Takes the tensors. A request that outlives ``execute`` needs copies: Triton's memory of them need not."""
-        arrays = {tensor.name(): tensor.as_numpy() for tensor in inference.inputs()}
-        self.tensors = arrays if self.sender is None else {name: array.copy() for name, array in arrays.items()}
+    def receive(self, inference: Any) -> None:
+        """Takes the tensors, which are views of Triton's memory."""
+        self.tensors = {tensor.name(): tensor.as_numpy() for tensor in inference.inputs()}
         self.num_samples = len(self.tensors[wire.NUM_FRAMES])
+
+    def outlive(self, inference: Any) -> None:
+        """Makes it a request that is answered after ``execute``, when Triton's memory of its tensors may be gone."""
+        self.sender = inference.get_response_sender()
+        self.is_cancelled = self.sender.is_cancelled
+        self.tensors = {name: array.copy() for name, array in self.tensors.items()}
 
     def begin(self) -> None:
         """Notes that its turn has come."""

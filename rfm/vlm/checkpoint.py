@@ -51,6 +51,7 @@ from rfm.vlm.run_config import RunConfig
 ADAPTER_CONFIG = "adapter_config.json"
 ADAPTER_WEIGHTS = "adapter_model.safetensors"
 CUSTOM_HEADS = "custom_heads.safetensors"
+LORA = "lora"  # in VlmCheckpoint.parts: the factors that change the network's weights
 SETTINGS = "rfm"  # key of our own fields in an exported config.json
 EMBEDDING = "model.language_model.embed_tokens.weight"
 
@@ -100,7 +101,7 @@ class VlmCheckpoint:
     @property
     def parts(self) -> dict[str, dict[str, Tensor]]:
         """All weights: the network's, and the LoRA factors that change them."""
-        return {NETWORK: self.weights, "lora": self.factors}
+        return {NETWORK: self.weights, LORA: self.factors}
 
     @cached_property
     def collator(self) -> VlmCollator:
@@ -171,7 +172,7 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
         backbone = {} if is_adapter else read_json(folder / NETWORK_CONFIG)
         if SETTINGS in backbone:  # written by VlmCheckpoint.save, with every setting
             config = _saved_config(backbone)
-            tensors, scale = _renamed(read_weights(folder), _renames(config.family)), 1.0
+            weights, factors = _used(_renamed(read_weights(folder), _renames(config.family)))
         else:
             run = RunConfig.of(folder)
             run.check_model_type()
@@ -180,8 +181,8 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
                 backbone, tensors, scale = _adapted(folder, options.base_model or _base_of_adapter(folder, run))
             else:
                 tensors, scale = _whole(folder, backbone, run)
-            config = _trained_config(folder, backbone, run, tensors, options.resize_images)
-        weights, factors = _used(*split(tensors, scale))
+            weights, factors = _used(tensors, scale)
+            config = _trained_config(folder, backbone, run, weights, options.resize_images)
     own = folder / PROCESSOR_FOLDER
     checkpoint = VlmCheckpoint(config, weights, factors, options.base_model or (own if own.is_dir() else None))
     checkpoint.check()
@@ -194,8 +195,8 @@ def _has_adapter(folder: Path) -> bool:
     whole = [name for name in (WEIGHTS, WEIGHTS_INDEX) if is_there(folder / name)]
     if has_adapter and whole:
         raise CheckpointError(
-            f"{folder}: expected {ADAPTER_WEIGHTS} or whole weights, got both; move {ADAPTER_CONFIG} away to take "
-            f"{whole[0]}, or the other way round"
+            f"{folder}: expected an adapter ({ADAPTER_CONFIG}) or whole weights ({whole[0]}), got both; move away the "
+            "one that is not meant"
         )
     return has_adapter
 
@@ -286,8 +287,9 @@ def _whole(folder: Path, backbone: Mapping[str, Any], run: RunConfig) -> tuple[d
     return _renamed(tensors, _renames(backbone["model_type"])), scale
 
 
-def _used(weights: dict[str, Tensor], factors: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """The weights that a reward is made with, and their LoRA factors."""
+def _used(tensors: Mapping[str, Tensor], scale: float = 1.0) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """The weights that a reward is made with, and their LoRA factors; ``scale``: of these."""
+    weights, factors = split(tensors, scale)
     weights = {name: tensor for name, tensor in weights.items() if name not in _UNUSED}
     return weights, {name: tensor for name, tensor in factors.items() if changed_by(name) in weights}
 

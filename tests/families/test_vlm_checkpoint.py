@@ -203,7 +203,7 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "an adapter and whole weights": (
         ADAPTER,
         lambda folder: save_file({"any": torch.zeros(1)}, folder / "model.safetensors"),
-        r"expected adapter_model\.safetensors or whole weights, got both",
+        r"expected an adapter \(adapter_config\.json\) or whole weights \(model\.safetensors\), got both",
     ),
     "an adapter without its embedding": (
         ADAPTER,

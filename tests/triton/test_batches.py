@@ -70,7 +70,7 @@ class Gate(Model):
     ) -> None:
         self.may_answer = threading.Event()
         super().__init__(folder, settings=settings, num_instances=num_instances)
-        self._request_s = 1.0  # so long that others are taken in meanwhile
+        self._sample_s = 1.0  # so long that others are taken in meanwhile
 
     def answer(self, questions: Sequence[Sample], execution: Execution) -> list[Result | RewardError]:
         assert self.may_answer.wait(PATIENCE_S)
@@ -107,13 +107,15 @@ def test_what_finds_no_room_is_rejected_at_once_and_counted(tmp_path: Path) -> N
     assert model.samples == {("progress", "scored"): 3, ("progress", "rejected"): 1}
 
 
-def test_several_instances_share_the_bound_of_what_may_wait(tmp_path: Path) -> None:
-    model = Gate(tmp_path, {"max_queue_size": "3"}, num_instances=2)
-    scored, *waiting = requests = [request(count) for count in (1, 5, 6, 7)]
+@pytest.mark.parametrize(("max_queue_size", "expected"), [("19", 10), ("9", 8), ("3", 3)])
+def test_several_instances_share_the_bound_of_what_may_wait(tmp_path: Path, max_queue_size: str, expected: int) -> None:
+    """Each has room for what fits into a batch, if the bound allows for it."""
+    model = Gate(tmp_path, {"max_queue_size": max_queue_size}, num_instances=2)
+    scored, *waiting = requests = [request(count) for count in (1, *[5] * 12)]
     model.take([scored])
     wait_for(lambda: model._pipeline.num_waiting == 0)
     model.take(waiting)
-    assert [len(each.responses) for each in waiting] == [0, 0, 1]
+    assert sum(not each.responses for each in waiting) == expected
     model.open(*requests)
 
 
@@ -125,10 +127,14 @@ def test_cheap_requests_wait_for_what_is_under_way_and_are_answered_together(
     first, cheap = request(1), [request(5), request(6)]
     model.take([first])
     wait_for(lambda: model._pipeline._is_scoring)
-    monkeypatch.setattr(batch_model, "LONE_ANSWER_S", PATIENCE_S)
+    monkeypatch.setattr(batch_model, "AT_ONCE_S", PATIENCE_S)
     model._cheap_answer_s = PATIENCE_S
+    waits = threading.Event()
+    wait_for_idle = model._pipeline.wait_for
+    monkeypatch.setattr(model._pipeline, "wait_for", lambda *of_wait: (waits.set(), wait_for_idle(*of_wait)))
     with ThreadPoolExecutor(1) as pool:
         answered = pool.submit(model.execute, cheap)
+        assert waits.wait(PATIENCE_S)
         assert not answered.done()
         model.may_answer.set()
         responses = answered.result(PATIENCE_S)
@@ -138,8 +144,38 @@ def test_cheap_requests_wait_for_what_is_under_way_and_are_answered_together(
 
 def test_cheap_requests_that_take_long_together_are_sent_as_they_come(tmp_path: Path) -> None:
     model = Model(tmp_path)
-    model._request_s = batch_model.LONE_ANSWER_S / 7
-    assert model.execute([request(5) for _ in range(7)]) is None
+    model._cheap_answer_s = PATIENCE_S
+    model._sample_s = batch_model.AT_ONCE_S / 4
+    requests = [request(5) for _ in range(4)]
+    assert model.execute(requests) is None
+    wait_for(lambda: all(each.responses for each in requests))
+    model._sample_s = batch_model.AT_ONCE_S / 4
+    responses = model.execute([request(5) for _ in range(3)])
+    assert responses is not None and len(responses) == 3
+
+
+@pytest.mark.parametrize("num_samples", [[8], [4, 4], [5]])
+def test_a_full_batch_of_samples_is_sent_as_it_comes(tmp_path: Path, num_samples: list[int]) -> None:
+    """More may wait behind it, and some of them may have to be rejected. Another request of 5 samples would not fit."""
+    model = Model(tmp_path)
+    model._sample_s = 0.0
+    requests = [request(*[5] * count) for count in num_samples]
+    assert model.execute(requests) is None
+    wait_for(lambda: all(each.responses for each in requests))
+
+
+def test_cheap_requests_do_not_wait_for_many_that_wait_already(tmp_path: Path) -> None:
+    model = Gate(tmp_path)
+    first, waiting, late = request(1), [request(5), request(6)], request(7)
+    model.take([first])
+    wait_for(lambda: model._pipeline._is_scoring)
+    model.take(waiting)
+    model._sample_s = batch_model.AT_ONCE_S / 3
+    model._cheap_answer_s = PATIENCE_S
+    model._pipeline.wait_for = None  # type: ignore[assignment, method-assign]  nobody calls it
+    model.take([late])
+    assert late.responses == []
+    model.open(first, *waiting, late)
 
 
 @pytest.mark.parametrize(("settings", "timeout_us"), [({"queue_timeout_ms": "20"}, 0), ({}, 20_000)])
@@ -313,7 +349,7 @@ def test_what_is_prepared_step_by_step_gets_on_until_it_stops(
     clock.now_s = 1.0
     monkeypatch.setattr(journal, "time", clock)
     model = Stepwise(tmp_path, clock, is_ahead=is_ahead)
-    model._request_s = 1.0  # long enough that requests are answered later
+    model._sample_s = 1.0  # long enough that requests are answered later
     model.respond([request(1)])
     assert model.busy_s == [1.0] * 100 + [50.0]
     one_step_further()  # of a thread that is late: the work has ended

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from rfm.journal import NO_DIGEST, Journal
+from rfm.triton_model import other_instances
 from rfm.triton_model.other_instances import OtherInstances
 from rfm.triton_model.pipeline import Bounds, Pipeline, Stages
 from rfm_serve import PATIENCE_S, wait_for
@@ -62,7 +63,8 @@ def test_while_another_is_idle_nothing_more_is_taken(busy: Instance) -> None:
             waiting.result(PATIENCE_S)
 
 
-def test_where_all_are_busy_a_batch_is_taken_ahead_and_no_more(busy: Instance) -> None:
+def test_where_all_are_busy_a_batch_is_taken_ahead_and_no_more(busy: Instance, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(other_instances, "LONG_S", PATIENCE_S)
     with busy.other.at_work_on([NO_DIGEST]), ThreadPoolExecutor(1) as pool:
         busy.wait()
         busy.pipeline.put([Job(), Job()])
@@ -72,15 +74,24 @@ def test_where_all_are_busy_a_batch_is_taken_ahead_and_no_more(busy: Instance) -
         waiting.result(PATIENCE_S)
 
 
-def test_where_all_have_enough_to_do_more_is_taken(busy: Instance) -> None:
+def test_where_all_have_enough_to_do_more_is_taken(busy: Instance, monkeypatch: pytest.MonkeyPatch) -> None:
     """So that what is too much can be rejected."""
-    busy.pipeline.put([Job(), Job()])
+    monkeypatch.setattr(other_instances, "LONG_S", PATIENCE_S)
+    busy.pipeline.put([Job() for _ in range(MAX_WAITING + 1)])
     with busy.other.at_work_on([NO_DIGEST]), ThreadPoolExecutor(1) as pool:
-        busy.other.owe(MAX_WAITING - 1)
+        busy.other.owe(MAX_WAITING)
         waiting = pool.submit(busy.wait)
         assert not busy.pipeline.wait_for(waiting.done, 0.1)
         busy.other.owe(1)
         waiting.result(PATIENCE_S)
+
+
+def test_where_the_others_work_for_long_more_is_taken(busy: Instance, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that scores in ``execute`` owes nothing, and takes nothing from Triton either."""
+    monkeypatch.setattr(other_instances, "LONG_S", 0.0)
+    busy.pipeline.put([Job() for _ in range(MAX_WAITING)])
+    with busy.other.at_work_on([NO_DIGEST]):
+        busy.wait()
 
 
 def test_an_idle_instance_waits_for_nobody(busy: Instance) -> None:

@@ -123,7 +123,7 @@ def _overload(exam: Exam, door: str, connect: Connect, room: int, count: Callabl
 
 
 def _crowd(site: Site) -> Row:
-    """More callers of the gateway than Triton's queue takes; every refusal is in the gateway's metrics."""
+    """More callers of the gateway than the model takes; every refusal is in the gateway's metrics."""
     before = _rejections(site.gateway_url)
     tally, _ = asyncio.run(open_loop(through_gateway(site.gateway_url), site.progress, CROWD_PER_S, CROWD_S))
     counted = _rejections(site.gateway_url) - before
