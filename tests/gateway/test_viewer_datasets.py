@@ -25,10 +25,13 @@ from pyarrow import parquet
 from gateway_requests import failure
 from gateways import Gateway, poll, running
 from labelling import LEROBOT, BrightnessScorer
+from pictures import TURNS, numbered, turn, write_video
 from rfm.launch.process import Endpoints
 from rfm_client.contract.settings import ConfigError
+from rfm_client.data.datasets.films import Span
 from rfm_client.labelling import LabelOptions, label, open_dataset, summarise
 from rfm_gateway.config import GatewayConfig
+from rfm_gateway.viewer.cuts import cut
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, dataset, encoded_anew, labelled
 
 KEY = "open sesame"
@@ -160,6 +163,24 @@ def test_a_cut_is_exact_however_the_film_is_coded(tmp_path: Path, coding: tuple[
         shelf = Shelf(gateway, (root,))
         for episode in range(len(dataset(root).episodes)):
             check_frames(shelf.video(0, episode, 0).content, root, episode, 0, tmp_path)
+
+
+@pytest.mark.parametrize("matrix", [matrix for matrix, _ in TURNS.values()], ids=TURNS)
+def test_a_cut_of_a_turned_film_is_turned_alike(tmp_path: Path, matrix: tuple[int, int, int, int]) -> None:
+    write_video(tmp_path / "film.mp4", numbered(6))
+    turn(tmp_path / "film.mp4", matrix)
+    times_s, rotation = shown(tmp_path / "film.mp4")
+    cut(Span(tmp_path / "film.mp4", times_s[:4], 0.01, "episode 0"), tmp_path / "cut.mp4", lambda num_bytes: None)
+    cut_times_s, cut_rotation = shown(tmp_path / "cut.mp4")
+    assert cut_rotation == rotation
+    assert len(cut_times_s) == 4
+
+
+def shown(film: Path) -> tuple[np.ndarray[Any, np.dtype[np.float64]], set[int]]:
+    """The times of a film's frames, in seconds, and how far they are turned."""
+    with av.open(str(film)) as container:
+        frames = list(container.decode(video=0))
+    return np.array([float(frame.time) for frame in frames]), {frame.rotation for frame in frames}
 
 
 def test_ranges_are_parts_of_the_same_video(shelf: Shelf) -> None:
