@@ -58,6 +58,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "rfm/embedding.py": ("test_encoders",),
     "rfm/feature_cache.py": ("test_feature_cache", "test_shot_cache"),
     "rfm/checkpoint/digest.py": ("test_export",),
+    "rfm/checkpoint/training.py": ("test_checkpoint", "test_export"),
     "rfm/checkpoint/*.py": (
         "test_checkpoint",
         "test_hostile_files",
