@@ -52,13 +52,7 @@ def late(served: Served) -> Iterator[LateClient]:
 
 @pytest.fixture
 def repository(tmp_path: Path) -> Path:
-    """The demo's checkpoint, one instance on one thread."""
+    """The demo's checkpoint, which has one instance on one thread."""
     folder = tmp_path / "model_repository"
     shutil.copytree(ROOT / "model_repository" / "rfm", folder / "rfm")
-    config = folder / "rfm" / "config.pbtxt"
-    text = config.read_text()
-    threads = 'key: "torch_threads"\n  value {\n    string_value: "%s"'
-    assert threads % 0 in text
-    assert "count: 2" in text
-    config.write_text(text.replace(threads % 0, threads % 1).replace("count: 2", "count: 1"))
     return folder
