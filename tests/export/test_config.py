@@ -213,7 +213,7 @@ def test_a_file_that_agrees_with_the_repository_is_not_worth_a_word(told: Any) -
 def test_what_takes_effect_at_export_alone_is_told_by_serve(told: Any, tmp_path: Path) -> None:
     file = tmp_path / "serve.yaml"
     file.write_text(
-        "num_gpus: 0\ninstances: 2\nexport: {max_batch_size: 32, dtype: float16, checkpoint: org/name, token_budget: 16384}\n"
+        "num_gpus: 0\ntorch_threads: 1\nexport: {max_batch_size: 32, dtype: float16, checkpoint: org/name, token_budget: 16384}\n"
         "serve: {http_port: 8010}\n"
     )
     _, lines = told("--repository", str(REPOSITORY), "--config", str(file))
@@ -349,7 +349,7 @@ def test_a_configuration_tells_the_settings_that_it_was_made_from() -> None:
 def test_export_tells_flat_keys_that_another_command_reads(tmp_path: Path) -> None:
     repository = shutil.copytree(REPOSITORY, tmp_path / "repository")
     file = tmp_path / "serve.yaml"
-    file.write_text("num_gpus: 0\ninstances: 2\nserver_port: 8010\nserve: {grpc_port: 8011}\ngateway_port: 8100\n")
+    file.write_text("num_gpus: 0\ntorch_threads: 1\nserver_port: 8010\nserve: {grpc_port: 8011}\ngateway_port: 8100\n")
     words = ["export", "--check", "--repository", str(repository), "--config", str(file)]
     result = CliRunner().invoke(cli.app, words)
     assert result.exit_code == 0, result.output
