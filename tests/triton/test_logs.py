@@ -79,12 +79,9 @@ class Running:
 
     def lines(self) -> list[tuple[str, dict[str, Any]]]:
         """The model's own: severity and content."""
-        found = []
-        for line in self.log.read_text().splitlines():
-            match = re.fullmatch(r'([IWE])\d{4} \S+ \d+ request_log\.py:\d+\] ("\{.*\}")', line)
-            if match is not None:
-                found.append((match[1], json.loads(json.loads(match[2]))))
-        return found
+        # With its verbose log on, Triton now and then writes two messages without a newline between them.
+        pattern = r'([IWE])\d{4} \S+ \d+ request_log\.py:\d+\] ("\{(?:[^"\\]|\\.)*\}")'
+        return [(match[1], json.loads(json.loads(match[2]))) for match in re.finditer(pattern, self.log.read_text())]
 
     def said_of(self, request_id: str) -> tuple[str, dict[str, Any]]:
         """The one line about a request. Triton may write it a moment after it has answered."""
