@@ -5,7 +5,7 @@
 requests wait for their turn, and scores those that are ready together. ``placement`` says on which device and with how
 many threads. ``other_instances`` are the other instances of the model, which share its requests.
 
-Around that stand the ``quarantine`` of requests that kill (known by their ``request_digest``), ``cancellation``,
-``metrics``, the ``request_log`` and the ``self_check`` of an instance. ``weights`` are checked before they are loaded;
-``exit`` ends the process with Triton.
+Around that stand the ``quarantine`` of requests that kill (known by their ``request_digest``), ``metrics``, the
+``request_log`` and the ``self_check`` of an instance. ``weights`` are checked before they are loaded; ``exit`` ends the
+process with Triton.
 """

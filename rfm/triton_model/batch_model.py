@@ -18,7 +18,6 @@ from rfm.execution import Execution
 from rfm.journal import NO_DIGEST
 from rfm.parameters import BUDGET_PARAMETER, QUEUE_SIZE_PARAMETER, QUEUE_TIMEOUT_PARAMETER
 from rfm.probe import blank_question
-from rfm.triton_model.cancellation import Cancellation
 from rfm.triton_model.exit import exit_with_triton
 from rfm.triton_model.metrics import Counted, Metrics
 from rfm.triton_model.other_instances import OtherInstances
@@ -92,12 +91,11 @@ class BatchModel(Generic[Question, Answer]):
         num_preparing: threads that work ahead
         """
         self._cheap_answer_s, self._is_on_cpu = CHEAP_ANSWER_S[device], device == "cpu"
-        self._sample_s: float | None = None  # what each sample of the last group took; None: there was none
+        self._sample_s = math.inf  # what each sample of the last group took; inf: there was none
         bounds = _bounds(config, settings)
         self._max_batch = bounds.batch_samples
         self._max_ahead = min(self._max_batch, bounds.waiting_jobs or self._max_batch)
         self._patience_s = (int(settings.get(QUEUE_TIMEOUT_PARAMETER) or 0) / MS_PER_S) or None
-        self._cancellation = Cancellation()
         self._self_check = SelfCheck(self._score_blank, self._log.report_end)
         self._blank_tensors = blank_question(config)
         warmups = config.get("model_warmup", [])
@@ -183,7 +181,7 @@ class BatchModel(Generic[Question, Answer]):
         Where the process dies, Triton 2.51 fails the requests of ``execute``, and never those that are to be answered
         later. So all are answered at once while a suspect may kill the process.
         """
-        if self._quarantine.has_suspects or self._sample_s is None:
+        if self._quarantine.has_suspects or self._sample_s == math.inf:
             return True
         return self._take_less(batch, AT_ONCE_S) if len(batch) == 1 else self._are_cheap(batch)
 
@@ -194,7 +192,7 @@ class BatchModel(Generic[Question, Answer]):
     def _take_less(self, batch: Sequence[Request[Question]], limit_s: float, num_waiting: int = 0) -> bool:
         """Whether requests that are no full batch probably take less than ``limit_s``, and with others AT_ONCE_S."""
         num_samples, most = sum(each.num_samples for each in batch), max(each.num_samples for each in batch)
-        if self._sample_s is None or num_samples + most > self._max_batch:  # one more like them would not fit
+        if num_samples + most > self._max_batch:  # one more like them would not fit
             return False
         return self._sample_s * num_samples < limit_s and self._sample_s * (num_samples + num_waiting) < AT_ONCE_S
 
@@ -289,14 +287,14 @@ class BatchModel(Generic[Question, Answer]):
 
     def _answer_together(self, batch: Sequence[Request[Question]], execution: Execution) -> None:
         for request in batch:
-            request.error = self._cancellation.of(request) or request.out_of_patience(self._patience_s)
+            request.error = request.given_up(self._sample_s) or request.out_of_patience(self._patience_s)
         for group in self._quarantine.groups([request for request in batch if request.error is None]):
             questions = [question for request in group for question in request.prepared]
             started_s = time.perf_counter()
             with self._quarantine.at_work_on([request.digest for request in group]):
                 answers = iter(self.answer(questions, execution))
             took_s = time.perf_counter() - started_s
-            self._sample_s = self._cancellation.answer_s = took_s / len(questions)
+            self._sample_s = took_s / len(questions)
             for request in group:
                 request.answers = [next(answers) for _ in request.prepared]
                 request.error = _first_error(request.answers)

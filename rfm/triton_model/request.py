@@ -41,6 +41,7 @@ SAMPLE_TYPES = {
     NamedFootage: "encode",
 }
 US_PER_S = 1e6
+WORTH_CHECKING_S = 10e-3  # for one answer: to ask Triton's process takes 0.1 ms a request
 UNKNOWN_TYPE = "unknown"  # of the samples of a request that could not be decoded
 
 
@@ -119,6 +120,15 @@ class Request(Generic[Question]):
     def begin(self) -> None:
         """Notes that its turn has come."""
         self.waited_s = time.monotonic() - self.arrived_s
+
+    def given_up(self, answer_s: float) -> CancelledError | None:
+        """The error of a request that its client has cancelled; else None.
+
+        Triton is only asked where an answer, which takes ``answer_s``, is worth a question.
+        """
+        if answer_s < WORTH_CHECKING_S or not self.is_cancelled():
+            return None
+        return CancelledError("cancelled by the client")
 
     def out_of_patience(self, patience_s: float | None) -> RejectedError | None:
         """The error of a request that had waited for longer than ``patience_s``, or than itself said; else None."""

@@ -14,8 +14,9 @@ import torch
 from batch_models import BREAKS, CONFIG, FAILS, REFUSED, WIDTHS, Model, Request, backend, request  # noqa: F401  a fixture
 from rfm.execution import Execution
 from rfm.probe import blank_question
-from rfm.triton_model import batch_model, cancellation
+from rfm.triton_model import batch_model
 from rfm.triton_model.placement import Placement
+from rfm.triton_model.request import WORTH_CHECKING_S
 from rfm_client import (
     FrameScores,
     InferenceFailedError,
@@ -89,10 +90,10 @@ def test_a_request_that_breaks_a_batch_is_found(tmp_path: Path) -> None:
     assert model.samples == {("progress", "scored"): 2, ("progress", "failed"): 1}
 
 
-@pytest.mark.parametrize("answer_s", [cancellation.WORTH_CHECKING_S, 0.0])
+@pytest.mark.parametrize("answer_s", [WORTH_CHECKING_S, 0.0])
 def test_a_cancelled_request_costs_nothing_where_it_is_worth_a_question(tmp_path: Path, answer_s: float) -> None:
     model = Model(tmp_path)
-    model._cancellation.answer_s = answer_s
+    model._sample_s = answer_s
     cancelled, _ = model.respond([request(1, is_given_up=True), request(5)])
     if answer_s:
         assert cancelled.error == ("cancelled", "cancelled by the client")
@@ -115,7 +116,7 @@ def test_what_an_answer_takes_is_that_of_a_question(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(batch_model, "time", SimpleNamespace(perf_counter=lambda: next(times)))
     model = Model(tmp_path)
     model.respond([request(1), request(1, 1)])
-    assert model._cancellation.answer_s == model._sample_s == 2
+    assert model._sample_s == 2
 
 
 def test_warm_ups_and_probes_are_not_counted(tmp_path: Path) -> None:

@@ -128,7 +128,7 @@ class TritonPythonModel(TritonPythonModel):
             if request.request_id.startswith("{UNTIL_CANCELLED}"):
                 while not request.is_cancelled() and time.monotonic() < ends_s:
                     time.sleep(0.01)
-                self._cancellation.answer_s = 1.0
+                self._sample_s = 1.0
         super()._answer_together(batch, execution)
         if any(request.request_id.startswith("{TO_FAIL}") for request in batch):
             raise ZeroDivisionError("a fault of the model's")
