@@ -28,6 +28,7 @@ from rfm.triton_model.request import SAMPLE_TYPES, Origins, RejectedError, Reque
 from rfm.triton_model.request_digest import digest
 from rfm.triton_model.request_log import RequestLog
 from rfm.triton_model.self_check import SelfCheck
+from rfm.triton_model.triton_queue import TritonQueue
 from rfm.triton_model.weights import check_digest
 from rfm_client.contract import InvalidSampleError, RewardError, wire
 from rfm_client.contract.model_info import DIGEST_PARAMETER, NETWORK_PARAMETER, REVISION_PARAMETER, SOURCE_PARAMETER
@@ -38,7 +39,7 @@ from rfm_client.contract.wire import Tensors
 
 MS_PER_S = 1e3
 MAX_INT32 = 2**31 - 1
-AT_ONCE_S = 50e-3  # what takes longer is done by another thread, so that meanwhile others can be rejected
+AT_ONCE_S = 50e-3  # for so long Triton is left alone at most: others may wait there, who are to be rejected
 CHEAP_ANSWER_S = {"cpu": 5e-3, "cuda": 0.2e-3}  # one that takes less is not worth the time that sending it takes
 
 Question = TypeVar("Question")
@@ -97,6 +98,7 @@ class BatchModel(Generic[Question, Answer]):
         self._max_ahead = min(self._max_batch, bounds.waiting_jobs or self._max_batch)
         self._patience_s = (int(settings.get(QUEUE_TIMEOUT_PARAMETER) or 0) / MS_PER_S) or None
         self._self_check = SelfCheck(self._score_blank, self._log.report_end)
+        self._triton_queue = TritonQueue()
         self._blank_tensors = blank_question(config)
         warmups = config.get("model_warmup", [])
         self._origins = Origins(sum(max(warmup.get("count", 0), 1) for warmup in warmups), digest(self._blank_tensors))
@@ -152,13 +154,22 @@ class BatchModel(Generic[Question, Answer]):
     def execute(self, requests: Sequence[Any]) -> list[Any] | None:
         """Called by Triton with requests. Gives their responses; None: they are sent as they come."""
         self._self_check.wait_if_ending()
+        self._triton_queue.called()
         batch = [self._received(inference) for inference in requests]
-        if self._is_on_cpu and self._are_cheap(batch, self._pipeline.num_waiting):
+        if self._is_on_cpu and self._are_cheap(batch, self._pipeline.num_samples_waiting):
             self._pipeline.wait_for(lambda: self._pipeline.is_idle, AT_ONCE_S)
         if self._pipeline.is_idle and self._is_better_at_once(batch):
-            for request in batch:
-                self._read(request)
-            return self._responses_of(batch)
+            responses = self._responses_to(batch)
+            self._triton_queue.returned(len(responses))
+            return responses
+        self._take_in(batch, requests)
+        if self._other_instances is not None:
+            self._other_instances.wait_for_turn(self._pipeline, self._max_ahead)
+        self._triton_queue.returned(0)
+        return None
+
+    def _take_in(self, batch: Sequence[Request[Question]], requests: Sequence[Any]) -> None:
+        """Has requests wait for their turn, or answers why they cannot."""
         self._quarantine.owe(len(batch))
         for request, inference in zip(batch, requests, strict=True):
             request.outlive(inference)
@@ -167,16 +178,14 @@ class BatchModel(Generic[Question, Answer]):
         failed += self._put([request for request in batch if request.error is None])
         if failed:
             self._send(failed, [(failed, Execution())])
-        if self._other_instances is not None:
-            self._other_instances.wait_for_turn(self._pipeline, self._max_ahead)
-        return None
 
     def _is_better_at_once(self, batch: Sequence[Request[Question]]) -> bool:
         """Whether requests are better scored here, while nothing else is, and answered together.
 
         To send a response takes a tenth of a millisecond longer than to give it back, and a lone caller waits for the
         change of threads. But what is scored here keeps Triton from handing over more, and an accelerator waits until
-        it does. A full batch says that more wait; some of them may have to be rejected.
+        it does. A full batch says that more wait; some of them may have to be rejected. Of what waits behind a batch
+        that is not full, nothing is known; so all that is scored here between two looks takes AT_ONCE_S at most.
 
         Where the process dies, Triton 2.51 fails the requests of ``execute``, and never those that are to be answered
         later. So all are answered at once while a suspect may kill the process.
@@ -186,18 +195,23 @@ class BatchModel(Generic[Question, Answer]):
         return self._take_less(batch, AT_ONCE_S) if len(batch) == 1 else self._are_cheap(batch)
 
     def _are_cheap(self, batch: Sequence[Request[Question]], num_waiting: int = 0) -> bool:
-        """Whether the answers take little time, each, and all together with those to ``num_waiting`` other requests."""
+        """Whether the answers take little time, a request on average, and all together with ``num_waiting`` samples."""
         return self._take_less(batch, min(AT_ONCE_S, self._cheap_answer_s * len(batch)), num_waiting)
 
     def _take_less(self, batch: Sequence[Request[Question]], limit_s: float, num_waiting: int = 0) -> bool:
-        """Whether requests that are no full batch probably take less than ``limit_s``, and with others AT_ONCE_S."""
+        """Whether requests that are no full batch probably take less than ``limit_s``, and with ``num_waiting`` other
+        samples no longer than those who may wait in Triton are to be left alone.
+        """
         num_samples, most = sum(each.num_samples for each in batch), max(each.num_samples for each in batch)
         if num_samples + most > self._max_batch:  # one more like them would not fit
             return False
-        return self._sample_s * num_samples < limit_s and self._sample_s * (num_samples + num_waiting) < AT_ONCE_S
+        left_s = AT_ONCE_S - self._triton_queue.unseen_s
+        return self._sample_s * num_samples < limit_s and self._sample_s * (num_samples + num_waiting) < left_s
 
-    def _responses_of(self, batch: Sequence[Request[Question]]) -> list[Any]:
-        """Scores and encodes the requests here and now."""
+    def _responses_to(self, batch: Sequence[Request[Question]]) -> list[Any]:
+        """Reads, scores and answers the requests here and now."""
+        for request in batch:
+            self._read(request)
         scored: Scored[Question] = []
         if failed := [request for request in batch if request.error is not None]:
             scored.append((failed, Execution()))

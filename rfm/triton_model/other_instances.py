@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -11,18 +12,20 @@ from pathlib import Path
 from typing import Any
 
 from rfm.journal import Journal
+from rfm.proc import arguments_of
 from rfm.triton_model.pipeline import Pipeline
 from rfm.triton_model.quarantine import all_journals, own_journal
 
 POLL_S = 2e-3  # between two questions whether another instance is idle, while this instance computes
-LONG_S = 0.1  # one that has worked on a batch for so long takes nothing from Triton soon, whatever it owes
+LONG_S = 0.1  # one that owes nothing and has worked for so long does so in ``execute``: it takes nothing meanwhile
 LOOK_S = 1.0  # between two looks for other instances: they come and go with a load
+_MODEL_FILE = 1  # which argument of a model process names its model.py
 
 
 class OtherInstances:
-    """The other instances of a model, as their journals show them.
+    """The other instances of a version of a model, as their journals show them.
 
-    files: finds the journals of all instances, this one's included
+    files: finds the journals of all instances of the version, this one's included
     own: this instance's journal
     """
 
@@ -35,7 +38,7 @@ class OtherInstances:
     @classmethod
     def of_this_process(cls, model: str) -> OtherInstances:
         """Those of the running process, which Triton has started for ``model``."""
-        return cls(partial(all_journals, model), own_journal(model))
+        return cls(partial(_journals_of_this_version, model), own_journal(model))
 
     def wait_for_turn(self, pipeline: Pipeline[Any, Any], max_waiting: int) -> None:
         """Returns when the pipeline should take more requests from Triton.
@@ -65,6 +68,17 @@ class OtherInstances:
 
 
 def _has(journal: Journal, num_owed: int) -> bool:
-    """Whether an instance is at work, and owes so many answers or has worked for long."""
-    busy_s = journal.busy_s
-    return busy_s > 0 and (journal.num_owed >= num_owed or busy_s >= LONG_S)
+    """Whether an instance is at work, and owes so many answers or has scored for long in ``execute``."""
+    busy_s, owed = journal.busy_s, journal.num_owed
+    return busy_s > 0 and (owed >= num_owed or (not owed and busy_s >= LONG_S))
+
+
+def _journals_of_this_version(model: str) -> list[Path]:
+    """Those of the processes that run the same model.py. While versions take turns, there are others, too."""
+    journals = [journal for file in all_journals(model) if (journal := Journal.open(file)) is not None]
+    return [journal.file for journal in journals if _model_file(journal.pid) == _model_file(os.getpid())]
+
+
+def _model_file(pid: int) -> str | None:
+    """The model.py that a model process runs; None: it has ended."""
+    return next(iter(arguments_of(pid)[_MODEL_FILE:]), None)

@@ -91,6 +91,12 @@ class Pipeline(Generic[SomeJob, Scored]):
         return len(self._ahead) + len(self._behind)
 
     @property
+    def num_samples_waiting(self) -> int:
+        """Samples of the jobs that wait for their turn."""
+        with self._changed:
+            return sum(job.num_samples for job, _ in self._ahead) + sum(job.num_samples for job in self._behind)
+
+    @property
     def is_idle(self) -> bool:
         """Whether no job waits and none is scored."""
         return not (self._is_scoring or self.num_waiting)

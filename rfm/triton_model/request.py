@@ -115,7 +115,10 @@ class Request(Generic[Question]):
         """Makes it a request that is answered after ``execute``, when Triton's memory of its tensors may be gone."""
         self.sender = inference.get_response_sender()
         self.is_cancelled = self.sender.is_cancelled
-        self.tensors = {name: array.copy() for name, array in self.tensors.items()}
+        try:
+            self.tensors = {name: array.copy() for name, array in self.tensors.items()}
+        except MemoryError as error:
+            self.fail(error)
 
     def begin(self) -> None:
         """Notes that its turn has come."""

@@ -191,14 +191,14 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
 
 def _has_adapter(folder: Path) -> bool:
     """Whether the folder's weights are an adapter. Raises CheckpointError if there are whole weights, too."""
-    has_adapter = is_there(folder / ADAPTER_CONFIG)
+    adapter = [name for name in (ADAPTER_CONFIG, ADAPTER_WEIGHTS, CUSTOM_HEADS) if is_there(folder / name)]
     whole = [name for name in (WEIGHTS, WEIGHTS_INDEX) if is_there(folder / name)]
-    if has_adapter and whole:
+    if adapter and whole:
         raise CheckpointError(
-            f"{folder}: expected an adapter ({ADAPTER_CONFIG}) or whole weights ({whole[0]}), got both; move away the "
-            "one that is not meant"
+            f"{folder}: expected an adapter ({adapter[0]}) or whole weights ({whole[0]}), got both; move away the one "
+            "that is not meant"
         )
-    return has_adapter
+    return bool(adapter)
 
 
 def _base_of_adapter(folder: Path, run: RunConfig) -> str:

@@ -205,6 +205,11 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
         lambda folder: save_file({"any": torch.zeros(1)}, folder / "model.safetensors"),
         r"expected an adapter \(adapter_config\.json\) or whole weights \(model\.safetensors\), got both",
     ),
+    "whole weights and an adapter without its configuration": (
+        PLAIN,
+        lambda folder: save_file({"any": torch.zeros(1)}, folder / "adapter_model.safetensors"),
+        r"expected an adapter \(adapter_model\.safetensors\) or whole weights \(model\.safetensors\), got both",
+    ),
     "an adapter without its embedding": (
         ADAPTER,
         change_tensors("adapter_model.safetensors", drop_first("embed_tokens")),

@@ -8,7 +8,7 @@ import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from rfm.execution import Execution
 from rfm.journal import Journal
 from rfm.probe import blank_question
 from rfm.steps import one_step_further
-from rfm.triton_model import batch_model, self_check
+from rfm.triton_model import batch_model, self_check, triton_queue
 from rfm.triton_model.quarantine import Quarantine
 from rfm.triton_model.request_digest import digest
 from rfm_client import (
@@ -176,6 +176,62 @@ def test_cheap_requests_do_not_wait_for_many_that_wait_already(tmp_path: Path) -
     model.take([late])
     assert late.responses == []
     model.open(first, *waiting, late)
+
+
+class Slow(Model):
+    """Takes a millisecond for each sample."""
+
+    def answer(self, questions: Sequence[Sample], execution: Execution) -> list[Result | RewardError]:
+        time.sleep(1e-3 * len(questions))
+        return super().answer(questions, execution)
+
+
+@pytest.mark.parametrize("batches", [[[1, 1, 1], [7]], [[1]]], ids=["of two sizes", "each alone"])
+def test_what_waits_in_triton_behind_small_batches_is_bounded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batches: list[list[int]]
+) -> None:
+    """Triton ends a batch also where the next request does not fit in, or has other inputs, however many wait."""
+    monkeypatch.setattr(triton_queue, "HAND_OVER_S", PATIENCE_S)
+    model = Slow(tmp_path, settings={"max_queue_size": "8"})
+    model.respond([request(1)])
+    backlog = [[request(*[5] * size) for size in batch] for batch in batches * (200 // len(batches))]
+    for batch in backlog:
+        model.take(batch)
+    requests = [each for batch in backlog for each in batch]
+    wait_for(lambda: all(each.responses for each in requests))
+    errors = [each.responses[0].error for each in requests if each.responses[0].error is not None]
+    assert 0 < len(errors) < len(requests)
+    assert all("the queue is full: 8 requests wait" in message for _, message in errors)
+
+
+def test_a_lone_caller_s_requests_are_all_answered_before_execute_returns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It takes him a moment to send the next one, so that none can wait in Triton."""
+    monkeypatch.setattr(batch_model, "time", SimpleNamespace(perf_counter=lambda: 0.0))  # no answer takes any time
+    model = Model(tmp_path)
+    model.respond([request(1)])
+    ends_s = time.monotonic() + 3 * batch_model.AT_ONCE_S
+    while time.monotonic() < ends_s:
+        time.sleep(triton_queue.HAND_OVER_S)
+        assert model.execute([request(5)]) is not None
+
+
+def test_a_request_for_which_there_is_no_memory_fails_alone(tmp_path: Path) -> None:
+    model = Model(tmp_path)
+    model.respond([request(1)])
+    model._sample_s = 1.0  # so long that they are answered later
+
+    class Large(np.ndarray):  # type: ignore[type-arg]
+        def copy(self, order: Any = None) -> Any:
+            raise MemoryError
+
+    large = request(5)
+    large.tensors["video_embeddings"] = large.tensors["video_embeddings"].view(Large)
+    failed, scored = model.respond([large, request(6)])
+    assert failed.error == ("internal", "scoring failed; the server's log has the reason")
+    assert scored.error is None
+    wait_for(lambda: model._quarantine._journal.num_owed == 0)
 
 
 @pytest.mark.parametrize(("settings", "timeout_us"), [({"queue_timeout_ms": "20"}, 0), ({}, 20_000)])

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import struct
+import subprocess
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -92,6 +94,38 @@ def test_where_the_others_work_for_long_more_is_taken(busy: Instance, monkeypatc
     busy.pipeline.put([Job() for _ in range(MAX_WAITING)])
     with busy.other.at_work_on([NO_DIGEST]):
         busy.wait()
+
+
+def test_one_that_is_long_at_work_on_what_it_owes_takes_more_before_this_one(
+    busy: Instance, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its ``execute`` has returned."""
+    monkeypatch.setattr(other_instances, "LONG_S", 0.0)
+    busy.pipeline.put([Job() for _ in range(MAX_WAITING)])
+    busy.other.owe(1)
+    with busy.other.at_work_on([NO_DIGEST]), ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(busy.wait)
+        assert not busy.pipeline.wait_for(waiting.done, 0.1)
+        busy.may_score.set()
+        waiting.result(PATIENCE_S)
+
+
+def test_an_idle_instance_of_another_version_is_waited_for_by_none(
+    busy: Instance, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While versions take turns, Triton gives it no request of this one's."""
+    journals = [tmp_path / "own", tmp_path / "other"]
+    Journal.create(journals[0], 1)
+    with subprocess.Popen(["sleep", str(3 * PATIENCE_S)]) as other, ThreadPoolExecutor(1) as pool:
+        journals[1].write_bytes(struct.pack("<Q", other.pid) + journals[1].read_bytes()[8:])
+        monkeypatch.setattr(other_instances, "all_journals", lambda model: journals)
+        monkeypatch.setattr(other_instances, "own_journal", lambda model: journals[0])
+        waiting = pool.submit(OtherInstances.of_this_process("rfm").wait_for_turn, busy.pipeline, MAX_WAITING)
+        try:
+            waiting.result(PATIENCE_S / 4)  # less than this instance waits for its first job
+        finally:
+            other.kill()
+            busy.may_score.set()
 
 
 def test_an_idle_instance_waits_for_nobody(busy: Instance) -> None:
