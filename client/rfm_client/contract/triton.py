@@ -36,7 +36,7 @@ LOST_REGION = "Unable to find shared memory region"  # of a server that was star
 REGION_IN_USE = "it is currently in use"  # of a region to unmap: tests/client/test_shared_memory_faults.py
 RESTRICTED = "is restricted, expecting header"  # of an API that wants a key
 QUEUE_FULL = "the queue is full"  # of a model, in which as many requests wait as may
-TRITON_QUEUE_FULL = "Exceeds maximum queue size"  # of Triton, in which requests for a model of several instances wait
+TRITON_QUEUE_FULL = "Exceeds maximum queue size"  # of Triton, for a model with a queue policy, as older exports have
 
 _NO_CONNECTION = "failed to connect"  # of gRPC itself: nothing was sent
 _LOST_CONNECTION = re.compile("Socket closed|Connection reset|Broken pipe|connection termination")  # or of a proxy
