@@ -71,8 +71,7 @@ class BatchModel(Generic[Question, Answer]):
         self._log = RequestLog(model)
         self._metrics = Metrics(labels, _checkpoint(settings), _sample_types(names))
         num_preparing = placement.num_preparing if self.works_ahead else 0
-        capacity = max(config["max_batch_size"], 1)
-        self._quarantine = Quarantine.of_this_process(args["model_name"], capacity, num_preparing)
+        self._quarantine = Quarantine.of_this_process(args["model_name"], config["max_batch_size"], num_preparing)
         other_instances = OtherInstances.of_this_process(args["model_name"]) if num_instances(config) > 1 else None
         self.start(config, settings, other_instances, placement.apply, placement.device.type, num_preparing)
 
@@ -362,7 +361,7 @@ def _located(error: RewardError, index: int, count: int) -> RewardError:
 
 def _bounds(config: Mapping[str, Any], settings: Mapping[str, str]) -> Bounds:
     """How much an instance takes at a time, as it was exported; what an older export does not say is unbounded."""
-    batch_samples = max(config["max_batch_size"], 1)
+    batch_samples = config["max_batch_size"]
     batch_tokens = int(settings.get(BUDGET_PARAMETER) or MAX_INT32)
     waiting = int(settings.get(QUEUE_SIZE_PARAMETER) or 0) or None
     # An idle instance, to which Triton hands a full batch, has room for it.

@@ -23,7 +23,7 @@ import local_hub
 from paths import ROOT
 from rfm import families
 from rfm.checkpoint.content import CheckpointError
-from rfm.checkpoint.files import best_tag
+from rfm.checkpoint.files import best_tag, find_run_config
 from rfm.rewind.network import RewindConfig
 from rfm.vlm.network import VlmConfig
 
@@ -380,6 +380,17 @@ def test_config_yaml_is_found_on_main_of_the_hub_s_repository(from_hub: dict[str
     expected = asdict(families.load(goldens.config(WITH_IMAGES).checkpoint).config)
     assert expected["multi_image"] and expected["per_frame_progress_token"]
     assert json.loads(from_hub[source]) == json.loads(json.dumps(expected))
+
+
+@pytest.mark.parametrize(("main", "is_found"), [("a" * 40, True), ("a" * 41, False), ("../other", False)])
+def test_main_of_the_hub_s_cache_is_a_commit(tmp_path: Path, main: str, is_found: bool) -> None:
+    snapshots = tmp_path / "snapshots"
+    for folder in (snapshots / "of-the-tag", snapshots / ("a" * 40), tmp_path / "refs"):
+        folder.mkdir(parents=True)
+    (snapshots / ("a" * 40) / "config.yaml").touch()
+    (tmp_path / "refs" / "main").write_text(main)
+    found = find_run_config(snapshots / "of-the-tag")
+    assert found == ((snapshots / ("a" * 40) / "config.yaml").resolve() if is_found else None)
 
 
 def test_a_hub_s_checkpoint_without_any_config_yaml_is_refused(from_hub: dict[str, str]) -> None:

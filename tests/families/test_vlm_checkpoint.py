@@ -28,6 +28,7 @@ from rfm import families
 from rfm.checkpoint.content import CheckpointError
 from rfm.config import ExportConfig
 from rfm.engine import Engine
+from rfm.vlm import lora
 from rfm.vlm.checkpoint import VlmCheckpoint
 from rfm.vlm.images import fitted_size
 from rfm_client import (
@@ -87,6 +88,19 @@ def test_updates_too_small_for_bfloat16_are_not_lost(copied: Callable[[str], Pat
         assert ((base + update).bfloat16() == base).double().mean() > 0.9  # a sum in bfloat16 is the base alone
         torch.testing.assert_close(built[f"{module}.weight"].double() - base, update, rtol=1e-2, atol=1e-7)
     assert len(modules) == 14
+
+
+def test_factors_that_need_no_scale_stay_as_they_are() -> None:
+    """So an export of an export is the same, and as large."""
+    factors = {f"layer.lora_{side}.weight": torch.ones(2, 2, dtype=torch.bfloat16) for side in "AB"}
+    _, split = lora.split({"layer.weight": torch.zeros(2, 2)} | factors)
+    assert {name: tensor.dtype for name, tensor in split.items()} == dict.fromkeys(factors, torch.bfloat16)
+
+
+def test_a_built_network_is_there_for_scoring_alone() -> None:
+    network = load(PLAIN).build(torch.float32)
+    assert not network.training
+    assert not any(parameter.requires_grad for parameter in network.parameters())
 
 
 def test_lora_of_weights_that_make_text_is_not_needed(copied: Callable[[str], Path]) -> None:

@@ -201,6 +201,7 @@ VIDEO_SIZES = {
     "a short film keeps its size": (2, (448, 336), [(448, 336)]),
     "a long side is scaled down first": (2, (540, 960), [(270, 480), (280, 504)]),
     "a small one is enlarged": (2, (64, 64), [(112, 112), (336, 336)]),
+    "1024 frames have 225 tokens, 15 times 15, each": (1024, (448, 448), [(448, 448), (420, 420)]),
     "1200 frames have 192 tokens each at most": (1200, (480, 480), [(504, 504), (364, 364)]),
     "2000 frames would have 115": (2000, (448, 336), [(448, 336), (364, 280)]),
 }

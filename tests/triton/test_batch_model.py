@@ -119,6 +119,12 @@ def test_what_an_answer_takes_is_that_of_a_question(tmp_path: Path, monkeypatch:
     assert model._sample_s == 2
 
 
+def test_what_is_refused_when_it_comes_has_not_waited(tmp_path: Path) -> None:
+    model = Model(tmp_path)
+    model.respond([Request(request(1).tensors | {"num_frames": np.zeros((1, 2), np.int32)})])
+    assert [counted.wait_s for counted in model.counted] == [0.0]
+
+
 def test_warm_ups_and_probes_are_not_counted(tmp_path: Path) -> None:
     model = Model(tmp_path, warmups=2)
     blank = Request(blank_question(CONFIG), id=f"{PROBE_PREFIX}-rfm")

@@ -234,8 +234,13 @@ def test_a_request_for_which_there_is_no_memory_fails_alone(tmp_path: Path) -> N
     wait_for(lambda: model._quarantine._journal.num_owed == 0)
 
 
-@pytest.mark.parametrize(("settings", "timeout_us"), [({"queue_timeout_ms": "20"}, 0), ({}, 20_000)])
-def test_what_has_waited_for_too_long_is_rejected(tmp_path: Path, settings: dict[str, str], timeout_us: int) -> None:
+@pytest.mark.parametrize(
+    ("settings", "timeout_us", "whose"),
+    [({"queue_timeout_ms": "20"}, 0, "queue_timeout_ms"), ({}, 20_000, "its own timeout")],
+)
+def test_what_has_waited_for_too_long_is_rejected(
+    tmp_path: Path, settings: dict[str, str], timeout_us: int, whose: str
+) -> None:
     model = Gate(tmp_path, settings)
     first, late = request(1), Request(request(5).tensors, timeout_us=timeout_us)
     model.take([first])
@@ -245,7 +250,7 @@ def test_what_has_waited_for_too_long_is_rejected(tmp_path: Path, settings: dict
     model.open(first, late)
     ((code, message),) = (response.error for response in late.responses)
     assert code == "unavailable"
-    assert message.startswith("the request has waited for longer than 0.02 s")
+    assert message.startswith(f"the request has waited for longer than 0.02 s ({whose})")
     assert model.samples == {("progress", "scored"): 1, ("progress", "rejected"): 1}
 
 

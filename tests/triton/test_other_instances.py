@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from clock import Clock
 from rfm.journal import NO_DIGEST, Journal
 from rfm.triton_model import other_instances
 from rfm.triton_model.other_instances import OtherInstances
@@ -94,6 +95,21 @@ def test_where_the_others_work_for_long_more_is_taken(busy: Instance, monkeypatc
     busy.pipeline.put([Job() for _ in range(MAX_WAITING)])
     with busy.other.at_work_on([NO_DIGEST]):
         busy.wait()
+
+
+def test_an_instance_that_is_started_later_is_noticed_within_a_second(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock()
+    monkeypatch.setattr(other_instances, "time", clock)
+    files = [tmp_path / "own"]
+    others = OtherInstances(lambda: files, tmp_path / "own")
+    assert others._are_busy(0, MAX_WAITING)
+    Journal.create(tmp_path / "other", 1)
+    files.append(tmp_path / "other")
+    assert others._are_busy(0, MAX_WAITING)
+    clock.sleep(1.0)
+    assert not others._are_busy(0, MAX_WAITING)
 
 
 def test_one_that_is_long_at_work_on_what_it_owes_takes_more_before_this_one(

@@ -69,6 +69,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "client/rfm_client/contract/wire.py": ("test_wire", "test_samples", "test_properties"),
     "rfm/triton_model/batch_model.py": ("test_batch_model", "test_batches", "test_poison", "test_logs"),
     "rfm/triton_model/other_instances.py": ("test_other_instances",),
+    "rfm/triton_model/triton_queue.py": ("test_triton_queue", "test_batches"),
     "rfm/triton_model/request.py": ("test_batch_model", "test_batches", "test_poison"),
     "rfm/supervise/model_states.py": ("test_model_states",),
     "rfm/supervise/model_watch.py": ("test_model_watch",),
