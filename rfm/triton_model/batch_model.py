@@ -39,7 +39,8 @@ from rfm_client.contract.wire import Tensors
 
 MS_PER_S = 1e3
 MAX_INT32 = 2**31 - 1
-AT_ONCE_S = 50e-3  # for so long Triton is left alone at most: others may wait there, who are to be rejected
+AT_ONCE_S = 50e-3  # what takes longer is done by another thread, so that meanwhile others can be rejected
+UNSEEN_S = 0.25  # for so long others may wait in Triton unseen: each look at them costs the time to send answers apart
 CHEAP_ANSWER_S = {"cpu": 5e-3, "cuda": 0.2e-3}  # one that takes less is not worth the time that sending it takes
 
 Question = TypeVar("Question")
@@ -93,7 +94,7 @@ class BatchModel(Generic[Question, Answer]):
         self._cheap_answer_s, self._is_on_cpu = CHEAP_ANSWER_S[device], device == "cpu"
         self._sample_s = math.inf  # what each sample of the last group took; inf: there was none
         bounds = _bounds(config, settings)
-        self._max_batch = bounds.batch_samples
+        self._max_batch, self._max_waiting = bounds.batch_samples, bounds.waiting_jobs
         self._max_ahead = min(self._max_batch, bounds.waiting_jobs or self._max_batch)
         self._patience_s = (int(settings.get(QUEUE_TIMEOUT_PARAMETER) or 0) / MS_PER_S) or None
         self._self_check = SelfCheck(self._score_blank, self._log.report_end)
@@ -184,7 +185,7 @@ class BatchModel(Generic[Question, Answer]):
         To send a response takes a tenth of a millisecond longer than to give it back, and a lone caller waits for the
         change of threads. But what is scored here keeps Triton from handing over more, and an accelerator waits until
         it does. A full batch says that more wait; some of them may have to be rejected. Of what waits behind a batch
-        that is not full, nothing is known; so all that is scored here between two looks takes AT_ONCE_S at most.
+        that is not full, nothing is known; so there is a look at them before they may have waited for too long.
 
         Where the process dies, Triton 2.51 fails the requests of ``execute``, and never those that are to be answered
         later. So all are answered at once while a suspect may kill the process.
@@ -199,12 +200,15 @@ class BatchModel(Generic[Question, Answer]):
 
     def _take_less(self, batch: Sequence[Request[Question]], limit_s: float, num_waiting: int = 0) -> bool:
         """Whether requests that are no full batch probably take less than ``limit_s``, and with ``num_waiting`` other
-        samples no longer than those who may wait in Triton are to be left alone.
+        samples less than AT_ONCE_S, and than those who may wait in Triton can be left alone.
         """
         num_samples, most = sum(each.num_samples for each in batch), max(each.num_samples for each in batch)
         if num_samples + most > self._max_batch:  # one more like them would not fit
             return False
-        left_s = AT_ONCE_S - self._triton_queue.unseen_s
+        # Unseen, none shall wait for longer than it may wait here.
+        queue_s = math.inf if self._max_waiting is None else self._sample_s * self._max_waiting
+        longest_s = min(UNSEEN_S, queue_s, self._patience_s or math.inf)
+        left_s = min(AT_ONCE_S, longest_s - self._triton_queue.unseen_s)
         return self._sample_s * num_samples < limit_s and self._sample_s * (num_samples + num_waiting) < left_s
 
     def _responses_to(self, batch: Sequence[Request[Question]]) -> list[Any]:

@@ -128,6 +128,7 @@ def test_cheap_requests_wait_for_what_is_under_way_and_are_answered_together(
     model.take([first])
     wait_for(lambda: model._pipeline._is_scoring)
     monkeypatch.setattr(batch_model, "AT_ONCE_S", PATIENCE_S)
+    monkeypatch.setattr(batch_model, "UNSEEN_S", PATIENCE_S)
     model._cheap_answer_s = PATIENCE_S
     waits = threading.Event()
     wait_for_idle = model._pipeline.wait_for
@@ -187,21 +188,33 @@ class Slow(Model):
 
 
 @pytest.mark.parametrize("batches", [[[1, 1, 1], [7]], [[1]]], ids=["of two sizes", "each alone"])
+@pytest.mark.parametrize("settings", [{"max_queue_size": "8"}, {"max_queue_size": "100"}], ids=["8 wait", "100 wait"])
 def test_what_waits_in_triton_behind_small_batches_is_bounded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batches: list[list[int]]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batches: list[list[int]], settings: dict[str, str]
 ) -> None:
     """Triton ends a batch also where the next request does not fit in, or has other inputs, however many wait."""
     monkeypatch.setattr(triton_queue, "HAND_OVER_S", PATIENCE_S)
-    model = Slow(tmp_path, settings={"max_queue_size": "8"})
+    model = Slow(tmp_path, settings=settings)
     model.respond([request(1)])
-    backlog = [[request(*[5] * size) for size in batch] for batch in batches * (200 // len(batches))]
+    backlog = [[request(*[5] * size) for size in batch] for batch in batches * (600 // len(batches))]
     for batch in backlog:
         model.take(batch)
     requests = [each for batch in backlog for each in batch]
     wait_for(lambda: all(each.responses for each in requests))
     errors = [each.responses[0].error for each in requests if each.responses[0].error is not None]
     assert 0 < len(errors) < len(requests)
-    assert all("the queue is full: 8 requests wait" in message for _, message in errors)
+    assert all(f"the queue is full: {settings['max_queue_size']} requests wait" in message for _, message in errors)
+
+
+def test_a_short_timeout_has_triton_looked_at_more_often(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(triton_queue, "HAND_OVER_S", PATIENCE_S)
+    monkeypatch.setattr(batch_model, "UNSEEN_S", PATIENCE_S)
+    model = Slow(tmp_path, settings={"queue_timeout_ms": "10"})
+    model.respond([request(1)])
+    requests = [request(5) for _ in range(100)]
+    answered_at_once = [model.execute([each]) is not None for each in requests]
+    assert not all(answered_at_once)
+    wait_for(lambda: len(model.batches) > 1 and model._pipeline.is_idle)
 
 
 def test_a_lone_caller_s_requests_are_all_answered_before_execute_returns(
@@ -211,7 +224,7 @@ def test_a_lone_caller_s_requests_are_all_answered_before_execute_returns(
     monkeypatch.setattr(batch_model, "time", SimpleNamespace(perf_counter=lambda: 0.0))  # no answer takes any time
     model = Model(tmp_path)
     model.respond([request(1)])
-    ends_s = time.monotonic() + 3 * batch_model.AT_ONCE_S
+    ends_s = time.monotonic() + 2 * batch_model.UNSEEN_S
     while time.monotonic() < ends_s:
         time.sleep(triton_queue.HAND_OVER_S)
         assert model.execute([request(5)]) is not None
