@@ -45,7 +45,7 @@ MAY_IMPORT = {
     "rfm.checkpoint": {"rfm.plain_yaml"},
     "rfm.rewind": SHARED,
     "rfm.vlm": SHARED,
-    "rfm.triton_model": {*SHARED, "rfm.journal", "rfm.parameters", "rfm.probe"},
+    "rfm.triton_model": {*SHARED, "rfm.journal", "rfm.parameters", "rfm.probe", "rfm.proc"},
     "rfm.launch": {"rfm.config", "rfm.journal", "rfm_client.contract"},
     "rfm.supervise": {"rfm.journal", "rfm.launch", "rfm.probe", "rfm.proc", "rfm_client.contract"},
     "rfm": {"rfm_client.contract"},
