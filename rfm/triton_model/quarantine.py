@@ -23,6 +23,7 @@ from queue import SimpleQueue
 from typing import Any
 
 from rfm.journal import NO_DIGEST, Journal, journal_file, journal_files
+from rfm.proc import arguments_of
 from rfm.steps import telling
 from rfm.triton_model.request import Request
 from rfm_client.contract.errors import DEADLY, InvalidSampleError
@@ -129,7 +130,7 @@ def all_journals(model: str) -> list[Path]:
 
 def _region() -> str:
     """Name of this process' shared memory."""
-    return os.fsdecode(Path("/proc/self/cmdline").read_bytes().split(b"\0")[_REGION])
+    return arguments_of(os.getpid())[_REGION]
 
 
 def _of_the_dead(file: Path) -> Journal | None:
