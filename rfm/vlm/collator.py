@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any, TypeAlias
 
@@ -37,8 +39,16 @@ QWEN3 = "qwen3_vl"
 VISION_START, VISION_END = "<|vision_start|>", "<|vision_end|>"
 IMAGE_PAD, VIDEO_PAD = "<|image_pad|>", "<|video_pad|>"
 SMOL_IMAGE, GLOBAL_IMAGE, FAKE = "<image>", "<global-img>", "<fake_token_around_image>"
+KEPT_TEXTS = 256  # conversations: an RL loop asks about the same task again and again
 
 Spans: TypeAlias = list[tuple[int, int]]
+
+
+class Visual(Enum):
+    """What a chat template shows besides text, by the name that it has there."""
+
+    IMAGE = "image"
+    VIDEO = "video"
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +104,8 @@ class VlmCollator:
         self.tokenizer = tokenizer
         self.images = images
         self._special_tokens = tuple(tokenizer.get_added_vocab())
+        self._rendered = lru_cache(KEPT_TEXTS)(self._render)
+        self._tokens = lru_cache(KEPT_TEXTS)(self._tokenise)
 
     @property
     def frames_per_shot(self) -> int:
@@ -159,15 +171,14 @@ class VlmCollator:
         return self._with_pixels(batch, rows)
 
     def _row(self, sample: Sample | NamedProgressSample, films: tuple[Film, ...]) -> VlmRow:
-        parts: list[str | dict[str, str]] = []
+        parts: list[str | Visual] = []
         for part in question(sample, progress_in_preference=self.config.progress_in_preference):
             parts += self._frame_parts(films[part.index].num_shown) if isinstance(part, TrajectoryPart) else [part]
         try:
-            text, pad, lengths = self._placed(self._rendered(parts), films)
+            text, pad, lengths = self._placed(self._rendered(tuple(parts)), films)
         except ValueError as error:  # an image of a shape that cannot be brought to size
             raise InvalidSampleError.at("frames", *str(error).split(", got ")) from error
-        ids = np.asarray(self.tokenizer(text, add_special_tokens=False, verbose=False)["input_ids"], np.int64)
-        ids = _expanded(ids, self.tokenizer.convert_tokens_to_ids(pad), lengths)
+        ids = _expanded(self._tokens(text), self.tokenizer.convert_tokens_to_ids(pad), lengths)
         is_similarity = isinstance(sample, SimilaritySample)
         query_token = SIMILARITY_TOKEN if is_similarity else PREFERENCE_TOKEN
         query = int(self._positions(ids, query_token)[-1]) if len(films) > 1 else None
@@ -175,20 +186,26 @@ class VlmCollator:
             ids, films, self._spans(ids, films), query, is_similarity, position_ids=self._position_ids(ids, films)
         )
 
-    def _frame_parts(self, num_frames: int) -> list[str | dict[str, str]]:
+    def _frame_parts(self, num_frames: int) -> list[str | Visual]:
         """Placeholders of one trajectory in the conversation."""
         if not self.config.multi_image:
-            return [{"type": "video"}]
-        each: list[str | dict[str, str]] = [{"type": "image"}]
+            return [Visual.VIDEO]
+        each: list[str | Visual] = [Visual.IMAGE]
         if self.config.per_frame_progress_token:
             each.append(PROGRESS_TOKEN)
         return each * num_frames
 
-    def _rendered(self, parts: Sequence[str | dict[str, str]]) -> str:
+    def _render(self, parts: tuple[str | Visual, ...]) -> str:
         """The chat template's text of one user message."""
-        content = [{"type": "text", "text": part} if isinstance(part, str) else part for part in parts]
+        content = [{"type": "text", "text": part} if isinstance(part, str) else {"type": part.value} for part in parts]
         conversation = [{"role": "user", "content": content}]
         return str(self.tokenizer.apply_chat_template(conversation, tokenize=False, add_vision_id=True))
+
+    def _tokenise(self, text: str) -> Indices:
+        """int64 [L]: the text's tokens; not to be changed."""
+        ids = np.asarray(self.tokenizer(text, add_special_tokens=False, verbose=False)["input_ids"], np.int64)
+        ids.setflags(write=False)
+        return ids
 
     def _placed(self, text: str, films: tuple[Film, ...]) -> tuple[str, str, list[int]]:
         """The text with one pad token for each image or video or group of it, which token, and of how many it stands

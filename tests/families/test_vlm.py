@@ -352,6 +352,42 @@ def test_the_task_is_not_a_template() -> None:
     assert "'put {task} there'" in tokens.tokenizer.decode(row.input_ids)
 
 
+@pytest.mark.parametrize("name", [PLAIN, "q25_video_last_l2", "smol_mean_disc10"])
+def test_a_question_that_was_asked_before_has_the_tokens_that_it_has_alone(name: str) -> None:
+    """Questions differ in one thing each: the task, the number of frames, their size, dense mode, the type, the order."""
+    one, other = film(0, 4, 56, 56), film(1, 3, 56, 84)
+    questions: list[Sample] = [
+        ProgressSample(one),
+        ProgressSample(film(0, 4, 56, 56, "stack the block")),
+        ProgressSample(film(0, 6, 56, 56)),
+        ProgressSample(film(0, 4, 84, 56)),
+        ProgressSample(one, frame_steps=2),
+        PreferenceSample(one, other),
+        PreferenceSample(other, one),
+        ProgressSample(film(0, 4, 56, 56, "image")),
+    ]
+    many = predictor_of(name).collator
+    for question in questions * 2:
+        (alone, *_), (among, *_) = load(name).collator.rows(question), many.rows(question)
+        np.testing.assert_array_equal(among.input_ids, alone.input_ids)
+        assert (among.spans, among.query) == (alone.spans, alone.query)
+
+
+def test_a_question_that_is_asked_again_is_not_rendered_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    collator = load(PLAIN).collator
+    rendered: list[object] = []
+    render = collator.tokenizer.apply_chat_template
+
+    def spy(conversation: object, **options: Any) -> object:
+        rendered.append(conversation)
+        return render(conversation, **options)
+
+    monkeypatch.setattr(collator.tokenizer, "apply_chat_template", spy)
+    for seed, height in ((0, 56), (1, 84), (2, 56)):
+        collator.rows(ProgressSample(film(seed, 2, height, 56)))
+    assert len(rendered) == 1
+
+
 def test_both_frames_of_a_group_carry_its_value() -> None:
     (outcome,) = load_engine("q25_video_last_l2").evaluate([ProgressSample(film(0, 5, 56, 56))])
     assert isinstance(outcome, ProgressResult)
