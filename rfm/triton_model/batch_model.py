@@ -154,8 +154,8 @@ class BatchModel(Generic[Question, Answer]):
     def execute(self, requests: Sequence[Any]) -> list[Any] | None:
         """Called by Triton with requests. Gives their responses; None: they are sent as they come."""
         self._self_check.wait_if_ending()
-        self._triton_queue.called()
         batch = [self._received(inference) for inference in requests]
+        self._triton_queue.called(len(batch), sum(request.num_bytes for request in batch))
         if self._is_on_cpu and self._are_cheap(batch, self._pipeline.num_samples_waiting):
             self._pipeline.wait_for(lambda: self._pipeline.is_idle, AT_ONCE_S)
         if self._pipeline.is_idle and self._is_better_at_once(batch):
@@ -205,8 +205,9 @@ class BatchModel(Generic[Question, Answer]):
         num_samples, most = sum(each.num_samples for each in batch), max(each.num_samples for each in batch)
         if num_samples + most > self._max_batch:  # one more like them would not fit
             return False
-        # Unseen, none shall wait for longer than it may wait here.
-        queue_s = math.inf if self._max_waiting is None else self._sample_s * self._max_waiting
+        # Unseen, none shall wait for longer than it may wait here, behind requests as large as these.
+        request_s = self._sample_s * num_samples / len(batch)
+        queue_s = math.inf if self._max_waiting is None else request_s * self._max_waiting
         longest_s = min(UNSEEN_S, queue_s, self._patience_s or math.inf)
         left_s = min(AT_ONCE_S, longest_s - self._triton_queue.unseen_s)
         return self._sample_s * num_samples < limit_s and self._sample_s * (num_samples + num_waiting) < left_s

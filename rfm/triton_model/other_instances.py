@@ -17,7 +17,8 @@ from rfm.triton_model.pipeline import Pipeline
 from rfm.triton_model.quarantine import all_journals, own_journal
 
 POLL_S = 2e-3  # between two questions whether another instance is idle, while this instance computes
-LONG_S = 0.1  # one that owes nothing and has worked for so long does so in ``execute``: it takes nothing meanwhile
+LONG_S = 0.1  # one that owes nothing and has not got on for so long scores in ``execute``: it takes nothing meanwhile
+STUCK_S = 1.0  # one that has not got on for so long may hang: nobody leaves requests to it
 LOOK_S = 1.0  # between two looks for other instances: they come and go with a load
 _MODEL_FILE = 1  # which argument of a model process names its model.py
 
@@ -68,9 +69,9 @@ class OtherInstances:
 
 
 def _has(journal: Journal, num_owed: int) -> bool:
-    """Whether an instance is at work, and owes so many answers or has scored for long in ``execute``."""
+    """Whether an instance is at work, and owes so many answers, or has not got on for long."""
     busy_s, owed = journal.busy_s, journal.num_owed
-    return busy_s > 0 and (owed >= num_owed or (not owed and busy_s >= LONG_S))
+    return busy_s > 0 and (owed >= num_owed or busy_s >= (STUCK_S if owed else LONG_S))
 
 
 def _journals_of_this_version(model: str) -> list[Path]:

@@ -174,6 +174,11 @@ class Request(Generic[Question]):
         self.sender.send(response, flags=pb_utils.TRITONSERVER_RESPONSE_COMPLETE_FINAL)
 
     @property
+    def num_bytes(self) -> int:
+        """Bytes of its tensors."""
+        return sum(array.nbytes for array in self.tensors.values())
+
+    @property
     def is_counted(self) -> bool:
         """Whether the metrics count this request: a caller sent it."""
         return self.origin is Origin.CALLER

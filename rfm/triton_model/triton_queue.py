@@ -6,29 +6,34 @@ from __future__ import annotations
 import math
 import time
 
-HAND_OVER_S = 1e-3  # what waits in Triton comes sooner, if Triton sends one response before; twice so long for two
+HAND_OVER_S = 1e-3  # within it Triton sends one response, or hands over one request
+COPY_S_PER_BYTE = 2e-9  # to hand a request over, Triton copies its inputs
+LATE_CALLS = 2  # one may be late because the machine is busy
 
 
 class TritonQueue:
     """Triton's queue of requests for a model, as the times of the calls of ``execute`` show it.
 
     When ``execute`` has returned, Triton sends the responses that it gave back, and hands over what waits. If it takes
-    longer to call again, nothing waited.
+    longer than that to call again, nothing waited. After LATE_CALLS such calls in a row the queue counts as empty.
     """
 
     def __init__(self) -> None:
         self._returned_s = self._empty_s = -math.inf
         self._num_responses = 0
+        self._num_late = LATE_CALLS - 1  # before the first call nothing has waited
 
     @property
     def unseen_s(self) -> float:
-        """Seconds since the queue was last seen to be empty: no request waits in it for longer."""
+        """Seconds since the queue last counted as empty: no request has waited in it for longer."""
         return time.monotonic() - self._empty_s
 
-    def called(self) -> None:
-        """Notes that Triton calls ``execute``."""
+    def called(self, num_requests: int, num_bytes: int) -> None:
+        """Notes that Triton has called ``execute`` with so many requests, with so many bytes of inputs."""
         called_s = time.monotonic()
-        if called_s - self._returned_s >= HAND_OVER_S * max(self._num_responses, 1):
+        hand_over_s = HAND_OVER_S * (self._num_responses + num_requests) + COPY_S_PER_BYTE * num_bytes
+        self._num_late = self._num_late + 1 if called_s - self._returned_s >= hand_over_s else 0
+        if self._num_late >= LATE_CALLS:
             self._empty_s = called_s
 
     def returned(self, num_responses: int) -> None:

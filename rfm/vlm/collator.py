@@ -8,12 +8,12 @@ Reading a row is cheap. Bringing its frames to size is not: that may be done bef
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -40,7 +40,11 @@ VISION_START, VISION_END = "<|vision_start|>", "<|vision_end|>"
 IMAGE_PAD, VIDEO_PAD = "<|image_pad|>", "<|video_pad|>"
 SMOL_IMAGE, GLOBAL_IMAGE, FAKE = "<image>", "<global-img>", "<fake_token_around_image>"
 KEPT_TEXTS = 256  # conversations: an RL loop asks about the same task again and again
+MAX_KEPT_CHARACTERS = 16_384  # of one; a task sentence and 128 frames have fewer
+FRAME_CHARACTERS = 64  # of a chat template's text about a frame, about
 
+Asked = TypeVar("Asked", bound=Hashable)
+Read = TypeVar("Read")
 Spans: TypeAlias = list[tuple[int, int]]
 
 
@@ -104,8 +108,8 @@ class VlmCollator:
         self.tokenizer = tokenizer
         self.images = images
         self._special_tokens = tuple(tokenizer.get_added_vocab())
-        self._rendered = lru_cache(KEPT_TEXTS)(self._render)
-        self._tokens = lru_cache(KEPT_TEXTS)(self._tokenise)
+        self._rendered = _kept(self._render, _num_characters)
+        self._tokens = _kept(self._tokenise, len)
 
     @property
     def frames_per_shot(self) -> int:
@@ -384,6 +388,17 @@ class SmolCollator(VlmCollator):
             shape=(len(rows), int(counts.max())),
         )
         return replace(batch, pixels=pixels)
+
+
+def _kept(read: Callable[[Asked], Read], length: Callable[[Asked], int]) -> Callable[[Asked], Read]:
+    """``read``, whose latest results are kept for what is not long; ``length``: characters of what is read."""
+    kept = lru_cache(KEPT_TEXTS)(read)
+    return lambda asked: (kept if length(asked) <= MAX_KEPT_CHARACTERS else read)(asked)
+
+
+def _num_characters(parts: Sequence[str | Visual]) -> int:
+    """About as many as the chat template makes of the parts."""
+    return sum(len(part) if isinstance(part, str) else FRAME_CHARACTERS for part in parts)
 
 
 def _film(trajectory: Trajectory | NamedTrajectory, frame_steps: int) -> Film:

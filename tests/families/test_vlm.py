@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -352,9 +353,15 @@ def test_the_task_is_not_a_template() -> None:
     assert "'put {task} there'" in tokens.tokenizer.decode(row.input_ids)
 
 
-@pytest.mark.parametrize("name", [PLAIN, "q25_video_last_l2", "smol_mean_disc10"])
-def test_a_question_that_was_asked_before_has_the_tokens_that_it_has_alone(name: str) -> None:
-    """Questions differ in one thing each: the task, the number of frames, their size, dense mode, the type, the order."""
+ASKED_AGAIN = {
+    **{name: partial(predictor_of, name) for name in (PLAIN, "q25_video_last_l2", "smol_mean_disc10")},
+    f"{PLAIN} on videos": lambda: on_videos(PLAIN),
+}
+
+
+@pytest.mark.parametrize("make", ASKED_AGAIN.values(), ids=ASKED_AGAIN)
+def test_a_question_is_read_as_if_no_other_had_been_asked_before(make: Callable[[], VlmPredictor]) -> None:
+    """Questions differ in one thing each: the task, how many frames, their size, dense mode, the type, the order."""
     one, other = film(0, 4, 56, 56), film(1, 3, 56, 84)
     questions: list[Sample] = [
         ProgressSample(one),
@@ -366,26 +373,41 @@ def test_a_question_that_was_asked_before_has_the_tokens_that_it_has_alone(name:
         PreferenceSample(other, one),
         ProgressSample(film(0, 4, 56, 56, "image")),
     ]
-    many = predictor_of(name).collator
+    many = make().collator
     for question in questions * 2:
-        (alone, *_), (among, *_) = load(name).collator.rows(question), many.rows(question)
+        fresh = copy(many)
+        fresh.__init__(many.config, many.tokenizer, many.images)  # type: ignore[misc]  # it has kept nothing
+        (alone, *_), (among, *_) = fresh.rows(question), many.rows(question)
         np.testing.assert_array_equal(among.input_ids, alone.input_ids)
+        np.testing.assert_array_equal(among.position_ids, alone.position_ids)  # type: ignore[arg-type]
         assert (among.spans, among.query) == (alone.spans, alone.query)
 
 
-def test_a_question_that_is_asked_again_is_not_rendered_again(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("task", "expected"), [("stack", 1), ("stack " * 3000, 3)], ids=["short", "long"])
+def test_a_short_question_that_is_asked_again_is_not_tokenised_again(
+    monkeypatch: pytest.MonkeyPatch, task: str, expected: int
+) -> None:
+    """Long ones are not kept: they would take memory without end."""
     collator = load(PLAIN).collator
-    rendered: list[object] = []
-    render = collator.tokenizer.apply_chat_template
+    made: Counter[str] = Counter()
 
-    def spy(conversation: object, **options: Any) -> object:
-        rendered.append(conversation)
-        return render(conversation, **options)
+    class Spy:
+        def __call__(self, text: str, **options: Any) -> Any:
+            made["tokens"] += 1
+            return tokenizer(text, **options)
 
-    monkeypatch.setattr(collator.tokenizer, "apply_chat_template", spy)
+        def apply_chat_template(self, *arguments: Any, **options: Any) -> Any:
+            made["text"] += 1
+            return tokenizer.apply_chat_template(*arguments, **options)
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(tokenizer, name)
+
+    tokenizer = collator.tokenizer
+    monkeypatch.setattr(collator, "tokenizer", Spy())
     for seed, height in ((0, 56), (1, 84), (2, 56)):
-        collator.rows(ProgressSample(film(seed, 2, height, 56)))
-    assert len(rendered) == 1
+        collator.rows(ProgressSample(film(seed, 2, height, 56, task)))
+    assert made == {"text": expected, "tokens": expected}
 
 
 def test_both_frames_of_a_group_carry_its_value() -> None:

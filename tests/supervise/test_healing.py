@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import re
 import signal
@@ -39,10 +40,12 @@ from rfm.triton_model.self_check import FAILED_BATCHES
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,
+    ProgressSample,
     RewardClient,
     ServerUnavailableError,
 )
-from rfm_client.contract import triton
+from rfm_client.contract import triton, wire
+from rfm_client.transport.calls import Answer, connect
 from rfm_serve import MODEL, PATIENCE_S, RFM, TRUTH_S, Serving, children, serving, wait_for
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
@@ -60,6 +63,12 @@ def slow(self, questions, execution):
 
 
 TritonPythonModel.answer = slow
+"""
+CHEAP = f"""
+
+from rfm.triton_model import batch_model
+
+batch_model.CHEAP_ANSWER_S = {{"cpu": {PATIENCE_S}}}  # every answer counts as cheap, however slow the machine is
 """
 BREAKS = """
 
@@ -433,6 +442,34 @@ def test_a_full_queue_refuses_at_once_and_a_long_wait_is_cut_short(tmp_path: Pat
         assert sorted(full)[len(full) // 2] < max(served)  # they did not wait for anybody
         # Who tries again is served in the end.
         assert [future.result()[1] for future in [pool.submit(ask, patient) for _ in range(12)]] == [None] * 12
+
+
+def test_a_full_queue_refuses_cheap_requests_that_triton_hands_over_one_by_one(tmp_path: Path) -> None:
+    """Every other request has one more input, so none shares a batch with the next, however many wait in Triton."""
+    repository = make_repository(tmp_path, more_code=CHEAP, max_queue_size=4)
+    with (repository / MODEL / "config.pbtxt").open("a") as config:
+        config.write('input { name: "more" data_type: TYPE_FP32 dims: [ 1 ] optional: true }\n')
+    inputs = wire.encode_samples([ProgressSample(trajectory(0))])
+    others = inputs | {"more": np.zeros((1, 1), np.float32)}
+
+    async def outcomes(url: str) -> list[Answer | BaseException]:
+        server = connect(url)
+        try:
+            await server.infer(MODEL, inputs, ["progress"], PATIENCE_S)
+            asked = [server.infer(MODEL, each, ["progress"], PATIENCE_S) for each in [inputs, others] * 128]
+            return await asyncio.gather(*asked, return_exceptions=True)
+        finally:
+            await server.close()
+
+    with (
+        (tmp_path / "log").open("wb") as log,
+        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+    ):
+        came = asyncio.run(outcomes(server.endpoints.grpc_url))
+        errors = [outcome for outcome in came if isinstance(outcome, BaseException)]
+        assert 0 < len(errors) < len(came)
+        assert all(triton.QUEUE_FULL in str(error) for error in errors)
+        wait_for(lambda: rejected(server.endpoints.metrics_url) == len(errors))
 
 
 def rejected(metrics_url: str) -> float:

@@ -226,7 +226,7 @@ def test_a_lone_caller_s_requests_are_all_answered_before_execute_returns(
     model.respond([request(1)])
     ends_s = time.monotonic() + 2 * batch_model.UNSEEN_S
     while time.monotonic() < ends_s:
-        time.sleep(triton_queue.HAND_OVER_S)
+        time.sleep(3 * triton_queue.HAND_OVER_S)
         assert model.execute([request(5)]) is not None
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import subprocess
 import threading
@@ -126,22 +127,36 @@ def test_one_that_is_long_at_work_on_what_it_owes_takes_more_before_this_one(
         waiting.result(PATIENCE_S)
 
 
-def test_an_idle_instance_of_another_version_is_waited_for_by_none(
-    busy: Instance, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("other_version", ["1", "2"])
+def test_an_idle_instance_is_waited_for_by_those_of_its_version_alone(
+    busy: Instance, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, other_version: str
 ) -> None:
-    """While versions take turns, Triton gives it no request of this one's."""
+    """While versions take turns, Triton gives it no request of another's."""
     journals = [tmp_path / "own", tmp_path / "other"]
     Journal.create(journals[0], 1)
     with subprocess.Popen(["sleep", str(3 * PATIENCE_S)]) as other, ThreadPoolExecutor(1) as pool:
         journals[1].write_bytes(struct.pack("<Q", other.pid) + journals[1].read_bytes()[8:])
+        arguments = {os.getpid(): ["stub", "rfm/1/model.py"], other.pid: ["stub", f"rfm/{other_version}/model.py"]}
+        monkeypatch.setattr(other_instances, "arguments_of", arguments.__getitem__)
         monkeypatch.setattr(other_instances, "all_journals", lambda model: journals)
         monkeypatch.setattr(other_instances, "own_journal", lambda model: journals[0])
         waiting = pool.submit(OtherInstances.of_this_process("rfm").wait_for_turn, busy.pipeline, MAX_WAITING)
         try:
-            waiting.result(PATIENCE_S / 4)  # less than this instance waits for its first job
+            if other_version == "1":
+                assert not busy.pipeline.wait_for(waiting.done, 0.1)
+            else:
+                waiting.result(PATIENCE_S / 4)  # less than this instance waits for its first job
         finally:
             other.kill()
             busy.may_score.set()
+
+
+def test_one_that_may_hang_takes_nothing_whatever_it_owes(busy: Instance, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(other_instances, "STUCK_S", 0.0)
+    busy.pipeline.put([Job() for _ in range(MAX_WAITING)])
+    busy.other.owe(1)
+    with busy.other.at_work_on([NO_DIGEST]):
+        busy.wait()
 
 
 def test_an_idle_instance_waits_for_nobody(busy: Instance) -> None:
