@@ -420,6 +420,25 @@ def test_both_frames_of_a_group_carry_its_value() -> None:
     assert len(set(progress)) == 3
 
 
+@pytest.mark.parametrize("config", goldens.VLM, ids=lambda config: config.name)
+def test_a_network_that_reads_images_is_causal_and_one_that_reads_videos_is_not(config: goldens.Config) -> None:
+    """As the documents say: there is no need to score each prefix of a trajectory that is read as images."""
+    engine = load_engine(config.name)
+    whole, prefix = engine.evaluate(
+        [ProgressSample(film(0, 8, 56, 56)), ProgressSample(of_length(film(0, 8, 56, 56), 5))]
+    )
+    assert isinstance(whole, ProgressResult)
+    assert isinstance(prefix, ProgressResult)
+    difference = np.abs(whole.progress[:5] - prefix.progress).max()
+    is_causal = load(config.name).description.frames_per_value == 1
+    assert (difference <= MIXED_TOLERANCE) == is_causal
+
+
+def of_length(trajectory: Trajectory, count: int) -> Trajectory:
+    assert trajectory.frames is not None
+    return Trajectory(frames=trajectory.frames[:count], task=trajectory.task)
+
+
 def test_out_of_memory_halves_the_batch_and_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     """The CPU has no memory of a device that could run out: the network refuses larger batches in its place."""
     engine = Engine(load_engine(PLAIN).predictor)
