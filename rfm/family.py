@@ -8,17 +8,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-import torch
-from torch import Tensor
-
-from rfm.execution import Execution
 from rfm.feature_cache import FeatureCache
-from rfm.predictor import Predictor
 from rfm_client.contract import FrameSize, RewardError
 from rfm_client.contract.named_frames import NamedFootage
 from rfm_client.contract.samples import Float32Array, Footage
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+    from rfm.execution import Execution
+    from rfm.predictor import Predictor
 
 NETWORK = "network"  # in Checkpoint.parts: the weights of the network that scores
 

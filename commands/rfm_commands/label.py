@@ -3,78 +3,20 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
-from functools import cached_property
-from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Annotated, Any, cast
+from typing import Annotated
 
-import torch
 import typer
 
-from rfm import families
-from rfm.checkpoint import training
-from rfm.checkpoint.digest import settings_digest, weights_digest
-from rfm.engine import Engine
-from rfm.execution import Execution
-from rfm.family import Checkpoint, FrameEncoders
-from rfm_client import ProgressResult, ProgressSample, RewardError, Trajectory
+from rfm.checkpoint.content import CheckpointError
+from rfm_client import RewardError
 from rfm_client.cli.label import Source
 from rfm_client.cli.label_flags import LabelFlags, with_label_flags
 from rfm_client.cli.options import missing_package
-from rfm_client.contract.samples import Footage, UInt8Array
-from rfm_client.labelling import CheckpointFacts, Scorer
+from rfm_client.labelling import Scorer
 
 EXIT_FAILED = 1
-
-
-class EngineScorer:
-    """Scores with an engine, one call at a time: while one thread scores, the others decode.
-
-    The engine is on its device as soon as it scores; until then only the checkpoint is in memory.
-
-    notes: lines for the user on what the checkpoint's training run left untrained
-    """
-
-    def __init__(self, source: str, *, device: str = "cpu", **options: Any) -> None:
-        """The scorer of a checkpoint folder or Hugging Face id. Raises CheckpointError.
-
-        options: as in ``rfm.families.load``
-        """
-        self._checkpoint = families.load(source, **options)
-        self._encoders = self._checkpoint.encoders()
-        told = {"device": torch.device(device).type, **{name: _named(value) for name, value in options.items()}}
-        folders = _folders(source, options)
-        self._facts = _facts(source, self._checkpoint, self._encoders, folders, told)
-        self.notes = training.notes(folders[0], (training.PROGRESS, training.SUCCESS))
-        self._device = device
-        self._lock = threading.Lock()
-
-    def checkpoint(self) -> CheckpointFacts:
-        """The facts of the checkpoint."""
-        return self._facts
-
-    def encode(self, frames: UInt8Array, task: str) -> Trajectory:
-        """The embeddings of frames and task. Raises RewardError."""
-        with self._lock:
-            encoders = self._engine.encoders
-            assert encoders is not None  # or the facts would not say that it encodes
-            footage = Footage((Trajectory(frames=frames, task=task),))
-            (outcome,) = encoders.encode([footage], Execution(), None)
-        return cast(Footage, _result(outcome)).trajectories[0]
-
-    def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
-        """The result of each sample. Raises RewardError for the first that fails."""
-        with self._lock:
-            outcomes = self._engine.evaluate(samples)
-        return [cast(ProgressResult, _result(outcome)) for outcome in outcomes]
-
-    @cached_property
-    def _engine(self) -> Engine:
-        return Engine.of(self._checkpoint, encoders=self._encoders, device=self._device)
 
 
 @with_label_flags
@@ -101,6 +43,8 @@ def label(
 
     @contextmanager
     def connect() -> Iterator[Scorer]:
+        from rfm_commands.engine_scorer import EngineScorer
+
         scorer = EngineScorer(checkpoint, device=device, **options)
         for note in scorer.notes:
             _say(note)
@@ -113,66 +57,13 @@ def label(
     raise typer.Exit(status)
 
 
-def _facts(
-    source: str,
-    checkpoint: Checkpoint,
-    encoders: FrameEncoders | None,
-    folders: Sequence[Path],
-    told: Mapping[str, Any],
-) -> CheckpointFacts:
-    description = checkpoint.description
-    limits = [limit for limit in (description.trained_frames, description.max_frames) if limit is not None]
-    name, _, tag = source.partition("@")
-    is_local = Path(source).is_dir()
-    return CheckpointFacts(
-        source="/".join(Path(source).resolve().parts[-2:]) if is_local else name,
-        revision=None if is_local else tag or None,
-        weights_digest=weights_digest(folders),
-        settings_digest=_settings_digest(checkpoint, encoders, folders, told),
-        max_frames=min(limits, default=None),
-        frame_size=description.frame_size if encoders is None else encoders.description.frame_size,
-        encodes=encoders is not None,
-        is_causal=getattr(checkpoint.config, "causal_mask", None) is True,
-    )
-
-
-def _settings_digest(
-    checkpoint: Checkpoint, encoders: FrameEncoders | None, folders: Sequence[Path], told: Mapping[str, Any]
-) -> str:
-    """Of all that decides the scores beside the folders' weights, encoders of the Hub with their weights."""
-    told = {**told, "network": asdict(checkpoint.config)}
-    if encoders is None:
-        return settings_digest(folders, told)
-    with TemporaryDirectory(prefix="rfm-label-") as written:
-        encoders.save(Path(written))
-        told["encoders"] = weights_digest([Path(written)])
-        return settings_digest([*folders, Path(written)], told)
-
-
-def _named(value: Any) -> Any:
-    """An option; of one that names a local folder nothing, since its files are looked at."""
-    return None if isinstance(value, str) and Path(value).is_dir() else value
-
-
-def _folders(source: str, options: dict[str, Any]) -> list[Path]:
-    """The local folders whose weights decide the scores, the checkpoint's first."""
-    named = [options.get(name) for name in ("image_encoder", "text_encoder", "base_model")]
-    return [families.find(source), *(Path(folder) for folder in named if folder and Path(folder).is_dir())]
-
-
-def _result(outcome: Any) -> Any:
-    if isinstance(outcome, RewardError):
-        raise outcome
-    return outcome
-
-
 @contextmanager
 def _errors_on_one_line(say: Callable[[str], None]) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
         say(missing_package(error))
-    except (families.CheckpointError, RewardError, OSError) as error:
+    except (CheckpointError, RewardError, OSError) as error:
         say(str(error))
     else:
         return

@@ -10,14 +10,15 @@ import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 from safetensors import SafetensorError
-from safetensors.torch import load_file
-from torch import Tensor
 
 from rfm.plain_yaml import read_yaml
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 MAX_JSON_BYTES = 2**24
 MAX_HEADER_BYTES = 2**24  # of a safetensors file: a hundred for each tensor
@@ -127,6 +128,8 @@ def read_run_config(file: Path) -> dict[str, Any]:
 
 def read_tensors(file: Path) -> dict[str, Tensor]:
     """All tensors of one safetensors file. Raises CheckpointError."""
+    from safetensors.torch import load_file  # not before: PyTorch takes seconds, and few commands need it
+
     _require(file)
     try:
         _check_header(file)

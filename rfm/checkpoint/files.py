@@ -6,12 +6,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Any
 
 from rfm.checkpoint.content import CheckpointError, cut, is_there, listed, read_json, read_tensors, shown
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 WEIGHTS = "model.safetensors"
 WEIGHTS_INDEX = "model.safetensors.index.json"
@@ -80,8 +80,8 @@ def check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> N
 def check_finite(weights: Mapping[str, Tensor]) -> None:
     """Raises CheckpointError for a weight that is no number: every score would be none."""
     for name, tensor in weights.items():
-        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
-            at = (~torch.isfinite(tensor)).nonzero()[0].tolist()
+        if tensor.is_floating_point() and not tensor.isfinite().all():
+            at = (~tensor.isfinite()).nonzero()[0].tolist()
             raise CheckpointError(f"{name}: expected finite weights, got {tensor[tuple(at)].item()} at {at}")
 
 

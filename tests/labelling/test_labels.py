@@ -29,7 +29,7 @@ from rfm_client.labelling import (
     open_dataset,
     parse_episodes,
 )
-from rfm_commands.label import EngineScorer
+from rfm_commands.engine_scorer import EngineScorer
 
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 TOLERANCE = 1e-5

@@ -18,7 +18,7 @@ from rfm.launch.process import Endpoints
 from rfm_client import RewardClient
 from rfm_client.labelling import ClientScorer
 from rfm_commands.cli import app
-from rfm_commands.label import EngineScorer
+from rfm_commands.engine_scorer import EngineScorer
 
 DATASET = LEROBOT / "toy_v30_many"
 MODELS = ROOT / "model_repository"

@@ -150,6 +150,13 @@ def test_labelling_is_imported_without_an_extra() -> None:
     assert output.strip() == "[]"
 
 
+def test_rfm_serve_and_rfm_models_start_without_pytorch() -> None:
+    """It would take them two seconds and 200 MB."""
+    modules = "rfm_commands.cli, rfm_commands.rollout, rfm_commands.unused_settings, rfm.supervise.supervisor"
+    code = f"import sys, {modules}; sys.exit('torch' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
 def test_the_domain_knows_nothing_of_triton() -> None:
     for file in (ROOT / "rfm").rglob("*.py"):
         if not {"launch", "supervise", "triton_model"} & set(file.parts):
