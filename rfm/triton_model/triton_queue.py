@@ -6,8 +6,9 @@ from __future__ import annotations
 import math
 import time
 
-HAND_OVER_S = 1e-3  # within it Triton sends one response, or hands over one request
-COPY_S_PER_BYTE = 2e-9  # to hand a request over, Triton copies its inputs
+CALL_S = 1e-3  # within it Triton calls again if something waits, or sends one response; twice so long for two
+REQUEST_S = 0.25e-3  # more for each request that it hands over
+COPY_S_PER_BYTE = 2e-9  # and for its inputs, which Triton copies
 LATE_CALLS = 2  # one may be late because the machine is busy
 
 
@@ -31,8 +32,8 @@ class TritonQueue:
     def called(self, num_requests: int, num_bytes: int) -> None:
         """Notes that Triton has called ``execute`` with so many requests, with so many bytes of inputs."""
         called_s = time.monotonic()
-        hand_over_s = HAND_OVER_S * (self._num_responses + num_requests) + COPY_S_PER_BYTE * num_bytes
-        self._num_late = self._num_late + 1 if called_s - self._returned_s >= hand_over_s else 0
+        needed_s = CALL_S * max(self._num_responses, 1) + REQUEST_S * num_requests + COPY_S_PER_BYTE * num_bytes
+        self._num_late = self._num_late + 1 if called_s - self._returned_s >= needed_s else 0
         if self._num_late >= LATE_CALLS:
             self._empty_s = called_s
 

@@ -193,7 +193,7 @@ def test_what_waits_in_triton_behind_small_batches_is_bounded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batches: list[list[int]], settings: dict[str, str]
 ) -> None:
     """Triton ends a batch also where the next request does not fit in, or has other inputs, however many wait."""
-    monkeypatch.setattr(triton_queue, "HAND_OVER_S", PATIENCE_S)
+    monkeypatch.setattr(triton_queue, "CALL_S", PATIENCE_S)
     model = Slow(tmp_path, settings=settings)
     model.respond([request(1)])
     backlog = [[request(*[5] * size) for size in batch] for batch in batches * (600 // len(batches))]
@@ -207,7 +207,7 @@ def test_what_waits_in_triton_behind_small_batches_is_bounded(
 
 
 def test_a_short_timeout_has_triton_looked_at_more_often(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(triton_queue, "HAND_OVER_S", PATIENCE_S)
+    monkeypatch.setattr(triton_queue, "CALL_S", PATIENCE_S)
     monkeypatch.setattr(batch_model, "UNSEEN_S", PATIENCE_S)
     model = Slow(tmp_path, settings={"queue_timeout_ms": "10"})
     model.respond([request(1)])
@@ -226,7 +226,7 @@ def test_a_lone_caller_s_requests_are_all_answered_before_execute_returns(
     model.respond([request(1)])
     ends_s = time.monotonic() + 2 * batch_model.UNSEEN_S
     while time.monotonic() < ends_s:
-        time.sleep(3 * triton_queue.HAND_OVER_S)
+        time.sleep(3 * triton_queue.CALL_S)
         assert model.execute([request(5)]) is not None
 
 

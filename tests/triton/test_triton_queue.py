@@ -9,7 +9,7 @@ import pytest
 
 from clock import Clock
 from rfm.triton_model import triton_queue
-from rfm.triton_model.triton_queue import COPY_S_PER_BYTE, HAND_OVER_S, TritonQueue
+from rfm.triton_model.triton_queue import CALL_S, COPY_S_PER_BYTE, REQUEST_S, TritonQueue
 
 
 @pytest.fixture
@@ -48,10 +48,10 @@ def test_at_the_first_call_nothing_has_waited(clock: Clock) -> None:
 @pytest.mark.parametrize(
     ("num_responses", "num_requests", "num_bytes", "allowed_s"),
     [
-        (0, 1, 0, HAND_OVER_S),
-        (3, 1, 0, 4 * HAND_OVER_S),
-        (0, 5, 0, 5 * HAND_OVER_S),
-        (2, 1, 20_000_000, 3 * HAND_OVER_S + 20_000_000 * COPY_S_PER_BYTE),
+        (0, 1, 0, CALL_S + REQUEST_S),
+        (3, 1, 0, 3 * CALL_S + REQUEST_S),
+        (0, 5, 0, CALL_S + 5 * REQUEST_S),
+        (2, 1, 20_000_000, 2 * CALL_S + REQUEST_S + 20_000_000 * COPY_S_PER_BYTE),
     ],
 )
 def test_nothing_waited_if_two_calls_in_a_row_come_later_than_triton_needs(
