@@ -9,7 +9,7 @@ import pytest
 
 from clock import Clock
 from rfm.triton_model import triton_queue
-from rfm.triton_model.triton_queue import CALL_S, COPY_S_PER_BYTE, REQUEST_S, TritonQueue
+from rfm.triton_model.triton_queue import CALL_S, COPY_S_PER_BYTE, REQUEST_S, SURELY, TritonQueue
 
 
 @pytest.fixture
@@ -71,3 +71,5 @@ def test_nothing_waited_if_two_calls_in_a_row_come_later_than_triton_needs(
     unseen_s(late_s)
     assert unseen_s(late_s) == 0.0
     assert unseen_s(late_s) == 0.0  # for as long as they are late
+    assert unseen_s(in_time_s) > 0.0
+    assert unseen_s(1.1 * SURELY * allowed_s) == 0.0  # so late is no call that brings what has waited
