@@ -27,7 +27,7 @@ class TritonQueue:
 
     @property
     def unseen_s(self) -> float:
-        """Seconds since the queue last counted as empty: no request has waited in it for longer."""
+        """Seconds since the queue last counted as empty: as far as that tells, none has waited in it for longer."""
         return time.monotonic() - self._empty_s
 
     def called(self, num_requests: int, num_bytes: int) -> None:

@@ -8,12 +8,10 @@ Reading a row is cheap. Bringing its frames to size is not: that may be done bef
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from enum import Enum
-from functools import lru_cache
 from itertools import pairwise
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -21,6 +19,7 @@ from torch import Tensor
 
 from rfm.feature_cache import FeatureCache
 from rfm.vlm.batch import FramesOfOneSize, QwenPixels, SmolPixels, VlmBatch
+from rfm.vlm.chat import Chat, Visual
 from rfm.vlm.film import Film, Indices, Shot, SizedFrames, named_frames
 from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, Grid, QwenImages, SmolImages
 from rfm.vlm.network import VlmConfig
@@ -39,20 +38,8 @@ QWEN3 = "qwen3_vl"
 VISION_START, VISION_END = "<|vision_start|>", "<|vision_end|>"
 IMAGE_PAD, VIDEO_PAD = "<|image_pad|>", "<|video_pad|>"
 SMOL_IMAGE, GLOBAL_IMAGE, FAKE = "<image>", "<global-img>", "<fake_token_around_image>"
-KEPT_TEXTS = 256  # conversations: an RL loop asks about the same task again and again
-MAX_KEPT_CHARACTERS = 16_384  # of one; a task sentence and 128 frames have fewer
-FRAME_CHARACTERS = 64  # of a chat template's text about a frame, about
 
-Asked = TypeVar("Asked", bound=Hashable)
-Read = TypeVar("Read")
 Spans: TypeAlias = list[tuple[int, int]]
-
-
-class Visual(Enum):
-    """What a chat template shows besides text, by the name that it has there."""
-
-    IMAGE = "image"
-    VIDEO = "video"
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +95,7 @@ class VlmCollator:
         self.tokenizer = tokenizer
         self.images = images
         self._special_tokens = tuple(tokenizer.get_added_vocab())
-        self._rendered = _kept(self._render, _num_characters)
-        self._tokens = _kept(self._tokenise, len)
+        self._chat = Chat(tokenizer)
 
     @property
     def frames_per_shot(self) -> int:
@@ -179,10 +165,10 @@ class VlmCollator:
         for part in question(sample, progress_in_preference=self.config.progress_in_preference):
             parts += self._frame_parts(films[part.index].num_shown) if isinstance(part, TrajectoryPart) else [part]
         try:
-            text, pad, lengths = self._placed(self._rendered(tuple(parts)), films)
+            text, pad, lengths = self._placed(self._chat.text(tuple(parts)), films)
         except ValueError as error:  # an image of a shape that cannot be brought to size
             raise InvalidSampleError.at("frames", *str(error).split(", got ")) from error
-        ids = _expanded(self._tokens(text), self.tokenizer.convert_tokens_to_ids(pad), lengths)
+        ids = _expanded(self._chat.tokens(text), self.tokenizer.convert_tokens_to_ids(pad), lengths)
         is_similarity = isinstance(sample, SimilaritySample)
         query_token = SIMILARITY_TOKEN if is_similarity else PREFERENCE_TOKEN
         query = int(self._positions(ids, query_token)[-1]) if len(films) > 1 else None
@@ -198,18 +184,6 @@ class VlmCollator:
         if self.config.per_frame_progress_token:
             each.append(PROGRESS_TOKEN)
         return each * num_frames
-
-    def _render(self, parts: tuple[str | Visual, ...]) -> str:
-        """The chat template's text of one user message."""
-        content = [{"type": "text", "text": part} if isinstance(part, str) else {"type": part.value} for part in parts]
-        conversation = [{"role": "user", "content": content}]
-        return str(self.tokenizer.apply_chat_template(conversation, tokenize=False, add_vision_id=True))
-
-    def _tokenise(self, text: str) -> Indices:
-        """int64 [L]: the text's tokens; not to be changed."""
-        ids = np.asarray(self.tokenizer(text, add_special_tokens=False, verbose=False)["input_ids"], np.int64)
-        ids.setflags(write=False)
-        return ids
 
     def _placed(self, text: str, films: tuple[Film, ...]) -> tuple[str, str, list[int]]:
         """The text with one pad token for each image or video or group of it, which token, and of how many it stands
@@ -388,17 +362,6 @@ class SmolCollator(VlmCollator):
             shape=(len(rows), int(counts.max())),
         )
         return replace(batch, pixels=pixels)
-
-
-def _kept(read: Callable[[Asked], Read], length: Callable[[Asked], int]) -> Callable[[Asked], Read]:
-    """``read``, whose latest results are kept for what is not long; ``length``: characters of what is read."""
-    kept = lru_cache(KEPT_TEXTS)(read)
-    return lambda asked: (kept if length(asked) <= MAX_KEPT_CHARACTERS else read)(asked)
-
-
-def _num_characters(parts: Sequence[str | Visual]) -> int:
-    """About as many as the chat template makes of the parts."""
-    return sum(len(part) if isinstance(part, str) else FRAME_CHARACTERS for part in parts)
 
 
 def _film(trajectory: Trajectory | NamedTrajectory, frame_steps: int) -> Film:

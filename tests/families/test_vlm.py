@@ -404,7 +404,7 @@ def test_a_short_question_that_is_asked_again_is_not_tokenised_again(
             return getattr(tokenizer, name)
 
     tokenizer = collator.tokenizer
-    monkeypatch.setattr(collator, "tokenizer", Spy())
+    monkeypatch.setattr(collator._chat, "_tokenizer", Spy())
     for seed, height in ((0, 56), (1, 84), (2, 56)):
         collator.rows(ProgressSample(film(seed, 2, height, 56, task)))
     assert made == {"text": expected, "tokens": expected}
