@@ -3,8 +3,9 @@
 
     python benchmarks/perf_analyzer.py --size small
 
-The program is that of the tritonclient 2.51.0 wheel, unless one is named. For the ratios the bare engine is measured
-before each run, in this process, and our own generator (load.py) after it.
+The program is that of the tritonclient 2.51.0 wheel, unless one is named. Each load is measured in several short
+rounds. In each, the bare engine is measured in this process, then perf_analyzer runs, then our own generator (load.py).
+What the table compares is compared within a round; the table has medians.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import argparse
 import csv
 import os
 import shlex
+import statistics
 import subprocess
 import sys
 import zipfile
@@ -34,24 +36,28 @@ from rfm_client.cli.show import table
 
 WHEEL = "tritonclient==2.51.0"
 LIBRARIES = ("libcudart.so.12", "libb64.so.0d")  # the wheel of tritonserver has them under other names
-WINDOW_MS = 3000
+ROUNDS = 3
+WINDOW_MS = 1000
+NUM_WINDOWS = 3  # in a run of perf_analyzer
 ANY_SPREAD = 999  # per cent between windows; what is wanted is three windows, not their agreement
-SECONDS = WINDOW_MS / 1e3
+SECONDS = NUM_WINDOWS * WINDOW_MS / 1e3
 KINDS = {
     "progress, 16 frames": Load(1, SECONDS, (16, 16)),
     "all types, 1 to 16 frames": Load(1, SECONDS, (1, 16), mixed=True),
 }
+DIGITS = (0, 2, 2, 1, 1, 1, 1, 1, 1)  # of the table's figures, behind the decimal point
 US_PER_MS = 1e3
 US_PER_S = 1e6
 
 
 def main() -> None:
-    """Measures, writes a CSV file a run, and prints a table."""
+    """Measures, writes a CSV file a load, and prints a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", default="small", choices=["default", "small"], help="of the checkpoint")
     parser.add_argument("--perf-analyzer", type=Path, help="program; else that of the wheel, which is fetched")
     parser.add_argument("--concurrency", type=int, nargs="+", default=[1, 8, 32])
     parser.add_argument("--poisson", type=float, nargs="*", default=[0.3], help="rates, as shares of the bare engine's")
+    parser.add_argument("--rounds", type=int, default=ROUNDS)
     parser.add_argument("--output", type=Path, default=RESULTS / "perf_analyzer")
     arguments = parser.parse_args()
 
@@ -69,14 +75,20 @@ def main() -> None:
                 requests = Path(folder) / f"{_file_name(kind)}.json"
                 write_perf_analyzer_input(requests, samples(load, *bare.widths))
                 command = [str(program), "-m", "rfm", "-i", "grpc", "-u", endpoints.grpc_url.partition("://")[2]]
-                command += ["--input-data", str(requests), "--async", "-p", str(WINDOW_MS), "--max-trials", "3"]
-                command += ["--stability-percentage", str(ANY_SPREAD)]
+                command += ["--input-data", str(requests), "--async", "-p", str(WINDOW_MS)]
+                command += ["--max-trials", str(NUM_WINDOWS), "--stability-percentage", str(ANY_SPREAD)]
                 for name, options, asked in _runs(load, bare, arguments.concurrency, arguments.poisson):
-                    ceiling = max(bare.measure(load, size).samples_per_s for size in (8, 32))
                     file = output / f"{_file_name(kind)}_{_file_name(name)}.csv"
-                    of_run = _run([*command, *options], file, environment)
-                    cells = _cells(of_run, ceiling, callers.measure(asked).samples_per_s)
-                    rows.append((kind, name, *cells, _over_bare(of_run, bare, asked)))
+                    file.unlink(missing_ok=True)
+                    rounds = []
+                    for _ in range(arguments.rounds):
+                        ceiling = max(bare.measure(load, size).samples_per_s for size in (8, 32))
+                        of_run = _run([*command, *options], file, environment)
+                        figures = _figures(of_run, ceiling, callers.measure(asked).samples_per_s)
+                        rounds.append((*figures, *_over_bare(of_run, bare, asked)))
+                    medians = [statistics.median(values) for values in zip(*rounds, strict=True)]
+                    cells = [f"{value:.{digits}f}" for digits, value in zip(DIGITS, medians, strict=False)]
+                    rows.append((kind, name, *cells, *[""] * (len(DIGITS) - len(cells))))
     columns = (
         "requests",
         "load",
@@ -84,9 +96,9 @@ def main() -> None:
         "of the bare engine",
         "of our generator",
         *("p50 ms", "p99 ms", "queue ms", "compute ms"),
-        "p50 over the bare engine's, ms",
+        *("p50 over the bare engine's, ms", "compute over the bare engine's, ms"),
     )
-    console = Console(width=150, record=True)
+    console = Console(width=160, record=True)
     console.print(table(f"perf_analyzer, {arguments.size} checkpoint", columns, rows))
     (output / "summary.txt").write_text(console.export_text())
 
@@ -108,30 +120,35 @@ def _file_name(text: str) -> str:
 
 
 def _run(command: Sequence[str], file: Path, environment: Mapping[str, str]) -> Mapping[str, str]:
-    """The line of perf_analyzer's CSV file."""
-    words = [*command, "-f", str(file)]
-    print(shlex.join(words), file=sys.stderr)
-    done = subprocess.run(words, env={**os.environ, **environment}, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise RuntimeError(f"perf_analyzer: expected to measure, got {done.stdout[-1000:]}{done.stderr[-1000:]}")
-    return next(csv.DictReader(file.open()))
+    """The line of perf_analyzer's CSV file, which is added to ``file``."""
+    with TemporaryDirectory(prefix="rfm-perf-run-") as folder:
+        words = [*command, "-f", str(Path(folder) / "run.csv")]
+        print(shlex.join(words), file=sys.stderr)
+        done = subprocess.run(words, env={**os.environ, **environment}, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise RuntimeError(f"perf_analyzer: expected to measure, got {done.stdout[-1000:]}{done.stderr[-1000:]}")
+        header, line = (Path(folder) / "run.csv").read_text().splitlines()[:2]
+    with file.open("a") as of_load:
+        of_load.write(f"{line}\n" if of_load.tell() else f"{header}\n{line}\n")
+    return next(csv.DictReader([header, line]))
 
 
-def _cells(measured: Mapping[str, str], ceiling: float, by_our_generator: float) -> tuple[str, ...]:
+def _figures(measured: Mapping[str, str], ceiling: float, by_our_generator: float) -> tuple[float, ...]:
     rate = float(measured["Inferences/Second"])
     compute_us = sum(float(measured[f"Server Compute {part}"]) for part in ("Input", "Infer", "Output"))
-    times_us = [float(measured[name]) for name in ("p50 latency", "p99 latency", "Server Queue")]
-    ratios = (rate / ceiling, rate / by_our_generator)
-    return (f"{rate:.0f}", *(f"{r:.2f}" for r in ratios), *(f"{us / US_PER_MS:.1f}" for us in (*times_us, compute_us)))
+    times_us = [*(float(measured[name]) for name in ("p50 latency", "p99 latency", "Server Queue")), compute_us]
+    return (rate, rate / ceiling, rate / by_our_generator, *(us / US_PER_MS for us in times_us))
 
 
-def _over_bare(measured: Mapping[str, str], bare: BareEngine, load: Load) -> str:
-    """Of a lone caller: how much longer it waits than the bare engine takes, with the same pauses between samples."""
+def _over_bare(measured: Mapping[str, str], bare: BareEngine, load: Load) -> tuple[float, ...]:
+    """Of a lone caller, in ms: how much longer it waits than the bare engine takes, with the same pauses between
+    samples; and how much longer the server computes. Of others: nothing.
+    """
     if load.callers != 1:
-        return ""
-    p50_us = float(measured["p50 latency"])
-    pause_us = max(p50_us - float(measured["Server Compute Infer"]), 0.0)
-    return f"{p50_us / US_PER_MS - bare.measure(load, 1, pause_us / US_PER_S).p50_ms:.1f}"
+        return ()
+    p50_us, compute_us = float(measured["p50 latency"]), float(measured["Server Compute Infer"])
+    bare_ms = bare.measure(load, 1, max(p50_us - compute_us, 0.0) / US_PER_S).p50_ms
+    return p50_us / US_PER_MS - bare_ms, compute_us / US_PER_MS - bare_ms
 
 
 def _program(given: Path | None, folder: Path) -> tuple[Path, dict[str, str]]:

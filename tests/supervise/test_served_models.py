@@ -28,7 +28,7 @@ from rfm.supervise.served_models import NOT_LOADED, SILENT, ServedModels
 from rfm.supervise.status import NO_REASON, Status
 from rfm.supervise.triton_watch import TritonWatch
 from rfm_commands.rollout import Rollout
-from rfm_serve import MODEL, Serving, serving, wait_for
+from rfm_serve import MODEL, Serving, kill_while_idle, serving, wait_for
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
@@ -89,7 +89,7 @@ def test_what_was_served_is_healed_and_not_what_was_exported_since(tmp_path: Pat
     with administered(repository) as (served, api):
         rollout.export(rollout.other_checkpoint(tmp_path / "other"), repository)
         for process in served.model_processes:
-            process.kill()
+            kill_while_idle(process)
         served.wait_ready(False)
         served.wait_ready()
         assert [api.ready_versions(part) for part in parts] == [[1]] * 3
@@ -136,7 +136,8 @@ def test_a_version_that_loads_and_fails_or_takes_long_costs_the_other_nothing(
         # From now on both count.
         served.wait_ready()
         (process,) = [process for process in served.model_processes if process.version == 2]
-        wait_for(lambda: process.kill() or restarts_of(served, MODEL) == 1)
+        kill_while_idle(process)
+        wait_for(lambda: restarts_of(served, MODEL) == 1)
         served.wait_ready()
         assert api.ready_versions(MODEL) == [1, 2]
 
@@ -194,7 +195,7 @@ def test_a_model_that_cannot_be_loaded_again_is_not_ready_and_the_others_serve(t
 
     with administered(repository) as (served, api), served.client() as client:
         code.write_text("raise ValueError('broken')\n")
-        served.model_processes_of(OTHER)[0].kill()
+        kill_while_idle(served.model_processes_of(OTHER)[0])
         wait_for(is_given_up, LOOP_S)
         assert served.reasons()[MODEL] == NO_REASON
         assert served.metric("rfm_serve_not_ready", model=OTHER, reason=served.reasons()[OTHER]) == 1
@@ -215,7 +216,7 @@ def test_a_model_that_cannot_be_loaded_again_is_not_ready_and_the_others_serve(t
 def heal(served: Serving, model: str, meanwhile: Callable[[], Any]) -> None:
     before = restarts_of(served, model)
     (process,) = served.model_processes_of(model)
-    process.kill()
+    kill_while_idle(process)
     served.wait_ready(False)
     meanwhile()
     served.wait_ready()

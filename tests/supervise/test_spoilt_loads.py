@@ -20,7 +20,7 @@ from rfm.launch.process import Endpoints, SpoiltStartError, StalledStartError, T
 from rfm.supervise.model_processes import ModelProcess, ProcessWatch
 from rfm.supervise.supervisor import Supervisor
 from rfm_client import RewardClient
-from rfm_serve import MODEL, PATIENCE_S, children, serving, wait_for
+from rfm_serve import MODEL, PATIENCE_S, children, kill_while_idle, serving, wait_for
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
@@ -166,7 +166,7 @@ def test_a_model_that_loads_for_ever_is_healed(tmp_path: Path, trigger: Path) ->
     with serving(make_dawdling(tmp_path, trigger)) as served:
         served.wait_ready()
         trigger.touch()
-        served.model_processes[0].kill()
+        kill_while_idle(served.model_processes[0])
         served.wait_ready(False)
         wait_for(lambda: not trigger.exists())
         served.wait_ready(True, process.STALLED_S + PATIENCE_S)

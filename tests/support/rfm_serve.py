@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -40,6 +42,21 @@ def children(pid: int, program: str) -> list[int]:
     return [
         int(word) for word in subprocess.run(["pgrep", "-P", str(pid), program], stdout=subprocess.PIPE).stdout.split()
     ]
+
+
+def kill_while_idle(process: ModelProcess) -> None:
+    """Ends the process while it owes no answer, not even to a probe: else Triton would be started again with it."""
+
+    def is_stopped_idle() -> bool:
+        os.kill(process.pid, signal.SIGSTOP)
+        journal = process.journal
+        if journal is not None and not journal.num_owed and not journal.busy_s:
+            return True
+        os.kill(process.pid, signal.SIGCONT)
+        return False
+
+    wait_for(is_stopped_idle)
+    process.kill()
 
 
 @dataclass
