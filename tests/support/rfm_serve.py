@@ -129,6 +129,9 @@ def serving(repository: Path, *more: str) -> Iterator[Serving]:
     served = Serving(process, endpoints, f"http://127.0.0.1:{status_port}", log)
     try:
         yield served
+    except BaseException:
+        print("\n".join(served.said), file=sys.stderr)  # shown with the failed test
+        raise
     finally:
         if process.poll() is None:
             process.terminate()
