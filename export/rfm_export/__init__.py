@@ -5,16 +5,16 @@ from typing import TYPE_CHECKING, Any
 
 from rfm_export.errors import ExportDiffersError, ExportError
 
-if TYPE_CHECKING:
-    from rfm_export.exporter import check, export
-
 __all__ = ["ExportDiffersError", "ExportError", "check", "export"]
 
+if TYPE_CHECKING:
+    from rfm_export.exporter import check, export
+else:
 
-def __getattr__(name: str) -> Any:
-    """``check`` and ``export`` when they are first asked for: they need PyTorch, which takes seconds to import."""
-    if name not in ("check", "export"):
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from rfm_export import exporter
+    def __getattr__(name: str) -> Any:
+        """``check`` and ``export`` when they are first asked for: they need PyTorch, which takes seconds to import."""
+        if name not in ("check", "export"):
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from rfm_export import exporter
 
-    return getattr(exporter, name)
+        return getattr(exporter, name)

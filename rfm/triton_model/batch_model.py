@@ -153,9 +153,10 @@ class BatchModel(Generic[Question, Answer]):
 
     def execute(self, requests: Sequence[Any]) -> list[Any] | None:
         """Called by Triton with requests. Gives their responses; None: they are sent as they come."""
+        called_s = time.monotonic()
         self._self_check.wait_if_ending()
         batch = [self._received(inference) for inference in requests]
-        self._triton_queue.called(len(batch), sum(request.num_bytes for request in batch))
+        self._triton_queue.called(called_s, len(batch), sum(request.num_bytes for request in batch))
         if self._is_on_cpu and self._are_cheap(batch, self._pipeline.num_samples_waiting):
             self._pipeline.wait_for(lambda: self._pipeline.is_idle, AT_ONCE_S)
         if self._pipeline.is_idle and self._is_better_at_once(batch):

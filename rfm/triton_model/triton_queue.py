@@ -30,9 +30,11 @@ class TritonQueue:
         """Seconds since the queue last counted as empty: as far as that tells, none has waited in it for longer."""
         return time.monotonic() - self._empty_s
 
-    def called(self, num_requests: int, num_bytes: int) -> None:
-        """Notes that Triton has called ``execute`` with so many requests, with so many bytes of inputs."""
-        called_s = time.monotonic()
+    def called(self, called_s: float, num_requests: int, num_bytes: int) -> None:
+        """Notes that Triton has called ``execute`` with so many requests, with so many bytes of inputs.
+
+        called_s: when, by time.monotonic
+        """
         needed_s = CALL_S * max(self._num_responses, 1) + REQUEST_S * num_requests + COPY_S_PER_BYTE * num_bytes
         took_s = called_s - self._returned_s
         self._num_late = self._num_late + 1 if took_s >= needed_s else 0

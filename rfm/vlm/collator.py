@@ -88,14 +88,26 @@ class VlmCollator:
 
     tokenizer: the base model's, with the checkpoint's special tokens appended and a chat template
     images: preprocessing of the backbone's kind
+    keeps_conversations: whether the text and tokens of the latest conversations, without their frames, are kept
     """
 
-    def __init__(self, config: VlmConfig, tokenizer: Any, images: QwenImages | SmolImages) -> None:
+    def __init__(
+        self,
+        config: VlmConfig,
+        tokenizer: Any,
+        images: QwenImages | SmolImages,
+        *,
+        keeps_conversations: bool = False,
+    ) -> None:
         self.config = config
         self.tokenizer = tokenizer
         self.images = images
         self._special_tokens = tuple(tokenizer.get_added_vocab())
-        self._chat = Chat(tokenizer)
+        self._chat = Chat(tokenizer, keeps=keeps_conversations)
+
+    def keeping_conversations(self) -> VlmCollator:
+        """The same, but one that keeps conversations."""
+        return type(self)(self.config, self.tokenizer, self.images, keeps_conversations=True)
 
     @property
     def frames_per_shot(self) -> int:

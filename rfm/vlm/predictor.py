@@ -39,7 +39,7 @@ class VlmPredictor:
     ) -> None:
         self.network = network.to(device).eval()
         speed_up(self.network)
-        self.collator = collator
+        self.collator = collator if cache is None else collator.keeping_conversations()
         self.device = device
         self.cache = cache
         self._upload = Upload(device)

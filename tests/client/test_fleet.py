@@ -8,7 +8,6 @@ import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -171,27 +170,40 @@ def test_servers_behind_one_name_share_the_calls_and_those_that_are_added_join(
     first = Endpoints.free()
     places = [first, *(replace(first, host=f"127.0.0.{number}") for number in (2, 3))]
 
-    def is_shared(client: RewardClient, num_calls: list[int]) -> bool:
-        """Whether each place answers so many calls. Triton counts one after it is answered: ask again."""
-        asked = places[: len(num_calls)]
-        before = [answered(place) for place in asked]
-        for _ in range(sum(num_calls)):
-            client.progress(trajectory(0))
-        return np.subtract([answered(place) for place in asked], before).tolist() == num_calls
+    running: list[Endpoints] = []
+    num_calls = 0
+
+    def ask() -> ProgressResult:
+        nonlocal num_calls
+        num_calls += 1
+        return client.progress(trajectory(0))
+
+    def counts() -> list[int]:
+        """How many calls each has answered. Triton counts one after it has sent the answer."""
+        wait_for(lambda: sum(map(answered, running)) == num_calls)
+        return [answered(place) for place in running]
+
+    def shares(num_new: int) -> list[int]:
+        """How many of so many new calls each answers."""
+        before = counts()
+        for _ in range(num_new):
+            ask()
+        return [after - count for after, count in zip(counts(), before, strict=True)]
 
     with ExitStack() as stack:
         client = stack.enter_context(RewardClient(url % first.grpc_port, shared_memory=True))
-        for number, place in enumerate(places):
+        for place in places:
             stack.enter_context(OneModelServer(make_repository(tmp_path / place.host), place))
-            found.hosts = tuple(one.host for one in places[: number + 1])
-            if number:  # of one address gRPC looks the name up itself, which is not faked
-                wait_for(partial(is_shared, client, [1] * (number + 1)))
+            running.append(place)
+            found.hosts = tuple(one.host for one in running)
+            if len(running) > 1:  # of one address gRPC looks the name up itself, which is not faked
+                wait_for(lambda: shares(len(running)) == [1] * len(running))
         # One that is taken away is asked no more, and an error of the look-up changes nothing.
         found.hosts = found.hosts[:2]
         asked = found.num_asked
-        wait_for(lambda: client.progress(trajectory(0)) and found.num_asked > asked + 1)
+        wait_for(lambda: ask() and found.num_asked > asked + 1)
         found.error = socket.gaierror("no answer")
-        wait_for(partial(is_shared, client, [3, 3, 0]))
+        assert shares(6) == [3, 3, 0]
 
 
 def test_a_server_that_is_looked_up_is_known_by_its_name() -> None:

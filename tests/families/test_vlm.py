@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from copy import copy
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -373,10 +372,9 @@ def test_a_question_is_read_as_if_no_other_had_been_asked_before(make: Callable[
         PreferenceSample(other, one),
         ProgressSample(film(0, 4, 56, 56, "image")),
     ]
-    many = make().collator
+    many = make().collator.keeping_conversations()
     for question in questions * 2:
-        fresh = copy(many)
-        fresh.__init__(many.config, many.tokenizer, many.images)  # type: ignore[misc]  # it has kept nothing
+        fresh = many.keeping_conversations()  # has kept nothing
         (alone, *_), (among, *_) = fresh.rows(question), many.rows(question)
         np.testing.assert_array_equal(among.input_ids, alone.input_ids)
         np.testing.assert_array_equal(among.position_ids, alone.position_ids)  # type: ignore[arg-type]
@@ -388,7 +386,7 @@ def test_a_short_question_that_is_asked_again_is_not_tokenised_again(
     monkeypatch: pytest.MonkeyPatch, task: str, expected: int
 ) -> None:
     """Long ones are not kept: they would take memory without end."""
-    collator = load(PLAIN).collator
+    collator = load(PLAIN).collator.keeping_conversations()
     made: Counter[str] = Counter()
 
     class Spy:

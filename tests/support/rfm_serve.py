@@ -20,6 +20,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from rfm.journal import SHARED_MEMORY
 from rfm.launch.process import Endpoints
+from rfm.proc import STOPPED
 from rfm.supervise.model_processes import ModelProcess, ProcessWatch
 from rfm_client import RewardClient
 
@@ -48,15 +49,16 @@ def kill_while_idle(process: ModelProcess) -> None:
     """Ends the process while it owes no answer, not even to a probe: else Triton would be started again with it."""
 
     def is_stopped_idle() -> bool:
-        os.kill(process.pid, signal.SIGSTOP)
-        journal = process.journal
-        if journal is not None and not journal.num_owed and not journal.busy_s:
-            return True
         os.kill(process.pid, signal.SIGCONT)
-        return False
+        os.kill(process.pid, signal.SIGSTOP)
+        wait_for(lambda: process.state == STOPPED)
+        journal = process.journal
+        return journal is not None and not journal.num_owed and not journal.busy_s
 
-    wait_for(is_stopped_idle)
-    process.kill()
+    try:
+        wait_for(is_stopped_idle)
+    finally:
+        process.kill()
 
 
 @dataclass

@@ -113,7 +113,9 @@ def test_the_first_batch_asks_who_has_cancelled(tmp_path: Path) -> None:
 
 def test_what_an_answer_takes_is_that_of_a_question(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     times = iter([10.0, 16.0])
-    monkeypatch.setattr(batch_model, "time", SimpleNamespace(perf_counter=lambda: next(times)))
+    monkeypatch.setattr(
+        batch_model, "time", SimpleNamespace(monotonic=time.monotonic, perf_counter=lambda: next(times))
+    )
     model = Model(tmp_path)
     model.respond([request(1), request(1, 1)])
     assert model._sample_s == 2

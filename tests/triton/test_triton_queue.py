@@ -9,7 +9,7 @@ import pytest
 
 from clock import Clock
 from rfm.triton_model import triton_queue
-from rfm.triton_model.triton_queue import CALL_S, COPY_S_PER_BYTE, REQUEST_S, SURELY, TritonQueue
+from rfm.triton_model.triton_queue import TritonQueue
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def called(
 ) -> float:
     """How long the queue is unseen when ``execute``, which then takes a second, is called again."""
     clock.now_s += after_s
-    queue.called(num_requests, num_bytes)
+    queue.called(clock.now_s, num_requests, num_bytes)
     unseen_s = queue.unseen_s
     clock.now_s += 1.0
     queue.returned(num_responses)
@@ -48,10 +48,10 @@ def test_at_the_first_call_nothing_has_waited(clock: Clock) -> None:
 @pytest.mark.parametrize(
     ("num_responses", "num_requests", "num_bytes", "allowed_s"),
     [
-        (0, 1, 0, CALL_S + REQUEST_S),
-        (3, 1, 0, 3 * CALL_S + REQUEST_S),
-        (0, 5, 0, CALL_S + 5 * REQUEST_S),
-        (2, 1, 20_000_000, 2 * CALL_S + REQUEST_S + 20_000_000 * COPY_S_PER_BYTE),
+        (0, 1, 0, 0.00125),  # 1 ms, and 0.25 ms for the request
+        (3, 1, 0, 0.00325),  # 1 ms for each response
+        (0, 5, 0, 0.00225),
+        (2, 1, 20_000_000, 0.04225),  # 2 ms for each megabyte
     ],
 )
 def test_nothing_waited_if_two_calls_in_a_row_come_later_than_triton_needs(
@@ -72,4 +72,6 @@ def test_nothing_waited_if_two_calls_in_a_row_come_later_than_triton_needs(
     assert unseen_s(late_s) == 0.0
     assert unseen_s(late_s) == 0.0  # for as long as they are late
     assert unseen_s(in_time_s) > 0.0
-    assert unseen_s(1.1 * SURELY * allowed_s) == 0.0  # so late is no call that brings what has waited
+    assert unseen_s(9.0 * allowed_s) > 0.0  # one call alone
+    unseen_s(in_time_s)
+    assert unseen_s(11.0 * allowed_s) == 0.0  # so late is no call that brings what has waited
