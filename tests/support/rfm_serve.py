@@ -49,11 +49,13 @@ def kill_while_idle(process: ModelProcess) -> None:
     """Ends the process while it owes no answer, not even to a probe: else Triton would be started again with it."""
 
     def is_stopped_idle() -> bool:
-        os.kill(process.pid, signal.SIGCONT)
         os.kill(process.pid, signal.SIGSTOP)
         wait_for(lambda: process.state == STOPPED)
         journal = process.journal
-        return journal is not None and not journal.num_owed and not journal.busy_s
+        is_idle = journal is not None and not journal.num_owed and not journal.busy_s
+        if not is_idle:
+            os.kill(process.pid, signal.SIGCONT)  # it gets on until the next look
+        return is_idle
 
     try:
         wait_for(is_stopped_idle)
