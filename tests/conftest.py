@@ -24,6 +24,7 @@ from rfm.launch.process import Endpoints
 SHARED_SERVERS = ("served", "demo_server")  # fixtures that start a server for all who only ask
 
 torch.set_num_threads(1)
+os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that tests start, which share the cores with other tests
 os.environ[RUN] = uuid.uuid4().hex  # by which tests know what this run has started
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test asks the network
 os.environ["ONEDNN_MAX_CPU_ISA"] = "AVX512_CORE"  # as the references were computed: AMX rounds bfloat16 elsewhere

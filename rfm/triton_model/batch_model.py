@@ -22,7 +22,7 @@ from rfm.triton_model.exit import exit_with_triton
 from rfm.triton_model.metrics import Counted, Metrics
 from rfm.triton_model.other_instances import OtherInstances
 from rfm.triton_model.pipeline import Bounds, Pipeline, Stages
-from rfm.triton_model.placement import Placement, num_instances
+from rfm.triton_model.placement import Placement, num_instances, use_threads
 from rfm.triton_model.quarantine import Quarantine
 from rfm.triton_model.request import SAMPLE_TYPES, Origins, RejectedError, Request
 from rfm.triton_model.request_digest import digest
@@ -62,10 +62,9 @@ class BatchModel(Generic[Question, Answer]):
         config = json.loads(args["model_config"])
         settings = {name: value["string_value"] for name, value in config["parameters"].items()}
         placement = Placement.of(args, config, settings)
-        placement.apply()
         version = Path(args["model_repository"], args["model_version"])
         check_digest(version, settings.get(DIGEST_PARAMETER, ""))
-        self.load(version, placement.device, settings)
+        placement.run(lambda: self.load(version, placement.device, settings))
         model = {"model": args["model_name"], "version": args["model_version"]}
         labels = {**model, "device": str(placement.device), "instance": args["model_instance_name"]}
         names = [spec["name"] for spec in config["input"]]
@@ -87,7 +86,7 @@ class BatchModel(Generic[Question, Answer]):
     ) -> None:
         """Begins to take requests. Weights, log, metrics and quarantine are there.
 
-        begin: called in the thread that scores
+        begin: called in the thread that scores; in this one nothing is computed with several threads
         device: type of the one that computes; answers that are cheap there are given together
         num_preparing: threads that work ahead
         """
@@ -108,7 +107,7 @@ class BatchModel(Generic[Question, Answer]):
             self._send,
             self._self_check.end,
             begin,
-            begin_preparing=partial(torch.set_num_threads, 1),  # there are as many threads as this instance has cores
+            begin_preparing=partial(use_threads, 1),  # there are as many threads as this instance has cores
             prepare=self._work_ahead,
             num_preparing=num_preparing,
         )
@@ -181,12 +180,12 @@ class BatchModel(Generic[Question, Answer]):
             self._send(failed, [(failed, Execution())])
 
     def _is_better_at_once(self, batch: Sequence[Request[Question]]) -> bool:
-        """Whether requests are better scored here, while nothing else is, and answered together.
+        """Whether requests are better scored while ``execute`` waits, and answered together.
 
-        To send a response takes a tenth of a millisecond longer than to give it back, and a lone caller waits for the
-        change of threads. But what is scored here keeps Triton from handing over more, and an accelerator waits until
-        it does. A full batch says that more wait; some of them may have to be rejected. Of what waits behind a batch
-        that is not full, nothing is known; so there is a look at them before they may have waited for too long.
+        To send a response takes a tenth of a millisecond longer than to give it back. But to wait here keeps Triton
+        from handing over more, and an accelerator waits until it does. A full batch says that more wait; some of them
+        may have to be rejected. Of what waits behind a batch that is not full, nothing is known; so there is a look at
+        them before they may have waited for too long.
 
         Where the process dies, Triton 2.51 fails the requests of ``execute``, and never those that are to be answered
         later. So all are answered at once while a suspect may kill the process.

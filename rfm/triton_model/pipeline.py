@@ -72,6 +72,7 @@ class Pipeline(Generic[SomeJob, Scored]):
         self._is_scoring = self._is_closed = False
         self._ahead: deque[tuple[SomeJob, Future[None] | None]] = deque()  # prepared, or being prepared
         self._behind: deque[SomeJob] = deque()  # those after them
+        self._awaited: tuple[list[SomeJob], Future[Scored]] | None = None  # jobs that ``run`` waits for
         self._scored: SimpleQueue[tuple[list[SomeJob], Scored] | None] = SimpleQueue()  # None: there will be no more
         self._preparing = (
             ThreadPoolExecutor(stages.num_preparing, "rfm-prepare", stages.begin_preparing)
@@ -116,11 +117,19 @@ class Pipeline(Generic[SomeJob, Scored]):
         return rejected
 
     def run(self, jobs: list[SomeJob]) -> Scored:
-        """Scores jobs, prepared or not, in the thread that calls. To be called by who puts, while it is idle."""
+        """Scores jobs, prepared or not, and gives what ``score`` gave: they are not replied to. To be called by who
+        puts, while it is idle.
+
+        They are scored in the thread that scores all others. libgomp has a team of threads for each thread that
+        computes; with two teams it counts more threads than cores, and no longer spins where they wait for each other.
+        """
+        scored: Future[Scored] = Future()
         with self._changed:
             assert self.is_idle
             self._is_scoring = True
-        return self._score(jobs)
+            self._awaited = jobs, scored
+            self._changed.notify_all()
+        return scored.result()
 
     def wait_for(self, is_so: Callable[[], bool], timeout_s: float | None = None) -> bool:
         """Waits until jobs have moved on so far that ``is_so``, or for ``timeout_s``; whether it is."""
@@ -151,10 +160,10 @@ class Pipeline(Generic[SomeJob, Scored]):
             self._ahead.append((job, preparation))
 
     def _next_batch(self) -> list[SomeJob]:
-        """The jobs whose turn it is, as many as are prepared and fit; none when the pipeline is closed."""
+        """The jobs whose turn it is, as many as are prepared and fit; none if ``run`` waits, or nothing will come."""
         with self._changed:
-            self._changed.wait_for(lambda: not self._is_scoring and (self._ahead or self._is_closed))
-            if not self._ahead:
+            self._changed.wait_for(lambda: self._awaited or (not self._is_scoring and (self._ahead or self._is_closed)))
+            if self._awaited is not None or not self._ahead:
                 return []
             self._is_scoring = True
             _, preparation = self._ahead[0]
@@ -191,9 +200,20 @@ class Pipeline(Generic[SomeJob, Scored]):
 
     def _score_all(self) -> None:
         self._stages.begin()
-        while batch := self._next_batch():
-            self._scored.put((batch, self._score(batch)))
+        while (batch := self._next_batch()) or self._awaited is not None:
+            if self._awaited is None:
+                self._scored.put((batch, self._score(batch)))
+            else:
+                self._score_awaited(*self._awaited)
         self._scored.put(None)
+
+    def _score_awaited(self, jobs: list[SomeJob], scored: Future[Scored]) -> None:
+        self._awaited = None
+        try:
+            scored.set_result(self._score(jobs))
+        except BaseException as error:
+            scored.set_exception(error)
+            raise
 
     def _reply_to_all(self) -> None:
         while (scored := self._scored.get()) is not None:

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,10 +36,22 @@ class Placement:
 
     def apply(self) -> None:
         """To be called in each thread that computes: both settings are a thread's own."""
-        torch.set_num_threads(self.num_threads)
+        use_threads(self.num_threads)
         keep_float32()
         if self.device.type == "cuda":
             torch.cuda.set_device(self.device)  # some kernels launch on the current device, whatever their tensors'
+
+    def run(self, work: Callable[[], None]) -> None:
+        """Computes in a thread that ends with it, as do the threads that OpenMP starts for it."""
+        use_threads(1)  # in the thread that calls
+        with ThreadPoolExecutor(1, "rfm-load", self.apply) as thread:
+            thread.submit(work).result()
+
+
+def use_threads(number: int) -> None:
+    """Has PyTorch compute with so many threads in the calling thread."""
+    torch.get_num_threads()  # at first it takes over what any thread has set last, even after ``set_num_threads``
+    torch.set_num_threads(number)
 
 
 def num_instances(config: Mapping[str, Any]) -> int:

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +19,7 @@ from batch_models import BREAKS, CONFIG, FAILS, REFUSED, WIDTHS, Model, Request,
 from rfm.execution import Execution
 from rfm.probe import blank_question
 from rfm.triton_model import batch_model
-from rfm.triton_model.placement import Placement
+from rfm.triton_model.placement import Placement, use_threads
 from rfm.triton_model.request import WORTH_CHECKING_S
 from rfm_client import (
     FrameScores,
@@ -30,6 +33,7 @@ from rfm_client import (
 )
 from rfm_client.contract import wire
 from rfm_client.contract.names import PROBE_PREFIX
+from rfm_serve import PATIENCE_S
 from trajectories import random_trajectory
 
 
@@ -210,3 +214,48 @@ def test_the_cores_of_a_machine_are_shared_among_the_instances(
     assert placement.num_threads == (2 if gpus else 8)
     assert placement.num_preparing == (2 if gpus else 1)
     assert Placement.of(args, config, {"torch_threads": "5"}).num_threads == 5
+
+
+def test_what_is_loaded_is_computed_in_a_thread_that_ends() -> None:
+    seen: list[tuple[threading.Thread, int]] = []
+    placement = Placement(torch.device("cpu"), num_threads=3)
+    placement.run(lambda: seen.append((threading.current_thread(), torch.get_num_threads())))
+    ((thread, num_threads),) = seen
+    assert not thread.is_alive()
+    assert num_threads == 3
+    assert torch.get_num_threads() == 1  # the calling thread starts no team of its own
+    with pytest.raises(ZeroDivisionError):
+        placement.run(lambda: [][1 // 0])
+
+
+def test_a_thread_computes_with_its_own_number_of_threads_whatever_others_set() -> None:
+    may_look = threading.Event()
+
+    def number() -> int:
+        use_threads(3)
+        assert may_look.wait(PATIENCE_S)
+        return torch.get_num_threads()
+
+    with ThreadPoolExecutor(2) as pool:
+        seen = pool.submit(number)
+        pool.submit(use_threads, 2).result()
+        may_look.set()
+        assert seen.result() == 3
+
+
+def test_all_forward_passes_are_made_in_one_thread(tmp_path: Path) -> None:
+    """Warm-ups, requests that ``execute`` answers itself, and those answered later: else OpenMP has two teams."""
+    model = Model(tmp_path, warmups=1)
+    threads = set()
+    answer = model.answer
+
+    def watched(questions: Sequence[Sample], execution: Execution) -> Any:
+        threads.add(threading.current_thread().name)
+        return answer(questions, execution)
+
+    model.answer = watched  # type: ignore[method-assign]
+    model.respond([request(1)])  # the first is answered at once
+    model.respond([request(2), request(3)])
+    model._sample_s = 1.0  # later ones are answered later
+    model.respond([request(4), request(5)])
+    assert threads == {"rfm-score"}

@@ -148,16 +148,32 @@ def test_a_batch_does_not_wait_for_a_job_that_is_still_prepared_behind_it() -> N
     assert work.batches[1:] == [[ready], [slow]]
 
 
-def test_an_idle_pipeline_scores_in_the_thread_that_asks() -> None:
+def test_an_idle_pipeline_scores_at_once_in_the_thread_that_scores_all() -> None:
     work = Work()
     with running(work) as pipeline:
         work.may_score.set()
-        jobs = [Job(num_tokens=2), Job(num_tokens=3)]
+        jobs, later = [Job(num_tokens=2), Job(num_tokens=3)], Job()
         assert pipeline.is_idle
         assert pipeline.run(jobs) == [2, 3]
         assert work.replied == []
-        assert work.threads == {threading.current_thread().name}
         assert pipeline.is_idle
+        pipeline.put([later])
+        wait_for(lambda: work.replied == [later])
+        assert pipeline.run([Job(9)]) == [1]
+    assert work.threads == {"rfm-score"}
+    assert sizes(work) == [[1, 1], [1], [9]]
+
+
+def test_who_runs_jobs_gets_the_error_and_nothing_is_scored_any_more() -> None:
+    work = Work()
+
+    def broken(batch: list[Job]) -> list[int]:
+        raise MemoryError
+
+    pipeline = Pipeline(Stages(broken, work.reply, work.fail), BOUNDS)
+    with pytest.raises(MemoryError):
+        pipeline.run([Job()])
+    wait_for(lambda: work.failures == ["MemoryError()"])
 
 
 def test_nothing_is_scored_beside_what_another_thread_scores() -> None:
