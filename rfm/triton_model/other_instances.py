@@ -17,7 +17,7 @@ from rfm.triton_model.pipeline import Pipeline
 from rfm.triton_model.quarantine import all_journals, own_journal
 
 POLL_S = 2e-3  # between two questions whether another instance is idle, while this instance computes
-LONG_S = 0.1  # one that owes nothing and has not got on for so long scores in ``execute``: it takes nothing meanwhile
+LONG_S = 0.1  # one that owes nothing and has not got on for so long has its ``execute`` wait: it takes nothing
 STUCK_S = 5.0  # one that has not got on for so long may hang: nobody leaves requests to it. Few passes take longer.
 LOOK_S = 1.0  # between two looks for other instances: they come and go with a load
 _MODEL_FILE = 1  # which argument of a model process names its model.py

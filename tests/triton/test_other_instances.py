@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 
@@ -163,3 +165,12 @@ def test_an_idle_instance_waits_for_nobody(busy: Instance) -> None:
     busy.may_score.set()
     assert busy.pipeline.wait_for(lambda: busy.pipeline.is_idle, PATIENCE_S)
     busy.wait()
+
+
+@pytest.mark.parametrize(
+    ("num_owed", "busy_s", "has_enough"), [(0, 0.09, False), (0, 0.1, True), (1, 4.9, False), (1, 5.0, True)]
+)
+def test_how_long_others_are_waited_for(num_owed: int, busy_s: float, has_enough: bool) -> None:
+    """One that owes nothing and computes waits in ``execute``; one that owes answers for so long may hang."""
+    journal = cast(Journal, SimpleNamespace(busy_s=busy_s, num_owed=num_owed))
+    assert other_instances._has(journal, MAX_WAITING) == has_enough
