@@ -21,8 +21,8 @@ class CallOptions(TypedDict, total=False):
     timeout_s: the longest that it may take, instead of the client's
     logits: with the raw scores of the progress bins, which only discrete checkpoints have
     timing: with the server's time for the batch
-    subsample: of a trajectory longer than the checkpoint was trained on (``ModelInfo.max_frames``) so many frames are
-        scored, evenly from the first to the last, as training cuts its clips; ``frame_indices`` names them (None: all)
+    subsample: of a trajectory longer than ``ModelInfo.max_frames`` so many frames are scored, evenly from the first to
+        the last, as training cuts its clips; ``frame_indices`` names them (None: all)
     resize: frames are made as small as the checkpoint reads them before they are sent (needs Pillow); ReWiND's scores
         differ slightly from those of the frames as they are
     request_id: with which the ids of the call's requests begin, in errors and in the server's log (None: a random one)

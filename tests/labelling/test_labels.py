@@ -282,7 +282,7 @@ def test_the_run_tells_what_was_decided_and_by_whom(output: Path) -> None:
     assert notes.lines == [
         f"cameras: {FRONT}, {WRIST} (all but depth cameras)",
         "sampling: rint_pad (the rule of upstream's training and RL loop)",
-        "frames: 16 (as many as the checkpoint was trained on)",
+        "frames: 16 (the most in training; if the checkpoint does not say, the most its network takes)",
         "fuse: mean of 2 cameras",
     ]
     notes = Notes()

@@ -30,7 +30,8 @@ class ModelInfo:
     max_batch_size: most samples of one request
     by_digest: whether it keeps what it made of frames, and takes their digests in place of pixels
     instances: of the model that one server runs; 0: of an ensemble, whose parts have them
-    max_frames: frames of a trajectory that the checkpoint was trained on, at most; None: it does not say
+    max_frames: the most frames of a trajectory in training; if the checkpoint does not say, the most that its network
+        takes; None: neither is known
     frame_size: to what the checkpoint brings each frame; None: that depends on the frame
     video_dim, text_dim: widths D and Dt of the embeddings; None: it reads raw frames
     progress_bins: K of a discrete checkpoint; None: continuous

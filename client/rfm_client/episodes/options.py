@@ -46,7 +46,7 @@ class EpisodeOptions:
 
     sampling: which frames of the episode so far a model is shown: a rule of ``rfm_client.data.sampling``. ``rint_pad``
         is that of upstream's own RL loop
-    frames: the rule's number of frames; None: as many as the checkpoint was trained on. If it does not say, a rule
+    frames: the rule's number of frames; None: the checkpoint's ``ModelInfo.max_frames``. If it has none, a rule
         that needs a number raises ValueError at the first step
     cameras: names of the cameras whose frames each step brings; none: there is one, without a name
     fuse: how the scores of several cameras become one

@@ -54,7 +54,7 @@ class RewardOptions:
         of upstream's own RL loop
     resize: frames are made as small as the checkpoint reads them before they are kept and sent (needs Pillow); ReWiND's
         scores differ slightly from those of the frames as they are
-    max_frames: the rule's number of frames; None: as many as the checkpoint was trained on. If it does not say, a rule
+    max_frames: the rule's number of frames; None: the checkpoint's ``ModelInfo.max_frames``. If it has none, a rule
         that needs a number raises ValueError at the first reset
     blocking: a step waits for its score
     max_pending: most steps of one environment whose questions are open when not blocking

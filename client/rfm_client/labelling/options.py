@@ -33,8 +33,8 @@ class LabelOptions:
     alias: the progress file is written under this name, too: ``sarm_progress`` is what LeRobot's training reads
     formats: which files; empty: ``progress`` and ``signals``, of an HDF5 dataset ``hdf5``
     cameras: each is scored, and the scores fused; empty: all but depth cameras
-    sampling, frames: the rule by which frame t's prefix is sampled, and to how many frames; None: ``rint_pad`` and what
-        the checkpoint was trained on
+    sampling, frames: the rule by which frame t's prefix is sampled, and to how many frames; None: ``rint_pad`` and the
+        checkpoint's ``max_frames``
     mode: ``prefix``: frame t is scored on the frames up to t; ``whole``: all frames of an episode are scored together
     fuse: how the scores of several cameras become one
     resize: frames are made as small as the checkpoint reads them before they are sent

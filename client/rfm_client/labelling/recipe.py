@@ -14,6 +14,7 @@ from rfm_client.labelling.options import DEFAULT_RULE, LabelOptions, Mode
 from rfm_client.labelling.scorer import CheckpointFacts
 
 RECIPE_FORMAT = 2  # another one wherever the same recipe would give other scores
+OF_CHECKPOINT = "the most in training; if the checkpoint does not say, the most its network takes"
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class Recipe:
     def told(self, options: LabelOptions) -> list[str]:
         """What is done, a line each, with who decided it."""
         of_rule = "asked for" if options.sampling else "the rule of upstream's training and RL loop"
-        of_frames = "asked for" if options.frames else "as many as the checkpoint was trained on"
+        of_frames = "asked for" if options.frames else OF_CHECKPOINT
         one = len(self.cameras) == 1
         of_cameras = "asked for" if options.cameras else "all but depth cameras"
         lines = [f"cameras: {', '.join(self.cameras)} ({of_cameras})"]

@@ -25,7 +25,8 @@ class CheckpointFacts:
     source, revision: where it came from; None: not known
     weights_digest: of its weights
     settings_digest: of what else decides its scores: configuration, encoders, dtype, device
-    max_frames: frames of a trajectory that it was trained on, at most; None: it does not say
+    max_frames: the most frames of a trajectory in training; if it does not say, the most that its network takes; None:
+        neither is known
     frame_size: to what it brings each frame; None: that depends on the frame
     encodes: frames can be encoded by themselves, and prefixes scored from their embeddings
     is_causal: no frame's score depends on later frames
