@@ -19,7 +19,7 @@ from rfm.checkpoint.content import CheckpointError
 from rfm.config import ExportConfig, ServeConfig
 from rfm.launch.admin_key import AdminKeyError, take_key
 from rfm.launch.installation import ServerStartError, find_installation
-from rfm.launch.process import SHORT_SPIN, Endpoints, TritonServer
+from rfm.launch.process import Endpoints, TritonServer, short_spin
 from rfm.launch.temporary import stopped_by_signals, temporary_server
 from rfm.supervise.supervisor import Supervisor
 from rfm_client import RewardError
@@ -305,6 +305,5 @@ def _fail(message: str) -> NoReturn:
 
 def main() -> None:
     """Entry point of the ``rfm`` console script."""
-    for name, value in SHORT_SPIN.items():
-        os.environ.setdefault(name, value)  # before PyTorch is imported
+    os.environ.update(short_spin(os.environ))  # before PyTorch is imported
     app()

@@ -35,11 +35,17 @@ PATIENT_S = 600.0  # or, where that was too short, has loaded models of other ba
 MAX_REPEATS = 3  # of a start that Triton spoils: a machine that stands still for a second may do so again
 ANSWER_TIMEOUT_S = 10.0  # of one that starts
 NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # a `load` would load all versions anew: their folders have changed
-# For so long (0.1 ms) threads of a forward pass on the CPU spin where they wait for each other; then they sleep. With
-# libgomp's 3 ms a pass takes several times as long on a busy machine; without any, half as long again on a quiet one.
-SHORT_SPIN = {"GOMP_SPINCOUNT": "10000"}
 SECRETS = (VARIABLE, GATEWAY_KEY_VARIABLE)  # variables that neither Triton nor a model process needs
 _REGIONS = "--backend-config=python,shm-region-prefix-name="
+
+
+def short_spin(environment: Mapping[str, str]) -> dict[str, str]:
+    """What to add to the environment of a process that computes, unless that says itself how OpenMP's threads wait.
+
+    For 0.1 ms threads of a forward pass on the CPU spin where they wait for each other; then they sleep. With libgomp's
+    own 3 ms a pass takes several times as long on a busy machine; without any, half as long again on a quiet one.
+    """
+    return {} if {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & environment.keys() else {"GOMP_SPINCOUNT": "10000"}
 
 
 @dataclass(frozen=True)
@@ -322,7 +328,7 @@ class TritonServer:
     def _environment(self) -> dict[str, str]:
         """Environment of tritonserver: that of this process, without its secrets."""
         own = {name: value for name, value in os.environ.items() if name not in SECRETS}
-        return {**SHORT_SPIN, **own, **self._installation.environment, **NO_BYTECODE}
+        return {**short_spin(own), **own, **self._installation.environment, **NO_BYTECODE}
 
     def _check_listen_address(self) -> None:
         check_before_start(self.endpoints.host, self._installation, accepted=self._accepts_known_vulnerabilities)

@@ -86,7 +86,7 @@ class BatchModel(Generic[Question, Answer]):
     ) -> None:
         """Begins to take requests. Weights, log, metrics and quarantine are there.
 
-        begin: called in the thread that scores; in this one nothing is computed with several threads
+        begin: called in the thread that scores; the thread of ``execute`` computes nothing with several threads
         device: type of the one that computes; answers that are cheap there are given together
         num_preparing: threads that work ahead
         """
@@ -213,7 +213,7 @@ class BatchModel(Generic[Question, Answer]):
         return self._sample_s * num_samples < limit_s and self._sample_s * (num_samples + num_waiting) < left_s
 
     def _responses_to(self, batch: Sequence[Request[Question]]) -> list[Any]:
-        """Reads, scores and answers the requests here and now."""
+        """Reads the requests, waits until they are scored, and answers them."""
         for request in batch:
             self._read(request)
         scored: Scored[Question] = []

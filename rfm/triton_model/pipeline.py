@@ -73,6 +73,7 @@ class Pipeline(Generic[SomeJob, Scored]):
         self._ahead: deque[tuple[SomeJob, Future[None] | None]] = deque()  # prepared, or being prepared
         self._behind: deque[SomeJob] = deque()  # those after them
         self._awaited: tuple[list[SomeJob], Future[Scored]] | None = None  # jobs that ``run`` waits for
+        self._broken: BaseException | None = None  # why nothing is scored any more
         self._scored: SimpleQueue[tuple[list[SomeJob], Scored] | None] = SimpleQueue()  # None: there will be no more
         self._preparing = (
             ThreadPoolExecutor(stages.num_preparing, "rfm-prepare", stages.begin_preparing)
@@ -117,14 +118,16 @@ class Pipeline(Generic[SomeJob, Scored]):
         return rejected
 
     def run(self, jobs: list[SomeJob]) -> Scored:
-        """Scores jobs, prepared or not, and gives what ``score`` gave: they are not replied to. To be called by who
-        puts, while it is idle.
+        """Scores jobs, prepared or not, and gives what ``score`` gave. Nobody is replied to. To be called by who puts,
+        while it is idle. Raises the error with which scoring has ended.
 
         They are scored in the thread that scores all others. libgomp has a team of threads for each thread that
         computes; with two teams it counts more threads than cores, and no longer spins where they wait for each other.
         """
         scored: Future[Scored] = Future()
         with self._changed:
+            if self._broken is not None:
+                raise self._broken
             assert self.is_idle
             self._is_scoring = True
             self._awaited = jobs, scored
@@ -162,7 +165,7 @@ class Pipeline(Generic[SomeJob, Scored]):
     def _next_batch(self) -> list[SomeJob]:
         """The jobs whose turn it is, as many as are prepared and fit; none if ``run`` waits, or nothing will come."""
         with self._changed:
-            self._changed.wait_for(lambda: self._awaited or (not self._is_scoring and (self._ahead or self._is_closed)))
+            self._changed.wait_for(lambda: self._awaited or self._ahead or self._is_closed)
             if self._awaited is not None or not self._ahead:
                 return []
             self._is_scoring = True
@@ -199,21 +202,30 @@ class Pipeline(Generic[SomeJob, Scored]):
                 self._changed.notify_all()
 
     def _score_all(self) -> None:
-        self._stages.begin()
-        while (batch := self._next_batch()) or self._awaited is not None:
-            if self._awaited is None:
-                self._scored.put((batch, self._score(batch)))
-            else:
-                self._score_awaited(*self._awaited)
+        try:
+            self._stages.begin()
+            while (batch := self._next_batch()) or self._awaited is not None:
+                if self._awaited is None:
+                    self._scored.put((batch, self._score(batch)))
+                else:
+                    self._score_awaited(*self._awaited)
+        except BaseException as error:
+            self._break(error)
+            raise
         self._scored.put(None)
 
     def _score_awaited(self, jobs: list[SomeJob], scored: Future[Scored]) -> None:
+        result = self._score(jobs)
         self._awaited = None
-        try:
-            scored.set_result(self._score(jobs))
-        except BaseException as error:
-            scored.set_exception(error)
-            raise
+        scored.set_result(result)
+
+    def _break(self, error: BaseException) -> None:
+        """From now on nothing is scored. Who waits in ``run`` is told."""
+        with self._changed:
+            self._broken = error
+            awaited, self._awaited = self._awaited, None
+        if awaited is not None:
+            awaited[1].set_exception(error)
 
     def _reply_to_all(self) -> None:
         while (scored := self._scored.get()) is not None:

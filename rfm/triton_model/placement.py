@@ -42,9 +42,10 @@ class Placement:
             torch.cuda.set_device(self.device)  # some kernels launch on the current device, whatever their tensors'
 
     def run(self, work: Callable[[], None]) -> None:
-        """Computes in a thread that ends with it, as do the threads that OpenMP starts for it."""
+        """Does the work in a thread of its own. When that ends, its OpenMP threads end, too."""
         use_threads(1)  # in the thread that calls
-        with ThreadPoolExecutor(1, "rfm-load", self.apply) as thread:
+        with ThreadPoolExecutor(1, "rfm-load") as thread:
+            thread.submit(self.apply).result()
             thread.submit(work).result()
 
 

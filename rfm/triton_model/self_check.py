@@ -69,10 +69,13 @@ class SelfCheck:
 
     def end(self, error: BaseException) -> None:
         """Reports the error of a process that is broken, and ends it when Triton has passed on what it said."""
-        self._report(error)
-        self._ending = threading.Timer(ANSWERED_S, _end)
-        self._ending.daemon = True
-        self._ending.start()
+        try:
+            self._report(error)
+        finally:
+            ending = threading.Timer(ANSWERED_S, _end)
+            ending.daemon = True
+            ending.start()
+            self._ending = ending
 
 
 def _end() -> None:

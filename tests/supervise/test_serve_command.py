@@ -116,6 +116,19 @@ def test_neither_triton_nor_a_model_process_has_a_key_in_its_environment(
         ]
 
 
+@pytest.mark.parametrize("own", [{}, {"GOMP_SPINCOUNT": "7"}, {"OMP_WAIT_POLICY": "passive"}])
+def test_threads_spin_shortly_unless_the_environment_says_how_they_wait(
+    own: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in own.items():
+        monkeypatch.setenv(name, value)
+    given = TritonServer(REPOSITORY, Endpoints.free(), find_installation())._environment()
+    waits = {name: given[name] for name in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY") if name in given}
+    assert waits == (own or {"GOMP_SPINCOUNT": "10000"})
+
+
 def test_the_page_of_a_gateway_beside_triton_is_where_its_link_says(tmp_path: Path) -> None:
     repository = tmp_path / "model_repository"
     shutil.copytree(REPOSITORY, repository)

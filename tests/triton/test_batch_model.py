@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,7 +33,7 @@ from rfm_client import (
 )
 from rfm_client.contract import wire
 from rfm_client.contract.names import PROBE_PREFIX
-from rfm_serve import PATIENCE_S
+from rfm_serve import PATIENCE_S, wait_for
 from trajectories import random_trajectory
 
 
@@ -216,8 +216,17 @@ def test_the_cores_of_a_machine_are_shared_among_the_instances(
     assert Placement.of(args, config, {"torch_threads": "5"}).num_threads == 5
 
 
+@pytest.fixture
+def _own_number_of_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    use_threads(before)
+
+
+@pytest.mark.usefixtures("_own_number_of_threads")
 def test_what_is_loaded_is_computed_in_a_thread_that_ends() -> None:
     seen: list[tuple[threading.Thread, int]] = []
+    use_threads(2)
     placement = Placement(torch.device("cpu"), num_threads=3)
     placement.run(lambda: seen.append((threading.current_thread(), torch.get_num_threads())))
     ((thread, num_threads),) = seen
@@ -226,36 +235,44 @@ def test_what_is_loaded_is_computed_in_a_thread_that_ends() -> None:
     assert torch.get_num_threads() == 1  # the calling thread starts no team of its own
     with pytest.raises(ZeroDivisionError):
         placement.run(lambda: [][1 // 0])
+    with pytest.raises(RuntimeError, match="positive"):  # PyTorch's own words, not those of a pool of threads
+        Placement(torch.device("cpu"), num_threads=0).run(lambda: None)
 
 
+@pytest.mark.usefixtures("_own_number_of_threads")
 def test_a_thread_computes_with_its_own_number_of_threads_whatever_others_set() -> None:
-    may_look = threading.Event()
+    has_set, may_look = threading.Event(), threading.Event()
 
     def number() -> int:
         use_threads(3)
+        has_set.set()
         assert may_look.wait(PATIENCE_S)
         return torch.get_num_threads()
 
     with ThreadPoolExecutor(2) as pool:
         seen = pool.submit(number)
+        assert has_set.wait(PATIENCE_S)
         pool.submit(use_threads, 2).result()
         may_look.set()
         assert seen.result() == 3
 
 
 def test_all_forward_passes_are_made_in_one_thread(tmp_path: Path) -> None:
-    """Warm-ups, requests that ``execute`` answers itself, and those answered later: else OpenMP has two teams."""
+    """Warm-ups, requests for which ``execute`` waits, and those answered later: else OpenMP has two teams."""
     model = Model(tmp_path, warmups=1)
-    threads = set()
+    threads = []
     answer = model.answer
 
     def watched(questions: Sequence[Sample], execution: Execution) -> Any:
-        threads.add(threading.current_thread().name)
+        threads.append(threading.current_thread().name)
         return answer(questions, execution)
 
     model.answer = watched  # type: ignore[method-assign]
-    model.respond([request(1)])  # the first is answered at once
-    model.respond([request(2), request(3)])
-    model._sample_s = 1.0  # later ones are answered later
-    model.respond([request(4), request(5)])
-    assert threads == {"rfm-score"}
+    assert model.execute([request(1)]) is not None
+    model._sample_s = 1.0  # so long that they are answered later
+    later = [request(5), request(6)]
+    assert model.execute(later) is None
+    wait_for(lambda: all(each.responses for each in later))
+    assert [each.responses[0].error for each in later] == [None, None]
+    assert len(threads) >= 2
+    assert set(threads) == {"rfm-score"}

@@ -171,9 +171,30 @@ def test_who_runs_jobs_gets_the_error_and_nothing_is_scored_any_more() -> None:
         raise MemoryError
 
     pipeline = Pipeline(Stages(broken, work.reply, work.fail), BOUNDS)
-    with pytest.raises(MemoryError):
-        pipeline.run([Job()])
-    wait_for(lambda: work.failures == ["MemoryError()"])
+    for _ in range(2):
+        with pytest.raises(MemoryError):
+            pipeline.run([Job()])
+        wait_for(lambda: work.failures == ["MemoryError()"])
+
+
+@pytest.mark.parametrize("is_early", [True, False])
+def test_who_runs_jobs_does_not_wait_for_a_thread_that_could_not_begin(is_early: bool) -> None:
+    work, may_begin = Work(), threading.Event()
+
+    def begin() -> None:
+        assert may_begin.wait(PATIENCE_S)
+        raise MemoryError
+
+    pipeline = Pipeline(Stages(work.score, work.reply, work.fail, begin=begin), BOUNDS)
+    if is_early:
+        may_begin.set()
+        wait_for(lambda: work.failures == ["MemoryError()"])
+    with ThreadPoolExecutor(1) as pool:
+        ran = pool.submit(pipeline.run, [Job()])
+        assert is_early or not pipeline.wait_for(ran.done, 0.05)
+        may_begin.set()
+        with pytest.raises(MemoryError):
+            ran.result(PATIENCE_S)
 
 
 def test_nothing_is_scored_beside_what_another_thread_scores() -> None:
