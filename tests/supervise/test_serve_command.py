@@ -66,8 +66,10 @@ def test_a_signal_leaves_nothing_running(tmp_path: Path, arguments: list[str], n
     program.chmod(0o755)
     temporary = tmp_path / "tmp"
     temporary.mkdir()
+    free = Endpoints.free()
+    ports = [f"--{name.replace('_', '-')}={getattr(free, name)}" for name in ("http_port", "grpc_port", "metrics_port")]
     process = subprocess.Popen(
-        [str(RFM), *arguments, "--tritonserver", str(program)],
+        [str(RFM), *arguments, *(ports if arguments[0] == "serve" else []), "--tritonserver", str(program)],
         cwd=tmp_path,
         env={**os.environ, "TMPDIR": str(temporary)},
         stdout=subprocess.DEVNULL,
