@@ -233,8 +233,12 @@ def test_what_is_loaded_is_computed_in_a_thread_that_ends() -> None:
     assert not thread.is_alive()
     assert num_threads == 3
     assert torch.get_num_threads() == 1  # the calling thread starts no team of its own
+
+    def broken() -> None:
+        raise ZeroDivisionError
+
     with pytest.raises(ZeroDivisionError):
-        placement.run(lambda: [][1 // 0])
+        placement.run(broken)
     with pytest.raises(RuntimeError, match="positive"):  # PyTorch's own words, not those of a pool of threads
         Placement(torch.device("cpu"), num_threads=0).run(lambda: None)
 
