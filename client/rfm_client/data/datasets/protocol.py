@@ -16,6 +16,7 @@ import numpy as np
 
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.samples import Trajectory, UInt8Array
+from rfm_client.data.orientation import Orientation
 
 DIGEST_BYTES = 16
 
@@ -83,8 +84,19 @@ class Dataset(Protocol):
         """Those of the cameras whose pictures are distances, not colours: left out unless they are named."""
 
     @property
+    def left_out(self) -> Mapping[str, str]:
+        """Cameras that cannot be scored and are none of ``cameras``, with the reason."""
+
+    @property
+    def orientations(self) -> Mapping[str, Orientation]:
+        """How ``frames`` turns the stored pictures of each camera that it turns."""
+
+    @property
     def episodes(self) -> Sequence[Episode]:
         """All episodes, by index."""
+
+    def decoder(self, camera: str) -> str | None:
+        """The library that decodes the camera's pictures, with its version; None: they are stored as pixels."""
 
     def check(self, episode: Episode, camera: str) -> Contents:
         """Finds every frame of the episode without decoding one. DatasetError for what contradicts itself, or is

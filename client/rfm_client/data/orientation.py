@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: MIT
+"""How stored pictures are turned so that they are upright, for each camera. T frames, H x W pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias, get_args
+
+import numpy as np
+
+from rfm_client.contract.samples import UInt8Array
+
+Orientation: TypeAlias = Literal["none", "rotate180", "flip-vertical", "flip-horizontal", "rotate90", "rotate270"]
+ORIENTATIONS: tuple[Orientation, ...] = get_args(Orientation)
+
+
+def turned(frames: UInt8Array, orientation: Orientation) -> UInt8Array:
+    """uint8 [..., H, W, 3], turned: ``rotate90`` is a quarter turn clockwise; ``flip-vertical`` puts the top below."""
+    if orientation == "none":
+        return frames
+    views = {
+        "rotate180": frames[..., ::-1, ::-1, :],
+        "flip-vertical": frames[..., ::-1, :, :],
+        "flip-horizontal": frames[..., ::-1, :],
+        "rotate90": np.swapaxes(frames[..., ::-1, :, :], -3, -2),
+        "rotate270": np.swapaxes(frames, -3, -2)[..., ::-1, :, :],
+    }
+    return np.ascontiguousarray(views[orientation])
+
+
+@dataclass(frozen=True)
+class Orient:
+    """What the caller says of orientations. Raises ValueError for an unknown one.
+
+    default: of every camera that ``cameras`` does not name; None: the caller does not say
+    """
+
+    default: Orientation | None = None
+    cameras: Mapping[str, Orientation] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for orientation in (self.default, *self.cameras.values()):
+            if orientation is not None and orientation not in ORIENTATIONS:
+                raise ValueError(f"orient: expected one of {', '.join(ORIENTATIONS)}, got {orientation!r}")
+
+    @classmethod
+    def parse(cls, texts: Iterable[str]) -> Orient:
+        """From ``rotate180``, or ``agentview_rgb=rotate180`` for one camera, each once. Raises ValueError."""
+        default: str | None = None
+        cameras: dict[str, str] = {}
+        for text in texts:
+            camera, is_named, orientation = text.rpartition("=")
+            if (camera in cameras) if is_named else default is not None:
+                raise ValueError(f"orient: expected each camera once, got {text!r} again")
+            if is_named:
+                cameras[camera] = orientation
+            else:
+                default = orientation
+        return cls(default, cameras)  # type: ignore[arg-type]  # checked there
