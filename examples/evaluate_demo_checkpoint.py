@@ -17,7 +17,7 @@ import typer
 from rich.console import Console
 
 from demo_evaluation.figures import Figure, figures
-from demo_evaluation.questions import HeldOut
+from demo_evaluation.questions import HeldOut, noise_samples
 from rfm_client import Result, RewardClient, RewardError, Sample
 from rfm_client.cli.show import table
 
@@ -40,19 +40,23 @@ def evaluate(
     output.parent.mkdir(parents=True, exist_ok=True)
     held_out = HeldOut.of(clips, seed)
     with _evaluator(repository, url, checkpoint, output.parent) as ask:
-        samples = held_out.samples()
-        results: list[Result] = []
-        for start in range(0, len(samples), REQUEST_SAMPLES):
-            for result in ask(samples[start : start + REQUEST_SAMPLES]):
-                if isinstance(result, RewardError):
-                    raise result
-                results.append(result)
-    found = figures(held_out, results)
+        results, of_noise = _results(ask, held_out.samples()), _results(ask, noise_samples())
+    found = figures(held_out, results, of_noise)
     Console().print(table(f"{held_out.num_clips} held-out clips", ("figure", "value", "bound", ""), _rows(found)))
     record = {"clips": held_out.num_clips, "seed": seed, "figures": {each.name: each.value for each in found}}
     output.write_text(json.dumps(record, indent=1) + "\n")
     if not all(each.holds for each in found):
         raise typer.Exit(1)
+
+
+def _results(ask: Evaluate, samples: Sequence[Sample]) -> list[Result]:
+    results: list[Result] = []
+    for start in range(0, len(samples), REQUEST_SAMPLES):
+        for result in ask(samples[start : start + REQUEST_SAMPLES]):
+            if isinstance(result, RewardError):
+                raise result
+            results.append(result)
+    return results
 
 
 def _rows(found: Sequence[Figure]) -> list[tuple[str, str, str, str]]:

@@ -50,12 +50,13 @@ class _Answers:
         )
 
 
-def figures(held_out: HeldOut, results: Sequence[Result]) -> list[Figure]:
-    """All figures, from the results of ``held_out.samples()``."""
+def figures(held_out: HeldOut, results: Sequence[Result], of_noise: Sequence[Result]) -> list[Figure]:
+    """All figures, from the results of ``held_out.samples()`` and of ``noise_samples()``."""
     count = len(results) // len(held_out.cases)
     answers = [_Answers.of(case, results[i * count : (i + 1) * count]) for i, case in enumerate(held_out.cases)]
     scored = [pair for each in answers for pair in zip(each.case.clips, each.progress, strict=True)]
     successes = [progress for each in answers for progress in each.progress[:2]]
+    preferences, noise = ([r.preference for r in rs if isinstance(r, PreferenceResult)] for rs in (results, of_noise))
     return [
         Figure("Spearman(progress, time), successes, median", float(np.median(_rises(successes))), 0.95),
         Figure(
@@ -67,6 +68,8 @@ def figures(held_out: HeldOut, results: Sequence[Result]) -> list[Figure]:
         Figure(
             "same task more similar than another", _mean(a.similarities[0] > a.similarities[1] for a in answers), 0.95
         ),
+        Figure("agreement of both orders, held-out pairs", order_agreement(preferences), 0.95),
+        Figure("agreement of both orders, random pixels", order_agreement(noise), 0.8),
         Figure("last progress: right above wrong sentence", _mean(_right_higher(a) for a in answers)),
         Figure("last progress: successes, mean", _mean(p.last_progress for p in successes)),
         Figure("last progress: wrong sentence, mean", _mean(a.progress[4].last_progress for a in answers)),
@@ -91,6 +94,11 @@ def auroc(scores: npt.ArrayLike, labels: npt.ArrayLike) -> float:
     positives, negatives = int(is_positive.sum()), int((~is_positive).sum())
     rank_sum = (_ranks(np.asarray(scores))[is_positive] + 1).sum()
     return float((rank_sum - positives * (positives + 1) / 2) / (positives * negatives))
+
+
+def order_agreement(preferences: npt.ArrayLike) -> float:
+    """1 less the mean |P(a,b) + P(b,a) - 1| of pairs, each asked in two orders one after the other."""
+    return 1 - float(np.abs(np.reshape(preferences, (-1, 2)).sum(axis=1) - 1).mean())
 
 
 def _ranks(values: npt.NDArray[np.generic]) -> Values:

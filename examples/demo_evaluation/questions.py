@@ -8,9 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from rfm_client import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
-from toy_world import FAILURES, TASKS, VERBS, Clip, make_clip
+from toy_world import FAILURES, NUM_FRAMES, TASKS, VERBS, Clip, make_clip
+from toy_world.render import SIZE_PX
 
 _SEEDS_PER_TASK = 10  # room between the seeds of one case and the next
+_NOISE_PAIRS = 40
+_NOISE_SEED = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +74,18 @@ class HeldOut:
     def samples(self) -> list[Sample]:
         """The questions, case by case."""
         return [sample for case in self.cases for sample in case.samples()]
+
+
+def noise_samples() -> list[Sample]:
+    """Preferences between clips of random pixels, each pair either way round."""
+    random = np.random.default_rng(_NOISE_SEED)
+    samples: list[Sample] = []
+    for index in range(_NOISE_PAIRS):
+        task = TASKS[index % len(TASKS)].sentence(VERBS[index % len(VERBS)])
+        first, second = random.integers(0, 256, (2, NUM_FRAMES, SIZE_PX, SIZE_PX, 3), np.uint8)
+        pair = PreferenceSample(Trajectory(frames=first, task=task), Trajectory(frames=second, task=task))
+        samples += [pair, pair.swapped]
+    return samples
 
 
 def _case(index: int, seed: int) -> Case:

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from demo_evaluation.figures import auroc, spearman
+from demo_evaluation.figures import auroc, order_agreement, spearman
 from demo_training.groups import GroupsDataset
 from toy_world import FAILURES, KINDS, TASKS, Task, make_clip
 
@@ -70,4 +70,5 @@ def test_rank_figures() -> None:
     assert spearman([1, 2, 3, 4], [10, 20, 40, 30]) == pytest.approx(0.8)
     assert auroc([0.1, 0.4, 0.35, 0.8], [0, 0, 1, 1]) == pytest.approx(0.75)
     assert auroc([0.5, 0.5], [0, 1]) == 0.5
+    assert order_agreement([0.9, 0.1, 0.9, 0.6]) == pytest.approx(0.75)
     assert set(FAILURES) < set(KINDS)

@@ -74,7 +74,7 @@ def test_the_served_checkpoint_keeps_its_bounds_on_clips_it_never_saw(tmp_path: 
     output = tmp_path / "evaluation.json"
     with nothing_left_behind():
         shown = example("evaluate_demo_checkpoint.py", "--repository", REPOSITORY, "--clips", 48, "--output", output)
-    assert shown.count("holds") == 6
+    assert shown.count("holds") == 8
     figures = json.loads(output.read_text())["figures"]
     assert figures["last progress: successes, mean"] > 0.9
     assert figures["last progress: wrong sentence, mean"] < 0.2

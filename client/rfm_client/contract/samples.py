@@ -113,6 +113,12 @@ class PreferenceSample:
         """The trajectories in the order in which they lie on the time axis."""
         return (self.first, self.second)
 
+    @property
+    def swapped(self) -> PreferenceSample:
+        """The same question with ``second`` in the first place: its task stays that of ``first``."""
+        asked = self.first
+        return PreferenceSample(replace(self.second, task=asked.task, text_embedding=asked.text_embedding), asked)
+
 
 @dataclass(frozen=True, eq=False)
 class SimilaritySample:
