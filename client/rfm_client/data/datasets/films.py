@@ -17,7 +17,17 @@ import numpy.typing as npt
 
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.datasets.protocol import DIGEST_BYTES, Contents, DatasetError, digest_of
-from rfm_client.data.film_files import DAMAGED, UNDAMAGED, broken_off, judged, upright
+from rfm_client.data.film_files import (
+    DAMAGED,
+    UNDAMAGED,
+    FilmError,
+    broken_off,
+    film_packets,
+    film_stream,
+    import_av,
+    judged,
+    upright,
+)
 
 Times = npt.NDArray[np.float64]
 
@@ -29,14 +39,16 @@ class Span:
     """The frames of one episode in a film.
 
     times_s: float64 [T], rising; each frame's time stamp in the film
-    tolerance_s: how far a time stamp may be off: half the time from one frame to the next
+    tolerance_s: half the time from one frame to the next
     where: names episode and camera in messages
+    container: FFmpeg's name of the format that the file is read as; None: whatever it looks like
     """
 
     file: Path
     times_s: Times
     tolerance_s: float
     where: str
+    container: str | None = None
 
     def error(self, expected: str, got: str) -> DatasetError:
         """The error of this span's film."""
@@ -50,15 +62,19 @@ class Packets:
     times_s: float64 [N], rising
     digests: of each frame's bytes, in the same order
     sizes: how many bytes each has
+    tick_s: what times are multiples of
+    fps: frames a second on average; 0: the file does not say it
     """
 
     times_s: Times
     digests: tuple[bytes, ...]
     sizes: tuple[int, ...]
+    tick_s: float
+    fps: float
 
     @classmethod
-    def read(cls, file: Path) -> Packets:
-        """All packets of the film's first video stream. Raises DatasetError for a missing or truncated film."""
+    def read(cls, file: Path, container: str | None = None) -> Packets:
+        """The packets of all frames. Raises DatasetError for a missing or truncated file, and one of several films."""
         av = import_av()
         found: list[tuple[float, bytes, int]] = []
         try:
@@ -66,74 +82,52 @@ class Packets:
                 missing = broken_off(opened)
             if missing is not None:
                 raise DatasetError.at(file, "a whole video file", missing)
-            with av.open(str(file)) as container:
-                if not container.streams.video:
-                    raise DatasetError.at(file, "a video stream", "none")
-                for packet in container.demux(video=0):
+            with av.open(str(file), format=container) as film:
+                stream = film_stream(film)
+                for packet in film_packets(film, stream):
                     if packet.is_corrupt:
                         raise DatasetError.at(file, "a whole video file", f"one whose frame {len(found)} is broken")
-                    if packet.size and packet.pts is not None:
+                    if packet.pts is not None:
                         digest = hashlib.blake2b(bytes(packet), digest_size=DIGEST_BYTES).digest()
                         found.append((float(packet.pts * packet.time_base), digest, packet.size))
+                tick_s, fps = float(stream.time_base), float(stream.average_rate or 0)
+        except FilmError as error:
+            raise DatasetError.at(file, error.expected, error.got) from error
         except FileNotFoundError as error:
             raise DatasetError.at(file, "a video file", "none") from error
         except (av.FFmpegError, OSError) as error:
             raise DatasetError.at(file, "a whole video file", error.strerror or str(error)) from error
         found.sort()
         times_s, digests, sizes = zip(*found, strict=True) if found else ((), (), ())
-        return cls(np.array(times_s), digests, sizes)
+        return cls(np.array(times_s), digests, sizes, tick_s, fps)
 
-    def check(self, span: Span) -> Contents:
-        """What the span's frames are made of. Raises DatasetError if one is missing, or would have to stand for two."""
-        if not len(self.times_s):
-            raise span.error("frames", "none")
-        after = np.clip(np.searchsorted(self.times_s, span.times_s), 1, max(len(self.times_s) - 1, 1))
-        after = np.minimum(after, len(self.times_s) - 1)
-        before = np.maximum(after - 1, 0)
-        is_before = np.abs(self.times_s[before] - span.times_s) <= np.abs(self.times_s[after] - span.times_s)
-        nearest = np.where(is_before, before, after)
-        off_s = np.abs(self.times_s[nearest] - span.times_s)
-        missing = np.flatnonzero(off_s > span.tolerance_s)
-        if len(missing):
-            t = int(missing[0])
-            got = f"the nearest at {self.times_s[nearest[t]]:.4f} s ({len(self.times_s)} frames in the file)"
-            raise span.error(f"frame {t} at {span.times_s[t]:.4f} s", got)
-        twice = np.flatnonzero(np.diff(nearest) <= 0)
-        if len(twice):
-            raise span.error(f"a frame of its own at {span.times_s[twice[0] + 1]:.4f} s", "the one before it")
-        picked = nearest.tolist()
-        return Contents(digest_of(self.digests[index] for index in picked), sum(self.sizes[index] for index in picked))
+    def contents(self, frames: slice = slice(None)) -> Contents:
+        """What these frames are made of."""
+        return Contents(digest_of(self.digests[frames]), sum(self.sizes[frames]))
 
 
 def decode(span: Span) -> Iterator[UInt8Array]:
-    """The T frames, uint8 [H, W, 3], upright, the nearest to each time. Raises DatasetError, also for a damaged one."""
+    """The T frames, uint8 [H, W, 3], upright. Raises DatasetError for a frame that is not there, or damaged."""
     av = import_av()
     num_given = 0
     try:
-        with av.open(str(span.file)) as container:
-            for frame, is_damaged in _nearest(span, judged(_decoded(container, span))):
+        with av.open(str(span.file), format=span.container) as container:
+            for frame, is_damaged in _within(span, judged(_decoded(container, span))):
                 if is_damaged:
                     raise DatasetError.at(f"{span.where}: {span.file}: frame {num_given}", UNDAMAGED, DAMAGED)
                 yield upright(frame)
                 num_given += 1
+    except FilmError as error:
+        raise span.error(error.expected, error.got) from error
     except (av.FFmpegError, OSError) as error:
         raise span.error(f"frame {num_given} to be decoded", error.strerror or str(error)) from error
     if num_given != len(span.times_s):
         raise span.error(f"{len(span.times_s)} frames", f"{num_given}")
 
 
-def import_av() -> Any:
-    """The module ``av``. Raises ImportError that names the extra."""
-    try:
-        import av
-    except ImportError as error:
-        raise ImportError('video files need PyAV: pip install "./client[video]"') from error
-    return av
-
-
 def _decoded(container: Any, span: Span) -> Iterator[Any]:
     """Frames from before the span on, in the order of their times."""
-    stream = container.streams.video[0]
+    stream = film_stream(container)
     stream.thread_type = "AUTO"
     first_s = float(span.times_s[0])
     container.seek(max(int((first_s - _FRAMES_BEFORE * 2 * span.tolerance_s) / stream.time_base), 0), stream=stream)
@@ -148,17 +142,11 @@ def _decoded(container: Any, span: Span) -> Iterator[Any]:
     yield from frames
 
 
-def _nearest(span: Span, frames: Iterator[tuple[Any, bool]]) -> Iterator[tuple[Any, bool]]:
-    """Of the judged frames the nearest to each time. Raises DatasetError if that is not within the tolerance."""
-    t = 0
-    held = next(frames, None)
-    while held is not None and t < len(span.times_s):
-        following = next(frames, None)
-        target_s = float(span.times_s[t])
-        held_s = held[0].time
-        if following is None or abs(held_s - target_s) <= abs(following[0].time - target_s):
-            if abs(held_s - target_s) > span.tolerance_s:
-                raise span.error(f"frame {t} at {target_s:.4f} s", f"the nearest at {held_s:.4f} s")
-            yield held
-            t += 1
-        held = following
+def _within(span: Span, frames: Iterator[tuple[Any, bool]]) -> Iterator[tuple[Any, bool]]:
+    """Of the judged frames those of the span. Raises DatasetError for one that is missing among them."""
+    for t, time_s in enumerate(span.times_s.tolist()):
+        found = next((each for each in frames if each[0].time > time_s - span.tolerance_s), None)
+        if found is None or found[0].time > time_s + span.tolerance_s:
+            got = "none" if found is None else f"the next at {found[0].time:.4f} s"
+            raise span.error(f"frame {t} at {time_s:.4f} s", got)
+        yield found

@@ -7,7 +7,7 @@ A frame in a film is found by its time stamp: where the episode begins in the fi
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,8 @@ from rfm_client.data.datasets import lerobot_v21, lerobot_v30
 from rfm_client.data.datasets.films import Packets, Span, Times, decode
 from rfm_client.data.datasets.lerobot_info import Info
 from rfm_client.data.datasets.lerobot_rows import Entry, RowReader, read_table
-from rfm_client.data.datasets.protocol import Contents, DatasetError, Episode, contents_of
+from rfm_client.data.datasets.protocol import Contents, DatasetError, Episode, GivenTask, contents_of, orientations_of
+from rfm_client.data.orientation import Orient, turned
 
 FILMS_AT_A_TIME = 4  # whose tables of packets are kept in memory
 
@@ -28,9 +29,22 @@ class LeRobotDataset:
     """A LeRobot dataset in a local folder.
 
     source, revision: of the Hub, if it came from there
+    task: what the caller says of tasks
+    orient: how pictures are turned
     """
 
-    def __init__(self, root: Path, *, source: str | None = None, revision: str | None = None) -> None:
+    left_out: Mapping[str, str] = {}
+    notes: Sequence[str] = ()
+
+    def __init__(
+        self,
+        root: Path,
+        *,
+        source: str | None = None,
+        revision: str | None = None,
+        task: GivenTask = GivenTask(),
+        orient: Orient = Orient(),
+    ) -> None:
         self.root = root
         self.source = source or root.resolve().name
         self.revision = revision
@@ -38,7 +52,9 @@ class LeRobotDataset:
         self._packets = lru_cache(FILMS_AT_A_TIME)(Packets.read)
         version = lerobot_v30 if self.info.version == "v3.0" else lerobot_v21
         self._entries = {entry.index: entry for entry in version.read_entries(root, self.info)}
-        self._rows = RowReader(version.read_tasks(root))
+        self._task = task
+        self._rows = RowReader({} if task.overrides else version.read_tasks(root), task)
+        self.orientations = orientations_of(orient, self.cameras)
         self._check_totals()
 
     @property
@@ -59,7 +75,9 @@ class LeRobotDataset:
     @cached_property
     def episodes(self) -> Sequence[Episode]:
         """All episodes. Reads and checks the rows of all of them; raises DatasetError."""
-        return [self._episode(entry) for _, entry in sorted(self._entries.items())]
+        episodes = [self._episode(entry) for _, entry in sorted(self._entries.items())]
+        self._task.check_used(episodes)
+        return episodes
 
     def check(self, episode: Episode, camera: str) -> Contents:
         """What the episode's frames are made of; each is there. Raises DatasetError."""
@@ -69,7 +87,11 @@ class LeRobotDataset:
         return contents_of(self._images(episode, camera))
 
     def frames(self, episode: Episode, camera: str) -> Iterator[UInt8Array]:
-        """The episode's frames, uint8 [H, W, 3]. Raises DatasetError."""
+        """The episode's frames, uint8 [H, W, 3], turned as ``orientations`` says. Raises DatasetError."""
+        orientation = self.orientations.get(camera, "none")
+        return (turned(frame, orientation) for frame in self._stored(episode, camera))
+
+    def _stored(self, episode: Episode, camera: str) -> Iterator[UInt8Array]:
         if camera in self.info.films:
             return decode(self.span(episode, camera))
         images = self._images(episode, camera)

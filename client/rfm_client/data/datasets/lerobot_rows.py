@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.data.datasets.protocol import DatasetError, checked_task
+from rfm_client.data.datasets.protocol import DatasetError, GivenTask
 
 ROW_COLUMNS = ("index", "episode_index", "frame_index", "timestamp", "task_index")
 FILES_AT_A_TIME = 4  # whose rows are kept in memory
@@ -51,10 +51,14 @@ class Rows:
 
 
 class RowReader:
-    """Reads and checks rows. The columns of the files that were read last are kept."""
+    """Reads and checks rows. The columns of the files that were read last are kept.
 
-    def __init__(self, tasks: Mapping[int, str]) -> None:
+    tasks: sentences by number; given: what the caller says of them
+    """
+
+    def __init__(self, tasks: Mapping[int, str | None], given: GivenTask) -> None:
         self._tasks = tasks
+        self._given = given
         self._columns = lru_cache(FILES_AT_A_TIME)(_read_columns)
 
     def read(self, entry: Entry) -> Rows:
@@ -71,11 +75,14 @@ class RowReader:
         return Rows(int(columns["index"][own][0]), times_s, self._task(entry, where, columns["task_index"][own]))
 
     def _task(self, entry: Entry, where: str, task_indices: npt.NDArray[np.int64]) -> str:
+        if self._given.overrides:
+            return self._given.of(where, None)
         used = np.unique(task_indices).tolist()
         if len(used) != 1:
             raise DatasetError.at(f"{where}: task_index", "one task in an episode", f"{len(used)}: {used}")
-        task = checked_task(f"{entry.where}: task {used[0]} in meta/tasks", self._tasks.get(used[0]))
-        if entry.tasks and task not in entry.tasks:
+        own = self._tasks.get(used[0])
+        task = self._given.of(f"{entry.where}: task {used[0]} in meta/tasks", own)
+        if entry.tasks and task == own and task not in entry.tasks:
             raise DatasetError.at(f"{entry.where}: meta/episodes: tasks", repr(task), repr(list(entry.tasks)))
         return task
 

@@ -32,7 +32,7 @@ def read_entries(root: Path, info: Info) -> Iterator[Entry]:
         )
 
 
-def read_tasks(root: Path) -> dict[int, str]:
+def read_tasks(root: Path) -> dict[int, str | None]:
     """Each task's sentence by its number. Raises DatasetError."""
     return {_number(where, line, "task_index"): line.get("task", "") for where, line in _lines(root / TASKS_FILE)}
 

@@ -38,7 +38,7 @@ def read_entries(root: Path, info: Info) -> Iterator[Entry]:
     yield from entries
 
 
-def read_tasks(root: Path) -> dict[int, str]:
+def read_tasks(root: Path) -> dict[int, str | None]:
     """Each task's sentence by its number. Raises DatasetError.
 
     The sentences are the index of a pandas table, whose column has another name in each version of its writer.
@@ -46,7 +46,7 @@ def read_tasks(root: Path) -> dict[int, str]:
     file = root / TASKS_FILE
     columns: dict[str, list[Any]] = read_table(file).to_pydict()
     numbers = columns.pop("task_index", None)
-    texts = [values for values in columns.values() if all(isinstance(value, str) for value in values)]
+    texts = [values for values in columns.values() if all(value is None or isinstance(value, str) for value in values)]
     if numbers is None or len(texts) != 1:
         raise DatasetError.at(file, "task_index and one column of sentences", ", ".join(["task_index"] * bool(numbers)))
     return dict(zip(numbers, texts[0], strict=True))

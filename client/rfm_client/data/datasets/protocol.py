@@ -16,7 +16,7 @@ import numpy as np
 
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.samples import Trajectory, UInt8Array
-from rfm_client.data.orientation import Orientation
+from rfm_client.data.orientation import Orient, Orientation
 
 DIGEST_BYTES = 16
 
@@ -92,6 +92,10 @@ class Dataset(Protocol):
         """How ``frames`` turns the stored pictures of each camera that it turns."""
 
     @property
+    def notes(self) -> Sequence[str]:
+        """What the caller should know of its pictures before they are scored, a line each."""
+
+    @property
     def episodes(self) -> Sequence[Episode]:
         """All episodes, by index."""
 
@@ -117,14 +121,37 @@ def chosen_cameras(dataset: Dataset, names: Iterable[str]) -> tuple[str, ...]:
     """
     chosen = []
     for name in names:
-        camera = next((known for known in dataset.cameras if known in (name, _CAMERA_PREFIX + name)), None)
+        camera = _camera_named(name, dataset.cameras)
         if camera is None:
-            raise DatasetError.at("cameras", f"some of {', '.join(dataset.cameras)}", repr(name))
+            reason = f", which is left out: {dataset.left_out[name]}" if name in dataset.left_out else ""
+            raise DatasetError.at("cameras", f"some of {', '.join(dataset.cameras)}", f"{name!r}{reason}")
         chosen.append(camera)
     chosen = chosen or [camera for camera in dataset.cameras if camera not in dataset.depth_cameras]
     if dataset.cameras and not chosen:
         raise DatasetError.at("cameras", f"some of {', '.join(dataset.cameras)} named: all are depth cameras", "none")
     return tuple(chosen)
+
+
+def orientations_of(
+    orient: Orient, cameras: Sequence[str], defaults: Mapping[str, Orientation] | None = None
+) -> Mapping[str, Orientation]:
+    """The orientation of each camera that is turned. Raises DatasetError for a camera that is not there.
+
+    defaults: of cameras that the caller does not speak of
+    """
+    asked: dict[str, Orientation] = dict(defaults or {})
+    if orient.default is not None:
+        asked = dict.fromkeys(cameras, orient.default)
+    for name, orientation in orient.cameras.items():
+        camera = _camera_named(name, cameras)
+        if camera is None:
+            raise DatasetError.at("orient", f"one of the cameras {', '.join(cameras)}", repr(name))
+        asked[camera] = orientation
+    return {camera: orientation for camera, orientation in asked.items() if orientation != "none"}
+
+
+def _camera_named(name: str, cameras: Sequence[str]) -> str | None:
+    return next((known for known in cameras if known in (name, _CAMERA_PREFIX + name)), None)
 
 
 def iter_episodes(
@@ -169,8 +196,34 @@ def digest_of(parts: Iterable[bytes]) -> str:
     return digest.hexdigest()
 
 
-def checked_task(where: object, task: object) -> str:
-    """The task's sentence. Raises DatasetError if there is none."""
-    if not isinstance(task, str) or not task.strip():
-        raise DatasetError.at(where, "a task as a sentence", "none" if not task else repr(task))
-    return task
+@dataclass(frozen=True)
+class GivenTask:
+    """What the caller says of tasks. Raises DatasetError for an override without a text.
+
+    text: of episodes that have none of their own; None: the caller does not say
+    overrides: whether it is the task of all episodes
+    """
+
+    text: str | None = None
+    overrides: bool = False
+
+    def __post_init__(self) -> None:
+        is_said = self.text is not None and self.text.strip()
+        if not is_said and (self.text is not None or self.overrides):
+            raise DatasetError.at("task", "a sentence", "none" if self.text is None else repr(self.text))
+
+    def of(self, where: object, own: object) -> str:
+        """The task of an episode, whose own task may be missing. Raises DatasetError if neither is there."""
+        is_missing = not own or (isinstance(own, str) and not own.strip())
+        if self.text is not None and (self.overrides or is_missing):
+            return self.text
+        if is_missing or not isinstance(own, str):
+            got = "none" if not own else repr(own)
+            raise DatasetError.at(where, "a task as a sentence", f'{got}: add --task "what is to be done"')
+        return own
+
+    def check_used(self, episodes: Sequence[Episode]) -> None:
+        """Raises DatasetError if no episode has the task, since all have other ones."""
+        if self.text is not None and all(episode.task != self.text for episode in episodes):
+            got = f"{self.text!r}: leave it out, or put it in the place of theirs with --override-task"
+            raise DatasetError.at("task", "none for episodes that all have tasks of their own", got)

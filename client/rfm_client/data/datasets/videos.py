@@ -10,14 +10,23 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from functools import cached_property, lru_cache
 from pathlib import Path
 
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.datasets.films import Packets, Span, decode
-from rfm_client.data.datasets.protocol import Contents, DatasetError, Episode, checked_task, chosen_cameras, digest_of
+from rfm_client.data.datasets.protocol import (
+    Contents,
+    DatasetError,
+    Episode,
+    GivenTask,
+    chosen_cameras,
+    digest_of,
+    orientations_of,
+)
 from rfm_client.data.lerobot_videos import check_local_film
+from rfm_client.data.orientation import Orient, turned
 
 TABLES = ("tasks.csv", "tasks.json")
 CAMERA = "video"
@@ -29,34 +38,40 @@ class VideoFolder:
     """Videos and their tasks.
 
     table: the file of tasks, or the folder that holds it
+    task: what the caller says of tasks
+    orient: how pictures are turned
     """
 
     kind = "videos"
     revision = None
     cameras: Sequence[str] = (CAMERA,)
     depth_cameras: Sequence[str] = ()
+    left_out: Mapping[str, str] = {}
+    notes: Sequence[str] = ()
 
-    def __init__(self, table: Path) -> None:
+    def __init__(self, table: Path, *, task: GivenTask = GivenTask(), orient: Orient = Orient()) -> None:
         self._table = _table_in(table) if table.is_dir() else table
         self.root = self._table.parent
         self.source = self.root.resolve().name
         self._packets = lru_cache(_FILES_AT_A_TIME)(Packets.read)
-        self._tasks = _read(self._table)
+        self._task = task
+        self.orientations = orientations_of(orient, self.cameras)
+        self._tasks = _read(self._table, {"video"} if task.text else {"video", "task"})
 
     @cached_property
     def episodes(self) -> Sequence[Episode]:
         """All videos, in the table's order. Counts their frames; raises DatasetError."""
         episodes: list[Episode] = []
         first = 0
-        for index, (name, task) in enumerate(self._tasks.items()):
+        for index, (name, own) in enumerate(self._tasks.items()):
+            task = self._task.of(f"{self._table}: {name}", own)
             check_local_film(self.root / name)
             num_frames = len(self._packets(self.root / name).times_s)
             if not num_frames:
                 raise DatasetError.at(self.root / name, "frames", "none")
-            episodes.append(
-                Episode(index, name, checked_task(f"{self._table}: {name}", task).strip(), num_frames, first)
-            )
+            episodes.append(Episode(index, name, task.strip(), num_frames, first))
             first += num_frames
+        self._task.check_used(episodes)
         return episodes
 
     def check(self, episode: Episode, camera: str) -> Contents:
@@ -66,32 +81,34 @@ class VideoFolder:
         return Contents(digest_of(packets.digests), sum(packets.sizes))
 
     def frames(self, episode: Episode, camera: str) -> Iterator[UInt8Array]:
-        """The video's frames, uint8 [H, W, 3]. Raises DatasetError."""
+        """The video's frames, uint8 [H, W, 3], turned as ``orientations`` says. Raises DatasetError."""
         file = self.root / episode.name
         times_s = self._packets(file).times_s
         gaps_s = times_s[1:] - times_s[:-1]
         tolerance_s = 0.5 * float(gaps_s.min()) if len(gaps_s) else 0.5
-        return decode(Span(file, times_s, tolerance_s, episode.name))
+        orientation = self.orientations.get(camera, "none")
+        return (turned(frame, orientation) for frame in decode(Span(file, times_s, tolerance_s, episode.name)))
 
 
 def _table_in(folder: Path) -> Path:
     found = [folder / name for name in TABLES if (folder / name).is_file()]
     if len(found) != 1:
-        got = "none" if not found else "both"
+        all_of_one = f'(cd {folder}; (echo video; ls *.mp4) > tasks.csv) and --task "what is to be done"'
+        got = "both" if found else f"none: write it, or, if all videos have one task, {all_of_one}"
         raise DatasetError.at(folder, f"one of {' and '.join(TABLES)} with the task of each video", got)
     return found[0]
 
 
-def _read(table: Path) -> Mapping[str, str]:
-    """The task of each video, by its path."""
+def _read(table: Path, required: Set[str]) -> Mapping[str, str | None]:
+    """The task of each video, by its path; None: the table has none. required: columns of a CSV file"""
     try:
-        text = table.read_text(encoding="utf-8")
+        text = table.read_text(encoding="utf-8-sig")  # with the mark that spreadsheets put before it, or without
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError.at(table, "a readable table of tasks", str(error)) from error
-    return _from_json(table, text) if table.suffix.lower() == ".json" else _from_csv(table, text)
+    return _from_json(table, text) if table.suffix.lower() == ".json" else _from_csv(table, text, required)
 
 
-def _from_json(table: Path, text: str) -> Mapping[str, str]:
+def _from_json(table: Path, text: str) -> Mapping[str, str | None]:
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -101,12 +118,12 @@ def _from_json(table: Path, text: str) -> Mapping[str, str]:
     return document
 
 
-def _from_csv(table: Path, text: str) -> Mapping[str, str]:
+def _from_csv(table: Path, text: str, required: Set[str]) -> Mapping[str, str | None]:
     rows = csv.DictReader(text.splitlines())
-    missing = {"video", "task"} - set(rows.fieldnames or ())
-    if missing:
-        raise DatasetError.at(table, "the columns video and task", ", ".join(rows.fieldnames or ()) or "none")
-    tasks: dict[str, str] = {}
+    if required - set(rows.fieldnames or ()):
+        got = ", ".join(rows.fieldnames or ()) or "none"
+        raise DatasetError.at(table, "the columns video and task", f"{got} (--task stands for the column task)")
+    tasks: dict[str, str | None] = {}
     num_columns = len(rows.fieldnames or ())
     for row in rows:
         cells = [cell for cell in row.values() if isinstance(cell, str)]
@@ -116,7 +133,7 @@ def _from_csv(table: Path, text: str) -> Mapping[str, str]:
             raise DatasetError.at(f"{table}: line {rows.line_num}", expected, str(num_cells))
         if row["video"] in tasks:
             raise DatasetError.at(f"{table}: line {rows.line_num}", "each video once", row["video"])
-        tasks[row["video"]] = row["task"]
+        tasks[row["video"]] = row.get("task")
     if not tasks:
         raise DatasetError.at(table, "at least one video", "none")
     return tasks
