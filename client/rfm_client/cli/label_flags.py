@@ -14,6 +14,7 @@ import typer
 
 from rfm_client.cli.options import usage_errors
 from rfm_client.data.camera_fusion import Fuse
+from rfm_client.data.orientation import ORIENTATIONS, Orient
 from rfm_client.data.sampling import Rule
 from rfm_client.labelling.options import (
     DEFAULT_RULE,
@@ -76,7 +77,20 @@ class LabelFlags:
         bool, typer.Option("--resize", help="Make frames as small as the checkpoint reads them, then send.")
     ] = False
     task: Annotated[
-        str | None, typer.Option(help="What is to be done, for an HDF5 file that does not say it.", show_default=False)
+        str | None,
+        typer.Option(help="What is to be done in the episodes that do not say it, as a sentence.", show_default=False),
+    ] = None
+    override_task: Annotated[
+        bool, typer.Option("--override-task", help="Put --task in the place of the tasks that episodes have.")
+    ] = False
+    orient: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[CAMERA=]" + "|".join(ORIENTATIONS),
+            help="Turn stored pictures upright, of all cameras or of one; may be repeated. Else as stored; LIBERO's "
+            "HDF5 files flip-vertical.",
+            show_default=False,
+        ),
     ] = None
     episodes: Annotated[
         str | None, typer.Option(metavar="0:100,205", help="Some of the episodes, by number.", show_default=False)
@@ -129,6 +143,13 @@ class LabelFlags:
     def ray(self) -> RayOptions:
         """Where and how many Ray actors label."""
         return RayOptions(self.address, self.actors, self.num_gpus_per_actor)
+
+    @property
+    def opening(self) -> dict[str, Any]:
+        """With what ``open_dataset`` opens the dataset. Raises typer.BadParameter for an orientation that is none."""
+        with usage_errors("DATASET"):
+            orient = Orient.parse(self.orient or ())
+        return {"task": self.task, "override_task": self.override_task, "orient": orient}
 
     def options(self) -> LabelOptions:
         """The options of the run. Raises typer.BadParameter for what contradicts itself."""

@@ -30,6 +30,7 @@ from rfm_client.contract.errors import (
 from rfm_client.contract.results import FrameScores, ProgressResult, Result
 from rfm_client.contract.samples import ProgressSample, Trajectory
 from rfm_client.data.fitting import FittedSample, fitted, with_frame_indices
+from rfm_client.data.orientation import Orientation
 from rfm_client.data.prefixes import of_prefixes, prefix_samples
 from rfm_client.data.sampling import Rule, Sampling
 
@@ -51,6 +52,7 @@ class Question:
     max_frames: frames that are sent at most, besides the checkpoint's own limit, which ``subsample`` applies
     sampling, sampled_frames: each frame is scored on its prefix, sampled by this rule to so many frames (None: as the
         checkpoint was trained); None: the frames are scored together
+    orient: how frames are turned, so that they are upright
     """
 
     task: str
@@ -61,6 +63,7 @@ class Question:
     resize: bool = False
     sampling: Rule | None = None
     sampled_frames: int | None = None
+    orient: Orientation = "none"
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,11 +80,12 @@ class Source:
         from rfm_client.data.inputs import ARRAY_SUFFIXES, load_trajectory
         from rfm_client.data.video import frame_times_s, is_url
 
-        if not is_url(name) and PurePath(name).suffix.lower() in ARRAY_SUFFIXES:
-            return cls(name, _with_task(load_trajectory(name, task=question.task)), None)
-        trajectory = _with_task(load_trajectory(name, task=question.task, fps=question.fps))
+        are_arrays = not is_url(name) and PurePath(name).suffix.lower() in ARRAY_SUFFIXES
+        fps = None if are_arrays else question.fps
+        trajectory = _with_task(load_trajectory(name, task=question.task, fps=fps, orient=question.orient))
         # What is behind a URL is gone once it is read.
-        return cls(name, trajectory, None if is_url(name) else frame_times_s(name, trajectory.num_frames))
+        has_times = not are_arrays and not is_url(name)
+        return cls(name, trajectory, frame_times_s(name, trajectory.num_frames) if has_times else None)
 
     def panel(self, title: str, scores: FrameScores) -> Panel:
         """What a plot shows of it."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import tokenize
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -18,6 +19,7 @@ import numpy.typing as npt
 
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import Trajectory, UInt8Array, as_array
+from rfm_client.data.orientation import Orientation, turned
 from rfm_client.data.video import is_url, read_video
 
 MAX_UINT8 = 255
@@ -41,6 +43,7 @@ def load_trajectory(
     fps: float | None = None,
     start_s: float | None = None,
     end_s: float | None = None,
+    orient: Orientation = "none",
 ) -> Trajectory:
     """The trajectory in a file or behind an http(s) URL.
 
@@ -50,18 +53,19 @@ def load_trajectory(
     task: instead of the file's own
     fps: frames a second to take of a video; None: all frames
     start_s, end_s: the part of a video to take, by its time stamps; None: from the start, to the end
+    orient: how frames are turned, so that they are upright
 
     Raises InvalidSampleError. Arrays of Python objects are refused: to read them is to run code. So are video files in
     which LeRobot v3.0 keeps several episodes, unless ``start_s`` and ``end_s`` name a part.
     """
     if is_url(source) or Path(source).suffix.lower() not in ARRAY_SUFFIXES:
-        return Trajectory(frames=read_video(source, fps, start_s=start_s, end_s=end_s), task=task)
+        return Trajectory(frames=turned(read_video(source, fps, start_s=start_s, end_s=end_s), orient), task=task)
     for name, value in (("fps", fps), ("start_s", start_s), ("end_s", end_s)):
         if value is not None:
             raise InvalidSampleError.at(name, "None with arrays, which do not tell their own", repr(value))
     arrays = _arrays(Path(source))
     try:
-        return as_trajectory(arrays, task=task)
+        return _turned(as_trajectory(arrays, task=task), orient)
     except InvalidSampleError as error:
         raise InvalidSampleError(f"{error} ({source})") from error
 
@@ -99,6 +103,14 @@ def as_trajectory(
     if key + _IS_PAD in columns:
         frames = frames[~_padding(key + _IS_PAD, columns[key + _IS_PAD], len(frames))]
     return Trajectory(frames=frames, task=task)
+
+
+def _turned(trajectory: Trajectory, orientation: Orientation) -> Trajectory:
+    if trajectory.frames is not None:
+        return replace(trajectory, frames=turned(trajectory.frames, orientation))
+    if orientation != "none":
+        raise InvalidSampleError.at("orient", "none for embeddings, which cannot be turned", orientation)
+    return trajectory
 
 
 def _arrays(file: Path) -> Mapping[str, npt.NDArray[Any]]:

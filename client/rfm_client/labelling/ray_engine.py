@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 
 from rfm_client.contract.errors import RewardError
 from rfm_client.data.datasets.opening import open_dataset
+from rfm_client.data.orientation import Orient
 from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.plan import Plan
 from rfm_client.labelling.run import Failure, Run, Watch
@@ -48,7 +49,7 @@ class RayOptions:
 class Job:
     """What every actor is told.
 
-    source, task: with which the dataset is opened
+    source, task, override_task, orient: with which the dataset is opened
     connect: gives the actor's scorer
     """
 
@@ -58,6 +59,8 @@ class Job:
     plan: Plan
     parts: str
     workers: int
+    override_task: bool = False
+    orient: Orient = Orient()
 
 
 class EpisodeActor:
@@ -67,7 +70,9 @@ class EpisodeActor:
         self._held = ExitStack()  # what it holds is closed as soon as nothing refers to it
         self._job = job
         self._parts = Parts(job.parts)
-        self._dataset = open_dataset(job.source, task=job.task)
+        self._dataset = open_dataset(
+            job.source, task=job.task, override_task=job.override_task, orient=job.orient
+        )
         self._scorer = self._held.enter_context(job.connect())  # open as long as the actor lives
 
     def __del__(self) -> None:

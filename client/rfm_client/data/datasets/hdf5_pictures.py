@@ -63,7 +63,7 @@ def _is_picture(value: Any) -> bool:
     if not hasattr(value, "shape"):
         return any(_is_picture(each) for each in value.values())
     if len(value.shape) == 3:
-        return min(value.shape[1:]) >= _LEAST_SIZE_PX
+        return all(size >= _LEAST_SIZE_PX for size in value.shape[1:])
     return len(value.shape) > 3 or _is_encoded(value)
 
 
