@@ -19,6 +19,7 @@ from rfm_client.cli.ports import wrong_port
 from rfm_client.client import RewardClient
 from rfm_client.contract import errors
 from rfm_client.contract.names import DEFAULT_MODEL
+from rfm_client.data.orientation import Orientation
 from rfm_client.data.sampling import Rule, Sampling
 from rfm_client.transport.access import Access
 
@@ -101,6 +102,10 @@ SamplingRule = Annotated[
 SampledFrames = Annotated[
     int | None,
     typer.Option("--frames", min=1, help="Frames that the rule shows the model; else as many as in training."),
+]
+Orient = Annotated[
+    Orientation,
+    typer.Option("--orient", help="Turn frames upright before they are scored (see docs/guides/label-a-dataset.md)."),
 ]
 MaxFrames = Annotated[int | None, typer.Option(min=1, help="Score at most so many frames, evenly.")]
 Resize = Annotated[bool, typer.Option("--resize", help="Make frames as small as the checkpoint reads them, then send.")]
