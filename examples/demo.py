@@ -7,6 +7,7 @@ python examples/demo.py --url grpc://localhost:8001  # asks a running server
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -16,6 +17,7 @@ from rich.console import Console
 from rfm.launch.temporary import stopped_by_signals, temporary_server
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Sample, SimilaritySample, Trajectory
 from rfm_client.cli.show import Panel, plot, scores_table
+from rfm_client.data.inputs import load_trajectory
 from rfm_commands.demo import show_metrics
 from toy_world import Clip, Task, make_clip
 from toy_world.video import write_video
@@ -54,23 +56,25 @@ def demo(
     """Progress, success, preference and similarity of toy-world clips: a table and a picture. The clips are kept."""
     output.mkdir(parents=True, exist_ok=True)
     console = Console()
-    clips = Clips.of(seed)
+    trajectories = [filmed(clip, output / f"{name}.mp4") for name, clip in Clips.of(seed)._asdict().items()]
     if url is not None:
-        show_clips(url, clips, output / "rewards.png", console)
+        show_clips(url, trajectories, output / "rewards.png", console)
     else:
         with stopped_by_signals(), temporary_server(repository, output / "tritonserver.log") as endpoints:
-            show_clips(endpoints.grpc_url, clips, output / "rewards.png", console)
+            show_clips(endpoints.grpc_url, trajectories, output / "rewards.png", console)
             show_metrics(endpoints, console)
-    for name, clip in clips._asdict().items():
-        write_video(output / f"{name}.mp4", clip.frames)
     console.print(f"the clips as videos: {output}/*.mp4")
 
 
-def show_clips(url: str, clips: Clips, picture: Path, console: Console) -> None:
-    """Asks about all clips in one call, prints a table and draws a picture of the answers."""
-    success, failure, rewound, wrong, second = (
-        Trajectory(frames=clip.frames, task=clip.task.sentence()) for clip in clips
-    )
+def filmed(clip: Clip, file: Path) -> Trajectory:
+    """The clip as it is read back from its video, so that ``rfm-client score`` and the page give the same numbers."""
+    write_video(file, clip.frames)
+    return load_trajectory(file, task=clip.task.sentence())
+
+
+def show_clips(url: str, trajectories: Sequence[Trajectory], picture: Path, console: Console) -> None:
+    """Asks about the clips, in the order of ``Clips``, in one call; prints a table and draws a picture."""
+    success, failure, rewound, wrong, second = trajectories
     samples: dict[str, Sample] = {
         "a success": ProgressSample(success),
         "a failure: dropped": ProgressSample(failure),

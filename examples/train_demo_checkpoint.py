@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from demo_training.groups import Groups, GroupsDataset
-from demo_training.losses import Questions, drawn_verb, hint_loss
+from demo_training.losses import Questions, drawn_verb, hint_loss, noise_clips, with_noise
 from demo_training.networks import Learner, num_parameters, seeded_learner, write_checkpoint
 
 ENCODER_STEPS = 1400
@@ -141,6 +141,10 @@ def _losses(learner: Learner, groups: Groups, random: np.random.Generator, plan:
     with torch.set_grad_enabled(not is_frozen):
         embeddings = learner.embed_frames(groups.frames)
         losses = {} if is_frozen else {"hints": hint_loss(learner, embeddings, groups.hints)}
+        if step >= plan.encoder:
+            height, width = groups.frames.shape[-3:-1]
+            noise = learner.embed_frames(noise_clips(len(groups.task), (height, width), random))
+            groups, embeddings = with_noise(groups, embeddings, noise)
     if step >= plan.encoder:
         questions = Questions(groups, embeddings, learner.embed_tasks(drawn_verb(random)), random)
         losses |= questions.losses(learner)

@@ -51,6 +51,7 @@ class Description:
     progress_bins: K; 1: continuous progress
     max_frames: the longest trajectory that its network can take; None: any length
     trained_frames: the most frames of a trajectory in training; None: the checkpoint does not say
+    trained_padding: whether training padded shorter trajectories; None: the checkpoint does not say
     frame_size: to what it brings each raw frame; None: that depends on the frame
     frames_per_value: frames that share their scores
     keeps_features: it can keep what it makes of frames, and takes samples with named frames then
@@ -64,6 +65,7 @@ class Description:
     has_similarity: bool
     max_frames: int | None = None
     trained_frames: int | None = None
+    trained_padding: bool | None = None
     frame_size: FrameSize | None = None
     frames_per_value: int = 1
     keeps_features: bool = False

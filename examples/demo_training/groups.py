@@ -25,7 +25,6 @@ from toy_world.tasks import COLOURS, TARGETS, TASKS, Task
 CLIP_FRAMES = 12
 SCATTERED_FRAMES = 3  # of a clip, where the encoder learns alone: few of each, so that it sees many scenes
 SUCCESS, SECOND_SUCCESS, FAILURE, OTHER_TASK = range(4)  # the clips of a group
-CLIPS = 4
 HINT_DIM = 3 + 4 * len(COLOURS) + len(TARGETS) + 2 * len(TASKS)
 _SAME_SCENE_SHARE = 0.5
 

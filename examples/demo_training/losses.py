@@ -22,7 +22,7 @@ from rfm.rewind.network import RewindBatch
 from toy_world.tasks import TASKS, VERBS
 
 LENGTHS = (4, 17)  # frames of a row: from, below
-_LONG_ROWS_SHARE, _LONGEST = 0.1, 33
+_LONG_ROWS_SHARE, _LONGEST = 0.2, 33
 _PLACE_WEIGHT, _TASK_WEIGHT = 3.0, 8.0  # of the hints on where everything is, and on how far the tasks have come
 _SUCCESS_POSITIVE_WEIGHT = 2.0
 
@@ -39,7 +39,10 @@ _SINGLES = (
     (OTHER_TASK, "forward", "other"),
     (OTHER_TASK, "forward", "any"),
 )
-# (first, how, second, how): the first is better.
+NOISE, OTHER_NOISE, RANDOM, OTHER_RANDOM = range(4, 8)  # clips without a world: frames of noise, random embeddings
+_NOISE_FRAMES = 6  # of a clip of noise, which shows them in turn
+
+# (one, how, another, how): the first is better.
 _PREFERENCES = (
     (SUCCESS, "forward", FAILURE, "forward"),
     (SECOND_SUCCESS, "forward", FAILURE, "forward"),
@@ -47,6 +50,13 @@ _PREFERENCES = (
     (SECOND_SUCCESS, "forward", OTHER_TASK, "forward"),
     (SUCCESS, "forward", SECOND_SUCCESS, "rewound"),
     (SECOND_SUCCESS, "forward", SUCCESS, "stopped"),
+    (SUCCESS, "forward", NOISE, "forward"),
+)
+# Neither is better, in either order. The last pair goes under a random text, too.
+_UNDECIDED = (
+    (SUCCESS, "forward", SECOND_SUCCESS, "forward"),
+    (NOISE, "forward", OTHER_NOISE, "forward"),
+    (RANDOM, "forward", OTHER_RANDOM, "forward"),
 )
 # (reference, other, whether they do the same)
 _SIMILARITIES = (
@@ -68,7 +78,7 @@ class _Video(NamedTuple):
 
 @dataclass(frozen=True)
 class Questions:
-    """Draws rows about groups whose clips are embedded: float32 [G, 4, T, Dv]; texts: float32 [6, Dt]."""
+    """Draws rows about groups whose clips are embedded: float32 [G, 8, T, Dv]; texts: float32 [6, Dt]."""
 
     groups: Groups
     embeddings: Tensor
@@ -98,13 +108,14 @@ class Questions:
         lengths = self._length(), self._length()
         own = self.groups.task
         firsts, seconds, labels = [], [], []
-        for better, how_better, worse, how_worse in _PREFERENCES:
+        for better, how_better, worse, how_worse in (*_PREFERENCES, *_UNDECIDED):
             pair = [(better, how_better), (worse, how_worse)]
             swapped = bool(self.random.random() < 0.5)
             (first, how_first), (second, how_second) = pair[::-1] if swapped else pair
             firsts.append(self._video(first, how_first, own, lengths[0]))
             seconds.append(self._video(second, how_second, own, lengths[1]))
             labels.append(0.0 if swapped else 1.0)
+        labels[-len(_UNDECIDED) :] = [0.5] * len(_UNDECIDED)
         for reference, other, same in _SIMILARITIES:
             firsts.append(self._video(reference, "forward", own, lengths[0]))
             seconds.append(self._video(other, "forward", own, lengths[1]))
@@ -115,7 +126,10 @@ class Questions:
         num_groups = len(self.groups.task)
         labels = labels.repeat_interleave(num_groups)
         texts = self.texts[self.groups.task.repeat(len(labels) // num_groups)]
-        is_similarity = torch.arange(len(labels)) >= len(_PREFERENCES) * num_groups
+        num_preferences = (len(_PREFERENCES) + len(_UNDECIDED)) * num_groups
+        is_similarity = torch.arange(len(labels)) >= num_preferences
+        is_random = (torch.arange(len(labels)) >= num_preferences - num_groups) & ~is_similarity
+        texts = torch.where(is_random[:, None], torch.randn_like(texts), texts)
         lengths = [first.progress.shape[1], second.progress.shape[1]]
         batch = RewindBatch.of(
             learner.network.config,
@@ -153,6 +167,31 @@ class Questions:
     @staticmethod
     def _joined(videos: Sequence[_Video]) -> _Video:
         return _Video(*(torch.cat(parts) for parts in zip(*videos, strict=True)))
+
+
+def noise_clips(num_groups: int, size_px: tuple[int, int], random: np.random.Generator) -> Tensor:
+    """uint8 [G, 2, T, H, W, 3], clips of noise, finer or coarser, of more or less contrast."""
+    height, width = size_px
+    clips = np.empty((num_groups, 2, _NOISE_FRAMES, height, width, 3), np.uint8)
+    for clip in clips.reshape(-1, *clips.shape[2:]):
+        grain = int(random.choice([1, 1, 4, 16]))
+        coarse = random.integers(0, 256, (_NOISE_FRAMES, height // grain, width // grain, 3))
+        contrast, light = random.uniform(0.3, 1), random.uniform(0, 1)
+        fine = coarse.repeat(grain, axis=1).repeat(grain, axis=2)
+        clip[:] = fine * contrast + 255 * light * (1 - contrast)
+    return torch.from_numpy(clips)
+
+
+def with_noise(groups: Groups, embeddings: Tensor, noise: Tensor) -> tuple[Groups, Tensor]:
+    """Groups and embeddings, float32 [G, 8, T, Dv], with the clips that show nothing: no progress, no success.
+
+    noise: float32 [G, 2, S, Dv], embeddings of ``noise_clips``
+    """
+    shown = noise.repeat(1, 1, CLIP_FRAMES // _NOISE_FRAMES, 1)
+    embeddings = torch.cat([embeddings, shown, torch.randn_like(shown)], dim=1)
+    nothing = torch.zeros_like(groups.progress)
+    progress, success = (torch.cat([truth, nothing], dim=1) for truth in (groups.progress, groups.success))
+    return groups._replace(progress=progress, success=success), embeddings
 
 
 def hint_loss(learner: Learner, embeddings: Tensor, hints: Tensor) -> Tensor:

@@ -39,6 +39,8 @@ CONFIG = RewindConfig(
     use_per_frame_progress_token=True,
     progress_bins=10,
     has_similarity=True,
+    trained_frames=32,
+    trained_padding=False,
 )
 
 

@@ -19,7 +19,12 @@ from rfm.family import Description, EncodersDescription
 from rfm.parameters import FAMILY_PARAMETER, FEATURE_CACHE_PARAMETER
 from rfm_client.contract import FrameSize, PreferenceSample, ProgressSample, Sample, SimilaritySample, wire
 from rfm_client.contract.made_up import blank_trajectory
-from rfm_client.contract.model_info import FRAME_SIZE_PARAMETER, FRAMES_PER_VALUE_PARAMETER, MAX_FRAMES_PARAMETER
+from rfm_client.contract.model_info import (
+    FRAME_SIZE_PARAMETER,
+    FRAMES_PER_VALUE_PARAMETER,
+    MAX_FRAMES_PARAMETER,
+    TRAINED_PADDING_PARAMETER,
+)
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_export.about import about_encoders
 from rfm_export.pbtxt import Interface, Warmup, ensemble_config, exported_settings, python_config, render
@@ -156,10 +161,12 @@ def _of_encoder(settings: ExportConfig) -> ExportConfig:
 def _limits(description: Description, frame_size: FrameSize | None) -> dict[str, str]:
     """What a client may want to know before it sends a trajectory; empty: no limit."""
     limits = [n for n in (description.trained_frames, description.max_frames) if n is not None]
+    padding = description.trained_padding
     return {
         MAX_FRAMES_PARAMETER: str(min(limits)) if limits else "",
         FRAME_SIZE_PARAMETER: "" if frame_size is None else str(frame_size),
         FRAMES_PER_VALUE_PARAMETER: str(description.frames_per_value),
+        **({} if padding is None else {TRAINED_PADDING_PARAMETER: str(padding).lower()}),
     }
 
 

@@ -86,6 +86,7 @@ class RewindCheckpoint:
             has_similarity=self.config.has_similarity,
             max_frames=self.config.max_frames,
             trained_frames=self.config.trained_frames,
+            trained_padding=self.config.trained_padding,
         )
 
     @property
@@ -185,6 +186,7 @@ def _rewind_config(folder: Path, weights: Mapping[str, Tensor]) -> RewindConfig:
             progress_bins=_shape(weights, "progress_head.4.weight", 2)[0],
             has_similarity="similarity_head.0.weight" in weights,
             trained_frames=_trained_frames(folder),
+            trained_padding=_trained_padding(folder),
         )
     except KeyError as error:
         raise CheckpointError(f"{folder}: expected a ReWiND checkpoint, which has {error}") from error
@@ -221,6 +223,14 @@ def _trained_frames(folder: Path) -> int | None:
             return frame_count(saved, f"{folder / NETWORK_CONFIG}: trained_frames")
     run_config = find_run_config(folder)
     return None if run_config is None else trained_frames(read_run_config(run_config), run_config)
+
+
+def _trained_padding(folder: Path) -> bool | None:
+    """Whether training padded shorter trajectories, as ``save`` wrote it; upstream's configurations do not say."""
+    padding = read_json(folder / NETWORK_CONFIG).get("trained_padding") if is_there(folder / NETWORK_CONFIG) else None
+    if padding is not None and not isinstance(padding, bool):
+        raise CheckpointError(f"{folder / NETWORK_CONFIG}: trained_padding: expected true or false, got {shown(padding)}")
+    return padding
 
 
 def _stated(folder: Path) -> dict[str, Any]:

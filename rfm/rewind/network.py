@@ -32,6 +32,8 @@ class RewindConfig:
     """What a checkpoint's network looks like; field names as in upstream's config.json where it has them.
 
     trained_frames: the most frames of a trajectory in training; None: the checkpoint does not say
+    trained_padding: whether training padded shorter trajectories to ``trained_frames``, as upstream's does; None: the
+        checkpoint does not say
     """
 
     video_feature_dim: int
@@ -45,6 +47,7 @@ class RewindConfig:
     progress_bins: int
     has_similarity: bool
     trained_frames: int | None = None
+    trained_padding: bool | None = None
 
     @property
     def max_frames(self) -> int | None:

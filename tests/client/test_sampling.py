@@ -51,7 +51,10 @@ def test_each_rule_shows_the_frames_that_the_original_takes(file: Path) -> None:
         assert prefix.indices.dtype == np.int64
         assert prefix.indices.tolist() == indices, (sampling, t)
         seen.add((sampling.rule, sampling.frames))
-    assert {rule for rule, _ in seen} == set(RULES) - {"all"}
+        if sampling.rule == "rint_pad":
+            unpadded = Sampling("rint", sampling.frames).prefix(t).indices
+            assert unpadded.tolist() == indices[: len(indices) - prefix.num_padding], (sampling, t)
+    assert {rule for rule, _ in seen} == set(RULES) - {"all", "rint"}
     assert len(seen) == 3 * 6 + 2
 
 
@@ -59,6 +62,9 @@ PADDED = {
     "linspace_trunc repeats frames and pads none": (Sampling("linspace_trunc", 4), 1, [0, 0, 0, 1], 0, 3),
     "linspace_trunc of one frame shows the first": (Sampling("linspace_trunc", 1), 9, [0], 0, 0),
     "linspace_round rounds half to even": (Sampling("linspace_round", 3), 5, [0, 2, 5], 0, 2),
+    "rint does not pad": (Sampling("rint", 4), 1, [0, 1], 0, 1),
+    "rint of one frame shows the newest": (Sampling("rint", 1), 9, [9], 0, 0),
+    "rint of a long episode": (Sampling("rint", 4), 9, [0, 3, 6, 9], 0, 3),
     "rint_pad reads a padded slot": (Sampling("rint_pad", 4), 1, [0, 1, 1, 1], 2, 3),
     "rint_pad of one frame shows the newest": (Sampling("rint_pad", 1), 9, [9], 0, 0),
     "rint_pad of a long episode": (Sampling("rint_pad", 4), 9, [0, 3, 6, 9], 0, 3),
@@ -121,6 +127,9 @@ def test_the_checkpoint_says_how_many_frames_if_the_caller_does_not() -> None:
     assert Sampling.of("rint_pad", 4, 8) == Sampling("rint_pad", 4)
     assert Sampling.of("all", None, 8) == Sampling("all")
     assert Sampling.of("rewind_pad16_offline", None, 8).frames == 16
+    assert Sampling.of(None, None, 8) == Sampling("rint_pad", 8)
+    assert Sampling.of(None, None, 8, trained_padding=False) == Sampling("rint", 8)
+    assert Sampling.of(None, 4, 8, trained_padding=False) == Sampling("rint", 4)
     with pytest.raises(
         ValueError, match="frames: expected how many frames the rule rint_pad shows the model, got none"
     ):

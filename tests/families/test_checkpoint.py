@@ -226,6 +226,10 @@ SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
         change_json("config.json", lambda c: c.update(trained_frames=7.5)),
         r"config.json: trained_frames: expected a whole number of at least 1, got 7.5",
     ),
+    "padding that is a number": (
+        change_json("config.json", lambda c: c.update(trained_padding=1)),
+        r"config.json: trained_padding: expected true or false, got 1",
+    ),
 }
 
 

@@ -14,6 +14,7 @@ from rfm_client.contract.frame_size import FrameSize
 MAX_FRAMES_PARAMETER = "max_frames"  # parameters of config.pbtxt; empty: no limit
 FRAME_SIZE_PARAMETER = "frame_size"
 FRAMES_PER_VALUE_PARAMETER = "frames_per_value"
+TRAINED_PADDING_PARAMETER = "trained_padding"  # "false", or anything else for true
 SOURCE_PARAMETER = "source"
 REVISION_PARAMETER = "revision"
 DIGEST_PARAMETER = "weights_digest"
@@ -32,6 +33,8 @@ class ModelInfo:
     instances: of the model that one server runs; 0: of an ensemble, whose parts have them
     max_frames: the most frames of a trajectory in training; if the checkpoint does not say, the most that its network
         takes; None: neither is known
+    trained_padding: training padded shorter trajectories with their last frame, as upstream's does; True also of a
+        checkpoint that does not say
     frame_size: to what the checkpoint brings each frame; None: that depends on the frame
     video_dim, text_dim: widths D and Dt of the embeddings; None: it reads raw frames
     progress_bins: K of a discrete checkpoint; None: continuous
@@ -54,6 +57,7 @@ class ModelInfo:
     text_dim: int | None
     progress_bins: int | None
     frames_per_value: int = 1
+    trained_padding: bool = True
     by_digest: bool = False
     instances: int = 1
     source: str | None = None
@@ -89,6 +93,7 @@ class ModelInfo:
             text_dim=last_dims.get(wire.TEXT_EMBEDDING),
             progress_bins=last_dims.get(wire.PROGRESS_LOGITS),
             frames_per_value=int(parameters.get(FRAMES_PER_VALUE_PARAMETER) or 1),
+            trained_padding=parameters.get(TRAINED_PADDING_PARAMETER) != "false",
             by_digest=wire.FRAME_DIGESTS in last_dims,
             instances=sum(map(_num_instances, config.get("instance_group", []))),
             source=parameters.get(SOURCE_PARAMETER) or None,

@@ -4,17 +4,20 @@
     rule                  shows of the frames 0..t                             padding              read at
     linspace_trunc        linspace(0, t, K), cut to whole numbers              none                 last slot
     linspace_round        linspace(0, t, K), rounded half to even              none                 last slot
-    rint_pad              all while t + 1 <= K, then linspace(0, t, K)         the last frame, to   last slot
-                          rounded half to even                                 K slots
+    rint                  all while t + 1 <= K, then linspace(0, t, K)         none                 last slot
+                          rounded half to even
+    rint_pad              the same                                             the last frame, to   last slot
+                                                                               K slots
     rewind_pad16_online   all while t + 1 <= 16, then linspace(0, t, 16) cut   the last frame, to   last slot
                                                                                16 slots
     rewind_pad16_offline  the same                                             the same             slot min(t, 15)
     all                   all                                                  none                 last slot
 
 ``linspace_trunc`` is what the evaluation server's frame steps do (``frame_steps`` on the wire), ``linspace_round``
-LeRobot's Robometer labels, ``rint_pad`` the RL loop and relabelling of ``robometer``; the two readings of
-``rewind_pad16`` are those of the first ReWiND code, online and for offline labels. The first two repeat frames while
-t + 1 < K, and with K = 1 they show frame 0; ``rint_pad`` then shows frame t. No rule shows a frame after t.
+LeRobot's Robometer labels, ``rint_pad`` the RL loop and relabelling of ``robometer``, ``rint`` the same for a
+checkpoint whose training did not pad; the two readings of ``rewind_pad16`` are those of the first ReWiND code, online
+and for offline labels. The first two repeat frames while t + 1 < K, and with K = 1 they show frame 0; ``rint`` and
+``rint_pad`` then show frame t. No rule shows a frame after t.
 
 Shapes: K frames that the rule shows, S slots of the sample that is sent.
 """
@@ -28,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 Rule: TypeAlias = Literal[
-    "linspace_trunc", "linspace_round", "rint_pad", "rewind_pad16_online", "rewind_pad16_offline", "all"
+    "linspace_trunc", "linspace_round", "rint", "rint_pad", "rewind_pad16_online", "rewind_pad16_offline", "all"
 ]
 FrameIndices: TypeAlias = npt.NDArray[np.int64]
 
@@ -36,6 +39,11 @@ RULES: tuple[Rule, ...] = get_args(Rule)
 REWIND_FRAMES = 16  # of the first ReWiND code, whatever its checkpoint
 
 _REWIND: tuple[Rule, ...] = ("rewind_pad16_online", "rewind_pad16_offline")
+
+
+def trained_rule(trained_padding: bool) -> Rule:
+    """The rule by which a checkpoint's training cut its clips, and padded shorter ones or did not."""
+    return "rint_pad" if trained_padding else "rint"
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +93,16 @@ class Sampling:
             raise ValueError(f"frames: expected at least 1 with the rule {self.rule}, got {self.frames}")
 
     @classmethod
-    def of(cls, rule: Rule, frames: int | None, trained_frames: int | None) -> Sampling:
-        """The rule with as many frames as the caller says or else, where it needs a number, the checkpoint.
+    def of(
+        cls, rule: Rule | None, frames: int | None, trained_frames: int | None, *, trained_padding: bool = True
+    ) -> Sampling:
+        """The rule and its number of frames: where the caller says neither (None), those of the checkpoint's training.
 
-        trained_frames: of the checkpoint; None: it does not say. Raises ValueError if nobody says.
+        trained_frames, trained_padding: ``max_frames`` and ``trained_padding`` of the checkpoint's ``ModelInfo``
+
+        Raises ValueError if neither says how many frames a rule shows that needs a number.
         """
+        rule = rule or trained_rule(trained_padding)
         if frames is None and rule not in (*_REWIND, "all"):
             frames = trained_frames
             if frames is None:
@@ -108,6 +121,8 @@ class Sampling:
             return _unpadded(np.linspace(0, t, self.frames).astype(np.int64))
         if self.rule == "linspace_round":
             return _unpadded(np.linspace(0, t, self.frames).round().astype(np.int64))
+        if self.rule == "rint":
+            return _unpadded(_rint(t, self.frames))
         if self.rule == "rint_pad":
             return _padded(_rint(t, self.frames), self.frames)
         shown = np.arange(t + 1) if t < self.frames else np.linspace(0, t, self.frames).astype(np.int64)
@@ -118,7 +133,7 @@ class Sampling:
 def thinned(num_frames: int, limit: int | None) -> FrameIndices | None:
     """int64 [limit], the frames of a longer clip that training would have kept; None: all may stay.
 
-    As ``robometer`` cuts its training clips, and as ``rint_pad`` shows them, without the padding of shorter ones.
+    As ``robometer`` cuts its training clips: the rule ``rint``.
     """
     return None if limit is None or num_frames <= limit else _rint(num_frames - 1, limit)
 

@@ -8,12 +8,12 @@ import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.samples import MAX_FRAME_STEPS
 from rfm_client.data.sampling import RULES, Rule, Sampling
 from rfm_gateway.body import invalid
 
 DEFAULT_FPS = 3.0  # as rfm-client score has it
-DEFAULT_RULE: Rule = "rint_pad"  # what RL loops show the model
 _FLAGS = {"true": True, "false": False, "": False}
 
 
@@ -21,22 +21,23 @@ _FLAGS = {"true": True, "false": False, "": False}
 class Question:
     """How videos are scored.
 
-    fps: frames a second that are taken of a video; frames: K of the rule, None: as the checkpoint was trained
+    fps: frames a second that are taken of a video
+    rule, frames: of each point's prefix; None: as the checkpoint was trained
     resize: frames are made as small as the checkpoint reads them
     """
 
     task: str
     model: str
     fps: float
-    rule: Rule
+    rule: Rule | None
     frames: int | None
     resize: bool
 
     @classmethod
     def of(cls, fields: Mapping[str, str], default_model: str) -> Question:
         """The question of a form. Raises RequestValidationError for a field that is not allowed."""
-        rule = fields.get("sampling") or DEFAULT_RULE
-        if rule not in RULES:
+        rule = fields.get("sampling") or None
+        if rule is not None and rule not in RULES:
             raise invalid(("sampling",), f"expected one of {', '.join(RULES)}, got {reprlib.repr(rule)}")
         if not fields.get("task", "").strip():
             raise invalid(("task",), "expected what is to be done, as a sentence, got none")
@@ -52,10 +53,10 @@ class Question:
             resize=_FLAGS[resize],
         )
 
-    def sampling(self, trained_frames: int | None) -> Sampling:
+    def sampling(self, info: ModelInfo) -> Sampling:
         """The rule with its frames. Raises RequestValidationError for a number that the rule does not take."""
         try:
-            return Sampling.of(self.rule, self.frames, trained_frames)
+            return Sampling.of(self.rule, self.frames, info.max_frames, trained_padding=info.trained_padding)
         except ValueError as error:
             where, _, message = str(error).partition(": ")
             raise invalid((where,), message) from None

@@ -28,7 +28,7 @@ from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import PreferenceResult
 from rfm_client.contract.samples import ProgressSample, Trajectory
 from rfm_client.data.fitting import fitted
-from rfm_client.data.sampling import RULES, Rule, Sampling
+from rfm_client.data.sampling import RULES, Rule, Sampling, trained_rule
 from rfm_client.status import read_status
 from rfm_gateway.body import COMPARE_ENDPOINT, SCORE_ENDPOINT, Admitted, BodyLimits, invalid, parts_of
 from rfm_gateway.cancellation import while_connected
@@ -38,7 +38,7 @@ from rfm_gateway.observe import Metrics
 from rfm_gateway.versions import of_one_version
 from rfm_gateway.viewer.curves import Call, Parts, curve
 from rfm_gateway.viewer.models import Models, names_of
-from rfm_gateway.viewer.question import DEFAULT_FPS, DEFAULT_RULE, Question
+from rfm_gateway.viewer.question import DEFAULT_FPS, Question
 from rfm_gateway.viewer.videos import Video, read_upload
 
 STATUS_TIMEOUT_S = 5.0
@@ -99,12 +99,17 @@ async def _served(behind: Behind) -> dict[str, Any]:
     infos = await behind.models.infos(names_of(status.models), STATUS_TIMEOUT_S)
     return {
         "models": [
-            {"name": name, "max_frames": info.max_frames, "versions": list(info.versions), "source": info.source}
+            {
+                "name": name,
+                "max_frames": info.max_frames,
+                "rule": trained_rule(info.trained_padding),
+                "versions": list(info.versions),
+                "source": info.source,
+            }
             for name, info in infos
         ],
         "model": behind.model,
         "rules": [{"name": rule, "frames": _frames_of(rule)} for rule in RULES],
-        "rule": DEFAULT_RULE,
         "fps": DEFAULT_FPS,
         "url": config.triton_url,
     }
@@ -148,7 +153,7 @@ async def _asked(behind: Behind, request: Request, stack: ExitStack, names: tupl
             arrival.deadline = float("inf")  # all of it has come
             question = Question.of(fields, behind.model)
             client, info = await behind.models.client(question.model, timeout_s)
-            sampling = question.sampling(info.max_frames)
+            sampling = question.sampling(info)
             videos = await while_connected(request, _videos(admitted, uploads, names, question.fps, timeout_s))
     return _Asked(question, sampling, client, info, videos, admitted.share)
 
@@ -216,11 +221,14 @@ async def _preferences(asked: _Asked, timeout_s: float, request_id: str) -> dict
         where, _, message = error.message.partition(": ")
         raise invalid((where,), message) from None
     orders = (("first", "second"), ("second", "first"))
+    pair = PreferenceResult.of_both_orders(*results)
     return {
         "orders": [
             {"asked": names, "preference": result.preference} for names, result in zip(orders, results, strict=True)
         ],
-        "model_version": results[0].model_version,
+        "verdict": pair.verdict,
+        "orders_agree": pair.orders_agree,
+        "model_version": pair.model_version,
     }
 
 

@@ -41,10 +41,9 @@ async function begin() {
   page["key-form"].hidden = true;
   page.model.replaceChildren(...gateway.models.map(({ name }) => new Option(name)));
   page.rule.replaceChildren(...gateway.rules.map(({ name }) => new Option(name)));
-  page.rule.value = gateway.rule;
   page.fps.value = gateway.fps;
   if (gateway.models.some(({ name }) => name === gateway.model)) page.model.value = gateway.model;
-  showLimits();
+  chooseRule();
   const none = "model: expected one that scores frames of videos, got none";
   page.status.textContent = gateway.models.length ? "Ready." : none;
 }
@@ -58,6 +57,13 @@ function failed(error) {
   const line = document.createElement("p");
   line.textContent = error.message;
   page.errors.replaceChildren(line);
+}
+
+/** Chooses the rule of the model's training. */
+function chooseRule() {
+  const model = gateway.models.find(({ name }) => name === page.model.value);
+  if (model) page.rule.value = model.rule;
+  showLimits();
 }
 
 function showLimits() {
@@ -225,7 +231,7 @@ function listen(element, events) {
 listen(page.question, { submit: (event) => { event.preventDefault(); scoreAll(); } });
 listen(page["key-form"], { submit: (event) => { event.preventDefault(); useKey(page.key.value.trim()); begin(); } });
 listen(page.files, { change: () => addFiles(page.files.files) });
-listen(page.model, { change: showLimits });
+listen(page.model, { change: chooseRule });
 listen(page.rule, { change: showLimits });
 listen(page.stop, { click: stop });
 listen(page.clear, { click: clear });
