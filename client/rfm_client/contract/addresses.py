@@ -3,25 +3,40 @@
 
 from __future__ import annotations
 
+import errno
 import ipaddress
+import os
 import re
+import socket
 import ssl
 from pathlib import Path
 
 MAX_PORT = 65535
 
-_URL = re.compile(r"((?P<scheme>grpcs?|https?)://|dns:///)(?P<address>[^/]+:(?P<port>[0-9]{1,5}))/?")
+_URL = re.compile(
+    r"((?P<scheme>grpcs?|https?)://|dns:///)(?P<address>(\[[\da-fA-F:.]+(%\w+)?\]|[^][:/@\s]+):(?P<port>\d{1,5}))/?"
+)
+_PORTS = {"grpc": 8001, "http": 8000}
 
 
 def split_url(url: str) -> tuple[str, str]:
     """The parts of a URL: ``grpc``, ``http``, ``grpcs`` or ``https``, and ``host:port``. Raises ValueError.
 
-    ``dns:///host:port``, as gRPC writes it, is ``grpc://host:port``.
+    ``dns:///host:port``, as gRPC writes it, is ``grpc://host:port``. An IPv6 address stands in brackets.
     """
+    scheme, _, address = url.rstrip("/").partition("://")
+    for host, port in (address.rpartition(":")[::2], (address, str(_PORTS.get(scheme.removesuffix("s"), 8000)))):
+        if _is_ipv6(host):
+            raise ValueError(f"url: expected brackets around an IPv6 address, {scheme}://[{host}]:{port}, got {url!r}")
     match = _URL.fullmatch(url)
     if match is None or int(match["port"]) > MAX_PORT:
         raise ValueError(f"url: expected grpc://host:port or http://host:port, or grpcs:// or https://, got {url!r}")
     return match["scheme"] or "grpc", match["address"]
+
+
+def host_of(address: str) -> str:
+    """The host of ``host:port``; an IPv6 address without its brackets."""
+    return address.rpartition(":")[0].strip("[]")
 
 
 def is_loopback(host: str) -> bool:
@@ -29,7 +44,38 @@ def is_loopback(host: str) -> bool:
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
-        return host == "localhost"
+        return host.lower() == "localhost"
+
+
+def from_here(host: str) -> str:
+    """The address at which this machine reaches a server that listens at ``host``, be it at all addresses."""
+    return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+
+
+def in_url(host: str) -> str:
+    """An address as URLs write it: IPv6 in brackets."""
+    return f"[{host}]" if ":" in host else host
+
+
+def check_free(host: str, port: int, where: str, *, port_option: str, host_option: str = "--host") -> None:
+    """Raises ValueError (``where: ...``) unless a server could listen there now, with the option that mends it."""
+    try:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        socket.create_server((host, port), family=family).close()
+    except (OSError, OverflowError) as error:
+        number = getattr(error, "errno", None)
+        reason = os.strerror(number) if number and number > 0 else str(error)
+        is_of_port = number in (errno.EADDRINUSE, errno.EACCES) or isinstance(error, OverflowError)
+        remedy = f"give another with {port_option if is_of_port else host_option}"
+        expected = f"a free port of this machine at {in_url(host)}:{port}"
+        raise ValueError(f"{where}: expected {expected}, got: {reason}; {remedy}") from error
+
+
+def _is_ipv6(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).version == 6
+    except ValueError:
+        return False
 
 
 def check_certificate(certificate: str | Path, key: str | Path, where: str) -> None:
