@@ -96,10 +96,22 @@ class AsyncRewardClient:
         return cast(ProgressResult, await self.score(ProgressSample(trajectory, frame_steps=frame_steps), **options))
 
     async def preference(
-        self, first: Trajectory, second: Trajectory, **options: Unpack[CallOptions]
+        self, first: Trajectory, second: Trajectory, *, both_orders: bool = False, **options: Unpack[CallOptions]
     ) -> PreferenceResult:
-        """Probability that ``first`` does its task better than ``second``. Raises RewardError."""
-        return cast(PreferenceResult, await self.score(PreferenceSample(first, second), **options))
+        """Probability that ``first`` does its task better than ``second``. Raises RewardError.
+
+        both_orders: the other order is asked, too, since a model's answer may depend on it; the ``preference`` is the
+            mean, and where the orders disagree there is no ``verdict``. For labels, ask so.
+        """
+        sample = PreferenceSample(first, second)
+        if not both_orders:
+            return cast(PreferenceResult, await self.score(sample, **options))
+        outcomes = await self.evaluate([sample, sample.swapped], return_errors=True, **options)
+        for outcome in outcomes:
+            if isinstance(outcome, RewardError):
+                raise outcome
+        asked, swapped = cast("list[PreferenceResult]", outcomes)
+        return PreferenceResult.of_both_orders(asked, swapped)
 
     async def similarity(
         self, reference: Trajectory, other: Trajectory, **options: Unpack[CallOptions]
@@ -188,10 +200,15 @@ class AsyncRewardClient:
     async def wait_ready(self, timeout_s: float) -> None:
         """Returns as soon as ``is_ready``. Raises DeadlineExceededError."""
         deadline = self._deadline(timeout_s)
+        is_first = True
         while not await self.is_ready(timeout_s=min(PROBE_TIMEOUT_S, deadline.remaining_s())):
+            if is_first:
+                await self._servers.check_ports()
+            is_first = False
             if deadline.ends_within(READY_POLL_S):
                 names = f"{self._model} and {frames_name(self._model)}"
-                raise DeadlineExceededError(f"{self._servers}: {names}: not ready within {timeout_s:g} s")
+                why = await self._why_unready()
+                raise DeadlineExceededError(f"{self._servers}: {names}: not ready within {timeout_s:g} s{why}")
             await asyncio.sleep(READY_POLL_S)
 
     async def model_info(
@@ -235,6 +252,15 @@ class AsyncRewardClient:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         await self.close()
+
+    async def _why_unready(self) -> str:
+        try:
+            await self._servers.model_info(frames_name(self._model), Deadline(PROBE_TIMEOUT_S))
+        except ModelNotFoundError as error:
+            return f": {error}"
+        except RewardError:
+            pass
+        return ""
 
     def _call(self, options: CallOptions) -> Call:
         """The call that begins now, with these options."""

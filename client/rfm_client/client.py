@@ -51,9 +51,14 @@ class RewardClient:
         """Progress and success at each frame; ``frame_steps`` as in ProgressSample. Raises RewardError."""
         return self._loop.wait(self._client.progress(trajectory, frame_steps=frame_steps, **options))
 
-    def preference(self, first: Trajectory, second: Trajectory, **options: Unpack[CallOptions]) -> PreferenceResult:
-        """Probability that ``first`` does its task better than ``second``. Raises RewardError."""
-        return self._loop.wait(self._client.preference(first, second, **options))
+    def preference(
+        self, first: Trajectory, second: Trajectory, *, both_orders: bool = False, **options: Unpack[CallOptions]
+    ) -> PreferenceResult:
+        """Probability that ``first`` does its task better than ``second``; ``both_orders`` as in AsyncRewardClient.
+
+        Raises RewardError.
+        """
+        return self._loop.wait(self._client.preference(first, second, both_orders=both_orders, **options))
 
     def similarity(self, reference: Trajectory, other: Trajectory, **options: Unpack[CallOptions]) -> SimilarityResult:
         """Raw similarity score of ``other`` to ``reference``. Raises RewardError."""

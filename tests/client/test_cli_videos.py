@@ -21,6 +21,8 @@ from client_commands import (
     ask,
     assert_scores,
     columns,
+    invoke,
+    rows,
     run,
     web_server,
 )
@@ -30,12 +32,16 @@ from rfm_client import (
     FrameScores,
     PreferenceResult,
     PreferenceSample,
+    RewardClient,
     Trajectory,
 )
 from rfm_client.cli.commands import app
-from rfm_client.cli.options import ExitCode
+from rfm_client.cli.comparing import Comparison
+from rfm_client.cli.options import ExitCode, Server
+from rfm_client.cli.scoring import Source
 from rfm_client.cli.show import Panel, plot
 from rfm_client.data.inputs import load_trajectory
+from shelves import Shelf
 from trajectories import random_trajectory
 
 MAX_FRAMES = 16  # of that checkpoint
@@ -198,15 +204,16 @@ def test_compare_writes_what_the_client_gives(served: Served, protocol: str, vid
     ]
     both = (document["preference"] + 1 - document["orders"][1]["preference"]) / 2
     wins = {str(video): both, str(still): 1 - both}
-    ranked = sorted(wins, key=lambda name: -wins[name])
-    assert [(each["source"], each["wins"]) for each in document["ranking"]] == [
-        (name, pytest.approx(wins[name])) for name in ranked
+    assert [(each["source"], each["wins"]) for each in document["videos"]] == [
+        (name, pytest.approx(share)) for name, share in wins.items()
     ]
-    scores = {each["source"]: each for each in document["ranking"]}
-    for rank, name in enumerate(ranked, 1):
-        figures = (wins[name], scores[name]["progress"][-1], scores[name]["success"][-1])
-        row, *_ = (columns(line, name) for line in result.stdout.splitlines() if line.strip().startswith(name))
-        assert row[1:] == [str(rank), *(f"{figure:.4f}" for figure in figures), str(len(scores[name]["progress"]))]
+    assert (document["preference"] > 0.5) == (swapped > 0.5)  # this checkpoint prefers what it is shown first
+    assert (document["verdict"], document["orders_agree"], document["ranking"]) == (None, False, None)
+    for name, each in zip(wins, document["videos"], strict=True):
+        figures = (wins[name], each["progress"][-1], each["success"][-1])
+        row, *pairs = rows(result.stdout, name)
+        assert row[1:] == ["?", *(f"{figure:.4f}" for figure in figures), str(len(each["progress"]))]
+        assert [pair[-1] for pair in pairs] == ["no answer: the orders disagree"] * (name == str(video))
     assert (tmp_path / "both.pdf").read_bytes().startswith(b"%PDF")
 
 
@@ -235,18 +242,80 @@ def test_compare_ranks_several_videos_by_both_orders_of_every_two(served: Served
     wins = [
         np.mean([(told[a, b].preference + 1 - told[b, a].preference) / 2 for b in range(3) if b != a]) for a in range(3)
     ]
-    ranked = sorted(range(3), key=lambda index: -wins[index])
-    assert [each["source"] for each in document["ranking"]] == [str(files[index]) for index in ranked]
-    for index, each in zip(ranked, document["ranking"], strict=True):
+    assert [each["source"] for each in document["videos"]] == list(map(str, files))
+    for index, each in enumerate(document["videos"]):
         assert each["wins"] == pytest.approx(wins[index], abs=TOLERANCE)
         assert_scores(each, told[0, 1].first if index == 0 else told[0, index].second)
     pairs = [line for line in result.stdout.splitlines() if line.rstrip().endswith("agree")]
-    for line, (first, second) in zip(pairs, [(0, 1), (0, 2), (1, 2)], strict=True):
+    for line, (first, second), pair in zip(pairs, [(0, 1), (0, 2), (1, 2)], document["pairs"], strict=True):
         answers = told[first, second].preference, 1 - told[second, first].preference
-        agree = "agree" if (answers[0] > 0.5) == (answers[1] > 0.5) else "disagree"
+        agree = (answers[0] > 0.5) == (answers[1] > 0.5)
         shown = [f"{share:.4f}" for share in (*answers, sum(answers) / 2)]
-        assert columns(line, str(files[first])) == [str(files[first]), str(files[second]), *shown, agree]
+        orders = "agree" if agree else "no answer: the orders disagree"
+        assert columns(line, str(files[first])) == [str(files[first]), str(files[second]), *shown, orders]
+        verdict = ("first" if answers[0] > 0.5 else "second") if agree else None
+        assert pair == {
+            "first": str(files[first]),
+            "second": str(files[second]),
+            "verdict": verdict,
+            "orders_agree": agree,
+        }
     assert (tmp_path / "all.svg").read_text().startswith("<?xml")
+
+
+ORDERS: dict[str, tuple[dict[tuple[int, int], float], list[int | None], list[int] | None, list[str]]] = {
+    "agree": ({(0, 1): 0.4, (1, 0): 0.9}, [2, 1], [1, 0], ["agree"]),
+    "disagree by a hair": (
+        {(0, 1): 0.5001, (1, 0): 0.5001},
+        [None, None],
+        None,
+        ["no answer: the orders disagree"],
+    ),
+    "one is even": ({(0, 1): 0.9, (1, 0): 0.5}, [None, None], None, ["no answer: the orders disagree"]),
+    "both are even": ({(0, 1): 0.5, (1, 0): 0.5}, [None, None], None, ["no answer: both are exactly 0.5"]),
+    "the third loses to either": (
+        {(0, 1): 0.9, (1, 0): 0.9, (0, 2): 0.9, (2, 0): 0.1, (1, 2): 0.8, (2, 1): 0.2},
+        [None, None, 3],
+        None,
+        ["no answer: the orders disagree", "agree", "agree"],
+    ),
+    "of three": (
+        {(0, 1): 0.3, (1, 0): 0.9, (0, 2): 0.2, (2, 0): 0.8, (1, 2): 0.6, (2, 1): 0.3},
+        [3, 1, 2],
+        [1, 2, 0],
+        ["agree", "agree", "agree"],
+    ),
+}
+
+
+@pytest.mark.parametrize(("preferences", "ranks", "ranking", "answers"), ORDERS.values(), ids=ORDERS)
+def test_a_comparison_names_no_winner_where_the_orders_disagree(
+    preferences: dict[tuple[int, int], float],
+    ranks: list[int | None],
+    ranking: list[int] | None,
+    answers: list[str],
+) -> None:
+    scores = FrameScores(progress=np.zeros(2, np.float32), success=np.zeros(2, np.float32))
+    seen = random_trajectory(0, 2, *WIDTHS)
+    comparison = Comparison(
+        [Source(f"{index}.npz", seen, None) for index in range(len(ranks))],
+        {order: PreferenceResult(preference=each, first=scores, second=scores) for order, each in preferences.items()},
+    )
+    assert (comparison.ranks, comparison.ranking) == (ranks, ranking)
+    videos, pairs = ([list(column.cells) for column in table.columns] for table in comparison.tables())
+    assert [str(cell) for cell in videos[1]] == [str(ranks[index] or "?") for index in ranking or range(len(ranks))]
+    assert [str(cell) for cell in pairs[-1]] == answers
+
+
+def test_compare_refuses_the_answers_of_two_versions(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, video: Path
+) -> None:
+    np.save(tmp_path / "small.npy", np.zeros((2, 40, 30, 3), np.uint8))  # of another size: a request of its own
+    client = RewardClient("", transports=[Shelf(after=1)])
+    monkeypatch.setattr(Server, "connected", lambda _server: client)
+    result = invoke("compare", video, tmp_path / "small.npy", "--task", TASK, "--url", "grpc://127.0.0.1:1")
+    assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
+    assert result.stderr == "rfm-client: model_version: expected one for all videos, got 1, 2: ask again\n"
 
 
 def test_compare_takes_videos_of_two_sizes(served: Served, protocol: str, video: Path, tmp_path: Path) -> None:

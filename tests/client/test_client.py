@@ -16,13 +16,16 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from client_calls import NOBODY, futures
 from engines import load_engine
-from mixtures import FRAMES_MODEL, MODEL, assert_same, mixed_samples, plug
+from mixtures import FRAMES_MODEL, MODEL, TOLERANCE, assert_same, mixed_samples, plug
 from reference_server import Served
 from rfm_client import (
     AsyncRewardClient,
     DeadlineExceededError,
+    FrameScores,
+    InferenceFailedError,
     InvalidSampleError,
     ModelNotFoundError,
+    PreferenceResult,
     PreferenceSample,
     ProgressResult,
     ProgressSample,
@@ -36,6 +39,7 @@ from rfm_client import (
 from rfm_client.batching import MAX_REQUEST_BYTES
 from rfm_client.transport.deadline import Deadline
 from rfm_client.transport.in_flight import MAX_BYTES, InFlight
+from shelves import Shelf
 from trajectories import random_trajectory
 
 
@@ -314,6 +318,76 @@ def test_a_long_trajectory_is_subsampled_when_asked(served: Served, protocol: st
     assert pair.second.frame_indices is None
     assert dense.frame_indices is None
     assert len(dense.progress) == 40
+
+
+VERDICTS: dict[str, tuple[float, float | None, float, bool | None, str | None]] = {
+    "first, asked once": (0.9, None, 0.9, None, "first"),
+    "second, asked once": (0.1, None, 0.1, None, "second"),
+    "even, asked once": (0.5, None, 0.5, None, None),
+    "first": (0.75, 0.5 - 0.25, 0.75, True, "first"),
+    "second": (0.25, 0.875, 0.1875, True, "second"),
+    "disagree": (0.75, 0.75, 0.5, False, None),
+    "disagree, though the mean is high": (1.0, 0.625, 0.6875, False, None),
+    "one is even": (0.75, 0.5, 0.625, False, None),
+    "both are even": (0.5, 0.5, 0.5, True, None),
+}
+
+
+@pytest.mark.parametrize(("asked", "swapped", "mean", "agree", "verdict"), VERDICTS.values(), ids=VERDICTS)
+def test_there_is_a_verdict_where_the_orders_agree(
+    asked: float, swapped: float | None, mean: float, agree: bool | None, verdict: str | None
+) -> None:
+    scores = FrameScores(progress=np.zeros(2, np.float32), success=np.zeros(2, np.float32))
+    result = PreferenceResult(preference=asked, first=scores, second=scores)
+    if swapped is not None:
+        result = PreferenceResult.of_both_orders(
+            result, PreferenceResult(preference=swapped, first=scores, second=scores)
+        )
+        assert result.both_orders == (asked, 1 - swapped)
+    assert (result.preference, result.orders_agree, result.verdict) == (mean, agree, verdict)
+
+
+def test_both_orders_are_asked_under_the_task_of_the_first(served: Served, protocol: str) -> None:
+    first, second = random_trajectory(1, 40), random_trajectory(2, 5)
+    back = replace(second, text_embedding=first.text_embedding)
+    with served.client(protocol) as client:
+        once = client.preference(first, second, subsample=True)
+        swapped = client.preference(back, first, subsample=True).preference
+        both = client.preference(first, second, both_orders=True, subsample=True)
+        other_text = client.preference(second, first, subsample=True).preference
+
+    async def ask() -> PreferenceResult:
+        async with AsyncRewardClient(served.url(protocol), model=MODEL) as client:
+            return await client.preference(
+                first, replace(second, text_embedding=None), both_orders=True, subsample=True
+            )
+
+    assert other_text != pytest.approx(swapped, abs=1e-4)
+    assert once.both_orders is None
+    for result in (both, asyncio.run(ask())):
+        assert result.both_orders == pytest.approx((once.preference, 1 - swapped), abs=TOLERANCE)
+        assert_same(replace(result, preference=once.preference), once)
+        assert result.first.frame_indices is not None
+        assert len(result.first.frame_indices) == 16
+        assert result.second.frame_indices is None
+
+
+def test_orders_that_two_versions_answered_are_an_error() -> None:
+    films = [Trajectory(frames=np.zeros((2, size, 8, 3), np.uint8), task="lift") for size in (8, 16)]
+    with RewardClient("", transports=[Shelf(after=1)]) as client:
+        with pytest.raises(InferenceFailedError, match=r"^model_version: expected one for both orders, got 1, 2: ask"):
+            client.preference(*films, both_orders=True)
+        assert client.preference(*films, both_orders=True).model_version == "2"
+
+
+def test_an_error_of_both_orders_names_the_place_as_asked_once(served: Served) -> None:
+    long, short = random_trajectory(1, 40), random_trajectory(2, 5)
+    with served.client("grpc") as client:
+        with pytest.raises(InvalidSampleError) as once:
+            client.preference(short, long)
+        with pytest.raises(InvalidSampleError) as both:
+            client.preference(short, long, both_orders=True)
+    assert both.value.message == once.value.message
 
 
 def test_frames_are_resized_when_asked(served: Served) -> None:

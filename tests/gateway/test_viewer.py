@@ -189,8 +189,19 @@ def test_a_preference_is_asked_in_both_orders(film: Gateway, videos: Path, tmp_p
     for order, videos_ in zip(answer["orders"], orders.values(), strict=True):
         words = ["rfm-client", "compare", *videos_, "--url", film.triton_url, "--model", FILM, "--task", clip.TASK]
         by_command_line(tmp_path, f"{shlex.join(map(str, words))} --json pair.json")
-        preference = json.loads((tmp_path / "pair.json").read_text())["preference"]
-        assert order["preference"] == pytest.approx(preference, abs=TOLERANCE)
+        told = json.loads((tmp_path / "pair.json").read_text())
+        assert order["preference"] == pytest.approx(told["preference"], abs=TOLERANCE)
+    swap = {"first": "second", "second": "first", None: None}
+    assert (answer["verdict"], answer["orders_agree"]) == (swap[told["verdict"]], told["orders_agree"])
+
+
+def test_a_video_is_no_better_than_itself(film: Gateway, videos: Path) -> None:
+    response = post(film.url, COMPARE, {"first": videos / "clip.mp4", "second": videos / "clip.mp4"}, **QUESTION)
+    answer = response.json()
+    forth, back = (order["preference"] for order in answer["orders"])
+    assert forth == pytest.approx(back, abs=TOLERANCE)
+    assert forth != 0.5
+    assert (answer["verdict"], answer["orders_agree"]) == (None, False)
 
 
 KINDS = "MP4, MOV, WebM, Matroska, Ogg or AVI"

@@ -210,6 +210,7 @@ def test_a_pair_is_compared_in_both_orders(page: Stage) -> None:
         assert order["preference"] == pytest.approx(preference, abs=TOLERANCE)
         assert float(line.rpartition(" ")[2]) == pytest.approx(preference, abs=SHOWN + TOLERANCE)
     assert page.browser.all("#pairs p")[0].text == "Both orders agree: success.mp4 is better."
+    assert (answer["verdict"], answer["orders_agree"]) == ("first", True)
 
 
 def test_the_threshold_says_when_success_is_reached(page: Stage) -> None:

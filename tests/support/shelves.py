@@ -60,7 +60,8 @@ class Shelf:
             return Answer({name: array.astype(np.float32) for name, array in tensors.items()}, now.version)
         self.count += 1
         self.shapes.append(inputs[wire.FRAMES if model == "rfm_frames" else wire.VIDEO_EMBEDDINGS].shape)
-        scores = np.full(self.shapes[-1][:2], now.score)
+        num_frames = inputs[wire.NUM_FRAMES].sum(axis=1)  # of both trajectories, which may lie in two arrays
+        scores = np.full((len(num_frames), num_frames.max()), now.score)
         return Answer(dict.fromkeys(outputs, scores.astype(np.float32)), now.version)
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:

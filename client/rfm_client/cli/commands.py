@@ -17,11 +17,10 @@ from rfm_client.async_client import DEFAULT_TIMEOUT_S
 from rfm_client.cli import comparing, options, outputs, scoring, toy
 from rfm_client.cli.label import label
 from rfm_client.cli.options import EXIT_CODES, STANDARD_OUTPUT, OneLineCommand, Server
-from rfm_client.cli.ports import wrong_port
 from rfm_client.cli.scoring import Failed, Outcome, Question, Scored
 from rfm_client.cli.show import MAX_PANELS, print_tables
 from rfm_client.contract.addresses import split_url
-from rfm_client.contract.errors import RewardError, ServerUnavailableError
+from rfm_client.contract.errors import RewardError
 from rfm_client.contract.names import DEFAULT_MODEL, frames_name
 from rfm_client.contract.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS
 
@@ -91,6 +90,7 @@ def score(
     sampling: options.SamplingRule = None,
     frames: options.SampledFrames = None,
     resize: options.Resize = False,
+    orient: options.Orient = "none",
     plot: options.Plot = None,
     rrd: options.Recorded = None,
     json: options.Json = None,
@@ -114,7 +114,7 @@ def score(
         raise typer.BadParameter(expected, param_hint="--frame-steps")
     options.check_sampling(sampling, frames, others={"--frame-steps": frame_steps, "--max-frames": max_frames})
     server = Server(urls, model, timeout, context.obj)
-    question = Question(task, fps, max_frames, frame_steps, subsample, resize, sampling, frames)
+    question = Question(task, fps, max_frames, frame_steps, subsample, resize, sampling, frames, orient)
     rows = None if json == STANDARD_OUTPUT else outputs.Rows(videos)
     arrays = outputs.Arrays(npy, videos)
 
@@ -150,6 +150,7 @@ def compare(
     max_frames: options.MaxFrames = None,
     subsample: options.Subsample = True,
     resize: options.Resize = False,
+    orient: options.Orient = "none",
     plot: options.Plot = None,
     json: options.Json = None,
     timeout: options.TimeoutS = DEFAULT_TIMEOUT_S,
@@ -157,7 +158,7 @@ def compare(
     """Which of several videos does the task best.
 
     Every two are compared in both orders. They are ranked by the mean probability of winning against the others.
-    The progress in each is shown, too.
+    A video is not ranked ("?") if the orders disagree about it and another one. The progress in each is shown, too.
     """
     from rfm_client.cli import show
 
@@ -166,7 +167,7 @@ def compare(
         raise typer.BadParameter(f"expected at least {MIN_COMPARED} videos, got {len(videos)}", param_hint="VIDEO")
     _check_panels(plot, videos)
     server = Server(urls, model, timeout, context.obj)
-    question = Question(task, fps, max_frames, subsample=subsample, resize=resize)
+    question = Question(task, fps, max_frames, subsample=subsample, resize=resize, orient=orient)
     comparison = comparing.compare(server, videos, question)
     for source, scores in zip(comparison.sources, comparison.scores, strict=True):
         _report_subsampled(source.name, len(scores.progress), source.trajectory.num_frames)
@@ -195,13 +196,8 @@ def status(
     options.check_outputs(json, None)
     if metrics_url is not None and len(urls) > 1:
         raise typer.BadParameter("expected one --url with it, got several", param_hint="--metrics-url")
-    try:
-        with options.usage_errors("--url"):
-            statuses = [
-                read_status(url, metrics_url=metrics_url, timeout_s=timeout, access=context.obj) for url in urls
-            ]
-    except RewardError as error:
-        raise options.port_named(urls, error) from error
+    with options.usage_errors("--url"):
+        statuses = [read_status(url, metrics_url=metrics_url, timeout_s=timeout, access=context.obj) for url in urls]
     if json != STANDARD_OUTPUT:
         print_tables(*(table for status in statuses for table in status_tables(status)))
     if json is not None:
@@ -213,7 +209,9 @@ def wait(
     context: typer.Context,
     urls: options.Urls,
     model: options.Model = DEFAULT_MODEL,
-    timeout: Annotated[float, typer.Option(min=options.MIN_TIMEOUT_S, help="Seconds to wait at most.")] = 120.0,
+    timeout: Annotated[
+        float, typer.Option(min=options.MIN_TIMEOUT_S, callback=options.finite, help="Seconds to wait at most.")
+    ] = 120.0,
 ) -> None:
     """Return as soon as the model is ready. Of several servers, one is enough."""
     from rfm_client.client import RewardClient
@@ -221,8 +219,6 @@ def wait(
     with options.usage_errors("--url"):
         client = RewardClient(urls, model=model, **context.obj.options)
     with client:
-        if all(named := [wrong_port(url) for url in urls]):
-            raise ServerUnavailableError(named[0])  # which no wait will mend
         client.wait_ready(timeout)
 
 
@@ -319,12 +315,19 @@ def _report_subsampled(name: str, num_scored: int, num_frames: int) -> None:
 
 
 def _add_gateway() -> None:
-    """Adds the command of the distribution rfm-gateway, if it is installed. Its fault is no other command's."""
-    for found in entry_points(group="rfm_client.commands", name="gateway"):
-        try:
+    """Adds the command of the distribution rfm-gateway; without that, one that says how to install it."""
+    try:
+        for found in entry_points(group="rfm_client.commands", name="gateway"):
             app.command(found.name, cls=OneLineCommand)(found.load())
-        except ImportError as error:
-            options.report(f"note: the gateway cannot be used: {error}")
+            return
+        reason = "rfm-gateway is not installed"
+    except ImportError as error:
+        reason = str(error)
+
+    @app.command("gateway", context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
+    def gateway() -> None:
+        """Serve the FastAPI server's endpoints before a Triton server; it needs rfm-gateway."""
+        options.fail(f"gateway: {reason}: pip install ./client ./gateway", options.ExitCode.FAILED)
 
 
 _add_gateway()

@@ -1,21 +1,24 @@
 # SPDX-License-Identifier: MIT
 """``rfm-client compare``: which of several videos does a task best. N videos.
 
-A model's verdict on a pair depends on which of the two it is shown first, so it is asked in both orders.
+A model's answer may depend on which of the two it is shown first, so it is asked in both orders. Where they disagree
+there is no answer.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import PurePath
+from statistics import fmean
 from typing import TYPE_CHECKING, cast
 
 from rfm_client.cli.options import Server
 from rfm_client.cli.scoring import Question, Source, fitted_to
 from rfm_client.cli.show import Panel, number, table
-from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError
 from rfm_client.contract.results import FrameScores, PreferenceResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Trajectory
 from rfm_client.data.fitting import with_frame_indices
@@ -23,77 +26,97 @@ from rfm_client.data.fitting import with_frame_indices
 if TYPE_CHECKING:
     from rich.table import Table
 
-EVEN = 0.5  # neither is preferred
-
 Order = tuple[int, int]  # numbers of two videos, as they are asked
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """N sources, and what the model says of them.
+    """N sources, and what one version of the model says of them.
 
-    scores: of each source, as the model tells them when it compares the source with the first one, in the order given
-    preferences: probability that the first of two does the task better, for every order of every two
-    model_version: that answered all; None: several did, or it is not known
+    results: of every order of every two
     """
 
     sources: Sequence[Source]
-    scores: Sequence[FrameScores]
-    preferences: Mapping[Order, float]
-    model_version: str | None
-
-    def wins(self, index: int) -> float:
-        """The mean probability that a source wins, over both orders against all others."""
-        others = [other for other in self._numbers if other != index]
-        return sum(self.mean(index, other) for other in others) / len(others)
-
-    def mean(self, first: int, second: int) -> float:
-        """The probability that ``first`` wins against ``second``, as the mean of both orders."""
-        return (self.preferences[first, second] + 1 - self.preferences[second, first]) / 2
+    results: Mapping[Order, PreferenceResult]
 
     @property
-    def ranking(self) -> list[int]:
-        """The numbers of the sources, the best one first; of equals the one that was named first."""
-        return sorted(self._numbers, key=self.wins, reverse=True)
+    def scores(self) -> list[FrameScores]:
+        """Scores of each source, as told when the model compares it with the first one, in the order given."""
+        return [self.results[0, 1].first, *(self.results[0, other].second for other in self._numbers[1:])]
+
+    def pair(self, first: int, second: int) -> PreferenceResult:
+        """Both orders of two sources as one result."""
+        return PreferenceResult.of_both_orders(self.results[first, second], self.results[second, first])
+
+    def couples(self) -> Iterator[Order]:
+        """Every two sources once, in the order given."""
+        return itertools.combinations(self._numbers, 2)
+
+    @cached_property
+    def wins(self) -> list[float]:
+        """The mean probability that a source wins, over both orders against all others, of each source."""
+        return [
+            fmean(self.pair(index, other).preference for other in self._numbers if other != index)
+            for index in self._numbers
+        ]
+
+    @cached_property
+    def ranks(self) -> list[int | None]:
+        """The place of each source by its ``wins``, from 1; None if one of the source's pairs has no verdict."""
+        best_first = sorted(self._numbers, key=self.wins.__getitem__, reverse=True)
+        untold = {index for couple in self.couples() if self.pair(*couple).verdict is None for index in couple}
+        return [None if index in untold else best_first.index(index) + 1 for index in self._numbers]
+
+    @property
+    def ranking(self) -> list[int] | None:
+        """The numbers of the sources, the best one first; None if a pair has no verdict."""
+        if None in self.ranks:
+            return None
+        return sorted(self._numbers, key=lambda index: cast(int, self.ranks[index]))
 
     def tables(self) -> list[Table]:
-        """The sources, the best one first, and both answers about every two."""
-        couples = itertools.combinations(self._numbers, 2)
+        """The sources, the best one first if they have a ranking, and both answers about every two."""
         columns = ("video", "rank", "P(wins)", "its last progress", "its last success", "frames")
-        ranked = [(*self._row(index, rank), str(len(self.scores[index].progress))) for rank, index in self._ranked()]
         pairs = ("first", "second", "P(first wins)", "asked second first", "mean", "orders")
         return [
-            table("", columns, ranked),
-            table("", pairs, [self._pair(*couple) for couple in couples], names=2),
+            table("", columns, [self._row(index) for index in self._shown]),
+            table("", pairs, [self._pair_row(*couple) for couple in self.couples()], names=2),
         ]
 
     def panels(self) -> list[Panel]:
-        """What a plot shows of it, the best one first."""
+        """What a plot shows of it, in the order of the table."""
         return [
             self.sources[index].panel(
-                f"{rank}. {PurePath(self.sources[index].name).name}: wins with P = {self.wins(index):.3f}",
+                f"{self._rank(index)}. {PurePath(self.sources[index].name).name}: wins with P = {self.wins[index]:.3f}",
                 self.scores[index],
             )
-            for rank, index in self._ranked()
+            for index in self._shown
         ]
 
     @property
     def _numbers(self) -> range:
         return range(len(self.sources))
 
-    def _ranked(self) -> list[tuple[int, int]]:
-        return list(enumerate(self.ranking, 1))
+    @property
+    def _shown(self) -> Sequence[int]:
+        return self.ranking or self._numbers
 
-    def _row(self, index: int, rank: int) -> tuple[str, ...]:
+    def _rank(self, index: int) -> str:
+        return str(self.ranks[index] or "?")
+
+    def _row(self, index: int) -> tuple[str, ...]:
         scores = self.scores[index]
-        figures = (self.wins(index), scores.progress[-1], scores.success[-1])
-        return (self.sources[index].name, str(rank), *map(number, figures))
+        figures = (self.wins[index], scores.progress[-1], scores.success[-1])
+        return (self.sources[index].name, self._rank(index), *map(number, figures), str(len(scores.progress)))
 
-    def _pair(self, first: int, second: int) -> tuple[str, ...]:
-        answers = self.preferences[first, second], 1 - self.preferences[second, first]
-        agree = (answers[0] > EVEN) == (answers[1] > EVEN)
+    def _pair_row(self, first: int, second: int) -> tuple[str, ...]:
+        pair = self.pair(first, second)
         names = (self.sources[index].name for index in (first, second))
-        return (*names, *map(number, (*answers, self.mean(first, second))), "agree" if agree else "disagree")
+        if pair.verdict is not None:
+            orders = "agree"
+        else:
+            orders = "no answer: both are exactly 0.5" if pair.orders_agree else "no answer: the orders disagree"
+        return (*names, *map(number, (*(pair.both_orders or ()), pair.preference)), orders)
 
 
 def compare(server: Server, names: Sequence[str], question: Question) -> Comparison:
@@ -110,10 +133,10 @@ def compare(server: Server, names: Sequence[str], question: Question) -> Compari
         order: cast(PreferenceResult, with_frame_indices(answer, [kept[index] for index in order]))
         for order, answer in zip(orders, answers, strict=True)
     }
-    scores = [results[0, 1].first, *(results[0, other].second for other in range(1, len(sources)))]
-    preferences = {order: result.preference for order, result in results.items()}
-    versions = {result.model_version for result in results.values()}
-    return Comparison(sources, scores, preferences, versions.pop() if len(versions) == 1 else None)
+    versions = sorted({str(result.model_version) for result in results.values()})
+    if len(versions) > 1:
+        raise InferenceFailedError(f"model_version: expected one for all videos, got {', '.join(versions)}: ask again")
+    return Comparison(sources, results)
 
 
 def _of_one_task(first: Source, other: Source) -> Trajectory:

@@ -58,35 +58,51 @@ def origin(server: Server) -> dict[str, Any]:
 
 def score_document(server: Server, question: Question, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """The JSON document that ``score --json`` writes."""
-    parameters = {"task": question.task, "fps": question.fps, "frame_steps": question.frame_steps}
-    parameters |= {"sampling": question.sampling, "sampled_frames": question.sampled_frames}
+    parameters = {"task": question.task, "fps": question.fps, "orient": question.orient}
+    parameters |= {
+        "frame_steps": question.frame_steps,
+        "sampling": question.sampling,
+        "sampled_frames": question.sampled_frames,
+    }
     return {**origin(server), **parameters, "videos": [_outcome(outcome) for outcome in outcomes]}
 
 
 def comparison_document(server: Server, question: Question, comparison: Comparison) -> dict[str, Any]:
     """What ``compare --json`` writes; a ``preference`` is the probability that the first of an order is preferred.
 
-    Of two videos it also has the answer to the order given: ``preference``, and scores as ``first`` and ``second``.
+    Of two videos it also has the answer to the order given, ``preference``, the verdict of both orders, and scores as
+    ``first`` and ``second``. No verdict, rank or ranking is null.
     """
-    document = {**origin(server), "task": question.task, "fps": question.fps}
-    document["model_version"] = comparison.model_version
-    scored = [
+    names = [source.name for source in comparison.sources]
+    videos = [
         {
             "source": source.name,
             "num_frames": source.trajectory.num_frames,
             **frame_document(scores, times_of(source, scores)),
+            "wins": wins,
+            "rank": rank,
         }
-        for source, scores in zip(comparison.sources, comparison.scores, strict=True)
+        for source, scores, wins, rank in zip(
+            comparison.sources, comparison.scores, comparison.wins, comparison.ranks, strict=True
+        )
     ]
-    if len(scored) == len(SIDES):
-        document |= {"preference": comparison.preferences[0, 1], **dict(zip(SIDES, scored, strict=True))}
-    names = [source.name for source in comparison.sources]
     orders = [
-        {"first": names[first], "second": names[second], "preference": preference}
-        for (first, second), preference in comparison.preferences.items()
+        {"first": names[first], "second": names[second], "preference": result.preference}
+        for (first, second), result in comparison.results.items()
     ]
-    ranking = [{**scored[index], "wins": comparison.wins(index)} for index in comparison.ranking]
-    return {**document, "orders": orders, "ranking": ranking}
+    pairs = [
+        {"first": names[first], "second": names[second], **_verdict(comparison.pair(first, second))}
+        for first, second in comparison.couples()
+    ]
+    asked = comparison.results[0, 1]
+    parameters = {"task": question.task, "fps": question.fps, "orient": question.orient}
+    document = {**origin(server), **parameters, "model_version": asked.model_version}
+    if len(videos) == len(SIDES):
+        document |= {"preference": asked.preference, **_verdict(comparison.pair(0, 1))}
+        document |= dict(zip(SIDES, videos, strict=True))
+    best_first = comparison.ranking
+    ranking = None if best_first is None else [videos[index] for index in best_first]
+    return {**document, "orders": orders, "pairs": pairs, "videos": videos, "ranking": ranking}
 
 
 def samples_document(server: Server, kind: str, outcomes: Sequence[Result | RewardError]) -> dict[str, Any]:
@@ -220,6 +236,10 @@ def _outcome(outcome: Outcome) -> dict[str, Any]:
         return {"source": outcome.name, **_error(outcome.error, outcome.message)}
     about = {"source": outcome.name, "num_frames": outcome.num_frames, "took_s": outcome.took_s}
     return {**about, **result_document(outcome.result, (outcome.times_s,))}
+
+
+def _verdict(pair: PreferenceResult) -> dict[str, Any]:
+    return {"verdict": pair.verdict, "orders_agree": pair.orders_agree}
 
 
 def _error(error: Exception, message: str) -> dict[str, Any]:

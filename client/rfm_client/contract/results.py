@@ -3,15 +3,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TypeAlias
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from rfm_client.contract.errors import InferenceFailedError
+from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.samples import Float32Array
 
 SUCCESS_THRESHOLD = 0.5
+EVEN = 0.5  # the preference for neither of two trajectories
 
 
 @dataclass(frozen=True)
@@ -54,10 +57,10 @@ class FrameScores:
     def succeeded(self, *, last: int = 1, threshold: float = SUCCESS_THRESHOLD) -> bool:
         """Whether more than half of the ``last`` frames (all, if there are fewer) reach the probability ``threshold``.
 
-        Raises ValueError if the checkpoint does not predict success.
+        Raises ValueError if the checkpoint does not predict success, or for a threshold outside 0..1.
         """
-        if last < 1:
-            raise ValueError(f"last: expected at least one frame, got {last}")
+        checked_count("last", last)
+        checked_share("threshold", threshold)
         votes = _known("success", self.success)[-last:] >= threshold
         return bool(2 * np.count_nonzero(votes) > len(votes))
 
@@ -75,13 +78,43 @@ class ProgressResult(FrameScores):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PreferenceResult:
-    """Answer to a PreferenceSample: the probability that ``first`` is preferred, and each frame's scores."""
+    """Answer to a PreferenceSample: the probability that ``first`` is preferred, and each frame's scores.
+
+    preference: of both orders, if both were asked, the mean
+    first, second: scores of the order (first, second)
+    timing: of that order
+    both_orders: the probability that ``first`` is preferred as told in the order (first, second) and in the order
+        (second, first); None: only the former was asked
+    """
 
     preference: float
     first: FrameScores
     second: FrameScores
     timing: BatchTiming | None = None
     model_version: str | None = None
+    both_orders: tuple[float, float] | None = None
+
+    @classmethod
+    def of_both_orders(cls, asked: PreferenceResult, swapped: PreferenceResult) -> PreferenceResult:
+        """One result of the answers to a sample and to its ``swapped``.
+
+        Raises InferenceFailedError if two versions of the checkpoint gave them.
+        """
+        if asked.model_version != swapped.model_version:
+            got = f"{asked.model_version}, {swapped.model_version}"
+            raise InferenceFailedError(f"model_version: expected one for both orders, got {got}: ask again")
+        both = (asked.preference, 1 - swapped.preference)
+        return replace(asked, preference=sum(both) / len(both), both_orders=both)
+
+    @property
+    def orders_agree(self) -> bool | None:
+        """Whether both orders prefer the same trajectory, or both none (exactly 0.5); None if only one was asked."""
+        return None if self.both_orders is None else len(set(map(_preferred, self.both_orders))) == 1
+
+    @property
+    def verdict(self) -> Literal["first", "second"] | None:
+        """The preferred trajectory; None if the orders disagree, or if the preference is exactly 0.5."""
+        return None if self.orders_agree is False else _preferred(self.preference)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -96,6 +129,12 @@ class SimilarityResult:
 
 
 Result: TypeAlias = ProgressResult | PreferenceResult | SimilarityResult
+
+
+def _preferred(preference: float) -> Literal["first", "second"] | None:
+    if preference > EVEN:
+        return "first"
+    return "second" if preference < EVEN else None
 
 
 def _known(name: str, scores: Float32Array) -> Float32Array:

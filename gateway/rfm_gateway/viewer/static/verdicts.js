@@ -3,8 +3,6 @@
 
 import { shown } from "./table.js";
 
-const EVEN = 0.5;
-
 /** Writes what the model says of a pair into `host`. verdict: videos, task, model, answer of the gateway */
 export function addVerdict(host, { videos, task, model, answer }) {
   const names = Object.fromEntries(["first", "second"].map((side, index) => [side, videos[index].name]));
@@ -13,11 +11,8 @@ export function addVerdict(host, { videos, task, model, answer }) {
     const [one, other] = asked.map((side) => names[side]);
     list.append(element("li", `Asked as ${one}, then ${other}: P(${one} is better) = ${shown(preference)}`));
   }
-  const [forth, back] = answer.orders.map(({ preference }) => preference > EVEN);
-  const better = forth ? names.first : names.second;
-  const verdict = forth === back
-    ? "The model contradicts itself: its answer depends on the order."
-    : `Both orders agree: ${better} is better.`;
+  const untold = answer.orders_agree ? "No answer: both are exactly 0.5." : "No answer: the orders disagree.";
+  const verdict = answer.verdict ? `Both orders agree: ${names[answer.verdict]} is better.` : untold;
   const box = document.createElement("div");
   box.append(element("h3", `${task} (${model})`), list, element("p", verdict));
   host.append(box);
