@@ -30,6 +30,8 @@ from typing import Literal, TypeAlias, get_args
 import numpy as np
 import numpy.typing as npt
 
+from rfm_client.contract.numbers import checked_count
+
 Rule: TypeAlias = Literal[
     "linspace_trunc", "linspace_round", "rint", "rint_pad", "rewind_pad16_online", "rewind_pad16_offline", "all"
 ]
@@ -89,8 +91,10 @@ class Sampling:
             if self.frames not in (None, REWIND_FRAMES):
                 raise ValueError(f"frames: expected {REWIND_FRAMES} with the rule {self.rule}, got {self.frames}")
             object.__setattr__(self, "frames", REWIND_FRAMES)
-        elif self.rule != "all" and (self.frames is None or self.frames < 1):
-            raise ValueError(f"frames: expected at least 1 with the rule {self.rule}, got {self.frames}")
+        elif self.rule != "all":
+            if self.frames is None:
+                raise ValueError(f"frames: expected at least 1 with the rule {self.rule}, got None")
+            object.__setattr__(self, "frames", checked_count("frames", self.frames))
 
     @classmethod
     def of(

@@ -3,13 +3,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import UInt8Array, as_array
+from rfm_client.data.orientation import Orient, Orientation
+
+
+def orientations_of(orient: Orientation | Mapping[str, Orientation], cameras: Sequence[str]) -> list[Orientation]:
+    """How frames are turned: those of each camera, or those of the only one, which has no name. Raises ValueError."""
+    said = Orient(cameras=orient) if isinstance(orient, Mapping) else Orient(orient)
+    unknown = [camera for camera in said.cameras if camera not in cameras]
+    if unknown:
+        expected = f"some of the cameras {list(cameras)}" if cameras else "one orientation, as cameras names none"
+        raise ValueError(f"orient: expected {expected}, got {', '.join(map(repr, unknown))}")
+    return [said.cameras.get(camera, said.default or "none") for camera in cameras or ("",)]
 
 
 def checked_frame(frame: Any, where: str = "frame") -> UInt8Array:

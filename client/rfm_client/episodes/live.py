@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.resize import load_pillow
 from rfm_client.episodes.live_reports import Address, Reporter
@@ -85,9 +86,12 @@ class LiveView:
         """An episode that appears with its first step.
 
         env: number of its environment, from 0; threshold: at which success counts; inf: never
+
+        Raises ValueError.
         """
-        if env < 0:
-            raise ValueError(f"env: expected at least 0, got {env}")
+        checked_count("env", env, least=0)
+        if threshold != math.inf:
+            checked_share("threshold", threshold)
         return LiveEpisode(self, task, env, threshold)
 
     def close(self) -> None:

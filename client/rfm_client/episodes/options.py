@@ -3,20 +3,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypedDict
 
+from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.results import SUCCESS_THRESHOLD
 from rfm_client.data.camera_fusion import Fuse, check_fuse, checked_cameras
+from rfm_client.data.orientation import Orientation
 from rfm_client.data.sampling import Rule, Sampling
+from rfm_client.episodes.frames import orientations_of
 from rfm_client.episodes.live import LiveView
 
 
 @dataclass(frozen=True)
 class SuccessRule:
     """A scored step succeeds when most of the last frames shown to the model have a success of ``threshold`` or more.
+    Raises ValueError.
 
+    threshold: a probability, 0..1
     last: how many frames vote. Padding and repeated frames count once.
     """
 
@@ -24,8 +29,8 @@ class SuccessRule:
     last: int = 1
 
     def __post_init__(self) -> None:
-        if self.last < 1:
-            raise ValueError(f"last: expected at least 1, got {self.last}")
+        checked_share("threshold", self.threshold)
+        checked_count("last", self.last)
 
 
 class EpisodeSettings(TypedDict, total=False):
@@ -35,6 +40,7 @@ class EpisodeSettings(TypedDict, total=False):
     frames: int | None
     cameras: Sequence[str]
     fuse: Fuse
+    orient: Orientation | Mapping[str, Orientation]
     resize: bool
     success: SuccessRule
     live: LiveView | None
@@ -50,6 +56,8 @@ class EpisodeOptions:
         that needs a number raises ValueError at the first step
     cameras: names of the cameras whose frames each step brings; none: there is one, without a name
     fuse: how the scores of several cameras become one
+    orient: how frames are turned so that they are upright, before all else: an Orientation, or such by camera; a camera
+        that is not named: not at all
     resize: frames are made as small as the checkpoint reads them before they are kept and sent (needs Pillow);
         ReWiND's scores differ slightly from those of the frames as they are
     success: when a step counts as a success
@@ -60,6 +68,7 @@ class EpisodeOptions:
     frames: int | None = None
     cameras: Sequence[str] = ()
     fuse: Fuse = "mean"
+    orient: Orientation | Mapping[str, Orientation] = "none"
     resize: bool = False
     success: SuccessRule = SuccessRule()
     live: LiveView | None = None
@@ -67,4 +76,5 @@ class EpisodeOptions:
     def __post_init__(self) -> None:
         object.__setattr__(self, "cameras", checked_cameras(self.cameras))
         check_fuse(self.fuse)
+        orientations_of(self.orient, self.cameras)
         Sampling.of(self.sampling, self.frames, trained_frames=1)  # whether rule and number go together

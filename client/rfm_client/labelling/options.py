@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias, get_args
 
+from rfm_client.contract.numbers import checked_count
 from rfm_client.data.camera_fusion import FUSES, Fuse
 from rfm_client.data.sampling import Rule
 
@@ -80,9 +81,9 @@ class LabelOptions:
             raise ValueError(f"sampling: expected all in mode whole, which shows every frame, got {self.sampling}")
         if self.shard is not None and not 0 <= self.shard[0] < self.shard[1]:
             raise ValueError(f"shard: expected i/n with i from 0 to n - 1, got {self.shard[0]}/{self.shard[1]}")
-        for where, number in (("workers", self.workers), ("limit", self.limit)):
-            if number is not None and number < 1:
-                raise ValueError(f"{where}: expected at least 1, got {number}")
+        for where, number in (("workers", self.workers), ("limit", self.limit), ("frames", self.frames)):
+            if number is not None:
+                object.__setattr__(self, where, checked_count(where, number))
 
 
 def parse_episodes(text: str) -> list[int]:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 from rfm_client.contract.errors import RewardError
+from rfm_client.contract.numbers import checked_count, checked_finite
 from rfm_client.data.datasets.opening import open_dataset
 from rfm_client.data.orientation import Orient
 from rfm_client.labelling.finished_episodes import Parts
@@ -39,9 +40,8 @@ class RayOptions:
     num_gpus_per_actor: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.actors < 1:
-            raise ValueError(f"actors: expected at least 1, got {self.actors}")
-        if self.num_gpus_per_actor < 0:
+        checked_count("actors", self.actors)
+        if checked_finite("num_gpus_per_actor", self.num_gpus_per_actor) < 0:
             raise ValueError(f"num_gpus_per_actor: expected 0 or more, got {self.num_gpus_per_actor}")
 
 
@@ -70,9 +70,7 @@ class EpisodeActor:
         self._held = ExitStack()  # what it holds is closed as soon as nothing refers to it
         self._job = job
         self._parts = Parts(job.parts)
-        self._dataset = open_dataset(
-            job.source, task=job.task, override_task=job.override_task, orient=job.orient
-        )
+        self._dataset = open_dataset(job.source, task=job.task, override_task=job.override_task, orient=job.orient)
         self._scorer = self._held.enter_context(job.connect())  # open as long as the actor lives
 
     def __del__(self) -> None:

@@ -13,15 +13,15 @@ else:
     from async_timeout import timeout as timeout
 
 from rfm_client.contract.errors import DeadlineExceededError
+from rfm_client.contract.numbers import checked_positive
 
 MAX_TIMEOUT_S = 1e9  # more than thirty years; Triton counts nanoseconds, and could not count many more
 
 
 def check_timeout(timeout_s: float) -> None:
     """Raises ValueError for a time limit that a call may not have. It may not wait for ever: servers can hang."""
-    if not 0 < timeout_s <= MAX_TIMEOUT_S:  # nor NaN
-        expected = f"a number of seconds above 0 and at most {MAX_TIMEOUT_S:g}"
-        raise ValueError(f"timeout_s: expected {expected}, got {timeout_s}")
+    expected = f"a number of seconds above 0 and at most {MAX_TIMEOUT_S:g}"
+    checked_positive("timeout_s", timeout_s, expected, most=MAX_TIMEOUT_S)
 
 
 class Deadline:

@@ -7,6 +7,7 @@ import asyncio
 from collections import deque
 from types import TracebackType
 
+from rfm_client.contract.numbers import checked_count
 from rfm_client.transport.deadline import Deadline, timeout
 
 MAX_BYTES = 256 * 2**20  # of inputs; they are held several times over while they are written to a socket
@@ -18,9 +19,7 @@ class InFlight:
     """Room for ``max_requests`` requests of MAX_BYTES together, for one event loop. First come, first served."""
 
     def __init__(self, max_requests: int) -> None:
-        if max_requests < 1:
-            raise ValueError(f"max_in_flight: expected at least 1, got {max_requests}")
-        self._free_requests = max_requests
+        self._free_requests = checked_count("max_in_flight", max_requests)
         self._free_units = _UNITS
         self._turns: deque[tuple[int, asyncio.Future[None]]] = deque()  # of those that wait, with their units
 
