@@ -291,7 +291,7 @@ def test_progress_becomes_a_reward() -> None:
     scores = FrameScores(progress=progress, success=progress)
     assert scores.last_progress == 0.375
     np.testing.assert_array_equal(scores.progress_deltas, np.array([0, 0.25, -0.125], np.float32))
-    with pytest.raises(ValueError, match="last: expected at least one frame, got 0"):
+    with pytest.raises(ValueError, match="last: expected at least 1, got 0"):
         scores.succeeded(last=0)
 
 

@@ -59,9 +59,8 @@ class FrameScores:
 
         Raises ValueError if the checkpoint does not predict success, or for a threshold outside 0..1.
         """
-        checked_count("last", last)
-        checked_share("threshold", threshold)
-        votes = _known("success", self.success)[-last:] >= threshold
+        newest = _known("success", self.success)[-checked_count("last", last) :]
+        votes = newest >= checked_share("threshold", threshold)
         return bool(2 * np.count_nonzero(votes) > len(votes))
 
 
