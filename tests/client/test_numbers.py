@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: MIT
+"""Numbers that callers give: refused where they cannot hold, taken from numpy as from Python."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from rfm_client import RewardClient
+from rfm_client.cli.commands import app
+from rfm_client.contract.results import FrameScores
+from rfm_client.data.inputs import load_trajectory
+from rfm_client.data.sampling import Sampling
+from rfm_client.data.video import read_video
+from rfm_client.episodes.options import EpisodeOptions, SuccessRule
+from rfm_client.gym import RewardOptions
+from rfm_client.labelling.options import LabelOptions
+from rfm_client.labelling.ray_engine import RayOptions
+
+URL = "grpc://127.0.0.1:1"
+SCORES = FrameScores(progress=np.full(4, 0.5, np.float32), success=np.full(4, 0.5, np.float32))
+
+Given = Callable[[Any], object]
+
+
+def client(**options: Any) -> None:
+    RewardClient(URL, **options).close()
+
+
+SHARES: dict[str, Given] = {
+    "SuccessRule.threshold": SuccessRule,
+    "FrameScores.succeeded": lambda value: SCORES.succeeded(threshold=value),
+}
+COUNTS: dict[str, Given] = {
+    "SuccessRule.last": lambda value: SuccessRule(last=value),
+    "FrameScores.succeeded": lambda value: SCORES.succeeded(last=value),
+    "RewardOptions.every": lambda value: RewardOptions(every=value),
+    "RewardOptions.max_pending": lambda value: RewardOptions(max_pending=value),
+    "RewardOptions.max_frames": lambda value: RewardOptions(sampling="rint_pad", max_frames=value),
+    "EpisodeOptions.frames": lambda value: EpisodeOptions(sampling="rint_pad", frames=value),
+    "Sampling.frames": lambda value: Sampling("linspace_trunc", value),
+    "LabelOptions.workers": lambda value: LabelOptions(workers=value),
+    "LabelOptions.limit": lambda value: LabelOptions(limit=value),
+    "LabelOptions.frames": lambda value: LabelOptions(frames=value),
+    "RayOptions.actors": lambda value: RayOptions(actors=value),
+    "RewardClient.max_in_flight": lambda value: client(max_in_flight=value),
+}
+POSITIVES: dict[str, Given] = {"RewardClient.timeout_s": lambda value: client(timeout_s=value)}
+FINITES: dict[str, Given] = {
+    "RewardOptions.scale": lambda value: RewardOptions(scale=value),
+    "RayOptions.num_gpus_per_actor": lambda value: RayOptions(num_gpus_per_actor=value),
+}
+NO_NUMBERS = [math.nan, math.inf, True, "8", np.bool_(True), [1]]
+
+
+def cases(kinds: dict[str, Given], values: list[Any]) -> list[Any]:
+    return [pytest.param(give, value, id=f"{name}-{value!r}") for name, give in kinds.items() for value in values]
+
+
+@pytest.mark.parametrize(
+    ("give", "value"),
+    [
+        *cases(SHARES, [*NO_NUMBERS, -1, -0.01, 1.01, 80, np.float32(80)]),
+        *cases(COUNTS, [*NO_NUMBERS, 0, -1, 2.5, 2.0, np.float64(2)]),
+        *cases(POSITIVES, [*NO_NUMBERS, 0, -1]),
+        *cases(FINITES, NO_NUMBERS),
+    ],
+)
+def test_a_number_that_cannot_hold_is_refused(give: Given, value: Any) -> None:
+    with pytest.raises(ValueError, match=r"^\w+: expected .*, got "):
+        give(value)
+
+
+@pytest.mark.parametrize(
+    ("give", "value"),
+    [
+        *cases(SHARES, [0, 1, 0.5, np.float32(0.8), np.int64(1)]),
+        *cases(COUNTS, [1, 8, np.int64(8), np.uint8(8)]),
+        *cases(POSITIVES, [1, 0.5, np.float32(0.5), np.int64(8)]),
+        *cases(FINITES, [1, 0.5, np.float32(0.5), 0]),
+    ],
+)
+def test_a_number_may_be_numpy_s(give: Given, value: Any) -> None:
+    give(value)
+
+
+@pytest.mark.parametrize("give", SHARES.values(), ids=SHARES)
+def test_percent_are_told_from_a_probability(give: Given) -> None:
+    with pytest.raises(
+        ValueError, match=r"^threshold: expected a number from 0 to 1, got 80; for 80 percent give 0\.8$"
+    ):
+        give(80)
+
+
+@pytest.mark.parametrize("value", [math.nan, -1.0, True, "1"])
+@pytest.mark.parametrize("read", [load_trajectory, read_video])
+@pytest.mark.parametrize("name", ["fps", "start_s", "end_s"])
+def test_a_part_of_a_video_has_times_that_can_be(tmp_path: Path, read: Any, name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=rf"^{name}: expected .*, got "):
+        read(tmp_path / "film.mp4", **{name: value})
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["score", "film.mp4", "--task", "push", "--fps", "nan"],
+        ["score", "film.mp4", "--task", "push", "--fps", "inf"],
+        ["score", "film.mp4", "--task", "push", "--timeout", "nan"],
+        ["wait", "--timeout", "nan"],
+        ["label", "folder", "--num-gpus-per-actor", "nan"],
+    ],
+    ids=lambda words: " ".join(words[-2:]),
+)
+def test_a_command_refuses_nan(words: list[str]) -> None:
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 2
+    assert f"Invalid value for '{words[-2]}'" in done.output
