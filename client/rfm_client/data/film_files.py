@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""What all readers of films keep to: a file that breaks off is refused, frames are upright, damaged ones are known.
+"""What all readers of films keep to: which stream is the film, colours, frames that are upright, damage, broken files.
 
-The frames and packets are PyAV's.
+The containers, streams, packets and frames are PyAV's.
 """
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable, Iterator
 from typing import Any, BinaryIO
@@ -16,6 +17,13 @@ from rfm_client.contract.samples import UInt8Array
 
 UNDAMAGED = "an undamaged frame"
 DAMAGED = "one that the decoder marks, or is made from such a one"
+
+_MATRICES = (1, 4, 5, 7, 9)  # from YUV to RGB, as libswscale numbers them; the frame's numbers (ITU-T H.273) are equal
+_BT709, _BT601, _BT2020 = 1, 5, 9
+_SAME_MATRIX = {6: _BT601, 10: _BT2020}  # numbers of H.273 that stand for one of them
+_LIMITED, _FULL = 1, 2  # ranges, numbered likewise
+_BITS = 8  # of a depth map's or a grey film's one channel that is no distance
+_NEARLY = math.tan(math.radians(1))  # how far FFmpeg lets a display matrix be from quarter turns
 
 _EBML, _SEGMENT = 0x1A45DFA3, 0x18538067  # how Matroska and WebM begin (RFC 8794, RFC 9559)
 _BOX_BYTES = 8  # size and kind of an MP4 box (ISO 14496-12)
@@ -36,10 +44,60 @@ def broken_off(file: BinaryIO) -> str | None:
     return f"the first {there} bytes of at least {declared}" if declared is not None and declared > there else None
 
 
+class FilmError(Exception):
+    """A file that cannot be read as one film: what was expected, and what is there."""
+
+    def __init__(self, expected: str, got: str) -> None:
+        super().__init__(expected, got)
+        self.expected = expected
+        self.got = got
+
+
+def import_av() -> Any:
+    """The module ``av``. Raises ImportError that names the extra."""
+    try:
+        import av
+    except ImportError as error:
+        raise ImportError('video files need PyAV: pip install "./client[video]"') from error
+    return av
+
+
+def decoder() -> str:
+    """PyAV with its version, and those of the libraries in it that decide what a decoded frame looks like."""
+    av = import_av()
+    libraries = (f"{name} {'.'.join(map(str, av.library_versions[name]))}" for name in ("libswscale", "libavcodec"))
+    return f"PyAV {av.__version__}, {', '.join(libraries)}"
+
+
+def film_stream(container: Any) -> Any:
+    """The video stream of an opened file that is the film. Attached pictures, such as cover art, are none.
+
+    Raises FilmError if there is none, or more than one, and for depth maps.
+    """
+    attached = import_av().stream.Disposition.attached_pic
+    films = {n: stream for n, stream in enumerate(container.streams.video) if not stream.disposition & attached}
+    if not films:
+        raise FilmError("a file with a video stream", "none")
+    if len(films) > 1:
+        told = ", ".join(f"0:v:{n} ({_described(stream.codec_context)})" for n, stream in films.items())
+        raise FilmError("one video stream (take one: ffmpeg -i IN -map 0:v:N -c copy OUT)", f"{len(films)}: {told}")
+    (stream,) = films.values()
+    _check_colours(stream.codec_context.format)
+    return stream
+
+
+def film_packets(container: Any, stream: Any) -> Iterator[Any]:
+    """The packets of the stream that are shown, as a film that was cut without encoding has others too."""
+    return (packet for packet in container.demux(stream) if packet.size and not packet.is_discard)
+
+
 def upright(frame: Any) -> UInt8Array:
-    """uint8 [H, W, 3], a decoded frame in RGB as it is to be shown: turned as phones film, not mirrored."""
-    image = frame.to_ndarray(format="rgb24")
-    return np.ascontiguousarray(np.rot90(image, round(frame.rotation / 90)))  # both count counter-clockwise
+    """uint8 [H, W, 3], a decoded frame in RGB as it is to be shown, turned and mirrored as FFmpeg does.
+
+    Raises FilmError for a frame that is to be shown aslant.
+    """
+    image, matrix = _rgb(frame), frame.side_data.get("DISPLAYMATRIX")
+    return image if matrix is None else np.ascontiguousarray(_shown(image, np.frombuffer(bytes(matrix), np.int32)))
 
 
 def judged(frames: Iterable[Any]) -> Iterator[tuple[Any, bool]]:
@@ -48,6 +106,51 @@ def judged(frames: Iterable[Any]) -> Iterator[tuple[Any, bool]]:
     for frame in frames:
         is_damaged = frame.is_corrupt or (is_damaged and not frame.key_frame)
         yield frame, is_damaged
+
+
+def _described(codec: Any) -> str:
+    return f"{codec.name}, {codec.width}x{codec.height}"
+
+
+def _check_colours(pixels: Any) -> None:
+    """Raises FilmError for pixels as depth maps have them: of one channel, but for transparency, or of floats."""
+    if pixels is None:
+        return
+    has_one = len(pixels.components) <= 2 and max(component.bits for component in pixels.components) > _BITS
+    if has_one or "f16" in pixels.name or "f32" in pixels.name:
+        remedy = "leave a depth camera out (--cameras), or convert the film: ffmpeg -i IN -pix_fmt yuv420p OUT"
+        raise FilmError(f"a film of colours ({remedy})", f"{pixels.name}, as depth maps have")
+
+
+def _rgb(frame: Any) -> UInt8Array:
+    """uint8 [H, W, 3], equal to what ``ffmpeg -pix_fmt rgb24`` makes of the frame.
+
+    Matrix and range are passed, since PyAV before 17 takes each film for one of BT.601 and limited range. It also does
+    so where source and target are equal: they differ here, which means nothing for RGB.
+    """
+    options: dict[str, int] = {}
+    if not frame.format.is_rgb:
+        matrix = _SAME_MATRIX.get(frame.colorspace, frame.colorspace)
+        matrix = matrix if matrix in _MATRICES else _BT601
+        is_full = frame.color_range == _FULL or frame.format.name.startswith("yuvj")
+        options["src_colorspace"] = matrix
+        options["dst_colorspace"] = _BT601 if matrix == _BT709 else _BT709
+        options["src_color_range"] = _FULL if is_full else _LIMITED
+        options["dst_color_range"] = _FULL
+    image: UInt8Array = frame.reformat(format="rgb24", interpolation="BICUBIC", **options).to_ndarray()
+    return image
+
+
+def _shown(image: UInt8Array, matrix: np.ndarray[Any, np.dtype[np.int32]]) -> UInt8Array:
+    """The image by a display matrix: x' = a x + c y, y' = b x + d y, y downwards (ISO 14496-12)."""
+    a, b, _, c, d = (float(value) for value in matrix[:5])
+    is_turned = max(abs(a), abs(d)) <= _NEARLY * min(abs(b), abs(c))
+    if not is_turned and max(abs(b), abs(c)) > _NEARLY * min(abs(a), abs(d)):
+        got = f"one that is turned by {math.degrees(math.atan2(b, a)):.1f} degrees, or skewed"
+        raise FilmError("a film that is shown upright or by quarter turns (turn it: ffmpeg -i IN OUT)", got)
+    across, down = (c, b) if is_turned else (a, d)
+    image = image.swapaxes(0, 1) if is_turned else image
+    return image[:: -1 if down < 0 else 1, :: -1 if across < 0 else 1]
 
 
 def _matroska_bytes(file: BinaryIO) -> int | None:

@@ -18,8 +18,19 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.contract.numbers import checked_finite, checked_positive
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.film_files import DAMAGED, UNDAMAGED, broken_off, judged, upright
+from rfm_client.data.film_files import (
+    DAMAGED,
+    UNDAMAGED,
+    FilmError,
+    broken_off,
+    film_packets,
+    film_stream,
+    import_av,
+    judged,
+    upright,
+)
 from rfm_client.data.lerobot_videos import check_film_behind, check_local_film
 
 DOWNLOAD_TIMEOUT_S = 60.0
@@ -57,9 +68,9 @@ def read_video(
     """uint8 [T, H, W, 3], the frames at ``fps`` of a video file or http(s) URL; None: all of them.
 
     Frames are counted, not timed: in a video of variable frame rate, T is that of its average rate, and frames are
-    even in number, not in time. A video that is to be shown turned (as phones film) is turned upright; one that is to
-    be shown mirrored is not. Of all decoded frames only those that are returned are held in memory. A URL is
-    downloaded once, to a temporary file.
+    even in number, not in time. Colours are those of ``ffmpeg -pix_fmt rgb24``, whatever PyAV is installed. A video
+    that is to be shown turned (as phones film) or mirrored is. Of all decoded frames only those that are returned are
+    held in memory. A URL is downloaded once, to a temporary file.
 
     start_s, end_s: only the frames from here to before there, by their time stamps; None: from the start, to the end
     timeout_s: the longest that the server of a URL may be silent
@@ -68,16 +79,12 @@ def read_video(
         name other files or addresses, which are then opened; None: whatever it looks like
 
     Raises InvalidSampleError for what is no video, breaks off, or cannot be had, for a damaged frame among those that
-    are returned, and for a file of several LeRobot episodes (``lerobot_videos``) unless ``start_s`` and ``end_s`` name
-    a part of it.
+    are returned, for a file of several films or of depth maps, and for one of several LeRobot episodes
+    (``lerobot_videos``) unless ``start_s`` and ``end_s`` name a part of it.
     """
-    try:
-        import av
-    except ImportError as error:
-        raise ImportError('video files need PyAV: pip install "./client[video]"') from error
-    if fps is not None and not 0 < fps < math.inf:
-        raise InvalidSampleError.at("fps", "a number above 0", repr(fps))
-    try:
+    av = import_av()
+    _check_numbers(fps, start_s, end_s, timeout_s)
+    with _errors_of(source):
         if start_s is None or end_s is None:
             check_film_behind(str(source)) if is_url(source) else check_local_film(source)
         with _opened(source, timeout_s) as file:
@@ -85,10 +92,6 @@ def read_video(
             if (start_s, end_s) == (None, None):
                 return _sampled(decoder, fps)
             return _part(decoder, fps, start_s, end_s)
-    except InvalidSampleError as error:
-        raise InvalidSampleError(f"{error} ({source})") from error
-    except (av.FFmpegError, OSError) as error:
-        raise InvalidSampleError.at("video", _EXPECTED, f"{error.strerror or error} ({source})") from error
 
 
 def frame_times_s(file: str | Path, num_frames: int, *, container: str | None = None) -> npt.NDArray[np.float64] | None:
@@ -96,14 +99,37 @@ def frame_times_s(file: str | Path, num_frames: int, *, container: str | None = 
 
     container: as in ``read_video``
     """
-    import av
-
-    with av.open(str(file), format=container) as opened:
-        packets = [packet for packet in opened.demux(video=0) if packet.size]
+    with _errors_of(file), import_av().open(str(file), format=container) as opened:
+        packets = film_packets(opened, film_stream(opened))
         times = sorted(float(packet.pts * packet.time_base) for packet in packets if packet.pts is not None)
     if len(times) < num_frames:
         return None
     return np.array(times)[_spread(len(times), num_frames)] - times[0]
+
+
+@contextmanager
+def _errors_of(source: str | Path) -> Iterator[None]:
+    """Raises InvalidSampleError with the source for what goes wrong inside."""
+    try:
+        yield
+    except FilmError as error:
+        raise InvalidSampleError.at("video", error.expected, f"{error.got} ({source})") from error
+    except InvalidSampleError as error:
+        raise InvalidSampleError(f"{error} ({source})") from error
+    except (import_av().FFmpegError, OSError) as error:
+        raise InvalidSampleError.at("video", _EXPECTED, f"{error.strerror or error} ({source})") from error
+
+
+def _check_numbers(fps: float | None, start_s: float | None, end_s: float | None, timeout_s: float) -> None:
+    try:
+        checked_positive("timeout_s", timeout_s)
+        for where, number in (("fps", fps), ("end_s", end_s)):
+            if number is not None:
+                checked_positive(where, number)
+        if start_s is not None and checked_finite("start_s", start_s) < 0:
+            raise ValueError(f"start_s: expected 0 or more, got {start_s}")
+    except ValueError as error:
+        raise InvalidSampleError(str(error)) from None
 
 
 def _spread(total: int, count: int) -> npt.NDArray[np.int64]:
@@ -192,10 +218,8 @@ class _Decoder:
         if missing is not None:
             raise InvalidSampleError.at("video", _WHOLE, missing)
         with self._opened() as container:
-            if not container.streams.video:
-                raise InvalidSampleError.at("video", _EXPECTED, "none")
-            stream = container.streams.video[0]
-            are_broken = [packet.is_corrupt for packet in container.demux(stream) if packet.size]
+            stream = film_stream(container)
+            are_broken = [packet.is_corrupt for packet in film_packets(container, stream)]
             if are_broken and are_broken[-1]:
                 raise InvalidSampleError.at("video", _WHOLE, f"one that breaks off in frame {len(are_broken) - 1}")
             return len(are_broken), float(stream.average_rate or 0)
@@ -203,14 +227,14 @@ class _Decoder:
     def times_s(self) -> npt.NDArray[np.float64]:
         """float64 [T], the time stamps of the packets that have one, in order."""
         with self._opened() as container:
-            packets = [packet for packet in container.demux(video=0) if packet.size and packet.pts is not None]
-            return np.sort([float(packet.pts * packet.time_base) for packet in packets])
+            packets = film_packets(container, film_stream(container))
+            return np.sort([float(packet.pts * packet.time_base) for packet in packets if packet.pts is not None])
 
     def frames(self, indices: Collection[int]) -> tuple[list[UInt8Array], int]:
         """The frames of these indices, and how many there are in all. Raises InvalidSampleError for a damaged one."""
         wanted, picked, total = set(indices), [], 0
         with self._opened() as container:
-            for frame, is_damaged in judged(container.decode(video=0)):
+            for frame, is_damaged in judged(container.decode(film_stream(container))):
                 self._take(frame.width * frame.height * _RGB_BYTES if total in wanted else 0)
                 if total in wanted:
                     if is_damaged:

@@ -17,6 +17,7 @@ from typing import Any
 import av
 
 from rfm_client.data.datasets.films import Span
+from rfm_client.data.film_files import FilmError, film_stream
 
 MEDIA_TYPE = "video/mp4"
 
@@ -32,10 +33,10 @@ def cut(span: Span, target: Path, take: Callable[[int], object]) -> None:
     """
     try:
         with av.open(str(span.file), format=_CONTAINER) as film:
-            if not film.streams.video:
-                raise span.error("a video stream", "none")
-            packets = _packets(film, span, take)
-            _write(target, film.streams.video[0], packets)
+            stream = film_stream(film)
+            _write(target, stream, _packets(film, stream, span, take))
+    except FilmError as error:
+        raise span.error(error.expected, error.got) from error
     except (av.FFmpegError, OSError) as error:
         raise span.error("a film of the episode", error.strerror or str(error)) from error
     modified = span.file.stat()
@@ -54,8 +55,7 @@ class _Packets:
     end: int
 
 
-def _packets(film: Any, span: Span, take: Callable[[int], object]) -> _Packets:
-    stream = film.streams.video[0]
+def _packets(film: Any, stream: Any, span: Span, take: Callable[[int], object]) -> _Packets:
     tick_s = float(stream.time_base)
 
     def ticks(time_s: float) -> int:

@@ -108,9 +108,9 @@ class ShownDataset:
         cameras = self.dataset.info.films
         if not 0 <= camera < len(cameras):
             raise UnknownError(f"camera: expected one of {len(cameras)} with films, got {camera}")
-        span = self.dataset.span(self._episode(number), cameras[camera])
-        _check_inside(self.root, span.file)
-        return span
+        episode = self._episode(number)
+        _check_inside(self.root, self.dataset.film(episode, cameras[camera]))
+        return self.dataset.span(episode, cameras[camera])
 
     def without_folder(self, message: str) -> str:
         """A message for people elsewhere, whom the place of the dataset on this machine does not concern."""

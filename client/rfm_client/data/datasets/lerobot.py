@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """LeRobot datasets of all versions, without LeRobot: frame t is the dataset's frame t. Needs pyarrow, and PyAV.
 
-A frame in a film is found by its time stamp: where the episode begins in the film, plus the row's own.
+A film has as many frames as the rows of its episodes, at the same times (``lerobot_films``), or it is refused.
 """
 
 from __future__ import annotations
@@ -16,13 +16,18 @@ import numpy as np
 
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.datasets import lerobot_v21, lerobot_v30
-from rfm_client.data.datasets.films import Packets, Span, Times, decode
+from rfm_client.data.datasets.films import Span, Times, decode
+from rfm_client.data.datasets.lerobot_films import Film, Part
 from rfm_client.data.datasets.lerobot_info import Info
 from rfm_client.data.datasets.lerobot_rows import Entry, RowReader, read_table
 from rfm_client.data.datasets.protocol import Contents, DatasetError, Episode, GivenTask, contents_of, orientations_of
+from rfm_client.data.film_files import decoder
 from rfm_client.data.orientation import Orient, turned
 
 FILMS_AT_A_TIME = 4  # whose tables of packets are kept in memory
+
+_COLOURS = ("1", "L", "LA", "P", "RGB", "RGBA")  # Pillow's names of what has 8 bits a channel, or fewer
+_DEEP = ";16"  # how Pillow names 16 bits a channel that it cuts to 8
 
 
 class LeRobotDataset:
@@ -49,9 +54,10 @@ class LeRobotDataset:
         self.source = source or root.resolve().name
         self.revision = revision
         self.info = Info.read(root)
-        self._packets = lru_cache(FILMS_AT_A_TIME)(Packets.read)
+        self._film = lru_cache(FILMS_AT_A_TIME)(self._read_film)
         version = lerobot_v30 if self.info.version == "v3.0" else lerobot_v21
-        self._entries = {entry.index: entry for entry in version.read_entries(root, self.info)}
+        entries: Iterator[Entry] = version.read_entries(root, self.info)
+        self._entries = {entry.index: entry for entry in entries}
         self._task = task
         self._rows = RowReader({} if task.overrides else version.read_tasks(root), task)
         self.orientations = orientations_of(orient, self.cameras)
@@ -82,9 +88,11 @@ class LeRobotDataset:
     def check(self, episode: Episode, camera: str) -> Contents:
         """What the episode's frames are made of; each is there. Raises DatasetError."""
         if camera in self.info.films:
-            span = self.span(episode, camera)
-            return self._packets(span.file).check(span)
-        return contents_of(self._images(episode, camera))
+            return self._film(camera, self.film(episode, camera)).contents(episode.index)
+        images = self._images(episode, camera)
+        for t, image in enumerate(images):
+            _opened_image(self._where(episode, camera, t), image)
+        return contents_of(images)
 
     def frames(self, episode: Episode, camera: str) -> Iterator[UInt8Array]:
         """The episode's frames, uint8 [H, W, 3], turned as ``orientations`` says. Raises DatasetError."""
@@ -101,16 +109,39 @@ class LeRobotDataset:
         """float64 [T], when each frame was taken, from the start of the episode. Raises DatasetError."""
         return self._rows.read(self._entries[episode.index]).times_s
 
+    def film(self, episode: Episode, camera: str) -> Path:
+        """The film of a camera, one of ``info.films``, that the episode is in."""
+        return self._entries[episode.index].films[camera][0]
+
     def span(self, episode: Episode, camera: str) -> Span:
-        """Where the episode's frames are in the film of a camera, one of ``info.films``. Raises DatasetError."""
-        entry = self._entries[episode.index]
-        file, from_s = entry.films[camera]
-        return Span(file, from_s + self.times_s(episode), 0.5 / self.info.fps, f"{entry.where}: {camera}")
+        """Where the episode's frames are in that film. Raises DatasetError if its frames and rows differ."""
+        film = self._film(camera, self.film(episode, camera))
+        return film.span(episode.index, f"{episode.name}: {camera}", self.info.fps)
 
     def files(self) -> set[Path]:
         """The tables and films that the episodes are in."""
         entries = self._entries.values()
         return {entry.data_file for entry in entries} | {film for entry in entries for film, _ in entry.films.values()}
+
+    def decoder(self, camera: str) -> str | None:
+        """PyAV or Pillow, with the versions that decide what a picture looks like."""
+        return decoder() if camera in self.info.films else _pillow()
+
+    @cached_property
+    def _in_film(self) -> Mapping[tuple[str, Path], Sequence[Entry]]:
+        """The episodes in each film of each camera."""
+        found: dict[tuple[str, Path], list[Entry]] = {}
+        for entry in self._entries.values():
+            for camera, (file, _) in entry.films.items():
+                found.setdefault((camera, file), []).append(entry)
+        return found
+
+    def _read_film(self, camera: str, file: Path) -> Film:
+        parts = [
+            Part(entry.index, entry.where, entry.films[camera][1] + self._rows.read(entry).times_s)
+            for entry in self._in_film[camera, file]
+        ]
+        return Film.read(file, camera, parts, self.info.fps)
 
     def _episode(self, entry: Entry) -> Episode:
         rows = self._rows.read(entry)
@@ -149,12 +180,33 @@ class LeRobotDataset:
 
 
 def _decoded_image(where: str, image: bytes) -> UInt8Array:
-    try:
-        from PIL import Image, UnidentifiedImageError
-    except ImportError as error:
-        raise ImportError('datasets of images need Pillow: pip install "./client[label]"') from error
-    try:
-        with Image.open(io.BytesIO(image)) as opened:
+    with _opened_image(where, image) as opened:
+        try:
             return np.asarray(opened.convert("RGB"))
+        except OSError as error:
+            raise DatasetError.at(where, "an image", str(error)) from error
+
+
+def _opened_image(where: str, image: bytes) -> Any:
+    """A picture of which only the head is read. Raises DatasetError for what is none of 8-bit colours."""
+    _pillow()
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        opened = Image.open(io.BytesIO(image))
     except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         raise DatasetError.at(where, "an image", str(error)) from error
+    is_deep = _DEEP in str(opened.tile)
+    if opened.mode not in _COLOURS or is_deep:
+        expected = "a picture of 8-bit colours (convert it, or leave a depth camera out: --cameras)"
+        raise DatasetError.at(where, expected, f"{opened.mode}{' of 16 bits' if is_deep else ''}, as Pillow names it")
+    return opened
+
+
+def _pillow() -> str:
+    """Pillow with its version. Raises ImportError that names the extra."""
+    try:
+        import PIL
+    except ImportError as error:
+        raise ImportError('datasets of images need Pillow: pip install "./client[label]"') from error
+    return f"Pillow {PIL.__version__}"

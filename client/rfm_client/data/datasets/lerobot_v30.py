@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +27,9 @@ def read_entries(root: Path, info: Info) -> Iterator[Entry]:
     if not files:
         raise DatasetError.at(root / EPISODES_FOLDER, "Parquet files", "none")
     of_films = [f"videos/{key}/{name}" for key in info.films for name in _OF_A_FILM]
-    entries = [
-        _entry(root, info, file, row)
-        for file in files
-        for row in read_table(file, [*_OF_AN_EPISODE, *of_films]).to_pylist()
-    ]
-    for key in info.films:
-        _check_apart(info, key, entries)
-    yield from entries
+    for file in files:
+        for row in read_table(file, [*_OF_AN_EPISODE, *of_films]).to_pylist():
+            yield _entry(root, info, file, row)
 
 
 def read_tasks(root: Path) -> dict[int, str | None]:
@@ -79,12 +73,3 @@ def _film(root: Path, info: Info, where: str, row: dict[str, Any], key: str) -> 
         expected, got = f"{expected_s:.4f} s for {row['length']} frames", f"{to_s - from_s:.4f} s"
         raise DatasetError.at(f"{where}: videos/{key}: from_timestamp to to_timestamp", expected, got)
     return info.path(root, info.video_path, video_key=key, chunk_index=chunk, file_index=number), float(from_s)
-
-
-def _check_apart(info: Info, key: str, entries: list[Entry]) -> None:
-    """Raises DatasetError for two episodes that share frames of a film."""
-    spans = sorted((*entry.films[key], entry.length / info.fps, entry.where) for entry in entries)
-    for (file, from_s, duration_s, where), (next_file, next_s, _, next_where) in pairwise(spans):
-        if file == next_file and next_s < from_s + duration_s - 0.5 / info.fps:
-            expected = f"a start at {from_s + duration_s:.4f} s or later, behind {where}"
-            raise DatasetError.at(f"{next_where}: {file}", expected, f"{next_s:.4f} s")

@@ -22,9 +22,9 @@ from rfm_client.data.datasets.protocol import (
     Episode,
     GivenTask,
     chosen_cameras,
-    digest_of,
     orientations_of,
 )
+from rfm_client.data.film_files import decoder
 from rfm_client.data.lerobot_videos import check_local_film
 from rfm_client.data.orientation import Orient, turned
 
@@ -74,11 +74,14 @@ class VideoFolder:
         self._task.check_used(episodes)
         return episodes
 
+    def decoder(self, camera: str) -> str | None:
+        """PyAV, with the versions that decide what a frame looks like."""
+        return decoder()
+
     def check(self, episode: Episode, camera: str) -> Contents:
         """What the video's frames are made of. Raises DatasetError."""
         chosen_cameras(self, [camera])
-        packets = self._packets(self.root / episode.name)
-        return Contents(digest_of(packets.digests), sum(packets.sizes))
+        return self._packets(self.root / episode.name).contents()
 
     def frames(self, episode: Episode, camera: str) -> Iterator[UInt8Array]:
         """The video's frames, uint8 [H, W, 3], turned as ``orientations`` says. Raises DatasetError."""
