@@ -121,6 +121,23 @@ def test_score_passes_its_options_on(served: Served, video: Path, words: list[ob
     np.testing.assert_allclose(scored["frame_times_s"], np.linspace(0, 31, 10).astype(int) / clip.FPS)
 
 
+def test_score_and_compare_turn_frames_as_they_are_told(served: Served, video: Path, tmp_path: Path) -> None:
+    upright, stored = load_trajectory(video, fps=3.0).frames, tmp_path / "upside_down.npy"
+    assert upright is not None
+    np.save(stored, upright[:, ::-1])
+    asked = ("--task", TASK, "--orient", "flip-vertical", "--json")
+    told = json.loads(ask(served, "score", stored, *asked).stdout)
+    compared = json.loads(ask(served, "compare", stored, video, *asked).stdout)
+    assert told["orient"] == compared["orient"] == "flip-vertical"
+    first, second = (Trajectory(frames=frames, task=TASK) for frames in (upright, upright[:, ::-1]))
+    with served.client("grpc", MODEL) as client:
+        expected = client.progress(first)
+        preference = client.preference(first, second).preference
+        assert not np.allclose(expected.progress, client.progress(second).progress, atol=100 * TOLERANCE)
+    assert_scores(told["videos"][0], expected)
+    assert compared["preference"] == pytest.approx(preference, abs=TOLERANCE)
+
+
 @pytest.mark.parametrize("limit", [4, 24])
 def test_score_takes_at_most_as_many_frames_as_it_is_told_and_the_checkpoint_reads(
     served: Served, video: Path, limit: int
