@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,7 +102,7 @@ class ServeConfig(Settings):
     ``host`` may be written as a URL, as in the FastAPI server's file; it is the address alone here.
     """
 
-    host: str = setting(DEFAULT_HOST, "Address to listen on.")
+    host: str = setting(DEFAULT_HOST, "IP address to listen on, 0.0.0.0 or :: for all of IPv4 or IPv6.")
     http_port: int = setting(8000, "Triton's HTTP port.", **_PORT)
     grpc_port: int = setting(8001, "Triton's gRPC port.", **_PORT)
     metrics_port: int = setting(8002, "Port of Triton's metrics.", **_PORT)
@@ -114,17 +115,15 @@ class ServeConfig(Settings):
     )
     grpc_key: Path | None = setting(None, "The certificate's key (PEM).")
     grpc_client_ca: Path | None = setting(None, "Authorities (PEM) of gRPC's clients, which then need a certificate.")
-    canary_s: int = setting(2, "Seconds from one health probe of a model to the next.", least=1)
-    hang_s: int = setting(30, "Seconds without progress after which a model is loaded again.", least=1)
+    canary_s: int = setting(2, "Seconds from one health probe of a model to the next.", **_COUNT)
+    hang_s: int = setting(30, "Seconds without progress after which a model is loaded again.", **_COUNT)
     triton_silent_s: int = setting(
-        10, "Seconds that Triton may give no answer before it is killed and restarted.", least=1
+        10, "Seconds that Triton may give no answer before it is killed and restarted.", **_COUNT
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "host", _address(self.host))
-        if ":" in self.host:
-            raise ConfigError("host", f"expected an address without port (http_port), got {self.host!r}")
         if (self.grpc_certificate is None) != (self.grpc_key is None):
             raise ConfigError("grpc_certificate, grpc_key", "expected both or none, got one")
         if self.grpc_client_ca is not None and self.grpc_certificate is None:
@@ -137,6 +136,16 @@ class ServeConfig(Settings):
 
 
 def _address(host: str) -> str:
-    """The address in a host that may be written as a URL."""
+    """The IP address in a host that may be written as a URL. Raises ConfigError."""
     address = (host.partition("://")[2] or host).rstrip("/")
-    return DEFAULT_HOST if address == "localhost" else address
+    if address == "localhost":
+        return DEFAULT_HOST
+    if address.startswith("[") and address.endswith("]"):
+        address = address[1:-1]
+    try:
+        if "%" in address:  # a zone, which Triton's HTTP server does not take
+            raise ValueError
+        return str(ipaddress.ip_address(address))
+    except ValueError:  # Triton would listen for a name at 255.255.255.255
+        expected = "an IP address without port (http_port), such as 127.0.0.1, ::1, 0.0.0.0 or ::"
+        raise ConfigError("host", f"expected {expected}, got {address!r:.200}") from None

@@ -23,12 +23,20 @@ from rfm.launch.process import Endpoints, TritonServer, short_spin
 from rfm.launch.temporary import stopped_by_signals, temporary_server
 from rfm.supervise.supervisor import Supervisor
 from rfm_client import RewardError
+from rfm_client.cli.options import Fps, finite
+from rfm_client.contract.listening import from_here
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.settings import ConfigError
+
+try:
+    import rfm_gateway  # noqa: F401  before the modules below, which import parts of it
+except ModuleNotFoundError:
+    raise SystemExit("rfm: expected the package rfm-gateway, got none: pip install ./client ./gateway .") from None
 from rfm_commands.config import Config
 from rfm_commands.label import label
 from rfm_commands.models import AdminKeyFile
 from rfm_commands.models import app as models_app
+from rfm_commands.rollout import names_of
 from rfm_gateway.command import gateway, gateway_command
 from rfm_gateway.config import GatewayConfig
 from rfm_gateway.options import Given, with_options
@@ -165,14 +173,14 @@ def serve(
             ends_with_parent=True,
         )
         status = _supervisor(server, config).run()
-    except (AdminKeyError, ServerStartError) as error:
+    except (AdminKeyError, ServerStartError, OSError) as error:
         _fail(str(error))
     raise typer.Exit(status)
 
 
 def _supervisor(server: TritonServer, config: Config) -> Supervisor:
     """What runs the server, and a gateway if the configuration has one."""
-    gateway = None if config.gateway.port is None else _beside(server.endpoints, config)
+    gateway = None if config.gateway.port is None else _beside(server, config)
     return Supervisor(
         server,
         gateway=None if gateway is None else gateway_command(gateway),
@@ -184,20 +192,24 @@ def _supervisor(server: TritonServer, config: Config) -> Supervisor:
     )
 
 
-def _beside(endpoints: Endpoints, config: Config) -> GatewayConfig:
+def _beside(server: TritonServer, config: Config) -> GatewayConfig:
     """The gateway before this server: what its section leaves open is the server's. It could start now."""
-    gateway = config.gateway
+    gateway, endpoints = config.gateway, server.endpoints
+    behind = replace(endpoints, host=from_here(endpoints.host))
     filled = replace(
         gateway,
         host=gateway.host or (endpoints.http_host if gateway.certificate is None else endpoints.host),
-        triton=gateway.triton or (endpoints.grpc_url if endpoints.grpc_tls is None else endpoints.http_url),
-        metrics_url=gateway.metrics_url or endpoints.metrics_url,
+        triton=gateway.triton or (behind.grpc_url if behind.grpc_tls is None else behind.http_url),
+        metrics_url=gateway.metrics_url or behind.metrics_url,
         model=gateway.model or config.export.name,
     )
     try:
         filled.check(os.environ)
     except (OSError, ValueError) as error:
         _fail(f"gateway: {error}")
+    names = names_of(server.repository)
+    if gateway.triton is None and names and filled.model not in names:
+        _fail(f"gateway: model: expected one of {', '.join(names)}, got {filled.model}; --gateway-model names another")
     return filled
 
 
@@ -208,7 +220,9 @@ def tune(
     config_file: ConfigFile = None,
     callers: Annotated[int, typer.Option(min=1, help="Callers at a time, each with one sample.")] = 32,
     frames: Annotated[bool, typer.Option("--frames", help="Send raw frames instead of embeddings.")] = False,
-    seconds: Annotated[float, typer.Option(min=0.1, help="Seconds that each measurement takes.")] = 3.0,
+    seconds: Annotated[
+        float, typer.Option(min=0.1, callback=finite, help="Seconds that each measurement takes.")
+    ] = 3.0,
     rounds: Annotated[int, typer.Option(min=1, help="How often each setting is measured.")] = 3,
     tritonserver: TritonPath = None,
 ) -> None:
@@ -242,7 +256,7 @@ app.add_typer(models_app, name="models")
 def demo(
     video: Annotated[Path, typer.Option(help="Video file to score.")],
     task: Annotated[str, typer.Option(help="What is to be done in the video, as a sentence.")],
-    fps: Annotated[float, typer.Option(help="Frames a second that are scored.")] = 3.0,
+    fps: Fps = 3.0,
     repository: Annotated[Path, typer.Option(help="Repository to serve, if no checkpoint is given.")] = DEMO,
     output: Annotated[Path, typer.Option(help="Folder for the plot and Triton's log.")] = Path("demo_output"),
     tritonserver: TritonPath = None,
@@ -266,7 +280,7 @@ def demo(
             with temporary_server(repository, output / "tritonserver.log", tritonserver) as endpoints:
                 score_video(endpoints, video, task, fps, output / "rewards.png", console)
                 show_metrics(endpoints, console)
-        except (CheckpointError, rfm_export.ExportError, ServerStartError, RewardError) as error:
+        except (CheckpointError, rfm_export.ExportError, ServerStartError, RewardError, OSError) as error:
             _fail(str(error))
 
 

@@ -11,8 +11,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
 
-import torch
-
 from rfm import families
 from rfm.checkpoint import training
 from rfm.checkpoint.digest import settings_digest, weights_digest
@@ -22,6 +20,7 @@ from rfm.family import Checkpoint, FrameEncoders
 from rfm_client import ProgressResult, ProgressSample, RewardError, Trajectory
 from rfm_client.contract.samples import Footage, UInt8Array
 from rfm_client.labelling import CheckpointFacts
+from rfm_export.device import device_named
 
 
 class EngineScorer:
@@ -33,17 +32,18 @@ class EngineScorer:
     """
 
     def __init__(self, source: str, *, device: str = "cpu", **options: Any) -> None:
-        """The scorer of a checkpoint folder or Hugging Face id. Raises CheckpointError.
+        """The scorer of a checkpoint folder or Hugging Face id. Raises CheckpointError, and ExportError for a device.
 
         options: as in ``rfm.families.load``
         """
+        on = device_named(device)
         self._checkpoint = families.load(source, **options)
         self._encoders = self._checkpoint.encoders()
-        told = {"device": torch.device(device).type, **{name: _named(value) for name, value in options.items()}}
+        told = {"device": on.type, **{name: _named(value) for name, value in options.items()}}
         folders = _folders(source, options)
         self._facts = _facts(source, self._checkpoint, self._encoders, folders, told)
         self.notes = training.notes(folders[0], (training.PROGRESS, training.SUCCESS))
-        self._device = device
+        self._device = on
         self._lock = threading.Lock()
 
     def checkpoint(self) -> CheckpointFacts:

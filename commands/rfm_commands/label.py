@@ -15,6 +15,7 @@ from rfm_client.cli.label import Source
 from rfm_client.cli.label_flags import LabelFlags, with_label_flags
 from rfm_client.cli.options import missing_package
 from rfm_client.labelling import Scorer
+from rfm_export.errors import ExportError
 
 EXIT_FAILED = 1
 
@@ -63,7 +64,7 @@ def _errors_on_one_line(say: Callable[[str], None]) -> Iterator[None]:
         yield
     except ImportError as error:
         say(missing_package(error))
-    except (CheckpointError, RewardError, OSError) as error:
+    except (CheckpointError, ExportError, RewardError, OSError) as error:
         say(str(error))
     else:
         return

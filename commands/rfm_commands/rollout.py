@@ -31,12 +31,12 @@ from google.protobuf.text_format import ParseError
 from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
+from rfm.launch.repository_folder import CONFIG_FILE, models_in, no_models
 from rfm_client import PreferenceSample, ProgressSample, RewardError
 from rfm_client.contract import wire
 from rfm_client.contract.made_up import random_trajectory
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_export.errors import ExportError
-from rfm_export.layout import CONFIG_FILE
 from rfm_export.pbtxt import serving_versions
 from rfm_export.publish import alone, config_of, read_config, replace_config, staging
 
@@ -60,8 +60,15 @@ def models_of(repository: Path, name: str) -> list[str]:
     names = (encoder_name(name), name, frames_name(name))
     models = [model for model in names if (repository / model / CONFIG_FILE).is_file()]
     if not models:
-        raise RolloutError(f"{repository}: expected a model {name} (rfm export --name), got none")
+        there = ", ".join(names_of(repository))
+        raise RolloutError(f"{repository}: expected one of {there}, got {name}" if there else no_models(repository))
     return models
+
+
+def names_of(repository: Path) -> list[str]:
+    """The names with which the repository's models were exported, `rfm export --name`."""
+    endings = frames_name(""), encoder_name("")
+    return sorted({model.removesuffix(endings[0]).removesuffix(endings[1]) for model in models_in(repository)})
 
 
 def previous_version(repository: Path, name: str, server: RepositoryApi) -> int:

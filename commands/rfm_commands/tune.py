@@ -18,14 +18,16 @@ from tempfile import TemporaryDirectory
 import yaml
 from tritonclient.grpc import model_config_pb2 as pb
 
+from rfm.launch.repository_folder import CONFIG_FILE, models_in, no_models
 from rfm.launch.temporary import temporary_server
 from rfm.parameters import THREADS_PARAMETER
 from rfm_client import AsyncRewardClient, ProgressSample, RewardClient, Sample
 from rfm_client.cli.toy import SampleKind, Toy
 from rfm_commands.config import File
 from rfm_export.errors import ExportError
-from rfm_export.layout import CONFIG_FILE, lay_out
-from rfm_export.pbtxt import parse, render
+from rfm_export.layout import lay_out
+from rfm_export.pbtxt import render
+from rfm_export.publish import read_config
 
 AS_FAST = 0.95  # of the highest rate: closer than that, rates do not separate settings
 INSTANCES_PER_GPU = (1, 2, 3)
@@ -89,7 +91,7 @@ class Sweep:
         """
         batched = [config for config in _configs(self.repository).values() if config.instance_group]
         if not batched:
-            raise ExportError(f"{self.repository}: expected an exported repository, got no model of one")
+            raise ExportError(no_models(self.repository))
         (group,), batch_size = batched[0].instance_group, batched[0].max_batch_size
         if group.kind == pb.ModelInstanceGroup.KIND_GPU:
             threads = int(batched[0].parameters[THREADS_PARAMETER].string_value)
@@ -196,4 +198,4 @@ def _apply(setting: Setting, repository: Path) -> None:
 
 
 def _configs(repository: Path) -> dict[str, pb.ModelConfig]:
-    return {file.parent.name: parse(file.read_text()) for file in sorted(repository.glob(f"*/{CONFIG_FILE}"))}
+    return {name: read_config(repository, name) for name in models_in(repository)}

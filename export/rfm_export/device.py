@@ -41,7 +41,8 @@ def device_named(name: str) -> torch.device:
     there = ["cpu", "cuda", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
     there = there if torch.cuda.is_available() else there[:1]
     if name not in there:
-        raise ExportError(f"device: expected one of {', '.join(there)}, got {name}")
+        why = "" if torch.cuda.is_available() else f": PyTorch {torch.__version__} finds no GPU; --device cpu"
+        raise ExportError(f"device: expected one of {', '.join(there)}, got {name}{why}")
     return torch.device(name)
 
 

@@ -101,7 +101,8 @@ def _check_gpus(num_gpus: int | None) -> None:
     there = torch.cuda.device_count()
     if num_gpus is not None and num_gpus > there:
         raise ExportError(
-            f"num_gpus: expected at most {there}, got {num_gpus}; --other-machine exports for a machine with more GPUs"
+            f"num_gpus: expected at most {there}, got {num_gpus}; --other-machine exports for a machine with more, "
+            "--num-gpus 0 for the CPU"
         )
 
 

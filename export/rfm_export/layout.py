@@ -16,6 +16,7 @@ from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.config import ExportConfig
 from rfm.family import Description, EncodersDescription
+from rfm.launch.repository_folder import CONFIG_FILE
 from rfm.parameters import FAMILY_PARAMETER, FEATURE_CACHE_PARAMETER
 from rfm_client.contract import FrameSize, PreferenceSample, ProgressSample, Sample, SimilaritySample, wire
 from rfm_client.contract.made_up import blank_trajectory
@@ -29,7 +30,6 @@ from rfm_client.contract.names import encoder_name, frames_name
 from rfm_export.about import about_encoders
 from rfm_export.pbtxt import Interface, Warmup, ensemble_config, exported_settings, python_config, render
 
-CONFIG_FILE = "config.pbtxt"
 MODEL_FILE = "model.py"
 WARMUP_FOLDER = "warmup"
 KEEP_FILE = ".keep"  # Triton wants an ensemble's version folder, and git forgets empty ones

@@ -27,8 +27,9 @@ from pathlib import Path
 
 from tritonclient.grpc import model_config_pb2 as pb
 
+from rfm.launch.repository_folder import CONFIG_FILE
 from rfm_export.errors import ExportError
-from rfm_export.layout import CONFIG_FILE, WARMUP_FOLDER, GeneratedModel
+from rfm_export.layout import WARMUP_FOLDER, GeneratedModel
 from rfm_export.pbtxt import parse, render, serving_versions
 
 _SCRATCH = ".export-"
@@ -42,7 +43,7 @@ def alone(repository: Path) -> Iterator[None]:
 
     It removes what killed ones left. Raises ExportError while another one runs.
     """
-    repository.mkdir(parents=True, exist_ok=True)
+    _make_writable(repository)
     descriptor = os.open(repository, os.O_RDONLY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # given back when the process ends, however it ends
@@ -62,6 +63,24 @@ def alone(repository: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+def _make_writable(repository: Path) -> None:
+    """Makes the folder, if need be. Raises ExportError for one that an export or rollout could not change."""
+    try:
+        if (repository / CONFIG_FILE).exists():
+            raise ExportError(
+                f"{repository}: expected a repository, got a model of one: --repository {repository.parent}"
+            )
+        repository.mkdir(parents=True, exist_ok=True)
+        if not os.access(repository, os.W_OK | os.X_OK):
+            reason = errno.EROFS if os.statvfs(repository).f_flag & os.ST_RDONLY else errno.EACCES
+            raise OSError(reason, os.strerror(reason))
+    except OSError as error:
+        expected = "a folder that this user may change"
+        raise ExportError(
+            f"{repository}: expected {expected}, got: {error.strerror}; --repository names another one"
+        ) from error
 
 
 @contextmanager

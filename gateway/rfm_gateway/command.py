@@ -10,6 +10,7 @@ import sys
 import typer
 
 from rfm_client.contract.addresses import is_loopback
+from rfm_client.contract.listening import check_free, from_here, in_url
 from rfm_client.contract.settings import ConfigError, settings_of
 from rfm_gateway.config import GatewayConfig
 from rfm_gateway.options import Given, refused, with_options
@@ -36,11 +37,12 @@ def gateway(*, given: Given) -> None:
         config = GatewayConfig(**given)
         api_key, tls = config.api_key(os.environ), config.tls
         app = create_app(config, api_key)
+        host, port = config.host or DEFAULT_HOST, config.port or DEFAULT_PORT
+        check_free(host, port, "gateway", port_option="--port")
     except ConfigError as error:
         raise refused(error, GatewayConfig) from None
     except (ValueError, OSError) as error:
         raise typer.BadParameter(str(error)) from None
-    host = config.host or DEFAULT_HOST
     if api_key is None and not is_loopback(host):
         logger.warning("%s is no loopback address, and no key is required: whoever reaches it may use it", host)
     if config.viewer:
@@ -48,7 +50,7 @@ def gateway(*, given: Given) -> None:
     uvicorn.run(
         app,
         host=host,
-        port=config.port or DEFAULT_PORT,
+        port=port,
         access_log=False,
         log_config=None,
         timeout_keep_alive=KEEP_ALIVE_S,
@@ -73,6 +75,5 @@ def gateway_command(config: GatewayConfig) -> list[str]:
 def page_link(config: GatewayConfig) -> str:
     """Where a browser on this machine, or one that may reach the address, finds the page."""
     host = config.host or DEFAULT_HOST
-    shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
     scheme = "http" if config.certificate is None else "https"
-    return f"{scheme}://{shown}:{config.port or DEFAULT_PORT}/"
+    return f"{scheme}://{in_url(from_here(host))}:{config.port or DEFAULT_PORT}/"

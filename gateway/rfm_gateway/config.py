@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rfm_client.contract.addresses import MAX_PORT, check_certificate, split_url
+from rfm_client.contract.listening import check_free
 from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
 from rfm_client.transport.access import Access
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from rfm_gateway.viewer.datasets import ShownDataset
 
 MIB = 2**20
-_SHORTEST_S = 0.001
+_SHORTEST_S, _LONGEST_S = 0.001, 86_400.0  # a day
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,10 @@ class GatewayConfig(Settings):
     cors_origin: Texts = setting((), "Origin from which browsers may ask. Again for more.")
     allow_folder: Path | None = setting(None, "Folder whose files requests may name.")
     timeout: float = setting(
-        120.0, "Seconds that a request may wait, then take to arrive, then to be scored.", least=_SHORTEST_S
+        120.0,
+        "Seconds that a request may wait, then take to arrive, then to be scored.",
+        least=_SHORTEST_S,
+        most=_LONGEST_S,
     )
     max_body_mib: int = setting(512, "Largest request.", least=1)
     max_memory_mib: int = setting(1024, "What all requests under way may hold; others wait.", least=1)
@@ -104,6 +108,9 @@ class GatewayConfig(Settings):
     def check(self, environment: Mapping[str, str]) -> None:
         """Raises ValueError or OSError for what a gateway would not start with."""
         split_url(self.triton_url)
+        if self.host is not None and self.port is not None:
+            options = {"port_option": "--gateway-port", "host_option": "--gateway-host"}
+            check_free(self.host, self.port, "port", **options)
         if self.allow_folder is not None:
             self.allow_folder.resolve(strict=True)
         _ = self.access, self.tls, self.api_key(environment), self.shown_datasets()

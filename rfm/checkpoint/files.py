@@ -21,6 +21,7 @@ RUN_CONFIG = "config.yaml"
 _BEST_TAG = re.compile(r"best-.*?-(-?\d+\.\d+)-step-\d+")
 _COMMIT_DIGITS = 40
 MAX_COUNT = 2**20  # of frames: longer than any trajectory
+_LEVELS = ("*", "*/*", "*/*/*")  # below a folder: a training run's checkpoints, those of a model repository
 _PICKLES = ("*.bin", "*.pt", "*.pth", "*.ckpt", "*.pkl")
 _CONVERT = (
     "python -c \"import torch, safetensors.torch as s; weights = torch.load('{file}', map_location='cpu', "
@@ -35,6 +36,8 @@ def find(source: str | Path) -> Path:
         path = Path(source).expanduser()
         if str(source) and path.is_dir():
             return path
+        if path.is_file():
+            raise CheckpointError(f"checkpoint: expected {expected}, got the file {path}: name {path.parent}")
     except (OSError, RuntimeError) as error:
         got = f"{shown(str(source))}: {type(error).__name__}"
         raise CheckpointError(f"checkpoint: expected {expected}, got {got}") from error
@@ -128,7 +131,8 @@ def _fetch(repo_id: str, tag: str | None) -> Path:
             _fetch_run_config_of_main(repo_id)
         return folder
     except (HfHubHTTPError, HFValidationError, OSError) as error:
-        raise CheckpointError(f"{repo_id}@{tag or 'latest'}: cannot be fetched: {error}") from error
+        here = "there is no folder of this name, and from the Hub it"
+        raise CheckpointError(f"{repo_id}@{tag or 'latest'}: {here} cannot be fetched: {error}") from error
 
 
 def _fetch_run_config_of_main(repo_id: str) -> None:
@@ -157,7 +161,9 @@ def read_weights(folder: Path) -> dict[str, Tensor]:
             f"{folder}: expected {WEIGHTS}, got {pickles[0].name}: pickle files run code when loaded and are refused; "
             f"if you trust it, convert it with: {command}"
         )
-    raise CheckpointError(f"{folder}: expected {WEIGHTS} or {WEIGHTS_INDEX}, got {_listing(folder)}")
+    below = next((file.parent for level in _LEVELS for file in sorted(folder.glob(f"{level}/{WEIGHTS}*"))), None)
+    remedy = "a checkpoint's folder has it, beside config.json" if below is None else f"{below} has it"
+    raise CheckpointError(f"{folder}: expected {WEIGHTS} or {WEIGHTS_INDEX}, got {_listing(folder)}: {remedy}")
 
 
 def _read_shards(index: Path) -> dict[str, Tensor]:

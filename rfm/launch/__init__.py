@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What starts one Triton, secures it, and leaves nothing of it behind.
 
+- ``repository_folder`` is what Triton reads.
 - ``process`` is one tritonserver, from an ``installation``, with ``triton_options``; ``temporary`` has one for a while.
 - Who reaches it: the ``listen_address``, ``tls`` of its gRPC port, the ``admin_key`` of its restricted APIs.
 - ``ending`` ends processes, with the one that started them if need be; ``cleanup`` removes the shared memory and the

@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
-import socket
 import subprocess
 import time
 from collections.abc import Collection, Mapping, Sequence
@@ -25,8 +25,10 @@ from rfm.launch.installation import Installation, ServerStartError
 from rfm.launch.listen_address import check_before_start, check_version
 from rfm.launch.ports import free_ports
 from rfm.launch.repository_api import INDEX_PATH, RepositoryApi, versions_of
+from rfm.launch.repository_folder import models_in, no_models
 from rfm.launch.tls import GrpcTls, OwnTls
 from rfm.launch.triton_options import check_arguments, size_limits
+from rfm_client.contract.listening import check_free, in_url
 from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
 
 POLL_S = 0.1
@@ -36,6 +38,9 @@ MAX_REPEATS = 3  # of a start that Triton spoils: a machine that stands still fo
 ANSWER_TIMEOUT_S = 10.0  # of one that starts
 NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # a `load` would load all versions anew: their folders have changed
 SECRETS = (VARIABLE, GATEWAY_KEY_VARIABLE)  # variables that neither Triton nor a model process needs
+# Of Triton and of PyTorch, where a model is to be on a GPU that the machine, or its PyTorch, lacks.
+_LACKS_GPU = re.compile(r"unsupported gpu id|KIND_GPU|compiled with CUDA|no NVIDIA driver")
+EXPORT_HERE = "; they were exported for GPUs that this machine lacks: export again here (--num-gpus 0: for the CPU)"
 _REGIONS = "--backend-config=python,shm-region-prefix-name="
 
 
@@ -72,7 +77,7 @@ class Endpoints:
     @property
     def http_url(self) -> str:
         """URL at which RewardClient reaches the server over HTTP."""
-        return f"http://{self.http_host}:{self.http_port}"
+        return f"http://{in_url(self.http_host)}:{self.http_port}"
 
     @property
     def http_host(self) -> str:
@@ -82,12 +87,12 @@ class Endpoints:
     @property
     def grpc_url(self) -> str:
         """URL at which RewardClient reaches the server over gRPC."""
-        return f"{'grpc' if self.grpc_tls is None else 'grpcs'}://{self.host}:{self.grpc_port}"
+        return f"{'grpc' if self.grpc_tls is None else 'grpcs'}://{in_url(self.host)}:{self.grpc_port}"
 
     @property
     def metrics_url(self) -> str:
         """URL of the metrics that Prometheus scrapes."""
-        return f"http://{self.host}:{self.metrics_port}/metrics"
+        return f"http://{in_url(self.host)}:{self.metrics_port}/metrics"
 
     def check_free(self) -> None:
         """Raises ServerStartError for a port that is taken or an address that is not this machine's."""
@@ -98,12 +103,9 @@ class Endpoints:
         )
         for name, host, port in listening:
             try:
-                socket.create_server((host, port)).close()
-            except (OSError, OverflowError) as error:
-                expected = f"a free port of this machine at {host}:{port}"
-                number = getattr(error, "errno", None)
-                reason = os.strerror(number) if number and number > 0 else str(error)
-                raise ServerStartError(f"{name}: expected {expected}, got: {reason}") from error
+                check_free(host, port, name, port_option=f"--{name.lower()}-port")
+            except ValueError as error:
+                raise ServerStartError(str(error)) from None
 
 
 class SpoiltStartError(ServerStartError):
@@ -159,7 +161,7 @@ class TritonServer:
     @property
     def models(self) -> list[str]:
         """The names of the models in the repository."""
-        return sorted(file.parent.name for file in self.repository.glob("*/config.pbtxt"))
+        return models_in(self.repository)
 
     @property
     def pid(self) -> int:
@@ -206,7 +208,7 @@ class TritonServer:
         models = self.models
         self._loading = frozenset(models if restored is None else ())
         if not models:
-            raise ServerStartError(f"repository: expected a folder of models, got {self.repository}")
+            raise ServerStartError(no_models(self.repository))
         own = self._arguments(sorted(models if restored is None else restored))
         check_arguments(self._more_arguments, [*own, _REGIONS])
         self._check_listen_address()
@@ -278,7 +280,8 @@ class TritonServer:
             failed = [entry for entry in versions_of(index) if not entry.is_ready and entry.name in self._loading]
             if failed:
                 reasons = "; ".join(f"{entry.name}: {entry.reason or 'not loaded'}" for entry in failed)
-                raise ServerStartError(f"models: expected all to be ready, got {reasons}")
+                remedy = EXPORT_HERE if _LACKS_GPU.search(reasons) else ""
+                raise ServerStartError(f"models: expected all to be ready, got {reasons}{remedy}")
             check_version(self.endpoints.host, version, accepted=self._accepts_known_vulnerabilities)
             return
         kind = SpoiltStartError if self._process.returncode == -signal.SIGABRT else ServerStartError
@@ -315,11 +318,11 @@ class TritonServer:
             "--strict-readiness=false",  # else one version that cannot be loaded keeps all models from being ready
             "--exit-on-error=false",  # so that the reason of each model that fails can be read
             f"--exit-timeout-secs={EXIT_TIMEOUT_S}",
-            f"--http-address={endpoints.http_host}",
+            f"--http-address={_of_http_server(endpoints.http_host)}",
             f"--http-port={endpoints.http_port}",
-            f"--grpc-address={endpoints.host}",
+            f"--grpc-address={in_url(endpoints.host)}",
             f"--grpc-port={endpoints.grpc_port}",
-            f"--metrics-address={endpoints.host}",
+            f"--metrics-address={_of_http_server(endpoints.host)}",
             f"--metrics-port={endpoints.metrics_port}",
             *([f"--http-thread-count={self._http_threads}"] if self._http_threads else []),
             *restrictions(self._admin_key),
@@ -349,3 +352,8 @@ class TritonServer:
         if self._claim is not None:
             self._claim.release()
             self._claim = None
+
+
+def _of_http_server(host: str) -> str:
+    """An address as Triton's HTTP servers read it: without the prefix they take IPv6 for a name."""
+    return f"ipv6:{host}" if ":" in host else host

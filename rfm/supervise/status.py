@@ -16,6 +16,7 @@ from typing import Any
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
 from rfm.launch.installation import ServerStartError
+from rfm_client.contract.listening import check_free
 
 NO_REASON = ""  # the reason why a model is not ready, of one that is
 REQUEST_S = 5.0  # from its connection to its answer
@@ -101,9 +102,10 @@ class StatusServer:
 
     def __init__(self, host: str, port: int, status: Status) -> None:
         try:
-            self._server = _BoundedServer((host, port), _handler(status))
-        except OSError as error:
-            raise ServerStartError(f"status: expected a free port at {host}:{port}, got: {error.strerror}") from error
+            check_free(host, port, "status", port_option="--status-port")
+        except ValueError as error:
+            raise ServerStartError(str(error)) from None
+        self._server = _BoundedServer((host, port), _handler(status))
         self._thread = threading.Thread(target=self._server.serve_forever, name="rfm-status", daemon=True)
         self._thread.start()
 
@@ -120,10 +122,11 @@ class _BoundedServer(ThreadingHTTPServer):
     daemon_threads = True
     request_queue_size = 8 * MOST_CONNECTIONS  # connections beyond this number have to try again after a second
 
-    def __init__(self, *arguments: Any) -> None:
+    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
         self._open: dict[socket.socket, None] = {}  # the oldest first
         self._lock = threading.Lock()
-        super().__init__(*arguments)
+        self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+        super().__init__(address, handler)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         deadline = threading.Timer(REQUEST_S, _cut, [request])

@@ -19,6 +19,7 @@ from rfm.launch.admin_key import http_headers
 from rfm.launch.http import NO_ANSWER, Http
 from rfm.launch.process import TritonServer
 from rfm.launch.repository_api import INDEX_PATH, READY, ModelVersion, versions_of
+from rfm.launch.repository_folder import CONFIG_FILE
 from rfm.supervise.background import Calls
 
 INTERVAL_S = 1.0
@@ -67,7 +68,7 @@ def serving_just(config: Config, versions: Sequence[int]) -> Config:
 def names_the_same_versions(repository: Path, model: str, config: Config) -> bool:
     """Whether the model's file names the versions of ``config``, which is as ``serving_just`` gives it."""
     try:
-        file = text_format.Parse((repository / model / "config.pbtxt").read_text(), ModelConfig())
+        file = text_format.Parse((repository / model / CONFIG_FILE).read_text(), ModelConfig())
     except (OSError, UnicodeDecodeError, text_format.ParseError):
         return False
     return bool(list(file.version_policy.specific.versions) == config["version_policy"]["specific"]["versions"])

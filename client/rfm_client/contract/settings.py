@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import types
 import typing
 from dataclasses import dataclass, field, fields
@@ -67,7 +68,9 @@ class Setting:
         """Raises ConfigError for a value that is out of bounds."""
         if value is None:
             return
-        if self.least is not None and not value >= self.least:  # nor is NaN
+        if self.least is not None and not _is_number(value):
+            raise ConfigError(self.name, f"expected a finite number, got {value!r:.200}")
+        if self.least is not None and value < self.least:
             raise ConfigError(self.name, f"expected at least {self.least}, got {value}")
         if self.most is not None and value > self.most:
             raise ConfigError(self.name, f"expected at most {self.most}, got {value}")
@@ -92,6 +95,11 @@ def settings_of(kind: Any) -> dict[str, Setting]:
     """The settings of a ``Settings`` by name, in their order."""
     hints = typing.get_type_hints(kind)
     return {each.name: Setting(each.name, hints[each.name], each.default, **each.metadata) for each in fields(kind)}
+
+
+def _is_number(value: Any) -> bool:
+    """Whether it is an int, or a float that is neither NaN nor infinite; not what isinstance says: True is none."""
+    return type(value) is int or (type(value) is float and math.isfinite(value))
 
 
 def _spells(value: Any, kind: Any) -> bool:

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: MIT
+"""The folder that a server is to read: which models are in it, or what it is instead."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+CONFIG_FILE = "config.pbtxt"
+_WEIGHTS = "model.safetensors*"  # or their index
+_EXPORT = "rfm export --checkpoint {checkpoint} --repository {repository}"
+_LEVELS_ABOVE = 4  # from a folder of weights, MODEL/VERSION/checkpoint, to its repository
+
+
+def models_in(repository: Path) -> list[str]:
+    """The names of the models in the repository, sorted. A model's folder, whose versions keep theirs, has none."""
+    if (repository / CONFIG_FILE).exists():
+        return []
+    return sorted(file.parent.name for file in repository.glob(f"*/{CONFIG_FILE}"))
+
+
+def no_models(repository: Path) -> str:
+    """Why ``repository`` is no repository, which has no models, and what to do instead."""
+    got, remedy = _found(repository)
+    return f"repository: expected a folder of models, got {repository}, {got}: {remedy}"
+
+
+def _found(folder: Path) -> tuple[str, str]:
+    new = _EXPORT.format(checkpoint="CHECKPOINT", repository=folder)
+    if not folder.exists():
+        return "which is not there", f"{new} writes one"
+    if not folder.is_dir():
+        return "a file", "--repository names the folder"
+    if not os.access(folder, os.R_OK | os.X_OK):
+        return "which may not be read", "give this user the right to read it"
+    above = next((path for path in folder.resolve().parents[:_LEVELS_ABOVE] if models_in(path)), None)
+    if above is not None:
+        return "a folder inside one", f"--repository {above}"
+    if any(folder.glob(_WEIGHTS)):
+        export = _EXPORT.format(checkpoint=folder, repository="model_repository")
+        return "a checkpoint", f"{export}, then --repository model_repository"
+    below = next((file.parent.parent for file in sorted(folder.glob(f"*/*/{CONFIG_FILE}"))), None)
+    if below is not None:
+        return "a folder that has one", f"--repository {below}"
+    return "which has none", f"{new} writes them"
