@@ -238,6 +238,29 @@ def test_cameras_are_scored_apart_and_fused(served: Served) -> None:
             episode.add({"front": front[0]})
 
 
+@pytest.mark.parametrize(
+    ("orient", "front_as", "wrist_as"),
+    [
+        ("rotate180", lambda frame: frame[::-1, ::-1], lambda frame: frame[::-1, ::-1]),
+        ({"front": "rotate90"}, lambda frame: np.rot90(frame, -1), lambda frame: frame),
+        ({"front": "flip-vertical", "wrist": "flip-horizontal"}, np.flipud, np.fliplr),
+    ],
+    ids=["all cameras", "one of them", "each its own"],
+)
+def test_frames_are_scored_as_they_are_turned(served: Served, orient: Any, front_as: Any, wrist_as: Any) -> None:
+    front, wrist = film(104, 3), film(105, 3, (48, 48))
+    with served.client("grpc", MODEL) as client:
+        upright = client.episodes(1, TASK, sampling="all", cameras=("front", "wrist"))
+        turned = client.episode(TASK, sampling="all", cameras=("front", "wrist"), orient=orient)
+        for a, b in zip(front, wrist, strict=True):
+            expected = upright.add({"front": [front_as(a)], "wrist": [wrist_as(b)]})
+            assert turned.add({"front": a, "wrist": b}).progress == pytest.approx(expected.progress[0], abs=TOLERANCE)
+        one, another = (client.episode(TASK, sampling="all", orient=each) for each in ("rotate270", "none"))
+        for frame in front:
+            expected_one = another.add(np.rot90(frame))
+            assert one.add(frame).progress == pytest.approx(expected_one.progress, abs=TOLERANCE)
+
+
 def test_the_success_rule_decides(served: Served) -> None:
     frames = film(106, 3)
     with served.client("grpc", MODEL) as client:
@@ -401,6 +424,8 @@ def test_a_task_or_model_that_is_not_there_is_told(served: Served) -> None:
         client.episodes(3, ["a", "b"])
     with pytest.raises(ValueError, match=r"cameras: expected a sequence of names, got 'front'"):
         client.episode(TASK, cameras="front")
+    with pytest.raises(ValueError, match=r"^orient: expected some of the cameras \['front'\], got 'wrist'$"):
+        client.episode(TASK, cameras=["front"], orient={"wrist": "rotate180"})
     with served.client("grpc", MODEL) as client:
         with pytest.raises(
             InvalidSampleError, match=r"frames: expected frames of one camera .*, got frames of \['a'\]"

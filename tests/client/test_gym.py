@@ -227,6 +227,9 @@ BAD_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
     "cameras": ({"cameras": ["front"]}, r"^cameras: expected keys of the observation \[\], got \['front'\]$"),
     "a camera": ({"cameras": "front"}, "^cameras: expected a sequence of names, got 'front'$"),
     "fuse": ({"fuse": "sum"}, "^fuse: expected one of mean, min, max, got 'sum'$"),
+    "orient": ({"orient": "upside-down"}, "^orient: expected one of none, rotate180, .*, got 'upside-down'$"),
+    "orient of a camera": ({"orient": {"front": "rotate180"}}, "^orient: expected one orientation, .*, got 'front'$"),
+    "scale": ({"scale": float("nan")}, "^scale: expected a number, got nan$"),
     "frames_from": ({"frames_from": "pixels"}, r"^frames_from: expected a key of the observation \[\], got 'pixels'$"),
 }
 

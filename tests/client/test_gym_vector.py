@@ -167,9 +167,13 @@ def test_success_ends_an_episode_of_a_vector_that_the_caller_resets(client: Rewa
     assert [env.step(actions)[2].tolist() for _ in range(2)] == [[False, False], [True, True]]
     infos = env.reset(options={"reset_mask": np.array([True, False])})[1]
     assert infos["reward_model"]["_progress"].tolist() == [True, False]
-    assert env.step(actions)[2].tolist() == [False, True]
-    infos = env.step(actions)[4]["reward_model"]
-    assert infos["step"].tolist() == [2, 4]
+    with pytest.raises(gym.error.ResetNeeded, match=r"^step: expected a reset of the environments \[1\], since their"):
+        env.step(actions)
+    env.reset(options={"reset_mask": np.array([False, True])})
+    assert env.step(actions)[2].tolist() == [False, False]
+    told = env.step(actions)
+    assert told[2].tolist() == [True, True]
+    assert told[4]["reward_model"]["step"].tolist() == [2, 2]
 
 
 REFUSED_VECTORS: dict[str, tuple[AutoresetMode, dict[str, Any], str]] = {

@@ -13,13 +13,15 @@ import numpy as np
 
 from rfm_client.client import RewardClient
 from rfm_client.contract.errors import InvalidSampleError, RewardError
+from rfm_client.contract.numbers import checked_count, checked_finite
 from rfm_client.contract.results import ProgressResult, Result
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.camera_fusion import FUSES, Fuse, check_fuse, checked_cameras
+from rfm_client.data.orientation import Orientation, turned
 from rfm_client.data.prefixes import of_frames
 from rfm_client.data.resize import resize_frames
 from rfm_client.data.sampling import Prefix, Rule, Sampling
-from rfm_client.episodes.frames import checked_frame
+from rfm_client.episodes.frames import checked_frame, orientations_of
 from rfm_client.episodes.live import LiveView
 from rfm_client.episodes.options import SuccessRule
 from rfm_client.episodes.windows import NamedFrame, Window
@@ -28,11 +30,6 @@ from rfm_client.integrations.watching import Watching
 Info: TypeAlias = dict[str, Any]
 Fit: TypeAlias = Callable[[UInt8Array], UInt8Array]
 ClientSource: TypeAlias = RewardClient | Callable[[], RewardClient]
-
-
-def _check_at_least_one(name: str, value: int) -> None:
-    if value < 1:
-        raise ValueError(f"{name}: expected at least 1, got {value}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +47,8 @@ class RewardOptions:
     cameras: each is scored, and the scores fused: keys, of the observation or of what ``frames_from`` says, that hold a
         frame of each; none: there is one camera, without a name
     fuse: how the scores of several cameras become one
+    orient: how frames, rendered ones too, are turned so that they are upright: an Orientation, or such by camera; a
+        camera that is not named: not at all
     sampling: which frames of the episode so far are sent: a rule of ``rfm_client.data.sampling``. ``rint_pad`` is that
         of upstream's own RL loop
     resize: frames are made as small as the checkpoint reads them before they are kept and sent (needs Pillow); ReWiND's
@@ -70,6 +69,7 @@ class RewardOptions:
     frames_from: str | Callable[[Any], UInt8Array | Mapping[str, UInt8Array]] | None = None
     cameras: Sequence[str] = ()
     fuse: Fuse = "mean"
+    orient: Orientation | Mapping[str, Orientation] = "none"
     sampling: Rule = "rint_pad"
     resize: bool = False
     max_frames: int | None = None
@@ -81,12 +81,14 @@ class RewardOptions:
     def __post_init__(self) -> None:
         if self.mode not in ("absolute", "delta"):
             raise ValueError(f"mode: expected 'absolute' or 'delta', got {self.mode!r}")
-        _check_at_least_one("every", self.every)
-        _check_at_least_one("max_pending", self.max_pending)
+        checked_finite("scale", self.scale)
+        checked_count("every", self.every)
+        checked_count("max_pending", self.max_pending)
         if self.max_frames is not None:
-            _check_at_least_one("max_frames", self.max_frames)
+            checked_count("max_frames", self.max_frames)
         object.__setattr__(self, "cameras", checked_cameras(self.cameras))
         check_fuse(self.fuse)
+        orientations_of(self.orient, self.cameras)
         Sampling.of(self.sampling, self.max_frames, trained_frames=1)  # whether rule and number go together
 
     @property
@@ -203,6 +205,7 @@ class Episode:
     def __init__(self, options: RewardOptions, task: str, env: int | None = None) -> None:
         self._options = options
         self._task = task
+        self._orientations = orientations_of(options.orient, options.cameras)
         self._where = "" if env is None else f"envs[{env}]"
         self._watching = Watching(options.live, task, options.terminate_on_success, env or 0)
         self._frames: list[tuple[NamedFrame, ...]] = []  # of each camera
@@ -229,8 +232,8 @@ class Episode:
         """Number of requests that have no answer yet."""
         return len(self._pending)
 
-    def add(self, frame: Any, find_fit: Callable[[], Fit | None] = lambda: None) -> None:
-        """Adds a copy of the frame: an environment may draw into the same array again.
+    def add(self, frame: Any, find_fit: Callable[[], Fit | None] = lambda: None) -> Sequence[UInt8Array]:
+        """Adds a copy of the frame: an environment may draw into the same array again. Of each camera, as it came.
 
         frame: with cameras a tuple of theirs
         find_fit: gives what makes the episode's frames smaller; asked at its first
@@ -238,7 +241,10 @@ class Episode:
         frames = frame if self._options.cameras else (frame,)
         names = [f"frame[{camera!r}]" for camera in self._options.cameras] or ["frame"]
         try:
-            kept = [checked_frame(each, name) for each, name in zip(frames, names, strict=True)]
+            kept = [
+                turned(checked_frame(each, name), orientation)
+                for each, name, orientation in zip(frames, names, self._orientations, strict=True)
+            ]
             self._check_sizes(kept, names)
         except InvalidSampleError as error:
             raise self._located(error) from None
@@ -246,6 +252,7 @@ class Episode:
             self._fit = find_fit()
         self._sizes = [each.shape for each in kept]
         self._frames.append(tuple(NamedFrame(each if self._fit is None else self._fit(each)) for each in kept))
+        return kept
 
     def windows(self, sampling: Sampling) -> list[Window]:
         """The question about the newest frame of each camera."""

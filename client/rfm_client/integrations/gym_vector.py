@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: MIT
+"""Vectors of Gymnasium environments whose reward is a served reward model's. ``gym.py`` states the rules."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector.utils import iterate
+
+from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.integrations.episode import ClientSource, Episode, Info, RewardOptions, Scorer
+from rfm_client.integrations.gym import DEFAULTS, INFO, LOST, check_frame_source, check_kind
+
+Episodes: TypeAlias = dict[int, Episode]  # by number of their environment
+Mask: TypeAlias = npt.NDArray[np.bool_]
+
+_INSTEAD_OF_SAME_STEP = "make the vector with autoreset_mode=AutoresetMode.NEXT_STEP"
+
+
+class RewardModelVectorWrapper(VectorWrapper):
+    """A vector environment paid by a reward model: its sub-environments' questions of a step go in one call.
+
+    client: as in RewardModelWrapper
+    task: one task sentence for all sub-environments, or one for each
+
+    ``infos["reward_model"]`` has arrays and masks as Gymnasium's own infos; where a sub-environment resets in the step
+    that ends its episode (SAME_STEP), the end's is in ``infos["final_info"]``. The step in which one does nothing but
+    reset (NEXT_STEP) is paid 0, as in Gymnasium, and waits for the score of that frame even when not blocking. Where
+    the caller resets (DISABLED), a step after an episode's end raises ResetNeeded.
+
+    Raises ValueError if frames cannot come from where ``options`` says, for SAME_STEP with frames from ``render()``,
+    which never shows an episode's last frame, and for ``terminate_on_success`` unless the mode is DISABLED: what
+    resets by itself does not know of it. Wrap each sub-environment in RewardModelWrapper then. Raises TypeError for
+    what is no ``gymnasium.vector.VectorEnv``.
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv,
+        client: ClientSource,
+        task: str | Sequence[str],
+        options: RewardOptions = DEFAULTS,
+    ) -> None:
+        check_kind(env, VectorEnv)
+        check_frame_source(options, env.render_mode, env.single_observation_space)
+        autoreset_mode = _checked_autoreset_mode(env, options)
+        tasks = [task] * env.num_envs if isinstance(task, str) else list(task)
+        if len(tasks) != env.num_envs:
+            raise ValueError(f"task: expected one for each of the {env.num_envs} environments, got {len(tasks)}")
+        super().__init__(env)  # a wrapper that is refused must not close the environments when it is collected
+        self._scorer = Scorer(client, options)
+        self._options = options
+        self._autoreset_mode = autoreset_mode
+        self._tasks = tasks
+        self._episodes: dict[int, Episode] = {}
+        self._whole: Mask = np.zeros(env.num_envs, np.bool_)  # all frames of the episode are kept
+        self._ended: Mask = np.zeros(env.num_envs, np.bool_)
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
+        """Resets the environments (those of ``reset_mask``), and scores their first frames. Raises RewardError."""
+        everyone = np.ones(self.num_envs, np.bool_)
+        reset_mask = (options or {}).get("reset_mask", everyone)  # before env.reset, which takes it out of the options
+        whole, self._whole = self._whole, np.zeros_like(self._whole)
+        observations, infos = self.env.reset(seed=seed, options=options)
+        self._whole, self._ended = whole & ~reset_mask, self._ended & ~reset_mask
+        indices = np.flatnonzero(reset_mask).tolist()
+        for episode in [self._episodes[index] for index in indices if index in self._episodes]:
+            episode.end()
+        shown = self._shown(observations)
+        fresh = {index: self._begin(index, shown[index])[0] for index in indices}
+        self._scorer.score(dict.fromkeys(fresh.values(), False))
+        return observations, self._with_scores(infos, fresh)
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, Info]:
+        """Steps the environments; rewards: float64 [num_envs], the model's. Raises RewardError, ResetNeeded."""
+        self._check_can_step()
+        resetting = self._resetting
+        self._whole = np.zeros_like(self._whole)  # until each frame is kept
+        observations, env_rewards, terminations, truncations, infos = self.env.step(actions)
+        self._ended = ended = terminations | truncations
+        stepped, fresh, final = self._added(self._shown(observations), infos, resetting)
+        self._scorer.score(
+            {episode: bool(ended[index]) for index, episode in stepped.items()} | dict.fromkeys(fresh.values(), False)
+        )
+        rewards = np.zeros(self.num_envs)
+        for index, episode in stepped.items():
+            rewards[index] = episode.reward(float(env_rewards[index]))
+            scores: Info = {INFO: episode.info() | {"env_reward": float(env_rewards[index])}}
+            infos = self._add_info(infos, {"final_info": scores} if index in final else scores, index)
+        return observations, rewards, terminations | self._succeeded(), truncations, self._with_scores(infos, fresh)
+
+    def close(self, **kwargs: Any) -> None:
+        """Cancels what is open, and closes the environments, and the client if it was made here."""
+        for episode in self._episodes.values():
+            episode.end()
+        self._scorer.close()
+        super().close(**kwargs)
+
+    def _check_can_step(self) -> None:
+        """Raises ResetNeeded if a step would show a frame that is not the next one of an episode."""
+        if len(self._episodes) != self.num_envs:
+            raise ResetNeeded("step: expected a reset of every environment before it")
+        is_caller_s = self._autoreset_mode is AutoresetMode.DISABLED  # whether to reset
+        over = (self._ended | self._succeeded()) & is_caller_s
+        for indices, reason in ((over, "their episodes have ended"), (~self._whole & ~self._resetting, LOST)):
+            if indices.any():
+                expected = f"expected a reset of the environments {np.flatnonzero(indices).tolist()}, since {reason}"
+                remedy = 'call reset, for some environments with options={"reset_mask": mask}'
+                raise ResetNeeded(f"step: {expected}, got another step; {remedy}")
+
+    @property
+    def _resetting(self) -> Mask:
+        """Which environments do nothing but reset in the next step."""
+        return self._ended & (self._autoreset_mode is AutoresetMode.NEXT_STEP)
+
+    def _succeeded(self) -> Mask:
+        return np.array([episode.succeeded for _, episode in sorted(self._episodes.items())], np.bool_)
+
+    def _added(self, shown: Sequence[Any], infos: Info, resetting: Mask) -> tuple[Episodes, Episodes, Collection[int]]:
+        """Adds the frames of a step, each as soon as it is made: it may be drawn into the array of the one before.
+
+        The episodes that went on, those that began, and the environments that did both (SAME_STEP).
+        """
+        final = self._final_observations(infos) if self._autoreset_mode is AutoresetMode.SAME_STEP else {}
+        stepped = {index: self._episodes[index] for index in np.flatnonzero(~resetting).tolist()}
+        last = {}
+        for index, episode in stepped.items():
+            last[index] = episode.add(self._frame(final.get(index, shown[index])), self._scorer.fit)
+            self._whole[index] = index not in final
+        fresh = {}
+        for index in (*np.flatnonzero(resetting).tolist(), *final):
+            if index not in final:
+                self._episodes[index].end()
+            fresh[index], first = self._begin(index, shown[index])
+            if index in final:
+                _check_differ(index, last[index], first)
+        return stepped, fresh, final
+
+    def _begin(self, index: int, shown: Any) -> tuple[Episode, Sequence[UInt8Array]]:
+        """A new episode and its first frame, of each camera."""
+        self._episodes[index] = Episode(self._options, self._tasks[index], index)
+        frames = self._episodes[index].add(self._frame(shown), self._scorer.fit)
+        self._whole[index] = True
+        return self._episodes[index], frames
+
+    def _shown(self, observations: Any) -> Sequence[Any]:
+        """What each environment shows: its rendered frame, or its observation."""
+        if self._options.renders:
+            shown = list(self.env.render() or ())
+        else:
+            shown = list(iterate(self.env.observation_space, observations))
+        if len(shown) != self.num_envs:
+            raise InvalidSampleError.at("frames", f"one of each of the {self.num_envs} environments", str(len(shown)))
+        return shown
+
+    def _frame(self, shown: Any) -> Any:
+        return shown if self._options.renders else self._options.frames_of(shown)
+
+    def _final_observations(self, infos: Info) -> dict[int, Any]:
+        """The last ones of the episodes that ended, whose environments show the next episode already."""
+        observations = infos.get("final_obs", [None] * self.num_envs)
+        final = {index: observations[index] for index in np.flatnonzero(self._ended).tolist()}
+        missing = [index for index, observation in final.items() if observation is None]
+        if missing:
+            expected = f"final_obs of the environments {missing}, whose episodes ended in this step"
+            raise InvalidSampleError.at("infos", expected, f"none in {list(infos)}; {_INSTEAD_OF_SAME_STEP}")
+        return final
+
+    def _with_scores(self, infos: Info, fresh: Mapping[int, Episode]) -> Info:
+        for index, episode in fresh.items():
+            infos = self._add_info(infos, {INFO: episode.info()}, index)
+        return infos
+
+
+def _check_differ(index: int, last: Sequence[UInt8Array], first: Sequence[UInt8Array]) -> None:
+    """Raises InvalidSampleError where a reset has drawn over the last frame of the episode before."""
+    if any(np.array_equal(*pair) for pair in zip(last, first, strict=True)):
+        got = "the first frame of the next one: the environment seems to draw into the array that it has returned"
+        remedy = f"let it return a copy of its observation, or {_INSTEAD_OF_SAME_STEP}"
+        raise InvalidSampleError.at(f"final_obs[{index}]", "the last frame of the ended episode", f"{got}; {remedy}")
+
+
+def _checked_autoreset_mode(env: VectorEnv, options: RewardOptions) -> AutoresetMode:
+    mode = env.metadata.get("autoreset_mode")
+    instead = "; wrap each environment in RewardModelWrapper instead"
+    if not isinstance(mode, AutoresetMode):
+        raise ValueError(f"metadata['autoreset_mode']: expected an AutoresetMode, got {mode!r}")
+    if mode is AutoresetMode.SAME_STEP and options.renders:
+        expected = "NEXT_STEP or DISABLED with frames from render(), which never shows an episode's last frame"
+        raise ValueError(f"autoreset_mode: expected {expected}, got SAME_STEP{instead}")
+    if mode is not AutoresetMode.DISABLED and options.terminate_on_success is not None:
+        raise ValueError(f"autoreset_mode: expected DISABLED with terminate_on_success, got {mode.name}{instead}")
+    return mode

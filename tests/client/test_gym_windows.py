@@ -1,0 +1,372 @@
+# SPDX-License-Identifier: MIT
+"""Which frames the Gymnasium wrappers send: frames that say their environment, episode and step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import Autoreset, TimeLimit
+
+from coded_env import Code, CodedEnv, Recorder, frame_of
+from environments import MODEL
+from reference_server import Served
+from rfm_client import InvalidSampleError, RewardError, ServerUnavailableError
+from rfm_client.gym import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
+
+LENGTHS = (3,), (4, 1, 2)  # steps of the episodes of each environment, in turn
+TASKS = ["task 0", "task 1"]
+STEPS = 9
+ACTIONS = np.zeros(2, int)
+NEXT_STEP, SAME_STEP, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
+
+SOURCES: dict[str, Any] = {"rendered": None, "a key": "pixels", "a function": lambda observation: observation["pixels"]}
+CASES = [
+    pytest.param(mode, source, reuse, id=f"{mode.name}-{name}{'-reused' if reuse else ''}")
+    for mode in AutoresetMode
+    for name, source in SOURCES.items()
+    for reuse in (False, True)
+    if mode is not SAME_STEP or not (reuse or source is None)  # refused, see below
+]
+
+
+@pytest.fixture
+def recorder(served: Served) -> Iterator[Recorder]:
+    with Recorder(served.url("grpc"), MODEL) as client:
+        yield client
+
+
+def options(source: Any, **more: Any) -> RewardOptions:
+    return RewardOptions(sampling="all", frames_from=source, **more)
+
+
+def vector_of(
+    kind: Any, mode: AutoresetMode, client: Recorder, source: Any, reuse: bool, **more: Any
+) -> RewardModelVectorWrapper:
+    makers = [partial(CodedEnv, number, lengths, reuse=reuse) for number, lengths in enumerate(LENGTHS)]
+    kinds = {"context": "spawn"} if kind is AsyncVectorEnv else {}
+    return RewardModelVectorWrapper(kind(makers, autoreset_mode=mode, **kinds), client, TASKS, options(source), **more)
+
+
+def up_to(number: int, episode: int, step: int) -> tuple[list[Code], str]:
+    """The question about a step: all frames of its episode so far, and the environment's task."""
+    return [(number, episode, each) for each in range(step + 1)], TASKS[number]
+
+
+def expected_calls(mode: AutoresetMode, steps: int) -> list[list[tuple[list[Code], str]]]:
+    """The questions of each call while each environment is stepped, or reset where it has ended."""
+    now = [[0, 0], [0, 0]]  # episode and step of each
+    calls = [[up_to(number, 0, 0) for number in range(2)]]
+    for _ in range(steps):
+        ended = [t == LENGTHS[number][episode % len(LENGTHS[number])] for number, (episode, t) in enumerate(now)]
+        if mode is DISABLED and any(ended):
+            now = [[episode + 1, 0] if over else [episode, t] for (episode, t), over in zip(now, ended, strict=True)]
+            calls.append([up_to(number, *now[number]) for number in range(2) if ended[number]])
+            continue
+        now = [[episode + 1, 0] if over else [episode, t + 1] for (episode, t), over in zip(now, ended, strict=True)]
+        call = [up_to(number, *each) for number, each in enumerate(now)]
+        if mode is SAME_STEP:
+            for number, (episode, t) in enumerate(now):
+                if t == LENGTHS[number][episode % len(LENGTHS[number])]:
+                    now[number] = [episode + 1, 0]
+                    call.append(up_to(number, *now[number]))
+        calls.append(call)
+    return calls
+
+
+def roll(env: RewardModelVectorWrapper, mode: AutoresetMode, steps: int) -> None:
+    """Resets what has ended, if the mode leaves that to the caller; steps otherwise."""
+    env.reset(seed=0)
+    ended = np.zeros(2, np.bool_)
+    for _ in range(steps):
+        if mode is DISABLED and ended.any():
+            env.reset(options={"reset_mask": ended})
+            ended = np.zeros(2, np.bool_)
+        else:
+            _, _, terminations, truncations, _ = env.step(ACTIONS)
+            ended = terminations | truncations
+
+
+def in_order(calls: list[list[tuple[list[Code], str]]]) -> list[list[tuple[list[Code], str]]]:
+    return [sorted(call) for call in calls]
+
+
+@pytest.mark.parametrize(("mode", "source", "reuse"), CASES)
+def test_a_vector_sends_each_episode_s_own_frames(
+    recorder: Recorder, mode: AutoresetMode, source: Any, reuse: bool
+) -> None:
+    with closing(vector_of(SyncVectorEnv, mode, recorder, source, reuse)) as env:
+        roll(env, mode, STEPS)
+    assert in_order(recorder.calls) == in_order(expected_calls(mode, STEPS))
+
+
+@pytest.mark.parametrize(
+    ("mode", "source"), [(NEXT_STEP, None), (NEXT_STEP, "pixels"), (SAME_STEP, "pixels"), (DISABLED, "pixels")]
+)
+def test_a_vector_of_processes_sends_each_episode_s_own_frames(
+    recorder: Recorder, mode: AutoresetMode, source: Any
+) -> None:
+    with closing(vector_of(AsyncVectorEnv, mode, recorder, source, reuse=mode is not SAME_STEP)) as env:
+        roll(env, mode, STEPS)
+    assert in_order(recorder.calls) == in_order(expected_calls(mode, STEPS))
+
+
+def test_a_function_may_draw_all_frames_of_a_vector_into_one_array(recorder: Recorder) -> None:
+    canvas = np.zeros_like(CodedEnv().canvas)
+
+    def drawn(observation: Any) -> Any:
+        canvas[:] = observation["pixels"]
+        return canvas
+
+    with closing(vector_of(SyncVectorEnv, SAME_STEP, recorder, drawn, reuse=False)) as env:
+        roll(env, SAME_STEP, STEPS)
+    assert in_order(recorder.calls) == in_order(expected_calls(SAME_STEP, STEPS))
+
+
+@pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv])
+def test_a_reset_that_draws_over_the_last_frame_is_refused(recorder: Recorder, kind: Any) -> None:
+    message = r"^final_obs\[0\]: expected the last frame .*, got the first frame of the next .* a copy .*NEXT_STEP$"
+    with closing(vector_of(kind, SAME_STEP, recorder, "pixels", reuse=True)) as env:
+        env.reset(seed=0)
+        for _ in range(2):
+            env.step(ACTIONS)
+        with pytest.raises(InvalidSampleError, match=message):
+            env.step(ACTIONS)
+    assert all(codes == up_to(*codes[-1])[0] for call in recorder.calls for codes, _ in call)
+
+
+@pytest.mark.parametrize("present", [False, True], ids=["no key", "None"])
+def test_a_vector_that_does_not_tell_the_last_frame_is_refused(recorder: Recorder, present: bool) -> None:
+    class Silent(SyncVectorEnv):
+        def step(self, actions: Any) -> Any:
+            *told, _ = super().step(actions)
+            return *told, {"final_obs": np.full(2, None)} if present else {}
+
+    env = vector_of(Silent, SAME_STEP, recorder, "pixels", reuse=False)
+    env.reset(seed=0)
+    for _ in range(2):
+        env.step(ACTIONS)
+    with pytest.raises(InvalidSampleError, match=r"^infos: expected final_obs of the environments \[0\], .*NEXT_STEP$"):
+        env.step(ACTIONS)
+    with pytest.raises(
+        ResetNeeded, match=r"^step: expected a reset of the environments \[0, 1\], since a frame was lost"
+    ):
+        env.step(ACTIONS)
+
+
+# Failures: the frame of a step whose score failed is part of the episode; one that was not kept needs a reset.
+
+
+def down(at: int) -> Callable[[int], RewardError | None]:
+    return lambda call: ServerUnavailableError("the server is restarting") if call == at else None
+
+
+@pytest.mark.parametrize("failing", range(STEPS))
+@pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.name)
+def test_a_vector_goes_on_after_a_failure_at_any_step(served: Served, mode: AutoresetMode, failing: int) -> None:
+    with (
+        Recorder(served.url("grpc"), MODEL, down(failing)) as client,
+        closing(vector_of(SyncVectorEnv, mode, client, "pixels", reuse=mode is not SAME_STEP)) as env,
+    ):
+        envs: list[CodedEnv] = env.unwrapped.envs  # type: ignore[attr-defined]
+        for call in range(STEPS + 1):
+            ended = np.array([each.has_ended for each in envs])
+            act: Any = partial(env.step, ACTIONS)
+            if call == 0:
+                act = partial(env.reset, seed=0)
+            elif mode is DISABLED and ended.any():
+                with pytest.raises(ResetNeeded, match="since their episodes have ended, got another step; call reset"):
+                    act()
+                act = partial(env.reset, options={"reset_mask": ended})
+            if call == failing:
+                with pytest.raises(ServerUnavailableError):
+                    act()
+            else:
+                act()
+    assert in_order(client.calls) == in_order(expected_calls(mode, STEPS))
+
+
+@pytest.mark.parametrize("failing", range(STEPS))
+@pytest.mark.parametrize("source", [None, "pixels"], ids=["rendered", "observed"])
+@pytest.mark.parametrize("resets", ["by the caller", "by Autoreset below", "by Autoreset above"])
+def test_an_environment_goes_on_after_a_failure_at_any_step(
+    served: Served, resets: str, source: Any, failing: int
+) -> None:
+    coded = CodedEnv(0, (3, 1), reuse=True)
+    with Recorder(served.url("grpc"), MODEL, down(failing)) as client:
+        below = Autoreset(coded) if resets == "by Autoreset below" else coded
+        env: gym.Env[Any, Any] = RewardModelWrapper(below, client, TASKS[0], options(source))
+        if resets == "by Autoreset above":
+            env = Autoreset(env)
+        expected = []
+        for call in range(STEPS + 1):
+            act: Any = partial(env.step, 0)
+            if call == 0 or (coded.has_ended and resets == "by the caller"):
+                act = env.reset
+            elif coded.has_ended and resets == "by Autoreset above" and call == failing + 1:  # which was not told
+                with pytest.raises(ResetNeeded):
+                    act()
+                act = env.reset
+            if call == failing:
+                with pytest.raises(ServerUnavailableError):
+                    act()
+            else:
+                act()
+            expected.append([up_to(*coded.code)])
+    assert client.calls == expected
+
+
+def test_the_step_in_which_autoreset_resets_begins_an_episode_and_pays_nothing(recorder: Recorder) -> None:
+    coded = CodedEnv(0, (2,))
+    tasks = iter(TASKS)
+    env = RewardModelWrapper(
+        TimeLimit(Autoreset(coded), 9), recorder, lambda info: next(tasks), options("pixels", add_to_env_reward=True)
+    )
+    env.reset()
+    told = [env.step(0) for _ in range(3)]
+    assert [terminated for _, _, terminated, _, _ in told] == [False, True, False]
+    assert told[1][1] > 1
+    assert told[2][1] == 0
+    assert told[2][4]["reward_model"]["step"] == 0
+    assert "env_reward" not in told[2][4]["reward_model"]
+    assert recorder.calls[-1] == [([(0, 1, 0)], TASKS[1])]
+
+
+def time_limit(env: CodedEnv) -> gym.Env[Any, Any]:
+    return TimeLimit(env, 1)
+
+
+def time_limit_over_autoreset(env: CodedEnv) -> gym.Env[Any, Any]:
+    return TimeLimit(Autoreset(env), 1)  # which is not told of the end
+
+
+ENDED: dict[str, tuple[Callable[[CodedEnv], gym.Env[Any, Any]], int, SuccessRule | None]] = {
+    "terminated": (lambda env: env, 3, None),
+    "truncated": (time_limit, 1, None),
+    "truncated above Autoreset": (time_limit_over_autoreset, 1, None),
+    "succeeded": (lambda env: env, 1, SuccessRule(threshold=0.0)),
+    "succeeded above Autoreset": (Autoreset, 1, SuccessRule(threshold=0.0)),
+}
+
+
+@pytest.mark.parametrize(("wrapped", "length", "rule"), ENDED.values(), ids=ENDED)
+def test_a_step_after_the_end_is_refused(
+    recorder: Recorder, wrapped: Callable[[CodedEnv], gym.Env[Any, Any]], length: int, rule: SuccessRule | None
+) -> None:
+    coded = CodedEnv()
+    env = RewardModelWrapper(wrapped(coded), recorder, TASKS[0], options("pixels", terminate_on_success=rule))
+    env.reset()
+    for _ in range(length):
+        _, _, terminated, truncated, _ = env.step(0)
+    assert terminated or truncated
+    for _ in range(2):
+        with pytest.raises(ResetNeeded, match=r"^step: expected a reset, since the episode has ended, .*Autoreset"):
+            env.step(0)
+    assert coded.code == (0, 0, length)  # it was not stepped
+    env.reset()
+    assert recorder.calls[-1] == [([(0, 1, 0)], TASKS[0])]
+
+
+@pytest.mark.parametrize(("step", "is_last"), [(0, False), (1, False), (3, True)])
+@pytest.mark.parametrize("autoreset", [False, True])
+def test_after_a_frame_that_could_not_be_kept_an_episode_needs_a_reset(
+    recorder: Recorder, autoreset: bool, step: int, is_last: bool
+) -> None:
+    coded = CodedEnv(bad=(0, 0, step))
+    env = RewardModelWrapper(Autoreset(coded) if autoreset else coded, recorder, TASKS[0], options(None))
+    with pytest.raises(InvalidSampleError, match=r"^frame: expected uint8 \[H, W, 3\], got uint8 \[32, 3\]$"):
+        env.reset()
+        for _ in range(step):
+            env.step(0)
+    if is_last and autoreset:
+        env.step(0)  # which is the reset
+    else:
+        with pytest.raises(ResetNeeded, match="since the episode has ended" if is_last else "since a frame was lost"):
+            env.step(0)
+        env.reset()
+    env.step(0)
+    assert recorder.calls[-2:] == [[up_to(0, 1, 0)], [up_to(0, 1, 1)]]
+
+
+@pytest.mark.parametrize("mode", [NEXT_STEP, DISABLED], ids=lambda mode: mode.name)
+def test_after_a_frame_that_could_not_be_kept_a_vector_needs_a_reset(recorder: Recorder, mode: AutoresetMode) -> None:
+    coded = [CodedEnv(0, (3,)), CodedEnv(1, (3,), bad=(1, 0, 1))]
+    makers: list[Callable[[], CodedEnv]] = [lambda: coded[0], lambda: coded[1]]
+    env = RewardModelVectorWrapper(SyncVectorEnv(makers, autoreset_mode=mode), recorder, TASKS, options(None))
+    env.reset()
+    with pytest.raises(InvalidSampleError, match=r"^envs\[1\]\.frame: expected uint8"):
+        env.step(ACTIONS)
+    with pytest.raises(ResetNeeded, match=r"^step: expected a reset of the environments \[1\], since a frame was lost"):
+        env.step(ACTIONS)
+    env.reset(options={"reset_mask": np.array([False, True])})
+    env.step(ACTIONS)
+    assert recorder.calls[-1] == [up_to(0, 0, 2), up_to(1, 1, 1)]
+
+
+def test_an_environment_that_resets_in_its_last_step_is_refused(recorder: Recorder) -> None:
+    class Resetting(CodedEnv):
+        def step(self, action: Any) -> Any:
+            observation, reward, terminated, truncated, info = super().step(action)
+            if terminated:
+                return self.reset()[0], reward, terminated, truncated, {"final_observation": observation}
+            return observation, reward, terminated, truncated, info
+
+    env = RewardModelWrapper(Resetting(), recorder, TASKS[0], options("pixels"))
+    env.reset()
+    env.step(0)
+    env.step(0)
+    with pytest.raises(InvalidSampleError, match=r"^info: expected none of .*, got final_observation; .*Autoreset"):
+        env.step(0)
+    with pytest.raises(ResetNeeded):
+        env.step(0)
+    assert recorder.calls[-1] == [up_to(0, 0, 2)]
+
+
+@pytest.mark.parametrize("wrapper", [RewardModelWrapper, RewardModelVectorWrapper])
+def test_another_kind_of_vector_is_refused(recorder: Recorder, wrapper: Any) -> None:
+    class VecEnv:
+        render_mode = "rgb_array"
+
+    with pytest.raises(TypeError, match=r"^env: expected a gymnasium \w+, got .*VecEnv; wrap each environment in Rew"):
+        wrapper(VecEnv(), recorder, TASKS[0])
+
+
+TURNS: dict[str, Callable[[Any], Any]] = {
+    "none": lambda frame: frame,
+    "rotate180": lambda frame: frame[::-1, ::-1],
+    "flip-vertical": np.flipud,
+    "flip-horizontal": np.fliplr,
+    "rotate90": lambda frame: np.rot90(frame, -1),
+    "rotate270": np.rot90,
+}
+
+
+@pytest.mark.parametrize("source", [None, "pixels"], ids=["rendered", "observed"])
+@pytest.mark.parametrize("orient", TURNS)
+def test_frames_are_turned_upright(recorder: Recorder, orient: Any, source: Any) -> None:
+    env = RewardModelWrapper(CodedEnv(reuse=True), recorder, TASKS[0], options(source, orient=orient))
+    env.reset()
+    env.step(0)
+    expected = [TURNS[orient](frame_of(0, 0, step)) for step in range(2)]
+    np.testing.assert_array_equal(recorder.pixels[-1], expected)
+
+
+def test_each_camera_of_a_vector_is_turned_its_own_way(recorder: Recorder) -> None:
+    def shown(observation: Any) -> Any:
+        return {"front": observation["pixels"], "wrist": 255 - observation["pixels"]}
+
+    how = options(shown, cameras=["front", "wrist"], orient={"wrist": "rotate180"})
+    makers = [partial(CodedEnv, number) for number in range(2)]
+    env = RewardModelVectorWrapper(SyncVectorEnv(makers, autoreset_mode=SAME_STEP), recorder, TASKS, how)
+    env.reset()
+    for number in range(2):
+        front, wrist = (window[0] for window in recorder.pixels[2 * number : 2 * number + 2])
+        np.testing.assert_array_equal(front, frame_of(number, 0, 0))
+        np.testing.assert_array_equal(wrist, 255 - frame_of(number, 0, 0)[::-1, ::-1])

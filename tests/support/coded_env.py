@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: MIT
+"""An environment whose frames say which environment, episode and step they are of, and a client that reads that."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, TypeAlias
+
+import gymnasium as gym
+import numpy as np
+
+from rfm_client import RewardClient, RewardError
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.episodes.windows import Window
+
+SIZE_PX = 32
+
+Code: TypeAlias = tuple[int, int, int]  # environment, episode, step
+
+
+def frame_of(*code: int) -> UInt8Array:
+    """A frame that says what it is of, and looks like no other."""
+    frame = np.random.default_rng(code).integers(0, 256, (SIZE_PX, SIZE_PX, 3), np.uint8)
+    frame[0, 0] = code
+    return frame
+
+
+class CodedEnv(gym.Env[Any, Any]):
+    """Odd environments truncate, even ones terminate.
+
+    lengths: steps of its episodes, in turn
+    reuse: all frames are drawn into the same array
+    bad: of this code a picture is rendered that is none
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, number: int = 0, lengths: Sequence[int] = (3,), *, reuse: bool = False, bad: Code | None = None):
+        self.render_mode = "rgb_array"
+        self.observation_space = gym.spaces.Dict({"pixels": gym.spaces.Box(0, 255, (SIZE_PX, SIZE_PX, 3), np.uint8)})
+        self.number, self.lengths, self.reuse, self.bad = number, lengths, reuse, bad
+        self.episode, self.t = -1, 0
+        self.canvas = np.zeros((SIZE_PX, SIZE_PX, 3), np.uint8)
+
+    @property
+    def code(self) -> Code:
+        """Of what it shows now."""
+        return self.number, self.episode, self.t
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether a step would be one after the episode's end."""
+        return self.t >= self.lengths[self.episode % len(self.lengths)]
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.episode, self.t = self.episode + 1, 0
+        return {"pixels": self._drawn()}, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        assert not self.has_ended
+        self.t += 1
+        ends = self.has_ended
+        return {"pixels": self._drawn()}, 1.0, ends and self.number % 2 == 0, ends and self.number % 2 == 1, {}
+
+    def render(self) -> Any:
+        return self._drawn()[0] if self.code == self.bad else self._drawn()
+
+    def _drawn(self) -> UInt8Array:
+        if not self.reuse:
+            return frame_of(*self.code)
+        self.canvas[:] = frame_of(*self.code)
+        return self.canvas
+
+
+class Recorder(RewardClient):
+    """Keeps the frames' codes and the task of every question. fails: which calls fail, by number, and with what"""
+
+    def __init__(self, url: str, model: str, fails: Callable[[int], RewardError | None] = lambda call: None) -> None:
+        super().__init__(url, model=model, retry=False)
+        self.calls: list[list[tuple[list[Code], str]]] = []
+        self.pixels: list[list[UInt8Array]] = []  # of each window
+        self._fails = fails
+
+    def score_windows(self, windows: Sequence[Window], **options: Any) -> Any:
+        self.pixels += [[frame.pixels for frame in window.frames] for window in windows]
+        codes = [[tuple(frame.pixels[0, 0].tolist()) for frame in window.frames] for window in windows]
+        self.calls.append([(of_window, window.task) for of_window, window in zip(codes, windows, strict=True)])
+        error = self._fails(len(self.calls) - 1)
+        if error is not None:
+            return [error] * len(windows)
+        return super().score_windows(windows, **options)
