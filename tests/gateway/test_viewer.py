@@ -133,6 +133,7 @@ RULES_ASKED = {
     "rewind_pad16_offline": {"sampling": "rewind_pad16_offline", "fps": "8"},
     "all": {"sampling": "all"},
     "resized": {"sampling": "linspace_round", "frames": "4", "resize": "true"},
+    "turned": {"orient": "rotate90", "frames": "4"},
 }
 
 
@@ -157,6 +158,7 @@ def test_the_curve_is_that_of_the_command_line(
     words += ["--sampling", fields.get("sampling", "rint_pad"), "--fps", fields.get("fps", "3")]
     words += ["--frames", fields["frames"]] if "frames" in fields else []
     words += ["--resize"] if "resize" in fields else []
+    words += ["--orient", fields["orient"]] if "orient" in fields else []
     by_command_line(tmp_path, f"{shlex.join(map(str, words))} --json scores.json")
     (video,) = json.loads((tmp_path / "scores.json").read_text())["videos"]
     curve = curve_of(told)
@@ -220,6 +222,7 @@ BROKEN: dict[str, tuple[bytes | None, dict[str, str], list[str], str]] = {
     "frames of all": (None, {"sampling": "all", "frames": "4"}, ["frames"], "expected none with the rule all, got 4"),
     "fps": (None, {"fps": "nan"}, ["fps"], "expected a number above 0, got 'nan'"),
     "resize": (None, {"resize": "maybe"}, ["resize"], "expected true or false, got 'maybe'"),
+    "orient": (None, {"orient": "up"}, ["orient"], "expected one of none, rotate180, .*, rotate270, got 'up'"),
 }
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from selenium.webdriver import ActionChains, Keys
 from selenium.webdriver.support.select import Select
 
@@ -21,6 +23,7 @@ from browsers import IMAGES_VARIABLE, Browser, chromium
 from gateway_requests import TOLERANCE
 from gateways import Gateway, poll, running
 from rfm.launch.process import Endpoints
+from rfm_client.data.orientation import ORIENTATIONS, Orientation, turned
 from toy_world import Task, make_clip
 from viewer_requests import by_command_line
 
@@ -125,6 +128,36 @@ def test_dropped_clips_get_the_curves_of_the_command_line(page: Stage) -> None:
         expected = [video[name][index] for index in (0, -1) for name in ("progress", "success")]
         assert numbers == pytest.approx(expected, abs=SHOWN + TOLERANCE)
     assert "success.mp4: put the red block in the bowl" in page.browser["chart"].get_attribute("aria-label")
+
+
+def picture(page: Stage) -> Image.Image:
+    """What the page shows of its one video, without the box around it."""
+    (player,) = page.browser.all("video")
+    shown = Image.open(io.BytesIO(player.screenshot_as_png)).convert("RGB")
+    lit = np.argwhere(np.asarray(shown).max(axis=2) > 8)  # beside a quarter turn the box is black
+    (top, left), (bottom, right) = lit.min(axis=0), lit.max(axis=0)
+    return shown.crop((left, top, right + 1, bottom + 1))
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_a_person_sees_what_the_model_sees(page: Stage, orientation: Orientation) -> None:
+    frames = make_clip("success", Task("red", "bowl"), 2_000_000).frames[:, :40]
+    clip.write(page.videos / "wide.mp4", frames, FPS)
+    Select(page.browser["orient"]).select_by_value(orientation)
+    scored(page, "wide")
+    (told,) = taken_along(page)["videos"]
+    by_command_line(page.videos, page.browser["command"].text)
+    (video,) = json.loads((page.videos / "scores.json").read_text())["videos"]
+    assert told["orient"] == orientation
+    np.testing.assert_allclose(told["progress"], video["progress"], rtol=0, atol=TOLERANCE)
+
+    def distance(other: Orientation) -> float:
+        expected = Image.fromarray(turned(frames[0], other))
+        return float(np.abs(np.float32(picture(page).resize(expected.size)) - np.float32(expected)).mean())
+
+    page.browser["time"].send_keys(Keys.HOME)
+    poll(lambda: times_s(page)[0] == pytest.approx(0, abs=0.01))
+    assert min(ORIENTATIONS, key=distance) == orientation
 
 
 def test_the_first_point_comes_within_a_second_of_the_drop(page: Stage) -> None:

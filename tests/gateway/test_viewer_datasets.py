@@ -29,9 +29,13 @@ from pictures import TURNS, numbered, turn, write_video
 from rfm.launch.process import Endpoints
 from rfm_client.contract.settings import ConfigError
 from rfm_client.data.datasets.films import Span
+from rfm_client.data.orientation import Orient
+from rfm_client.data.video import read_video
 from rfm_client.labelling import LabelOptions, label, open_dataset, summarise
+from rfm_client.labelling.options import Format
 from rfm_gateway.config import GatewayConfig
 from rfm_gateway.viewer.cuts import cut
+from rfm_gateway.viewer.datasets import ShownDataset
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, dataset, encoded_anew, labelled
 
 KEY = "open sesame"
@@ -106,6 +110,14 @@ def test_the_table_tells_what_the_labels_say_of_each_episode(shelf: Shelf, numbe
     assert (told["labels"], told["cameras"], told["threshold"]) == ("rfm_progress.parquet", list(CAMERAS), 0.5)
 
 
+@pytest.mark.parametrize("form", ["progress", "signals"])
+def test_the_table_tells_how_pictures_were_turned_for_the_labels(tmp_path: Path, form: Format) -> None:
+    root = copied("toy_v21", tmp_path)
+    turned = open_dataset(root, orient=Orient.parse(["wrist=rotate180"]))
+    label(turned, BrightnessScorer(), LabelOptions(formats=(form,)))
+    assert ShownDataset.open(str(root)).table(None)["orientations"] == ["none", "rotate180"]
+
+
 def test_a_dataset_without_labels_lists_tasks_and_lengths(shelf: Shelf) -> None:
     told = shelf.get(f"/{PLAIN}").json()
     assert (told["labels"], told["bins"]) == (None, None)
@@ -174,6 +186,7 @@ def test_a_cut_of_a_turned_film_is_turned_alike(tmp_path: Path, matrix: tuple[in
     cut_times_s, cut_rotation = shown(tmp_path / "cut.mp4")
     assert cut_rotation == rotation
     assert len(cut_times_s) == 4
+    np.testing.assert_array_equal(read_video(tmp_path / "cut.mp4"), read_video(tmp_path / "film.mp4")[:4])
 
 
 def shown(film: Path) -> tuple[np.ndarray[Any, np.dtype[np.float64]], set[int]]:

@@ -7,9 +7,10 @@ might have named files of this machine. Needs pyarrow. T frames of an episode.
 
 from __future__ import annotations
 
+import json
 import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -24,7 +25,9 @@ from rfm_client.data.datasets.films import Span
 from rfm_client.data.datasets.lerobot import LeRobotDataset
 from rfm_client.data.datasets.lerobot_info import INFO_FILE
 from rfm_client.data.datasets.protocol import DatasetError, Episode
+from rfm_client.data.orientation import ORIENTATIONS
 from rfm_client.labelling.label_files import Curve, EpisodeLabels, find_label_files, read_episode_labels
+from rfm_client.labelling.sidecars import PROVENANCE_KEY, SIGNALS_PROVENANCE_KEY
 from rfm_client.labelling.summary import Summary, summarise
 
 NUM_BINS = 20  # of the final progress, from 0 to 1
@@ -74,6 +77,7 @@ class ShownDataset:
         return {
             "labels": None if file is None else self._name_of(file),
             "cameras": list(self.dataset.info.films),
+            "orientations": [_orientations(file).get(camera, "none") for camera in self.dataset.info.films],
             "fps": self.dataset.info.fps,
             "threshold": SUCCESS_THRESHOLD,
             "bins": None if summary is None else _bins(summary),
@@ -147,6 +151,16 @@ class ShownDataset:
 def _numbers(values: Iterable[float]) -> list[float | None]:
     """Scores as JSON has them: null for one that is not there."""
     return [None if math.isnan(value) else value for value in values]
+
+
+def _orientations(file: Path | None) -> Mapping[str, str]:
+    """How the pictures of each camera that was turned were turned for these labels."""
+    from pyarrow import parquet
+
+    metadata = {} if file is None else parquet.read_schema(file).metadata or {}
+    provenance = json.loads(metadata.get(PROVENANCE_KEY, metadata.get(SIGNALS_PROVENANCE_KEY, b"{}")))
+    found = provenance.get("orientations", {})  # labels of version 0.1.0 have none
+    return {camera: orientation for camera, orientation in found.items() if orientation in ORIENTATIONS}
 
 
 @lru_cache(_SUMMARIES_AT_A_TIME)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.samples import MAX_FRAME_STEPS
+from rfm_client.data.orientation import ORIENTATIONS, Orientation
 from rfm_client.data.sampling import RULES, Rule, Sampling
 from rfm_gateway.body import invalid
 
@@ -24,6 +25,7 @@ class Question:
     fps: frames a second that are taken of a video
     rule, frames: of each point's prefix; None: as the checkpoint was trained
     resize: frames are made as small as the checkpoint reads them
+    orient: how frames are turned before
     """
 
     task: str
@@ -32,6 +34,7 @@ class Question:
     rule: Rule | None
     frames: int | None
     resize: bool
+    orient: Orientation
 
     @classmethod
     def of(cls, fields: Mapping[str, str], default_model: str) -> Question:
@@ -44,6 +47,11 @@ class Question:
         resize = fields.get("resize", "")
         if resize not in _FLAGS:
             raise invalid(("resize",), f"expected true or false, got {reprlib.repr(resize)}")
+        orient = next((each for each in ORIENTATIONS if each == (fields.get("orient") or "none")), None)
+        if orient is None:
+            raise invalid(
+                ("orient",), f"expected one of {', '.join(ORIENTATIONS)}, got {reprlib.repr(fields['orient'])}"
+            )
         return cls(
             task=fields["task"].strip(),
             model=fields.get("model") or default_model,
@@ -51,6 +59,7 @@ class Question:
             rule=rule,
             frames=_frames(fields.get("frames", "").strip()),
             resize=_FLAGS[resize],
+            orient=orient,
         )
 
     def sampling(self, info: ModelInfo) -> Sampling:

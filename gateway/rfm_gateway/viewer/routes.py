@@ -28,6 +28,7 @@ from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import PreferenceResult
 from rfm_client.contract.samples import ProgressSample, Trajectory
 from rfm_client.data.fitting import fitted
+from rfm_client.data.orientation import ORIENTATIONS
 from rfm_client.data.sampling import RULES, Rule, Sampling, trained_rule
 from rfm_client.status import read_status
 from rfm_gateway.body import COMPARE_ENDPOINT, SCORE_ENDPOINT, Admitted, BodyLimits, invalid, parts_of
@@ -110,6 +111,7 @@ async def _served(behind: Behind) -> dict[str, Any]:
         ],
         "model": behind.model,
         "rules": [{"name": rule, "frames": _frames_of(rule)} for rule in RULES],
+        "orientations": list(ORIENTATIONS),
         "fps": DEFAULT_FPS,
         "url": config.triton_url,
     }
@@ -154,27 +156,27 @@ async def _asked(behind: Behind, request: Request, stack: ExitStack, names: tupl
             question = Question.of(fields, behind.model)
             client, info = await behind.models.client(question.model, timeout_s)
             sampling = question.sampling(info)
-            videos = await while_connected(request, _videos(admitted, uploads, names, question.fps, timeout_s))
+            videos = await while_connected(request, _videos(admitted, uploads, names, question, timeout_s))
     return _Asked(question, sampling, client, info, videos, admitted.share)
 
 
 async def _videos(
-    admitted: Admitted, uploads: Mapping[str, UploadFile], names: Sequence[str], fps: float, timeout_s: float
+    admitted: Admitted, uploads: Mapping[str, UploadFile], names: Sequence[str], question: Question, timeout_s: float
 ) -> tuple[Video, ...]:
     """The videos of these names. Raises RequestValidationError, also for one that takes too long to read.
 
     A thread that reads one that nobody waits for ends at its next frame: the request's share of the memory is over.
     """
     with anyio.move_on_after(timeout_s):
-        return tuple([await _video(admitted, uploads, name, fps) for name in names])
+        return tuple([await _video(admitted, uploads, name, question) for name in names])
     raise invalid((names[0],), f"expected videos that are read within {timeout_s:g} s, got longer ones")
 
 
-async def _video(admitted: Admitted, uploads: Mapping[str, UploadFile], name: str, fps: float) -> Video:
+async def _video(admitted: Admitted, uploads: Mapping[str, UploadFile], name: str, question: Question) -> Video:
     if name not in uploads:
         raise invalid((name,), "expected a video file, got none")
     try:
-        return await read_upload(uploads[name], fps, admitted.share.take)
+        return await read_upload(uploads[name], question.fps, admitted.share.take, question.orient)
     except InvalidSampleError as error:
         where, _, message = error.message.partition(": ")
         raise invalid((name if where == "video" else where,), message) from None

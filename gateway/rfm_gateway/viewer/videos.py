@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TypeAlias
@@ -21,6 +21,7 @@ from starlette.datastructures import UploadFile
 
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import UInt8Array
+from rfm_client.data.orientation import Orientation, turned
 from rfm_client.data.video import frame_times_s, read_video
 
 Times: TypeAlias = npt.NDArray[np.float64]
@@ -39,12 +40,19 @@ class Video:
     times_s: Times | None
 
 
-async def read_upload(upload: UploadFile, fps: float, take: Callable[[int], object]) -> Video:
+async def read_upload(
+    upload: UploadFile, fps: float, take: Callable[[int], object], orient: Orientation = "none"
+) -> Video:
     """The frames at ``fps`` of an uploaded video. Raises InvalidSampleError, and what ``take`` raises.
 
     take: told how many bytes of memory are taken, before they are
+    orient: how frames are turned
     """
-    return await asyncio.to_thread(_read, upload, fps, take)
+    video = await asyncio.to_thread(_read, upload, fps, take)
+    if orient == "none":
+        return video
+    take(video.frames.nbytes)  # both are there for a moment
+    return replace(video, frames=await asyncio.to_thread(turned, video.frames, orient))
 
 
 def _read(upload: UploadFile, fps: float, take: Callable[[int], object]) -> Video:

@@ -12,7 +12,7 @@ export class Curve {
   numFrames = null;
   sampledFrames = null;
 
-  /** settings: task, model, rule, frames, fps, resize, as in the form */
+  /** settings: task, model, rule, frames, fps, orient, resize, as in the form */
   constructor(index, video, settings) {
     Object.assign(this, { index, video, ...settings, frames: settings.frames || null });
     this.allTimes = null;
@@ -20,12 +20,13 @@ export class Curve {
 
   /** The same for two curves that ask the same. */
   get identity() {
-    const { video, task, model, rule, frames, fps, resize } = this;
-    return JSON.stringify([video.id, task, model, rule, frames, fps, resize]);
+    const { video, task, model, rule, frames, fps, orient, resize } = this;
+    return JSON.stringify([video.id, task, model, rule, frames, fps, orient, resize]);
   }
 
   get sampling() {
-    return this.sampledFrames === null ? this.rule : `${this.rule}, ${this.sampledFrames} frames`;
+    const frames = this.sampledFrames === null ? [] : [`${this.sampledFrames} frames`];
+    return [this.rule, ...frames, ...(this.orient === "none" ? [] : [this.orient])].join(", ");
   }
 
   get label() {

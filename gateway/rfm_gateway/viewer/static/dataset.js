@@ -8,7 +8,7 @@ import { cell, named, shown } from "./table.js";
 import { Timeline } from "./timeline.js";
 
 const CAMERA_PREFIX = "observation.images.";
-const NOTHING = { episodes: [], cameras: [], bins: null, threshold: 0.5 };
+const NOTHING = { episodes: [], cameras: [], orientations: [], bins: null, threshold: 0.5 };
 
 export class DatasetTab {
   #page;
@@ -23,7 +23,7 @@ export class DatasetTab {
   #curves = [];
   #stopping = new AbortController();
 
-  /** onScore({ files, task, fps }): somebody wants an episode scored; onError(error): something went wrong */
+  /** onScore({ files, task, fps, orientations }): somebody wants an episode scored; onError(error): something went wrong */
   constructor(page, { onScore, onError }) {
     this.#page = page;
     this.#onScore = onScore;
@@ -139,7 +139,7 @@ export class DatasetTab {
   }
 
   async #fetch({ episode }, signal) {
-    const { cameras } = this.#told;
+    const { cameras, orientations } = this.#told;
     const told = await curvesOf(this.#number, episode, this.#labels, signal);
     this.#curves = curvesIn(told);
     this.#timeline.time = 0;
@@ -151,7 +151,7 @@ export class DatasetTab {
     cameras.forEach((camera, index) => {
       const file = `${name}_episode_${`${episode}`.padStart(6, "0")}.${short(camera)}.mp4`;
       this.#watched.files.push(new File([blobs[index]], file, { type: blobs[index].type }));
-      this.#timeline.videos.add(this.#watched.files.at(-1), short(camera));
+      this.#timeline.videos.add(this.#watched.files.at(-1), short(camera), orientations[index]);
     });
     this.#page["score-episode"].disabled = !cameras.length;
     if (!matchMedia("(prefers-reduced-motion: reduce)").matches) this.#timeline.videos.play();
@@ -171,7 +171,8 @@ export class DatasetTab {
 
   #score() {
     this.#timeline.videos.pause();
-    this.#onScore({ files: this.#watched.files, task: this.#watched.task, fps: this.#told.fps });
+    const { fps, orientations } = this.#told;
+    this.#onScore({ files: this.#watched.files, task: this.#watched.task, fps, orientations });
   }
 }
 

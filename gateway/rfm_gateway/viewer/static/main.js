@@ -41,6 +41,8 @@ async function begin() {
   page["key-form"].hidden = true;
   page.model.replaceChildren(...gateway.models.map(({ name }) => new Option(name)));
   page.rule.replaceChildren(...gateway.rules.map(({ name }) => new Option(name)));
+  page.orient.replaceChildren(...gateway.orientations.map((name) => new Option(name === "none" ? "as stored" : name, name)));
+  videos.turn(page.orient.value);
   page.fps.value = gateway.fps;
   if (gateway.models.some(({ name }) => name === gateway.model)) page.model.value = gateway.model;
   chooseRule();
@@ -92,20 +94,21 @@ function form(fields, files) {
 }
 
 /** Adds files, and scores them at once if a task is there. */
-function addFiles(files) {
-  for (const file of files) videos.add(file);
+function addFiles(files, orientations = []) {
+  [...files].forEach((file, index) => videos.add(file, file.name, orientations[index] ?? page.orient.value));
   page["no-videos"].hidden = videos.all.length > 0;
   update();
   if (tasks().length && page.model.value) scoreAll();
 }
 
-/** Scores an episode of a dataset in place of what was there. fps: frames a second of the dataset */
-function scoreEpisode({ files, task, fps }) {
+/** Scores an episode of a dataset in place of what was there. fps: frames a second; orientations: of each file */
+function scoreEpisode({ files, task, fps, orientations }) {
   clear();
   page.tasks.value = task;
   page.fps.value = fps;
+  page.orient.value = orientations[0] ?? "none";
   tabs.select(0);
-  addFiles(files);
+  addFiles(files, orientations);
 }
 
 /** Asks about each video and task that was not yet asked about with these settings. */
@@ -123,7 +126,7 @@ function scoreAll() {
   const known = new Set(curves.filter(({ error }) => !error).map(({ identity }) => identity));
   for (const video of videos.all) {
     for (const task of tasks()) {
-      const curve = new Curve(numCurves, video, { task, ...settings() });
+      const curve = new Curve(numCurves, video, { task, ...settings(), orient: video.orient });
       if (known.has(curve.identity)) continue;
       curves = curves.filter(({ identity }) => identity !== curve.identity); // one that failed is asked again
       curves.push(curve);
@@ -135,8 +138,8 @@ function scoreAll() {
 }
 
 async function ask(curve, signal) {
-  const { video, task, model, rule, frames, fps, resize } = curve;
-  const fields = { task, model, sampling: rule, frames, fps, resize };
+  const { video, task, model, rule, frames, fps, orient, resize } = curve;
+  const fields = { task, model, sampling: rule, frames, fps, orient, resize };
   try {
     await score(form(fields, { video: video.file }), signal, (name, document) => {
       curve.take(name, document);
@@ -153,13 +156,16 @@ async function ask(curve, signal) {
 async function comparePair() {
   const [first, second] = videos.all;
   const { model, fps, resize } = settings();
+  const { orient } = first;
   page.errors.replaceChildren();
   page.compare.disabled = true;
   try {
     if (!tasks().length) throw new Error("task: expected what is to be done, as a sentence, got none");
+    if (second.orient !== orient) throw new Error(`orient: expected the same of both videos, got ${orient} and ${second.orient}`);
     for (const task of tasks()) {
-      const data = form({ task, model, fps, resize }, { first: first.file, second: second.file });
-      const verdict = { videos: [first, second], task, model, fps, resize, answer: await compare(data, stopping.signal) };
+      const data = form({ task, model, fps, orient, resize }, { first: first.file, second: second.file });
+      const answer = await compare(data, stopping.signal);
+      const verdict = { videos: [first, second], task, model, fps, orient, resize, answer };
       verdicts.push(verdict);
       addVerdict(page.pairs, verdict);
       update();
@@ -233,6 +239,7 @@ listen(page["key-form"], { submit: (event) => { event.preventDefault(); useKey(p
 listen(page.files, { change: () => addFiles(page.files.files) });
 listen(page.model, { change: chooseRule });
 listen(page.rule, { change: showLimits });
+listen(page.orient, { change: () => videos.turn(page.orient.value) });
 listen(page.stop, { click: stop });
 listen(page.clear, { click: clear });
 listen(page.compare, { click: comparePair });

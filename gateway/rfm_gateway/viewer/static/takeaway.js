@@ -3,11 +3,11 @@
 
 /** The curves as CSV, one line a point. */
 export function csv(curves) {
-  const columns = ["video", "task", "model", "version", "sampling", "frames", "fps", "frame", "time_s", "progress", "success"];
+  const columns = ["video", "task", "model", "version", "sampling", "frames", "fps", "orient", "frame", "time_s", "progress", "success"];
   const lines = curves.flatMap((curve) =>
     curve.times.map((time, index) => [
       curve.video.name, curve.task, curve.model, curve.version, curve.rule, curve.sampledFrames, curve.fps,
-      index, time, curve.progress[index], curve.success[index],
+      curve.orient, index, time, curve.progress[index], curve.success[index],
     ]),
   );
   return [columns, ...lines].map((values) => values.map(csvField).join(",") + "\r\n").join("");
@@ -28,6 +28,7 @@ export function json(url, curves, verdicts) {
     fps: curve.fps,
     sampling: curve.rule,
     sampled_frames: curve.sampledFrames,
+    orient: curve.orient,
     resize: curve.resize,
     num_frames: curve.numFrames,
     progress: curve.progress,
@@ -36,8 +37,8 @@ export function json(url, curves, verdicts) {
     frame_times_s: curve.times,
     ...(curve.error ? { error: curve.error } : {}),
   }));
-  const comparisons = verdicts.map(({ videos, task, model, answer }) => ({
-    first: videos[0].name, second: videos[1].name, task, model, ...answer,
+  const comparisons = verdicts.map(({ videos, task, model, orient, answer }) => ({
+    first: videos[0].name, second: videos[1].name, task, model, orient, ...answer,
   }));
   return JSON.stringify({ servers: [url], videos, comparisons }, null, 2) + "\n";
 }
@@ -59,14 +60,15 @@ export function commands(url, curves, verdicts) {
   return [...scores, ...comparisons].join("\n");
 }
 
-function asked({ task, model, rule, sampledFrames, fps, resize }) {
-  return JSON.stringify([task, model, rule, sampledFrames, fps, resize]);
+function asked({ task, model, rule, sampledFrames, fps, orient, resize }) {
+  return JSON.stringify([task, model, rule, sampledFrames, fps, orient, resize]);
 }
 
-function line(command, videos, { task, model, fps, resize }, url, options) {
+function line(command, videos, { task, model, fps, orient, resize }, url, options) {
   const files = videos.map(({ name }) => (name.startsWith("-") ? `./${name}` : name));
   const words = ["rfm-client", command, ...files, "--url", url, "--model", model, "--task", task, "--fps", fps];
-  return [...words, ...(resize ? ["--resize"] : []), ...options].map(quoted).join(" ");
+  const turned = orient === "none" ? [] : ["--orient", orient];
+  return [...words, ...turned, ...(resize ? ["--resize"] : []), ...options].map(quoted).join(" ");
 }
 
 /** A word as a shell reads it. */

@@ -24,14 +24,15 @@ export class Videos {
     return this.#entries.some(({ player }) => !player.paused && !player.ended);
   }
 
-  /** Shows a file under a name, and gives what is known of it. */
-  add(file, name = file.name) {
+  /** Shows a file under a name, turned, and gives what is known of it. */
+  add(file, name = file.name, orient = "none") {
     const figure = document.createElement("figure");
     const player = document.createElement("video");
     const caption = document.createElement("figcaption");
-    const entry = { id: (this.#numAdded += 1), file, name, figure, player, wanted: null };
+    const entry = { id: (this.#numAdded += 1), file, name, figure, player, orient, wanted: null };
     Object.assign(player, { src: URL.createObjectURL(file), muted: true, playsInline: true, preload: "auto" });
     player.setAttribute("aria-label", `Video ${name}`);
+    player.className = orient;
     caption.textContent = name;
     player.addEventListener("error", () => {
       caption.textContent = `${name}: this browser cannot show it; its curve counts all the same`;
@@ -42,6 +43,11 @@ export class Videos {
     this.#host.append(figure);
     this.#entries.push(entry);
     return entry;
+  }
+
+  /** Turns all videos, as their frames are turned before they are scored. */
+  turn(orient) {
+    for (const entry of this.#entries) entry.player.className = entry.orient = orient;
   }
 
   /** Moves all videos to a time, but for `but`. */
