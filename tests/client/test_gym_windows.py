@@ -161,6 +161,20 @@ def test_a_vector_that_does_not_tell_the_last_frame_is_refused(recorder: Recorde
         env.step(ACTIONS)
 
 
+def test_a_reset_that_workers_would_do_twice_is_refused(recorder: Recorder) -> None:
+    makers = [partial(CodedEnv, number, (1,)) for number in range(2)]
+    workers = AsyncVectorEnv(makers, autoreset_mode=NEXT_STEP, shared_memory=False, context="spawn")
+    with closing(RewardModelVectorWrapper(workers, recorder, TASKS, options("pixels"))) as env:
+        env.reset()
+        env.step(ACTIONS)
+        with pytest.raises(ValueError, match=r"^reset: expected none .* environments \[0, 1\], .*shared_memory=True$"):
+            env.reset()
+        env.step(ACTIONS)
+        env.reset()
+        env.step(ACTIONS)
+    assert recorder.calls[-1] == [up_to(0, 2, 1), up_to(1, 2, 1)]
+
+
 # Failures: the frame of a step whose score failed is part of the episode; one that was not kept needs a reset.
 
 

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 from gymnasium.error import ResetNeeded
-from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import iterate
 
 from rfm_client.contract.errors import InvalidSampleError
@@ -66,6 +66,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         """Resets the environments (those of ``reset_mask``), and scores their first frames. Raises RewardError."""
         everyone = np.ones(self.num_envs, np.bool_)
         reset_mask = (options or {}).get("reset_mask", everyone)  # before env.reset, which takes it out of the options
+        self._check_can_reset(self._resetting & reset_mask)
         whole, self._whole = self._whole, np.zeros_like(self._whole)
         observations, infos = self.env.reset(seed=seed, options=options)
         self._whole, self._ended = whole & ~reset_mask, self._ended & ~reset_mask
@@ -101,6 +102,17 @@ class RewardModelVectorWrapper(VectorWrapper):
             episode.end()
         self._scorer.close()
         super().close(**kwargs)
+
+    def _check_can_reset(self, twice: Mask) -> None:
+        """Raises ValueError where Gymnasium (1.4) forgets that its workers are to reset, and they reset once more.
+
+        twice: which environments would reset in the next step anyway
+        """
+        vector = self.unwrapped
+        if twice.any() and isinstance(vector, AsyncVectorEnv) and not vector.shared_memory:
+            got = f"the environments {np.flatnonzero(twice).tolist()}, which would reset once more in the next step"
+            remedy = "take a step before it, or make the AsyncVectorEnv with shared_memory=True"
+            raise ValueError(f"reset: expected none whose episode has ended, got {got}; {remedy}")
 
     def _check_can_step(self) -> None:
         """Raises ResetNeeded if a step would show a frame that is not the next one of an episode."""
