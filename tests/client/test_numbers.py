@@ -48,9 +48,11 @@ COUNTS: dict[str, Given] = {
     "LabelOptions.workers": lambda value: LabelOptions(workers=value),
     "LabelOptions.limit": lambda value: LabelOptions(limit=value),
     "LabelOptions.frames": lambda value: LabelOptions(frames=value),
+    "LabelOptions.shard": lambda value: LabelOptions(shard=(0, value)),
     "RayOptions.actors": lambda value: RayOptions(actors=value),
     "RewardClient.max_in_flight": lambda value: client(max_in_flight=value),
 }
+FROM_0: dict[str, Given] = {"LabelOptions.episodes": lambda value: LabelOptions(episodes=[value])}
 POSITIVES: dict[str, Given] = {"RewardClient.timeout_s": lambda value: client(timeout_s=value)}
 FINITES: dict[str, Given] = {
     "RewardOptions.scale": lambda value: RewardOptions(scale=value),
@@ -68,6 +70,7 @@ def cases(kinds: dict[str, Given], values: list[Any]) -> list[Any]:
     [
         *cases(SHARES, [*NO_NUMBERS, -1, -0.01, 1.01, 80, np.float32(80)]),
         *cases(COUNTS, [*NO_NUMBERS, 0, -1, 2.5, 2.0, np.float64(2)]),
+        *cases(FROM_0, [*NO_NUMBERS, -1, 2.5]),
         *cases(POSITIVES, [*NO_NUMBERS, 0, -1]),
         *cases(FINITES, NO_NUMBERS),
     ],
@@ -81,6 +84,7 @@ def test_a_number_that_cannot_hold_is_refused(give: Given, value: Any) -> None:
     ("give", "value"),
     [
         *cases(SHARES, [0, 1, 0.5, np.float32(0.8), np.int64(1)]),
+        *cases(FROM_0, [0, np.int64(8)]),
         *cases(COUNTS, [1, 8, np.int64(8), np.uint8(8)]),
         *cases(POSITIVES, [1, 0.5, np.float32(0.5), np.int64(8)]),
         *cases(FINITES, [1, 0.5, np.float32(0.5), 0]),

@@ -79,7 +79,10 @@ class LabelOptions:
             raise ValueError(f"cameras: expected each once, got {', '.join(self.cameras)}")
         if self.mode == "whole" and self.sampling not in (None, "all"):
             raise ValueError(f"sampling: expected all in mode whole, which shows every frame, got {self.sampling}")
-        if self.shard is not None and not 0 <= self.shard[0] < self.shard[1]:
+        for where, numbers in (("episodes", self.episodes), ("shard", self.shard)):
+            if numbers is not None:
+                object.__setattr__(self, where, tuple(checked_count(where, each, least=0) for each in numbers))
+        if self.shard is not None and self.shard[0] >= self.shard[1]:
             raise ValueError(f"shard: expected i/n with i from 0 to n - 1, got {self.shard[0]}/{self.shard[1]}")
         for where, number in (("workers", self.workers), ("limit", self.limit), ("frames", self.frames)):
             if number is not None:
