@@ -25,6 +25,7 @@ from rfm_client.transport.calls import Transport, connect
 from rfm_client.transport.deadline import Deadline, check_timeout
 from rfm_client.transport.host_names import of_urls
 from rfm_client.transport.in_flight import InFlight
+from rfm_client.transport.one_process import OneProcess
 from rfm_client.transport.server import PROBE_TIMEOUT_S
 from rfm_client.transport.servers import Servers
 
@@ -57,7 +58,7 @@ class ClientOptions(AccessOptions, total=False):
     shared_memory: bool
 
 
-class AsyncRewardClient:
+class AsyncRewardClient(OneProcess):
     """A connection to one or several servers of the same checkpoint, for one event loop.
 
     Arrays of samples must not change while a call is awaited: they are sent as they are when it is their turn.
@@ -88,6 +89,7 @@ class AsyncRewardClient:
         self._scorer = Scorer(self._model, self._servers, in_flight, join=options.get("join", False))
         self._windows = WindowScorer(self._model, self._scorer)
         self._is_closed = False
+        self._loop: asyncio.AbstractEventLoop | None = None  # that it was first used in
 
     async def progress(
         self, trajectory: Trajectory, *, frame_steps: int = 0, **options: Unpack[CallOptions]
@@ -200,11 +202,8 @@ class AsyncRewardClient:
     async def wait_ready(self, timeout_s: float) -> None:
         """Returns as soon as ``is_ready``. Raises DeadlineExceededError."""
         deadline = self._deadline(timeout_s)
-        is_first = True
+        await self._servers.check_ports()
         while not await self.is_ready(timeout_s=min(PROBE_TIMEOUT_S, deadline.remaining_s())):
-            if is_first:
-                await self._servers.check_ports()
-            is_first = False
             if deadline.ends_within(READY_POLL_S):
                 names = f"{self._model} and {frames_name(self._model)}"
                 why = await self._why_unready()
@@ -239,6 +238,10 @@ class AsyncRewardClient:
                 told[part] = await self._servers.model_infos(name, deadline)
         return told
 
+    def stop_retrying(self) -> None:
+        """Has calls that fail from now on fail at once, as ``close`` does first."""
+        self._servers.stop_retrying()
+
     async def close(self) -> None:
         """Closes the connections and gives shared memory back."""
         self._is_closed = True
@@ -270,4 +273,9 @@ class AsyncRewardClient:
         """Deadline of a call which begins now; timeout_s: None: the client's."""
         if self._is_closed:
             raise RuntimeError("this AsyncRewardClient is closed")
+        loop = asyncio.get_running_loop()
+        self._loop = self._loop or loop
+        if self._loop is not loop:
+            expected = "the event loop that it was first used in"
+            raise RuntimeError(f"this AsyncRewardClient: expected {expected}, got another: make one in each loop")
         return Deadline(self._timeout_s if timeout_s is None else timeout_s)

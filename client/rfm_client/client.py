@@ -22,12 +22,13 @@ from rfm_client.episodes.options import EpisodeSettings
 from rfm_client.episodes.windows import Window
 from rfm_client.transport.calls import Transport
 from rfm_client.transport.loop_thread import LoopThread
+from rfm_client.transport.one_process import OneProcess
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 
-class RewardClient:
+class RewardClient(OneProcess):
     """AsyncRewardClient without ``await``, thread-safe: its event loop runs in a thread of its own.
 
     Arguments and errors are AsyncRewardClient's. Closes itself as a context manager and at the interpreter's end.
@@ -43,7 +44,7 @@ class RewardClient:
     ) -> None:
         self._client = AsyncRewardClient(urls, transports=transports, **options)
         self._loop = LoopThread("rfm-client")
-        self._finalizer = weakref.finalize(self, self._loop.stop, self._client.close)
+        self._finalizer = weakref.finalize(self, _close, self._client, self._loop)
 
     def progress(
         self, trajectory: Trajectory, *, frame_steps: int = 0, **options: Unpack[CallOptions]
@@ -169,3 +170,8 @@ class RewardClient:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _close(client: AsyncRewardClient, loop: LoopThread) -> None:
+    client.stop_retrying()  # before calls are cancelled, for a connection may seem to end under them
+    loop.stop(client.close)

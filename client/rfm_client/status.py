@@ -10,7 +10,6 @@ import re
 import ssl
 import textwrap
 import time
-import urllib.request
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -22,14 +21,18 @@ from tritonclient.utils import InferenceServerException
 from rfm_client.contract import triton
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import (
-    AccessDeniedError,
     DeadlineExceededError,
     InferenceFailedError,
     ServerUnavailableError,
 )
+from rfm_client.contract.proxies import grpc_proxy, open_url
+from rfm_client.transport import remedies
 from rfm_client.transport.access import Access
+from rfm_client.transport.connection import grpc_options
+from rfm_client.transport.ports import OF_A_PORT, wrong_port
 
 METRICS_PORT = 8002
+METRICS_OPTION = "--metrics-url"
 DEVICE_METRICS = "nv_cpu_utilization, nv_gpu_utilization, nv_*_memory_*_bytes"
 _PROCESSOR = "CPU"
 WAITING_METRICS = ("nv_inference_pending_request_count", "rfm_waiting_requests")  # in Triton, in the model
@@ -188,25 +191,40 @@ def read_status(
     Raises ServerUnavailableError, AccessDeniedError, DeadlineExceededError, and InferenceFailedError for what is no
     Triton server.
     """
+    try:
+        return _read(url, metrics_url, timeout_s, access or Access())
+    except OF_A_PORT as error:
+        named = wrong_port(url)
+        if named is None:
+            raise
+        raise ServerUnavailableError(named) from error
+
+
+def _read(url: str, metrics_url: str | None, timeout_s: float, access: Access) -> ServerStatus:
     scheme, address = split_url(url)
+    proxy = grpc_proxy(address) if scheme.startswith("grpc") else None
     try:
         read_server = _read_over_grpc if scheme.startswith("grpc") else _read_over_http
-        server = read_server(scheme, address, timeout_s, access or Access())
+        server = read_server(scheme, address, timeout_s, access)
         metrics_url = metrics_url or f"http://{address.rpartition(':')[0]}:{METRICS_PORT}/metrics"
         metrics = _read_metrics(metrics_url, timeout_s)
         models = tuple(_models(server, metrics))
     except InferenceServerException as error:
-        if triton.is_denied(str(error.status()), error.message() or ""):
-            raise AccessDeniedError(f"{url}: access denied: {error.message()}") from error
-        is_late = str(error.status()) in triton.OUT_OF_TIME
-        kind = DeadlineExceededError if is_late else ServerUnavailableError
-        raise kind(f"{url}: {error.message()}") from error
+        status, message = str(error.status()), error.message() or ""
+        if triton.is_denied(status, message):
+            raise remedies.denied(url, status, message) from error
+        if triton.is_unreachable(status, message):
+            raise remedies.unreachable(url, message, proxy) from error
+        if status in triton.OUT_OF_TIME:
+            where = f"{url} through {proxy}" if proxy else url
+            raise DeadlineExceededError(f"{where}: {message}") from error
+        raise ServerUnavailableError(f"{url}: {message}") from error
     except TimeoutError as error:
         raise DeadlineExceededError(f"{url}: no answer within {timeout_s:g} s") from error
     except ssl.SSLError as error:
-        raise AccessDeniedError(f"{url}: access denied: {error}") from error
+        raise remedies.denied(url, "", str(error)) from error
     except (OSError, EOFError, HTTPException) as error:
-        raise ServerUnavailableError(f"{url}: {error}") from error
+        raise remedies.unreachable(url, str(error)) from error
     except (ValueError, LookupError, TypeError, AttributeError) as error:  # reading what is no answer of Triton
         raise InferenceFailedError(f"{url}: the answer cannot be read: {error!r}") from error
     return ServerStatus(url, server.version, server.ready, models, metrics_url, metrics.error, metrics.devices)
@@ -241,7 +259,9 @@ def _read_over_http(scheme: str, address: str, timeout_s: float, access: Access)
 def _read_over_grpc(scheme: str, address: str, timeout_s: float, access: Access) -> _Server:
     import tritonclient.grpc
 
-    client = tritonclient.grpc.InferenceServerClient(address, **access.grpc_options(scheme))
+    client = tritonclient.grpc.InferenceServerClient(
+        address, channel_args=list(grpc_options(address).items()), **access.grpc_options(scheme)
+    )
     access.show_with_each_request(client)
     as_json = {"as_json": True, "client_timeout": timeout_s}
     try:
@@ -315,7 +335,7 @@ def _read_metrics(url: str, timeout_s: float) -> _Metrics:
             time.sleep(_POLL_S)
             samples = _scrape(url, timeout_s)
     except (OSError, HTTPException, ValueError) as error:
-        return _Metrics(error=f"no metrics of the machine: {url}: {textwrap.shorten(str(error), _REASON_CHARACTERS)}")
+        return _Metrics(error=f"no metrics of the machine: {url}: {_short(error)}: give their URL ({METRICS_OPTION})")
     devices: dict[str, dict[str, float]] = {}
     for sample in samples:
         match = _DEVICE_METRIC.fullmatch(sample.name)
@@ -337,6 +357,10 @@ def _read_metrics(url: str, timeout_s: float) -> _Metrics:
         batches=_batches(samples),
         refused={version: int(count) for version, count in _totals(refused, _SAMPLES_METRIC).items()},
     )
+
+
+def _short(error: Exception) -> str:
+    return textwrap.shorten(str(error), _REASON_CHARACTERS)
 
 
 def _totals(samples: list[Any], *names: str) -> dict[_Version, float]:
@@ -382,7 +406,7 @@ def _work(samples: list[Any], device: str) -> dict[str, DeviceWork]:
 def _scrape(url: str, timeout_s: float) -> list[Any]:
     from prometheus_client.parser import text_string_to_metric_families
 
-    with urllib.request.urlopen(url, timeout=timeout_s) as answer:
+    with open_url(url, timeout_s) as answer:
         families = text_string_to_metric_families(answer.read().decode())
         return [sample for family in families for sample in family.samples]
 

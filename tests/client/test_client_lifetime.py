@@ -196,7 +196,7 @@ def test_samples_that_fail_together_have_errors_of_their_own() -> None:
 
 def test_an_http_client_at_the_grpc_port_is_told_at_once(served: Served) -> None:
     url = served.url("grpc").replace("grpc://", "http://")
-    with RewardClient(url) as client, pytest.raises(InferenceFailedError, match="no answer of an HTTP server"):
+    with RewardClient(url) as client, pytest.raises(ServerUnavailableError, match="got its gRPC port: use grpc://"):
         client.progress(random_trajectory(0, 2))
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -15,7 +16,6 @@ import typer
 from typer.core import TyperCommand
 
 from rfm_client.async_client import DEFAULT_TIMEOUT_S
-from rfm_client.cli.ports import wrong_port
 from rfm_client.client import RewardClient
 from rfm_client.contract import errors
 from rfm_client.contract.names import DEFAULT_MODEL
@@ -53,6 +53,14 @@ _ERROR_CODES: dict[type[BaseException], ExitCode] = {
     errors.ModelNotFoundError: ExitCode.NO_MODEL,
 }
 
+
+def finite(value: float) -> float:
+    """Refuses infinity and NaN, which are within any bounds. Raises typer.BadParameter."""
+    if not math.isfinite(value):
+        raise typer.BadParameter(f"expected a number, got {value}")
+    return value
+
+
 Urls = Annotated[
     list[str],
     typer.Option(
@@ -77,7 +85,10 @@ ApiKeyFile = Annotated[
 ]
 Model = Annotated[str, typer.Option("--model", help="Name under which the checkpoint was exported.")]
 TimeoutS = Annotated[
-    float, typer.Option("--timeout", min=MIN_TIMEOUT_S, max=MAX_TIMEOUT_S, help="Seconds that a request may take.")
+    float,
+    typer.Option(
+        "--timeout", min=MIN_TIMEOUT_S, max=MAX_TIMEOUT_S, callback=finite, help="Seconds that a request may take."
+    ),
 ]
 Json = Annotated[
     str | None,
@@ -91,7 +102,9 @@ Recorded = Annotated[
     typer.Option("--rrd", metavar="FILE", help="Record frames and scores on one timeline for Rerun's viewer: .rrd."),
 ]
 Task = Annotated[str, typer.Option("--task", help="What is to be done, as a sentence.")]
-Fps = Annotated[float, typer.Option("--fps", min=0.001, help="Frames a second that are taken from a video.")]
+Fps = Annotated[
+    float, typer.Option("--fps", min=0.001, callback=finite, help="Frames a second that are taken from a video.")
+]
 Subsample = Annotated[
     bool, typer.Option(help="Score no more frames than the checkpoint was trained on, evenly spaced; else all.")
 ]
@@ -159,7 +172,7 @@ class Server:
                     return
                 except errors.RewardError as error:
                     problems.append(error)
-        raise port_named(self.urls, problems[0])
+        raise problems[0]
 
 
 def read_access(ca_file: Path | None, certificate: Path | None, key: Path | None, key_file: Path | None) -> Access:
@@ -170,14 +183,6 @@ def read_access(ca_file: Path | None, certificate: Path | None, key: Path | None
         except (OSError, UnicodeDecodeError) as error:
             raise ValueError(f"expected a text file, got {error}") from None
         return Access(ca_file, certificate, key, api_key=api_key)
-
-
-def port_named(urls: Sequence[str], error: errors.RewardError) -> errors.RewardError:
-    """The error of servers that do not answer as servers do; if a port is to blame, one that names the right one."""
-    if not isinstance(error, errors.ServerUnavailableError | errors.ServerError):
-        return error
-    named = next(filter(None, map(wrong_port, urls)), None)
-    return error if named is None else errors.ServerUnavailableError(named)
 
 
 def exit_code(error: BaseException) -> ExitCode:

@@ -33,12 +33,6 @@ def grpc_proxy(address: str) -> str | None:
     return _shown(name, os.environ[name])
 
 
-def through_proxy(address: str) -> str:
-    """What an error of a call over gRPC to ``host:port`` adds: the proxy and the remedy. Empty where there is none."""
-    proxy = grpc_proxy(address)
-    return f" (through {proxy}; to go there without a proxy, add {host_of(address)} to no_proxy)" if proxy else ""
-
-
 def open_url(url: str, timeout_s: float) -> Any:
     """The open response of an HTTP server. Raises OSError, HTTPException."""
     scheme, host = urlsplit(url).scheme, urlsplit(url).hostname or ""

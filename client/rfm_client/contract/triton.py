@@ -38,7 +38,7 @@ RESTRICTED = "is restricted, expecting header"  # of an API that wants a key
 QUEUE_FULL = "the queue is full"  # of a model, in which as many requests wait as may
 TRITON_QUEUE_FULL = "Exceeds maximum queue size"  # of Triton, for a model with a queue policy, as older exports have
 
-_NO_CONNECTION = "failed to connect"  # of gRPC itself: nothing was sent
+_NO_CONNECTION = re.compile("failed to connect|errors resolving|resolution failed")  # of gRPC itself: nothing was sent
 _LOST_CONNECTION = re.compile("Socket closed|Connection reset|Broken pipe|connection termination")  # or of a proxy
 _NO_TRUST = re.compile(f"CERTIFICATE|certificate|[Vv]erification [Cc]heck failed|WRONG_VERSION_NUMBER|{RESTRICTED}")
 _WRONG_SHAPE = re.compile(  # behind the batch axis, which the caller did not make
@@ -51,6 +51,11 @@ _PREFIX = re.compile(r"^(\[request id: [^\]]*\] )?(in ensemble '[^']*', )?")  # 
 def is_denied(status: str, message: str) -> bool:
     """Whether one side refused the other: no key, a wrong one, or a certificate that is not trusted."""
     return status in DENIED or (status == "StatusCode.UNAVAILABLE" and _NO_TRUST.search(message) is not None)
+
+
+def is_unreachable(status: str, message: str) -> bool:
+    """Whether gRPC found no connection to the server."""
+    return status == "StatusCode.UNAVAILABLE" and _NO_CONNECTION.search(message) is not None
 
 
 def is_absent(message: str) -> bool:
@@ -83,6 +88,6 @@ def error_of(status: str, message: str, bad_request: type[errors.RewardError]) -
     kind = _ERROR_OF.get(status, errors.InferenceFailedError)
     error = (bad_request if kind is errors.InvalidSampleError else kind)(text)
     if isinstance(error, errors.ServerUnavailableError):
-        is_lost = _LOST_CONNECTION.search(text) is not None and _NO_CONNECTION not in text
+        is_lost = _LOST_CONNECTION.search(text) is not None and not _NO_CONNECTION.search(text)
         error.may_have_ended_server = is_lost or status in BAD_GATEWAY
     return error

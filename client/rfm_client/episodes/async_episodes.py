@@ -19,15 +19,17 @@ from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import ProgressResult, Result
 from rfm_client.contract.samples import UInt8Array, as_array
 from rfm_client.data.camera_fusion import FUSES
+from rfm_client.data.orientation import turned
 from rfm_client.data.prefixes import of_frames
 from rfm_client.data.resize import resize_frames
 from rfm_client.data.sampling import Prefix, Sampling
-from rfm_client.episodes.frames import checked_frame, copied
+from rfm_client.episodes.frames import checked_frame, copied, orientations_of
 from rfm_client.episodes.live import LiveEpisode
 from rfm_client.episodes.options import EpisodeOptions
 from rfm_client.episodes.scores import StepScore, StepScores
 from rfm_client.episodes.windows import NamedFrame, Window
 from rfm_client.transport.deadline import Deadline
+from rfm_client.transport.one_process import OneProcess
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -47,7 +49,7 @@ class Windows(Protocol):
         """What the server says of its model."""
 
 
-class AsyncEpisodes:
+class AsyncEpisodes(OneProcess):
     """N episodes that grow side by side, as those of vectorised environments; as few requests a step as fit. An async
     context manager that closes it.
 
@@ -66,6 +68,7 @@ class AsyncEpisodes:
         self._options = options
         self._timeout_s = timeout_s
         self._cameras = options.cameras or (ONLY_CAMERA,)
+        self._orientations = dict(zip(self._cameras, orientations_of(options.orient, options.cameras), strict=True))
         self._tasks = list(tasks)
         self._frames: list[dict[str, list[NamedFrame]]] = [self._none() for _ in tasks]
         self._live: dict[int, LiveEpisode] = {}  # of those that are watched
@@ -200,7 +203,7 @@ class AsyncEpisodes:
         for camera, frame in frames.items():
             where = f"frame[{camera!r}]" if camera else "frame"
             try:
-                pixels = self._sized(checked_frame(frame, where))
+                pixels = self._sized(turned(checked_frame(frame, where), self._orientations[camera]))
                 before = self._frames[index][camera]
                 if before and before[0].pixels.shape != pixels.shape:
                     expected = f"uint8 {list(before[0].pixels.shape)}, as the episode's first"
@@ -256,7 +259,7 @@ class AsyncEpisodes:
         return error.inside(f"episodes[{index}]")
 
 
-class AsyncEpisode:
+class AsyncEpisode(OneProcess):
     """One episode that grows, for asyncio. Built by ``AsyncRewardClient.episode``."""
 
     def __init__(self, client: Windows, task: str, options: EpisodeOptions, timeout_s: float | None = None) -> None:

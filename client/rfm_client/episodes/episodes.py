@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 from rfm_client.episodes.async_episodes import AsyncEpisode, AsyncEpisodes
 from rfm_client.episodes.frames import copied
 from rfm_client.episodes.scores import StepScore, StepScores
+from rfm_client.transport.one_process import OneProcess
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -28,7 +29,7 @@ class Loop(Protocol):
         """What the coroutine will give."""
 
 
-class Episodes:
+class Episodes(OneProcess):
     """AsyncEpisodes without ``await``. Built by ``RewardClient.episodes``, whose client lives as long as this.
 
     A context manager that closes it.
@@ -67,7 +68,7 @@ class Episodes:
         self.close()
 
 
-class Episode:
+class Episode(OneProcess):
     """One episode that grows. Built by ``RewardClient.episode``, whose client lives as long as this. A context manager
     that closes it.
     """

@@ -9,6 +9,7 @@ import logging
 import os
 import ssl
 from collections.abc import Awaitable, Callable, Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache, partial
 from typing import Any, Protocol, TypeVar
@@ -19,9 +20,11 @@ from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 from rfm_client.contract import errors, triton
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.proxies import grpc_proxy
 from rfm_client.contract.wire import Tensors
+from rfm_client.transport import remedies
 from rfm_client.transport.access import SECURE_SCHEMES, Access
-from rfm_client.transport.connection import GRPC_OPTIONS, Connection
+from rfm_client.transport.connection import Connection, grpc_options
 from rfm_client.transport.deadline import timeout
 from rfm_client.transport.off_loop import MIN_BYTES, off_loop
 from rfm_client.transport.shared_memory import Region, SharedMemory
@@ -32,6 +35,10 @@ _US_PER_S = 1_000_000
 _AS_IT_IS = {"Accept-Encoding": "identity"}  # else aiohttp asks for gzip, which makes floats little smaller
 _SMALL_BYTES = 16  # what is asked about one sample, but for its embeddings
 _NUM_SMALL_INPUTS = 512  # that are kept
+_UNREADABLE = (ValueError, LookupError, TypeError)  # what comes of an answer that is not a KServe server's
+_SERVED_TIMEOUT_S = 2.0  # of what an error adds
+
+LATE = "no answer in time"
 
 logger = logging.getLogger("rfm_client")
 
@@ -80,8 +87,10 @@ def connect(
     return HttpTransport(url, access or Access(), shared_memory=shared_memory)
 
 
-class _TritonTransport:
+class TritonTransport:
     """What gRPC and HTTP have in common: tritonclient's asyncio clients are the same but for a few options."""
+
+    _proxy: str | None = None  # as an error tells it
 
     def __init__(self, url: str, access: Access, *, shared_memory: bool) -> None:
         self.url = url
@@ -198,23 +207,35 @@ class _TritonTransport:
             async with timeout(timeout_s):
                 return await self._answer(request)
         except InferenceServerException as error:
-            status, message = str(error.status()), error.message() or ""
-            if triton.is_denied(status, message):
-                raise errors.AccessDeniedError(f"{self.url}: access denied: {message}") from error
-            raise triton.error_of(status, message, bad_request) from error
+            raise await self._error_of(str(error.status()), error.message() or "", bad_request) from error
         except (asyncio.TimeoutError, TimeoutError) as error:  # in Python 3.10 two
-            raise errors.DeadlineExceededError(f"{self.url}: no answer in time") from error
+            where = self.url if self._proxy is None else f"{self.url} through {self._proxy}"
+            raise errors.DeadlineExceededError(f"{where}: {LATE}") from error
         except self.protocol_errors as error:
-            hint = "no answer of an HTTP server (is it the gRPC port? then grpc://)"
-            raise errors.InferenceFailedError(f"{self.url}: {hint}: {type(error).__name__}") from error
+            got = "no answer of an HTTP server"
+            raise errors.InferenceFailedError(f"{self.url}: {got}: {type(error).__name__}") from error
         except self.access_errors as error:
-            raise errors.AccessDeniedError(f"{self.url}: access denied: {error}") from error
+            raise remedies.denied(self.url, "", str(error)) from error
         except self.connection_errors as error:
-            unavailable = errors.ServerUnavailableError(f"{self.url}: no connection: {error or type(error).__name__}")
+            unavailable = remedies.unreachable(self.url, str(error) or type(error).__name__)
             unavailable.may_have_ended_server = self._was_under_way(error)
             raise unavailable from error
-        except (ValueError, LookupError, TypeError) as error:  # the answer is not that of a KServe server
+        except _UNREADABLE as error:
             raise errors.InferenceFailedError(f"{self.url}: the answer cannot be read: {error!r}") from error
+
+    async def _error_of(self, status: str, message: str, bad_request: type[errors.RewardError]) -> errors.RewardError:
+        """The error that an answer means to a caller, as ``triton.error_of`` has it, with its remedy."""
+        if triton.is_denied(status, message):
+            return remedies.denied(self.url, status, message)
+        if triton.is_unreachable(status, message):
+            return remedies.unreachable(self.url, message, self._proxy)
+        error = triton.error_of(status, message, bad_request)
+        if isinstance(error, errors.ModelNotFoundError):
+            with suppress(InferenceServerException, asyncio.TimeoutError, *_UNREADABLE, *self.connection_errors):
+                async with timeout(_SERVED_TIMEOUT_S):
+                    with self._connected().used() as client:
+                        return remedies.not_served(error.message, await self._served_models(client))
+        return error
 
     async def _answer(self, request: Callable[[Any], Awaitable[Answered]]) -> Answered:
         """What the server answers; a connection over which nothing comes is left to those who use it already."""
@@ -276,18 +297,22 @@ class _TritonTransport:
     async def _model_config(self, client: Any, model: str) -> Mapping[str, Any]:
         raise NotImplementedError
 
+    async def _served_models(self, client: Any) -> set[str]:
+        raise NotImplementedError
+
     def _model_version(self, answer: Any) -> str:
         raise NotImplementedError
 
 
-class GrpcTransport(_TritonTransport):
+class GrpcTransport(TritonTransport):
     """gRPC: a call that runs out of time, or is cancelled, is cancelled on the server too (if it has not begun)."""
 
     _first_process: int | None = None  # that used gRPC
 
     def __init__(self, url: str, access: Access, *, shared_memory: bool, named: str | None = None) -> None:
         super().__init__(url, access, shared_memory=shared_memory)
-        self._options = {**GRPC_OPTIONS, **_name_options(named)}
+        self._options = {**grpc_options(named or self._address), **_name_options(named)}
+        self._proxy = grpc_proxy(named or self._address)
 
     @cached_property
     def _triton(self) -> Any:
@@ -313,6 +338,10 @@ class GrpcTransport(_TritonTransport):
             answer = await client.get_system_shared_memory_status(as_json=True)
         return list(answer.get("regions", {}))
 
+    async def _served_models(self, client: Any) -> set[str]:
+        answer = await client.get_inference_statistics(as_json=True)
+        return {entry["name"] for entry in answer.get("model_stats", [])}
+
     async def _model_config(self, client: Any, model: str) -> Mapping[str, Any]:
         answer = await client.get_model_config(model, as_json=True)
         config: Mapping[str, Any] = answer["config"]
@@ -328,7 +357,7 @@ def _name_options(named: str | None) -> dict[str, str]:
     return {"grpc.default_authority": named, "grpc.ssl_target_name_override": named.rpartition(":")[0].strip("[]")}
 
 
-class HttpTransport(_TritonTransport):
+class HttpTransport(TritonTransport):
     """HTTP: as many connections as there are calls at a time. Triton finishes a request that nobody waits for."""
 
     @cached_property
@@ -378,6 +407,10 @@ class HttpTransport(_TritonTransport):
     async def registered_regions(self) -> list[str]:
         with self._connected().used() as client:
             return [region["name"] for region in await client.get_system_shared_memory_status()]
+
+    async def _served_models(self, client: Any) -> set[str]:
+        answer = await client.get_inference_statistics()
+        return {entry["name"] for entry in answer["model_stats"]}
 
     async def _model_config(self, client: Any, model: str) -> Mapping[str, Any]:
         config: Mapping[str, Any] = await client.get_model_config(model)

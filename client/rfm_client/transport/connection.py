@@ -21,6 +21,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from rfm_client.contract.proxies import grpc_proxy
+
 PING_MS = 330_000
 UNACKNOWLEDGED_MS = 10_000
 SILENT_S = 1.0
@@ -35,6 +37,11 @@ GRPC_OPTIONS: dict[str, int] = {
     "grpc.keepalive_timeout_ms": UNACKNOWLEDGED_MS,
     "grpc.use_local_subchannel_pool": 1,  # else a new channel would use the old one's connection
 }
+
+
+def grpc_options(address: str) -> dict[str, int]:
+    """Options of a channel to ``host:port``, the name by which the server is known."""
+    return GRPC_OPTIONS if grpc_proxy(address) else {**GRPC_OPTIONS, "grpc.enable_http_proxy": 0}
 
 
 class Connection:

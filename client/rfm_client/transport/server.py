@@ -24,6 +24,7 @@ class Server:
     """One server of several: its transport, its load and its failures.
 
     failures: how often it was left out since the last success
+    has_answered: it has ever had a success
     is_gone: it gets no more requests, and is closed as soon as nobody uses it
     """
 
@@ -34,6 +35,7 @@ class Server:
         self.outstanding = 0
         self.last_request = 0
         self.failures = 0
+        self.has_answered = False
         self.comeback: asyncio.Task[bool] | None = None  # whether it was seen to be healed
         self._has_ended_process = False
         self._is_to_heal = False  # it is left out since a process or a connection has ended

@@ -37,9 +37,10 @@ from rfm_client.contract.errors import (
 )
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.wire import Tensors
-from rfm_client.transport.calls import Answer, Transport
+from rfm_client.transport.calls import LATE, Answer, Transport, TritonTransport
 from rfm_client.transport.deadline import Deadline
 from rfm_client.transport.host_names import REFRESH_S, Name
+from rfm_client.transport.ports import OF_A_PORT, wrong_port
 from rfm_client.transport.server import HEALED_WITHIN_S, LONGEST_RETRY_PAUSE_S, Server, pause_s
 
 Answered = TypeVar("Answered")
@@ -98,6 +99,7 @@ class Servers:
             return await self._request(model, request, deadline, retry_ended=retry_ended)
         except RewardError as error:
             error.request_id = request_id
+            await self._look_at_ports(error)
             raise
 
     async def model_info(self, model: str, deadline: Deadline) -> ModelInfo:
@@ -107,7 +109,17 @@ class Servers:
         def request(server: Transport, left_s: float) -> Awaitable[ModelInfo]:
             return server.model_info(model, left_s)
 
-        return await self._request_among(None, model, request, deadline)
+        try:
+            return await self._request_among(None, model, request, deadline)
+        except RewardError as error:
+            await self._look_at_ports(error)
+            raise
+
+    async def check_ports(self) -> None:
+        """Raises ServerUnavailableError if every URL has a wrong port, which no wait mends."""
+        named = await self._wrong_ports()
+        if named and named[0] is not None and all(named):
+            raise ServerUnavailableError(named[0])
 
     async def model_infos(self, model: str, deadline: Deadline) -> list[ModelInfo]:
         """What each server says of ``model``. Left out are those that do not answer, for they score nothing either.
@@ -143,9 +155,13 @@ class Servers:
             for probe in probes:
                 probe.cancel()
 
+    def stop_retrying(self) -> None:
+        """Has calls that fail from now on fail at once, and without a word in the log."""
+        self._retry = False
+
     async def close(self) -> None:
         """Closes the connections to all servers."""
-        self._retry = False
+        self.stop_retrying()
         if self._looking_up is not None:
             self._looking_up.cancel()
         await asyncio.gather(*(server.close() for server in (*self._servers, *self._gone)))
@@ -203,7 +219,7 @@ class Servers:
             try:
                 with server.request_under_way():
                     answer = await request(server.transport, left_s)
-                server.failures = 0
+                server.failures, server.has_answered = 0, True
                 for other, refusal in refusals.items():  # not before: what all refuse is not one server's fault
                     self._leave_out(other, model, refusal)
                 return answer
@@ -212,7 +228,8 @@ class Servers:
                 failed = failures.get(server)
                 if failed is not None and left_s < deadline.timeout_s / 2:
                     raise failed from failed.__cause__  # the reason for most of the time
-                raise deadline.exceeded(server.transport.url) from error
+                where = error.message.rpartition(f": {LATE}")[0] or server.transport.url
+                raise deadline.exceeded(where) from error
             except (AccessDeniedError, InferenceFailedError, ModelNotFoundError) as error:
                 refusals[server] = error
                 if not self._retry:
@@ -228,6 +245,19 @@ class Servers:
                 has_other = only is None and self._has_other({server, *refusals})
                 await self._pause(0.0 if has_other else pause_s(attempt, LONGEST_RETRY_PAUSE_S), deadline, error)
         raise min(refusals.values(), key=lambda error: isinstance(error, ModelNotFoundError))  # which says the least
+
+    async def _look_at_ports(self, error: RewardError) -> None:
+        """Raises a better error than that with which a call fails for good, if the port of a URL is to blame."""
+        if isinstance(error, OF_A_PORT) and not any(server.has_answered for server in self._servers):
+            for named in filter(None, await self._wrong_ports()):
+                told = ServerUnavailableError(named)
+                told.request_id = error.request_id
+                raise told from error
+
+    async def _wrong_ports(self) -> list[str | None]:
+        """What is wrong with the port of each server."""
+        ours = [server.transport.url for server in self._servers if isinstance(server.transport, TritonTransport)]
+        return [await asyncio.to_thread(wrong_port, url) for url in ours]
 
     def _has_other(self, busy: Collection[Server]) -> bool:
         """Whether a server that is neither busy nor left out can take the request at once."""

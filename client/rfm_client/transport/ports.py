@@ -5,12 +5,15 @@ from __future__ import annotations
 
 import http.client
 import json
+import socket
+import ssl
 from enum import Enum
 from typing import Any
 
-from rfm_client.contract.addresses import split_url
+from rfm_client.contract import errors
+from rfm_client.contract.addresses import host_of, in_url, split_url
 
-LOOK_S = 2.0
+LOOK_S = 1.0
 _READ_BYTES = 4096
 _HTTP2_FRAME = "\x00\x00"  # how a gRPC server begins to answer a request that it does not understand
 
@@ -25,27 +28,35 @@ class Port(Enum):
 
 
 _EXPECTED = {"grpc": (Port.GRPC, "Triton's gRPC port", 8001), "http": (Port.HTTP, "Triton's HTTP port", 8000)}
+OF_A_PORT = (  # errors of which a port may be the reason
+    errors.ServerUnavailableError,
+    errors.AccessDeniedError,
+    errors.InferenceFailedError,
+    errors.ModelNotFoundError,  # a gateway
+)
 
 
 def wrong_port(url: str) -> str | None:
-    """What is wrong with the port of a server's URL, and the mend; None: nothing, or nobody knows.
-
-    With TLS it is not looked at.
-    """
+    """What is wrong with the port of a server's URL, and the mend; None: nothing, or it cannot be seen."""
     scheme, address = split_url(url)
-    if scheme not in _EXPECTED:
+    protocol = scheme.removesuffix("s")
+    right, expected, usual = _EXPECTED[protocol]
+    if scheme != protocol and _speaks_tls(address):
         return None
-    right, expected, usual = _EXPECTED[scheme]
     found = _port_at(address)
-    if found is None or found is right:
+    if found is None:
+        is_secure = scheme == protocol and _speaks_tls(address)
+        return f"{url}: expected {expected} without TLS, got TLS: use {protocol}s://{address}" if is_secure else None
+    if found is right and scheme == protocol:
         return None
     mend = {
         Port.GRPC: f"use grpc://{address}",
         Port.HTTP: f"use http://{address}",
-        Port.METRICS: f"use {scheme}://{address.rpartition(':')[0]}:{usual}, unless the server was given another",
+        Port.METRICS: f"use {scheme}://{in_url(host_of(address))}:{usual}, unless the server was given another",
         Port.GATEWAY: f"use that of the Triton behind it, by default {usual}",
     }[found]
-    return f"{url}: expected {expected}, got {found.value}: {mend}"
+    with_tls, without = ("", "") if scheme == protocol else (" with TLS", " without")
+    return f"{url}: expected {expected}{with_tls}, got {found.value}{without}: {mend}"
 
 
 def _port_at(address: str) -> Port | None:
@@ -61,6 +72,19 @@ def _port_at(address: str) -> Port | None:
         return Port.GRPC if str(error).startswith(_HTTP2_FRAME) else None
     except (OSError, http.client.HTTPException):
         return None
+
+
+def _speaks_tls(address: str) -> bool:
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    try:
+        place = host_of(address), int(address.rpartition(":")[2])
+        with socket.create_connection(place, LOOK_S) as plain, context.wrap_socket(plain):
+            return True
+    except ssl.SSLError as error:
+        return "ALERT" in (error.reason or "")  # it refuses this handshake in TLS
+    except (OSError, UnicodeError):
+        return False
 
 
 def _read(address: str, path: str) -> bytes:
