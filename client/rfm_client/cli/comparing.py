@@ -26,6 +26,11 @@ from rfm_client.data.fitting import with_frame_indices
 if TYPE_CHECKING:
     from rich.table import Table
 
+LEGEND = (
+    "no answer: the orders disagree, or both are exactly 0.5. "
+    "A video has no rank (?) if one of its pairs has no answer."
+)
+
 Order = tuple[int, int]  # numbers of two videos, as they are asked
 
 
@@ -74,13 +79,14 @@ class Comparison:
             return None
         return sorted(self._numbers, key=lambda index: cast(int, self.ranks[index]))
 
-    def tables(self) -> list[Table]:
-        """The sources, the best one first if they have a ranking, and both answers about every two."""
+    def tables(self) -> list[Table | str]:
+        """The sources, the best one first if they have a ranking, both answers about every two, and a legend."""
         columns = ("video", "rank", "P(wins)", "its last progress", "its last success", "frames")
         pairs = ("first", "second", "P(first wins)", "asked second first", "mean", "orders")
         return [
             table("", columns, [self._row(index) for index in self._shown]),
             table("", pairs, [self._pair_row(*couple) for couple in self.couples()], names=2),
+            *([LEGEND] if self.ranking is None else []),
         ]
 
     def panels(self) -> list[Panel]:
@@ -112,10 +118,7 @@ class Comparison:
     def _pair_row(self, first: int, second: int) -> tuple[str, ...]:
         pair = self.pair(first, second)
         names = (self.sources[index].name for index in (first, second))
-        if pair.verdict is not None:
-            orders = "agree"
-        else:
-            orders = "no answer: both are exactly 0.5" if pair.orders_agree else "no answer: the orders disagree"
+        orders = "agree" if pair.verdict else "no answer"
         return (*names, *map(number, (*(pair.both_orders or ()), pair.preference)), orders)
 
 
