@@ -16,10 +16,12 @@ from selenium.webdriver.support.select import Select
 
 from browsers import IMAGES_VARIABLE, Browser, chromium
 from gateways import Gateway, poll, running
+from labelling import BrightnessScorer
 from rfm.launch.process import Endpoints
 from rfm_client import RewardClient
+from rfm_client.data.orientation import Orient
 from rfm_client.labelling import ClientScorer, LabelOptions, Summary, label, open_dataset, summarise
-from shown_datasets import CAMERAS, CODINGS, columns_of, copied, dataset, encoded_anew, labelled
+from shown_datasets import CAMERAS, CODINGS, columns_of, copied, dataset, encoded_anew
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
@@ -104,7 +106,9 @@ def stage(demo_server: Endpoints, tmp_path_factory: pytest.TempPathFactory) -> I
     plain.mkdir()
     with RewardClient(demo_server.grpc_url) as client:
         label(open_dataset(demo), ClientScorer(client), LabelOptions())
-    folders: tuple[Path, ...] = (demo, labelled("toy_v21", folder), copied("toy_v21", plain))
+    bright = copied("toy_v21", folder)
+    label(open_dataset(bright, orient=Orient.parse(["wrist=rotate180"])), BrightnessScorer(), LabelOptions())
+    folders: tuple[Path, ...] = (demo, bright, copied("toy_v21", plain))
     for number, (codec, options) in enumerate(CODINGS.values()):
         (folder / f"{number}").mkdir()
         folders += (copied("toy_v30_many", folder / f"{number}"),)
@@ -278,6 +282,20 @@ def test_an_episode_is_put_into_the_score_tab_and_scored(page: Stage) -> None:
         assert [float(text) for text in row[7:9]] == pytest.approx(expected, abs=2 * SHOWN)  # as the labels
 
 
+def test_videos_are_turned_as_they_were_for_the_labels_also_when_they_are_scored(page: Stage) -> None:
+    page.choose(BRIGHT)
+    page.at_rest(1)
+    turned = "return [...document.querySelectorAll(`#${arguments[0]} video`)].map((video) => video.className)"
+    assert page.browser.run(turned, "episode-videos") == ["none", "rotate180"]
+    page.browser["score-episode"].click()
+    page.browser.until("document.getElementById('status').textContent === '2 of 2 curves are done.'")
+    assert page.browser.run(turned, "videos") == ["none", "rotate180"]
+    told = page.browser.run(
+        "return [...document.querySelectorAll('#curves tr')].map((row) => row.cells[3].textContent)"
+    )
+    assert [text.endswith(", rotate180") for text in told] == [False, True]
+
+
 def test_episodes_without_labels_can_be_watched_and_scored(page: Stage) -> None:
     page.choose(PLAIN)
     assert [row[3:] for row in page.rows] == [["-"] * 5] * 8
@@ -322,7 +340,7 @@ def test_a_dataset_that_breaks_says_why(stage: Stage, demo_server: Endpoints, tm
         browser["dataset-tab"].click()
         browser.run("document.querySelector('#episodes tr[data-episode=\"2\"] button').click()")
         told = browser.until("document.getElementById('errors').textContent")
-        assert "episode_000002.mp4: expected a film of the episode, got Invalid data" in told
+        assert "episode_000002.mp4: expected a whole video file, got Invalid data" in told
         assert str(tmp_path) not in told
 
 
