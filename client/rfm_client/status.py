@@ -77,11 +77,13 @@ class ModelStatus:
     of that, and tells it as ``batches``.
 
     requests_pending: requests that wait for their turn now, in Triton or in the model; None: the metrics do not say
+    requests_succeeded, requests_failed, last_used_s and the next two lines: since the model was loaded, warm-up
+        included
     samples, executions: of all requests together, as Triton has handed them over
     queue_ms, compute_ms: of all requests in Triton's queue, of all that Triton has handed over until it could go on
     last_used_s: Unix time of the last request; None: there was none
-    batches: None: the metrics do not say
-    samples_refused: that cannot be scored, the fault of those who sent them; None: the metrics do not say
+    batches, samples_refused: since Triton was started, whenever the model was loaded; None: the metrics do not say
+    samples_refused: that cannot be scored, the fault of those who sent them
     """
 
     name: str

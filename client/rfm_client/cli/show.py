@@ -36,9 +36,11 @@ DOTS_PER_IN = 200
 MAX_PANELS = 50  # one picture of more could not be looked at, nor drawn much further
 
 STATUS_LEGEND = (
-    "Since the model was loaded, warm-up included. requests: answered with scores; failed: answered with an error, "
-    "whoever is to blame; refused: samples that cannot be scored, the caller's fault; pending: waiting now. "
-    "batches: of callers' samples; queue ms: until a request's turn. The server's log has the reason of each."
+    "since load: since the model was loaded, warm-up included, as Triton's statistics count; since start: since Triton "
+    "was started, as the model's metrics count, which go on where a model is loaded again. requests: answered with "
+    "scores; failed: answered with an error, whoever is to blame; refused: samples that cannot be scored, the caller's "
+    "fault. batches: since start of callers' samples, since load of all; queue ms: until a request's turn, on average "
+    "in Triton since load and in the model since start. The server's log has the reason of each."
 )
 
 _GIB = 2**30
@@ -133,8 +135,8 @@ def status_tables(status: ServerStatus) -> list[Table | str]:
     """The server's models, their batches, what the figures mean, and the machine if its metrics describe it."""
     version = f" {status.version}" if status.version else ""
     title = f"{status.url}: Triton{version}, {'ready' if status.ready else 'not ready'}"
-    requests = ("model", "v", "state", "requests", "failed", "refused", "pending")
-    batches = ("model", "v", "batches", "samples each", "ms each", "queue ms")
+    requests = ("model", "v", "state", "requests since load", "failed since load", "refused since start", "pending now")
+    batches = ("model", "v", "batches", "samples each", "ms each", "queue ms", "since")
     reasons = [f"{model.name} {model.version}: {model.reason}" for model in status.models if model.reason]
     shown: list[Table | str] = [
         table(title, requests, [_requests_row(model) for model in status.models]),
@@ -262,6 +264,7 @@ def _batches_row(model: ModelStatus) -> tuple[str, ...]:
         number(model.samples_per_batch, 1),
         number(model.compute_ms_per_batch, 2),
         number(model.queue_ms_per_request, 2),
+        "start" if model.batches and model.batches.count else "load",
     )
 
 

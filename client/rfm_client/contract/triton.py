@@ -45,6 +45,7 @@ _WRONG_SHAPE = re.compile(  # behind the batch axis, which the caller did not ma
     r"unexpected shape for input '(?P<name>\w+)'.*?Expected \[-1,(?P<expected>[^\]]*)\], got \[\d+,(?P<got>[^\]]*)\]"
 )
 _NO_SECOND_FRAMES = re.compile(rf"expected \d+ inputs but got .*'{SECOND_FRAMES}'|unexpected .*input '{SECOND_FRAMES}'")
+_TOO_MANY_FRAMES = re.compile(r"\bnum_frames: expected at most \d")
 _PREFIX = re.compile(r"^(\[request id: [^\]]*\] )?(in ensemble '[^']*', )?")  # the caller knows both
 
 
@@ -85,6 +86,8 @@ def error_of(status: str, message: str, bad_request: type[errors.RewardError]) -
         return errors.ProcessEndedError(text)
     if LOST_REGION in text or f"has {NO_VERSIONS}" in text:  # the sample is not at fault: another try may succeed
         return errors.ServerUnavailableError(text)
+    if _TOO_MANY_FRAMES.search(text):
+        text += ": score some of them (subsample=True), each on few before it (frame_steps), or by a sampling rule"
     kind = _ERROR_OF.get(status, errors.InferenceFailedError)
     error = (bad_request if kind is errors.InvalidSampleError else kind)(text)
     if isinstance(error, errors.ServerUnavailableError):

@@ -12,13 +12,13 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, BinaryIO
 from urllib.error import HTTPError
-from urllib.request import urlopen
 
 import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.numbers import checked_finite, checked_positive
+from rfm_client.contract.proxies import open_url
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.film_files import (
     DAMAGED,
@@ -150,7 +150,7 @@ def _opened(source: str | Path, timeout_s: float) -> Iterator[BinaryIO]:
 
 def _download(url: str, file: BinaryIO, timeout_s: float) -> None:
     try:
-        with urlopen(url, timeout=timeout_s) as response:
+        with open_url(url, timeout_s) as response:
             shutil.copyfileobj(response, file)
             length = response.headers.get("Content-Length")
         if length and file.tell() != int(length):  # urllib takes a connection that broke for the end
