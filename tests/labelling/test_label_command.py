@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
@@ -10,7 +11,9 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import rerun
@@ -26,6 +29,7 @@ from paths import ROOT
 from rfm.launch.process import Endpoints
 from rfm_client.cli.options import ExitCode
 from rfm_commands.cli import app
+from toy_world import Task, make_clip
 
 DATASET = LEROBOT / "toy_v30_many"
 FRONT = "observation.images.front"
@@ -148,6 +152,33 @@ def test_no_frame_is_scored_where_the_package_for_recordings_is_missing(
     assert list(output.iterdir()) == []
 
 
+def test_pictures_that_are_stored_upside_down_get_the_labels_of_upright_ones(output: Path) -> None:
+    task = Task("red", "bowl")
+    upright = make_clip("success", task, 2_000_000).frames[::2]
+    libero = {"problem_info": json.dumps({"language_instruction": "another one"}), "bddl_file_name": "a.bddl"}
+
+    def labels(name: str, frames: Any, attributes: dict[str, str], *words: str) -> tuple[Any, str]:
+        file = output / f"{name}.hdf5"
+        with h5py.File(file, "w") as opened:
+            opened.create_group("data").attrs.update(attributes)
+            opened["data/demo_0/obs/agentview_rgb"] = frames
+        asked = ("--task", task.sentence(), "--override-task", "--no-picture", "--output", output)
+        result = own(file, *ENGINE, *asked, *words)
+        assert result.exit_code == 0, result.stderr
+        with h5py.File(output / f"{name}.rfm_rewards.hdf5") as opened:
+            return opened["data/demo_0/rfm_progress"][:], result.stderr
+
+    expected, told = labels("upright", upright, {})
+    assert "rfm: note: orient: agentview_rgb as stored, but LIBERO, which names cameras so, stores them upside" in told
+    by_itself, told = labels("libero", upright[:, ::-1], libero)
+    assert "rfm: note: orient: agentview_rgb flip-vertical (LIBERO stores its pictures upside down; " in told
+    asked_for, _ = labels("asked", upright[:, ::-1, ::-1], {}, "--orient", "agentview_rgb=rotate180")
+    as_stored, _ = labels("stored", upright[:, ::-1], libero, "--orient", "none")
+    np.testing.assert_array_equal(by_itself, expected)
+    np.testing.assert_array_equal(asked_for, expected)
+    assert np.abs(as_stored - expected).max() > 0.1
+
+
 def test_what_the_run_did_not_train_is_told(output: Path) -> None:
     """Of what is labelled: neither of preference nor of similarity."""
     checkpoint = shutil.copytree(MODELS / "rfm" / "1" / "checkpoint", output / "checkpoint")
@@ -178,6 +209,8 @@ WRONG = {
     "episodes": (["--episodes", "5:2"], "episodes: expected numbers and ranges such as 0:100,205, got '5:2'"),
     "a format": (["--format", "csv"], "format: expected some of progress, signals, hdf5, got 'csv'"),
     "a rule in mode whole": (["--mode", "whole", "--sampling", "rint_pad"], "sampling: expected all in mode whole"),
+    "an orientation": (["--orient", "up"], "orient: expected one of none, rotate180, "),
+    "a camera twice": (["--orient", "a=none", "--orient", "a=rotate90"], "expected each camera once, got 'a=rotate90'"),
 }
 
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from pyarrow import parquet
 from labelling import LEROBOT, BrightnessScorer, absent, picky, slow
 from rfm.launch.process import Endpoints
 from rfm_client import ProgressResult, RewardClient, RewardError
+from rfm_client.data.orientation import Orient
 from rfm_client.labelling import (
     ClientScorer,
     LabelOptions,
@@ -69,6 +70,30 @@ def test_a_scorer_is_open_as_long_as_its_actor_lives(output: Path) -> None:
     assert scorer.is_open
     del actor
     assert not scorer.is_open
+
+
+class SeeingScorer(BrightnessScorer):
+    """Keeps the frames that it is shown."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[Any] = []
+
+    def evaluate(self, samples: Any) -> list[ProgressResult]:
+        self.seen += [frame for sample in samples for frame in sample.trajectory.frames]
+        return super().evaluate(samples)
+
+
+def test_an_actor_opens_the_dataset_as_it_is_told(output: Path) -> None:
+    scorer, told = SeeingScorer(), {"task": "juggle", "override_task": True, "orient": Orient("rotate90")}
+    dataset = open_dataset(ROOT, **told)  # type: ignore[arg-type]
+    plan = plan_labels(dataset, scorer, LabelOptions(output=output, limit=1, cameras=(dataset.cameras[0],)))
+    job = Job(str(ROOT), "juggle", lambda: nullcontext(scorer), plan, str(output), 1, True, Orient("rotate90"))
+    assert EpisodeActor(job)({"places": [[0]]}) == {"place": [0], "reason": [""]}
+    assert scorer.tasks == {"juggle"}
+    (episode, *_), stored = dataset.episodes, open_dataset(ROOT)
+    last = list(stored.frames(episode, dataset.cameras[0]))[-1]
+    assert any(np.array_equal(frame, np.rot90(last, -1)) for frame in scorer.seen)
 
 
 @pytest.fixture
