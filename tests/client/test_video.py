@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 import socket
 import tracemalloc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -18,8 +18,9 @@ import pytest
 
 import clip
 from paths import VIDEOS
-from pictures import TURNS, numbered, numbers, turn, write_video
+from pictures import TURNS, Matrix, numbered, numbers, turn, write_video
 from rfm_client import InvalidSampleError
+from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.inputs import load_trajectory
 from rfm_client.data.video import read_video
 
@@ -73,13 +74,15 @@ def test_packets_without_a_frame_do_not_count(tmp_path: Path) -> None:
     assert numbers(read_video(tmp_path / "film.mp4", 5), 10) == [4, 6, 9]
 
 
-@pytest.mark.parametrize(("matrix", "quarter_turns"), TURNS.values(), ids=TURNS)
-def test_a_turned_video_is_read_upright(tmp_path: Path, matrix: tuple[int, int, int, int], quarter_turns: int) -> None:
+@pytest.mark.parametrize(("matrix", "shown"), TURNS.values(), ids=TURNS)
+def test_a_turned_or_mirrored_video_is_read_as_it_is_shown(
+    tmp_path: Path, matrix: Matrix, shown: Callable[[UInt8Array], UInt8Array]
+) -> None:
     picture = np.zeros((1, 32, 64, 3), np.uint8)
     picture[:, :16, :32], picture[:, :16, 32:], picture[:, 16:, :32] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
     write_video(tmp_path / "film.mp4", picture)
     turn(tmp_path / "film.mp4", matrix)
-    upright = np.rot90(picture[0], quarter_turns)
+    upright = shown(picture[0])
     read = read_video(tmp_path / "film.mp4")[0]
     assert read.shape == upright.shape
     assert np.abs(read.astype(int) - upright).mean() < 3

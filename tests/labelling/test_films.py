@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from encoding import encode
-from pictures import TURNS, numbered, turn, write_video
+from pictures import TURNS, Matrix, numbered, numbers, turn, write_video
 from rfm_client import InvalidSampleError
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.datasets.films import Packets, Span, decode
-from rfm_client.data.video import read_video
+from rfm_client.data.video import frame_times_s, read_video
 from rfm_client.labelling import DatasetError, open_dataset
 
 NUM_FRAMES = 40
@@ -37,9 +37,9 @@ def labelled(file: Path) -> UInt8Array:
     return np.stack(list(dataset.frames(episode, "video")))
 
 
-@pytest.mark.parametrize(("matrix", "quarter_turns"), TURNS.values(), ids=TURNS)
-def test_a_turned_film_is_labelled_upright_as_it_is_scored(
-    tmp_path: Path, matrix: tuple[int, int, int, int], quarter_turns: int
+@pytest.mark.parametrize(("matrix", "shown"), TURNS.values(), ids=TURNS)
+def test_a_turned_or_mirrored_film_is_labelled_upright_as_it_is_scored(
+    tmp_path: Path, matrix: Matrix, shown: Callable[[UInt8Array], UInt8Array]
 ) -> None:
     file = tmp_path / "film.mp4"
     pictures = np.ascontiguousarray(numbered(3)[:, :, :16])
@@ -47,9 +47,162 @@ def test_a_turned_film_is_labelled_upright_as_it_is_scored(
     write_video(file, pictures)
     turn(file, matrix)
     read = labelled(file)
-    assert read.shape[1:3] == ((32, 16) if quarter_turns == 2 else (16, 32))
-    assert np.abs(read.astype(int) - np.rot90(pictures, quarter_turns, axes=(1, 2))).mean() < 3
+    upright = np.stack([shown(picture) for picture in pictures])
+    assert read.shape == upright.shape
+    assert np.abs(read.astype(int) - upright).mean() < 3
     np.testing.assert_array_equal(read, read_video(file))
+
+
+@pytest.mark.parametrize("matrix", [(1, 1, -1, 1), (1, 0, 1, 1)], ids=["half a quarter turn", "skewed"])
+def test_a_film_that_is_shown_aslant_is_refused(tmp_path: Path, matrix: Matrix) -> None:
+    write_video(tmp_path / "film.mp4", numbered(3))
+    turn(tmp_path / "film.mp4", matrix)
+    refused = r"expected a film that is shown upright or by quarter turns \(turn it: ffmpeg -i IN OUT\), got one that"
+    with pytest.raises(InvalidSampleError, match=f"^video: {refused}"):
+        read_video(tmp_path / "film.mp4")
+    with pytest.raises(DatasetError, match=f"film.mp4: {refused}"):
+        labelled(tmp_path / "film.mp4")
+
+
+def test_packets_that_are_not_shown_are_no_frames(tmp_path: Path) -> None:
+    write_video(tmp_path / "film.mp4", numbered(10), shown_from=4)
+    assert numbers(labelled(tmp_path / "film.mp4"), 10) == [4, 5, 6, 7, 8, 9]
+
+
+# Pixel format, matrix and range (1: limited, 2: full) of a film, as ITU-T H.273 numbers them; 2: no matrix is named.
+COLOURS = {
+    "BT.709": ("yuv420p", 1, 1),
+    "BT.709, full range": ("yuv420p", 1, 2),
+    "BT.709, 4:2:2": ("yuv422p", 1, 1),
+    "BT.709, 4:4:4": ("yuv444p", 1, 1),
+    "BT.709, 10 bits": ("yuv420p10le", 1, 1),
+    "BT.709, 10 bits of full range": ("yuv420p10le", 1, 2),
+    "BT.601": ("yuv420p", 6, 1),
+    "BT.601, full range": ("yuv420p", 5, 2),
+    "no matrix": ("yuv420p", 2, 1),
+    "no matrix, full range": ("yuvj420p", 2, 2),
+    "no matrix, 10 bits": ("yuv420p10le", 2, 1),
+    "SMPTE 240M": ("yuv444p", 7, 1),
+    "BT.2020": ("yuv420p", 9, 1),
+    "BT.2020, 10 bits": ("yuv420p10le", 9, 1),
+}
+WEIGHTS = {1: (0.2126, 0.0722), 7: (0.212, 0.087), 9: (0.2627, 0.0593)}  # Kr and Kb; BT.601's where there are none
+BLOCK_PX = 16
+
+
+def rgb(levels: np.ndarray[Any, Any], matrix: int, is_full: bool) -> np.ndarray[Any, Any]:
+    """float64 [..., 3], 0..255, of levels Y, Cb, Cr in 8 bits (ITU-T H.273, equations of matrix coefficients)."""
+    kr, kb = WEIGHTS.get(matrix, (0.299, 0.114))
+    low, scale, chroma = (0, 255, 255) if is_full else (16, 219, 224)
+    y, pb, pr = (levels[..., 0] - low) / scale, (levels[..., 1] - 128) / chroma, (levels[..., 2] - 128) / chroma
+    red, blue = y + 2 * (1 - kr) * pr, y + 2 * (1 - kb) * pb
+    return np.clip(np.stack([red, (y - kr * red - kb * blue) / (1 - kr - kb), blue], -1) * 255, 0, 255)
+
+
+def write_levels(file: Path, levels: UInt8Array, pixels: str, matrix: int, full: int) -> None:
+    """A film of blocks of one colour each, levels uint8 [rows, columns, 3], without a loss."""
+    with av.open(str(file), "w") as container:
+        stream: Any = container.add_stream("libx264", rate=10, options={"qp": "0"})
+        stream.height, stream.width, stream.pix_fmt = *(BLOCK_PX * n for n in levels.shape[:2]), pixels
+        stream.codec_context.colorspace, stream.codec_context.color_range = matrix, full
+        frame = av.VideoFrame(stream.width, stream.height, pixels)
+        frame.colorspace, frame.color_range = matrix, full
+        for plane, channel in zip(frame.planes, np.moveaxis(levels, -1, 0), strict=True):
+            size = (plane.height // levels.shape[0], plane.width // levels.shape[1])
+            is_deep = pixels.endswith("10le")
+            values = np.kron(channel, np.ones(size, np.uint8)).astype("<u2" if is_deep else np.uint8) << 2 * is_deep
+            padded = np.zeros((plane.height, plane.line_size // values.itemsize), values.dtype)
+            padded[:, : plane.width] = values
+            plane.update(padded.tobytes())
+        for _ in range(2):
+            container.mux(stream.encode(frame))
+            frame.pts = None
+        container.mux(stream.encode())
+
+
+@pytest.mark.parametrize(("pixels", "matrix", "full"), COLOURS.values(), ids=COLOURS)
+def test_colours_are_those_of_the_film_s_matrix_and_range(tmp_path: Path, pixels: str, matrix: int, full: int) -> None:
+    """Whatever PyAV is installed: some take each film for one of BT.601, 6 to 29 levels off."""
+    levels = np.random.default_rng(0).integers(60, 190, (6, 8, 3), np.uint8)
+    write_levels(tmp_path / "film.mp4", levels, pixels, matrix, full)
+    read = read_video(tmp_path / "film.mp4")[0]
+    centres = read[BLOCK_PX // 2 :: BLOCK_PX, BLOCK_PX // 2 :: BLOCK_PX]
+    assert np.abs(centres - rgb(levels.astype(float), matrix, full == 2)).max() < 3.5  # libswscale rounds
+    np.testing.assert_array_equal(labelled(tmp_path / "film.mp4")[0], read)
+
+
+GREY = {"gray": False, "gray10le": True, "gray12le": True, "gray16le": True, "yuv420p10le": False, "bgr0": False}
+
+
+@pytest.mark.parametrize(("pixels", "is_depth"), GREY.items())
+def test_films_of_one_deep_channel_are_refused_as_depth_maps(tmp_path: Path, pixels: str, is_depth: bool) -> None:
+    file = tmp_path / "film.mkv"
+    with av.open(str(file), "w") as container:
+        stream: Any = container.add_stream("ffv1", rate=10)
+        stream.height, stream.width, stream.pix_fmt = 32, 32, pixels
+        for image in numbered(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+    if not is_depth:
+        assert numbers(read_video(file), 3) == numbers(labelled(file), 3) == [0, 1, 2]
+        return
+    refused = rf"expected a film of colours \(leave a depth camera out .*\), got {pixels}, as depth maps have"
+    with pytest.raises(InvalidSampleError, match=f"^video: {refused}"):
+        read_video(file)
+    with pytest.raises(DatasetError, match=f"film.mkv: {refused}"):
+        labelled(file)
+
+
+def write_streams(file: Path, *films: tuple[UInt8Array, bool]) -> None:
+    """Several films in one file, and whether each is an attached picture."""
+    with av.open(str(file), "w") as container:
+        streams: list[Any] = [
+            container.add_stream("mjpeg" if attached else "libx264", rate=10) for _, attached in films
+        ]
+        for stream, (frames, attached) in zip(streams, films, strict=True):
+            stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], "yuvj420p" if attached else "yuv420p"
+            if attached:
+                stream.disposition = av.stream.Disposition.attached_pic
+        for stream, (frames, _) in zip(streams, films, strict=True):
+            for image in frames:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+            container.mux(stream.encode())
+
+
+def test_cover_art_is_no_film(tmp_path: Path) -> None:
+    file = tmp_path / "film.mp4"
+    write_streams(file, (numbered(1)[:, :16], True), (numbered(5), False))
+    with av.open(str(file)) as container:
+        assert len(container.streams.video) == 2
+    assert numbers(read_video(file), 5) == numbers(labelled(file), 5) == [0, 1, 2, 3, 4]
+    np.testing.assert_allclose(frame_times_s(file, 5), np.arange(5) / 10)
+    write_streams(file, (numbered(1), True))
+    with pytest.raises(InvalidSampleError, match=r"^video: expected a file with a video stream, got none "):
+        read_video(file)
+    with pytest.raises(DatasetError, match=r"film\.mp4: expected a file with a video stream, got none"):
+        labelled(file)
+
+
+def test_a_file_of_several_films_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "film.mp4"
+    write_streams(file, (numbered(1)[:, :16], False), (numbered(1), True), (numbered(5), False))
+    refused = (
+        r"expected one video stream \(take one: ffmpeg -i IN -map 0:v:N -c copy OUT\), "
+        r"got 2: 0:v:\d \(h264, 32x16\), 0:v:\d \(h264, 32x32\)"
+    )
+    for read in (read_video, lambda file: frame_times_s(file, 5)):
+        with pytest.raises(InvalidSampleError, match=f"^video: {refused}"):
+            read(file)
+    with pytest.raises(DatasetError, match=rf"film\.mp4: {refused}"):
+        labelled(file)
+
+
+def test_the_decoder_is_told_with_its_versions(tmp_path: Path) -> None:
+    write_video(tmp_path / "film.mp4", numbered(3))
+    labelled(tmp_path / "film.mp4")
+    told = open_dataset(tmp_path).decoder("video") or ""
+    swscale = ".".join(map(str, av.library_versions["libswscale"]))
+    assert told.startswith(f"PyAV {av.__version__}, libswscale {swscale}, libavcodec ")
 
 
 def with_container(options: dict[str, str] | None = None, codec: str = "libx264", sound_s: float = 0.0) -> Write:

@@ -3,19 +3,26 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
+import re
 import shutil
+import struct
 import subprocess
 import sys
+import zlib
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import av
 import numpy as np
+import PIL
 import pyarrow as pa
 import pytest
+from PIL import Image
 from pyarrow import parquet
 
 import goldens
@@ -89,23 +96,38 @@ def test_one_may_walk_through_the_episodes_of_some_cameras() -> None:
         next(iter_episodes(dataset, ["top"]))
 
 
-def test_a_frame_is_the_nearest_to_its_time_stamp(tmp_path: Path) -> None:
-    """Films at twice the rate of the rows, whose time stamps are rounded: each second frame is one of the dataset."""
-    root = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "twice")
-    film = root / "videos" / "chunk-000" / FRONT / "episode_000000.mp4"
-    frames = whole_film(film)
+def rewrite(film: Path, change: Callable[[list[Any]], list[Any]], fps: Fraction = Fraction(10)) -> None:
+    """Encodes a film anew, of other frames, or of another rate."""
+    frames = change(whole_film(film))
     with av.open(str(film), "w") as container:
-        stream = container.add_stream("libx264", rate=20, options={"crf": "1"})
-        stream.height, stream.width, stream.pix_fmt = 256, 256, "yuv444p"
-        for frame in frames:
-            for image in (frame, 255 - frame):
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        stream = container.add_stream("libx264", rate=fps, options={"crf": "1"})
+        stream.height, stream.width, stream.pix_fmt = *frames[0].shape[:2], "yuv444p"
+        for image in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode())
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "film.mkv"])
+def test_a_film_may_begin_later_than_its_rows(tmp_path: Path, name: str) -> None:
+    """Also where time stamps are rounded to a millisecond, as in Matroska."""
+    root = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "later")
+    film = root / "videos" / "chunk-000" / FRONT / "episode_000000.mp4"
+    expected = whole_film(film)
+    with av.open(str(film)) as source, av.open(str(tmp_path / name), "w") as copy:
+        stream = copy.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
+            if packet.dts is not None:
+                packet.pts, packet.dts = (
+                    time + round(Fraction(7, 10) / packet.time_base) for time in (packet.pts, packet.dts)
+                )
+                packet.stream = stream
+                copy.mux(packet)
+    if name.endswith(".mkv"):
+        change_info(root, lambda info: info.update(video_path=info["video_path"].replace(".mp4", ".mkv")))
+    shutil.move(tmp_path / name, film.with_suffix(Path(name).suffix))
     dataset = open_dataset(root)
     read = list(dataset.frames(dataset.episodes[0], FRONT))
-    assert len(read) == len(frames)
-    for frame, expected in zip(read, frames, strict=True):
-        assert np.abs(frame.astype(int) - expected).mean() < 8
+    np.testing.assert_array_equal(np.stack(read), np.stack(expected))
 
 
 def test_av1_and_images_in_tables_are_read(tmp_path: Path) -> None:
@@ -147,21 +169,97 @@ def test_a_depth_camera_counts_only_where_it_is_named(tmp_path: Path, name: str,
         chosen_cameras(open_dataset(root), ())
 
 
-def store_as_images(root: Path, camera: str) -> list[np.ndarray[Any, Any]]:
-    """Episode 0's film of a camera goes into its table, as PNG in the rows and as files; gives its frames."""
-    import io
+PICTURES: dict[str, tuple[Callable[[Any], Any], str, str | None]] = {
+    "grey": (lambda image: image.convert("L"), "PNG", None),
+    "black and white": (lambda image: image.convert("1"), "PNG", None),
+    "a palette": (lambda image: image.quantize(16), "PNG", None),
+    "transparency": (lambda image: image.convert("RGBA"), "PNG", None),
+    "grey with transparency": (lambda image: image.convert("LA"), "PNG", None),
+    "JPEG": (lambda image: image, "JPEG", None),
+    "16 bits": (
+        lambda image: Image.fromarray(np.asarray(image.convert("L")).astype(np.uint16) * 20),
+        "PNG",
+        "16-bit I;16",
+    ),
+    "16 bits in TIFF": (
+        lambda image: Image.fromarray(np.asarray(image.convert("L")).astype(np.uint16)),
+        "TIFF",
+        "16-bit I;16",
+    ),
+    "32 bits": (lambda image: image.convert("I"), "TIFF", "I"),
+    "floats": (lambda image: image.convert("F"), "TIFF", "F"),
+    "inks": (lambda image: image.convert("CMYK"), "JPEG", "CMYK"),
+}
 
-    from PIL import Image
 
+@pytest.mark.parametrize(("convert", "form", "refused"), PICTURES.values(), ids=PICTURES)
+def test_pictures_in_tables_are_of_8_bit_colours(
+    tmp_path: Path, convert: Callable[[Any], Any], form: str, refused: str | None
+) -> None:
+    root = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "pictures")
+    store_as_images(root, WRIST, convert, form)
+    dataset = open_dataset(root)
+    first = dataset.episodes[0]
+    if refused is None:
+        dataset.check(first, WRIST)
+        pictures = np.stack(list(dataset.frames(first, WRIST)))
+        assert pictures.shape == (first.num_frames, 128, 128, 3)
+        assert pictures.std() > 10
+        return
+    message = (
+        "episode 0: observation.images.wrist: frame 0: expected a picture of 8-bit colours "
+        f"(convert it, or leave a depth camera out: --cameras), got {form} of {refused}"
+    )
+    for read in (dataset.check, lambda *asked: next(dataset.frames(*asked))):
+        with pytest.raises(DatasetError, match=re.escape(message) + "$"):
+            read(first, WRIST)
+
+
+def test_16_bits_that_pillow_would_cut_to_8_are_refused(tmp_path: Path) -> None:
+    root = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "pictures")
+    store_as_images(root, WRIST, content=png_of_16_bits(np.full((8, 8, 3), 300, np.uint16)))
+    dataset = open_dataset(root)
+    with pytest.raises(DatasetError, match=r"frame 0: expected a picture of 8-bit colours .* got PNG of 16-bit RGB$"):
+        dataset.check(dataset.episodes[0], WRIST)
+
+
+def png_of_16_bits(image: np.ndarray[Any, Any]) -> bytes:
+    """A PNG file, which Pillow does not write of 16 bits a channel."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    head = struct.pack(">IIBBBBB", image.shape[1], image.shape[0], 16, 2, 0, 0, 0)
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in image)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+
+
+def test_the_decoder_of_each_camera_is_told(tmp_path: Path) -> None:
+    root = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "mixed")
+    store_as_images(root, WRIST)
+    dataset = open_dataset(root)
+    assert dataset.decoder(WRIST) == f"Pillow {PIL.__version__}"
+    assert (dataset.decoder(FRONT) or "").startswith(f"PyAV {av.__version__}, libswscale ")
+
+
+def store_as_images(
+    root: Path,
+    camera: str,
+    convert: Callable[[Any], Any] = lambda image: image,
+    form: str = "PNG",
+    content: bytes | None = None,
+) -> list[np.ndarray[Any, Any]]:
+    """Episode 0's film of a camera goes into its table, as images in the rows and as files; gives its frames."""
     frames = whole_film(root / "videos" / "chunk-000" / camera / "episode_000000.mp4")
     images = []
     for t, frame in enumerate(frames):
-        content = io.BytesIO()
-        Image.fromarray(frame).save(content, "PNG")
+        written = io.BytesIO()
+        convert(Image.fromarray(frame)).save(written, form)
+        stored = content or written.getvalue()
         if t % 2:
             (root / "images").mkdir(exist_ok=True)
-            (root / "images" / f"{t}.png").write_bytes(content.getvalue())
-        images.append({"bytes": None if t % 2 else content.getvalue(), "path": f"images/{t}.png"})
+            (root / "images" / f"{t}.png").write_bytes(stored)
+        images.append({"bytes": None if t % 2 else stored, "path": f"images/{t}.png"})
     file = root / "data" / "chunk-000" / "episode_000000.parquet"
     table = parquet.read_table(file, partitioning=None).append_column(camera, pa.array(images))
     parquet.write_table(table, file)
@@ -228,7 +326,7 @@ CONTRADICTIONS: dict[str, tuple[str, Callable[[Path], object], str]] = {
             )
             for name in ("from_timestamp", "to_timestamp")
         ],
-        r"episode 9: .*front: .*mp4: expected frame 0 at \d+\.\d+ s, got the nearest at \d+\.\d+ s",
+        r"episode 9, row 0: .*front: .*mp4: expected its frame at 105\.5000 s, got one at 5\.5000 s; write the dataset again",
     ),
     "v3.0: episodes that share frames": (
         "toy_v30_many",
@@ -238,7 +336,7 @@ CONTRADICTIONS: dict[str, tuple[str, Callable[[Path], object], str]] = {
             )
             for name in ("from_timestamp", "to_timestamp")
         ],
-        r"episode 1: .*mp4: expected a start at 5\.8000 s or later, behind episode 0, got 5\.5000 s",
+        r"episode 1, row 0: .*mp4: expected its frame at 5\.5000 s, got one at 5\.8000 s",
     ),
     "v3.0: a row that is missing": (
         "toy_v30_many",
@@ -295,7 +393,61 @@ CONTRADICTIONS: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "v2.1: a film that is too short": (
         "toy_v21",
         lambda root: shutil.copy(root / V21_FILM.replace("005", "007"), root / V21_FILM),
-        r"episode 5: .*wrist: .*mp4: expected frame 20 at 2\.0000 s, got the nearest at 1\.9000 s \(20 frames in the file\)",
+        r"episode 5: .*wrist: .*mp4: expected 49 frames, one for each row, got 20; write the dataset again, or leave this "
+        r"film's episodes out \(--episodes\)$",
+    ),
+    "v2.1: a film of another episode, which is longer": (
+        "toy_v21",
+        lambda root: shutil.copy(root / V21_FILM, root / V21_FILM.replace("005", "007")),
+        r"episode 7: .*wrist: .*mp4: expected 20 frames, one for each row, got 49; ",
+    ),
+    "v2.1: a frame is there twice": (
+        "toy_v21",
+        lambda root: rewrite(root / V21_FILM, lambda frames: [*frames[:10], *frames[9:]]),
+        r"episode 5: .*wrist: .*mp4: expected 49 frames, one for each row, got 50; ",
+    ),
+    "v2.1: frames from before the episode": (
+        "toy_v21",
+        lambda root: rewrite(root / V21_FILM, lambda frames: [255 - frames[0]] * 3 + frames),
+        r"episode 5: .*wrist: .*mp4: expected 49 frames, one for each row, got 52; ",
+    ),
+    "v2.1: a film of twice the rate": (
+        "toy_v21",
+        lambda root: rewrite(root / V21_FILM, lambda frames: [image for image in frames for _ in "12"], Fraction(20)),
+        r"expected 49 frames, one for each row, got 98 \(the film has 20\.00 frames a second, meta/info\.json says 10\)",
+    ),
+    "v2.1: a film whose rate is nearly that of the rows": (
+        "toy_v21",
+        lambda root: rewrite(root / V21_FILM, lambda frames: frames, Fraction(10_000, 1001)),
+        r"episode 5, row 2: .*mp4: expected its frame at 0\.2000 s, got one at 0\.2002 s \(the film has 9\.99 frames a "
+        r"second, meta/info\.json says 10\); ffmpeg -r 10 -i IN OUT gives it that rate$",
+    ),
+    "v2.1: a row whose time is another's": (
+        "toy_v21",
+        lambda root: change_table(root / V21_ROWS, "timestamp", lambda values: values.__setitem__(4, values[4] + 0.06)),
+        r"episode 3, row 4: .*front: .*mp4: expected its frame at 0\.4600 s, got one at 0\.4000 s; write ",
+    ),
+    "v3.0: a film with frames of no episode": (
+        "toy_v30_many",
+        lambda root: rewrite(root / V30_FILM, lambda frames: frames + frames[-2:]),
+        r"episode \d to episode \d: .*front: .*file-001\.mp4: expected (\d+) frames, one for each row, got \d+; write ",
+    ),
+    "v3.0: starts of episodes that drift": (
+        "toy_v30_many",
+        lambda root: [
+            change_table(
+                root / V30_EPISODES,
+                f"videos/{FRONT}/{name}",
+                lambda values: values.__setitem__(slice(None), [value - 0.01 * k for k, value in enumerate(values)]),
+            )
+            for name in ("from_timestamp", "to_timestamp")
+        ],
+        r"episode 1, row 0: .*front: .*file-000\.mp4: expected its frame at 5\.7900 s, got one at 5\.8000 s; write ",
+    ),
+    "v3.0: a film of which only the first episode is asked for": (
+        "toy_v30_many",
+        lambda root: rewrite(root / V30_FILM.replace("001", "000"), lambda frames: frames[:-1]),
+        r"episode 0 to episode \d: .*front: .*file-000\.mp4: expected \d+ frames, one for each row, got \d+; write ",
     ),
     "v2.1: an empty task": (
         "toy_v21",

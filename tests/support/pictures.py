@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 
@@ -14,12 +15,19 @@ from rfm_client.contract.samples import UInt8Array
 
 TOP, WRIST = "observation.images.top", "observation.images.wrist"
 
-# The display matrix of a track: (a, b, c, d) of x' = a x + c y, y' = b x + d y, y downwards (ISO 14496-12), and the
-# quarter turns, counter-clockwise, that it asks for.
-TURNS: dict[str, tuple[tuple[int, int, int, int], int]] = {
-    "clockwise": ((0, 1, -1, 0), -1),
-    "upside down": ((-1, 0, 0, -1), 2),
-    "counter-clockwise": ((0, -1, 1, 0), 1),
+Matrix = tuple[int, int, int, int]
+
+# The display matrix of a track: (a, b, c, d) of x' = a x + c y, y' = b x + d y, y downwards (ISO 14496-12), and what it
+# makes of an image.
+TURNS: dict[str, tuple[Matrix, Callable[[UInt8Array], UInt8Array]]] = {
+    "clockwise": ((0, 1, -1, 0), lambda image: np.rot90(image, -1)),
+    "upside down": ((-1, 0, 0, -1), lambda image: np.rot90(image, 2)),
+    "counter-clockwise": ((0, -1, 1, 0), np.rot90),
+    "mirrored": ((-1, 0, 0, 1), np.fliplr),
+    "mirrored upside down": ((1, 0, 0, -1), np.flipud),
+    "mirrored, then clockwise": ((0, -1, -1, 0), lambda image: np.rot90(np.fliplr(image), -1)),
+    "mirrored, then counter-clockwise": ((0, 1, 1, 0), lambda image: np.rot90(np.fliplr(image))),
+    "without a matrix": ((0, 0, 0, 0), lambda image: image),
 }
 
 
@@ -52,7 +60,7 @@ def numbers(frames: UInt8Array, count: int) -> list[int]:
     return np.abs(means[:, None] - numbered(count)[:, 0, 0, 0]).argmin(axis=1).tolist()
 
 
-def turn(file: Path, matrix: tuple[int, int, int, int]) -> None:
+def turn(file: Path, matrix: Matrix) -> None:
     """Gives the track of an MP4 file one of the matrices of TURNS."""
     content = file.read_bytes()
     a, b, c, d = (value << 16 for value in matrix)

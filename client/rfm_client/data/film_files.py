@@ -144,9 +144,9 @@ def _rgb(frame: Any) -> UInt8Array:
 def _shown(image: UInt8Array, matrix: np.ndarray[Any, np.dtype[np.int32]]) -> UInt8Array:
     """The image by a display matrix: x' = a x + c y, y' = b x + d y, y downwards (ISO 14496-12)."""
     a, b, _, c, d = (float(value) for value in matrix[:5])
-    is_turned = max(abs(a), abs(d)) <= _NEARLY * min(abs(b), abs(c))
+    is_turned = max(abs(a), abs(d)) < _NEARLY * min(abs(b), abs(c))
     if not is_turned and max(abs(b), abs(c)) > _NEARLY * min(abs(a), abs(d)):
-        got = f"one that is turned by {math.degrees(math.atan2(b, a)):.1f} degrees, or skewed"
+        got = f"one that is turned by {abs(math.degrees(math.atan2(b, a))):.0f} degrees, or skewed"
         raise FilmError("a film that is shown upright or by quarter turns (turn it: ffmpeg -i IN OUT)", got)
     across, down = (c, b) if is_turned else (a, d)
     image = image.swapaxes(0, 1) if is_turned else image

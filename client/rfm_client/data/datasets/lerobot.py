@@ -199,7 +199,7 @@ def _opened_image(where: str, image: bytes) -> Any:
     is_deep = _DEEP in str(opened.tile)
     if opened.mode not in _COLOURS or is_deep:
         expected = "a picture of 8-bit colours (convert it, or leave a depth camera out: --cameras)"
-        raise DatasetError.at(where, expected, f"{opened.mode}{' of 16 bits' if is_deep else ''}, as Pillow names it")
+        raise DatasetError.at(where, expected, f"{opened.format} of {'16-bit ' * is_deep}{opened.mode}")
     return opened
 
 
