@@ -4,10 +4,8 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -23,9 +21,6 @@ import labelling
 from labelling import LEROBOT, BrightnessScorer, PickyScorer
 from rfm_client import ProgressResult, ProgressSample, ServerUnavailableError
 from rfm_client.labelling import DatasetError, LabelOptions, Watch, label, open_dataset
-from rfm_client.labelling.claims import Claims
-from rfm_client.labelling.finished_episodes import Parts
-from rfm_client.labelling.plan import Item
 
 ROOT = LEROBOT / "toy_v30_many"
 FILES = ("rfm_progress.parquet", "reward_signals/rfm.parquet")
@@ -183,7 +178,8 @@ def test_a_full_disk_stops_the_run_and_leaves_no_half_of_a_part(
         synced(file)
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space left on device"):
+    advice = "make room or name another place with --parts, and run the same command"
+    with pytest.raises(OSError, match=rf"\.rfm_parts: expected .* got No space left on device: {advice}$"):
         label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(output=output, workers=1))
     assert len(parts_of(output)) == 3
     assert [path.name for path in (output / ".rfm_parts").iterdir() if not path.name.startswith("episode")] == []
@@ -208,7 +204,7 @@ def test_labels_of_something_else_are_replaced_only_when_asked(output: Path) -> 
     before = contents(output)
     scorer = BrightnessScorer()
     with pytest.raises(
-        DatasetError, match=r"rfm_progress\.parquet: expected no file, or labels of the same provenance"
+        DatasetError, match=r"rfm_progress\.parquet: .* same recipe, got sampling\.frames: 16 there, 4 now"
     ):
         label(open_dataset(ROOT), scorer, LabelOptions(output=output, limit=2, frames=4))
     assert scorer.num_samples == 0
@@ -216,8 +212,21 @@ def test_labels_of_something_else_are_replaced_only_when_asked(output: Path) -> 
     label(open_dataset(ROOT), scorer, LabelOptions(output=output, limit=2, frames=4, overwrite=True))
     assert contents(output) != before
     (output / "sarm_progress.parquet").write_bytes(b"not ours")
-    with pytest.raises(DatasetError, match=r"sarm_progress\.parquet: expected no file"):
+    with pytest.raises(DatasetError, match=r"sarm_progress\.parquet: expected no labels, .* choose another --alias"):
         label(open_dataset(ROOT), scorer, LabelOptions(output=output, limit=2, frames=4, alias="sarm_progress"))
+
+
+def test_a_folder_of_labels_is_made_and_one_that_cannot_be_written_is_refused(
+    output: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = LabelOptions(output=output / "new" / "labels", limit=1)
+    label(open_dataset(ROOT), BrightnessScorer(), options)
+    assert (output / "new" / "labels" / FILES[0]).exists()
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    scorer = BrightnessScorer()
+    with pytest.raises(DatasetError, match=r"labels: expected a folder .* that cannot be written: .* with --output$"):
+        label(open_dataset(ROOT), scorer, options)
+    assert scorer.num_samples == 0
 
 
 BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
@@ -249,41 +258,6 @@ def test_parts_may_be_behind_a_url(output: Path, undisturbed: list[bytes], url: 
     label(open_dataset(ROOT), again, options)
     assert again.num_samples == 0
     assert not (output / ".rfm_parts").exists()
-
-
-def item() -> Item:
-    return Item(open_dataset(ROOT).episodes[0], "0" * 32, 0)
-
-
-@pytest.mark.parametrize("url", ["memory://labels/claims", "{}"])
-def test_a_claim_holds_until_it_is_given_back_or_its_process_ends(output: Path, url: str) -> None:
-    parts = Parts(url.format(output))
-    with Claims(parts) as first, Claims(parts) as second:
-        assert first.take(item())
-        assert not second.take(item())
-        first.give_back(item())
-        assert second.take(item())
-        second.give_back(item())
-        ended = subprocess.Popen([sys.executable, "-c", ""])
-        ended.wait()
-        owner = json.dumps({"host": socket.gethostname(), "pid": ended.pid}).encode()
-        parts.fs.pipe_file(parts.path(item().key + ".claim"), owner)
-        assert first.take(item())
-
-
-def test_a_claim_of_another_machine_expires_unless_it_is_renewed(output: Path) -> None:
-    parts = Parts(str(output))
-    path = output / (item().key + ".claim")
-    path.write_text(json.dumps({"host": "another machine", "pid": 1}))
-    with Claims(parts, expiry_s=30, renewal_s=0.01) as claims:
-        assert not claims.take(item())
-        os.utime(path, (time.time() - 31, time.time() - 31))
-        assert claims.take(item())
-        os.utime(path, (time.time() - 31, time.time() - 31))
-        while path.stat().st_mtime < time.time() - 30:
-            time.sleep(0.005)  # until it is renewed
-        assert not Claims(parts, expiry_s=30).take(item())
-    assert not path.exists()
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -82,61 +83,99 @@ def test_labels_that_are_overwritten_in_place_leave_none_of_another_provenance(d
     }
     with h5py.File(demos) as opened:
         attributes = opened["data"].attrs
-        assert sorted(attributes) == ["problem_info", "rfm_b_provenance", "rfm_provenance"]
+        assert sorted(attributes) == [
+            *("problem_info", "rfm_b_episodes", "rfm_b_provenance", "rfm_episodes", "rfm_provenance"),
+        ]
         assert attributes["rfm_b_provenance"] == others
         assert json.loads(attributes["rfm_provenance"])["checkpoint"]["weights_digest"] == "without success"
         dark = 1 - brightness(frames_of(1, "front"))
         np.testing.assert_allclose(opened["data/demo_1/rfm_progress"], dark, atol=1e-6)
 
 
-def label_and_be_killed(file: Path, options: LabelOptions, *, num_parts: int) -> None:
-    """Labels in a process that ends at once, as if it were killed, when it has written so many parts into the file."""
-    code = f"""
-import os, sys
+IN_ANOTHER_PROCESS = f"""
+import os, resource, sys
 sys.path.insert(0, {str(Path(labelling.__file__).parent)!r})
 from labelling import BrightnessScorer
 from rfm_client.labelling import LabelOptions, label, open_dataset
 from rfm_client.labelling.finished_episodes import Parts
 
-read, left = Parts.read, [{num_parts} + 1]  # the first is read to see its columns
+read, left = Parts.read, [2]  # the first is read to see its columns
 
-def read_or_end(*arguments):
+def end(self, item):
     left[0] -= 1
-    return read(*arguments) if left[0] >= 0 else os._exit(9)
+    return read(self, item) if left[0] >= 0 else os._exit(9)
 
-Parts.read = read_or_end
-label(open_dataset({str(file)!r}), BrightnessScorer(digest="killed"), {options!r})
+def fill(self, item):
+    size = os.path.getsize(sys.argv[1])
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size + int(sys.argv[2]), resource.RLIM_INFINITY))
+    return read(self, item)
+
+Parts.read = end if sys.argv[2] == "end" else fill
+label(open_dataset(sys.argv[1]), BrightnessScorer(), LabelOptions(in_place=True, overwrite=True))
 """
-    process = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60, check=False)
-    assert process.returncode == 9, process.stderr.decode()
 
 
-@pytest.mark.parametrize("num_parts", [0, 2])
-def test_the_same_command_goes_on_in_place_after_a_kill(demos: Path, num_parts: int) -> None:
-    label_and_be_killed(demos, LabelOptions(in_place=True), num_parts=num_parts)
-    with pytest.raises(DatasetError, match=r"got labels of another run, which did not end: choose another --name"):
-        label(open_dataset(demos), BrightnessScorer(), LabelOptions(in_place=True))
-    label(open_dataset(demos), BrightnessScorer(digest="killed"), LabelOptions(in_place=True))
-    assert set(map(len, rewards_in(demos).values())) == {len(COLUMNS)}
-    with h5py.File(demos) as opened:
-        assert sorted(opened["data"].attrs) == ["problem_info", "rfm_provenance"]
-        np.testing.assert_allclose(opened["data/demo_2/rfm_progress"], expected(2), atol=1e-6)
+def label_in_another_process(file: Path, what: object) -> subprocess.CompletedProcess[str]:
+    """Labels in place in a process that ends in the middle, as if it were killed, or may write so many bytes more."""
+    words = [sys.executable, "-c", IN_ANOTHER_PROCESS, str(file), str(what)]
+    return subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
 
 
-def test_labels_of_two_provenances_are_never_taken_for_those_of_the_first(demos: Path) -> None:
+@pytest.mark.parametrize("what", ["end", -4000, 0, 500, 2000, 4000])
+def test_in_place_the_file_is_whole_whoever_is_killed_and_whatever_is_full(demos: Path, what: object) -> None:
     label(open_dataset(demos), WithoutSuccess(), LabelOptions(in_place=True))
-    label_and_be_killed(demos, LabelOptions(in_place=True, overwrite=True), num_parts=1)
-    with h5py.File(demos) as opened:
-        assert "rfm_provenance" not in opened["data"].attrs
-    with pytest.raises(DatasetError, match=r"got labels of another run, which did not end"):
-        label(open_dataset(demos), WithoutSuccess(), LabelOptions(in_place=True))
-    label(open_dataset(demos), BrightnessScorer(digest="killed"), LabelOptions(in_place=True))
+    before = demos.read_bytes()
+    done = label_in_another_process(demos, what)
+    assert demos.read_bytes() == before
+    if what == "end":
+        assert done.returncode == 9, done.stderr
+    else:
+        assert done.returncode == 1, done.stderr
+        assert "make room, or leave --in-place away" in done.stderr.strip().splitlines()[-1]
+        assert [file.name for file in demos.parent.iterdir() if "demos" in file.name] == ["demos.hdf5"]
+    label(open_dataset(demos), BrightnessScorer(), LabelOptions(in_place=True, overwrite=True))
     assert set(map(len, rewards_in(demos).values())) == {len(COLUMNS)}
+
+
+def test_in_place_needs_room_for_a_copy_before_a_frame_is_scored(demos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    free = demos.stat().st_size + 100
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(2 * free, free, free))  # type: ignore[attr-defined]
+    scorer = BrightnessScorer()
+    with pytest.raises(
+        DatasetError, match=rf"demos\.hdf5: expected \d+ bytes of free disk.*, got {free}: make room, or"
+    ):
+        label(open_dataset(demos), scorer, LabelOptions(in_place=True))
+    assert scorer.num_samples == 0
+    label(open_dataset(demos), scorer, LabelOptions())
+
+
+def test_in_place_a_link_stays_one_and_the_permissions_are_kept(demos: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    demos.chmod(0o640)
+    real = demos.rename(tmp_path / "elsewhere" / "real.hdf5")
+    demos.symlink_to(real)
+    label(open_dataset(demos), BrightnessScorer(), LabelOptions(in_place=True))
+    assert demos.is_symlink()
+    assert real.stat().st_mode & 0o777 == 0o640
+    assert set(map(len, rewards_in(real).values())) == {len(COLUMNS)}
+
+
+def test_labels_that_an_older_version_did_not_write_to_the_end_are_of_another_run(demos: Path) -> None:
+    with h5py.File(demos, "r+") as opened:
+        opened["data/demo_1/rfm_progress"] = np.zeros(LENGTHS[1])
+        opened["data"].attrs["rfm_unfinished"] = "0" * 32
+    with pytest.raises(
+        DatasetError, match=r"got labels of a run that did not end: choose another --name, or --overwrite"
+    ):
+        label(open_dataset(demos), BrightnessScorer(), LabelOptions(in_place=True))
+    label(open_dataset(demos), BrightnessScorer(), LabelOptions(in_place=True, overwrite=True))
+    with h5py.File(demos) as opened:
+        assert sorted(opened["data"].attrs) == ["problem_info", "rfm_episodes", "rfm_provenance"]
 
 
 @pytest.mark.parametrize("column", ["rfm_progress", "rfm_success.front"])
 def test_what_a_user_wrote_under_the_name_of_a_reward_is_not_replaced(demos: Path, column: str) -> None:
     with h5py.File(demos, "r+") as opened:
         opened[f"data/demo_2/{column}"] = np.zeros(3)
-    with pytest.raises(DatasetError, match=r"expected no labels rfm, or of the same provenance, got labels of another"):
+    with pytest.raises(DatasetError, match=r"expected no labels, or .* got labels of another program: choose another"):
         label(open_dataset(demos), BrightnessScorer(), LabelOptions(in_place=True))

@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 from pyarrow import parquet
@@ -223,7 +224,10 @@ def test_the_files_have_the_documented_form(output: Path) -> None:
 
     metadata = {key.decode(): value.decode() for key, value in signals.schema.metadata.items()}
     own = {key.removeprefix("lerobot.reward_scoring."): value for key, value in metadata.items()}
-    assert sorted(own) == ["descriptors", "episode_indices", "format", "provenance", "schema_version"]
+    own_names = ["descriptors", "episode_indices", "format", "provenance", "rfm.episodes", "schema_version"]
+    assert sorted(own) == own_names
+    assert sorted(json.loads(own["rfm.episodes"])) == ["1", "2"]
+    assert progress.schema.metadata[b"rfm.episodes"] == signals.schema.metadata[b"rfm.episodes"]
     assert (own["format"], own["schema_version"], own["episode_indices"]) == ("lerobot.frame_signals", "1", "[1,2]")
     descriptors = json.loads(own["descriptors"])
     assert sorted(descriptors) == signal_names
@@ -244,6 +248,9 @@ def test_the_files_have_the_documented_form(output: Path) -> None:
     }
     assert provenance["sampling"] == {"rule": "rint_pad", "frames": 16}
     assert provenance["cameras"] == [FRONT, WRIST]
+    assert set(provenance["decoders"]) == {FRONT, WRIST}
+    assert provenance["decoders"][FRONT].startswith(f"PyAV {av.__version__}")
+    assert provenance["orientations"] == {}
     assert (provenance["dataset"]["kind"], provenance["dataset"]["source"]) == ("LeRobot v3.0", "toy_v30_many")
     assert progress.schema.metadata[b"reward_model_path"] == b"toy/brightness"
     assert json.loads(progress.schema.metadata[b"rfm.provenance"]) == provenance
@@ -276,6 +283,9 @@ class Notes(Watch):
         self.lines.append(text)
 
 
+LEROBOT_S = "LeRobot's reader gives frames of the others the weight 1.0"
+
+
 def test_the_run_tells_what_was_decided_and_by_whom(output: Path) -> None:
     notes = Notes()
     label(open_dataset(LEROBOT / "toy_v21"), BrightnessScorer(), LabelOptions(output=output, limit=1), notes)
@@ -284,6 +294,7 @@ def test_the_run_tells_what_was_decided_and_by_whom(output: Path) -> None:
         "sampling: rint_pad (the rule of upstream's training and RL loop)",
         "frames: 16 (the most in training; if the checkpoint does not say, the most its network takes)",
         "fuse: mean of 2 cameras",
+        f"1 of the dataset's 8 episodes have labels; {LEROBOT_S}",
     ]
     notes = Notes()
     options = LabelOptions(output=output, name="b", limit=1, sampling="linspace_round", frames=4, cameras=(WRIST,))
@@ -292,6 +303,7 @@ def test_the_run_tells_what_was_decided_and_by_whom(output: Path) -> None:
         f"cameras: {WRIST} (asked for)",
         "sampling: linspace_round (asked for)",
         "frames: 4 (asked for)",
+        f"1 of the dataset's 8 episodes have labels; {LEROBOT_S}",
     ]
 
 
@@ -302,7 +314,10 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"mode": "whole"},
         "episode 2: expected at most 16 frames, as the checkpoint takes, got 53: use mode prefix and a rule with a",
     ),
-    "no output": ({"output": Path("/nothing/here")}, "/nothing/here: expected a folder for the labels, got none"),
+    "an output in a file": (
+        {"output": Path(__file__) / "labels"},
+        f"{__file__}/labels: expected a folder for the labels, got Not a directory: name another one with --output",
+    ),
 }
 
 

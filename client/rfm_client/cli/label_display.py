@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
@@ -24,9 +25,10 @@ from rfm_client.integrations.episode_recordings import record_episodes
 from rfm_client.integrations.recording import load_rerun
 from rfm_client.labelling.episode_scores import episode_columns
 from rfm_client.labelling.finished_episodes import Parts
+from rfm_client.labelling.frame_memory import FrameMemory
 from rfm_client.labelling.label import Outputs, Report, label, label_with_ray, plan_labels
 from rfm_client.labelling.options import LabelOptions
-from rfm_client.labelling.plan import Item, Plan
+from rfm_client.labelling.plan import Item, Plan, selected
 from rfm_client.labelling.ray_engine import Connect
 from rfm_client.labelling.run import Watch
 from rfm_client.labelling.scorer import Scorer
@@ -122,9 +124,9 @@ def run(source: str, flags: LabelFlags, connect: Connect, say: Say) -> ExitCode:
     try:
         with watch:
             if flags.engine == "ray":
-                report = label_with_ray(source, connect, options, watch, task=flags.task, ray=flags.ray)
+                report = label_with_ray(source, connect, options, watch, ray=flags.ray, **flags.opening)
             else:
-                dataset = open_dataset(source, task=flags.task)
+                dataset = open_dataset(source, **flags.opening)
                 with connect() as scorer:
                     report = label(dataset, scorer, options, watch)
     except (RewardError, OSError, KeyboardInterrupt):
@@ -133,8 +135,10 @@ def run(source: str, flags: LabelFlags, connect: Connect, say: Say) -> ExitCode:
         raise
     status = _tell(report, flags, options, say)
     if flags.rrd is not None:
-        dataset = open_dataset(source, task=flags.task)
-        for file in record_episodes(flags.rrd, dataset, report.plan, Parts(report.parts)):
+        dataset = open_dataset(source, **flags.opening)
+        chosen = {episode.index for episode in selected(dataset, options)}
+        plan = replace(report.plan, items=[item for item in report.plan.items if item.episode.index in chosen])
+        for file in record_episodes(flags.rrd, dataset, plan, Parts(report.parts)):
             typer.echo(f"{file}")
     return status
 
@@ -142,7 +146,7 @@ def run(source: str, flags: LabelFlags, connect: Connect, say: Say) -> ExitCode:
 def _dry_run(source: str, flags: LabelFlags, connect: Connect, say: Say) -> ExitCode:
     """Checks everything, measures a few episodes, writes nothing."""
     options = flags.options()
-    dataset = open_dataset(source, task=flags.task)
+    dataset = open_dataset(source, **flags.opening)
     with connect() as scorer, ProgressBar(say) as watch:
         plan = plan_labels(dataset, scorer, options, watch)
         took_s = _measured_s(plan, dataset, scorer, options.workers)
@@ -188,9 +192,10 @@ def _show(summary: Summary, file: Path, flags: LabelFlags, options: LabelOptions
 def _measured_s(plan: Plan, dataset: Dataset, scorer: Scorer, workers: int) -> float:
     """How long the plan takes, after the first episodes, as many as are under way at a time."""
     first = plan.items[:workers]
+    memory = FrameMemory()
 
     def score(item: Item) -> None:
-        episode_columns(dataset, item.episode, scorer, plan.recipe, go_on=lambda: None)
+        episode_columns(dataset, item.episode, scorer, plan.recipe, memory=memory, go_on=lambda: None)
 
     score(first[0])  # once without the clock, so that what happens once does not count
     began_s = time.monotonic()

@@ -38,14 +38,28 @@ class Claims:
         self._renewing = threading.Thread(target=self._renew, name="rfm-claims", daemon=True)
 
     def take(self, item: Item) -> bool:
-        """Whether this process may label the episode now."""
+        """Whether this process may label the episode now. Raises OSError, with what to do."""
         path = self._path(item)
         if self._create(path):
             return True
-        if not self._is_void(path):
-            return False
-        self._remove(path)
+        try:
+            if not self._is_void(path):
+                return False
+            self._remove(path)
+        except OSError as error:
+            got = f"{error.strerror or error}: delete it if no process labels this dataset"
+            raise OSError(f"{path}: expected a claim that can be read and deleted, got {got}") from error
         return self._create(path)
+
+    def told(self, item: Item) -> str:
+        """Who claims the episode, since when, and how one ends that."""
+        path = self._path(item)
+        try:
+            owner, age_s = self._parts.fs.cat_file(path).decode(errors="replace"), self._age_s(path)
+        except FileNotFoundError:
+            return f"{path}: given back by now"
+        advice = f"it is void {self._expiry_s:.0f} s after that; if that process is gone, you may delete the file"
+        return f"{path}: claimed by {owner}, whose last sign of life was {age_s:.0f} s ago: {advice}"
 
     def give_back(self, item: Item) -> None:
         """Ends the claim, so that others may work on the episode."""
@@ -68,7 +82,7 @@ class Claims:
 
     def _create(self, path: str) -> bool:
         try:
-            with self._parts.fs.open(path, "xb") as file:
+            with self._parts.writing(), self._parts.fs.open(path, "xb") as file:
                 file.write(self._owner)
         except FileExistsError:
             return False
@@ -78,12 +92,15 @@ class Claims:
 
     def _is_void(self, path: str) -> bool:
         try:
-            owner = self._parts.fs.cat_file(path)
-            renewed: datetime = self._parts.fs.modified(path)
+            owner, age_s = self._parts.fs.cat_file(path), self._age_s(path)
         except FileNotFoundError:
             return True
-        age_s = (datetime.now(timezone.utc) - _in_utc(renewed)).total_seconds()
-        return age_s > self._expiry_s or _has_ended(owner)
+        # one from the future is of a clock that is wrong, and would not expire for as long
+        return abs(age_s) > self._expiry_s or _has_ended(owner)
+
+    def _age_s(self, path: str) -> float:
+        renewed: datetime = self._parts.fs.modified(path)
+        return (datetime.now(timezone.utc) - _in_utc(renewed)).total_seconds()
 
     def _renew(self) -> None:
         while not self._ended.wait(self._renewal_s):

@@ -16,6 +16,7 @@ from rfm_client.data.camera_fusion import FUSES
 from rfm_client.data.datasets.protocol import Dataset, DatasetError, Episode
 from rfm_client.data.prefixes import of_prefixes, prefix_samples
 from rfm_client.data.resize import resize_frames
+from rfm_client.labelling.frame_memory import FrameMemory
 from rfm_client.labelling.recipe import Recipe
 from rfm_client.labelling.scorer import Scorer, joined_embeddings
 
@@ -27,11 +28,18 @@ MAX_BYTES = 32 * 2**20  # of the samples that are made and sent together
 
 
 def episode_columns(
-    dataset: Dataset, episode: Episode, scorer: Scorer, recipe: Recipe, go_on: Callable[[], None]
+    dataset: Dataset,
+    episode: Episode,
+    scorer: Scorer,
+    recipe: Recipe,
+    *,
+    memory: FrameMemory,
+    go_on: Callable[[], None],
 ) -> Columns:
     """float32 [T] each: ``progress``, ``success`` if the checkpoint predicts it, and of several cameras each one's,
     ``progress.<camera>`` and ``success.<camera>``.
 
+    memory: of all workers; the frames of one camera are held at a time, if the checkpoint does not encode them first
     go_on: called between requests; what it raises ends the episode
 
     Raises RewardError.
@@ -39,7 +47,14 @@ def episode_columns(
     by_camera = {}
     for camera in recipe.cameras:
         frames = _checked(dataset.frames(episode, camera), episode, camera)
-        by_camera[camera] = _scores(frames, episode.task, scorer, recipe, go_on)
+        chunks = _shrunk(frames, recipe, go_on)
+        if recipe.checkpoint.encodes:
+            trajectory = joined_embeddings([scorer.encode(chunk, episode.task) for chunk in chunks])
+            by_camera[camera] = _scores(trajectory, scorer, recipe, go_on)
+        else:
+            first = next(chunks)
+            with memory.holding(first[0].nbytes * episode.num_frames):
+                by_camera[camera] = _scores(_held(first, chunks, episode), scorer, recipe, go_on)
     columns: Columns = {}
     for name in (PROGRESS, SUCCESS):
         scores = [getattr(result, name) for result in by_camera.values()]
@@ -52,10 +67,7 @@ def episode_columns(
     return columns
 
 
-def _scores(
-    frames: Iterator[UInt8Array], task: str, scorer: Scorer, recipe: Recipe, go_on: Callable[[], None]
-) -> ProgressResult:
-    trajectory = _trajectory(frames, task, scorer, recipe, go_on)
+def _scores(trajectory: Trajectory, scorer: Scorer, recipe: Recipe, go_on: Callable[[], None]) -> ProgressResult:
     if recipe.in_one_pass:
         (result,) = scorer.evaluate([ProgressSample(trajectory)])
         return result
@@ -67,22 +79,24 @@ def _scores(
     return of_prefixes(results, recipe.sampling)
 
 
-def _trajectory(
-    frames: Iterator[UInt8Array], task: str, scorer: Scorer, recipe: Recipe, go_on: Callable[[], None]
-) -> Trajectory:
-    """The episode as embeddings, if the checkpoint encodes: then few of its frames are in memory at a time."""
-    parts: list[Trajectory] = []
-    chunks: list[UInt8Array] = []
+def _shrunk(frames: Iterator[UInt8Array], recipe: Recipe, go_on: Callable[[], None]) -> Iterator[UInt8Array]:
+    """The frames in arrays of at most FRAMES_AT_A_TIME, as small as the recipe says."""
     while chunk := list(itertools.islice(frames, FRAMES_AT_A_TIME)):
         go_on()
         stacked = np.stack(chunk)
         if recipe.resize and recipe.checkpoint.frame_size is not None:
             stacked = resize_frames(stacked, recipe.checkpoint.frame_size)
-        if recipe.checkpoint.encodes:
-            parts.append(scorer.encode(stacked, task))
-        else:
-            chunks.append(stacked)
-    return joined_embeddings(parts) if parts else Trajectory(frames=np.concatenate(chunks), task=task)
+        yield stacked
+
+
+def _held(first: UInt8Array, others: Iterator[UInt8Array], episode: Episode) -> Trajectory:
+    """All frames of the episode, in one array."""
+    frames = np.empty((episode.num_frames, *first.shape[1:]), np.uint8)
+    start = 0
+    for chunk in itertools.chain([first], others):
+        frames[start : start + len(chunk)] = chunk
+        start += len(chunk)
+    return Trajectory(frames=frames, task=episode.task)
 
 
 def _by_bytes(samples: Iterable[ProgressSample]) -> Iterator[list[ProgressSample]]:
@@ -107,7 +121,8 @@ def _checked(frames: Iterator[UInt8Array], episode: Episode, camera: str) -> Ite
             raise DatasetError.at(f"{where}: frame {count}", f"the size {shape}", str(frame.shape))
         shape = frame.shape
         count += 1
-        yield frame
+        if count <= episode.num_frames:
+            yield frame
     if count != episode.num_frames:
         raise DatasetError.at(where, f"{episode.num_frames} frames", str(count))
 

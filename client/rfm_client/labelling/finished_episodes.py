@@ -9,7 +9,8 @@ from __future__ import annotations
 import io
 import os
 import uuid
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,19 @@ class Parts:
         self.url = url
         self.fs, self.root = url_to_fs(url)
         self.is_local = isinstance(self.fs, LocalFileSystem)
-        self.fs.makedirs(self.root, exist_ok=True)
+        with self.writing():
+            self.fs.makedirs(self.root, exist_ok=True)
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Makes an OSError say what to do; a FileExistsError stays as it is."""
+        try:
+            yield
+        except FileExistsError:
+            raise
+        except OSError as error:
+            got = f"{error.strerror or error}: make room or name another place with --parts, and run the same command"
+            raise OSError(f"{self.url}: expected a folder that can be written, got {got}") from error
 
     def path(self, name: str) -> str:
         """The path of a file in the file system."""
@@ -71,7 +84,8 @@ class Parts:
         table = pa.table({**identity, **columns}).replace_schema_metadata({DIGEST_KEY: item.digest})
         content = io.BytesIO()
         parquet.write_table(table, content)
-        self.put(item.key + SUFFIX, content.getvalue())
+        with self.writing():
+            self.put(item.key + SUFFIX, content.getvalue())
 
     def read(self, item: Item) -> Any:
         """The item's table. Raises DatasetError for a part that is missing or not whole."""

@@ -6,17 +6,24 @@ They go to a file of their own beside the dataset, or into the dataset's file if
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
 import uuid
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from rfm_client.data.datasets.hdf5 import Hdf5Dataset
-from rfm_client.data.datasets.protocol import DatasetError, digest_of
-from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS
+from rfm_client.data.datasets.protocol import DatasetError
+from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS, Columns
 from rfm_client.labelling.finished_episodes import Parts
-from rfm_client.labelling.plan import Plan
+from rfm_client.labelling.labelled_before import OF_ANOTHER_PROGRAM, LabelFile
+from rfm_client.labelling.plan import Item, Plan
 from rfm_client.labelling.sidecars import IDENTITY, canonical_json
+
+_DATASET_BYTES, _FILE_BYTES = 2**12, 2**20  # more than HDF5 takes for a dataset of one column, and for all attributes
+_REMEDY = "make room, or leave --in-place away: then the labels are in a file of their own"
 
 
 def sibling(dataset: Hdf5Dataset, folder: Path, name: str) -> Path:
@@ -24,73 +31,103 @@ def sibling(dataset: Hdf5Dataset, folder: Path, name: str) -> Path:
     return folder / f"{dataset.file.stem}.{name}_rewards.hdf5"
 
 
-def check_hdf5_replaceable(file: Path, plan: Plan, name: str) -> None:
-    """Raises DatasetError if the file holds labels of this name that are not this plan's.
-
-    What a run of this plan has left in the file, when it was killed, is this plan's.
-    """
+def hdf5_labels(file: Path, name: str) -> LabelFile | None:
+    """The labels of this name in the file; None: there are none. Raises DatasetError for what is no HDF5 file."""
     import h5py
 
     if not file.exists():
-        return
+        return None
     try:
         with h5py.File(file, "r") as opened:
             group = opened.get("data", {})
             attributes = getattr(group, "attrs", {})
-            known, begun = attributes.get(_provenance(name)), attributes.get(_unfinished(name))
-            has_labels = known is not None or bool(_labels(group, name))
+            provenance, digests = attributes.get(_provenance(name)), attributes.get(_episodes(name))
+            if provenance is None and not _labels(group, name):
+                return None
+            is_whole = _unfinished(name) not in attributes
     except OSError as error:
         raise DatasetError.at(file, "an HDF5 file", str(error)) from error
-    if begun is not None:
-        is_own, got = begun == _digest(plan), "labels of another run, which did not end"
-    else:
-        is_own, got = not has_labels or known == _document(plan), "labels of another provenance"
-    if not is_own:
-        advice = "choose another --name, or --overwrite"
-        raise DatasetError.at(file, f"no labels {name}, or of the same provenance", f"{got}: {advice}")
+    flaw = OF_ANOTHER_PROGRAM if is_whole else "labels of a run that did not end"
+    return LabelFile.of(file, provenance, digests, lambda items: _read(file, name, items), flaw)
+
+
+def check_room(file: Path, plan: Plan) -> None:
+    """Raises DatasetError if the disk has no room for a copy of the dataset's file with labels in it."""
+    target = file.resolve()
+    needed, free = target.stat().st_size + _most_bytes(plan), shutil.disk_usage(target.parent).free
+    if free < needed:
+        expected = f"{needed} bytes of free disk, for a copy that takes its place when it is whole"
+        raise DatasetError.at(file, expected, f"{free}: {_REMEDY}")
 
 
 def write_hdf5(file: Path, plan: Plan, parts: Parts, name: str, *, in_place: bool) -> None:
-    """Writes the labels of all parts. A file of its own is put in its place when it is whole.
+    """Writes the labels of all parts to a new file, which takes the file's place when it is whole.
 
-    in_place: the file is the dataset's own: all labels of this name give way to those of the plan. A run that is killed
-        leaves some of them, and the attribute ``<name>_unfinished`` in place of the provenance; the same command then
-        goes on
+    in_place: the file is the dataset's own: the new one is a copy of it, in which the labels of this name give way
 
-    Raises DatasetError for a part that is missing.
+    Raises DatasetError for a part that is missing, and OSError; then the file is as it was.
     """
     import h5py
 
-    written = file if in_place else file.with_name(f".{file.name}.{uuid.uuid4().hex}")
+    target = file.resolve()  # or a link would give way to the copy
+    written = target.with_name(f".{target.name}.{uuid.uuid4().hex}")
     try:
-        with h5py.File(written, "r+" if in_place else "w") as opened:
-            group = opened.require_group("data")
-            _begin(group, plan, name)
-            for item in plan.items:
-                table = parts.read(item)
-                demo = group.require_group(item.episode.name)
-                for column in (each for each in table.column_names if each not in IDENTITY):
-                    demo.create_dataset(f"{name}_{column}", data=table[column].to_numpy())
-            _end(group, plan, name)
-        written.replace(file)
+        if in_place:
+            shutil.copy2(target, written)
+        else:
+            h5py.File(written, "w").close()
+        _reserve(written, _most_bytes(plan))
+        with h5py.File(written, "r+") as opened:
+            _write(opened.require_group("data"), plan, parts, name)
+        with written.open("rb") as whole:
+            os.fsync(whole.fileno())
+        written.replace(target)
+    except (OSError, RuntimeError) as error:  # RuntimeError is how h5py reports some failed writes
+        advice = _REMEDY if in_place else "make room, and run the same command"
+        got = f"{error}, and no file has changed: {advice}"
+        raise OSError(f"{file}: expected to write the labels, got {got}") from error
     finally:
-        if not in_place:
-            written.unlink(missing_ok=True)
+        written.unlink(missing_ok=True)
 
 
-def _begin(group: Any, plan: Plan, name: str) -> None:
-    """Deletes all labels of this name. From before the first is gone, the file says that they are not whole."""
-    group.attrs[_unfinished(name)] = _digest(plan)
-    group.attrs.pop(_provenance(name), None)
-    group.file.flush()
+def _most_bytes(plan: Plan) -> int:
+    """More than the labels of the plan take."""
+    num_columns = len((PROGRESS, SUCCESS)) * (1 + len(plan.recipe.cameras))
+    return _FILE_BYTES + num_columns * (4 * plan.num_frames + _DATASET_BYTES * len(plan.items))
+
+
+def _reserve(file: Path, num_bytes: int) -> None:
+    """Appends so many bytes, of which HDF5 keeps what it needs: h5py breaks down where the disk is full in the middle.
+
+    Raises OSError.
+    """
+    with file.open("ab") as opened:
+        while num_bytes > 0:
+            num_bytes -= opened.write(bytes(min(num_bytes, _FILE_BYTES)))
+
+
+def _write(group: Any, plan: Plan, parts: Parts, name: str) -> None:
+    """The labels of the plan in place of all of this name."""
     for label in _labels(group, name):
         del group[label]
+    group.attrs.pop(_unfinished(name), None)
+    for item in plan.items:
+        table = parts.read(item)
+        demo = group.require_group(item.episode.name)
+        for column in (each for each in table.column_names if each not in IDENTITY):
+            demo.create_dataset(f"{name}_{column}", data=table[column].to_numpy())
+    group.attrs[_provenance(name)] = canonical_json(plan.provenance()).decode()
+    group.attrs[_episodes(name)] = canonical_json(plan.digests()).decode()
 
 
-def _end(group: Any, plan: Plan, name: str) -> None:
-    group.file.flush()  # the provenance comes after all that it is about
-    group.attrs[_provenance(name)] = _document(plan)
-    del group.attrs[_unfinished(name)]
+def _read(file: Path, name: str, items: Sequence[Item]) -> Iterator[tuple[Item, Columns]]:
+    import h5py
+
+    with h5py.File(file, "r") as opened:
+        for item in items:
+            demo = opened["data"].get(item.episode.name, {})
+            labels = _labels({"": demo}, name)
+            yield item, {label[len(f"/{name}_") :]: demo[label[1:]][()] for label in labels}
 
 
 def _labels(group: Any, name: str) -> list[str]:
@@ -100,17 +137,14 @@ def _labels(group: Any, name: str) -> list[str]:
     return [f"{demo}/{each}" for demo, content in demos.items() for each in content if column.fullmatch(each)]
 
 
-def _document(plan: Plan) -> str:
-    return canonical_json(plan.provenance()).decode()
-
-
-def _digest(plan: Plan) -> str:
-    return digest_of([canonical_json(plan.provenance())])
-
-
 def _provenance(name: str) -> str:
     return f"{name}_provenance"
 
 
+def _episodes(name: str) -> str:
+    return f"{name}_episodes"
+
+
 def _unfinished(name: str) -> str:
+    """What files have in place of the provenance that version 0.1.0 did not write to the end."""
     return f"{name}_unfinished"

@@ -48,6 +48,10 @@ class Plan:
         """Frames of all episodes."""
         return sum(item.episode.num_frames for item in self.items)
 
+    def digests(self) -> dict[str, str]:
+        """Of what each episode's labels are made, by its number."""
+        return {str(item.episode.index): item.digest for item in self.items}
+
     def provenance(self) -> dict[str, Any]:
         """What the labels are made of. The same for the same labels, whoever made them, and when."""
         digest = digest_of(item.digest.encode() for item in self.items)

@@ -3,26 +3,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from rfm_client.data.camera_fusion import Fuse
 from rfm_client.data.datasets.protocol import Dataset, DatasetError, Episode, chosen_cameras
+from rfm_client.data.orientation import Orientation
 from rfm_client.data.sampling import Sampling
 from rfm_client.labelling.options import DEFAULT_RULE, LabelOptions, Mode
 from rfm_client.labelling.scorer import CheckpointFacts
 
-RECIPE_FORMAT = 2  # another one wherever the same recipe would give other scores
+RECIPE_FORMAT = 3  # another one wherever the same recipe would give other scores
 OF_CHECKPOINT = "the most in training; if the checkpoint does not say, the most its network takes"
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """How an episode's frames become labels."""
+    """How an episode's frames become labels.
+
+    decoders: what decodes each camera's pictures, since versions differ in colours; None: they are stored as pixels
+    orientations: of the cameras that are turned
+    """
 
     checkpoint: CheckpointFacts
     cameras: tuple[str, ...]
+    decoders: Mapping[str, str | None]
+    orientations: Mapping[str, Orientation]
     sampling: Sampling
     mode: Mode
     fuse: Fuse
@@ -38,7 +45,16 @@ class Recipe:
         cameras = chosen_cameras(dataset, options.cameras)
         rule = options.sampling or ("all" if options.mode == "whole" else DEFAULT_RULE)
         sampling = Sampling.of(rule, options.frames, checkpoint.max_frames)
-        return cls(checkpoint, cameras, sampling, options.mode, options.fuse, options.resize)
+        return cls(
+            checkpoint,
+            cameras,
+            decoders={camera: dataset.decoder(camera) for camera in cameras},
+            orientations={camera: turn for camera, turn in dataset.orientations.items() if camera in cameras},
+            sampling=sampling,
+            mode=options.mode,
+            fuse=options.fuse,
+            resize=options.resize,
+        )
 
     @property
     def in_one_pass(self) -> bool:
@@ -52,6 +68,8 @@ class Recipe:
             "format": RECIPE_FORMAT,
             "checkpoint": self.checkpoint.document(),
             "cameras": list(self.cameras),
+            "decoders": dict(self.decoders),
+            "orientations": dict(self.orientations),
             "sampling": told,
             "mode": self.mode,
             "fuse": self.fuse if len(self.cameras) > 1 else None,

@@ -22,6 +22,7 @@ from rfm_client.data.datasets.protocol import Dataset, Episode
 from rfm_client.labelling.claims import Claims
 from rfm_client.labelling.episode_scores import episode_columns
 from rfm_client.labelling.finished_episodes import Parts
+from rfm_client.labelling.frame_memory import FrameMemory
 from rfm_client.labelling.plan import Item, Plan
 from rfm_client.labelling.scorer import Scorer
 
@@ -74,10 +75,12 @@ class Run:
 
     def __init__(self, plan: Plan, dataset: Dataset, scorer: Scorer, parts: Parts, watch: Watch) -> None:
         self._plan, self._dataset, self._scorer, self._parts, self._watch = plan, dataset, scorer, parts, watch
+        self._memory = FrameMemory()
         self._stopping = threading.Event()
         self._lock = threading.Lock()
         self._failures: list[Failure] = []
         self._cause: Exception | None = None
+        self._waited_for: set[str] = set()
 
     def finish_all(self, workers: int) -> list[Failure]:
         """Labels what has no part; waits for episodes that other processes have claimed. Gives what failed.
@@ -96,9 +99,15 @@ class Run:
                     raise self._cause
                 claimed = [item for item, fate in zip(pending, fates, strict=True) if fate is _Fate.CLAIMED]
                 if len(claimed) == len(pending):
-                    self._stopping.wait(POLL_S)
+                    self._wait_for(claimed[0], claims)
                 pending = claimed
         return sorted(self._failures, key=lambda failure: failure.episode.index)
+
+    def _wait_for(self, item: Item, claims: Claims) -> None:
+        if item.key not in self._waited_for:
+            self._waited_for.add(item.key)
+            self._watch.note(f"waiting for {item.episode.name}: {claims.told(item)}")
+        self._stopping.wait(POLL_S)
 
     def _attempt(self, items: Sequence[Item], claims: Claims, workers: int) -> list[_Fate]:
         with ThreadPoolExecutor(workers, thread_name_prefix="rfm-label") as pool:
@@ -138,7 +147,14 @@ class Run:
         if self._parts.has(item):  # another process has finished it meanwhile
             return
         try:
-            columns = episode_columns(self._dataset, item.episode, self._scorer, self._plan.recipe, self._go_on)
+            columns = episode_columns(
+                self._dataset,
+                item.episode,
+                self._scorer,
+                self._plan.recipe,
+                memory=self._memory,
+                go_on=self._go_on,
+            )
         except InferenceFailedError:  # perhaps of a checkpoint that came meanwhile
             self._check_checkpoint()
             raise

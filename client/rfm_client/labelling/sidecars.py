@@ -14,18 +14,23 @@ from __future__ import annotations
 import json
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rfm_client.data.datasets.protocol import DatasetError
-from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS
+from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS, Columns
 from rfm_client.labelling.finished_episodes import Parts
-from rfm_client.labelling.plan import Plan
+from rfm_client.labelling.label_files import read_label_table
+from rfm_client.labelling.labelled_before import LabelFile
+from rfm_client.labelling.plan import Item, Plan
 
 IDENTITY = ("index", "episode_index", "frame_index")
 ROWS_AT_A_TIME = 2**17  # of one row group
 PROVENANCE_KEY = b"rfm.provenance"
+EPISODES_KEY = b"rfm.episodes"  # the digest of each, so that a later run knows whether its labels still hold
 
 _SIGNALS = b"lerobot.reward_scoring."
 SIGNALS_PROVENANCE_KEY = _SIGNALS + b"provenance"
@@ -52,7 +57,11 @@ def progress_file(path: Path, plan: Plan, columns: Sequence[str]) -> Sidecar:
     model = checkpoint.source or checkpoint.weights_digest
     if checkpoint.revision:
         model += f"@{checkpoint.revision}"
-    metadata = {b"reward_model_path": model.encode(), PROVENANCE_KEY: canonical_json(plan.provenance())}
+    metadata = {
+        b"reward_model_path": model.encode(),
+        PROVENANCE_KEY: canonical_json(plan.provenance()),
+        EPISODES_KEY: canonical_json(plan.digests()),
+    }
     return Sidecar(path, {name: "progress_sparse" if name == PROGRESS else name for name in columns}, metadata)
 
 
@@ -67,23 +76,27 @@ def signals_file(path: Path, plan: Plan, columns: Sequence[str], name: str) -> S
         "episode_indices": canonical_json([item.episode.index for item in plan.items]),
     }
     ordered = dict(sorted(signals.items(), key=lambda signal: signal[1]))
-    return Sidecar(path, ordered, {_SIGNALS + key.encode(): value for key, value in metadata.items()})
+    named = {_SIGNALS + key.encode(): value for key, value in metadata.items()}
+    return Sidecar(path, ordered, {**named, EPISODES_KEY: canonical_json(plan.digests())})
 
 
 def write_sidecars(plan: Plan, parts: Parts, sidecars: Sequence[Sidecar]) -> None:
     """Streams the parts into all files, and puts each in its place when it is whole.
 
-    Raises DatasetError for a missing part, or one with other columns than the first: then no file changes.
+    Raises DatasetError for a missing part, or one with other columns than the first, and OSError: then no file changes.
     """
     if not sidecars:
         return
     temporary = [sidecar.path.with_name(f".{sidecar.path.name}.{uuid.uuid4().hex}") for sidecar in sidecars]
-    for file in temporary:
-        file.parent.mkdir(parents=True, exist_ok=True)
     try:
+        for file in temporary:
+            file.parent.mkdir(parents=True, exist_ok=True)
         _stream(plan, parts, dict(zip(temporary, sidecars, strict=True)))
         for file, sidecar in zip(temporary, sidecars, strict=True):
             file.replace(sidecar.path)
+    except OSError as error:
+        got = f"{error}: make room, or name another folder with --output and this one's --parts {parts.url}"
+        raise OSError(f"{sidecars[0].path.parent}: expected to write the labels, got {got}") from error
     finally:
         for file in temporary:
             file.unlink(missing_ok=True)
@@ -94,25 +107,42 @@ def part_columns(plan: Plan, parts: Parts) -> list[str]:
     return [name for name in parts.read(plan.items[0]).column_names if name not in IDENTITY]
 
 
-def check_replaceable(path: Path, plan: Plan) -> None:
-    """Raises DatasetError for a file that is there and is not this plan's own."""
+def parquet_labels(path: Path, option: str = "--name") -> LabelFile | None:
+    """The labels in the file of this path; None: there is none. option: chooses another path"""
     from pyarrow import ArrowException, parquet
 
     if not path.exists():
-        return
+        return None
     try:
         metadata = parquet.read_schema(path).metadata or {}
     except (OSError, ArrowException):
         metadata = {}
-    known = metadata.get(PROVENANCE_KEY, metadata.get(SIGNALS_PROVENANCE_KEY))
-    if known != canonical_json(plan.provenance()):
-        got = "one of another provenance: choose another --name, or --overwrite"
-        raise DatasetError.at(path, "no file, or labels of the same provenance", got)
+    provenance = metadata.get(PROVENANCE_KEY, metadata.get(SIGNALS_PROVENANCE_KEY))
+    found = LabelFile.of(path, provenance, metadata.get(EPISODES_KEY), lambda items: _read(path, items))
+    return replace(found, option=option)
 
 
 def canonical_json(document: Any) -> bytes:
     """The document as JSON, the same bytes for the same document."""
     return json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+
+
+def _read(path: Path, items: Sequence[Item]) -> Iterator[tuple[Item, Columns]]:
+    table, columns = read_label_table(path)
+    names = {
+        PROGRESS: columns.progress,
+        **{f"{PROGRESS}.{camera}": name for camera, name in columns.progress_of.items()},
+    }
+    if columns.success is not None:
+        names |= {
+            SUCCESS: columns.success,
+            **{f"{SUCCESS}.{camera}": name for camera, name in columns.success_of.items()},
+        }
+    episodes = table["episode_index"].to_numpy()
+    for item in items:
+        start, end = np.searchsorted(episodes, [item.episode.index, item.episode.index + 1]).tolist()
+        rows = table.slice(start, end - start)
+        yield item, {column: rows[name].to_numpy() for column, name in names.items()}
 
 
 def _stream(plan: Plan, parts: Parts, sidecars: Mapping[Path, Sidecar]) -> None:

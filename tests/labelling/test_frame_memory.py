@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: MIT
+"""Memory of long films, for a checkpoint that does not encode them first: each frame is held once, and few films."""
+
+from __future__ import annotations
+
+import functools
+import tracemalloc
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from labelling import BrightnessScorer
+from rfm_client import InvalidSampleError, ProgressResult, ProgressSample
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.data.datasets.protocol import Contents
+from rfm_client.labelling import Episode, LabelOptions, Report, episode_scores, label, run
+from rfm_client.labelling.frame_memory import FrameMemory
+
+NUM_FRAMES, SIDE = 2000, 32
+FILM_BYTES = NUM_FRAMES * SIDE * SIDE * 3
+WORKERS = 4
+
+
+@pytest.fixture(autouse=True)
+def small_requests(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is sent together is small beside a film, as it is beside a real one."""
+    monkeypatch.setattr(episode_scores, "MAX_BYTES", FILM_BYTES // 50)
+
+
+class LongFilms:
+    """Episodes of one camera, whose frames are made when they are asked for."""
+
+    kind, source, revision = "made up", "long films", None
+    cameras, depth_cameras, notes = ("front",), (), ()
+    left_out: dict[str, str] = {}  # noqa: RUF012
+    orientations: dict[str, Any] = {}  # noqa: RUF012
+
+    def __init__(self, root: Path, num_episodes: int, num_more: int = 0) -> None:
+        self.root, self.num_more = root, num_more
+        self.episodes = [Episode(i, f"film {i}", "wait", NUM_FRAMES, i * NUM_FRAMES) for i in range(num_episodes)]
+
+    def decoder(self, camera: str) -> None:
+        return None
+
+    def check(self, episode: Episode, camera: str) -> Contents:
+        return Contents(str(episode.index), FILM_BYTES)
+
+    def frames(self, episode: Episode, camera: str) -> Iterator[UInt8Array]:
+        return (np.full((SIDE, SIDE, 3), t % 256, np.uint8) for t in range(NUM_FRAMES + self.num_more))
+
+
+class Refusing(BrightnessScorer):
+    def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
+        raise InvalidSampleError.at("task", "another one", "this")
+
+
+def peak_films(dataset: LongFilms, options: LabelOptions, scorer: BrightnessScorer) -> tuple[float, Report]:
+    """The most memory that was held, in films."""
+    label(LongFilms(dataset.root, 1), BrightnessScorer(), LabelOptions(output=options.output, name="imports", frames=1))
+    tracemalloc.start()
+    try:
+        report = label(dataset, scorer, options)
+        return tracemalloc.get_traced_memory()[1] / FILM_BYTES, report
+    finally:
+        tracemalloc.stop()
+
+
+MODES: dict[str, dict[str, Any]] = {"prefixes": {"frames": 2}, "one pass": {"mode": "whole"}}
+
+
+@pytest.mark.parametrize("mode", MODES.values(), ids=MODES)
+def test_each_frame_of_a_film_is_held_once(output: Path, mode: dict[str, Any]) -> None:
+    options = LabelOptions(output=output, workers=1, formats=("progress",), **mode)
+    peak, report = peak_films(LongFilms(output, 1), options, BrightnessScorer(max_frames=None))
+    assert report.summary is not None
+    assert report.summary.final_progress.tolist() == pytest.approx([(NUM_FRAMES - 1) % 256 / 255])
+    assert 1 <= peak < 1.7
+
+
+@pytest.mark.parametrize("scorer", [BrightnessScorer, Refusing])
+def test_all_workers_together_hold_no_more_than_fits(
+    output: Path, scorer: type[BrightnessScorer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And an episode that failed holds nothing."""
+    monkeypatch.setattr(run, "FrameMemory", functools.partial(FrameMemory, int(1.5 * FILM_BYTES)))
+    options = LabelOptions(output=output, workers=WORKERS, frames=2)
+    peak, report = peak_films(LongFilms(output, 2 * WORKERS), options, scorer())
+    assert len(report.failures) == (2 * WORKERS if scorer is Refusing else 0)
+    assert 1 <= peak < 2
+
+
+def test_a_film_that_is_larger_than_all_that_fits_is_labelled_alone(
+    output: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "FrameMemory", functools.partial(FrameMemory, 1))
+    peak, report = peak_films(
+        LongFilms(output, 3), LabelOptions(output=output, workers=3, frames=2), BrightnessScorer()
+    )
+    assert report.failures == []
+    assert 1 <= peak < 2
+
+
+@pytest.mark.parametrize("num_more", [-1, 1, 100])
+def test_more_or_fewer_frames_than_rows_fail_the_episode(output: Path, num_more: int) -> None:
+    report = label(LongFilms(output, 1, num_more), BrightnessScorer(), LabelOptions(output=output, frames=2))
+    (failure,) = report.failures
+    assert str(failure.error) == f"film 0: front: expected {NUM_FRAMES} frames, got {NUM_FRAMES + num_more}"

@@ -1,0 +1,293 @@
+# SPDX-License-Identifier: MIT
+"""Labels that are there are kept: fewer episodes never replace more, and what has grown is labelled where it is new."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import av
+import h5py
+import numpy as np
+import pyarrow.compute as pc
+import pytest
+from pyarrow import parquet
+
+from labelling import LEROBOT, BrightnessScorer
+from rfm_client.labelling import DatasetError, LabelOptions, Watch, label, open_dataset
+
+TOY = LEROBOT / "toy_v30_many"
+FRONT, WRIST = "observation.images.front", "observation.images.wrist"
+CAMERAS = (WRIST, FRONT)  # not in the order of their names
+PROGRESS = "rfm_progress.parquet"
+ALL_FRAMES = 428
+EPISODE_FRAMES = [episode.num_frames for episode in open_dataset(TOY).episodes]
+
+
+class Notes(Watch):
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def note(self, text: str) -> None:
+        self.lines.append(text)
+
+
+def labelled(root: Path, output: Path, **options: Any) -> tuple[int, list[str]]:
+    """How many frames of each camera a run has scored, and what it has said."""
+    scorer, notes = BrightnessScorer(), Notes()
+    label(open_dataset(root), scorer, LabelOptions(output=output, cameras=CAMERAS, frames=4, **options), notes)
+    return scorer.num_samples // len(CAMERAS), notes.lines
+
+
+def contents(output: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(output)): file.read_bytes() for file in sorted(output.rglob("*.parquet"))}
+
+
+def labels(output: Path) -> dict[str, bytes]:
+    return {name: content for name, content in contents(output).items() if ".rfm_parts" not in name}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    output = tmp_path_factory.mktemp("undisturbed")
+    labelled(TOY, output)
+    return labels(output)
+
+
+FORMATS: dict[str, tuple[str, ...]] = {"both": (), "progress": ("progress",), "signals": ("signals",)}
+
+
+@pytest.mark.parametrize("formats", FORMATS.values(), ids=FORMATS)
+@pytest.mark.parametrize("keeps_parts", [True, False], ids=["parts kept", "parts gone"])
+def test_labels_of_further_episodes_are_joined_to_those_that_are_there(
+    output: Path, undisturbed: dict[str, bytes], formats: Any, keeps_parts: bool
+) -> None:
+    labelled(TOY, output, formats=formats, episodes=range(6))
+    if not keeps_parts:
+        shutil.rmtree(output / ".rfm_parts")
+    scored, notes = labelled(TOY, output, formats=formats, episodes=[6, 7, 8])
+    assert scored == sum(EPISODE_FRAMES[6:9])
+    assert "labels of 6 other episodes are there, and are kept" in notes
+    assert notes[-1].startswith("9 of the dataset's 10 episodes have labels")
+    if not keeps_parts:
+        shutil.rmtree(output / ".rfm_parts")
+    scored, notes = labelled(TOY, output, formats=formats)
+    assert scored == EPISODE_FRAMES[9]
+    assert not any("episodes have labels" in line for line in notes)
+    assert labels(output) == {name: content for name, content in undisturbed.items() if name in labels(output)}
+    assert len(labels(output)) == (len(formats) or 2)
+
+
+def test_the_run_says_what_lerobot_makes_of_episodes_without_labels(output: Path) -> None:
+    _, notes = labelled(TOY, output, limit=2)
+    lerobot = "; LeRobot's reader gives frames of the others the weight 1.0"
+    assert notes[-1] == f"2 of the dataset's 10 episodes have labels{lerobot}"
+
+
+OTHERS: dict[str, tuple[BrightnessScorer, dict[str, Any], str]] = {
+    "frames": (BrightnessScorer(), {"frames": 8}, "sampling.frames: 4 there, 8 now"),
+    "rule": (BrightnessScorer(), {"sampling": "linspace_round"}, "sampling.rule: {rule} there, linspace_round now"),
+    "cameras": (
+        BrightnessScorer(),
+        {"cameras": (WRIST,)},
+        f"cameras: {FRONT} there, {WRIST} now; decoders.{WRIST}: none there, {{decoder}} now; "
+        f"decoders.{FRONT}: {{decoder}} there, none now",
+    ),
+    "weights": (BrightnessScorer(digest="new"), {}, "checkpoint.weights_digest: brightness there, new now"),
+    "settings": (BrightnessScorer(settings="new"), {}, "checkpoint.settings_digest: settings there, new now"),
+}
+
+
+@pytest.mark.parametrize(("scorer", "options", "differs"), OTHERS.values(), ids=OTHERS)
+def test_labels_of_another_recipe_are_refused_with_the_setting_that_differs(
+    output: Path, scorer: BrightnessScorer, options: dict[str, Any], differs: str
+) -> None:
+    first = LabelOptions(output=output, cameras=(FRONT,), frames=4, formats=("progress",), episodes=[0, 1, 2])
+    label(open_dataset(TOY), BrightnessScorer(), first)
+    before = labels(output)
+    told = json.loads(parquet.read_schema(output / PROGRESS).metadata[b"rfm.provenance"])
+    expected = differs.format(rule=told["sampling"]["rule"], decoder=told["decoders"][FRONT])
+
+    changed: dict[str, Any] = {**vars(first), "episodes": [3], **options}
+    with pytest.raises(DatasetError) as caught:
+        label(open_dataset(TOY), scorer, LabelOptions(**changed))
+    got = f"{output / PROGRESS}: expected no labels, or those of the same recipe, got {expected}"
+    assert str(caught.value) == f"{got}: choose another --name, or --overwrite"
+    assert labels(output) == before
+
+    notes = Notes()
+    label(open_dataset(TOY), scorer, LabelOptions(**{**changed, "overwrite": True}), notes)
+    assert f"--overwrite: {got}" in notes.lines
+    assert notes.lines[-1].startswith("1 of the dataset's 10 episodes have labels; LeRobot's reader")
+    assert parquet.read_table(output / PROGRESS)["episode_index"].unique().to_pylist() == [3]
+
+
+def test_another_decoder_is_another_recipe(output: Path) -> None:
+    """Versions of PyAV differ in colours."""
+    options = LabelOptions(output=output, cameras=(FRONT,), frames=4, limit=1)
+    label(open_dataset(TOY), BrightnessScorer(), options)
+    dataset = open_dataset(TOY)
+    dataset.decoder = lambda camera: "PyAV 1.0"  # type: ignore[method-assign]
+    with pytest.raises(DatasetError, match=rf"got decoders\.{FRONT}: PyAV \d+\.\S+.* there, PyAV 1\.0 now: choose"):
+        label(dataset, BrightnessScorer(), options)
+
+
+def copy_of_toy(folder: Path) -> Path:
+    return shutil.copytree(TOY, folder / TOY.name)
+
+
+def demonstrations(file: Path, num_demos: int, *, changed: int | None = None, seed: int = 0) -> Path:
+    file.parent.mkdir(exist_ok=True)
+    with h5py.File(file, "w") as opened:
+        opened.create_group("data").attrs["problem_info"] = json.dumps({"language_instruction": "open the drawer"})
+        for index in range(num_demos):
+            random = np.random.default_rng([seed, index, index == changed])
+            frames = random.integers(0, 256, (5 + index, 16, 16, 3), np.uint8)
+            opened[f"data/demo_{index}/obs/front"] = frames
+    return file
+
+
+def label_demonstrations(file: Path, **options: Any) -> int:
+    scorer = BrightnessScorer()
+    label(open_dataset(file), scorer, LabelOptions(**options))
+    return scorer.num_samples
+
+
+def hdf5_labels(file: Path) -> dict[str, list[float]]:
+    with h5py.File(file) as opened:
+        data = opened["data"]
+        return {
+            f"{demo}/{name}": data[demo][name][()].tolist() for demo in data for name in data[demo] if name != "obs"
+        }
+
+
+@pytest.mark.parametrize("in_place", [True, False], ids=["in place", "beside"])
+def test_an_hdf5_file_s_labels_are_joined_too(tmp_path: Path, in_place: bool) -> None:
+    demos, whole = (demonstrations(tmp_path / name, 4) for name in ("demos.hdf5", "whole.hdf5"))
+    written = [file if in_place else file.with_name(f"{file.stem}.rfm_rewards.hdf5") for file in (demos, whole)]
+    label_demonstrations(whole, in_place=in_place, parts=str(tmp_path / "parts"))
+    assert label_demonstrations(demos, in_place=in_place, episodes=[1, 3]) == 6 + 8
+    shutil.rmtree(tmp_path / ".rfm_parts")
+    assert label_demonstrations(demos, in_place=in_place, episodes=[0]) == 5
+    shutil.rmtree(tmp_path / ".rfm_parts")
+    assert label_demonstrations(demos, in_place=in_place) == 7
+    assert hdf5_labels(written[0]) == hdf5_labels(written[1])
+
+
+def test_an_episode_that_has_changed_is_labelled_again_where_it_is_chosen(tmp_path: Path) -> None:
+    demos = demonstrations(tmp_path / "demos.hdf5", 4)
+    label_demonstrations(demos, episodes=[0, 1, 2])
+    before = hdf5_labels(tmp_path / "demos.rfm_rewards.hdf5")
+    demonstrations(demos, 4, changed=1)
+    with pytest.raises(DatasetError) as caught:
+        label_demonstrations(demos, episodes=[3])
+    expected = f"the frames and rows of its labels in {tmp_path}/demos.rfm_rewards.hdf5, or --episodes with 1"
+    assert str(caught.value) == f"demo_1: expected {expected}, got others: choose another --name, or --overwrite"
+    assert hdf5_labels(tmp_path / "demos.rfm_rewards.hdf5") == before
+    assert label_demonstrations(demos, episodes=[1, 3]) == 6 + 8
+    after = hdf5_labels(tmp_path / "demos.rfm_rewards.hdf5")
+    assert {name for name in before if after[name] != before[name]} == {"demo_1/rfm_progress", "demo_1/rfm_success"}
+
+
+def test_labels_of_another_dataset_of_the_same_name_are_not_replaced(tmp_path: Path, output: Path) -> None:
+    one, another = (demonstrations(tmp_path / str(seed) / "demos.hdf5", 3, seed=seed) for seed in (0, 1))
+    label_demonstrations(one, output=output)
+    with pytest.raises(DatasetError, match="expected labels of this dataset's episodes, got those of others: choose"):
+        label_demonstrations(another, output=output)
+    assert label_demonstrations(another, output=output, overwrite=True) == 5 + 6 + 7
+
+
+def test_labels_of_an_episode_that_the_dataset_has_lost_are_dropped_only_when_asked(tmp_path: Path) -> None:
+    demos = demonstrations(tmp_path / "demos.hdf5", 4)
+    label_demonstrations(demos)
+    demonstrations(demos, 3)
+    with pytest.raises(
+        DatasetError, match=r"expected labels of the dataset's 3 episodes, got some of episode 3: choose"
+    ):
+        label_demonstrations(demos)
+    assert label_demonstrations(demos, overwrite=True) == 0
+    assert len(hdf5_labels(tmp_path / "demos.rfm_rewards.hdf5")) == 2 * 3
+
+
+def without_last_episode(root: Path) -> None:
+    """The dataset as it was before its last episode came: LeRobot appended it to the files that were there."""
+    (meta,) = (root / "meta" / "episodes").rglob("*.parquet")
+    (rows,) = (root / "data").rglob("*.parquet")
+    last = parquet.read_table(meta).to_pylist()[-1]
+    for file in (meta, rows):
+        table = parquet.read_table(file, partitioning=None)
+        parquet.write_table(table.filter(pc.not_equal(table["episode_index"], last["episode_index"])), file)
+    for camera in (FRONT, WRIST):
+        chunk, number, from_s = (
+            last[f"videos/{camera}/{name}"] for name in ("chunk_index", "file_index", "from_timestamp")
+        )
+        assert from_s > 0
+        cut(root / "videos" / camera / f"chunk-{chunk:03d}" / f"file-{number:03d}.mp4", from_s)
+    info = json.loads((root / "meta" / "info.json").read_text())
+    info["total_episodes"] -= 1
+    info["total_frames"] -= last["length"]
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+
+
+def cut(film: Path, end_s: float) -> None:
+    """Leaves the packets from here on away, the others as they are."""
+    whole = film.rename(film.with_suffix(".whole"))
+    with av.open(str(whole), format="mp4") as source, av.open(str(film), "w") as shorter:
+        template = source.streams.video[0]
+        stream = shorter.add_stream_from_template(template)
+        for packet in source.demux(template):
+            if packet.size and float(packet.pts * packet.time_base) < end_s - 0.01:
+                packet.stream = stream
+                shorter.mux(packet)
+    whole.unlink()
+
+
+def test_a_dataset_that_has_grown_is_labelled_where_it_is_new(
+    tmp_path: Path, output: Path, undisturbed: dict[str, bytes]
+) -> None:
+    """Its films have grown with it: the packets of the episodes that were there are the same."""
+    root = copy_of_toy(tmp_path)
+    without_last_episode(root)
+    scored, _ = labelled(root, output)
+    assert scored == ALL_FRAMES - EPISODE_FRAMES[9]
+    shutil.rmtree(root)
+    copy_of_toy(tmp_path)
+    scored, _ = labelled(root, output)
+    assert scored == EPISODE_FRAMES[9]
+    assert labels(output) == undisturbed
+
+
+BY_OTHERS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no Parquet file": (lambda file: file.write_bytes(b"not ours"), "labels of another program"),
+    "of LeRobot": (
+        lambda file: parquet.write_table(parquet.read_table(file).replace_schema_metadata({}), file),
+        "labels of another program",
+    ),
+    "of a version without digests of episodes": (
+        lambda file: parquet.write_table(without_digests(parquet.read_table(file)), file),
+        "no digests of its episodes",
+    ),
+}
+
+
+def without_digests(table: Any) -> Any:
+    kept = {key: value for key, value in table.schema.metadata.items() if key != b"rfm.episodes"}
+    return table.replace_schema_metadata(kept)
+
+
+@pytest.mark.parametrize(("make", "got"), BY_OTHERS.values(), ids=BY_OTHERS)
+def test_labels_that_do_not_say_of_what_they_are_stay_unless_asked(
+    output: Path, make: Callable[[Path], object], got: str
+) -> None:
+    labelled(TOY, output, limit=1, alias="sarm_progress")
+    make(output / "sarm_progress.parquet")
+    before = labels(output)
+    with pytest.raises(DatasetError) as caught:
+        labelled(TOY, output, limit=2, alias="sarm_progress")
+    assert str(caught.value).endswith(f"got {got}: choose another --alias, or --overwrite")
+    assert labels(output) == before
+    labelled(TOY, output, limit=2, alias="sarm_progress", overwrite=True)
+    assert labels(output)["sarm_progress.parquet"] == labels(output)[PROGRESS]
