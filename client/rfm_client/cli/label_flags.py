@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import typer
 
-from rfm_client.cli.options import usage_errors
+from rfm_client.cli.options import finite, usage_errors
 from rfm_client.data.camera_fusion import Fuse
 from rfm_client.data.orientation import ORIENTATIONS, Orient
 from rfm_client.data.sampling import Rule
@@ -124,7 +124,9 @@ class LabelFlags:
         str | None, typer.Option(help="Ray cluster; else one that is found, or made here.", show_default=False)
     ] = None
     actors: Annotated[int, typer.Option(min=1, help="Ray actors, each with a scorer.")] = 1
-    num_gpus_per_actor: Annotated[float, typer.Option(min=0, help="GPUs of its node that a Ray actor takes.")] = 0.0
+    num_gpus_per_actor: Annotated[
+        float, typer.Option(min=0, callback=finite, help="GPUs of its node that a Ray actor takes.")
+    ] = 0.0
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Check everything, measure a few episodes, write nothing.")
     ] = False
