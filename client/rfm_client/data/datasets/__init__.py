@@ -3,5 +3,6 @@
 
 from rfm_client.data.datasets.opening import open_dataset
 from rfm_client.data.datasets.protocol import Dataset, DatasetError, Episode, iter_episodes
+from rfm_client.data.orientation import Orient
 
-__all__ = ["Dataset", "DatasetError", "Episode", "iter_episodes", "open_dataset"]
+__all__ = ["Dataset", "DatasetError", "Episode", "Orient", "iter_episodes", "open_dataset"]
