@@ -246,6 +246,17 @@ def test_a_pair_is_compared_in_both_orders(page: Stage) -> None:
     assert (answer["verdict"], answer["orders_agree"]) == ("first", True)
 
 
+def test_a_video_is_no_better_than_its_copy(page: Stage) -> None:
+    (page.videos / "copy.mp4").write_bytes((page.videos / "success.mp4").read_bytes())
+    scored(page, "success", "copy")
+    page.browser["compare"].click()
+    page.browser.until("document.querySelector('#pairs p')")
+    (answer,) = taken_along(page)["comparisons"]
+    assert answer["verdict"] is None
+    why = "both are exactly 0.5" if answer["orders_agree"] else "the orders disagree"
+    assert page.browser.all("#pairs p")[0].text == f"No answer: {why}."
+
+
 def test_the_threshold_says_when_success_is_reached(page: Stage) -> None:
     scored(page, "success", "rewound")
     success = [np.array(video["success"]) for video in taken_along(page)["videos"]]
