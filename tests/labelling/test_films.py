@@ -162,7 +162,7 @@ def write_streams(file: Path, *films: tuple[UInt8Array, bool]) -> None:
         for stream, (frames, attached) in zip(streams, films, strict=True):
             stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], "yuvj420p" if attached else "yuv420p"
             if attached:
-                stream.disposition = av.stream.Disposition.attached_pic
+                stream.disposition = av.stream.Disposition.attached_pic.value
         for stream, (frames, _) in zip(streams, films, strict=True):
             for image in frames:
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
