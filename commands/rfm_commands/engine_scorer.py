@@ -90,6 +90,7 @@ def _facts(
         frame_size=description.frame_size if encoders is None else encoders.description.frame_size,
         encodes=encoders is not None,
         is_causal=getattr(checkpoint.config, "causal_mask", None) is True,
+        trained_padding=description.trained_padding is not False,
     )
 
 

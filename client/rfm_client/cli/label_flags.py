@@ -17,7 +17,6 @@ from rfm_client.data.camera_fusion import Fuse
 from rfm_client.data.orientation import ORIENTATIONS, Orient
 from rfm_client.data.sampling import Rule
 from rfm_client.labelling.options import (
-    DEFAULT_RULE,
     DEFAULT_WORKERS,
     FORMATS,
     Format,
@@ -60,7 +59,7 @@ class LabelFlags:
     sampling: Annotated[
         Rule | None,
         typer.Option(
-            help=f"Rule by which frame t's prefix is sampled; else {DEFAULT_RULE}, as training does.",
+            help="Rule by which frame t's prefix is sampled; else that of the checkpoint's training.",
             show_default=False,
         ),
     ] = None

@@ -162,10 +162,13 @@ class AsyncEpisodes(OneProcess):
     async def _prepare(self, deadline: Deadline | None) -> None:
         """Finds out what the checkpoint reads. The client knows it, until another version of the checkpoint answers."""
         asked = self._options
-        if asked.resize or asked.frames is None:
-            self._info = await self._client.model_info(frames=True, timeout_s=_left_s(deadline))
-        trained_frames = None if self._info is None else self._info.max_frames
-        self._sampling = Sampling.of(asked.sampling, asked.frames, trained_frames)
+        if not asked.resize and asked.sampling is not None and asked.frames is not None:
+            self._sampling = Sampling(asked.sampling, asked.frames)
+            return
+        self._info = info = await self._client.model_info(frames=True, timeout_s=_left_s(deadline))
+        self._sampling = Sampling.of(
+            asked.sampling, asked.frames, info.max_frames, trained_padding=info.trained_padding
+        )
 
     def _given(self, frames: Any, index: int) -> Mapping[str, Any]:
         """The new frame of one episode, by camera."""

@@ -36,7 +36,7 @@ class SuccessRule:
 class EpisodeSettings(TypedDict, total=False):
     """The fields of EpisodeOptions, as arguments."""
 
-    sampling: Rule
+    sampling: Rule | None
     frames: int | None
     cameras: Sequence[str]
     fuse: Fuse
@@ -50,8 +50,8 @@ class EpisodeSettings(TypedDict, total=False):
 class EpisodeOptions:
     """How each step of an episode is scored. Raises ValueError for contradictory options.
 
-    sampling: which frames of the episode so far a model is shown: a rule of ``rfm_client.data.sampling``. ``rint_pad``
-        is that of upstream's own RL loop
+    sampling: which frames of the episode so far a model is shown: a rule of ``rfm_client.data.sampling``; None: that of
+        the checkpoint's training
     frames: the rule's number of frames; None: the checkpoint's ``ModelInfo.max_frames``. If it has none, a rule
         that needs a number raises ValueError at the first step
     cameras: names of the cameras whose frames each step brings; none: there is one, without a name
@@ -64,7 +64,7 @@ class EpisodeOptions:
     live: where each step is reported to, of several cameras the first one's frame; it delays nothing
     """
 
-    sampling: Rule = "rint_pad"
+    sampling: Rule | None = None
     frames: int | None = None
     cameras: Sequence[str] = ()
     fuse: Fuse = "mean"

@@ -49,8 +49,8 @@ class RewardOptions:
     fuse: how the scores of several cameras become one
     orient: how frames, rendered ones too, are turned so that they are upright: an Orientation, or such by camera; a
         camera that is not named: not at all
-    sampling: which frames of the episode so far are sent: a rule of ``rfm_client.data.sampling``. ``rint_pad`` is that
-        of upstream's own RL loop
+    sampling: which frames of the episode so far are sent: a rule of ``rfm_client.data.sampling``; None: that of the
+        checkpoint's training
     resize: frames are made as small as the checkpoint reads them before they are kept and sent (needs Pillow); ReWiND's
         scores differ slightly from those of the frames as they are
     max_frames: the rule's number of frames; None: the checkpoint's ``ModelInfo.max_frames``. If it has none, a rule
@@ -70,7 +70,7 @@ class RewardOptions:
     cameras: Sequence[str] = ()
     fuse: Fuse = "mean"
     orient: Orientation | Mapping[str, Orientation] = "none"
-    sampling: Rule = "rint_pad"
+    sampling: Rule | None = None
     resize: bool = False
     max_frames: int | None = None
     blocking: bool = True
@@ -188,12 +188,12 @@ class Scorer:
         return None if size is None else lambda frame: resize_frames(frame[np.newaxis], size)[0]
 
     def _sampling(self) -> Sampling:
-        """The rule with its number of frames, if nobody has said it that of the checkpoint that is served."""
-        asked = self._options
-        try:
-            return Sampling(asked.sampling, asked.max_frames)
-        except ValueError:  # it needs a number that nobody has said
-            return Sampling.of(asked.sampling, None, self._client.model_info(frames=True).max_frames)
+        """The rule with its number of frames; where the options do not say, those of the checkpoint that is served."""
+        rule, frames = self._options.sampling, self._options.max_frames
+        if rule is not None and frames is not None:
+            return Sampling(rule, frames)
+        info = self._client.model_info(frames=True)
+        return Sampling.of(rule, frames, info.max_frames, trained_padding=info.trained_padding)
 
 
 class Episode:

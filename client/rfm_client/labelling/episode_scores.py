@@ -68,7 +68,7 @@ def episode_columns(
 
 
 def _scores(trajectory: Trajectory, scorer: Scorer, recipe: Recipe, go_on: Callable[[], None]) -> ProgressResult:
-    if recipe.in_one_pass:
+    if recipe.in_one_pass(trajectory.num_frames):
         (result,) = scorer.evaluate([ProgressSample(trajectory)])
         return result
     results: list[ProgressResult] = []

@@ -18,7 +18,6 @@ Format: TypeAlias = Literal["progress", "signals", "hdf5"]
 
 MODES: tuple[Mode, ...] = get_args(Mode)
 FORMATS: tuple[Format, ...] = get_args(Format)
-DEFAULT_RULE: Rule = "rint_pad"  # by which upstream's training cuts its clips, and its RL loop the episode so far
 DEFAULT_WORKERS = 4
 
 _NAME = re.compile(r"[A-Za-z0-9][\w-]{0,63}")
@@ -34,8 +33,8 @@ class LabelOptions:
     alias: the progress file is written under this name, too: ``sarm_progress`` is what LeRobot's training reads
     formats: which files; empty: ``progress`` and ``signals``, of an HDF5 dataset ``hdf5``
     cameras: each is scored, and the scores fused; empty: all but depth cameras
-    sampling, frames: the rule by which frame t's prefix is sampled, and to how many frames; None: ``rint_pad`` and the
-        checkpoint's ``max_frames``
+    sampling, frames: the rule by which frame t's prefix is sampled, and to how many frames; None: as the checkpoint was
+        trained (``Sampling.of``)
     mode: ``prefix``: frame t is scored on the frames up to t; ``whole``: all frames of an episode are scored together
     fuse: how the scores of several cameras become one
     resize: frames are made as small as the checkpoint reads them before they are sent

@@ -11,10 +11,11 @@ from rfm_client.data.camera_fusion import Fuse
 from rfm_client.data.datasets.protocol import Dataset, DatasetError, Episode, chosen_cameras
 from rfm_client.data.orientation import Orientation
 from rfm_client.data.sampling import Sampling
-from rfm_client.labelling.options import DEFAULT_RULE, LabelOptions, Mode
+from rfm_client.labelling.options import LabelOptions, Mode
 from rfm_client.labelling.scorer import CheckpointFacts
 
 RECIPE_FORMAT = 3  # another one wherever the same recipe would give other scores
+OF_TRAINING = {True: "as upstream's training pads shorter clips", False: "the checkpoint's training did not pad"}
 OF_CHECKPOINT = "the most in training; if the checkpoint does not say, the most its network takes"
 
 
@@ -43,8 +44,8 @@ class Recipe:
         if not dataset.cameras:
             raise DatasetError.at(dataset.source, "at least one camera", "none")
         cameras = chosen_cameras(dataset, options.cameras)
-        rule = options.sampling or ("all" if options.mode == "whole" else DEFAULT_RULE)
-        sampling = Sampling.of(rule, options.frames, checkpoint.max_frames)
+        rule = "all" if options.mode == "whole" else options.sampling
+        sampling = Sampling.of(rule, options.frames, checkpoint.max_frames, trained_padding=checkpoint.trained_padding)
         return cls(
             checkpoint,
             cameras,
@@ -56,10 +57,11 @@ class Recipe:
             resize=options.resize,
         )
 
-    @property
-    def in_one_pass(self) -> bool:
-        """Whether one pass over an episode gives every frame's score."""
-        return self.mode == "whole" or (self.sampling.rule == "all" and self.checkpoint.is_causal)
+    def in_one_pass(self, num_frames: int) -> bool:
+        """Whether one pass over an episode of so many frames gives every frame's score."""
+        rule, frames = self.sampling.rule, self.sampling.frames
+        shows_all = rule == "all" or (rule == "rint" and frames is not None and num_frames <= frames)
+        return self.mode == "whole" or (shows_all and self.checkpoint.is_causal)
 
     def document(self) -> dict[str, Any]:
         """The recipe as provenance tells it."""
@@ -78,7 +80,7 @@ class Recipe:
 
     def told(self, options: LabelOptions) -> list[str]:
         """What is done, a line each, with who decided it."""
-        of_rule = "asked for" if options.sampling else "the rule of upstream's training and RL loop"
+        of_rule = "asked for" if options.sampling else OF_TRAINING[self.checkpoint.trained_padding]
         of_frames = "asked for" if options.frames else OF_CHECKPOINT
         one = len(self.cameras) == 1
         of_cameras = "asked for" if options.cameras else "all but depth cameras"

@@ -30,6 +30,7 @@ class CheckpointFacts:
     frame_size: to what it brings each frame; None: that depends on the frame
     encodes: frames can be encoded by themselves, and prefixes scored from their embeddings
     is_causal: no frame's score depends on later frames
+    trained_padding: training padded shorter trajectories; True also of a checkpoint that does not say
     """
 
     source: str | None
@@ -40,6 +41,7 @@ class CheckpointFacts:
     frame_size: FrameSize | None
     encodes: bool
     is_causal: bool
+    trained_padding: bool = True
 
     def document(self) -> dict[str, Any]:
         """What provenance says of it."""
@@ -86,6 +88,7 @@ class ClientScorer:
             frame_size=info.frame_size,
             encodes=embedded is not None,
             is_causal=network.get("config", {}).get("causal_mask") is True,
+            trained_padding=info.trained_padding,
         )
 
     def encode(self, frames: UInt8Array, task: str) -> Trajectory:
