@@ -63,6 +63,8 @@ def test_both_commands_write_the_same_labels_and_tell_what_they_did(demo_server:
             f"rfm-client: note: cameras: {FRONT} (asked for)",
             "rfm-client: note: sampling: rint_pad (the rule of upstream's training and RL loop)",
             "rfm-client: note: frames: 8 (asked for)",
+            "rfm-client: note: 3 of the dataset's 10 episodes have labels; "
+            "LeRobot's reader gives frames of the others the weight 1.0",
         ],
     )
     assert {"episodes": "3", "frames": "121"}.items() <= cells(served.stdout).items()
@@ -123,7 +125,11 @@ def test_labelled_episodes_are_recorded_with_the_frames_and_scores_of_each_camer
         assert result.exit_code == 0, result.stderr
         files = [folder / f"episode_{index:06d}.rrd" for index in (2, 3)]
         assert [line for line in result.stdout.splitlines() if line.endswith(".rrd")] == list(map(str, files))
+    chosen = (*words[:2], "--episodes", 3, *words[4:6], "--rrd", output / "look", "--output", output)
+    assert invoke(*chosen, "--url", demo_server.grpc_url).exit_code == 0
+    assert [file.name for file in (output / "look").iterdir()] == ["episode_000003.rrd"]
     labels = parquet.read_table(output / FILES[0])
+    assert labels["episode_index"].unique().to_pylist() == [2, 3]
     cameras = [name.removeprefix("progress.") for name in labels.column_names if name.startswith("progress.")]
     assert len(cameras) == 2
     for index, file in zip((2, 3), files, strict=True):
