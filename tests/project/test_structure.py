@@ -82,7 +82,7 @@ EXTRAS = {
     "av": {"video.py", "films.py"},
     "async_timeout": {"deadline.py"},  # Python 3.10 only
     "PIL": {"resize.py", "lerobot.py"},
-    "gymnasium": {"gym.py"},
+    "gymnasium": {"gym.py", "gym_vector.py"},
     "typer": {"cli"},
     "rich": {"cli"},
     "matplotlib": {"cli"},
