@@ -267,21 +267,31 @@ def demo(
     import rfm_export
 
     try:
+        from rfm_client.data.video import read_video
         from rfm_commands.demo import score_video, show_metrics
 
-        import_module("av")  # which reads the video, once all is served
+        import_module("av")  # which reads the video
     except ImportError as error:
         _fail(f'the demo needs {error.name}: pip install ".[demo,encoders,triton]"')
     console, settings = Console(), _config(None, export=given).export
     with stopped_by_signals(), TemporaryDirectory(prefix="rfm-demo-") as folder:
         try:
+            frames = read_video(video, fps)
+            _make_folder(output)
             if settings.checkpoint is not None:
                 repository = _exported_frames(settings.checkpoint, settings, Path(folder) / "model_repository")
             with temporary_server(repository, output / "tritonserver.log", tritonserver) as endpoints:
-                score_video(endpoints, video, task, fps, output / "rewards.png", console)
+                score_video(endpoints, video, frames, task, output / "rewards.png", console)
                 show_metrics(endpoints, console)
         except (CheckpointError, rfm_export.ExportError, ServerStartError, RewardError, OSError) as error:
             _fail(str(error))
+
+
+def _make_folder(output: Path) -> None:
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        _fail(f"{output}: expected a folder that can be made, got: {error.strerror}; --output names another one")
 
 
 def _exported_frames(checkpoint: str, settings: ExportConfig, repository: Path) -> Path:

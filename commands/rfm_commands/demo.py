@@ -10,13 +10,15 @@ from rich.console import Console
 from rfm.launch.process import Endpoints
 from rfm_client import RewardClient, Trajectory
 from rfm_client.cli.show import Panel, plot, scores_table, status_tables
-from rfm_client.data.video import frame_times_s, read_video
+from rfm_client.contract.samples import UInt8Array
+from rfm_client.data.video import frame_times_s
 from rfm_client.status import read_status
 
 
-def score_video(endpoints: Endpoints, video: Path, task: str, fps: float, picture: Path, console: Console) -> None:
-    """Scores the video's frames at ``fps``, or as many, evenly, as the checkpoint takes, and draws a picture."""
-    frames = read_video(video, fps)
+def score_video(
+    endpoints: Endpoints, video: Path, frames: UInt8Array, task: str, picture: Path, console: Console
+) -> None:
+    """Scores the video's frames, or as many, evenly, as the checkpoint takes, and draws a picture."""
     with RewardClient(endpoints.grpc_url) as client:
         result = client.progress(Trajectory(frames=frames, task=task), subsample=True)
     if len(result.progress) < len(frames):

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -73,9 +74,11 @@ def export(
         version = _version(loaded, settings, next_version(repository, names))
         models = generated_models(loaded.checkpoint.description, described, version)
         _check_replaceable(repository, models, settings)
-        _stage(loaded, models, version, staged)
+        with _needing_disk(repository):
+            _stage(loaded, models, version, staged)
         _verify(loaded, version, staged, named, say)
-        publish(repository, staged, models)
+        with _needing_disk(repository):
+            publish(repository, staged, models)
     return version.number
 
 
@@ -106,17 +109,24 @@ def _check_gpus(num_gpus: int | None) -> None:
         )
 
 
+@contextmanager
+def _needing_disk(repository: Path) -> Iterator[None]:
+    """Raises ExportError where the repository's disk takes no more."""
+    try:
+        yield
+    except (OSError, SafetensorError) as error:  # the latter of a full disk, too
+        kept = "the versions that are served stay as they are; make room there, or name another --repository"
+        raise ExportError(f"{repository}: expected room for the exported files, got: {error}; {kept}") from error
+
+
 def _stage(source: _Source, models: Sequence[GeneratedModel], version: Version, staged: Path) -> None:
     """Writes all files of the version."""
-    try:
-        source.checkpoint.save(_checkpoint_folder(source.checkpoint.description, version, staged))
-        if source.encoders is not None:
-            source.encoders.save(_encoders_folder(version, staged))
-        for path, content in _generated(models, staged).items():
-            (staged / path).parent.mkdir(parents=True, exist_ok=True)
-            (staged / path).write_bytes(content)
-    except (OSError, SafetensorError) as error:  # the latter of a full disk, too
-        raise ExportError(f"{staged}: expected room for the exported files, got: {error}") from error
+    source.checkpoint.save(_checkpoint_folder(source.checkpoint.description, version, staged))
+    if source.encoders is not None:
+        source.encoders.save(_encoders_folder(version, staged))
+    for path, content in _generated(models, staged).items():
+        (staged / path).parent.mkdir(parents=True, exist_ok=True)
+        (staged / path).write_bytes(content)
 
 
 def _verify(

@@ -73,7 +73,7 @@ def _make_writable(repository: Path) -> None:
                 f"{repository}: expected a repository, got a model of one: --repository {repository.parent}"
             )
         repository.mkdir(parents=True, exist_ok=True)
-        if not os.access(repository, os.W_OK | os.X_OK):
+        if not os.access(repository, os.W_OK | os.X_OK, effective_ids=True):
             reason = errno.EROFS if os.statvfs(repository).f_flag & os.ST_RDONLY else errno.EACCES
             raise OSError(reason, os.strerror(reason))
     except OSError as error:

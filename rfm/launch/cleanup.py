@@ -11,10 +11,13 @@ import tempfile
 from pathlib import Path
 
 from rfm.journal import SHARED_MEMORY
+from rfm.launch.installation import ServerStartError
 
 BACKENDS_PREFIX = "rfm-backends-"
 # The Python backend's regions have this name. Newer Tritons let no client map a region with it.
 REGION_PREFIX = "triton_python_backend_shm_region_rfm"
+
+NEEDS_ROOM = "free some (a container has more of /dev/shm with --shm-size; TMPDIR names another folder than /tmp)"
 
 _LOCK = "lock"
 _NEW = "rfm-new"
@@ -28,6 +31,15 @@ class Claim:
     """
 
     def __init__(self) -> None:
+        """Takes both. Raises ServerStartError where they cannot be written."""
+        try:
+            self._take()
+        except OSError as error:
+            raise ServerStartError(
+                f"{error.filename}: expected room for a server's files, got: {error.strerror}; {NEEDS_ROOM}"
+            ) from error
+
+    def _take(self) -> None:
         pid, token = os.getpid(), secrets.token_hex(4)
         self.region_prefix = f"{REGION_PREFIX}_{pid}_{token}_"
         self._lock = SHARED_MEMORY / f"{self.region_prefix}{_LOCK}"

@@ -18,7 +18,7 @@ from typing import IO
 from rfm.config import DEFAULT_HOST, ServeConfig
 from rfm.journal import all_wait, journals_of_the_dead, restore_journals
 from rfm.launch.admin_key import VARIABLE, http_headers, new_key, restrictions
-from rfm.launch.cleanup import Claim
+from rfm.launch.cleanup import NEEDS_ROOM, Claim
 from rfm.launch.ending import EXIT_TIMEOUT_S, end, ending_with_parent
 from rfm.launch.http import NO_ANSWER, Http
 from rfm.launch.installation import Installation, ServerStartError
@@ -38,9 +38,12 @@ MAX_REPEATS = 3  # of a start that Triton spoils: a machine that stands still fo
 ANSWER_TIMEOUT_S = 10.0  # of one that starts
 NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # a `load` would load all versions anew: their folders have changed
 SECRETS = (VARIABLE, GATEWAY_KEY_VARIABLE)  # variables that neither Triton nor a model process needs
-# Of Triton and of PyTorch, where a model is to be on a GPU that the machine, or its PyTorch, lacks.
-_LACKS_GPU = re.compile(r"unsupported gpu id|KIND_GPU|compiled with CUDA|no NVIDIA driver")
-EXPORT_HERE = "; they were exported for GPUs that this machine lacks: export again here (--num-gpus 0: for the CPU)"
+_REMEDIES = {  # by what Triton, PyTorch or the system say of a model that is not loaded
+    "unsupported gpu id|KIND_GPU|compiled with CUDA|no NVIDIA driver": (
+        "the models were exported for GPUs that this machine lacks: rfm export again here (--num-gpus 0: for the CPU)"
+    ),
+    "No space left on device": NEEDS_ROOM,
+}
 _REGIONS = "--backend-config=python,shm-region-prefix-name="
 
 
@@ -280,8 +283,7 @@ class TritonServer:
             failed = [entry for entry in versions_of(index) if not entry.is_ready and entry.name in self._loading]
             if failed:
                 reasons = "; ".join(f"{entry.name}: {entry.reason or 'not loaded'}" for entry in failed)
-                remedy = EXPORT_HERE if _LACKS_GPU.search(reasons) else ""
-                raise ServerStartError(f"models: expected all to be ready, got {reasons}{remedy}")
+                raise ServerStartError(f"models: expected all to be ready, got {reasons}{_remedy(reasons)}")
             check_version(self.endpoints.host, version, accepted=self._accepts_known_vulnerabilities)
             return
         kind = SpoiltStartError if self._process.returncode == -signal.SIGABRT else ServerStartError
@@ -352,6 +354,11 @@ class TritonServer:
         if self._claim is not None:
             self._claim.release()
             self._claim = None
+
+
+def _remedy(reasons: str) -> str:
+    """What to do where models are not loaded for ``reasons``, behind a semicolon; empty: that is not known."""
+    return next((f"; {remedy}" for said, remedy in _REMEDIES.items() if re.search(said, reasons)), "")
 
 
 def _of_http_server(host: str) -> str:

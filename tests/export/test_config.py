@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -67,7 +69,16 @@ def test_the_fastapi_servers_file_is_accepted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("url", "host"), [("http://0.0.0.0/", "0.0.0.0"), ("10.0.0.1", "10.0.0.1"), ("localhost", "127.0.0.1")]
+    ("url", "host"),
+    [
+        ("http://0.0.0.0/", "0.0.0.0"),
+        ("10.0.0.1", "10.0.0.1"),
+        ("localhost", "127.0.0.1"),
+        ("::1", "::1"),
+        ("[::1]", "::1"),
+        ("http://[::]/", "::"),
+        ("0:0:0:0:0:0:0:1", "::1"),
+    ],
 )
 def test_a_host_may_be_written_as_a_url(url: str, host: str) -> None:
     assert ServeConfig(host=url).host == host
@@ -125,7 +136,14 @@ BAD = {
         r"gateway\.cors_origin: expected list of str, got 'http://a'",
     ),
     "null for a number": ("gateway: {timeout: null}", r"serve\.yaml: gateway\.timeout: expected float, got None"),
-    "no number": ("gateway: {timeout: .nan}", r"serve\.yaml: gateway\.timeout: expected at least 0\.001, got nan"),
+    "no number": ("gateway: {timeout: .nan}", r"serve\.yaml: gateway\.timeout: expected a finite number, got nan"),
+    "infinity": ("gateway: {timeout: .inf}", r"serve\.yaml: gateway\.timeout: expected a finite number, got inf"),
+    "a number for ever": ("gateway: {timeout: 1.0e+300}", r"gateway\.timeout: expected at most 86400\.0, got 1e\+300"),
+    "seconds for ever": (
+        "serve: {hang_s: 99999999999}",
+        r"serve\.hang_s: expected at most 2147483647, got 99999999999",
+    ),
+    "true for seconds": ("gateway: {timeout: true}", r"serve\.yaml: gateway\.timeout: expected float, got True"),
     "another dtype": (
         "dtype: int8",
         r"serve\.yaml: dtype: expected one of float32, bfloat16, float16 or null, got 'int8'",
@@ -141,8 +159,14 @@ BAD = {
     "the gateway's port twice": ("gateway: {port: 8002}", r"serve\.yaml: ports: expected different ones, got"),
     "a port in the address": (
         "server_url: http://localhost:8000",
-        r"server_url: expected an address without port \(http_port\), got 'localhost:8000'",
+        r"server_url: expected an IP address without port \(http_port\), such as .*, got 'localhost:8000'",
     ),
+    "an IPv6 address with a port": (
+        'serve: {host: "[::1]:8000"}',
+        r"serve\.host: expected an IP .*, got '\[::1\]:8000'",
+    ),
+    "an address of one link": ('serve: {host: "fe80::1%eth0"}', r"serve\.host: expected an IP .*, got 'fe80::1%eth0'"),
+    "a host by name": ("serve: {host: gpu.example}", r"serve\.host: expected an IP address .*, got 'gpu\.example'"),
     "half a certificate": (
         "grpc_key: a",
         r"serve\.yaml: serve\.grpc_certificate, grpc_key: expected both or none, got one",
@@ -310,6 +334,29 @@ def test_a_gateway_that_would_not_start_is_refused_before_triton_starts(name: st
     assert result.exit_code == 1
     assert result.stderr.startswith("rfm: gateway: ")
     assert "nowhere" in result.stderr
+
+
+@pytest.mark.parametrize("value", [True, math.nan, math.inf, -math.inf, "5"], ids=str)
+@pytest.mark.parametrize("name", ["max_batch_size", "queue_timeout_ms", "feature_cache_mb", "num_gpus", "instances"])
+def test_a_program_gives_numbers_too(name: str, value: Any) -> None:
+    with pytest.raises(ConfigError, match=f"^{name}: expected a finite number, got {re.escape(repr(value))}$"):
+        ExportConfig(**{name: value})
+
+
+def test_a_gateway_before_a_model_that_is_not_there_is_refused_with_those_that_are() -> None:
+    words = ["serve", "--repository", str(REPOSITORY), "--gateway-port=8100", "--gateway-model=nope"]
+    result = CliRunner().invoke(cli.app, words)
+    told = "rfm: gateway: model: expected one of rfm, got nope; --gateway-model names another\n"
+    assert (result.exit_code, result.stderr) == (1, told)
+
+
+@pytest.mark.parametrize(("host", "reached"), [("0.0.0.0", "127.0.0.1"), ("::", "[::1]"), ("::1", "[::1]")], ids=str)
+def test_a_gateway_asks_a_server_that_listens_everywhere_at_this_machine(told: Any, host: str, reached: str) -> None:
+    words = ["--repository", str(REPOSITORY), "--host", host, "--gateway-port=8100", "--accept-known-vulnerabilities"]
+    options = options_of(told(*words)[0]["gateway"])
+    assert options["--host"] == [host]
+    assert options["--triton"] == [f"grpc://{reached}:8001"]
+    assert options["--metrics-url"] == [f"http://{reached}:8002/metrics"]
 
 
 def test_a_gateway_takes_from_the_server_what_its_section_leaves_open(told: Any, tmp_path: Path) -> None:

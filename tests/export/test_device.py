@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from typer.testing import CliRunner
 import goldens
 import rfm_export
 from engines import serve_config
+from labelling import LEROBOT
 from rfm import families
 from rfm.family import NETWORK
 from rfm_commands.cli import app
@@ -63,7 +66,8 @@ def test_a_small_network_stays_on_the_cpu(free_bytes: list[float]) -> None:
 
 
 def test_a_device_that_is_not_there_is_refused(free_bytes: list[float]) -> None:
-    with pytest.raises(rfm_export.ExportError, match="device: expected one of cpu, got cuda"):
+    told = f"device: expected one of cpu, got cuda: PyTorch {torch.__version__} finds no GPU; --device cpu"
+    with pytest.raises(rfm_export.ExportError, match=f"^{re.escape(told)}$"):
         device_named("cuda")
     free_bytes[:] = [1.0, 1.0]
     assert device_named("cuda:1") == torch.device("cuda", 1)
@@ -89,6 +93,15 @@ def test_the_command_says_where_it_compares(tmp_path: Path) -> None:
     assert "the export's scores are compared with the checkpoint's on cpu (--device names another one)" in done.output
     refused = CliRunner().invoke(app, [*words, "--device", "tpu"])
     assert (refused.exit_code, "device: expected one of cpu" in refused.output) == (1, True)
+
+
+@pytest.mark.parametrize("device", ["cuda", "cuda:x", "gpu", "0"])
+def test_label_refuses_a_device_that_is_not_there(tmp_path: Path, free_bytes: list[float], device: str) -> None:
+    assert not free_bytes  # no GPU
+    dataset = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "dataset")
+    done = CliRunner().invoke(app, ["label", str(dataset), "--checkpoint", str(SMALL.checkpoint), "--device", device])
+    assert done.exit_code == 1
+    assert f"rfm: device: expected one of cpu, got {device}: PyTorch " in done.stderr
 
 
 @pytest.mark.gpu

@@ -10,6 +10,8 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,30 +19,39 @@ import pytest
 
 import goldens
 import rfm_export
+from commands import REPOSITORY
 from engines import serve_config
 from rfm import families
 from rfm.checkpoint.content import CheckpointError
 from rfm.launch.installation import ServerStartError, find_installation
 from rfm.launch.process import Endpoints, TritonServer
 from rfm_export import ExportError
+from rfm_export.publish import alone
 from spoilt import WEIGHTS, copied, files_in, weights
 
 REWIND = goldens.config("legacy_keys_l2")
 LONGEST_S = 60
 
 
-def test_a_file_that_may_not_be_read_is_told(tmp_path: Path) -> None:
-    folder = copied(REWIND, tmp_path / "checkpoint")
-    (folder / "config.json").chmod(0)
+@contextmanager
+def as_any_user(folder: Path) -> Iterator[None]:
+    """A context in which this process, in ``folder``, has the rights of a user who may not do everything."""
     user = os.geteuid()
     try:
-        if user == 0:  # who may read everything
-            tmp_path.parents[0].chmod(0o755)
+        if user == 0:
+            folder.chmod(0o755)
             os.seteuid(65534)
-        with pytest.raises(CheckpointError, match=r"Permission ?[dD]enied|PermissionError"):
-            families.load(folder)
+        yield
     finally:
         os.seteuid(user)
+
+
+def test_a_file_that_may_not_be_read_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = copied(REWIND, Path("checkpoint"))
+    (folder / "config.json").chmod(0)
+    with as_any_user(tmp_path), pytest.raises(CheckpointError, match=r"Permission ?[dD]enied|PermissionError"):
+        families.load(folder)
 
 
 ROOMS = {"0": 0, "100": 100, "half": (REWIND.checkpoint / WEIGHTS).stat().st_size // 2}
@@ -99,11 +110,37 @@ def test_a_full_disk_is_told_and_changes_nothing(full_disks: dict[str, FullDisk]
     assert files_in(disk.folder) == disk.before
     assert not list(disk.folder.rglob(".*"))
     told = (
-        r"rfm: .*/model_repository/rfm/\.export-\w+: expected room for the exported files, got: .*[Ff]ile too large.*\n"
+        r"rfm: .*/model_repository: expected room for the exported files, got: .*[Ff]ile too large.*; the versions that "
+        r"are served stay as they are; make room there, or name another --repository\n"
     )
     *notes, error = disk.errors.splitlines(keepends=True)
     assert re.fullmatch(told, error), disk.errors
     assert all(note.startswith("rfm: config.yaml: model.train_") for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda folder: folder.mkdir(0o555),
+            "that this user may change, got: Permission denied; --repository names an",
+        ),
+        (
+            lambda folder: folder.write_text(""),
+            "that this user may change, got: File exists; --repository names another",
+        ),
+        (lambda folder: shutil.copytree(REPOSITORY / "rfm", folder), "got a model of one: --repository ."),
+    ],
+    ids=["read-only", "a file", "a model"],
+)
+def test_an_export_into_what_takes_none_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Callable[[Path], object], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = Path("models")
+    make(folder)
+    with as_any_user(tmp_path), pytest.raises(ExportError, match=re.escape(message)), alone(folder):
+        raise AssertionError("it may be changed")
 
 
 def test_two_exports_at_a_time_are_one_too_many(tmp_path: Path) -> None:

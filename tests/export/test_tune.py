@@ -126,7 +126,9 @@ def test_without_a_configuration_only_the_measured_keys_are_written(tmp_path: Pa
 
 
 def test_what_is_no_repository_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ExportError, match=r"expected an exported repository, got no model of one"):
+    with pytest.raises(
+        ExportError, match=r"repository: expected a folder of models, got .*: rfm export --checkpoint .* writes them"
+    ):
         Sweep(tmp_path, "rfm").best()
 
 

@@ -201,7 +201,7 @@ SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "no weights": (
         lambda folder: (folder / "model.safetensors").unlink(),
-        r"expected model.safetensors or .*, got config",
+        r"expected model.safetensors or .*, got config.*: a checkpoint's folder has it, beside config.json",
     ),
     "half a file": (truncate, r"model.safetensors: expected a safetensors file, got"),
     "a shard outside the folder": (shard_outside, r"expected names of files beside it, got '../../etc/passwd'"),
@@ -340,7 +340,10 @@ def test_a_hub_that_cannot_be_reached_is_told(monkeypatch: pytest.MonkeyPatch) -
         raise ConnectionRefusedError("no network")
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", refuse)
-    with pytest.raises(CheckpointError, match="org/name@v2: cannot be fetched: no network"):
+    with pytest.raises(
+        CheckpointError,
+        match="org/name@v2: there is no folder of this name, and from the Hub it cannot be fetched: no network",
+    ):
         families.load("org/name@v2")
 
 

@@ -253,6 +253,8 @@ BAD_OPTIONS: dict[str, tuple[list[str], str]] = {
         "--max-memory-mib: expected at least max_body_mib (512), got less",
     ),
     "no port": (["--port", "0"], "Input should be greater than or equal to 1"),
+    "an address of another machine": (["--host", "192.0.2.1"], "Cannot assign requested address; --host names another"),
+    "a time-out that never ends": (["--timeout", "inf"], "Input should be less than or equal to 86400"),
 }
 
 
@@ -262,6 +264,31 @@ def test_wrong_options_are_refused(options: list[str], message: str, tmp_path: P
     result = CliRunner().invoke(app, given, env={"COLUMNS": "200"})
     assert result.exit_code == 2
     assert message in result.output
+
+
+WITHOUT_GATEWAY = "import sys; sys.modules['rfm_gateway'] = None; sys.argv = {words}; from {module} import main; main()"
+
+
+@pytest.mark.parametrize(
+    ("module", "words", "message"),
+    [
+        (
+            "rfm_client.cli",
+            ["rfm-client", "gateway", "--triton", "grpc://localhost:1"],
+            "pip install ./client ./gateway",
+        ),
+        ("rfm_commands.cli", ["rfm", "serve", "--gateway-port", "8100"], "pip install ./client ./gateway ."),
+    ],
+    ids=["rfm-client", "rfm"],
+)
+def test_a_gateway_that_is_not_installed_is_told_with_the_command_that_installs_it(
+    module: str, words: list[str], message: str
+) -> None:
+    program = WITHOUT_GATEWAY.format(words=words, module=module)
+    done = subprocess.run([sys.executable, "-c", program], stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.endswith(f"{message}\n")
+    assert len(done.stderr.splitlines()) == 1
 
 
 def test_the_client_encodes_a_trajectory_once_for_many_questions(film: Gateway, tiny: Gateway) -> None:

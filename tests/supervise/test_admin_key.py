@@ -34,11 +34,11 @@ pytestmark = [pytest.mark.triton, pytest.mark.slow]
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        pytest.param(("rollout", "nobody", "1"), "repository: expected a model nobody (rfm export --name)", id="name"),
+        pytest.param(("rollout", "nobody", "1"), ", got nobody", id="name"),
         pytest.param(
             ("rollout", NAME, "77"), "rfm version 77: expected an exported version, got [Errno 2]", id="version"
         ),
-        pytest.param(("load", "nobody"), "expected a model nobody", id="load"),
+        pytest.param(("load", "nobody"), ", got nobody", id="load"),
     ],
 )
 def test_what_is_not_there_is_told_and_nothing_changes(running: Running, words: tuple[str, ...], message: str) -> None:

@@ -518,4 +518,5 @@ def test_the_status_port_names_a_taken_port(tmp_path: Path) -> None:
         port = taken.getsockname()[1]
         with serving(make_repository(tmp_path), f"--status-port={port}") as served:
             assert served.process.wait(PATIENCE_S) == 1
-    assert served.said == [f"rfm: status: expected a free port at 127.0.0.1:{port}, got: Address already in use"]
+    where = f"rfm: status: expected a free port of this machine at 127.0.0.1:{port}"
+    assert served.said == [f"{where}, got: Address already in use; --status-port names another port"]

@@ -17,12 +17,16 @@ from urllib.parse import urlsplit
 import httpx
 import numpy as np
 import pytest
+import torch
 
 import clip
+import rfm_export
 from commands import EXIT_S, REPOSITORY, RFM, command, nothing_left_behind, wait_for_http
 from gateways import answers, poll
+from rfm.config import ExportConfig
 from rfm.launch import installation
 from rfm.launch.installation import ServerStartError, find_installation
+from rfm.launch.ports import free_ports
 from rfm.launch.process import Endpoints, TritonServer
 from rfm.proc import is_alive
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
@@ -156,20 +160,88 @@ def test_a_model_that_cannot_be_loaded_is_named(tmp_path: Path) -> None:
     assert "config.json: expected JSON" in line
 
 
-def test_a_port_that_is_taken_is_named() -> None:
-    endpoints = Endpoints.free()
-    with nothing_left_behind(), socket.create_server((endpoints.host, endpoints.grpc_port)):
+@pytest.mark.parametrize(
+    ("option", "what"), [("http", "HTTP"), ("grpc", "gRPC"), ("metrics", "metrics"), ("gateway", "gateway: port")]
+)
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+def test_a_port_that_is_taken_is_named_with_its_option(host: str, option: str, what: str) -> None:
+    family, at = (socket.AF_INET6, "[::1]") if ":" in host else (socket.AF_INET, host)
+    with nothing_left_behind(), socket.create_server((host, 0), family=family) as taken:
+        port = taken.getsockname()[1]
+        words = [*command(REPOSITORY, Endpoints.free()), "--host", host, f"--{option}-port={port}"]
+        result = subprocess.run(words, capture_output=True, text=True, timeout=EXIT_S, check=False)
+    told = f"rfm: {what}: expected a free port of this machine at {at}:{port}, got: Address already in use; "
+    assert result.returncode == 1
+    assert result.stderr.splitlines()[-1] == f"{told}--{option}-port names another port"
+
+
+WRONG_FOLDERS: dict[str, tuple[str, str]] = {  # below a folder, by what it is
+    "missing": ("nothing", "which is not there: rfm export --checkpoint CHECKPOINT --repository {folder} writes one"),
+    "empty": ("empty", "which has none: rfm export --checkpoint CHECKPOINT --repository {folder} writes them"),
+    "a file": ("models/rfm/config.pbtxt", "a file: --repository names the folder"),
+    "a model": ("models/rfm", "a folder inside one: --repository {root}/models"),
+    "a version, with its own configuration": ("models/rfm/1", "a folder inside one: --repository {root}/models"),
+    "a served checkpoint": ("models/rfm/1/checkpoint", "a folder inside one: --repository {root}/models"),
+    "one above": ("", "a folder that has one: --repository {root}/models"),
+    "a checkpoint": (
+        "checkpoint",
+        "a checkpoint: rfm export --checkpoint {folder} --repository model_repository, "
+        "then --repository model_repository",
+    ),
+}
+
+
+@pytest.mark.parametrize(("below", "remedy"), WRONG_FOLDERS.values(), ids=WRONG_FOLDERS)
+def test_a_folder_without_models_is_refused_with_the_one_that_was_meant(
+    tmp_path: Path, below: str, remedy: str
+) -> None:
+    (tmp_path / "empty").mkdir()
+    shutil.copytree(REPOSITORY, tmp_path / "models")
+    shutil.copy(tmp_path / "models/rfm/config.pbtxt", tmp_path / "models/rfm/1")  # as an export leaves it
+    shutil.copytree(REPOSITORY / "rfm/1/checkpoint", tmp_path / "checkpoint")
+    folder = tmp_path / below
+    with pytest.raises(ServerStartError) as refused:
+        TritonServer(folder, Endpoints.free(), find_installation()).start()
+    got = f"repository: expected a folder of models, got {folder}, {remedy}"
+    assert str(refused.value) == got.format(folder=folder, root=tmp_path)
+
+
+def test_a_server_at_an_ipv6_address_is_watched_and_reached_like_any_other() -> None:
+    http, grpc, metrics, status, gateway = free_ports(5)
+    endpoints = Endpoints("::1", http, grpc, metrics)
+    words = [*command(REPOSITORY, endpoints), "--host=::1", f"--status-port={status}", f"--gateway-port={gateway}"]
+    film = ProgressSample(Trajectory(frames=clip.render()[::8], task=clip.TASK))
+    with nothing_left_behind(), subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            poll(lambda: answers(f"http://[::1]:{gateway}") or process.poll() is not None)
+            assert httpx.get(f"http://[::1]:{status}/ready").json()["ready"]
+            assert "nv_inference_count" in httpx.get(endpoints.metrics_url).text
+            assert httpx.get(f"http://[::1]:{gateway}/health").json()["status"] == "healthy"
+            scores = []
+            for url in (f"grpc://[::1]:{grpc}", f"http://[::1]:{http}"):
+                with RewardClient(url) as client:
+                    scores += [result.progress for result in client.evaluate([film])]  # type: ignore[union-attr]
+            np.testing.assert_array_equal(*scores)
+        finally:
+            process.send_signal(signal.SIGTERM)
+            _, log = process.communicate(timeout=EXIT_S)
+    assert process.returncode == 0
+    assert f"at grpc://[::1]:{grpc}, http://[::1]:{http}, metrics at http://[::1]:{metrics}/metrics\n" in log
+    assert f"look at rewards in the browser: http://[::1]:{gateway}/\n" in log
+
+
+def test_an_export_for_gpus_that_are_not_here_ends_in_how_to_export_it_again(tmp_path: Path) -> None:
+    there = torch.cuda.device_count()
+    settings = ExportConfig(num_gpus=there + 1)
+    rfm_export.export(REPOSITORY / "rfm/1/checkpoint", tmp_path / "models", settings, other_machine=True)
+    with nothing_left_behind():
         result = subprocess.run(
-            command(REPOSITORY, endpoints), capture_output=True, text=True, timeout=EXIT_S, check=False
+            command(tmp_path / "models", Endpoints.free()), capture_output=True, text=True, timeout=EXIT_S, check=False
         )
     assert result.returncode == 1
-    where = f"gRPC: expected a free port of this machine at 127.0.0.1:{endpoints.grpc_port}"
-    assert result.stderr == f"rfm: {where}, got: Address already in use\n"
-
-
-def test_a_folder_without_models_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ServerStartError, match="repository: expected a folder of models, got"):
-        TritonServer(tmp_path, Endpoints.free(), find_installation()).start()
+    last = result.stderr.splitlines()[-1]
+    assert last.startswith("rfm: models: expected all to be ready, got rfm: ")
+    assert last.endswith("for GPUs that this machine lacks: rfm export again here (--num-gpus 0: for the CPU)")
 
 
 def test_a_program_that_cannot_run_is_named(tmp_path: Path) -> None:
