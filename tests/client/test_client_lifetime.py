@@ -4,17 +4,24 @@
 from __future__ import annotations
 
 import asyncio
+import copy
+import pickle
 import shutil
 import subprocess
 import sys
 import sysconfig
+import threading
 import venv
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cloudpickle
+import gymnasium
 import numpy as np
 import pytest
 
@@ -34,6 +41,7 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract import wire
+from rfm_client.gym import RewardModelWrapper
 from rfm_client.transport.access import Access
 from rfm_client.transport.calls import Answer, GrpcTransport
 from trajectories import random_trajectory
@@ -84,6 +92,86 @@ def test_a_fork_of_what_used_grpc_is_told_so(served: Served, monkeypatch: pytest
         client.is_ready()
     with served.client("http") as client:
         assert client.is_ready()
+
+
+POLE = "CartPole-v1"
+HOLDERS: dict[str, Callable[[RewardClient], Any]] = {
+    "RewardClient": lambda client: client,
+    "AsyncRewardClient": lambda client: AsyncRewardClient(NOBODY),
+    "Episode": lambda client: client.episode("lift"),
+    "Episodes": lambda client: client.episodes(2, "lift"),
+    "AsyncEpisode": lambda client: AsyncRewardClient(NOBODY).episode("lift"),
+    "RewardModelWrapper": lambda client: RewardModelWrapper(
+        gymnasium.make(POLE, render_mode="rgb_array"), client, "lift"
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    "dumps", [pickle.dumps, cloudpickle.dumps, copy.deepcopy], ids=["pickle", "cloudpickle", "copy"]
+)
+@pytest.mark.parametrize("name", HOLDERS)
+def test_what_holds_a_client_says_what_to_pickle_instead(dumps: Callable[[Any], Any], name: str) -> None:
+    with RewardClient(NOBODY) as client:
+        holder = HOLDERS[name](client)
+        with pytest.raises(
+            TypeError, match=r"pass functools\.partial\(RewardClient, url\) instead, and call that in each"
+        ):
+            dumps(holder)
+    assert pickle.loads(pickle.dumps(partial(RewardClient, NOBODY))).args == (NOBODY,)
+
+
+def test_an_async_client_in_a_second_event_loop_says_so(served: Served, protocol: str) -> None:
+    client = AsyncRewardClient(served.url(protocol), model=MODEL)
+
+    async def ask() -> ProgressResult:
+        return await client.progress(random_trajectory(0, 2))
+
+    async def ask_and_close() -> None:
+        await ask()
+        await client.close()
+
+    with closing(asyncio.new_event_loop()) as first, closing(asyncio.new_event_loop()) as second:
+        assert len(first.run_until_complete(ask()).progress) == 2
+        for use in (ask, client.is_ready, client.model_info):
+            with pytest.raises(RuntimeError, match=r"that it was first used in, .*: make one in each loop"):
+                second.run_until_complete(use())
+        first.run_until_complete(ask_and_close())
+
+
+class LosesConnection:
+    """A server under whose request the connection seems to end when the request is cancelled."""
+
+    url = NOBODY
+
+    def __init__(self) -> None:
+        self.has_request = threading.Event()
+
+    async def infer(self, *_: Any, **__: Any) -> Answer:
+        self.has_request.set()
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            raise ServerUnavailableError("Stream removed") from None
+        raise AssertionError("nothing sets the event")
+
+    async def model_info(self, *_: Any) -> Any:
+        raise ServerUnavailableError("Stream removed")
+
+    async def is_ready(self, *_: Any) -> bool:
+        return False
+
+    async def close(self) -> None:
+        pass
+
+
+def test_a_client_that_is_closed_does_not_try_again(caplog: pytest.LogCaptureFixture) -> None:
+    server = LosesConnection()
+    with RewardClient("", transports=[server]) as client:
+        future = client.submit(ProgressSample(random_trajectory(0, 2)))
+        assert server.has_request.wait(10.0)
+    assert isinstance(future.exception(), ServerUnavailableError)
+    assert not caplog.records
 
 
 def test_submitting_while_it_is_closed_leaves_no_future_open(served: Served) -> None:

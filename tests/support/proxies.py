@@ -21,10 +21,11 @@ class Proxy:
     over a silent connection is still acknowledged, and dropped; otherwise nothing more is taken from it.
     """
 
-    def __init__(self, port: int, *, reads: bool = True) -> None:
+    def __init__(self, port: int, *, reads: bool = True, host: str = "127.0.0.1") -> None:
         self._port = port
         self._reads = reads
-        self._listener = socket.create_server(("127.0.0.1", 0), backlog=512)
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        self._listener = socket.create_server((host, 0), backlog=512, family=family)
         self.port = self._listener.getsockname()[1]
         self._is_closed = threading.Event()
         self._flows = threading.Event()
@@ -58,11 +59,18 @@ class Proxy:
                 return
             if not self._reads and not self._pairs:
                 near.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            if not self._greet(near) or self._is_closed.is_set():
+                near.close()
+                continue
             far = socket.create_connection(("127.0.0.1", self._port))
             is_silent = threading.Event()
             self._pairs.append((near, far, is_silent))
             for source, target in ((near, far), (far, near)):
                 threading.Thread(target=self._forward, args=(source, target, is_silent), daemon=True).start()
+
+    def _greet(self, near: socket.socket) -> bool:
+        """Whether the connection goes on to the server after what comes before the server's own bytes."""
+        return True
 
     def _forward(self, source: socket.socket, target: socket.socket, is_silent: threading.Event) -> None:
         while True:
@@ -89,3 +97,25 @@ class Proxy:
         for near, far, _ in self._pairs:
             near.close()
             far.close()
+
+
+class HttpProxy(Proxy):
+    """An HTTP proxy for CONNECT, behind which every host is the port. asked: the ``host:port`` of each CONNECT."""
+
+    def __init__(self, port: int) -> None:
+        self.asked: list[str] = []
+        super().__init__(port)
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+    def _greet(self, near: socket.socket) -> bool:
+        head = b""
+        while not head.endswith(b"\r\n\r\n"):
+            if not (byte := near.recv(1)):
+                return False
+            head += byte
+        self.asked.append(head.split()[1].decode())
+        near.sendall(b"HTTP/1.1 200 OK\r\n\r\n")
+        return True

@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: MIT
+"""Proxies that the environment names, and addresses of this machine that are IPv6's, before a real Triton."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from client_commands import invoke
+from gateways import running
+from proxies import HttpProxy, Proxy
+from rfm.launch.process import Endpoints
+from rfm_client import DeadlineExceededError, RewardClient, ServerUnavailableError
+from rfm_client.contract.proxies import grpc_proxy, open_url
+from rfm_client.status import read_status
+
+pytestmark = pytest.mark.triton
+
+VARIABLES = ("http_proxy", "https_proxy", "grpc_proxy", "HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY")
+DEAD = "http://user:secret@127.0.0.1:9"
+SHOWN = "http://***@127.0.0.1:9"
+ELSEWHERE = "elsewhere.invalid"  # which only a proxy can find
+
+
+@pytest.fixture(autouse=True)
+def no_proxies(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in (*VARIABLES, "no_proxy", "NO_PROXY", "no_grpc_proxy"):
+        monkeypatch.delenv(name, raising=False)
+
+
+@pytest.fixture
+def all_dead(no_proxies: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in VARIABLES:
+        monkeypatch.setenv(name, DEAD)
+
+
+@pytest.fixture
+def proxy(no_proxies: None, demo_server: Endpoints) -> Iterator[HttpProxy]:
+    with HttpProxy(demo_server.grpc_port) as proxy:
+        yield proxy
+
+
+@pytest.mark.usefixtures("all_dead")
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "LOCALHOST", "127.1.2.3"])
+@pytest.mark.parametrize("scheme", ["grpc", "http"])
+def test_this_machine_is_reached_without_a_proxy(demo_server: Endpoints, scheme: str, host: str) -> None:
+    port = demo_server.grpc_port if scheme == "grpc" else demo_server.http_port
+    with Proxy(port, host=host) as near, RewardClient(f"{scheme}://{host}:{near.port}", retry=False) as client:
+        assert client.model_info().name == "rfm"
+        assert read_status(f"{scheme}://{host}:{near.port}", metrics_url=demo_server.metrics_url).devices
+
+
+def test_a_gateway_reaches_its_triton_without_a_proxy(demo_server: Endpoints, tmp_path: Path) -> None:
+    dead = dict.fromkeys(VARIABLES, DEAD)
+    with running(demo_server, tmp_path, **dead) as gateway, open_url(f"{gateway.url}/gpu_status", 10.0) as answer:
+        assert answer.status == 200
+
+
+@pytest.mark.parametrize("variable", ["http_proxy", "https_proxy", "grpc_proxy"])
+def test_other_hosts_are_reached_through_it(proxy: HttpProxy, monkeypatch: pytest.MonkeyPatch, variable: str) -> None:
+    monkeypatch.setenv(variable, proxy.url)
+    with RewardClient(f"grpc://{ELSEWHERE}:8001", retry=False) as client:
+        assert client.model_info().name == "rfm"
+    assert proxy.asked == [f"{ELSEWHERE}:8001"]
+    assert read_status(f"grpc://{ELSEWHERE}:8001").ready
+
+
+@pytest.mark.parametrize("variable", ["http_proxy", "https_proxy", "grpc_proxy"])
+def test_an_error_names_the_proxy(monkeypatch: pytest.MonkeyPatch, variable: str) -> None:
+    monkeypatch.setenv(variable, DEAD)
+    told = f"no connection through {variable}={SHOWN}: "
+    url = "grpc://192.0.2.1:8001"
+    with RewardClient(url, retry=False) as client, pytest.raises(ServerUnavailableError) as caught:
+        client.model_info()
+    with pytest.raises(ServerUnavailableError) as of_status:
+        read_status(url)
+    for message in (str(caught.value), str(of_status.value), invoke("sample", "--url", url).stderr):
+        assert told in message
+        assert "unset that variable, or add the server's host to no_proxy" in message
+        assert "secret" not in message
+
+
+def test_an_error_names_a_proxy_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        value = f"http://127.0.0.1:{silent.getsockname()[1]}"
+        monkeypatch.setenv("http_proxy", value)
+        with (
+            RewardClient("grpc://192.0.2.1:8001", timeout_s=0.5) as client,
+            pytest.raises(DeadlineExceededError) as late,
+        ):
+            client.model_info()
+    assert str(late.value) == f"grpc://192.0.2.1:8001 through http_proxy={value}: no answer within 0.5 s"
+
+
+EXCEPTED = {
+    "no variable": ({}, None),
+    "empty": ({"grpc_proxy": "", "http_proxy": DEAD}, None),
+    "the first that is set": ({"http_proxy": "http://b:1", "grpc_proxy": "http://a:1"}, "grpc_proxy=http://a:1"),
+    "the host": ({"http_proxy": DEAD, "no_proxy": "a.b, server.lab"}, None),
+    "the end of its name": ({"http_proxy": DEAD, "no_proxy": ".LAB"}, None),
+    "others": ({"http_proxy": DEAD, "no_proxy": "other.lab,localhost"}, f"http_proxy={SHOWN}"),
+    "gRPC's own": ({"http_proxy": DEAD, "no_proxy": ".lab", "no_grpc_proxy": "other"}, f"http_proxy={SHOWN}"),
+    "upper case": ({"HTTP_PROXY": DEAD}, None),
+}
+
+
+@pytest.mark.parametrize(("environment", "expected"), EXCEPTED.values(), ids=EXCEPTED)
+def test_which_proxy_grpc_takes(
+    proxy: HttpProxy, monkeypatch: pytest.MonkeyPatch, environment: dict[str, str], expected: str | None
+) -> None:
+    """gRPC itself is asked, too: of a proxy that it takes the host is asked."""
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    assert grpc_proxy("server.lab:8001") == expected
+    for name, value in environment.items():
+        if value and "no_" not in name:
+            monkeypatch.setenv(name, proxy.url)
+    with RewardClient("grpc://server.lab:8001", retry=False, timeout_s=10.0) as client:
+        assert client.is_ready() == bool(proxy.asked) == (expected is not None)
+
+
+def test_networks_may_be_excepted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("http_proxy", DEAD)
+    monkeypatch.setenv("no_proxy", "10.0.0.0/8")
+    assert grpc_proxy("10.1.2.3:8001") is None
+    assert grpc_proxy("11.1.2.3:8001") == f"http_proxy={SHOWN}"
+
+
+def test_ipv6_addresses_are_reached(demo_server: Endpoints) -> None:
+    for scheme, port in (("grpc", demo_server.grpc_port), ("http", demo_server.http_port)):
+        with Proxy(port, host="::1") as near:
+            url = f"{scheme}://[::1]:{near.port}"
+            with RewardClient(url) as client:
+                assert client.model_info().name == "rfm"
+            status = read_status(url)
+            assert (status.ready, status.metrics_url) == (True, "http://[::1]:8002/metrics")
+            other = "http" if scheme == "grpc" else "grpc"
+            wrong = url.replace(scheme, other)
+            with (
+                RewardClient(wrong, retry=False) as client,
+                pytest.raises(ServerUnavailableError, match=f"use {scheme}"),
+            ):
+                client.model_info()
+
+
+BRACKETS = {
+    "grpc://::1:8001": "grpc://[::1]:8001",
+    "grpcs://::1:8001/": "grpcs://[::1]:8001",
+    "http://2001:db8::7:8000": "http://[2001:db8::7]:8000",
+    "https://fe80::1": "https://[fe80::1]:8000",
+    "grpc://::1": "grpc://[::1]:8001",
+}
+
+
+@pytest.mark.parametrize(("url", "right"), BRACKETS.items(), ids=BRACKETS)
+def test_ipv6_without_brackets_is_refused_with_the_right_form(url: str, right: str) -> None:
+    with pytest.raises(ValueError, match="expected brackets around an IPv6 address") as caught:
+        RewardClient(url)
+    assert str(caught.value) == f"url: expected brackets around an IPv6 address, {right}, got {url!r}"
+    assert f"{right}, got" in " ".join(invoke("sample", "--url", url).stderr.split())
