@@ -30,6 +30,7 @@ import local_hub
 from encoding import encode
 from labelling import LEROBOT, BrightnessScorer
 from pictures import write_video
+from rfm_client.data.datasets.lerobot import LeRobotDataset
 from rfm_client.data.datasets.protocol import chosen_cameras
 from rfm_client.labelling import DatasetError, LabelOptions, iter_episodes, label, open_dataset
 
@@ -452,6 +453,11 @@ CONTRADICTIONS: dict[str, tuple[str, Callable[[Path], object], str]] = {
         lambda root: (root / "meta" / "episodes.jsonl").write_text('{"episode_index": 0\n'),
         r"episodes\.jsonl: line 1: expected a JSON object, got ",
     ),
+    "a version of the past, from the Hub": (
+        "toy_v21",
+        lambda root: LeRobotDataset((root / "meta").rename(root / "meta_data").parent),
+        r"meta/info\.json, got a LeRobot dataset of v1: convert it to v2\.0 with convert_dataset_v1_to_v2\.py of ",
+    ),
     "a version of the future": (
         "toy_v21",
         lambda root: change_info(root, lambda info: info.update(codebase_version="v4.0")),
@@ -470,8 +476,8 @@ def test_a_dataset_that_contradicts_itself_is_refused_before_a_frame_is_decoded(
     tmp_path: Path, name: str, break_it: Callable[[Path], object], message: str
 ) -> None:
     root = shutil.copytree(LEROBOT / name, tmp_path / name)
-    break_it(root)
     with pytest.raises(DatasetError, match=message):
+        break_it(root)
         dataset = open_dataset(root)
         for episode in dataset.episodes:
             for camera in dataset.cameras:

@@ -79,7 +79,7 @@ FEWEST_WORDS = 4  # of a docstring
 LIGHT = {"numpy", "tritonclient", "aiohttp", "typing_extensions"}  # the last for type checkers only
 # What only an extra brings, and which files need it.
 EXTRAS = {
-    "av": {"video.py", "films.py"},
+    "av": {"film_files.py"},
     "async_timeout": {"deadline.py"},  # Python 3.10 only
     "PIL": {"resize.py", "lerobot.py"},
     "gymnasium": {"gym.py", "gym_vector.py"},

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
+from rfm_client.data.datasets.other_layouts import described
 from rfm_client.data.datasets.protocol import DatasetError
 
 INFO_FILE = Path("meta", "info.json")
@@ -44,6 +45,8 @@ class Info:
     def read(cls, root: Path) -> Info:
         """The information in ``root``. Raises DatasetError."""
         file = root / INFO_FILE
+        if not file.exists():
+            raise DatasetError.at(file, "a LeRobot dataset's meta/info.json", described(root) or "none")
         document = _read_json(file)
         features = _field(file, document, "features", dict)
         kinds = {key: feature.get("dtype") for key, feature in features.items() if isinstance(feature, dict)}
@@ -86,8 +89,6 @@ def _is_depth(feature: Mapping[str, Any]) -> bool:
 def _read_json(file: Path) -> Mapping[str, Any]:
     try:
         document = json.loads(file.read_bytes())
-    except FileNotFoundError as error:
-        raise DatasetError.at(file, "a LeRobot dataset's meta/info.json", "none") from error
     except (OSError, ValueError, RecursionError) as error:
         raise DatasetError.at(file, "a readable JSON file", str(error)) from error
     if not isinstance(document, dict):
