@@ -61,7 +61,7 @@ def test_both_commands_write_the_same_labels_and_tell_what_they_did(demo_server:
         0,
         [
             f"rfm-client: note: cameras: {FRONT} (asked for)",
-            "rfm-client: note: sampling: rint_pad (the rule of upstream's training and RL loop)",
+            "rfm-client: note: sampling: rint (the checkpoint's training did not pad)",
             "rfm-client: note: frames: 8 (asked for)",
             "rfm-client: note: 3 of the dataset's 10 episodes have labels; "
             "LeRobot's reader gives frames of the others the weight 1.0",

@@ -119,7 +119,7 @@ def test_triton_and_the_engine_give_every_frame_the_score_of_its_prefix(
     for name in served:
         np.testing.assert_allclose(served[name], own[name], rtol=0, atol=TOLERANCE)
 
-    sampling = Sampling("rint_pad", client.model_info(frames=True).max_frames)
+    sampling = Sampling("rint", client.model_info(frames=True).max_frames)
     episode, trajectories = next(iter_episodes(dataset))
     by_hand = {}
     for camera, film in trajectories.items():
@@ -291,7 +291,7 @@ def test_the_run_tells_what_was_decided_and_by_whom(output: Path) -> None:
     label(open_dataset(LEROBOT / "toy_v21"), BrightnessScorer(), LabelOptions(output=output, limit=1), notes)
     assert notes.lines == [
         f"cameras: {FRONT}, {WRIST} (all but depth cameras)",
-        "sampling: rint_pad (the rule of upstream's training and RL loop)",
+        "sampling: rint_pad (as upstream's training pads shorter clips)",
         "frames: 16 (the most in training; if the checkpoint does not say, the most its network takes)",
         "fuse: mean of 2 cameras",
         f"1 of the dataset's 8 episodes have labels; {LEROBOT_S}",
