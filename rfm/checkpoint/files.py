@@ -131,8 +131,8 @@ def _fetch(repo_id: str, tag: str | None) -> Path:
             _fetch_run_config_of_main(repo_id)
         return folder
     except (HfHubHTTPError, HFValidationError, OSError) as error:
-        here = "there is no folder of this name, and from the Hub it"
-        raise CheckpointError(f"{repo_id}@{tag or 'latest'}: {here} cannot be fetched: {error}") from error
+        remedy = "there is no folder of this name either; name one, or see to the Hub's name, login and network"
+        raise CheckpointError(f"{repo_id}@{tag or 'latest'}: cannot be fetched: {error}; {remedy}") from error
 
 
 def _fetch_run_config_of_main(repo_id: str) -> None:

@@ -69,7 +69,9 @@ def _wheel_installation() -> Installation:
     numpy_version = importlib.metadata.version("numpy")
     if int(numpy_version.partition(".")[0]) >= 2:
         # With numpy 2 the stub of this release answers with empty outputs and no error.
-        raise ServerStartError(f"numpy: expected < 2 with the Triton of {WHEEL}, got {numpy_version}")
+        raise ServerStartError(
+            f"numpy: expected < 2 with the Triton of {WHEEL}, got {numpy_version}: pip install 'numpy<2'"
+        )
     _stub(wheel)
     library_folders = (wheel.parent.parent / "nvidia_pytriton.libs", _libpython().parent)
     # The stub takes its Python environment from the first python3 in PATH.

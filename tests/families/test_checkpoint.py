@@ -342,7 +342,7 @@ def test_a_hub_that_cannot_be_reached_is_told(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(huggingface_hub, "snapshot_download", refuse)
     with pytest.raises(
         CheckpointError,
-        match="org/name@v2: there is no folder of this name, and from the Hub it cannot be fetched: no network",
+        match="org/name@v2: cannot be fetched: no network; there is no folder of this name either; name one",
     ):
         families.load("org/name@v2")
 

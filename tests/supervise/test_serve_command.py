@@ -325,7 +325,8 @@ def test_no_triton_at_all_is_told_with_the_command_that_installs_it(monkeypatch:
 
 def test_numpy_2_is_refused_with_the_wheel(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.metadata, "version", lambda _name: "2.1.0")
-    with pytest.raises(ServerStartError, match=r"numpy: expected < 2 with the Triton of nvidia-pytriton, got 2\.1\.0"):
+    told = r"numpy: expected < 2 with the Triton of nvidia-pytriton, got 2\.1\.0: pip install 'numpy<2'"
+    with pytest.raises(ServerStartError, match=told):
         find_installation()
 
 
