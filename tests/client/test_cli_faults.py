@@ -17,6 +17,7 @@ from client_commands import RFM_CLIENT, invoke, rows, run, web_server
 from gateways import Gateway, running
 from one_model import OneModelServer
 from rfm.launch.process import Endpoints
+from rfm_client import RewardClient, ServerUnavailableError
 from rfm_client.cli.options import ExitCode
 from rfm_client.cli.scoring import WORKERS
 from rfm_client.transport.ports import wrong_port
@@ -58,6 +59,28 @@ def test_a_wrong_port_is_told_with_the_right_one(
     assert result.exit_code == ExitCode.UNAVAILABLE
     expected = f"{scheme}://{address}: expected {told.format(address=address)}"
     assert result.stderr.splitlines()[-1] == f"rfm-client: {expected}"
+
+
+@pytest.mark.parametrize(("scheme", "port", "told"), PORTS.values(), ids=PORTS)
+def test_a_wrong_port_is_told_in_python(demo_server: Endpoints, scheme: str, port: str, told: str) -> None:
+    address = f"127.0.0.1:{getattr(demo_server, port)}"
+    expected = f"{scheme}://{address}: expected {told.format(address=address)}"
+    with RewardClient(f"{scheme}://{address}", retry=False) as client:
+        with pytest.raises(ServerUnavailableError) as of_call:
+            client.model_info()
+        with pytest.raises(ServerUnavailableError) as of_wait:
+            client.wait_ready(60.0)
+    assert [str(of_call.value), str(of_wait.value)] == [expected] * 2
+
+
+@pytest.mark.parametrize("scheme", ["grpc", "http"])
+def test_tls_where_there_is_none_is_told(demo_server: Endpoints, scheme: str) -> None:
+    url = demo_server.grpc_url if scheme == "grpc" else demo_server.http_url
+    secure = url.replace(scheme, f"{scheme}s")
+    with RewardClient(secure, retry=False) as client, pytest.raises(ServerUnavailableError) as caught:
+        client.model_info()
+    assert " with TLS, got its " in str(caught.value)
+    assert str(caught.value).endswith(f" without: use {url}")
 
 
 @pytest.mark.parametrize("scheme", ["grpc", "http"])

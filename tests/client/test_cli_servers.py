@@ -146,6 +146,7 @@ def test_status_shows_the_gpus_and_what_waits(served: Served, tmp_path: Path) ->
     requests, batches = rows(result.stdout, f"{MODEL} ")
     assert requests[5:] == ["6", "19"]  # refused; pending in Triton and in the model
     assert batches[2:5] == ["40", "3.0", "250.00"]
+    assert batches[6] == "start"
     with web_server(tmp_path) as url:
         (model,) = (m for m in read_status(served.url("grpc"), metrics_url=f"{url}/metrics").models if m.name == MODEL)
     assert model.queue_ms_per_request == pytest.approx(model.queue_ms / model.requests_succeeded + 500)
@@ -160,7 +161,9 @@ def test_status_without_metrics_shows_the_rest_and_says_so(served: Served) -> No
     result = invoke("status", "--url", served.url("http"), "--metrics-url", f"{address}/metrics")
     assert result.exit_code == 0
     assert f"no metrics of the machine: {address}/metrics: " in result.stdout
-    requests, _ = rows(result.stdout, f"{MODEL} ")
+    assert "give their URL (--metrics-url)" in result.stdout
+    requests, batches = rows(result.stdout, f"{MODEL} ")
+    assert batches[6] == "load"
     assert requests[1:3] == ["1", "READY"]
     assert requests[5:] == ["-", "-"]
 
@@ -314,6 +317,7 @@ def test_no_server_is_told_at_once(words: list[str], scheme: str) -> None:
     result = invoke(*words, "--url", free_url().replace("http", scheme))
     assert result.exit_code == ExitCode.UNAVAILABLE
     assert re.fullmatch(r"rfm-client: .*\n", result.stderr), result.stderr
+    assert "start the server there (rfm serve), or give the URL of one that runs" in result.stderr
     assert result.stdout == ""
 
 
@@ -330,6 +334,8 @@ def test_a_model_that_is_not_served_is_told(served: Served, protocol: str, name:
     result = ask(served, *ASKING[name], model="unknown", protocol=protocol)
     assert result.exit_code == ExitCode.NO_MODEL
     assert re.fullmatch(r"rfm-client: .*unknown_frames.*\n", result.stderr), result.stderr
+    (served_names,) = re.findall(r"; served: (.*): give the checkpoint's name with model \(--model\)$", result.stderr)
+    assert {MODEL, f"{MODEL}_frames"} <= set(served_names.split(", "))
 
 
 def test_embeddings_alone_are_no_model_for_videos(served: Served, video: Path) -> None:

@@ -66,8 +66,19 @@ def test_a_server_that_a_stranger_vouches_for_is_not_trusted(secure: Endpoints, 
         assert not asked.is_ready()
         with denied_at_once("access denied: .*CERTIFICATE_VERIFY_FAILED"):
             asked.progress(TRAJECTORY)
-    with client(secure.grpc_url) as asked, denied_at_once("CERTIFICATE_VERIFY_FAILED"):  # nor by the system
+    with (  # nor by the system
+        client(secure.grpc_url) as asked,
+        denied_at_once(r"CERTIFICATE_VERIFY_FAILED.*with ca_file \(--ca-file\)"),
+    ):
         asked.progress(TRAJECTORY)
+
+
+@pytest.mark.parametrize("scheme", ["grpc", "http"])
+def test_a_client_without_tls_is_told(secure: Endpoints, scheme: str) -> None:
+    url = secure.grpc_url.replace("grpcs", scheme)
+    with client(url, retry=False) as asked, pytest.raises(ServerUnavailableError) as caught:
+        asked.progress(TRAJECTORY)
+    assert f" without TLS, got TLS: use {url.replace(scheme, f'{scheme}s')}" in str(caught.value)
 
 
 def test_a_server_of_another_name_is_not_trusted(secure: Endpoints, papers: Papers) -> None:
