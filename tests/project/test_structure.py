@@ -89,7 +89,7 @@ EXTRAS = {
     "pyarrow": {"label_files.py", "lerobot_rows.py", "finished_episodes.py", "sidecars.py"},
     "fsspec": {"finished_episodes.py"},
     "huggingface_hub": {"opening.py"},
-    "h5py": {"hdf5.py", "hdf5_labels.py"},
+    "h5py": {"hdf5.py", "hdf5_labels.py", "other_layouts.py"},
     "ray": {"ray_engine.py"},
     "rerun": {"recording.py"},
     "prometheus_client": {"status.py"},
