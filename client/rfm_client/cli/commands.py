@@ -130,6 +130,8 @@ def score(
     with outputs.recorder(rrd, videos) as record:
         outcomes = scoring.score_all(server, videos, question, tell, record)
     scored = [outcome for outcome in outcomes if isinstance(outcome, Scored)]
+    if rows is not None and scored:
+        rows.end(question.rule)
     if json is not None:
         outputs.write_json(json, outputs.score_document(server, question, outcomes))
     if plot is not None and scored:

@@ -220,6 +220,10 @@ class Rows:
             row = GAP.join(cell.ljust(width) for cell, width in zip(line, self._widths, strict=True))
             print(f"{GAP}{row}".rstrip(), flush=True)
 
+    def end(self, text: str) -> None:
+        """Writes a line below the table."""
+        print(f"\n{GAP}{text}", flush=True)
+
 
 def check_arrays(npy: Path | None, videos: Sequence[str]) -> None:
     """Checks, before the first request, that arrays can be written. Raises typer.BadParameter."""

@@ -65,6 +65,16 @@ class Question:
     sampled_frames: int | None = None
     orient: Orientation = "none"
 
+    @property
+    def rule(self) -> str:
+        """Which frames decide the score of a frame, as a line for people."""
+        if self.frame_steps:
+            return f"Each frame is scored on its prefix: linspace_trunc, {self.frame_steps} frames."
+        if self.sampling is not None:
+            frames = f", {self.sampled_frames} frames" if self.sampled_frames else ""
+            return f"Each frame is scored on its prefix: {self.sampling}{frames}."
+        return "All frames in one pass; labels and the page score each prefix (--sampling)."
+
 
 @dataclass(frozen=True, eq=False)
 class Source:
