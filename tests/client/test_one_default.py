@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: MIT
+"""The same clip has the same curve, whichever way it is asked for, where nothing but the task is said."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pyarrow import parquet
+
+from client_commands import invoke
+from rfm.launch.process import Endpoints
+from rfm_client import RewardClient, load_trajectory
+from rfm_client.data.sampling import Sampling
+from rfm_client.labelling import ClientScorer, LabelOptions, label, open_dataset
+from toy_world import Task, make_clip
+from toy_world.video import write_video
+
+pytestmark = pytest.mark.triton
+
+TASK = "put the red block in the bowl"
+TOLERANCE = 1e-5
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("films")
+    write_video(folder / "success.mp4", make_clip("success", Task("red", "bowl"), 2_000_000).frames)
+    (folder / "tasks.json").write_text(json.dumps({"success.mp4": TASK}))
+    return folder / "success.mp4"
+
+
+def test_demo_score_episode_and_labels_agree_on_a_clip_of_the_demo(demo_server: Endpoints, film: Path) -> None:
+    trajectory = load_trajectory(film, task=TASK)
+    assert trajectory.frames is not None
+    with RewardClient(demo_server.grpc_url) as client:
+        info = client.model_info(frames=True)
+        assert Sampling.of(None, None, info.max_frames, trained_padding=info.trained_padding) == Sampling("rint", 32)
+        expected = client.progress(trajectory).progress  # as the demo asks
+        with client.episode(TASK) as episode:
+            stepped = [episode.add(frame).progress for frame in trajectory.frames]
+        report = label(open_dataset(film.parent), ClientScorer(client), LabelOptions())
+    labelled = parquet.read_table(report.files[0])["progress_sparse"].to_numpy()
+    shown = invoke("score", film, "--task", TASK, "--url", demo_server.http_url, "--json")
+    (scored,) = json.loads(shown.stdout)["videos"]
+    assert expected[-1] > 0.95
+    for curve in (stepped, labelled, scored["progress"]):
+        np.testing.assert_allclose(curve, expected, rtol=0, atol=TOLERANCE)
