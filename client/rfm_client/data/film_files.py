@@ -22,7 +22,7 @@ _MATRICES = (1, 4, 5, 7, 9)  # from YUV to RGB, as libswscale numbers them; the 
 _BT709, _BT601, _BT2020 = 1, 5, 9
 _SAME_MATRIX = {6: _BT601, 10: _BT2020}  # numbers of H.273 that stand for one of them
 _LIMITED, _FULL = 1, 2  # ranges, numbered likewise
-_BITS = 8  # of a depth map's or a grey film's one channel that is no distance
+_BITS = 8  # of the one channel of a grey film; depth maps have more
 _NEARLY = math.tan(math.radians(1))  # how far FFmpeg lets a display matrix be from quarter turns
 
 _EBML, _SEGMENT = 0x1A45DFA3, 0x18538067  # how Matroska and WebM begin (RFC 8794, RFC 9559)
