@@ -227,9 +227,10 @@ def _trained_frames(folder: Path) -> int | None:
 
 def _trained_padding(folder: Path) -> bool | None:
     """Whether training padded shorter trajectories, as ``save`` wrote it; upstream's configurations do not say."""
-    padding = read_json(folder / NETWORK_CONFIG).get("trained_padding") if is_there(folder / NETWORK_CONFIG) else None
+    file = folder / NETWORK_CONFIG
+    padding = read_json(file).get("trained_padding") if is_there(file) else None
     if padding is not None and not isinstance(padding, bool):
-        raise CheckpointError(f"{folder / NETWORK_CONFIG}: trained_padding: expected true or false, got {shown(padding)}")
+        raise CheckpointError(f"{file}: trained_padding: expected true or false, got {shown(padding)}")
     return padding
 
 

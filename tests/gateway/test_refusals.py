@@ -119,7 +119,11 @@ BAD_SAMPLES: dict[str, tuple[Any, list[Any], str]] = {
     ),
     "a task that is a number": (but(task=5), TASK_AT, "expected text, got int"),
     "frames without a task": (of_frames(BLACK, task=None), TASK_AT, "expected a task sentence with frames, got ''"),
-    "too many frames": (but(video_embeddings=np.ones((17, 48))), ["num_frames"], "expected at most 16 .*, got 17: .*sampling rule"),
+    "too many frames": (
+        but(video_embeddings=np.ones((17, 48))),
+        ["num_frames"],
+        "expected at most 16 .*, got 17: .*sampling rule",
+    ),
     "a sliver": (of_frames(np.ones((1, 2, 200, 3), int)), ["frames"], "expected frames at most 50 times as long .*"),
     "names of images": (of_frames(["0.png", "1.png"]), [*FRAMES_AT, 0], NO_FILES),
     "the name of a file": (progress({"embeddings_path": "a.npz"}), ["trajectory", "embeddings_path"], NO_FILES),

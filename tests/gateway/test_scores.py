@@ -272,7 +272,9 @@ def test_concurrent_callers_each_get_their_own_answer(film: Gateway) -> None:
             if index % 8:
                 assert answered(response) == numbers(alone[index])
             else:
-                check_refused(response, (["samples", 1, "num_frames"], "expected at most 16 .*, got 17: .*sampling rule"))
+                check_refused(
+                    response, (["samples", 1, "num_frames"], "expected at most 16 .*, got 17: .*sampling rule")
+                )
 
 
 def test_large_frames_are_scored(film: Gateway, ask: Ask) -> None:
