@@ -108,9 +108,7 @@ def restore(plan: Plan, parts: Parts, files: Sequence[LabelFile]) -> None:
         ]
         for item, columns in file.read(gone) if gone else ():
             scores = {name: columns[name] for name in order if name in columns}
-            if scores and all(
-                len(each) == item.episode.num_frames and np.isfinite(each).all() for each in scores.values()
-            ):
+            if scores and all(_is_whole(each, item) for each in scores.values()):
                 parts.write(item, scores)
                 finished.add(item.key)
 
