@@ -23,6 +23,7 @@ import clip
 import rfm_export
 from commands import EXIT_S, REPOSITORY, RFM, command, nothing_left_behind, wait_for_http
 from gateways import answers, poll
+from paths import ROOT
 from rfm.config import ExportConfig
 from rfm.launch import installation
 from rfm.launch.installation import ServerStartError, find_installation
@@ -58,7 +59,15 @@ def test_the_committed_repository_is_served_until_a_signal(number: signal.Signal
     "arguments",
     [
         ["serve", "--repository", str(REPOSITORY)],
-        ["demo", "--repository", str(REPOSITORY), "--video", "clip.mp4", "--task", clip.TASK],
+        [
+            "demo",
+            "--repository",
+            str(REPOSITORY),
+            "--video",
+            str(ROOT / "tests/videos/jaco_play_pick_up_green_cup.mp4"),
+            "--task",
+            clip.TASK,
+        ],
         ["tune", "--repository", str(REPOSITORY), "--output", "tuned.yaml"],
     ],
     ids=lambda words: words[0],
