@@ -107,7 +107,7 @@ def test_the_reason_of_a_model_that_is_not_ready_has_a_line_of_its_own() -> None
     shown = console.file.getvalue()  # type: ignore[attr-defined]
     first, second = (line for line in shown.splitlines() if line.strip().startswith("rfm_encoder  1"))
     assert first.split() == ["rfm_encoder", "1", "UNAVAILABLE", "1", "2", "7", "-"]
-    assert second.split() == ["rfm_encoder", "1", "4", "0.8", "1.50", "5.00"]
+    assert second.split() == ["rfm_encoder", "1", "4", "0.8", "1.50", "5.00", "load"]
     assert "rfm_encoder 1: a [reason]\n" in shown
     assert shown.rstrip().endswith("no metrics")
 

@@ -23,7 +23,7 @@ from vlm import assert_close, film, load
 
 TASK = "stack the blocks"
 TOLERANCE = 1e-5
-TAKE_A_NUMBER = ("linspace_trunc", "linspace_round", "rint_pad")
+TAKE_A_NUMBER = ("linspace_trunc", "linspace_round", "rint", "rint_pad")
 AS_VIDEO = " as video"  # no reference is a Qwen3-VL that reads videos
 MODELS = ["q3_tok_disc10", f"q3_tok_disc10{AS_VIDEO}", "q25_peft_adapter_disc10", "q25_video_avg_disc10"]
 

@@ -262,7 +262,7 @@ def test_parts_may_be_behind_a_url(output: Path, undisturbed: list[bytes], url: 
 
 @pytest.mark.slow
 def test_ctrl_c_leaves_what_is_finished(output: Path, undisturbed: list[bytes]) -> None:
-    process = start(output, 0.05)
+    process = start(output, 0.2)
     while not parts_of(output):
         assert process.poll() is None
         time.sleep(0.01)

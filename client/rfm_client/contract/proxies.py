@@ -36,10 +36,9 @@ def grpc_proxy(address: str) -> str | None:
 def open_url(url: str, timeout_s: float) -> Any:
     """The open response of an HTTP server. Raises OSError, HTTPException."""
     scheme, host = urlsplit(url).scheme, urlsplit(url).hostname or ""
-    if is_loopback(host):
-        return urllib.request.build_opener(urllib.request.ProxyHandler({})).open(url, timeout=timeout_s)
-    try:
-        return urllib.request.urlopen(url, timeout=timeout_s)
+    proxies = urllib.request.ProxyHandler({} if is_loopback(host) else None)
+    try:  # with an opener of its own: that of urlopen keeps the proxies of its first call
+        return urllib.request.build_opener(proxies).open(url, timeout=timeout_s)
     except OSError as error:
         proxy = urllib.request.getproxies().get(scheme)
         if not proxy or urllib.request.proxy_bypass(host):
