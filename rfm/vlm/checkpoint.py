@@ -36,14 +36,16 @@ from rfm.checkpoint.files import (
     check_shapes,
     read_weights,
 )
+from rfm.checkpoint.pickles import refuse_pickles
 from rfm.checkpoint.training import check_progress
 from rfm.family import NETWORK, Description, Options
 from rfm.feature_cache import FeatureCache
 from rfm.version_folder import PROCESSOR_FOLDER
+from rfm.vlm.backbone import BACKBONES, SMOL, backbone_config
 from rfm.vlm.collator import VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm.vlm.lora import LORA_NAME, changed_by, merged, scaling, split
-from rfm.vlm.network import BACKBONES, SMOL, VlmConfig, VlmRewardModel, build_backbone
+from rfm.vlm.network import VlmConfig, VlmRewardModel, build_backbone
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.processor import frame_size, load_collator, save_processor
 from rfm.vlm.run_config import RunConfig
@@ -169,7 +171,8 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
     """The checkpoint in a local folder. Raises CheckpointError."""
     with expecting("a vision-language checkpoint", folder):
         is_adapter = _has_adapter(folder)
-        backbone = {} if is_adapter else read_json(folder / NETWORK_CONFIG)
+        file = folder / NETWORK_CONFIG
+        backbone = {} if is_adapter else backbone_config(read_json(file), file)
         if SETTINGS in backbone:  # written by VlmCheckpoint.save, with every setting
             config = _saved_config(backbone)
             weights, factors = _used(_renamed(read_weights(folder), _renames(config.family)))
@@ -234,9 +237,7 @@ def _trained_config(
     weights: Mapping[str, Tensor],
     resize_images: bool | None,
 ) -> VlmConfig:
-    family = backbone.get("model_type")
-    if family not in BACKBONES:
-        raise CheckpointError(f"{folder}: model_type: expected one of {', '.join(BACKBONES)}, got {shown(family)}")
+    family = str(backbone["model_type"])
     for name in ("progress_head.4.weight", "frame_pool_attn.weight"):
         if name not in weights:
             raise CheckpointError(f"{folder}: expected reward heads, got no {name}")
@@ -308,6 +309,8 @@ def _check_layers(config: Any) -> None:
 def _adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Tensor], float]:
     """Configuration of the base model's backbone; its weights with those of the adapter; the scale of LoRA factors."""
     adapter_config = read_json(folder / ADAPTER_CONFIG)
+    if not is_there(folder / ADAPTER_WEIGHTS):
+        refuse_pickles(folder, ADAPTER_WEIGHTS, Path(ADAPTER_WEIGHTS).stem)
     adapter = _renamed(read_tensors(folder / ADAPTER_WEIGHTS), _ADAPTER)
     config, base = _read_base(base_model)
     if EMBEDDING not in adapter:
@@ -329,16 +332,20 @@ def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     import transformers
 
     try:
-        config = transformers.AutoConfig.from_pretrained(base_model, trust_remote_code=False)  # else it asks the user
-        if config.model_type not in BACKBONES:
-            known = ", ".join(BACKBONES)
-            raise CheckpointError(f"base model {base_model}: expected one of {known}, got {config.model_type}")
-        network, loaded = getattr(transformers, BACKBONES[config.model_type]).from_pretrained(
-            base_model, use_safetensors=True, dtype="auto", output_loading_info=True
+        content = transformers.PretrainedConfig.get_config_dict(base_model)[0]
+        backbone = backbone_config(content, f"base model {base_model}: {NETWORK_CONFIG}")
+        network_class = getattr(transformers, BACKBONES[backbone["model_type"]])
+        network, loaded = network_class.from_pretrained(
+            base_model,
+            config=network_class.config_class.from_dict(backbone),
+            use_safetensors=True,
+            dtype="auto",
+            output_loading_info=True,
         )
     except (OSError, RecursionError, ValueError) as error:
         hint = "name its folder with --base-model"
         raise CheckpointError(f"base model {base_model}: cannot be had: {cut(str(error))} ({hint})") from error
     if loaded["missing_keys"]:
         raise CheckpointError(f"base model {base_model}: missing keys: {sorted(loaded['missing_keys'])}")
-    return config.to_dict(), {f"model.{name}": tensor for name, tensor in network.state_dict().items()}
+    config = backbone_config(network.config.to_dict(), base_model)
+    return config, {f"model.{name}": tensor for name, tensor in network.state_dict().items()}

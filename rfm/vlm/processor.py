@@ -9,9 +9,10 @@ from typing import Any
 
 from rfm.checkpoint.content import CheckpointError, read_json
 from rfm.checkpoint.preprocessor import PREPROCESSOR_CONFIG
+from rfm.vlm.backbone import SMOL
 from rfm.vlm.collator import QwenCollator, SmolCollator, VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, Normalisation, QwenImages, SmolImages, fitted_size
-from rfm.vlm.network import SMOL, VlmConfig
+from rfm.vlm.network import VlmConfig
 from rfm.vlm.prompts import SPECIAL_TOKENS
 from rfm_client.contract import FrameSize
 

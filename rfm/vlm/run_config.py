@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from rfm.checkpoint.content import CheckpointError, read_run_config, shown
 from rfm.checkpoint.files import RUN_CONFIG, find_run_config, frame_count, trained_frames
-from rfm.vlm.network import SMOL
+from rfm.vlm.backbone import SMOL
 
 HEADS, VQA = "default", "vqa"  # values of model.model_type: reward heads, and answers in generated text
 DTYPES = ("float32", "bfloat16", "float16")

@@ -148,11 +148,58 @@ def change_adapter(**changes: object) -> Callable[[Path], None]:
     return spoil
 
 
-def change_layers(folder: Path) -> None:
-    file = folder / "config.json"
-    backbone = json.loads(file.read_text())
-    backbone["text_config"]["layer_types"][0] = "sliding_attention"
-    file.write_text(json.dumps(backbone))
+def change_backbone(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
+    """Changes config.json."""
+
+    def spoil(folder: Path) -> None:
+        file = folder / "config.json"
+        backbone = json.loads(file.read_text())
+        change(backbone)
+        file.write_text(json.dumps(backbone))
+
+    return spoil
+
+
+def change_text(**changes: object) -> Callable[[Path], None]:
+    return change_backbone(lambda backbone: backbone["text_config"].update(changes))
+
+
+def as_transformers_5_writes(backbone: dict[str, Any]) -> None:
+    text = backbone["text_config"]
+    text["rope_parameters"] = {"rope_type": "default"} | (text.pop("rope_scaling") or {})
+    text["rope_parameters"]["rope_theta"] = text.pop("rope_theta")
+    text["pad_token_id"] = None
+    if backbone["model_type"] != "smolvlm":
+        backbone["vision_config"]["rope_parameters"] = {"rope_theta": 10000.0, "rope_type": "axial"}
+        backbone["vision_config"]["model_type"] += "_vision"
+
+
+def as_before_text_config(backbone: dict[str, Any]) -> None:
+    text = backbone.pop("text_config")
+    sections = text["rope_scaling"]["mrope_section"]
+    for name, value in (text | {"rope_scaling": {"type": "mrope", "mrope_section": sections}}).items():
+        backbone.setdefault(name, value)
+
+
+FORMS: dict[str, tuple[str, Callable[[Path], None]]] = {
+    "Qwen2.5-VL of transformers 5": ("q25_mean_l2", change_backbone(as_transformers_5_writes)),
+    "Qwen3-VL of transformers 5": (PLAIN, change_backbone(as_transformers_5_writes)),
+    "SmolVLM of transformers 5": ("smol_mean_disc10", change_backbone(as_transformers_5_writes)),
+    "Qwen2.5-VL without text_config": ("q25_mean_l2", change_backbone(as_before_text_config)),
+}
+
+
+@pytest.mark.parametrize(("name", "change"), FORMS.values(), ids=FORMS)
+def test_a_checkpoint_in_another_form_scores_the_same(
+    copied: Callable[[str], Path], name: str, change: Callable[[Path], None]
+) -> None:
+    folder = copied(name)
+    change(folder)
+    engine = Engine.from_checkpoint(folder, base_model=str(goldens.config(name).base_model))
+    (result,), (expected,) = (
+        each.evaluate([ProgressSample(film(0, 3, 60, 84))]) for each in (engine, load_engine(name))
+    )
+    assert_close(result, expected, 0)
 
 
 def drop_first(part: str) -> Callable[[dict[str, Any]], object]:
@@ -203,8 +250,22 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "another model type": (PLAIN, change_yaml("model_type: default", "model_type: dpo"), r"model_type: expected default, got 'dpo'$"),
     "layers that see few tokens": (
         "q25_mean_l2",
-        change_layers,
+        change_text(layer_types=["sliding_attention", "full_attention"]),
         r"text_config\.layer_types: expected full_attention alone, got \['full_attention', 'sliding_attention'\]",
+    ),
+    "rotary positions without a base": (
+        "smol_mean_disc10",
+        change_backbone(lambda backbone: backbone["text_config"].pop("rope_theta")),
+        r"config\.json: text_config\.rope_theta: expected a number above 0, got None; copy it from config\.json of the base",
+    ),
+    "rotary positions without sections": (PLAIN, change_text(rope_scaling=None), r"rope_scaling\.mrope_section: expected a list of numbers, got None"),
+    "two bases of rotary positions": (PLAIN, change_text(rope_parameters={"rope_theta": 1e4}), r"expected one value of rope_theta in text_config, got 10000\.0 and 5000000\.0"),
+    "two types of rotary positions": (PLAIN, change_text(rope_parameters={"rope_type": "linear"}), r"expected one value of rope_type in rope_scaling, got 'linear' and 'default'"),
+    "half of a head rotated": (PLAIN, change_text(partial_rotary_factor=0.5), r"partial_rotary_factor: expected 1, got 0\.5"),
+    "a vision tower with other rotary positions": (
+        PLAIN,
+        change_backbone(lambda backbone: backbone["vision_config"].update(rope_parameters={"rope_theta": 100.0})),
+        r"vision_config\.rope_parameters: expected axial with a rope_theta of 10000, got {'rope_theta': 100\.0}",
     ),
     "LoRA without alpha": (LORA_INSIDE, change_yaml("lora_alpha: 8", "lora_beta: 8"), r"expected lora_alpha and r of the LoRA weights"),
     "half a LoRA pair": (LORA_INSIDE, change_tensors("model.safetensors", drop_first("lora_B")), r"expected a weight and LoRA factors A and B, got \['A'\]"),
