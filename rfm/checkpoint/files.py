@@ -8,7 +8,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rfm.checkpoint.content import CheckpointError, cut, is_there, listed, read_json, read_tensors, shown
+from rfm.checkpoint.content import CheckpointError, cut, is_there, listed, read_json, read_tensors, shown, tensor_names
+from rfm.checkpoint.pickles import refuse_pickles
+from rfm.checkpoint.wrappers import unwrapped
+from rfm.version_folder import IMAGE_ENCODER_FOLDER, TEXT_ENCODER_FOLDER
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -21,12 +24,12 @@ RUN_CONFIG = "config.yaml"
 _BEST_TAG = re.compile(r"best-.*?-(-?\d+\.\d+)-step-\d+")
 _COMMIT_DIGITS = 40
 MAX_COUNT = 2**20  # of frames: longer than any trajectory
+_SHARDS = "model-*.safetensors"
+_PICKLE_STEM = "pytorch_model"  # of transformers' pickles of weights
+_ENCODERS = (IMAGE_ENCODER_FOLDER, TEXT_ENCODER_FOLDER)  # below an exported checkpoint's
+_MAX_SUGGESTED = 5
 _LEVELS = ("*", "*/*", "*/*/*")  # below a folder: a training run's checkpoints, those of a model repository
-_PICKLES = ("*.bin", "*.pt", "*.pth", "*.ckpt", "*.pkl")
-_CONVERT = (
-    "python -c \"import torch, safetensors.torch as s; weights = torch.load('{file}', map_location='cpu', "
-    "weights_only=True); s.save_file({{k: v.contiguous() for k, v in weights.items()}}, '{target}')\""
-)
+_NAMES = (WEIGHTS, WEIGHTS_INDEX, "adapter_model.safetensors")  # of weights in them
 
 
 def find(source: str | Path) -> Path:
@@ -149,36 +152,58 @@ def _fetch_run_config_of_main(repo_id: str) -> None:
 
 
 def read_weights(folder: Path) -> dict[str, Tensor]:
-    """All tensors of model.safetensors or of the shards that its index names. Raises CheckpointError."""
+    """All tensors of model.safetensors or of the shards that its index names, without the prefixes of wrappers.
+
+    Raises CheckpointError.
+    """
+    check_one_form(folder)
     if is_there(folder / WEIGHTS):
-        return read_tensors(folder / WEIGHTS)
-    if is_there(folder / WEIGHTS_INDEX):
-        return _read_shards(folder / WEIGHTS_INDEX)
-    pickles = sorted(file for pattern in _PICKLES for file in folder.glob(pattern))
-    if pickles:
-        command = _CONVERT.format(file=pickles[0], target=folder / WEIGHTS)
+        files = [folder / WEIGHTS]
+        weights = read_tensors(folder / WEIGHTS)
+    elif is_there(folder / WEIGHTS_INDEX):
+        files, weights = _read_shards(folder / WEIGHTS_INDEX)
+    else:
+        refuse_pickles(folder, WEIGHTS, _PICKLE_STEM)
         raise CheckpointError(
-            f"{folder}: expected {WEIGHTS}, got {pickles[0].name}: pickle files run code when loaded and are refused; "
-            f"if you trust it, convert it with: {command}"
+            f"{folder}: expected {WEIGHTS} or {WEIGHTS_INDEX}, got {_listing(folder)}: {_below(folder)}"
         )
-    below = next((file.parent for level in _LEVELS for file in sorted(folder.glob(f"{level}/{WEIGHTS}*"))), None)
-    remedy = "a checkpoint's folder has it, beside config.json" if below is None else f"{below} has it"
-    raise CheckpointError(f"{folder}: expected {WEIGHTS} or {WEIGHTS_INDEX}, got {_listing(folder)}: {remedy}")
+    return unwrapped(weights, files, folder / WEIGHTS)
 
 
-def _read_shards(index: Path) -> dict[str, Tensor]:
+def check_one_form(folder: Path) -> None:
+    """Raises CheckpointError for weights that are there whole and in shards: which are the newer, no file says."""
+    shards = [path.name for path in (folder / WEIGHTS_INDEX, *sorted(folder.glob(_SHARDS))) if is_there(path)]
+    if shards and is_there(folder / WEIGHTS):
+        raise CheckpointError(
+            f"{folder}: expected {WEIGHTS} or shards, got {WEIGHTS} and {listed(shards)}, of which one is older; "
+            "move away what is not meant: transformers, which reads the former, leaves it when it writes shards"
+        )
+
+
+def _read_shards(index: Path) -> tuple[list[Path], dict[str, Tensor]]:
+    """The shards that the index names, and their tensors."""
     weight_map = read_json(index).get("weight_map")
     if not isinstance(weight_map, dict):
         raise CheckpointError(f"{index}: expected a weight_map, got none")
     weights: dict[str, Tensor] = {}
-    for name in dict.fromkeys(map(str, weight_map.values())):
-        if Path(name).name != name or not name.endswith(".safetensors"):
-            raise CheckpointError(f"{index}: expected names of files beside it, got {shown(name)}")
-        if not is_there(index.parent / name):
-            raise CheckpointError(f"{index}: names the shard {name}, which is not there")
-        weights |= read_tensors(index.parent / name)
+    shard_of: dict[str, str] = {}
+    for shard in dict.fromkeys(map(str, weight_map.values())):
+        if Path(shard).name != shard or not shard.endswith(".safetensors"):
+            raise CheckpointError(f"{index}: expected names of files beside it, got {shown(shard)}")
+        if not is_there(index.parent / shard):
+            raise CheckpointError(f"{index}: names the shard {shard}, which is not there")
+        for name, tensor in read_tensors(index.parent / shard).items():
+            if name in shard_of:
+                got = f"{shown(name)} in {shard_of[name]} and in {shard}"
+                raise CheckpointError(f"{index}: expected each tensor in one shard, got {got}; save the weights again")
+            weights[name], shard_of[name] = tensor, shard
     check_keys(weight_map.keys(), weights.keys())
-    return weights
+    for file in sorted(index.parent.glob(_SHARDS)):
+        unknown = set(tensor_names(file)) - shard_of.keys()
+        if unknown:
+            got = f"{file.name}, which it does not name, with {listed(sorted(unknown))}"
+            raise CheckpointError(f"{index}: expected the names of all shards, got {got}; move that file away")
+    return [index.parent / shard for shard in dict.fromkeys(shard_of.values())], weights
 
 
 def take_prefix(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
@@ -193,6 +218,15 @@ def check_keys(expected: Iterable[str], got: Iterable[str]) -> None:
     if missing or unexpected:
         named = [listed(names) if names else "none" for names in (missing, unexpected)]
         raise CheckpointError(f"{WEIGHTS}: missing keys: {named[0]}; unexpected keys: {named[1]}")
+
+
+def _below(folder: Path) -> str:
+    """Where there are weights below a folder that has none, or what a folder with weights looks like."""
+    found = [file.parent for level in _LEVELS for name in _NAMES for file in sorted(folder.glob(f"{level}/{name}"))]
+    checkpoints = [str(path) for path in dict.fromkeys(found) if path.name not in _ENCODERS]
+    if not checkpoints:
+        return "a checkpoint's folder has it, beside config.json"
+    return f"name the checkpoint in it: {cut(', '.join(checkpoints[:_MAX_SUGGESTED]))}"
 
 
 def _listing(folder: Path) -> str:

@@ -17,6 +17,7 @@ import huggingface_hub
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from torch import Tensor
 
 import goldens
 import local_hub
@@ -145,6 +146,37 @@ def truncate(folder: Path) -> None:
     (folder / "model.safetensors").write_bytes(content[: len(content) // 2])
 
 
+def take_weights(folder: Path) -> dict[str, torch.Tensor]:
+    weights = load_file(folder / "model.safetensors")
+    (folder / "model.safetensors").unlink()
+    return weights
+
+
+def sharded_pickle(folder: Path) -> None:
+    weights = take_weights(folder)
+    names = sorted(weights)
+    weight_map = {}
+    for number, part in enumerate((names[:20], names[20:]), 1):
+        shard = f"pytorch_model-0000{number}-of-00002.bin"
+        torch.save({name: weights[name] for name in part}, folder / shard)
+        weight_map |= dict.fromkeys(part, shard)
+    (folder / "pytorch_model.bin.index.json").write_text(json.dumps({"metadata": {}, "weight_map": weight_map}))
+
+
+def extra_shard(name: str, tensors: dict[str, Tensor]) -> Callable[[Path], None]:
+    def spoil(folder: Path) -> None:
+        split_into_shards(folder)
+        save_file(tensors, folder / name)
+
+    return spoil
+
+
+def whole_and_shards(folder: Path) -> None:
+    weights = load_file(folder / "model.safetensors")
+    split_into_shards(folder)
+    save_file(weights, folder / "model.safetensors")
+
+
 SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
     "missing and unexpected keys": (
         change_weights(lambda w: w.update(surplus=w.pop("success_head.4.bias"))),
@@ -197,7 +229,7 @@ SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "pickle": (
         as_pickle,
-        r"expected model.safetensors, got pytorch_model.bin: .*refused; .*python -c \"import torch, safetensors",
+        r"expected model.safetensors, got pytorch_model.bin: .*refused\. .*weights_only=True lets .*: python -c \"import",
     ),
     "no weights": (
         lambda folder: (folder / "model.safetensors").unlink(),
@@ -205,6 +237,37 @@ SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "half a file": (truncate, r"model.safetensors: expected a safetensors file, got"),
     "a shard outside the folder": (shard_outside, r"expected names of files beside it, got '../../etc/passwd'"),
+    "weights whole and in shards": (
+        whole_and_shards,
+        r"expected model\.safetensors or shards, got model\.safetensors and \['model\.safetensors\.index\.json'\], of which "
+        r"one is older; move away what is not meant",
+    ),
+    "weights whole and in shards without an index": (
+        lambda folder: shutil.copy(folder / "model.safetensors", folder / "model-00001-of-00002.safetensors") and None,
+        r"expected model\.safetensors or shards, got model\.safetensors and \['model-00001-of-00002\.safetensors'\]",
+    ),
+    "a tensor in two shards": (
+        lambda folder: (
+            split_into_shards(folder),
+            save_file(
+                load_file(folder / "a.safetensors") | load_file(folder / "b.safetensors"), folder / "b.safetensors"
+            ),
+        )[0],
+        r"expected each tensor in one shard, got 'first_embedding_A' in a\.safetensors and in b\.safetensors; save",
+    ),
+    "a shard that the index does not name": (
+        extra_shard("model-00003-of-00003.safetensors", {"more": torch.ones(1)}),
+        r"expected the names of all shards, got model-00003-of-00003\.safetensors, which it does not name, with "
+        r"\['more'\]; move that file away",
+    ),
+    "a weight with and without a wrapper's prefix": (
+        change_weights(lambda w: w.update({"module.success_head.4.bias": w["success_head.4.bias"] + 1})),
+        r"expected each weight once, got 'success_head\.4\.bias' and",
+    ),
+    "pickles whole and in shards": (
+        lambda folder: (shutil.copy(folder / "config.json", folder / "pytorch_model.bin"), sharded_pickle(folder))[1],
+        r"expected one form of the weights, got pytorch_model\.bin and pytorch_model-00001-of-00002\.bin; move away",
+    ),
     "a lost shard": (lost_shard, r"names the shard b.safetensors, which is not there"),
     "JSON that is none": (
         lambda folder: (folder / "config.json").write_text("{") and None,
@@ -254,15 +317,136 @@ def test_progress_since_the_frame_before_is_refused(tmp_path: Path, name: str, k
     families.load(folder, base_model=str(golden.base_model))
 
 
-def test_the_conversion_that_the_refusal_of_a_pickle_names_works(folder: Path) -> None:
+def in_data_parallel(folder: Path) -> None:
+    torch.save({f"module.{name}": tensor for name, tensor in take_weights(folder).items()}, folder / "rewind.pth")
+
+
+def sharing_memory(folder: Path) -> None:
+    """As tied weights are; a safetensors file holds none that share."""
+    weights = take_weights(folder)
+    both = torch.stack([weights["first_embedding_A"], weights["first_embedding_B"]])
+    torch.save(weights | {"first_embedding_A": both[0], "first_embedding_B": both[1]}, folder / "model.pt")
+
+
+PICKLES: dict[str, tuple[Callable[[Path], None], str]] = {
+    "of transformers": (as_pickle, "pytorch_model.bin"),
+    "shards": (sharded_pickle, "pytorch_model-00001-of-00002.bin, pytorch_model-00002-of-00002.bin"),
+    "of Lightning": (
+        lambda folder: torch.save(
+            {"epoch": 3, "state_dict": take_weights(folder), "callbacks": {}}, folder / "epoch=3.ckpt"
+        ),
+        "epoch=3.ckpt",
+    ),
+    "of a training loop": (
+        lambda folder: torch.save({"model_state_dict": take_weights(folder), "step": 7}, folder / "it's.pt"),
+        "it's.pt",
+    ),
+    "in data-parallel": (in_data_parallel, "rewind.pth"),
+    "weights that share memory": (sharing_memory, "model.pt"),
+}
+
+
+@pytest.mark.parametrize(("spoil", "named"), PICKLES.values(), ids=PICKLES)
+def test_the_conversion_that_the_refusal_of_a_pickle_names_works(
+    folder: Path, spoil: Callable[[Path], None], named: str
+) -> None:
     before = families.load(folder)
-    as_pickle(folder)
-    with pytest.raises(CheckpointError) as refusal:
+    spoil(folder)
+    for state in ("optimizer.pt", "scheduler.pt", "rng_state.pth", "rng_state_0.pth", "training_args.bin", "scaler.pt"):
+        torch.save({"state": {}}, folder / state)
+    with pytest.raises(CheckpointError, match=re.escape(f"expected model.safetensors, got {named}: pickles may run")):
         families.load(folder)
-    (code,) = re.findall(r'python -c "(.*)"', str(refusal.value))
-    exec(code, {})
+    run_the_command(families.load, folder)
+    after = families.load(folder)
+    assert after.config == before.config
+    assert all(torch.equal(after.network[name], before.network[name]) for name in before.network)
+
+
+def run_the_command(load: Callable[[Path], object], folder: Path) -> None:
+    """What the refusal of ``load`` says to type."""
+    with pytest.raises(CheckpointError) as refusal:
+        load(folder)
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    (command,) = re.findall(r"python -c .*", str(refusal.value))
+    subprocess.run(["bash", "-c", command], check=True, env={**os.environ, "PATH": path})
+
+
+def test_the_conversion_of_a_pickled_adapter_works(tmp_path: Path) -> None:
+    golden = goldens.config("q25_peft_adapter_disc10")
+
+    def load(folder: Path) -> Any:
+        return families.load(folder, base_model=str(golden.base_model))
+
+    before = load(golden.checkpoint)
+    folder = shutil.copytree(golden.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
+    torch.save(load_file(folder / "adapter_model.safetensors"), folder / "adapter_model.bin")
+    (folder / "adapter_model.safetensors").unlink()
+    with pytest.raises(CheckpointError, match=r"expected adapter_model\.safetensors, got adapter_model\.bin: pickles"):
+        load(folder)
+    run_the_command(load, folder)
+    after = load(folder)
+    assert after.config == before.config
+    assert all(torch.equal(after.factors[name], before.factors[name]) for name in before.factors)
+
+
+def test_the_state_of_an_optimizer_is_no_checkpoint(folder: Path) -> None:
+    take_weights(folder)
+    torch.save({"state": {}}, folder / "optimizer.pt")
+    with pytest.raises(
+        CheckpointError, match=r"expected model\.safetensors or .*optimizer\.pt: a checkpoint's folder has"
+    ):
+        families.load(folder)
+
+
+def renamed(change: Callable[[str], str]) -> Callable[[Path], None]:
+    def rename(folder: Path) -> None:
+        weights = {change(name): tensor for name, tensor in take_weights(folder).items()}
+        save_file(weights, folder / "model.safetensors")
+
+    return rename
+
+
+PREFIXES: dict[str, Callable[[str], str]] = {
+    "DataParallel": lambda name: f"module.{name}",
+    "torch.compile": lambda name: f"_orig_mod.{name}",
+    "PEFT": lambda name: f"base_model.model.{name}",
+    "FSDP": lambda name: f"_fsdp_wrapped_module.{name}".replace("layers.1.", "layers.1._fsdp_wrapped_module."),
+    "both": lambda name: f"module._orig_mod.{name}",
+    "some layers": lambda name: name.replace("transformer.", "transformer._orig_mod."),
+    "Lightning": lambda name: f"model.{name}",
+}
+
+
+@pytest.mark.parametrize("change", PREFIXES.values(), ids=PREFIXES)
+@pytest.mark.parametrize("name", [CONTINUOUS, WITH_IMAGES])
+def test_prefixes_of_wrappers_change_nothing(tmp_path: Path, name: str, change: Callable[[str], str]) -> None:
+    golden = goldens.config(name)
+    folder = shutil.copytree(golden.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
+    renamed(change)(folder)
+    before, after = (families.load(each, base_model=str(golden.base_model)) for each in (golden.checkpoint, folder))
+    assert after.config == before.config
+    assert after.parts["network"].keys() == before.parts["network"].keys()
+    assert all(torch.equal(after.parts["network"][key], tensor) for key, tensor in before.parts["network"].items())
+
+
+def test_the_command_that_strips_a_prefix_works(folder: Path) -> None:
+    before = families.load(folder)
+    renamed(lambda name: name if name.startswith("video") else f"student.{name}")(folder)
+    expected = (
+        "got 'student.progress_head.4.weight', with the prefix student. that 'video_proj.bias' lacks; strip it with"
+    )
+    with pytest.raises(CheckpointError, match=re.escape(expected)):
+        families.load(folder)
+    run_the_command(families.load, folder)
     after = families.load(folder)
     assert all(torch.equal(after.network[name], before.network[name]) for name in before.network)
+
+
+def test_an_old_shard_of_known_names_is_left_alone(folder: Path) -> None:
+    whole = families.load(folder)
+    extra_shard("model-00001-of-00003.safetensors", {"success_head.4.bias": torch.ones(1)})(folder)
+    sharded = families.load(folder)
+    assert all(torch.equal(sharded.network[name], whole.network[name]) for name in whole.network)
 
 
 def test_yaml_constructs_nothing(folder: Path, tmp_path: Path) -> None:
