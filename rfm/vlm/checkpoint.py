@@ -44,27 +44,38 @@ from rfm.version_folder import PROCESSOR_FOLDER
 from rfm.vlm.backbone import BACKBONES, SMOL, backbone_config
 from rfm.vlm.collator import VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP
-from rfm.vlm.lora import LORA_NAME, changed_by, merged, scaling, split
+from rfm.vlm.lora import LORA_NAME, Scaling, changed_by, check_adapter, merged, split
 from rfm.vlm.network import VlmConfig, VlmRewardModel, build_backbone
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.processor import frame_size, load_collator, save_processor
+from rfm.vlm.prompts import OF_AN_OLD_RUN
 from rfm.vlm.run_config import RunConfig
 
 ADAPTER_CONFIG = "adapter_config.json"
 ADAPTER_WEIGHTS = "adapter_model.safetensors"
 CUSTOM_HEADS = "custom_heads.safetensors"
+ADAPTER_TARGET = "peft_target_module.json"  # upstream writes it where it saves an adapter beside the whole model
 LORA = "lora"  # in VlmCheckpoint.parts: the factors that change the network's weights
 SETTINGS = "rfm"  # key of our own fields in an exported config.json
 EMBEDDING = "model.language_model.embed_tokens.weight"
 
 # Renames of one form, tried in order on each name; the first that matches is applied.
 _Renames = Sequence[tuple[str, str]]
-_FULL: _Renames = ()
 _SMOL: _Renames = ((r"^model\.model\.", "model."),)
-_LORA_INSIDE: _Renames = ((r"^(model\.\w+)\.base_model\.model\.", r"\1."),)
+_LORA_INSIDE: _Renames = ((r"^(model(\.\w+)?)\.base_model\.model\.", r"\1."),)
 _ADAPTER: _Renames = ((r"^base_model\.model\.", "model."),)
+# Of a Qwen backbone as transformers had its weights before 4.52, and as it writes them since in some cases.
+_OLD_QWEN: _Renames = (
+    (r"^visual\.", "model.visual."),
+    (r"^model\.(embed_tokens|layers|norm)\.", r"model.language_model.\1."),
+)
 _UNUSED = ("lm_head.weight", "model.lm_head.weight")  # makes text, which no reward head reads
 
+_NO_EMBEDDING = (
+    "expected the embedding of the special tokens, got none: their rows are drawn at random when a run begins, and are "
+    "lost with the run; save the whole model where it was trained (save_model() of the trainer), or the adapter with "
+    "save_pretrained(..., save_embedding_layers=True)"
+)
 _VARIANT = re.compile(r"(-unsloth)?(-bnb-\dbit)?$")  # of one model, which Unsloth puts in the place of a base model
 
 _LAYER_COUNTS = ("num_hidden_layers", "num_layers", "depth")
@@ -104,6 +115,11 @@ class VlmCheckpoint:
     def parts(self) -> dict[str, dict[str, Tensor]]:
         """All weights: the network's, and the LoRA factors that change them."""
         return {NETWORK: self.weights, LORA: self.factors}
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """Nothing that could not be checked decides its scores."""
+        return ()
 
     @cached_property
     def collator(self) -> VlmCollator:
@@ -180,11 +196,12 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
             run = RunConfig.of(folder)
             run.check_model_type()
             check_progress(run.sections, run.file)
+            scaling: Scaling | None
             if is_adapter:
-                backbone, tensors, scale = _adapted(folder, options.base_model or _base_of_adapter(folder, run))
+                backbone, tensors, scaling = _adapted(folder, options.base_model or _base_of_adapter(folder, run))
             else:
-                tensors, scale = _whole(folder, backbone, run)
-            weights, factors = _used(tensors, scale)
+                tensors, scaling = _whole(folder, backbone, run)
+            weights, factors = _used(tensors, scaling)
             config = _trained_config(folder, backbone, run, weights, options.resize_images)
     own = folder / PROCESSOR_FOLDER
     checkpoint = VlmCheckpoint(config, weights, factors, options.base_model or (own if own.is_dir() else None))
@@ -193,10 +210,14 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
 
 
 def _has_adapter(folder: Path) -> bool:
-    """Whether the folder's weights are an adapter. Raises CheckpointError if there are whole weights, too."""
+    """Whether the folder's weights are an adapter alone. Of one beside the whole model that upstream saved with it, the
+    whole model is read. Raises CheckpointError for one beside weights of which nothing is known.
+    """
     adapter = [name for name in (ADAPTER_CONFIG, ADAPTER_WEIGHTS, CUSTOM_HEADS) if is_there(folder / name)]
     whole = [name for name in (WEIGHTS, WEIGHTS_INDEX) if is_there(folder / name)]
     if adapter and whole:
+        if is_there(folder / ADAPTER_TARGET):
+            return False
         raise CheckpointError(
             f"{folder}: expected an adapter ({adapter[0]}) or whole weights ({whole[0]}), got both; move away the one "
             "that is not meant"
@@ -238,9 +259,10 @@ def _trained_config(
     resize_images: bool | None,
 ) -> VlmConfig:
     family = str(backbone["model_type"])
-    for name in ("progress_head.4.weight", "frame_pool_attn.weight"):
-        if name not in weights:
-            raise CheckpointError(f"{folder}: expected reward heads, got no {name}")
+    if "progress_head.4.weight" not in weights:
+        raise CheckpointError(f"{folder}: expected reward heads, got no progress_head.4.weight")
+    if "frame_pool_attn.weight" not in weights:
+        raise CheckpointError(f"{folder}: expected frame_pool_attn.weight, got none: {OF_AN_OLD_RUN}")
     network = run.network()
     config = VlmConfig(
         backbone=backbone,
@@ -266,7 +288,7 @@ def _check_transformers(config: VlmConfig) -> None:
 
 
 def _renames(family: Any) -> _Renames:
-    return _SMOL if family == SMOL else _FULL
+    return _SMOL if family == SMOL else _OLD_QWEN
 
 
 def _renamed(weights: Mapping[str, Tensor], renames: _Renames) -> dict[str, Tensor]:
@@ -280,17 +302,19 @@ def _renamed(weights: Mapping[str, Tensor], renames: _Renames) -> dict[str, Tens
     return {rename(name): tensor for name, tensor in weights.items()}
 
 
-def _whole(folder: Path, backbone: Mapping[str, Any], run: RunConfig) -> tuple[dict[str, Tensor], float]:
-    """The weights of the network by name, with LoRA factors if it has some; the scale of these."""
-    tensors, scale = read_weights(folder), 1.0
+def _whole(folder: Path, backbone: Mapping[str, Any], run: RunConfig) -> tuple[dict[str, Tensor], Scaling | None]:
+    """The weights of the network by name, with LoRA factors if it has some; what these are scaled with."""
+    tensors, scaling = read_weights(folder), None
     if any(LORA_NAME.fullmatch(name) for name in tensors):
-        tensors, scale = _renamed(tensors, _LORA_INSIDE), scaling(run.file, run.sections["peft"])
-    return _renamed(tensors, _renames(backbone["model_type"])), scale
+        tensors, scaling = _renamed(tensors, _LORA_INSIDE), Scaling.of(run.file, run.sections["peft"])
+        if is_there(folder / ADAPTER_CONFIG):
+            scaling.check_equal(Scaling.of(folder / ADAPTER_CONFIG, read_json(folder / ADAPTER_CONFIG)))
+    return _renamed(tensors, _renames(backbone["model_type"])), scaling
 
 
-def _used(tensors: Mapping[str, Tensor], scale: float = 1.0) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """The weights that a reward is made with, and their LoRA factors; ``scale``: of these."""
-    weights, factors = split(tensors, scale)
+def _used(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """The weights that a reward is made with, and their LoRA factors; ``scaling``: of these."""
+    weights, factors = split(tensors, scaling)
     weights = {name: tensor for name, tensor in weights.items() if name not in _UNUSED}
     return weights, {name: tensor for name, tensor in factors.items() if changed_by(name) in weights}
 
@@ -306,15 +330,20 @@ def _check_layers(config: Any) -> None:
             raise CheckpointError(f"{NETWORK_CONFIG}: {name}: expected at most {MAX_LAYERS}, got {shown(count)}")
 
 
-def _adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Tensor], float]:
-    """Configuration of the base model's backbone; its weights with those of the adapter; the scale of LoRA factors."""
-    adapter_config = read_json(folder / ADAPTER_CONFIG)
+def _adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Tensor], Scaling]:
+    """Configuration of the base model's backbone; its weights with those of the adapter; what its factors are scaled
+    with.
+    """
+    file = folder / ADAPTER_CONFIG
+    adapter_config = read_json(file)
+    scaling = Scaling.of(file, adapter_config)
+    check_adapter(file, adapter_config)
     if not is_there(folder / ADAPTER_WEIGHTS):
         refuse_pickles(folder, ADAPTER_WEIGHTS, Path(ADAPTER_WEIGHTS).stem)
-    adapter = _renamed(read_tensors(folder / ADAPTER_WEIGHTS), _ADAPTER)
-    config, base = _read_base(base_model)
+    adapter = _renamed(_renamed(read_tensors(folder / ADAPTER_WEIGHTS), _ADAPTER), _OLD_QWEN)
     if EMBEDDING not in adapter:
-        raise CheckpointError(f"{folder / ADAPTER_WEIGHTS}: expected the embedding of the special tokens, got none")
+        raise CheckpointError(f"{folder / ADAPTER_WEIGHTS}: {_NO_EMBEDDING}")
+    config, base = _read_base(base_model)
     factors = {name: tensor for name, tensor in adapter.items() if LORA_NAME.fullmatch(name)}
     replaced = {name: tensor for name, tensor in adapter.items() if name not in factors}
     unknown = sorted(replaced.keys() - base.keys())
@@ -323,8 +352,7 @@ def _adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, T
             f"{folder / ADAPTER_WEIGHTS}: expected weights of {base_model}, got also {listed(unknown)}"
         )
     config["text_config"]["vocab_size"] = len(replaced[EMBEDDING])
-    tensors = base | replaced | factors | read_tensors(folder / CUSTOM_HEADS)
-    return config, tensors, scaling(folder / ADAPTER_CONFIG, adapter_config)
+    return config, base | replaced | factors | read_tensors(folder / CUSTOM_HEADS), scaling
 
 
 def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:

@@ -13,7 +13,7 @@ from rfm.vlm.backbone import SMOL
 from rfm.vlm.collator import QwenCollator, SmolCollator, VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, Normalisation, QwenImages, SmolImages, fitted_size
 from rfm.vlm.network import VlmConfig
-from rfm.vlm.prompts import SPECIAL_TOKENS
+from rfm.vlm.prompts import OLD_SPECIAL_TOKENS, SPECIAL_TOKENS
 from rfm_client.contract import FrameSize
 
 SMOL_SIZE_PX = 512  # what upstream sets, whatever the base model says; so no image is split
@@ -48,7 +48,13 @@ def load_collator(config: VlmConfig, num_tokens: int, processor: str | Path) -> 
     tokenizer.add_tokens(list(SPECIAL_TOKENS), special_tokens=True)
     if len(tokenizer) != num_tokens:  # upstream resizes the embedding to it
         expected = f"a tokenizer of {num_tokens} tokens with the special ones, as the checkpoint's embedding"
-        raise CheckpointError(f"base model {processor}: expected {expected}, got {len(tokenizer)}")
+        is_old = num_tokens - len(tokenizer) == OLD_SPECIAL_TOKENS - len(SPECIAL_TOKENS)
+        hint = (
+            f" (with {OLD_SPECIAL_TOKENS} special tokens, as upstream before 2026-01-21, it would fit)"
+            if is_old
+            else ""
+        )
+        raise CheckpointError(f"base model {processor}: expected {expected}, got {len(tokenizer)}{hint}")
     return _collator(config, tokenizer, preprocessor, processor)
 
 
