@@ -130,6 +130,10 @@ class Checkpoint(Protocol):
     def parts(self) -> Mapping[str, Mapping[str, Tensor]]:
         """All weights by part and name. The part NETWORK is always there."""
 
+    @property
+    def notes(self) -> Sequence[str]:
+        """A line for the user on each thing that decides scores, was assumed, and could not be checked."""
+
     def encoders(self) -> FrameEncoders | None:
         """The checkpoint's encoders; None: it has none. Raises CheckpointError if they cannot be had or do not fit."""
 

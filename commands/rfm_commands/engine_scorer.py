@@ -28,7 +28,7 @@ class EngineScorer:
 
     The engine is on its device as soon as it scores; until then only the checkpoint is in memory.
 
-    notes: lines for the user on what the checkpoint's training run left untrained
+    notes: lines for the user, as ``rfm.families.notes`` has them of progress and success
     """
 
     def __init__(self, source: str, *, device: str = "cpu", **options: Any) -> None:
@@ -42,7 +42,7 @@ class EngineScorer:
         told = {"device": on.type, **{name: _named(value) for name, value in options.items()}}
         folders = _folders(source, options)
         self._facts = _facts(source, self._checkpoint, self._encoders, folders, told)
-        self.notes = training.notes(folders[0], (training.PROGRESS, training.SUCCESS))
+        self.notes = families.notes(folders[0], self._checkpoint, (training.PROGRESS, training.SUCCESS))
         self._device = on
         self._lock = threading.Lock()
 

@@ -94,15 +94,39 @@ class RewindCheckpoint:
         """All weights, by part and name."""
         return {NETWORK: self.network, "image_encoder": self.image_encoder, "text_encoder": self.text_encoder}
 
+    @property
+    def notes(self) -> list[str]:
+        """A line on the encoders, of which no file of a training run says which they were."""
+        if not self._has_encoders:
+            return []
+        known = (
+            "their weights are the checkpoint's" if self.image_encoder and self.text_encoder else "only widths agree"
+        )
+        return [
+            f"encoders: {self._image_source} and {self._text_source} are taken for those of the training run, which no "
+            f"file names ({known}); upstream's are {USUAL_IMAGE_ENCODER} and {USUAL_TEXT_ENCODER}"
+        ]
+
+    @property
+    def _has_encoders(self) -> bool:
+        return any((self.image_encoder, self.text_encoder, self.image_source, self.text_source))
+
+    @property
+    def _image_source(self) -> str:
+        return self.image_source or USUAL_IMAGE_ENCODER
+
+    @property
+    def _text_source(self) -> str:
+        return self.text_source or USUAL_TEXT_ENCODER
+
     def encoders(self) -> Encoders | None:
         """The encoders of a checkpoint that has them, or for which the user names them; else None.
 
         Raises CheckpointError if they cannot be had or do not fit the network.
         """
-        in_checkpoint = bool(self.image_encoder or self.text_encoder)
-        if not (in_checkpoint or self.image_source or self.text_source):
+        if not self._has_encoders:
             return None
-        image_source, text_source = self.image_source or USUAL_IMAGE_ENCODER, self.text_source or USUAL_TEXT_ENCODER
+        image_source, text_source = self._image_source, self._text_source
         where = f"encoders {image_source} and {text_source}"
         try:
             encoders = Encoders.from_pretrained(
@@ -229,7 +253,9 @@ def _trained_padding(folder: Path) -> bool | None:
     """Whether training padded shorter trajectories, as ``save`` wrote it; upstream's configurations do not say."""
     padding = read_json(folder / NETWORK_CONFIG).get("trained_padding") if is_there(folder / NETWORK_CONFIG) else None
     if padding is not None and not isinstance(padding, bool):
-        raise CheckpointError(f"{folder / NETWORK_CONFIG}: trained_padding: expected true or false, got {shown(padding)}")
+        raise CheckpointError(
+            f"{folder / NETWORK_CONFIG}: trained_padding: expected true or false, got {shown(padding)}"
+        )
     return padding
 
 

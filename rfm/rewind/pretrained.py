@@ -13,6 +13,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
+from rfm.checkpoint.files import check_finite
 from rfm.checkpoint.preprocessor import PREPROCESSOR_CONFIG
 from rfm.rewind.preprocessing import ImagePreprocessor
 
@@ -60,4 +61,5 @@ def load_model(source: str | Path, weights: Mapping[str, Tensor] | None) -> Any:
     found = {name: sorted(map(str, loaded[name])) for name in problems if loaded[name]}
     if found:  # transformers would leave missing ones random, and others out
         raise ValueError(f"{source}: the encoder's weights do not fit: {found}")
+    check_finite(model.state_dict())
     return model

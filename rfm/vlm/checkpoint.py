@@ -121,6 +121,11 @@ class VlmCheckpoint:
         """Nothing that could not be checked decides its scores."""
         return ()
 
+    @property
+    def notes(self) -> Sequence[str]:
+        """Nothing that could not be checked decides its scores."""
+        return ()
+
     @cached_property
     def collator(self) -> VlmCollator:
         """What makes batches of samples. Raises CheckpointError if the processor cannot be had or does not fit."""

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shutil
@@ -21,12 +22,16 @@ from torch import Tensor
 
 import goldens
 import local_hub
+import rfm_export
 from paths import ROOT
 from rfm import families
 from rfm.checkpoint.content import CheckpointError
 from rfm.checkpoint.files import best_tag, find_run_config
+from rfm.config import ExportConfig
+from rfm.engine import Engine
 from rfm.rewind.network import RewindConfig
 from rfm.vlm.network import VlmConfig
+from rfm_commands.engine_scorer import EngineScorer
 
 CONTINUOUS = "legacy_keys_l2"  # lacks causal_mask and use_per_frame_progress_token
 MISMATCHED = "h40_L3_H5_c1_t1_disc5_cfgmismatch"  # its configs say l2 and 32 bins, its weights 5 bins
@@ -447,6 +452,86 @@ def test_an_old_shard_of_known_names_is_left_alone(folder: Path) -> None:
     extra_shard("model-00001-of-00003.safetensors", {"success_head.4.bias": torch.ones(1)})(folder)
     sharded = families.load(folder)
     assert all(torch.equal(sharded.network[name], whole.network[name]) for name in whole.network)
+
+
+ENCODED = "enc_c1_t1_disc10"
+NO_NUMBERS = {
+    "a head": (CONTINUOUS, "success_head.4.bias", math.inf),
+    "the last of a head's last layer": (WITH_IMAGES, "progress_head.4.weight", -math.inf),
+    "a weight": (CONTINUOUS, "transformer.layers.0.norm1.weight", math.nan),
+    "a weight of an encoder": (ENCODED, "image_encoder.layernorm.bias", math.nan),
+}
+
+
+def exported(source: Path, *, to: Path, **options: Any) -> None:
+    rfm_export.export(source, to / "repository", ExportConfig(num_gpus=0, **options))
+
+
+def of_engine(source: Path, *, to: Path, **options: Any) -> None:
+    Engine.from_checkpoint(source, base_model=options.get("base_model"))
+
+
+DOORS: dict[str, Callable[..., object]] = {
+    "rfm export": exported,
+    "rfm label": lambda source, to, **options: EngineScorer(str(source), **options),
+    "Engine": of_engine,
+    "families": lambda source, to, **options: families.load(source, **options),
+}
+
+
+@pytest.mark.parametrize("door", DOORS.values(), ids=DOORS)
+@pytest.mark.parametrize(("name", "weight", "value"), NO_NUMBERS.values(), ids=NO_NUMBERS)
+def test_weights_that_are_no_numbers_are_refused_at_every_door(
+    tmp_path: Path, door: Callable[..., object], name: str, weight: str, value: float
+) -> None:
+    golden = goldens.config(name)
+    folder = shutil.copytree(golden.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
+    change_weights(lambda weights: weights[weight].view(-1)[-1:].fill_(value))(folder)
+    sources = {option: getattr(golden, option) for option in ("base_model", "image_encoder", "text_encoder")}
+    options = {option: str(source) for option, source in sources.items() if source is not None}
+    short = weight.removeprefix("image_encoder.")
+    with pytest.raises(CheckpointError, match=rf"{re.escape(short)}: expected finite weights, got {value} at \["):
+        door(folder, to=tmp_path, **options)
+
+
+@pytest.mark.parametrize("which", ["image_encoder", "text_encoder"])
+def test_an_encoder_s_weights_that_are_no_numbers_are_refused(tmp_path: Path, which: str) -> None:
+    golden = goldens.config(ENCODED)
+    folder = shutil.copytree(golden.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
+    change_weights(lambda weights: [weights.pop(name) for name in list(weights) if "_encoder." in name])(folder)
+    sources = {"image_encoder": golden.image_encoder, "text_encoder": golden.text_encoder}
+    spoilt = shutil.copytree(sources[which] or "", tmp_path / which, copy_function=shutil.copyfile)
+    weights = load_file(spoilt / "model.safetensors")
+    name = next(iter(weights))
+    weights[name].view(-1)[0] = math.inf
+    save_file(weights, spoilt / "model.safetensors", {"format": "pt"})
+    options = {option: str(source) for option, source in (sources | {which: spoilt}).items()}
+    with pytest.raises(CheckpointError, match=rf"{re.escape(name)}: expected finite weights, got inf at \["):
+        families.load(folder, **options).encoders()
+
+
+ZEROED = {
+    "the whole head": (["success_head"], ["success"]),
+    "its last weights": (["progress_head.4.weight"], ["progress"]),
+    "its bias": (["progress_head.4.bias"], []),
+    "two heads, one of which is not asked for": (["progress_head", "preference_head"], ["progress"]),
+}
+
+
+@pytest.mark.parametrize(("zeroed", "told"), ZEROED.values(), ids=ZEROED)
+@pytest.mark.parametrize("name", [CONTINUOUS, WITH_IMAGES])
+def test_a_head_of_zeros_is_told(tmp_path: Path, name: str, zeroed: list[str], told: list[str]) -> None:
+    golden = goldens.config(name)
+    folder = shutil.copytree(golden.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
+    change_weights(lambda w: [t.zero_() for key, t in w.items() if key.startswith(tuple(zeroed))])(folder)
+    checkpoint = families.load(folder, base_model=str(golden.base_model))
+    lines = [
+        line for line in families.notes(folder, checkpoint, ("progress", "success")) if "model.safetensors" in line
+    ]
+    assert lines == [
+        f"model.safetensors: {each}_head.4.weight is 0 throughout: {each} is the same whatever is scored, as if untrained"
+        for each in told
+    ]
 
 
 def test_yaml_constructs_nothing(folder: Path, tmp_path: Path) -> None:
