@@ -7,6 +7,7 @@ no ``text_config``. No weight shows how positions were rotated, so nothing about
 
 from __future__ import annotations
 
+import importlib.metadata
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -25,6 +26,11 @@ _NOT_OF_TEXT = (
 )  # fmt: skip
 _ROPE = ("rope_theta", "rope_scaling", "rope_parameters", "partial_rotary_factor")
 _COPY = "copy it from config.json of the base model"
+
+
+def is_at_least(version: int) -> bool:
+    """Whether the installed transformers is of that major version, or a later one."""
+    return int(importlib.metadata.version("transformers").partition(".")[0]) >= version
 
 
 def backbone_config(content: Mapping[str, Any], where: object) -> dict[str, Any]:

@@ -41,7 +41,7 @@ from rfm.checkpoint.training import check_progress
 from rfm.family import NETWORK, Description, Options
 from rfm.feature_cache import FeatureCache
 from rfm.version_folder import PROCESSOR_FOLDER
-from rfm.vlm.backbone import BACKBONES, SMOL, backbone_config
+from rfm.vlm.backbone import BACKBONES, SMOL, backbone_config, is_at_least
 from rfm.vlm.collator import VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm.vlm.lora import LORA_NAME, Scaling, changed_by, check_adapter, merged, split
@@ -115,11 +115,6 @@ class VlmCheckpoint:
     def parts(self) -> dict[str, dict[str, Tensor]]:
         """All weights: the network's, and the LoRA factors that change them."""
         return {NETWORK: self.weights, LORA: self.factors}
-
-    @property
-    def notes(self) -> Sequence[str]:
-        """Nothing that could not be checked decides its scores."""
-        return ()
 
     @property
     def notes(self) -> Sequence[str]:
@@ -286,9 +281,9 @@ def _check_transformers(config: VlmConfig) -> None:
     """Raises CheckpointError for SmolVLM on transformers 5, which computes other image features than in training."""
     if config.family != SMOL:
         return
-    version = importlib.metadata.version("transformers")
-    if int(version.partition(".")[0]) >= 5:
+    if is_at_least(5):
         expected = "transformers < 5 for a SmolVLM checkpoint, whose scores would differ"
+        version = importlib.metadata.version("transformers")
         raise CheckpointError(f"transformers: expected {expected}, got {version}")
 
 

@@ -420,6 +420,50 @@ def test_a_preprocessor_file_as_qwen_publishes_it_is_read(tmp_path: Path) -> Non
     Engine.from_checkpoint(goldens.config(PLAIN).checkpoint, base_model=str(base))
 
 
+def as_transformers_5_saves(base: Path) -> None:
+    """Rewrites a processor's files."""
+    config = json.loads((base / "tokenizer_config.json").read_text())
+    special = config.pop("additional_special_tokens")
+    config.pop("added_tokens_decoder")
+    config |= {"extra_special_tokens": special, "backend": "tokenizers", "tokenizer_class": "TokenizersBackend"}
+    (base / "tokenizer_config.json").write_text(json.dumps(config))
+    images = json.loads((base / "preprocessor_config.json").read_text())
+    (base / "processor_config.json").write_text(json.dumps({"image_processor": images}))
+    template = json.loads((base / "chat_template.json").read_text())["chat_template"]
+    (base / "chat_template.jinja").write_text(template)
+    for file in base.iterdir():
+        if file.name not in ("tokenizer.json", "tokenizer_config.json", "processor_config.json", "chat_template.jinja"):
+            file.unlink()
+
+
+@pytest.mark.parametrize("name", ["q25_mean_l2", PLAIN, "smol_mean_disc10"])
+def test_a_processor_of_transformers_5_reads_the_same(tmp_path: Path, name: str) -> None:
+    config = goldens.config(name)
+    base = tmp_path / "base"
+    shutil.copytree(str(config.base_model), base, copy_function=shutil.copyfile)
+    as_transformers_5_saves(base)
+    engine = Engine.from_checkpoint(config.checkpoint, base_model=str(base))
+    load(name, base=str(base)).save(tmp_path / "saved")
+    saved = Engine.from_checkpoint(tmp_path / "saved")
+    sample = ProgressSample(film(0, 3, 60, 84))
+    (expected,) = load_engine(name).evaluate([sample])
+    for other in (engine, saved):
+        (result,) = other.evaluate([sample])
+        assert_close(result, expected, 1e-6)
+
+
+def test_a_processor_without_image_settings_is_refused(tmp_path: Path) -> None:
+    base = tmp_path / "base"
+    shutil.copytree(str(goldens.config(PLAIN).base_model), base, copy_function=shutil.copyfile)
+    as_transformers_5_saves(base)
+    (base / "processor_config.json").write_text("{}")
+    expected = (
+        r"expected preprocessor_config\.json, or image_processor in processor_config\.json, got none .*--base-model"
+    )
+    with pytest.raises(CheckpointError, match=expected):
+        _ = load(PLAIN, base=str(base)).collator
+
+
 def test_a_thin_video_is_refused() -> None:
     sample = ProgressSample(film(0, 2, 1, 500))
     (outcome,) = load_engine("q25_video_last_l2").evaluate([sample])
