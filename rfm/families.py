@@ -9,7 +9,8 @@ from pathlib import Path
 
 from rfm.checkpoint import training
 from rfm.checkpoint.content import CheckpointError, read_run_config
-from rfm.checkpoint.files import best_tag, check_finite, find
+from rfm.checkpoint.files import check_finite
+from rfm.checkpoint.hub import best_tag, find
 from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options
 
 # Packages in the order in which they are tried. ReWiND's comes last: its first checkpoints do not say what they are.
@@ -86,6 +87,7 @@ def load_from(folder: Path, family: Family, options: Options) -> Checkpoint:
     checkpoint = family.load(folder, options)
     for weights in checkpoint.parts.values():
         check_finite(weights)
+    training.check_run(folder, checkpoint.description.progress_bins, checkpoint.config)
     return checkpoint
 
 

@@ -8,7 +8,17 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rfm.checkpoint.content import CheckpointError, cut, is_there, listed, read_json, read_tensors, shown, tensor_names
+from rfm.checkpoint.content import (
+    CheckpointError,
+    cut,
+    is_there,
+    listed,
+    read_json,
+    read_run_config,
+    read_tensors,
+    shown,
+    tensor_names,
+)
 from rfm.checkpoint.pickles import refuse_pickles
 from rfm.checkpoint.wrappers import unwrapped
 from rfm.version_folder import IMAGE_ENCODER_FOLDER, TEXT_ENCODER_FOLDER
@@ -19,9 +29,10 @@ if TYPE_CHECKING:
 WEIGHTS = "model.safetensors"
 WEIGHTS_INDEX = "model.safetensors.index.json"
 NETWORK_CONFIG = "config.json"
+ADAPTER_CONFIG = "adapter_config.json"
 RUN_CONFIG = "config.yaml"
+RUN_CONFIGS = (RUN_CONFIG, "config.yml", ".hydra/config.yaml")  # the first is read
 
-_BEST_TAG = re.compile(r"best-.*?-(-?\d+\.\d+)-step-\d+")
 _COMMIT_DIGITS = 40
 MAX_COUNT = 2**20  # of frames: longer than any trajectory
 _SHARDS = "model-*.safetensors"
@@ -32,45 +43,53 @@ _LEVELS = ("*", "*/*", "*/*/*")  # below a folder: a training run's checkpoints,
 _NAMES = (WEIGHTS, WEIGHTS_INDEX, "adapter_model.safetensors")  # of weights in them
 
 
-def find(source: str | Path) -> Path:
-    """The local folder of a checkpoint, fetched from the Hub if need be. An existing path wins over an id."""
-    expected = "a folder that exists or a Hugging Face id org/name[@tag]"
-    try:
-        path = Path(source).expanduser()
-        if str(source) and path.is_dir():
-            return path
-        if path.is_file():
-            raise CheckpointError(f"checkpoint: expected {expected}, got the file {path}: name {path.parent}")
-    except (OSError, RuntimeError) as error:
-        got = f"{shown(str(source))}: {type(error).__name__}"
-        raise CheckpointError(f"checkpoint: expected {expected}, got {got}") from error
-    repo_id, _, tag = str(source).partition("@")
-    if not re.fullmatch(r"\w[\w.-]*/\w[\w.-]*", repo_id):
-        raise CheckpointError(f"checkpoint: expected {expected}, got {shown(str(source))}")
-    return _fetch(repo_id, tag or None)
-
-
-def best_tag(tags: Iterable[str]) -> str | None:
-    """The tag ``best-<metric>-<score>-step-<n>`` of the highest score, the first of equals; None if there is none."""
-    scores = {tag: float(match[1]) for tag in tags if (match := _BEST_TAG.search(tag))}
-    return max(scores, key=scores.__getitem__, default=None)
-
-
 def find_run_config(folder: Path) -> Path | None:
-    """config.yaml in the checkpoint's folder, its parent or, of a snapshot in the Hub's cache, main's snapshot."""
+    """The training run's configuration in the checkpoint's folder, its parent or main's snapshot in the Hub's cache.
+
+    Raises CheckpointError for one from outside the folder that is of another kind of network.
+    """
     home = folder.resolve()
-    candidates = (folder / RUN_CONFIG, home.parent / RUN_CONFIG, *_run_config_of_main(home))
-    return next((file for file in candidates if is_there(file)), None)
+    for place in (folder, home.parent, *_snapshot_of_main(home)):
+        file = next((place / name for name in RUN_CONFIGS if is_there(place / name)), None)
+        if file is not None:
+            if place != folder:
+                _check_base(file, folder)
+            return file
+    return None
 
 
-def _run_config_of_main(home: Path) -> list[Path]:
-    """Where the Hub's cache has main's config.yaml: in the snapshot of the commit in refs/main, beside ``home``."""
+def not_of(folder: Path, expected: str, got: str, file: Path) -> CheckpointError:
+    """The error for a ``file`` outside ``folder`` that is of another run."""
+    return CheckpointError(
+        f"{file}: expected the run of {folder}, {expected}, got {got}; copy the run's {RUN_CONFIG} into {folder}, "
+        "also if it is this one"
+    )
+
+
+def _check_base(file: Path, folder: Path) -> None:
+    """Raises CheckpointError if the run's base model and the checkpoint's network are of different kinds."""
+    model = read_run_config(file).get("model")
+    base = model.get("base_model_id") if isinstance(model, dict) else None
+    if is_there(folder / NETWORK_CONFIG):
+        kind = read_json(folder / NETWORK_CONFIG).get("model_type")
+    else:  # an adapter names its base model; the first ReWiND checkpoints say nothing
+        kind = None if is_there(folder / ADAPTER_CONFIG) else "rewind_transformer"
+    if isinstance(kind, str) and isinstance(base, str) and base and _plain(kind) not in _plain(base):
+        raise not_of(folder, f"whose network is {shown(kind)}", f"model.base_model_id {shown(base)}", file)
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def _snapshot_of_main(home: Path) -> list[Path]:
+    """Where the Hub's cache has main: the snapshot of the commit in refs/main, beside ``home``."""
     main = home.parent.parent / "refs" / "main"
     if home.parent.name != "snapshots" or not is_there(main):
         return []
     with main.open("rb") as file:
         commit = file.read(_COMMIT_DIGITS + 1)
-    return [home.parent / commit.decode() / RUN_CONFIG] if re.fullmatch(rb"[0-9a-f]+", commit) else []
+    return [home.parent / commit.decode()] if re.fullmatch(rb"[0-9a-f]+", commit) else []
 
 
 def check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> None:
@@ -121,36 +140,6 @@ def frame_count(frames: Any, where: str) -> int | None:
     if frames is not None and frames > MAX_COUNT:
         raise CheckpointError(f"{where}: expected at most {MAX_COUNT}, got {shown(frames)}")
     return frames
-
-
-def _fetch(repo_id: str, tag: str | None) -> Path:
-    from huggingface_hub import HfApi, snapshot_download
-    from huggingface_hub.errors import HfHubHTTPError, HFValidationError
-
-    patterns = ["*.safetensors", "*.json", "*.yaml", "*.txt"]
-    try:
-        if tag is None:
-            tag = best_tag(ref.name for ref in HfApi().list_repo_refs(repo_id).tags)
-        folder = Path(snapshot_download(repo_id, revision=tag, allow_patterns=patterns))
-        if not is_there(folder / RUN_CONFIG):  # upstream's uploader tags a commit of before config.yaml's
-            _fetch_run_config_of_main(repo_id)
-        return folder
-    except (HfHubHTTPError, HFValidationError, OSError) as error:
-        remedy = "there is no folder of this name either; name one, or see to the Hub's name, login and network"
-        raise CheckpointError(f"{repo_id}@{tag or 'latest'}: cannot be fetched: {error}; {remedy}") from error
-
-
-def _fetch_run_config_of_main(repo_id: str) -> None:
-    """Fetches main's config.yaml into the Hub's cache, where ``find_run_config`` looks. Even main may have none."""
-    from huggingface_hub import hf_hub_download
-    from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
-
-    try:
-        hf_hub_download(repo_id, RUN_CONFIG)
-    except LocalEntryNotFoundError:  # the cache lacks it, and the Hub was not tried
-        raise
-    except EntryNotFoundError:
-        return
 
 
 def read_weights(folder: Path) -> dict[str, Tensor]:

@@ -26,7 +26,8 @@ import rfm_export
 from paths import ROOT
 from rfm import families
 from rfm.checkpoint.content import CheckpointError
-from rfm.checkpoint.files import best_tag, find_run_config
+from rfm.checkpoint.files import find_run_config
+from rfm.checkpoint.hub import best_tag
 from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.rewind.network import RewindConfig
@@ -70,6 +71,47 @@ def test_config_yaml_is_found_above_the_checkpoint(tmp_path: Path) -> None:
     shutil.copy(source / "model.safetensors", tmp_path / "run" / "ckpt")
     shutil.copy(source.parent / "config.yaml", tmp_path / "run")  # no config.json: all there is
     assert families.load(tmp_path / "run" / "ckpt").config == families.load(source).config
+
+
+@pytest.mark.parametrize("file", ["config.yml", ".hydra/config.yaml"])
+@pytest.mark.parametrize("above", [False, True], ids=["beside", "above"])
+def test_config_yaml_may_be_called_otherwise(folder: Path, file: str, above: bool) -> None:
+    expected = families.load(folder).config
+    target = (folder.parent if above else folder) / file
+    target.parent.mkdir(exist_ok=True)
+    (folder / "config.yaml").rename(target)
+    assert families.load(folder).config == expected
+    assert find_run_config(folder) == target
+
+
+OTHER_RUNS = {
+    "a vision-language one": (CONTINUOUS, WITH_IMAGES, "whose network is 'rewind_transformer', got model.base_model_id 'Qwen/"),
+    "a ReWiND one": (WITH_IMAGES, CONTINUOUS, "whose network is 'qwen3_vl', got model.base_model_id 'rewind_transformer'"),
+    "one of another backbone": ("q25_mean_l2", WITH_IMAGES, "whose network is 'qwen2_5_vl', got model.base_model_id 'Qwen/Qwen3-VL"),
+    "one of another head": ("q25_mean_l2", "q25_video_avg_disc10", "whose weights show loss.progress_discrete_bins 1, got 10"),
+    "one of other widths": (IN_RUN_FOLDER, CONTINUOUS, "whose weights show model.rewind.hidden_dim 64, got 32"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "other", "message"), OTHER_RUNS.values(), ids=OTHER_RUNS)
+def test_config_yaml_of_another_run_above_the_checkpoint_is_refused(
+    tmp_path: Path, name: str, other: str, message: str
+) -> None:
+    golden, above = goldens.config(name), goldens.config(other)
+    run = next(file for file in above.checkpoint.parent.rglob("config.yaml"))
+    folder = shutil.copytree(golden.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
+    own = folder / "config.yaml"
+    own = own if own.exists() else golden.checkpoint.parent / "config.yaml"
+    right = own.read_text()
+    (folder / "config.yaml").unlink(missing_ok=True)
+    shutil.copyfile(run, tmp_path / "config.yaml")
+    with pytest.raises(CheckpointError) as refusal:
+        families.load(folder, base_model=str(golden.base_model))
+    told = f"{tmp_path}/config.yaml: expected the run of {folder}, {message}"
+    assert str(refusal.value).startswith(told)
+    assert str(refusal.value).endswith(f"; copy the run's config.yaml into {folder}, also if it is this one")
+    (folder / "config.yaml").write_text(right)
+    families.load(folder, base_model=str(golden.base_model))
 
 
 def test_saving_and_loading_changes_nothing(tmp_path: Path) -> None:
@@ -663,7 +705,7 @@ def test_main_of_the_hub_s_cache_is_a_commit(tmp_path: Path, main: str, is_found
     snapshots = tmp_path / "snapshots"
     for folder in (snapshots / "of-the-tag", snapshots / ("a" * 40), tmp_path / "refs"):
         folder.mkdir(parents=True)
-    (snapshots / ("a" * 40) / "config.yaml").touch()
+    (snapshots / ("a" * 40) / "config.yaml").write_text("{}")
     (tmp_path / "refs" / "main").write_text(main)
     found = find_run_config(snapshots / "of-the-tag")
     assert found == ((snapshots / ("a" * 40) / "config.yaml").resolve() if is_found else None)
