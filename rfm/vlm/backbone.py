@@ -25,6 +25,16 @@ _NOT_OF_TEXT = (
     "vision_token_id",
 )  # fmt: skip
 _ROPE = ("rope_theta", "rope_scaling", "rope_parameters", "partial_rotary_factor")
+UNQUANTIZED = (
+    "export the checkpoint that was quantized (its scores differ), or load this one with the code that trained it, call "
+    "dequantize() of its model and save that"
+)
+DEQUANTIZED = (
+    "where bitsandbytes is installed, write its weights in full precision into a new folder: python -c "
+    "\"from transformers import AutoModelForImageTextToText as M; m = M.from_pretrained('{base}', device_map='auto'); "
+    "m.dequantize(); m.save_pretrained('NEW_FOLDER')\"; copy its tokenizer and processor files there, and name it "
+    "with --base-model"
+)
 _COPY = "copy it from config.json of the base model"
 
 
@@ -48,6 +58,15 @@ def backbone_config(content: Mapping[str, Any], where: object) -> dict[str, Any]
     config["text_config"] = _text(config["text_config"], family, f"{where}: text_config")
     config["vision_config"] = _vision(config["vision_config"], f"{where}: vision_config")
     return config
+
+
+def check_not_quantized(config: Mapping[str, Any], where: object, remedy: str) -> None:
+    """Raises CheckpointError, which ends in ``remedy``, for a configuration of weights of fewer bits."""
+    for part in (config, config.get("text_config")):
+        found = part.get("quantization_config") if isinstance(part, dict) else None
+        if found:
+            method = found.get("quant_method") if isinstance(found, dict) else found
+            raise CheckpointError(f"{where}: quantization_config: expected none, got {shown(method)}; {remedy}")
 
 
 def _nested(content: Mapping[str, Any]) -> dict[str, Any]:

@@ -41,7 +41,15 @@ from rfm.checkpoint.training import check_progress
 from rfm.family import NETWORK, Description, Options
 from rfm.feature_cache import FeatureCache
 from rfm.version_folder import PROCESSOR_FOLDER
-from rfm.vlm.backbone import BACKBONES, SMOL, backbone_config, is_at_least
+from rfm.vlm.backbone import (
+    BACKBONES,
+    DEQUANTIZED,
+    SMOL,
+    UNQUANTIZED,
+    backbone_config,
+    check_not_quantized,
+    is_at_least,
+)
 from rfm.vlm.collator import VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm.vlm.lora import LORA_NAME, Scaling, changed_by, check_adapter, merged, split
@@ -69,14 +77,20 @@ _OLD_QWEN: _Renames = (
     (r"^visual\.", "model.visual."),
     (r"^model\.(embed_tokens|layers|norm)\.", r"model.language_model.\1."),
 )
-_UNUSED = ("lm_head.weight", "model.lm_head.weight")  # makes text, which no reward head reads
+# What makes text, which no reward head reads; the rotary frequencies, which transformers once saved, and computes.
+_UNUSED = re.compile(r"(model\.)?lm_head\.weight|.*\.(rotary_emb|rotary_pos_emb)\.(original_)?inv_freq")
+# What bitsandbytes, GPTQ, AWQ and FP8 write beside or in place of a weight.
+_QUANTIZED = re.compile(
+    r"\.(absmax|quant_map|nested_absmax|SCB|qweight|qzeros|weight_packed|weight_scale|weight_scale_inv)$|\.quant_state\."
+)
 
 _NO_EMBEDDING = (
     "expected the embedding of the special tokens, got none: their rows are drawn at random when a run begins, and are "
     "lost with the run; save the whole model where it was trained (save_model() of the trainer), or the adapter with "
     "save_pretrained(..., save_embedding_layers=True)"
 )
-_VARIANT = re.compile(r"(-unsloth)?(-bnb-\dbit)?$")  # of one model, which Unsloth puts in the place of a base model
+_VARIANT = re.compile(r"-unsloth$")  # of one model, which Unsloth puts in the place of a base model
+_FEW_BITS = re.compile(r"-bnb-\dbit/?$")  # how Unsloth names a base model of fewer bits, which it trains on
 
 _LAYER_COUNTS = ("num_hidden_layers", "num_layers", "depth")
 MAX_LAYERS = 1024
@@ -189,6 +203,7 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
         is_adapter = _has_adapter(folder)
         file = folder / NETWORK_CONFIG
         backbone = {} if is_adapter else backbone_config(read_json(file), file)
+        check_not_quantized(backbone, file, UNQUANTIZED)
         if SETTINGS in backbone:  # written by VlmCheckpoint.save, with every setting
             config = _saved_config(backbone)
             weights, factors = _used(_renamed(read_weights(folder), _renames(config.family)))
@@ -231,6 +246,9 @@ def _base_of_adapter(folder: Path, run: RunConfig) -> str:
     if not base:
         raise CheckpointError(f"{run.file}: expected model.base_model_id (or --base-model), got none")
     named = read_json(folder / ADAPTER_CONFIG).get("base_model_name_or_path")
+    if isinstance(named, str) and _FEW_BITS.search(named):
+        expected = f"base_model_name_or_path: expected weights in full precision, got {shown(named)}"
+        raise CheckpointError(f"{folder / ADAPTER_CONFIG}: {expected}; {DEQUANTIZED.format(base=named)}")
     if named and _model_name(str(named)) != _model_name(base):
         raise CheckpointError(
             f"{folder / ADAPTER_CONFIG}: base_model_name_or_path: expected {cut(base)}, the model.base_model_id of "
@@ -305,6 +323,9 @@ def _renamed(weights: Mapping[str, Tensor], renames: _Renames) -> dict[str, Tens
 def _whole(folder: Path, backbone: Mapping[str, Any], run: RunConfig) -> tuple[dict[str, Tensor], Scaling | None]:
     """The weights of the network by name, with LoRA factors if it has some; what these are scaled with."""
     tensors, scaling = read_weights(folder), None
+    quantized = next((name for name in tensors if _QUANTIZED.search(name)), None)
+    if quantized is not None:
+        raise CheckpointError(f"{folder}: expected weights in full precision, got {shown(quantized)}; {UNQUANTIZED}")
     if any(LORA_NAME.fullmatch(name) for name in tensors):
         tensors, scaling = _renamed(tensors, _LORA_INSIDE), Scaling.of(run.file, run.sections["peft"])
         if is_there(folder / ADAPTER_CONFIG):
@@ -315,7 +336,7 @@ def _whole(folder: Path, backbone: Mapping[str, Any], run: RunConfig) -> tuple[d
 def _used(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """The weights that a reward is made with, and their LoRA factors; ``scaling``: of these."""
     weights, factors = split(tensors, scaling)
-    weights = {name: tensor for name, tensor in weights.items() if name not in _UNUSED}
+    weights = {name: tensor for name, tensor in weights.items() if not _UNUSED.fullmatch(name)}
     return weights, {name: tensor for name, tensor in factors.items() if changed_by(name) in weights}
 
 
@@ -361,7 +382,9 @@ def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
     try:
         content = transformers.PretrainedConfig.get_config_dict(base_model)[0]
-        backbone = backbone_config(content, f"base model {base_model}: {NETWORK_CONFIG}")
+        file = f"base model {base_model}: {NETWORK_CONFIG}"
+        backbone = backbone_config(content, file)
+        check_not_quantized(backbone, file, DEQUANTIZED.format(base=base_model))
         network_class = getattr(transformers, BACKBONES[backbone["model_type"]])
         network, loaded = network_class.from_pretrained(
             base_model,

@@ -218,6 +218,18 @@ FORMS: dict[str, tuple[str, Callable[[Path], None]]] = {
         "q25_mean_l2",
         rename(r"^model\.(language_model|visual)\b", lambda found: "visual" if found[1] == "visual" else "model"),
     ),
+    "with rotary frequencies": (
+        "q25_mean_l2",
+        change_tensors(
+            "model.safetensors",
+            lambda w: w.update(
+                {
+                    "model.language_model.rotary_emb.inv_freq": torch.ones(8),
+                    "model.visual.rotary_pos_emb.inv_freq": torch.ones(4),
+                }
+            ),
+        ),
+    ),
     "a whole model beside its adapter": (LORA_INSIDE, beside_its_adapter),
     "LoRA around the whole model": (
         LORA_INSIDE,
@@ -304,6 +316,22 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
         change_backbone(lambda backbone: backbone["vision_config"].update(rope_parameters={"rope_theta": 100.0})),
         r"vision_config\.rope_parameters: expected axial with a rope_theta of 10000, got {'rope_theta': 100\.0}",
     ),
+    **{
+        f"weights of {method}": (
+            PLAIN,
+            change_backbone(lambda backbone, method=method: backbone.update(quantization_config={"quant_method": method})),
+            rf"config\.json: quantization_config: expected none, got '{method}'; export the checkpoint that was quantized",
+        )
+        for method in ("bitsandbytes", "gptq", "awq", "fp8", "compressed-tensors")
+    },
+    **{
+        f"weights with {part}": (
+            PLAIN,
+            change_tensors("model.safetensors", lambda w, part=part: w.update({f"model.language_model.layers.0.mlp.up_proj{part}": torch.ones(1)})),
+            rf"expected weights in full precision, got '.*{part}'; export the checkpoint that was quantized",
+        )
+        for part in (".weight.absmax", ".weight.quant_state.bitsandbytes__nf4", ".SCB", ".qweight", ".weight_scale_inv")
+    },
     "LoRA without alpha": (LORA_INSIDE, change_yaml("lora_alpha: 8", "lora_beta: 8"), r"expected lora_alpha and r of the LoRA weights"),
     "half a LoRA pair": (LORA_INSIDE, change_tensors("model.safetensors", drop_first("lora_B")), r"expected a weight and LoRA factors A and B, got \['A'\]"),
     "LoRA factors of two ranks": (
@@ -622,8 +650,8 @@ OTHER_BASES = (
 )
 SAME_BASES = (
     "/scratch/models/Qwen2.5-VL-3B-Instruct/",
-    "unsloth/qwen2.5-vl-3b-instruct-unsloth-bnb-4bit",
-    "unsloth/Qwen2.5-VL-3B-Instruct-bnb-4bit",
+    "unsloth/qwen2.5-vl-3b-instruct-unsloth",
+    "unsloth/Qwen2.5-VL-3B-Instruct",
     None,
     "",
 )  # fmt: skip
@@ -637,6 +665,27 @@ def test_an_adapter_on_another_base_model_is_asked_about(copied: Callable[[str],
     with pytest.raises(CheckpointError, match=rf"{re.escape(expected)}, .*, got '{re.escape(base)}'; .* --base-model"):
         families.load(folder)
     assert load(ADAPTER, folder).config == load(ADAPTER).config  # which names --base-model
+
+
+@pytest.mark.parametrize(
+    "base", ["unsloth/qwen2.5-vl-3b-instruct-unsloth-bnb-4bit", "/models/Qwen2.5-VL-3B-Instruct-bnb-4bit/"]
+)
+def test_an_adapter_on_weights_of_few_bits_is_refused(copied: Callable[[str], Path], base: str) -> None:
+    folder = copied(ADAPTER)
+    name_base(folder, base)
+    expected = rf"adapter_config\.json: base_model_name_or_path: expected weights in full precision, got '{re.escape(base)}'; .*"
+    with pytest.raises(CheckpointError, match=expected + r"m\.dequantize\(\).* with --base-model$"):
+        families.load(folder)
+    assert load(ADAPTER, folder).config == load(ADAPTER).config  # which names --base-model
+
+
+def test_a_base_model_of_few_bits_is_refused(tmp_path: Path) -> None:
+    base = tmp_path / "base"
+    shutil.copytree(str(goldens.config(ADAPTER).base_model), base, copy_function=shutil.copyfile)
+    change_backbone(lambda config: config.update(quantization_config={"quant_method": "bitsandbytes"}))(base)
+    expected = rf"base model {base}: config\.json: quantization_config: expected none, got 'bitsandbytes'; .*dequantize"
+    with pytest.raises(CheckpointError, match=expected):
+        load(ADAPTER, base=str(base))
 
 
 @pytest.mark.parametrize("base", SAME_BASES)
