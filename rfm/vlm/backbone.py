@@ -26,8 +26,8 @@ _NOT_OF_TEXT = (
 )  # fmt: skip
 _ROPE = ("rope_theta", "rope_scaling", "rope_parameters", "partial_rotary_factor")
 UNQUANTIZED = (
-    "export the checkpoint that was quantized (its scores differ), or load this one with the code that trained it, call "
-    "dequantize() of its model and save that"
+    "export the checkpoint that was quantized (its scores differ), or load this one with the code that trained it, "
+    "call dequantize() of its model and save that"
 )
 DEQUANTIZED = (
     "where bitsandbytes is installed, write its weights in full precision into a new folder: python -c "

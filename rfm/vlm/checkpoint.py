@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -21,76 +20,36 @@ from torch import Tensor
 
 from rfm.checkpoint.content import (
     CheckpointError,
-    cut,
     expecting,
     is_there,
-    listed,
     read_json,
-    read_tensors,
     shown,
 )
 from rfm.checkpoint.files import (
+    ADAPTER_CONFIG,
     NETWORK_CONFIG,
     WEIGHTS,
-    WEIGHTS_INDEX,
     check_shapes,
     read_weights,
 )
-from rfm.checkpoint.pickles import refuse_pickles
 from rfm.checkpoint.training import check_progress
 from rfm.family import NETWORK, Description, Options
 from rfm.feature_cache import FeatureCache
 from rfm.version_folder import PROCESSOR_FOLDER
-from rfm.vlm.backbone import (
-    BACKBONES,
-    DEQUANTIZED,
-    SMOL,
-    UNQUANTIZED,
-    backbone_config,
-    check_not_quantized,
-    is_at_least,
-)
+from rfm.vlm.adapter import adapted, base_of_adapter, has_adapter
+from rfm.vlm.backbone import BACKBONES, SMOL, UNQUANTIZED, backbone_config, check_not_quantized, is_at_least
 from rfm.vlm.collator import VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP
-from rfm.vlm.lora import LORA_NAME, Scaling, changed_by, check_adapter, merged, split
+from rfm.vlm.lora import LORA_NAME, Scaling, changed_by, merged, split
+from rfm.vlm.names import LORA_INSIDE, QUANTIZED, QWEN_NAMES, SMOL_NAMES, UNUSED, Renames, renamed
 from rfm.vlm.network import VlmConfig, VlmRewardModel, build_backbone
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.processor import frame_size, load_collator, save_processor
 from rfm.vlm.prompts import OF_AN_OLD_RUN
 from rfm.vlm.run_config import RunConfig
 
-ADAPTER_CONFIG = "adapter_config.json"
-ADAPTER_WEIGHTS = "adapter_model.safetensors"
-CUSTOM_HEADS = "custom_heads.safetensors"
-ADAPTER_TARGET = "peft_target_module.json"  # upstream writes it where it saves an adapter beside the whole model
 LORA = "lora"  # in VlmCheckpoint.parts: the factors that change the network's weights
 SETTINGS = "rfm"  # key of our own fields in an exported config.json
-EMBEDDING = "model.language_model.embed_tokens.weight"
-
-# Renames of one form, tried in order on each name; the first that matches is applied.
-_Renames = Sequence[tuple[str, str]]
-_SMOL: _Renames = ((r"^model\.model\.", "model."),)
-_LORA_INSIDE: _Renames = ((r"^(model(\.\w+)?)\.base_model\.model\.", r"\1."),)
-_ADAPTER: _Renames = ((r"^base_model\.model\.", "model."),)
-# Of a Qwen backbone as transformers had its weights before 4.52, and as it writes them since in some cases.
-_OLD_QWEN: _Renames = (
-    (r"^visual\.", "model.visual."),
-    (r"^model\.(embed_tokens|layers|norm)\.", r"model.language_model.\1."),
-)
-# What makes text, which no reward head reads; the rotary frequencies, which transformers once saved, and computes.
-_UNUSED = re.compile(r"(model\.)?lm_head\.weight|.*\.(rotary_emb|rotary_pos_emb)\.(original_)?inv_freq")
-# What bitsandbytes, GPTQ, AWQ and FP8 write beside or in place of a weight.
-_QUANTIZED = re.compile(
-    r"\.(absmax|quant_map|nested_absmax|SCB|qweight|qzeros|weight_packed|weight_scale|weight_scale_inv)$|\.quant_state\."
-)
-
-_NO_EMBEDDING = (
-    "expected the embedding of the special tokens, got none: their rows are drawn at random when a run begins, and are "
-    "lost with the run; save the whole model where it was trained (save_model() of the trainer), or the adapter with "
-    "save_pretrained(..., save_embedding_layers=True)"
-)
-_VARIANT = re.compile(r"-unsloth$")  # of one model, which Unsloth puts in the place of a base model
-_FEW_BITS = re.compile(r"-bnb-\dbit/?$")  # how Unsloth names a base model of fewer bits, which it trains on
 
 _LAYER_COUNTS = ("num_hidden_layers", "num_layers", "depth")
 MAX_LAYERS = 1024
@@ -200,20 +159,20 @@ def reads(folder: Path) -> bool:
 def load(folder: Path, options: Options) -> VlmCheckpoint:
     """The checkpoint in a local folder. Raises CheckpointError."""
     with expecting("a vision-language checkpoint", folder):
-        is_adapter = _has_adapter(folder)
+        is_adapter = has_adapter(folder)
         file = folder / NETWORK_CONFIG
         backbone = {} if is_adapter else backbone_config(read_json(file), file)
         check_not_quantized(backbone, file, UNQUANTIZED)
         if SETTINGS in backbone:  # written by VlmCheckpoint.save, with every setting
             config = _saved_config(backbone)
-            weights, factors = _used(_renamed(read_weights(folder), _renames(config.family)))
+            weights, factors = _used(renamed(read_weights(folder), _renames(config.family)))
         else:
             run = RunConfig.of(folder)
             run.check_model_type()
             check_progress(run.sections, run.file)
             scaling: Scaling | None
             if is_adapter:
-                backbone, tensors, scaling = _adapted(folder, options.base_model or _base_of_adapter(folder, run))
+                backbone, tensors, scaling = adapted(folder, options.base_model or base_of_adapter(folder, run))
             else:
                 tensors, scaling = _whole(folder, backbone, run)
             weights, factors = _used(tensors, scaling)
@@ -222,44 +181,6 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
     checkpoint = VlmCheckpoint(config, weights, factors, options.base_model or (own if own.is_dir() else None))
     checkpoint.check()
     return checkpoint
-
-
-def _has_adapter(folder: Path) -> bool:
-    """Whether the folder's weights are an adapter alone. Of one beside the whole model that upstream saved with it, the
-    whole model is read. Raises CheckpointError for one beside weights of which nothing is known.
-    """
-    adapter = [name for name in (ADAPTER_CONFIG, ADAPTER_WEIGHTS, CUSTOM_HEADS) if is_there(folder / name)]
-    whole = [name for name in (WEIGHTS, WEIGHTS_INDEX) if is_there(folder / name)]
-    if adapter and whole:
-        if is_there(folder / ADAPTER_TARGET):
-            return False
-        raise CheckpointError(
-            f"{folder}: expected an adapter ({adapter[0]}) or whole weights ({whole[0]}), got both; move away the one "
-            "that is not meant"
-        )
-    return bool(adapter)
-
-
-def _base_of_adapter(folder: Path, run: RunConfig) -> str:
-    """The base model that the run names. Raises CheckpointError if the adapter names another."""
-    base = run.get("model.base_model_id", "")
-    if not base:
-        raise CheckpointError(f"{run.file}: expected model.base_model_id (or --base-model), got none")
-    named = read_json(folder / ADAPTER_CONFIG).get("base_model_name_or_path")
-    if isinstance(named, str) and _FEW_BITS.search(named):
-        expected = f"base_model_name_or_path: expected weights in full precision, got {shown(named)}"
-        raise CheckpointError(f"{folder / ADAPTER_CONFIG}: {expected}; {DEQUANTIZED.format(base=named)}")
-    if named and _model_name(str(named)) != _model_name(base):
-        raise CheckpointError(
-            f"{folder / ADAPTER_CONFIG}: base_model_name_or_path: expected {cut(base)}, the model.base_model_id of "
-            f"{run.file}, got {shown(named)}; name the one that the adapter was trained on with --base-model"
-        )
-    return base
-
-
-def _model_name(base: str) -> str:
-    """What is left of a base model's id or path where the same model may have several."""
-    return _VARIANT.sub("", base.rstrip("/").rpartition("/")[2].lower())
 
 
 def _saved_config(content: Mapping[str, Any]) -> VlmConfig:
@@ -305,38 +226,27 @@ def _check_transformers(config: VlmConfig) -> None:
         raise CheckpointError(f"transformers: expected {expected}, got {version}")
 
 
-def _renames(family: Any) -> _Renames:
-    return _SMOL if family == SMOL else _OLD_QWEN
-
-
-def _renamed(weights: Mapping[str, Tensor], renames: _Renames) -> dict[str, Tensor]:
-    def rename(name: str) -> str:
-        for pattern, replacement in renames:
-            changed, count = re.subn(pattern, replacement, name)
-            if count:
-                return changed
-        return name
-
-    return {rename(name): tensor for name, tensor in weights.items()}
+def _renames(family: Any) -> Renames:
+    return SMOL_NAMES if family == SMOL else QWEN_NAMES
 
 
 def _whole(folder: Path, backbone: Mapping[str, Any], run: RunConfig) -> tuple[dict[str, Tensor], Scaling | None]:
     """The weights of the network by name, with LoRA factors if it has some; what these are scaled with."""
     tensors, scaling = read_weights(folder), None
-    quantized = next((name for name in tensors if _QUANTIZED.search(name)), None)
+    quantized = next((name for name in tensors if QUANTIZED.search(name)), None)
     if quantized is not None:
         raise CheckpointError(f"{folder}: expected weights in full precision, got {shown(quantized)}; {UNQUANTIZED}")
     if any(LORA_NAME.fullmatch(name) for name in tensors):
-        tensors, scaling = _renamed(tensors, _LORA_INSIDE), Scaling.of(run.file, run.sections["peft"])
+        tensors, scaling = renamed(tensors, LORA_INSIDE), Scaling.of(run.file, run.sections["peft"])
         if is_there(folder / ADAPTER_CONFIG):
             scaling.check_equal(Scaling.of(folder / ADAPTER_CONFIG, read_json(folder / ADAPTER_CONFIG)))
-    return _renamed(tensors, _renames(backbone["model_type"])), scaling
+    return renamed(tensors, _renames(backbone["model_type"])), scaling
 
 
 def _used(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """The weights that a reward is made with, and their LoRA factors; ``scaling``: of these."""
     weights, factors = split(tensors, scaling)
-    weights = {name: tensor for name, tensor in weights.items() if not _UNUSED.fullmatch(name)}
+    weights = {name: tensor for name, tensor in weights.items() if not UNUSED.fullmatch(name)}
     return weights, {name: tensor for name, tensor in factors.items() if changed_by(name) in weights}
 
 
@@ -349,54 +259,3 @@ def _check_layers(config: Any) -> None:
         count = config.get(name)
         if isinstance(count, (int, float)) and count > MAX_LAYERS:
             raise CheckpointError(f"{NETWORK_CONFIG}: {name}: expected at most {MAX_LAYERS}, got {shown(count)}")
-
-
-def _adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Tensor], Scaling]:
-    """Configuration of the base model's backbone; its weights with those of the adapter; what its factors are scaled
-    with.
-    """
-    file = folder / ADAPTER_CONFIG
-    adapter_config = read_json(file)
-    scaling = Scaling.of(file, adapter_config)
-    check_adapter(file, adapter_config)
-    if not is_there(folder / ADAPTER_WEIGHTS):
-        refuse_pickles(folder, ADAPTER_WEIGHTS, Path(ADAPTER_WEIGHTS).stem)
-    adapter = _renamed(_renamed(read_tensors(folder / ADAPTER_WEIGHTS), _ADAPTER), _OLD_QWEN)
-    if EMBEDDING not in adapter:
-        raise CheckpointError(f"{folder / ADAPTER_WEIGHTS}: {_NO_EMBEDDING}")
-    config, base = _read_base(base_model)
-    factors = {name: tensor for name, tensor in adapter.items() if LORA_NAME.fullmatch(name)}
-    replaced = {name: tensor for name, tensor in adapter.items() if name not in factors}
-    unknown = sorted(replaced.keys() - base.keys())
-    if unknown:
-        raise CheckpointError(
-            f"{folder / ADAPTER_WEIGHTS}: expected weights of {base_model}, got also {listed(unknown)}"
-        )
-    config["text_config"]["vocab_size"] = len(replaced[EMBEDDING])
-    return config, base | replaced | factors | read_tensors(folder / CUSTOM_HEADS), scaling
-
-
-def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """The backbone of a base model: its configuration and its weights, named as in VlmRewardModel."""
-    import transformers
-
-    try:
-        content = transformers.PretrainedConfig.get_config_dict(base_model)[0]
-        file = f"base model {base_model}: {NETWORK_CONFIG}"
-        backbone = backbone_config(content, file)
-        check_not_quantized(backbone, file, DEQUANTIZED.format(base=base_model))
-        network_class = getattr(transformers, BACKBONES[backbone["model_type"]])
-        network, loaded = network_class.from_pretrained(
-            base_model,
-            config=network_class.config_class.from_dict(backbone),
-            use_safetensors=True,
-            dtype="auto",
-            output_loading_info=True,
-        )
-    except (OSError, RecursionError, ValueError) as error:
-        hint = "name its folder with --base-model"
-        raise CheckpointError(f"base model {base_model}: cannot be had: {cut(str(error))} ({hint})") from error
-    if loaded["missing_keys"]:
-        raise CheckpointError(f"base model {base_model}: missing keys: {sorted(loaded['missing_keys'])}")
-    config = backbone_config(network.config.to_dict(), base_model)
-    return config, {f"model.{name}": tensor for name, tensor in network.state_dict().items()}

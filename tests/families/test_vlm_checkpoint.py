@@ -332,6 +332,11 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
         )
         for part in (".weight.absmax", ".weight.quant_state.bitsandbytes__nf4", ".SCB", ".qweight", ".weight_scale_inv")
     },
+    "a weight under two names": (
+        "q25_mean_l2",
+        change_tensors("model.safetensors", lambda w: w.update({"model.norm.weight": torch.ones(32)})),
+        r"model\.language_model\.norm\.weight: expected one weight, got .*'model\.norm\.weight'.*; remove the one",
+    ),
     "LoRA without alpha": (LORA_INSIDE, change_yaml("lora_alpha: 8", "lora_beta: 8"), r"expected lora_alpha and r of the LoRA weights"),
     "half a LoRA pair": (LORA_INSIDE, change_tensors("model.safetensors", drop_first("lora_B")), r"expected a weight and LoRA factors A and B, got \['A'\]"),
     "LoRA factors of two ranks": (
