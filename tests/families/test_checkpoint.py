@@ -27,7 +27,7 @@ from paths import ROOT
 from rfm import families
 from rfm.checkpoint.content import CheckpointError
 from rfm.checkpoint.files import find_run_config
-from rfm.checkpoint.hub import best_tag
+from rfm.checkpoint.hub import best_tag, commit_of
 from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.rewind.network import RewindConfig
@@ -640,7 +640,7 @@ def test_an_existing_path_wins_over_an_id(
     assert hub == []
 
 
-@pytest.mark.parametrize("source", ["nowhere", "/no/such/folder", "a/b/c", ""])
+@pytest.mark.parametrize("source", ["nowhere", "/no/such/folder", "a/b/../c", "a/b@", ""])
 def test_what_is_neither_folder_nor_id_is_refused(source: str) -> None:
     with pytest.raises(CheckpointError, match="expected a folder that exists or a Hugging Face id"):
         families.load(source)
@@ -653,7 +653,7 @@ def test_a_hub_that_cannot_be_reached_is_told(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(huggingface_hub, "snapshot_download", refuse)
     with pytest.raises(
         CheckpointError,
-        match="org/name@v2: cannot be fetched: no network; there is no folder of this name either; name one",
+        match=r"org/name@v2: cannot be fetched: no network; there is no folder /.*/org/name@v2 either; name one",
     ):
         families.load("org/name@v2")
 
@@ -669,31 +669,51 @@ for source in sys.argv[1:]:
         print(error)
 """
 UNTAGGED, TAGGED, WITHOUT = "org/name", f"org/other@{TAG}", "org/without"  # repositories of their own
+IN_SUBFOLDER, PICKLED, PICKLED_WITHIN = "org/runs/one/ckpt=5@v1", "org/pickled", "org/runs/pickled@v1"
+NOT_THERE, ABSENT = "org/runs/none@v1", "org/absent/folder@v1"
+FROM_HUB = (UNTAGGED, TAGGED, WITHOUT, IN_SUBFOLDER, PICKLED, PICKLED_WITHIN, NOT_THERE)
+OFFLINE = (f"{UNTAGGED}@{TAG}", TAGGED, IN_SUBFOLDER, UNTAGGED, ABSENT, f"{WITHOUT}@{TAG}")
 
 
 @pytest.fixture(scope="module")
 def from_hub(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """What a process of its own says of checkpoints, since huggingface_hub reads its environment once.
+    """What a process of its own says of checkpoints, since huggingface_hub reads its environment once; a second one does
+    so offline, with the same cache.
 
     They are multi-image ones as upstream uploads them: the tag's commit lacks config.yaml, which main has.
     """
     folder = tmp_path_factory.mktemp("hub")
-    tag, main, without = folder / "tag", folder / "main", folder / "without"
+    tag, main, without, pickled, runs = (folder / name for name in ("tag", "main", "without", "pickled", "runs"))
     shutil.copytree(goldens.config(WITH_IMAGES).checkpoint, tag, copy_function=shutil.copyfile)
-    main.mkdir()
-    without.mkdir()
+    for empty in (main, without, pickled):
+        empty.mkdir()
+    shutil.copytree(tag, runs / "one" / "ckpt=5")
+    (runs / "one" / "ckpt=5" / "config.yaml").rename(runs / "one" / "config.yaml")
     (tag / "config.yaml").rename(main / "config.yaml")
     shutil.copy(main / "config.yaml", without / "README.md")
+    torch.save({}, pickled / "pytorch_model.bin")
+    torch.save({}, pickled / "optimizer.pt")
+    shutil.copytree(pickled, runs / "pickled")
     mains = {UNTAGGED: main, TAGGED: main, WITHOUT: without}
     repositories = {source.partition("@")[0]: {"main": files, TAG: tag} for source, files in mains.items()}
+    repositories |= {PICKLED: {"main": pickled}, "org/runs": {"main": main, "v1": runs}}
+    environment = {**os.environ, "HF_HOME": str(folder / "cache")}
+
+    def say(sources: tuple[str, ...], offline: str) -> list[str]:
+        command = [sys.executable, "-c", LOADS, *sources]
+        settings = {**environment, "HF_ENDPOINT": endpoint, "HF_HUB_OFFLINE": offline}
+        loaded = subprocess.run(command, env=settings, check=True, capture_output=True, text=True, cwd=folder)
+        return loaded.stdout.splitlines()
+
     with local_hub.hub(repositories) as endpoint:
-        environment = {**os.environ, "HF_ENDPOINT": endpoint, "HF_HOME": str(folder / "cache"), "HF_HUB_OFFLINE": "0"}
-        command = [sys.executable, "-c", LOADS, *mains]
-        loaded = subprocess.run(command, env=environment, check=True, capture_output=True, text=True, cwd=folder)
-    return dict(zip(mains, loaded.stdout.splitlines(), strict=True))
+        told = dict(zip(FROM_HUB, say(FROM_HUB, "0"), strict=True))
+    return told | {f"offline {source}": line for source, line in zip(OFFLINE, say(OFFLINE, "1"), strict=True)}
 
 
-@pytest.mark.parametrize("source", [UNTAGGED, TAGGED])
+IN_CACHE = [f"offline {source}" for source in (f"{UNTAGGED}@{TAG}", TAGGED, IN_SUBFOLDER)]
+
+
+@pytest.mark.parametrize("source", [UNTAGGED, TAGGED, IN_SUBFOLDER, *IN_CACHE])
 def test_config_yaml_is_found_on_main_of_the_hub_s_repository(from_hub: dict[str, str], source: str) -> None:
     expected = asdict(families.load(goldens.config(WITH_IMAGES).checkpoint).config)
     assert expected["multi_image"] and expected["per_frame_progress_token"]
@@ -709,6 +729,76 @@ def test_main_of_the_hub_s_cache_is_a_commit(tmp_path: Path, main: str, is_found
     (tmp_path / "refs" / "main").write_text(main)
     found = find_run_config(snapshots / "of-the-tag")
     assert found == ((snapshots / ("a" * 40) / "config.yaml").resolve() if is_found else None)
+
+
+REFUSED_HUB = {
+    "pickles alone": (
+        PICKLED,
+        r"org/pickled@main: expected model\.safetensors, got pytorch_model\.bin: pickles may run code .* hf download "
+        r"org/pickled --local-dir FOLDER, then name FOLDER as the checkpoint",
+    ),
+    "pickles alone in a subfolder": (
+        PICKLED_WITHIN,
+        r"org/runs@v1: expected .* hf download org/runs --revision v1 --local-dir FOLDER, then name FOLDER/pickled as",
+    ),
+    "no such subfolder": (NOT_THERE, r"org/runs@v1: expected the folder none, got none of this name"),
+    "offline, and no revision": (
+        f"offline {UNTAGGED}",
+        rf"org/name@latest: cannot be fetched: .*; without it, name a revision that is in the cache: org/name@{TAG}, org/name@main",
+    ),
+    "offline, and not in the cache": (
+        f"offline {ABSENT}",
+        r"org/absent@v1: cannot be fetched: .*; there is no folder /.*/org/absent/folder@v1 either; name one",
+    ),
+    "offline, and known to have no config.yaml": (
+        f"offline {WITHOUT}@{TAG}",
+        r"expected config\.yaml of the training run there",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("source", "message"), REFUSED_HUB.values(), ids=REFUSED_HUB)
+def test_what_a_hub_s_repository_lacks_is_told(from_hub: dict[str, str], source: str, message: str) -> None:
+    assert re.search(message, from_hub[source]), from_hub[source]
+
+
+def test_the_commit_of_a_subfolder_is_the_origin_s_revision(tmp_path: Path) -> None:
+    assert commit_of(tmp_path / "snapshots" / "abc" / "one" / "ckpt") == "abc"
+    assert commit_of(tmp_path / "snapshots" / "abc") == "abc"
+
+
+def test_a_misspelt_folder_is_told_beside_the_hub_s_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise ConnectionRefusedError("no network")
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", refuse)
+    (tmp_path / "runs" / "checkpoint").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    expected = (
+        f"no network; there is no folder {tmp_path}/runs/chekpoint@v2 either (but runs/checkpoint); name one, or see"
+    )
+    with pytest.raises(CheckpointError, match=re.escape(expected)):
+        families.load("runs/chekpoint@v2")
+    with pytest.raises(
+        CheckpointError, match=re.escape(f"got '{tmp_path}/runs/chekpoint' (but {tmp_path}/runs/checkpoint)")
+    ):
+        families.load(tmp_path / "runs" / "chekpoint")
+
+
+def test_a_run_folder_is_refused_with_its_checkpoints(folder: Path) -> None:
+    run = folder.parent / "run"
+    for name in ("ckpt-1", "ckpt-2"):
+        shutil.copytree(folder, run / name)
+    split_into_shards(run / "ckpt-2")
+    with pytest.raises(CheckpointError, match=re.escape(f"name the checkpoint in it: {run}/ckpt-1, {run}/ckpt-2")):
+        families.load(run)
+
+
+def test_a_model_repository_is_refused_with_its_checkpoints() -> None:
+    expected = f"name the checkpoint in it: {ROOT}/model_repository/rfm/1/checkpoint"
+    with pytest.raises(CheckpointError) as refusal:
+        families.load(ROOT / "model_repository")
+    assert str(refusal.value).endswith(expected)
 
 
 def test_a_hub_s_checkpoint_without_any_config_yaml_is_refused(from_hub: dict[str, str]) -> None:

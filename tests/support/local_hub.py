@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from urllib.parse import unquote
 
 
 def commit_of(revision: str) -> str:
@@ -54,9 +55,10 @@ def hub(repositories: Mapping[str, Mapping[str, Path]], kind: str = "models") ->
                 self._send(200, json.dumps(told).encode(), with_body)
             else:
                 revision, _, name = self.path.removeprefix(files).partition("/")
-                file = folders[revision] / name
+                file = folders[revision] / unquote(name)
                 if not file.is_file():
-                    self._send(404, b"", with_body, {"X-Error-Code": "EntryNotFound"})
+                    of_commit = {"X-Repo-Commit": _commit(revisions, revision)}
+                    self._send(404, b"", with_body, {"X-Error-Code": "EntryNotFound", **of_commit})
                     return
                 content = file.read_bytes()
                 etag = f'"{hashlib.sha1(content).hexdigest()}"'
