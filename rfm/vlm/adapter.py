@@ -117,4 +117,5 @@ def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if loaded["missing_keys"]:
         raise CheckpointError(f"base model {base_model}: missing keys: {sorted(loaded['missing_keys'])}")
     config = backbone_config(network.config.to_dict(), base_model)
+    config.pop("transformers_version", None)  # the one installed here, which says nothing of the training
     return config, {f"model.{name}": tensor for name, tensor in network.state_dict().items()}

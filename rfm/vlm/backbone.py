@@ -14,11 +14,11 @@ from typing import Any
 
 from rfm.checkpoint.content import CheckpointError, shown
 
-SMOL = "smolvlm"
-BACKBONES = {"qwen2_5_vl": "Qwen2_5_VLModel", "qwen3_vl": "Qwen3VLModel", SMOL: "SmolVLMModel"}
+SMOL, QWEN_2_5 = "smolvlm", "qwen2_5_vl"
+BACKBONES = {QWEN_2_5: "Qwen2_5_VLModel", "qwen3_vl": "Qwen3VLModel", SMOL: "SmolVLMModel"}
 VISION_THETA = 10_000.0  # which transformers 4.57 has in its code, for each backbone
 
-_FLAT = "qwen2_5_vl"  # had its text model's fields beside the others
+# Of a Qwen2.5-VL whose text model's fields stand beside the others.
 _NOT_OF_TEXT = (
     "architectures", "dtype", "image_token_id", "model_type", "tie_word_embeddings", "torch_dtype",
     "transformers_version", "video_token_id", "vision_config", "vision_end_token_id", "vision_start_token_id",
@@ -51,7 +51,7 @@ def backbone_config(content: Mapping[str, Any], where: object) -> dict[str, Any]
     family = content.get("model_type")
     if family not in BACKBONES:
         raise CheckpointError(f"{where}: model_type: expected one of {', '.join(BACKBONES)}, got {shown(family)}")
-    config = _nested(content) if family == _FLAT and "text_config" not in content else {**content}
+    config = _nested(content) if family == QWEN_2_5 and "text_config" not in content else {**content}
     for part in ("text_config", "vision_config"):
         if not isinstance(config.get(part), dict):
             raise CheckpointError(f"{where}: {part}: expected settings of the backbone, got {shown(config.get(part))}")
@@ -73,7 +73,7 @@ def _nested(content: Mapping[str, Any]) -> dict[str, Any]:
     """The fields of the text model in a ``text_config``, where transformers has them since 4.52."""
     rest = {name: value for name, value in content.items() if name in _NOT_OF_TEXT}
     text = {name: value for name, value in content.items() if name not in _NOT_OF_TEXT}
-    return rest | {"text_config": text | {"model_type": f"{_FLAT}_text"}}
+    return rest | {"text_config": text | {"model_type": f"{QWEN_2_5}_text"}}
 
 
 def _text(config: dict[str, Any], family: str, where: str) -> dict[str, Any]:

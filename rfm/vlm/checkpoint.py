@@ -37,7 +37,7 @@ from rfm.family import NETWORK, Description, Options
 from rfm.feature_cache import FeatureCache
 from rfm.version_folder import PROCESSOR_FOLDER
 from rfm.vlm.adapter import adapted, base_of_adapter, has_adapter
-from rfm.vlm.backbone import BACKBONES, SMOL, UNQUANTIZED, backbone_config, check_not_quantized, is_at_least
+from rfm.vlm.backbone import BACKBONES, QWEN_2_5, SMOL, UNQUANTIZED, backbone_config, check_not_quantized, is_at_least
 from rfm.vlm.collator import VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm.vlm.lora import LORA_NAME, Scaling, changed_by, merged, split
@@ -91,8 +91,16 @@ class VlmCheckpoint:
 
     @property
     def notes(self) -> Sequence[str]:
-        """Nothing that could not be checked decides its scores."""
-        return ()
+        """That positions may be others than in training, of a Qwen2.5-VL that reads videos."""
+        version = str(self.config.backbone.get("transformers_version"))
+        major = version.partition(".")[0]
+        if self.config.family != QWEN_2_5 or self.config.multi_image or not major.isdigit() or int(major) < 5:
+            return ()
+        return (
+            f"{NETWORK_CONFIG}: transformers_version is {version}: "
+            "text behind a video stands where transformers 4 puts "
+            "it; if the run was trained with transformers 5, which puts it elsewhere, scores differ from the run's",
+        )
 
     @cached_property
     def collator(self) -> VlmCollator:

@@ -242,12 +242,10 @@ FORMS: dict[str, tuple[str, Callable[[Path], None]]] = {
 def test_a_checkpoint_in_another_form_scores_the_same(
     copied: Callable[[str], Path], name: str, change: Callable[[Path], None]
 ) -> None:
-    folder = copied(name)
+    known, folder = load_engine(name), copied(name)
     change(folder)
     engine = Engine.from_checkpoint(folder, base_model=str(goldens.config(name).base_model))
-    (result,), (expected,) = (
-        each.evaluate([ProgressSample(film(0, 3, 60, 84))]) for each in (engine, load_engine(name))
-    )
+    (result,), (expected,) = (each.evaluate([ProgressSample(film(0, 3, 60, 84))]) for each in (engine, known))
     assert_close(result, expected, 1e-6)  # sums differ with where weights lie in memory
 
 
@@ -424,6 +422,24 @@ def test_smolvlm_is_refused_where_its_scores_would_differ(monkeypatch: pytest.Mo
         checkpoint.build()
 
 
+@pytest.mark.parametrize(
+    ("name", "version", "is_told"),
+    [
+        ("q25_video_last_l2", "5.5.4", True),
+        ("q25_video_last_l2", "4.57.6", False),
+        ("q25_mean_l2", "5.5.4", False),
+        (PLAIN, "5.5.4", False),
+    ],
+)
+def test_a_video_run_of_transformers_5_is_told_about_its_positions(
+    copied: Callable[[str], Path], name: str, version: str, is_told: bool
+) -> None:
+    folder = copied(name)
+    change_backbone(lambda backbone: backbone.update(transformers_version=version))(folder)
+    notes = families.notes(folder, load(name, folder))
+    assert any(f"transformers_version is {version}: text behind a video" in note for note in notes) == is_told
+
+
 def test_a_processor_of_another_model_is_refused() -> None:
     other = str(goldens.config(ADAPTER).base_model)
     with pytest.raises(CheckpointError, match=r"expected a tokenizer of 451 tokens .*, got 447"):
@@ -471,7 +487,7 @@ def as_transformers_5_saves(base: Path) -> None:
 
 @pytest.mark.parametrize("name", ["q25_mean_l2", PLAIN, "smol_mean_disc10"])
 def test_a_processor_of_transformers_5_reads_the_same(tmp_path: Path, name: str) -> None:
-    config = goldens.config(name)
+    known, config = load_engine(name), goldens.config(name)
     base = tmp_path / "base"
     shutil.copytree(str(config.base_model), base, copy_function=shutil.copyfile)
     as_transformers_5_saves(base)
@@ -479,7 +495,7 @@ def test_a_processor_of_transformers_5_reads_the_same(tmp_path: Path, name: str)
     load(name, base=str(base)).save(tmp_path / "saved")
     saved = Engine.from_checkpoint(tmp_path / "saved")
     sample = ProgressSample(film(0, 3, 60, 84))
-    (expected,) = load_engine(name).evaluate([sample])
+    (expected,) = known.evaluate([sample])
     for other in (engine, saved):
         (result,) = other.evaluate([sample])
         assert_close(result, expected, 1e-6)
