@@ -61,9 +61,6 @@ class ExportConfig(Settings):
     base_model: str | None = setting(
         None, "Folder or id of a vision-language checkpoint's base model; else the one that it names."
     )
-    resize_images: bool | None = setting(
-        None, "Whether a multi-image checkpoint was trained at its run's data.resized_height and _width."
-    )
     max_queue_size: int | None = setting(
         DEFAULT_QUEUE_SIZE, "Requests that may wait for a model; more are rejected at once. null: any number.", **_COUNT
     )

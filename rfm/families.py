@@ -68,7 +68,6 @@ def load(
     *,
     family: str | None = None,
     base_model: str | None = None,
-    resize_images: bool | None = None,
     image_encoder: str | None = None,
     text_encoder: str | None = None,
 ) -> Checkpoint:
@@ -78,7 +77,7 @@ def load(
     others: as in ``rfm.family.Options``
     """
     folder = find(source)
-    options = Options(base_model, resize_images, image_encoder, text_encoder)
+    options = Options(base_model, image_encoder, text_encoder)
     return load_from(folder, choose(folder, family), options)
 
 

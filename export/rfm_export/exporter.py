@@ -88,7 +88,7 @@ def _load(
     """What is at ``source``, checked. Says which file holds the training run's settings, and what may be wrong."""
     folder = families.find(source)
     kind = families.choose(folder, family)
-    options = Options(settings.base_model, settings.resize_images, settings.image_encoder, settings.text_encoder)
+    options = Options(settings.base_model, settings.image_encoder, settings.text_encoder)
     checkpoint = families.load_from(folder, kind, options)
     check_links(folder)
     if say is not None:

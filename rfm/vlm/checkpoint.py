@@ -184,7 +184,7 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
             else:
                 tensors, scaling = _whole(folder, backbone, run)
             weights, factors = _used(tensors, scaling)
-            config = _trained_config(folder, backbone, run, weights, options.resize_images)
+            config = _trained_config(folder, backbone, run, weights)
     own = folder / PROCESSOR_FOLDER
     checkpoint = VlmCheckpoint(config, weights, factors, options.base_model or (own if own.is_dir() else None))
     checkpoint.check()
@@ -203,7 +203,6 @@ def _trained_config(
     backbone: dict[str, Any],
     run: RunConfig,
     weights: Mapping[str, Tensor],
-    resize_images: bool | None,
 ) -> VlmConfig:
     family = str(backbone["model_type"])
     if "progress_head.4.weight" not in weights:
@@ -215,7 +214,7 @@ def _trained_config(
         backbone=backbone,
         progress_bins=weights["progress_head.4.weight"].shape[0],
         has_similarity="similarity_head.0.weight" in weights,
-        size_px=run.size_px(family, network["multi_image"], resize_images),
+        size_px=run.size_px(family, network["multi_image"]),
         **network,
     )
     if (family == SMOL or config.per_frame_progress_token) and not config.multi_image:

@@ -12,12 +12,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 import yaml
 from google.protobuf import text_format
-from PIL import Image
 from safetensors.torch import load_file, save_file
 from tritonclient.grpc import model_config_pb2 as pb
 
@@ -30,11 +28,9 @@ from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.vlm import lora
 from rfm.vlm.checkpoint import VlmCheckpoint
-from rfm.vlm.images import fitted_size
 from rfm_client import (
     InvalidSampleError,
     ProgressSample,
-    Trajectory,
 )
 from rfm_client.contract.model_info import FRAME_SIZE_PARAMETER
 from vlm import BFLOAT16, PLAIN, assert_close, film, load
@@ -279,7 +275,7 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
         change_yaml("  resized_height: 56\n", ""),
         r"data\.resized_height: expected a number or null, got no such key",
     ),
-    "a size that is none": (PLAIN, change_yaml("resized_width: null", "resized_width: wide"), r"data\.resized_width: expected a whole number"),
+    "a size that is none": ("q25_video_last_l2", change_yaml("resized_width: 84", "resized_width: wide"), r"data\.resized_width: expected a whole number"),
     "a run of nothing": (PLAIN, lambda folder: (folder / "config.yaml").write_text("{}") and None, r"config\.yaml: model: expected the settings"),
     "text for a truth": (PLAIN, change_yaml("average_temporal_patches: false", "average_temporal_patches: 'false'"), r"average_temporal_patches: expected bool, got 'false'"),
     "a temperature of zero": (PLAIN, change_yaml("attn_temperature: 1.0", "attn_temperature: 0.0"), r"temperature: expected a number above 0, got 0.0"),
@@ -581,56 +577,25 @@ def test_sections_that_disagree_are_refused(copied: Callable[[str], Path], key: 
         load(PLAIN, folder)
 
 
-SIZED = {"resized_height": 112, "resized_width": 84}
-
-
-@pytest.fixture
-def sized(copied: Callable[[str], Path]) -> Path:
-    """A multi-image checkpoint whose run set a size for frames."""
+def test_a_size_for_images_is_ignored_as_upstream_does(copied: Callable[[str], Path], tmp_path: Path) -> None:
     folder = copied(PLAIN)
-    rewritten(folder, lambda run: run["data"].update(SIZED))
-    return folder
-
-
-def test_a_size_for_images_is_asked_about(sized: Path) -> None:
-    with pytest.raises(CheckpointError, match=r"got 112 and 84: .* --resize-images .* --no-resize-images"):
-        load(PLAIN, sized)
-
-
-@pytest.mark.parametrize(("resize_images", "side_px"), [(True, (112, 84)), (False, None)])
-def test_a_size_for_images_is_kept_or_ignored_as_told(
-    sized: Path, tmp_path: Path, resize_images: bool, side_px: tuple[int, int] | None
-) -> None:
+    rewritten(folder, lambda run: run["data"].update(resized_height=112, resized_width=84))
     base = str(goldens.config(PLAIN).base_model)
     sample = ProgressSample(film(0, 2, 48, 80))
-    resized = ProgressSample(film(0, 2, 48, 80))
-    engine = Engine.from_checkpoint(sized, base_model=base, resize_images=resize_images)
-    (result,) = engine.evaluate([sample])
-    plain = load_engine(PLAIN)
-    if side_px is not None:  # what the checkpoint without a size says of frames that were brought to it before
-        frames = sample.trajectory.frames
-        assert frames is not None
-        fitted = fitted_size(*side_px, 32)
-        small = np.stack(
-            [np.asarray(Image.fromarray(f).resize(fitted[::-1], Image.Resampling.BICUBIC)) for f in frames]
-        )
-        resized = ProgressSample(Trajectory(frames=small, task=sample.trajectory.task))
-    (expected,) = plain.evaluate([resized])
+    (result,) = Engine.from_checkpoint(folder, base_model=base).evaluate([sample])
+    (expected,) = load_engine(PLAIN).evaluate([sample])
     assert_close(result, expected, 1e-6)
 
-    serve = ExportConfig(num_gpus=0, torch_threads=1, base_model=base, resize_images=resize_images)
-    rfm_export.export(sized, tmp_path / "repository", serve)
+    rfm_export.export(folder, tmp_path / "repository", ExportConfig(num_gpus=0, torch_threads=1, base_model=base))
     text = (tmp_path / "repository" / "rfm_frames" / "config.pbtxt").read_text()
-    told = text_format.Parse(text, pb.ModelConfig()).parameters[FRAME_SIZE_PARAMETER].string_value
-    assert told == ("" if side_px is None else "exact 128x96")
+    assert text_format.Parse(text, pb.ModelConfig()).parameters[FRAME_SIZE_PARAMETER].string_value == ""
     exported = families.load(tmp_path / "repository" / "rfm_frames" / "1" / "checkpoint")
     assert isinstance(exported, VlmCheckpoint)
-    assert exported.config.size_px == side_px
+    assert exported.config.size_px is None
 
 
-@pytest.mark.parametrize("resize_images", [True, False, None])
-def test_a_size_for_videos_always_holds(resize_images: bool | None) -> None:
-    checkpoint = families.load(goldens.config("q25_video_last_l2").checkpoint, resize_images=resize_images)
+def test_a_size_for_videos_holds() -> None:
+    checkpoint = families.load(goldens.config("q25_video_last_l2").checkpoint)
     assert isinstance(checkpoint, VlmCheckpoint)
     assert checkpoint.config.size_px == (56, 84)
 
