@@ -18,6 +18,12 @@ SMOL, QWEN_2_5 = "smolvlm", "qwen2_5_vl"
 BACKBONES = {QWEN_2_5: "Qwen2_5_VLModel", "qwen3_vl": "Qwen3VLModel", SMOL: "SmolVLMModel"}
 VISION_THETA = 10_000.0  # which transformers 4.57 has in its code, for each backbone
 
+# What no shape of a weight shows, and transformers has defaults for.
+_NEEDED = {
+    SMOL: (("num_attention_heads", "rms_norm_eps"), ("num_attention_heads",)),
+    QWEN_2_5: (("num_attention_heads", "rms_norm_eps"), ("num_heads", "window_size", "fullatt_block_indexes")),
+    "qwen3_vl": (("num_attention_heads", "rms_norm_eps"), ("num_heads", "deepstack_visual_indexes")),
+}
 # Of a Qwen2.5-VL whose text model's fields stand beside the others.
 _NOT_OF_TEXT = (
     "architectures", "dtype", "image_token_id", "model_type", "tie_word_embeddings", "torch_dtype",
@@ -52,9 +58,12 @@ def backbone_config(content: Mapping[str, Any], where: object) -> dict[str, Any]
     if family not in BACKBONES:
         raise CheckpointError(f"{where}: model_type: expected one of {', '.join(BACKBONES)}, got {shown(family)}")
     config = _nested(content) if family == QWEN_2_5 and "text_config" not in content else {**content}
-    for part in ("text_config", "vision_config"):
+    for part, needed in zip(("text_config", "vision_config"), _NEEDED[family], strict=True):
         if not isinstance(config.get(part), dict):
             raise CheckpointError(f"{where}: {part}: expected settings of the backbone, got {shown(config.get(part))}")
+        for name in needed:
+            if config[part].get(name) is None:
+                raise CheckpointError(f"{where}: {part}.{name}: expected a value, got none; {_COPY}")
     config["text_config"] = _text(config["text_config"], family, f"{where}: text_config")
     config["vision_config"] = _vision(config["vision_config"], f"{where}: vision_config")
     return config
@@ -97,6 +106,10 @@ def _rope(config: dict[str, Any], where: str) -> dict[str, Any]:
             raise CheckpointError(f"{where}.{part}: expected a mapping, got {shown(section)}")
         _add(rope, section, where, part)
     _add(rope, {name: config.get(name) for name in ("rope_theta", "partial_rotary_factor")}, where, "text_config")
+    if config.get("rope_interleaved"):
+        raise CheckpointError(
+            f"{where}.rope_interleaved: expected false, got {shown(config['rope_interleaved'])}; {_COPY}"
+        )
     partial = rope.pop("partial_rotary_factor", 1)
     if partial != 1:
         raise CheckpointError(f"{where}.partial_rotary_factor: expected 1, got {shown(partial)}; {_COPY}")

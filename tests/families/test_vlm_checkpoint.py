@@ -177,12 +177,14 @@ def as_before_text_config(backbone: dict[str, Any]) -> None:
         backbone.setdefault(name, value)
 
 
-def rename(pattern: str, replacement: str | Callable[[re.Match[str]], str]) -> Callable[[Path], None]:
+def rename(
+    pattern: str, replacement: str | Callable[[re.Match[str]], str], file: str = "model.safetensors"
+) -> Callable[[Path], None]:
     def change(weights: dict[str, Any]) -> None:
         for name in [*weights]:
             weights[re.sub(pattern, replacement, name)] = weights.pop(name)
 
-    return change_tensors("model.safetensors", change)
+    return change_tensors(file, change)
 
 
 def beside_another_adapter(folder: Path) -> None:
@@ -227,6 +229,10 @@ FORMS: dict[str, tuple[str, Callable[[Path], None]]] = {
         ),
     ),
     "a whole model beside its adapter": (LORA_INSIDE, beside_its_adapter),
+    "an adapter around the language model": (
+        ADAPTER,
+        rename(r"^base_model\.model\.language_model\.", "base_model.model.", "adapter_model.safetensors"),
+    ),
     "LoRA around the whole model": (
         LORA_INSIDE,
         rename(r"^model\.language_model\.base_model\.model\.", "model.base_model.model.language_model."),
@@ -304,6 +310,21 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "rotary positions without sections": (PLAIN, change_text(rope_scaling=None), r"rope_scaling\.mrope_section: expected a list of numbers, got None"),
     "two bases of rotary positions": (PLAIN, change_text(rope_parameters={"rope_theta": 1e4}), r"expected one value of rope_theta in text_config, got 10000\.0 and 5000000\.0"),
     "two types of rotary positions": (PLAIN, change_text(rope_parameters={"rope_type": "linear"}), r"expected one value of rope_type in rope_scaling, got 'linear' and 'default'"),
+    "pairs of a head rotated": (PLAIN, change_text(rope_interleaved=True), r"text_config\.rope_interleaved: expected false, got True"),
+    **{
+        f"no {name} of the {part}": (
+            checkpoint,
+            change_backbone(lambda backbone, part=part, name=name: backbone[part].pop(name)),
+            rf"config\.json: {part}\.{name}: expected a value, got none; copy it",
+        )
+        for checkpoint, part, name in [
+            (PLAIN, "text_config", "rms_norm_eps"),
+            ("q25_mean_l2", "text_config", "num_attention_heads"),
+            ("q25_mean_l2", "vision_config", "fullatt_block_indexes"),
+            (PLAIN, "vision_config", "deepstack_visual_indexes"),
+            ("smol_mean_disc10", "vision_config", "num_attention_heads"),
+        ]
+    },
     "half of a head rotated": (PLAIN, change_text(partial_rotary_factor=0.5), r"partial_rotary_factor: expected 1, got 0\.5"),
     "a vision tower with other rotary positions": (
         PLAIN,
