@@ -136,7 +136,9 @@ class RewindCheckpoint:
                 text_weights=self.text_encoder or None,
             )
         except (ImportError, OSError, ValueError) as error:
-            hint = "name local folders with --image-encoder and --text-encoder"
+            absent = [source for source in (image_source, text_source) if not Path(source).is_dir()]
+            here = f"; there is no folder {' nor '.join(absent)} either" if absent else ""
+            hint = f"name local folders with --image-encoder and --text-encoder{here}"
             raise CheckpointError(f"{where}: {error} ({hint})") from error
         widths, expected = (encoders.video_feature_dim, encoders.text_feature_dim), self.description.widths
         if widths != expected:
@@ -280,7 +282,7 @@ def _stated(folder: Path) -> dict[str, Any]:
         )
     stated: dict[str, Any] = {}
     for name, kind in _STATED_TYPES.items():
-        values = {source: content[name] for source, content in sources.items() if name in content}
+        values = {source: content[name] for source, content in sources.items() if content.get(name) is not None}
         for source, value in values.items():
             if type(value) is not kind:
                 raise CheckpointError(f"{folder}: {name} in {source}: expected {kind.__name__}, got {shown(value)}")

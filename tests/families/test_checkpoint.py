@@ -129,6 +129,13 @@ def test_what_decides_each_setting_is_documented(config: type[VlmConfig | Rewind
     assert [field.name for field in fields(config) if f"`{field.name}`" not in documented] == []
 
 
+@pytest.mark.parametrize("name", ["causal_mask", "num_attention_heads"])
+def test_a_null_is_a_key_that_is_not_there(folder: Path, name: str) -> None:
+    expected = families.load(folder).config
+    change_json("config.json", lambda content: content.update({name: None}))(folder)
+    assert families.load(folder).config == expected
+
+
 def test_encoder_weights_are_told_apart() -> None:
     checkpoint = families.load(goldens.config("enc_c1_t1_disc10").checkpoint)
     assert "embeddings.cls_token" in checkpoint.image_encoder
