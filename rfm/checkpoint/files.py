@@ -21,7 +21,6 @@ from rfm.checkpoint.content import (
 )
 from rfm.checkpoint.pickles import refuse_pickles
 from rfm.checkpoint.wrappers import unwrapped
-from rfm.version_folder import IMAGE_ENCODER_FOLDER, TEXT_ENCODER_FOLDER
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -37,7 +36,7 @@ _COMMIT_DIGITS = 40
 MAX_COUNT = 2**20  # of frames: longer than any trajectory
 _SHARDS = "model-*.safetensors"
 _PICKLE_STEM = "pytorch_model"  # of transformers' pickles of weights
-_ENCODERS = (IMAGE_ENCODER_FOLDER, TEXT_ENCODER_FOLDER)  # below an exported checkpoint's
+_ENCODERS = ("image_encoder", "text_encoder")  # below an exported checkpoint's
 _MAX_SUGGESTED = 5
 _LEVELS = ("*", "*/*", "*/*/*")  # below a folder: a training run's checkpoints, those of a model repository
 _NAMES = (WEIGHTS, WEIGHTS_INDEX, "adapter_model.safetensors")  # of weights in them
@@ -208,7 +207,13 @@ def check_keys(expected: Iterable[str], got: Iterable[str]) -> None:
     missing, unexpected = sorted(set(expected) - set(got)), sorted(set(got) - set(expected))
     if missing or unexpected:
         named = [listed(names) if names else "none" for names in (missing, unexpected)]
-        raise CheckpointError(f"{WEIGHTS}: missing keys: {named[0]}; unexpected keys: {named[1]}")
+        raise CheckpointError(f"{WEIGHTS}: missing keys: {named[0]}; unexpected keys: {named[1]}{_lost_heads(missing)}")
+
+
+def _lost_heads(missing: Iterable[str]) -> str:
+    """Which heads are missing, for a message; they are missing where a network was trained without them."""
+    heads = sorted({name.partition(".")[0].removesuffix("_head") for name in missing if "_head." in name})
+    return f"; a checkpoint without the head of {' and '.join(heads)} is not served yet" if heads else ""
 
 
 def _below(folder: Path) -> str:

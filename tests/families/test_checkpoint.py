@@ -236,6 +236,17 @@ SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
         change_weights(lambda w: w.update(surplus=w.pop("success_head.4.bias"))),
         r"missing keys: \['success_head.4.bias'\]; unexpected keys: \['surplus'\]",
     ),
+    "no head of preference, and none of success": (
+        change_weights(
+            lambda w: [w.pop(name) for name in list(w) if name.startswith(("preference_head", "success_head"))]
+        ),
+        r"missing keys: \['preference_head.0.bias', .*; a checkpoint without the head of preference and success is not "
+        r"served yet",
+    ),
+    "no head of progress": (
+        change_weights(lambda w: [w.pop(name) for name in list(w) if name.startswith("progress_head")]),
+        r"expected a ReWiND checkpoint, which has 'progress_head.4.weight'",
+    ),
     "a tensor of another shape": (
         change_weights(lambda w: w.update({"success_head.4.bias": torch.zeros(2)})),
         r"success_head\.4\.bias: expected \[1\], got \[2\]",
