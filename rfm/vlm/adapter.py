@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from rfm.checkpoint.content import CheckpointError, cut, is_there, listed, read_json, read_tensors, shown
-from rfm.checkpoint.files import ADAPTER_CONFIG, NETWORK_CONFIG, WEIGHTS, WEIGHTS_INDEX
+from rfm.checkpoint.files import ADAPTER_CONFIG, NETWORK_CONFIG, WEIGHTS, WEIGHTS_INDEX, check_one_form
 from rfm.checkpoint.pickles import refuse_pickles
 from rfm.vlm.backbone import BACKBONES, DEQUANTIZED, backbone_config, check_not_quantized
 from rfm.vlm.lora import LORA_NAME, Scaling, check_adapter
@@ -98,6 +98,8 @@ def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """The backbone of a base model: its configuration and its weights, named as in VlmRewardModel."""
     import transformers
 
+    if Path(base_model).is_dir():
+        check_one_form(Path(base_model))
     try:
         content = transformers.PretrainedConfig.get_config_dict(base_model)[0]
         file = f"base model {base_model}: {NETWORK_CONFIG}"

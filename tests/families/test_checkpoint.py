@@ -454,6 +454,16 @@ def test_the_conversion_of_a_pickled_adapter_works(tmp_path: Path) -> None:
     assert all(torch.equal(after.factors[name], before.factors[name]) for name in before.factors)
 
 
+def test_a_base_model_whose_weights_are_whole_and_in_shards_is_refused(tmp_path: Path) -> None:
+    golden = goldens.config("q25_peft_adapter_disc10")
+    base = shutil.copytree(golden.base_model or "", tmp_path / "base", copy_function=shutil.copyfile)
+    (base / "model.safetensors.index.json").write_text('{"weight_map": {}}')
+    with pytest.raises(
+        CheckpointError, match=r"/base: expected model\.safetensors or shards, got model\.safetensors and"
+    ):
+        families.load(golden.checkpoint, base_model=str(base))
+
+
 def test_the_state_of_an_optimizer_is_no_checkpoint(folder: Path) -> None:
     take_weights(folder)
     torch.save({"state": {}}, folder / "optimizer.pt")
