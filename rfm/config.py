@@ -37,7 +37,7 @@ _OF_A_MACHINE = {"most": MAX_OF_A_MACHINE}
 class ExportConfig(Settings):
     """What ``rfm export`` writes into a repository. To change it, export again."""
 
-    checkpoint: str | None = setting(None, "Folder, or Hugging Face id org/name[@tag].")
+    checkpoint: str | None = setting(None, "Folder, or Hugging Face id org/name[/subfolder][@tag].")
     name: str = setting(DEFAULT_MODEL, "Model name in the repository; raw frames are scored by NAME_frames.")
     num_gpus: int | None = setting(
         None, "GPUs, with as many instances on each; else all, or the CPU. 0: the CPU.", least=0, **_OF_A_MACHINE
@@ -60,9 +60,6 @@ class ExportConfig(Settings):
     text_encoder: str | None = setting(None, "Folder or id of ReWiND's text encoder.")
     base_model: str | None = setting(
         None, "Folder or id of a vision-language checkpoint's base model; else the one that it names."
-    )
-    resize_images: bool | None = setting(
-        None, "Whether a multi-image checkpoint was trained at its run's data.resized_height and _width."
     )
     max_queue_size: int | None = setting(
         DEFAULT_QUEUE_SIZE, "Requests that may wait for a model; more are rejected at once. null: any number.", **_COUNT

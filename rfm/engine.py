@@ -83,7 +83,6 @@ class Engine:
         family: str | None = None,
         encoders: FrameEncoders | None = None,
         base_model: str | None = None,
-        resize_images: bool | None = None,
         device: str | torch.device = "cpu",
         dtype: torch.dtype | None = None,
         token_budget: int = DEFAULT_TOKEN_BUDGET,
@@ -92,11 +91,11 @@ class Engine:
     ) -> Engine:
         """The engine of a checkpoint folder or Hugging Face id. Raises CheckpointError.
 
-        family, base_model, resize_images: as in ``rfm.families.load``
+        family, base_model: as in ``rfm.families.load``
         others: as in ``of``
         """
         return cls.of(
-            families.load(source, family=family, base_model=base_model, resize_images=resize_images),
+            families.load(source, family=family, base_model=base_model),
             encoders=encoders,
             device=device,
             dtype=dtype,

@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from importlib import import_module
 from pathlib import Path
 
+from rfm.checkpoint import training
 from rfm.checkpoint.content import CheckpointError, read_run_config
-from rfm.checkpoint.files import best_tag, check_finite, check_links, find
-from rfm.family import Checkpoint, Family, FrameEncoders, Options
+from rfm.checkpoint.files import check_finite
+from rfm.checkpoint.hub import best_tag, find
+from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options
 
 # Packages in the order in which they are tried. ReWiND's comes last: its first checkpoints do not say what they are.
 FAMILIES = ("rfm.vlm", "rfm.rewind")
@@ -18,12 +21,13 @@ __all__ = [
     "Checkpoint",
     "CheckpointError",
     "best_tag",
-    "check",
     "choose",
     "encoders_of",
     "find",
     "load",
+    "load_from",
     "named",
+    "notes",
     "read_run_config",
 ]
 
@@ -64,7 +68,6 @@ def load(
     *,
     family: str | None = None,
     base_model: str | None = None,
-    resize_images: bool | None = None,
     image_encoder: str | None = None,
     text_encoder: str | None = None,
 ) -> Checkpoint:
@@ -74,13 +77,26 @@ def load(
     others: as in ``rfm.family.Options``
     """
     folder = find(source)
-    return choose(folder, family).load(folder, Options(base_model, resize_images, image_encoder, text_encoder))
+    options = Options(base_model, image_encoder, text_encoder)
+    return load_from(folder, choose(folder, family), options)
 
 
-def check(folder: Path, checkpoint: Checkpoint) -> None:
-    """Raises CheckpointError for what is refused before a checkpoint of ``folder`` is served, beyond what ``load``
-    refuses: links that lead out of it, and weights that are no numbers.
-    """
-    check_links(folder)
+def load_from(folder: Path, family: Family, options: Options) -> Checkpoint:
+    """The checkpoint in a local folder. Raises CheckpointError, also for weights that are no numbers."""
+    checkpoint = family.load(folder, options)
     for weights in checkpoint.parts.values():
         check_finite(weights)
+    training.check_run(folder, checkpoint.description.progress_bins, checkpoint.config)
+    return checkpoint
+
+
+def notes(folder: Path, checkpoint: Checkpoint, answered: Collection[str] = training.HEADS) -> list[str]:
+    """A line for the user on each thing that decides the scores of the checkpoint in ``folder``, and may be wrong.
+
+    answered: heads of which its answers are made; those that it lacks do not count
+    Raises CheckpointError for a config.yaml that cannot be read.
+    """
+    has_similarity = checkpoint.description.has_similarity
+    heads = [head for head in answered if head != training.SIMILARITY or has_similarity]
+    of_weights = training.constant_heads(checkpoint.parts[NETWORK], heads)
+    return [*training.notes(folder, heads), *of_weights, *checkpoint.notes]

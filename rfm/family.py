@@ -30,14 +30,11 @@ class Options:
     """What a user may say of a checkpoint that its files do not hold. Each family reads its own fields.
 
     base_model: folder or id of a vision-language checkpoint's backbone; None: the one that the checkpoint names
-    resize_images: of a vision-language checkpoint that reads frames as images and whose run set a size for them:
-        whether it was trained with that size; None: such a checkpoint is refused
     image_encoder, text_encoder: folders or ids of a ReWiND checkpoint's encoders; None: the usual ones, if the
         checkpoint has weights of encoders
     """
 
     base_model: str | None = None
-    resize_images: bool | None = None
     image_encoder: str | None = None
     text_encoder: str | None = None
 
@@ -129,6 +126,10 @@ class Checkpoint(Protocol):
     @property
     def parts(self) -> Mapping[str, Mapping[str, Tensor]]:
         """All weights by part and name. The part NETWORK is always there."""
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """A line for the user on each thing that decides scores, was assumed, and could not be checked."""
 
     def encoders(self) -> FrameEncoders | None:
         """The checkpoint's encoders; None: it has none. Raises CheckpointError if they cannot be had or do not fit."""

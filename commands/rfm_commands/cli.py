@@ -44,7 +44,7 @@ from rfm_gateway.options import Given, with_options
 EXIT_FAILED = 1
 ACCEPTED_WARNING = "a Triton with known remote vulnerabilities is accepted: use NVIDIA's container 26.07 or newer"
 DEMO = Path("model_repository")
-OF_A_DEMO = ("checkpoint", "image_encoder", "text_encoder", "base_model", "resize_images")
+OF_A_DEMO = ("checkpoint", "image_encoder", "text_encoder", "base_model")
 
 app = typer.Typer(
     name="rfm",

@@ -36,7 +36,6 @@ FLAT_KEYS = {
     "image_encoder": "export.image_encoder",
     "text_encoder": "export.text_encoder",
     "base_model": "export.base_model",
-    "resize_images": "export.resize_images",
     "max_queue_size": "export.max_queue_size",
     "queue_timeout_ms": "export.queue_timeout_ms",
     "batch_size": "export.batch_size",

@@ -11,8 +11,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
 
+from safetensors import SafetensorError
+
 from rfm import families
 from rfm.checkpoint import training
+from rfm.checkpoint.content import CheckpointError
 from rfm.checkpoint.digest import settings_digest, weights_digest
 from rfm.engine import Engine
 from rfm.execution import Execution
@@ -28,7 +31,7 @@ class EngineScorer:
 
     The engine is on its device as soon as it scores; until then only the checkpoint is in memory.
 
-    notes: lines for the user on what the checkpoint's training run left untrained
+    notes: lines for the user, as ``rfm.families.notes`` has them of progress and success
     """
 
     def __init__(self, source: str, *, device: str = "cpu", **options: Any) -> None:
@@ -42,7 +45,7 @@ class EngineScorer:
         told = {"device": on.type, **{name: _named(value) for name, value in options.items()}}
         folders = _folders(source, options)
         self._facts = _facts(source, self._checkpoint, self._encoders, folders, told)
-        self.notes = training.notes(folders[0], (training.PROGRESS, training.SUCCESS))
+        self.notes = families.notes(folders[0], self._checkpoint, (training.PROGRESS, training.SUCCESS))
         self._device = on
         self._lock = threading.Lock()
 
@@ -101,10 +104,14 @@ def _settings_digest(
     told = {**told, "network": asdict(checkpoint.config)}
     if encoders is None:
         return settings_digest(folders, told)
-    with TemporaryDirectory(prefix="rfm-label-") as written:
-        encoders.save(Path(written))
-        told["encoders"] = weights_digest([Path(written)])
-        return settings_digest([*folders, Path(written)], told)
+    try:
+        with TemporaryDirectory(prefix="rfm-label-") as written:
+            encoders.save(Path(written))
+            told["encoders"] = weights_digest([Path(written)])
+            return settings_digest([*folders, Path(written)], told)
+    except (OSError, SafetensorError) as error:  # the latter of a full disk, too
+        expected = "a folder of temporary files with room for a copy of the encoders"
+        raise CheckpointError(f"TMPDIR: expected {expected}, got: {error}; name another one with it") from error
 
 
 def _named(value: Any) -> Any:

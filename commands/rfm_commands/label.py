@@ -30,17 +30,11 @@ def label(
     base_model: Annotated[
         str | None, typer.Option(help="Folder or id of a vision-language checkpoint's base model.")
     ] = None,
-    resize_images: Annotated[bool | None, typer.Option(help="As in rfm export.", show_default=False)] = None,
     *,
     flags: LabelFlags,
 ) -> None:
     """Label every frame of a dataset in this process, without Triton."""
-    options = {
-        "image_encoder": image_encoder,
-        "text_encoder": text_encoder,
-        "base_model": base_model,
-        "resize_images": resize_images,
-    }
+    options = {"image_encoder": image_encoder, "text_encoder": text_encoder, "base_model": base_model}
 
     @contextmanager
     def connect() -> Iterator[Scorer]:

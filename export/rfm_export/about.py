@@ -17,6 +17,7 @@ from tritonclient.grpc import model_config_pb2 as pb
 from rfm.checkpoint.content import read_run_config
 from rfm.checkpoint.digest import settings_digest, weights_digest
 from rfm.checkpoint.files import find_run_config
+from rfm.checkpoint.hub import commit_of
 from rfm.family import NETWORK, Checkpoint, EncodersDescription
 from rfm.parameters import DTYPE_PARAMETER
 from rfm_client.contract.model_info import (
@@ -49,11 +50,11 @@ class Origin:
     def of(cls, source: str | Path, folder: Path) -> Origin:
         """The origin of a checkpoint.
 
-        source: as the user named it; folder: where its files lie, of the Hub's a snapshot named by its commit
+        source: as the user named it; folder: where its files lie, of the Hub's in a snapshot named by its commit
         """
         file = find_run_config(folder)
         run_config = "" if file is None else json.dumps(_public(read_run_config(file)))
-        return cls(source_name(source), "" if _is_folder(source) else folder.name, run_config)
+        return cls(source_name(source), "" if _is_folder(source) else commit_of(folder), run_config)
 
     @classmethod
     def from_config(cls, config: pb.ModelConfig) -> Origin:

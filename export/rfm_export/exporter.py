@@ -15,7 +15,7 @@ from google.protobuf.text_format import ParseError
 from safetensors import SafetensorError
 
 from rfm import families
-from rfm.checkpoint import training
+from rfm.checkpoint.files import check_links, find_run_config
 from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.family import Checkpoint, Description, Family, FrameEncoders, Options
@@ -60,8 +60,8 @@ def export(
     other_machine: it is to be served elsewhere, so that ``num_gpus`` may be more than there are here
     family: package of the checkpoint's family, which the server must be able to import too; None: one of ours
     device: where the scores are compared; None: on the CPU, and those of a large network on a GPU with room for it
-    say: takes a line for the user: what the training run left untrained, and where the scores of a large network are
-        compared
+    say: takes a line for the user: which config.yaml was read, those of ``rfm.families.notes``, and where the scores of
+        a large network are compared
     Raises CheckpointError, ExportError.
     """
     if not other_machine:
@@ -85,16 +85,16 @@ def export(
 def _load(
     source: str | Path, settings: ExportConfig, family: str | None, say: Callable[[str], object] | None
 ) -> _Source:
-    """What is at ``source``, checked. Says what its training run left untrained."""
+    """What is at ``source``, checked. Says which file holds the training run's settings, and what may be wrong."""
     folder = families.find(source)
     kind = families.choose(folder, family)
-    options = Options(settings.base_model, settings.resize_images, settings.image_encoder, settings.text_encoder)
-    checkpoint = kind.load(folder, options)
-    families.check(folder, checkpoint)
+    options = Options(settings.base_model, settings.image_encoder, settings.text_encoder)
+    checkpoint = families.load_from(folder, kind, options)
+    check_links(folder)
     if say is not None:
-        has_similarity = checkpoint.description.has_similarity
-        answered = [head for head in training.HEADS if head != training.SIMILARITY or has_similarity]
-        for note in training.notes(folder, answered):
+        run_config = find_run_config(folder)
+        of_run = [] if run_config is None else [f"{run_config}: read as the settings of the training run"]
+        for note in (*of_run, *families.notes(folder, checkpoint)):
             say(note)
     return _Source(kind, checkpoint, checkpoint.encoders(), Origin.of(source, folder))
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 
 from rfm.plain_yaml import read_yaml
 
@@ -134,6 +134,17 @@ def read_tensors(file: Path) -> dict[str, Tensor]:
     try:
         _check_header(file)
         return load_file(file)
+    except (OSError, SafetensorError, *_MISFITS) as error:
+        raise CheckpointError(f"{file}: expected a safetensors file, got {cut(str(error))}") from error
+
+
+def tensor_names(file: Path) -> list[str]:
+    """The names of the tensors of one safetensors file. Raises CheckpointError."""
+    _require(file)
+    try:
+        _check_header(file)
+        with safe_open(file, "np") as content:
+            return list(content.keys())
     except (OSError, SafetensorError, *_MISFITS) as error:
         raise CheckpointError(f"{file}: expected a safetensors file, got {cut(str(error))}") from error
 

@@ -8,7 +8,19 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rfm.checkpoint.content import CheckpointError, cut, is_there, listed, read_json, read_tensors, shown
+from rfm.checkpoint.content import (
+    CheckpointError,
+    cut,
+    is_there,
+    listed,
+    read_json,
+    read_run_config,
+    read_tensors,
+    shown,
+    tensor_names,
+)
+from rfm.checkpoint.pickles import refuse_pickles
+from rfm.checkpoint.wrappers import unwrapped
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -16,58 +28,67 @@ if TYPE_CHECKING:
 WEIGHTS = "model.safetensors"
 WEIGHTS_INDEX = "model.safetensors.index.json"
 NETWORK_CONFIG = "config.json"
+ADAPTER_CONFIG = "adapter_config.json"
 RUN_CONFIG = "config.yaml"
+RUN_CONFIGS = (RUN_CONFIG, "config.yml", ".hydra/config.yaml")  # the first is read
 
-_BEST_TAG = re.compile(r"best-.*?-(-?\d+\.\d+)-step-\d+")
 _COMMIT_DIGITS = 40
 MAX_COUNT = 2**20  # of frames: longer than any trajectory
+_SHARDS = "model-*.safetensors"
+_PICKLE_STEM = "pytorch_model"  # of transformers' pickles of weights
+_ENCODERS = ("image_encoder", "text_encoder")  # below an exported checkpoint's
+_MAX_SUGGESTED = 5
 _LEVELS = ("*", "*/*", "*/*/*")  # below a folder: a training run's checkpoints, those of a model repository
-_PICKLES = ("*.bin", "*.pt", "*.pth", "*.ckpt", "*.pkl")
-_CONVERT = (
-    "python -c \"import torch, safetensors.torch as s; weights = torch.load('{file}', map_location='cpu', "
-    "weights_only=True); s.save_file({{k: v.contiguous() for k, v in weights.items()}}, '{target}')\""
-)
-
-
-def find(source: str | Path) -> Path:
-    """The local folder of a checkpoint, fetched from the Hub if need be. An existing path wins over an id."""
-    expected = "a folder that exists or a Hugging Face id org/name[@tag]"
-    try:
-        path = Path(source).expanduser()
-        if str(source) and path.is_dir():
-            return path
-        if path.is_file():
-            raise CheckpointError(f"checkpoint: expected {expected}, got the file {path}: name {path.parent}")
-    except (OSError, RuntimeError) as error:
-        got = f"{shown(str(source))}: {type(error).__name__}"
-        raise CheckpointError(f"checkpoint: expected {expected}, got {got}") from error
-    repo_id, _, tag = str(source).partition("@")
-    if not re.fullmatch(r"\w[\w.-]*/\w[\w.-]*", repo_id):
-        raise CheckpointError(f"checkpoint: expected {expected}, got {shown(str(source))}")
-    return _fetch(repo_id, tag or None)
-
-
-def best_tag(tags: Iterable[str]) -> str | None:
-    """The tag ``best-<metric>-<score>-step-<n>`` of the highest score, the first of equals; None if there is none."""
-    scores = {tag: float(match[1]) for tag in tags if (match := _BEST_TAG.search(tag))}
-    return max(scores, key=scores.__getitem__, default=None)
+_NAMES = (WEIGHTS, WEIGHTS_INDEX, "adapter_model.safetensors")  # of weights in them
 
 
 def find_run_config(folder: Path) -> Path | None:
-    """config.yaml in the checkpoint's folder, its parent or, of a snapshot in the Hub's cache, main's snapshot."""
+    """The training run's configuration in the checkpoint's folder, its parent or main's snapshot in the Hub's cache.
+
+    Raises CheckpointError for one from outside the folder that is of another kind of network.
+    """
     home = folder.resolve()
-    candidates = (folder / RUN_CONFIG, home.parent / RUN_CONFIG, *_run_config_of_main(home))
-    return next((file for file in candidates if is_there(file)), None)
+    for place in (folder, home.parent, *_snapshot_of_main(home)):
+        file = next((place / name for name in RUN_CONFIGS if is_there(place / name)), None)
+        if file is not None:
+            if place != folder:
+                _check_base(file, folder)
+            return file
+    return None
 
 
-def _run_config_of_main(home: Path) -> list[Path]:
-    """Where the Hub's cache has main's config.yaml: in the snapshot of the commit in refs/main, beside ``home``."""
+def not_of(folder: Path, expected: str, got: str, file: Path) -> CheckpointError:
+    """The error for a ``file`` outside ``folder`` that is of another run."""
+    return CheckpointError(
+        f"{file}: expected the run of {folder}, {expected}, got {got}; copy the run's {RUN_CONFIG} into {folder}, "
+        "also if it is this one"
+    )
+
+
+def _check_base(file: Path, folder: Path) -> None:
+    """Raises CheckpointError if the run's base model and the checkpoint's network are of different kinds."""
+    model = read_run_config(file).get("model")
+    base = model.get("base_model_id") if isinstance(model, dict) else None
+    if is_there(folder / NETWORK_CONFIG):
+        kind = read_json(folder / NETWORK_CONFIG).get("model_type")
+    else:  # an adapter names its base model; the first ReWiND checkpoints say nothing
+        kind = None if is_there(folder / ADAPTER_CONFIG) else "rewind_transformer"
+    if isinstance(kind, str) and isinstance(base, str) and base and _plain(kind) not in _plain(base):
+        raise not_of(folder, f"whose network is {shown(kind)}", f"model.base_model_id {shown(base)}", file)
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def _snapshot_of_main(home: Path) -> list[Path]:
+    """Where the Hub's cache has main: the snapshot of the commit in refs/main, beside ``home``."""
     main = home.parent.parent / "refs" / "main"
     if home.parent.name != "snapshots" or not is_there(main):
         return []
     with main.open("rb") as file:
         commit = file.read(_COMMIT_DIGITS + 1)
-    return [home.parent / commit.decode() / RUN_CONFIG] if re.fullmatch(rb"[0-9a-f]+", commit) else []
+    return [home.parent / commit.decode()] if re.fullmatch(rb"[0-9a-f]+", commit) else []
 
 
 def check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> None:
@@ -81,9 +102,11 @@ def check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> N
 
 
 def check_finite(weights: Mapping[str, Tensor]) -> None:
-    """Raises CheckpointError for a weight that is no number: every score would be none."""
+    """Raises CheckpointError for a weight that is no number. A score that it makes may still be one: success of 1."""
     for name, tensor in weights.items():
-        if tensor.is_floating_point() and not tensor.isfinite().all():
+        if not (tensor.is_floating_point() and tensor.numel()):
+            continue
+        if not all(extreme.isfinite() for extreme in tensor.aminmax()):  # fifty times as fast as isfinite of each
             at = (~tensor.isfinite()).nonzero()[0].tolist()
             raise CheckpointError(f"{name}: expected finite weights, got {tensor[tuple(at)].item()} at {at}")
 
@@ -118,67 +141,59 @@ def frame_count(frames: Any, where: str) -> int | None:
     return frames
 
 
-def _fetch(repo_id: str, tag: str | None) -> Path:
-    from huggingface_hub import HfApi, snapshot_download
-    from huggingface_hub.errors import HfHubHTTPError, HFValidationError
-
-    patterns = ["*.safetensors", "*.json", "*.yaml", "*.txt"]
-    try:
-        if tag is None:
-            tag = best_tag(ref.name for ref in HfApi().list_repo_refs(repo_id).tags)
-        folder = Path(snapshot_download(repo_id, revision=tag, allow_patterns=patterns))
-        if not is_there(folder / RUN_CONFIG):  # upstream's uploader tags a commit of before config.yaml's
-            _fetch_run_config_of_main(repo_id)
-        return folder
-    except (HfHubHTTPError, HFValidationError, OSError) as error:
-        remedy = "there is no folder of this name either; name one, or see to the Hub's name, login and network"
-        raise CheckpointError(f"{repo_id}@{tag or 'latest'}: cannot be fetched: {error}; {remedy}") from error
-
-
-def _fetch_run_config_of_main(repo_id: str) -> None:
-    """Fetches main's config.yaml into the Hub's cache, where ``find_run_config`` looks. Even main may have none."""
-    from huggingface_hub import hf_hub_download
-    from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
-
-    try:
-        hf_hub_download(repo_id, RUN_CONFIG)
-    except LocalEntryNotFoundError:  # the cache lacks it, and the Hub was not tried
-        raise
-    except EntryNotFoundError:
-        return
-
-
 def read_weights(folder: Path) -> dict[str, Tensor]:
-    """All tensors of model.safetensors or of the shards that its index names. Raises CheckpointError."""
+    """All tensors of model.safetensors or of the shards that its index names, without the prefixes of wrappers.
+
+    Raises CheckpointError.
+    """
+    check_one_form(folder)
     if is_there(folder / WEIGHTS):
-        return read_tensors(folder / WEIGHTS)
-    if is_there(folder / WEIGHTS_INDEX):
-        return _read_shards(folder / WEIGHTS_INDEX)
-    pickles = sorted(file for pattern in _PICKLES for file in folder.glob(pattern))
-    if pickles:
-        command = _CONVERT.format(file=pickles[0], target=folder / WEIGHTS)
+        files = [folder / WEIGHTS]
+        weights = read_tensors(folder / WEIGHTS)
+    elif is_there(folder / WEIGHTS_INDEX):
+        files, weights = _read_shards(folder / WEIGHTS_INDEX)
+    else:
+        refuse_pickles(folder, WEIGHTS, _PICKLE_STEM)
         raise CheckpointError(
-            f"{folder}: expected {WEIGHTS}, got {pickles[0].name}: pickle files run code when loaded and are refused; "
-            f"if you trust it, convert it with: {command}"
+            f"{folder}: expected {WEIGHTS} or {WEIGHTS_INDEX}, got {_listing(folder)}: {_below(folder)}"
         )
-    below = next((file.parent for level in _LEVELS for file in sorted(folder.glob(f"{level}/{WEIGHTS}*"))), None)
-    remedy = "a checkpoint's folder has it, beside config.json" if below is None else f"{below} has it"
-    raise CheckpointError(f"{folder}: expected {WEIGHTS} or {WEIGHTS_INDEX}, got {_listing(folder)}: {remedy}")
+    return unwrapped(weights, files, folder / WEIGHTS)
 
 
-def _read_shards(index: Path) -> dict[str, Tensor]:
+def check_one_form(folder: Path) -> None:
+    """Raises CheckpointError for weights that are there whole and in shards: which are the newer, no file says."""
+    shards = [path.name for path in (folder / WEIGHTS_INDEX, *sorted(folder.glob(_SHARDS))) if is_there(path)]
+    if shards and is_there(folder / WEIGHTS):
+        raise CheckpointError(
+            f"{folder}: expected {WEIGHTS} or shards, got {WEIGHTS} and {listed(shards)}, of which one is older; "
+            "move away what is not meant: transformers, which reads the former, leaves it when it writes shards"
+        )
+
+
+def _read_shards(index: Path) -> tuple[list[Path], dict[str, Tensor]]:
+    """The shards that the index names, and their tensors."""
     weight_map = read_json(index).get("weight_map")
     if not isinstance(weight_map, dict):
         raise CheckpointError(f"{index}: expected a weight_map, got none")
     weights: dict[str, Tensor] = {}
-    for name in dict.fromkeys(map(str, weight_map.values())):
-        if Path(name).name != name or not name.endswith(".safetensors"):
-            raise CheckpointError(f"{index}: expected names of files beside it, got {shown(name)}")
-        if not is_there(index.parent / name):
-            raise CheckpointError(f"{index}: names the shard {name}, which is not there")
-        weights |= read_tensors(index.parent / name)
+    shard_of: dict[str, str] = {}
+    for shard in dict.fromkeys(map(str, weight_map.values())):
+        if Path(shard).name != shard or not shard.endswith(".safetensors"):
+            raise CheckpointError(f"{index}: expected names of files beside it, got {shown(shard)}")
+        if not is_there(index.parent / shard):
+            raise CheckpointError(f"{index}: names the shard {shard}, which is not there")
+        for name, tensor in read_tensors(index.parent / shard).items():
+            if name in shard_of:
+                got = f"{shown(name)} in {shard_of[name]} and in {shard}"
+                raise CheckpointError(f"{index}: expected each tensor in one shard, got {got}; save the weights again")
+            weights[name], shard_of[name] = tensor, shard
     check_keys(weight_map.keys(), weights.keys())
-    return weights
+    for file in sorted(index.parent.glob(_SHARDS)):
+        unknown = set(tensor_names(file)) - shard_of.keys()
+        if unknown:
+            got = f"{file.name}, which it does not name, with {listed(sorted(unknown))}"
+            raise CheckpointError(f"{index}: expected the names of all shards, got {got}; move that file away")
+    return [index.parent / shard for shard in dict.fromkeys(shard_of.values())], weights
 
 
 def take_prefix(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
@@ -192,7 +207,22 @@ def check_keys(expected: Iterable[str], got: Iterable[str]) -> None:
     missing, unexpected = sorted(set(expected) - set(got)), sorted(set(got) - set(expected))
     if missing or unexpected:
         named = [listed(names) if names else "none" for names in (missing, unexpected)]
-        raise CheckpointError(f"{WEIGHTS}: missing keys: {named[0]}; unexpected keys: {named[1]}")
+        raise CheckpointError(f"{WEIGHTS}: missing keys: {named[0]}; unexpected keys: {named[1]}{_lost_heads(missing)}")
+
+
+def _lost_heads(missing: Iterable[str]) -> str:
+    """Which heads are missing, for a message; they are missing where a network was trained without them."""
+    heads = sorted({name.partition(".")[0].removesuffix("_head") for name in missing if "_head." in name})
+    return f"; a checkpoint without the head of {' and '.join(heads)} is not served yet" if heads else ""
+
+
+def _below(folder: Path) -> str:
+    """Where there are weights below a folder that has none, or what a folder with weights looks like."""
+    found = [file.parent for level in _LEVELS for name in _NAMES for file in sorted(folder.glob(f"{level}/{name}"))]
+    checkpoints = [str(path) for path in dict.fromkeys(found) if path.name not in _ENCODERS]
+    if not checkpoints:
+        return "a checkpoint's folder has it, beside config.json"
+    return f"name the checkpoint in it: {cut(', '.join(checkpoints[:_MAX_SUGGESTED]))}"
 
 
 def _listing(folder: Path) -> str:

@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: MIT
-"""What config.yaml says of how the heads of a checkpoint were trained. No weight and no score shows it."""
+"""How the heads of a checkpoint were trained: what config.yaml says of it, and weights. No score shows it."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rfm.checkpoint.content import CheckpointError, read_run_config, shown
-from rfm.checkpoint.files import RUN_CONFIG, find_run_config
+from rfm.checkpoint.files import RUN_CONFIG, WEIGHTS, find_run_config, not_of
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 PROGRESS, PREFERENCE, SUCCESS, SIMILARITY = HEADS = ("progress", "preference", "success", "similarity")
+_SHOWN = ("video_feature_dim", "text_feature_dim", "hidden_dim", "num_layers")  # of a ReWiND network, by its weights
 _RELATIVE = "relative"  # how upstream's names of increments begin
 
 
@@ -43,7 +47,41 @@ def notes(folder: Path, answered: Collection[str] = HEADS) -> list[str]:
             "alone, so progress of the frames before it means something only if the run started from a checkpoint "
             "that trained it"
         )
+    if _section(run, "model").get("quantization") is True:
+        lines.append(
+            f"{RUN_CONFIG}: model.quantization is true: the run scored with its base model rounded to a few bits; the "
+            "scores here are those of the weights as they stand, so they differ from the run's"
+        )
     return lines
+
+
+def constant_heads(weights: Mapping[str, Tensor], answered: Collection[str]) -> list[str]:
+    """A line for the user on each head of ``answered`` whose last layer multiplies by 0, as before any training."""
+    heads = {head: weights.get(f"{head}_head.4.weight") for head in answered}
+    return [
+        f"{WEIGHTS}: {head}_head.4.weight is 0 throughout: {head} is the same whatever is scored, as if untrained"
+        for head, weight in heads.items()
+        if weight is not None and not weight.any()
+    ]
+
+
+def check_run(folder: Path, progress_bins: int, network: object) -> None:
+    """Raises CheckpointError for a config.yaml from outside ``folder`` that says other things than the weights show.
+
+    In the folder itself it may: the weights decide.
+    network: the configuration that the weights show
+    """
+    file = find_run_config(folder)
+    if file is None or file.is_relative_to(folder):
+        return
+    run = read_run_config(file)
+    loss, rewind = _section(run, "loss"), _section(_section(run, "model"), "rewind")
+    bins = {"l2": 1, "discrete": loss.get("progress_discrete_bins")}.get(str(loss.get("progress_loss_type")))
+    pairs = {f"model.rewind.{name}": (getattr(network, name, None), rewind.get(name)) for name in _SHOWN}
+    pairs["loss.progress_discrete_bins"] = (progress_bins, bins)
+    for place, (shows, says) in pairs.items():
+        if None not in (shows, says) and shows != says:
+            raise not_of(folder, f"whose weights show {place} {shows}", shown(says), file)
 
 
 def check_progress(run: Mapping[str, Any], file: Path) -> None:

@@ -94,15 +94,39 @@ class RewindCheckpoint:
         """All weights, by part and name."""
         return {NETWORK: self.network, "image_encoder": self.image_encoder, "text_encoder": self.text_encoder}
 
+    @property
+    def notes(self) -> list[str]:
+        """A line on the encoders, of which no file of a training run says which they were."""
+        if not self._has_encoders:
+            return []
+        known = (
+            "their weights are the checkpoint's" if self.image_encoder and self.text_encoder else "only widths agree"
+        )
+        return [
+            f"encoders: {self._image_source} and {self._text_source} are taken for those of the training run, which no "
+            f"file names ({known}); upstream's are {USUAL_IMAGE_ENCODER} and {USUAL_TEXT_ENCODER}"
+        ]
+
+    @property
+    def _has_encoders(self) -> bool:
+        return any((self.image_encoder, self.text_encoder, self.image_source, self.text_source))
+
+    @property
+    def _image_source(self) -> str:
+        return self.image_source or USUAL_IMAGE_ENCODER
+
+    @property
+    def _text_source(self) -> str:
+        return self.text_source or USUAL_TEXT_ENCODER
+
     def encoders(self) -> Encoders | None:
         """The encoders of a checkpoint that has them, or for which the user names them; else None.
 
         Raises CheckpointError if they cannot be had or do not fit the network.
         """
-        in_checkpoint = bool(self.image_encoder or self.text_encoder)
-        if not (in_checkpoint or self.image_source or self.text_source):
+        if not self._has_encoders:
             return None
-        image_source, text_source = self.image_source or USUAL_IMAGE_ENCODER, self.text_source or USUAL_TEXT_ENCODER
+        image_source, text_source = self._image_source, self._text_source
         where = f"encoders {image_source} and {text_source}"
         try:
             encoders = Encoders.from_pretrained(
@@ -112,7 +136,9 @@ class RewindCheckpoint:
                 text_weights=self.text_encoder or None,
             )
         except (ImportError, OSError, ValueError) as error:
-            hint = "name local folders with --image-encoder and --text-encoder"
+            absent = [source for source in (image_source, text_source) if not Path(source).is_dir()]
+            here = f"; there is no folder {' nor '.join(absent)} either" if absent else ""
+            hint = f"name local folders with --image-encoder and --text-encoder{here}"
             raise CheckpointError(f"{where}: {error} ({hint})") from error
         widths, expected = (encoders.video_feature_dim, encoders.text_feature_dim), self.description.widths
         if widths != expected:
@@ -255,7 +281,7 @@ def _stated(folder: Path) -> dict[str, Any]:
         )
     stated: dict[str, Any] = {}
     for name, kind in _STATED_TYPES.items():
-        values = {source: content[name] for source, content in sources.items() if name in content}
+        values = {source: content[name] for source, content in sources.items() if content.get(name) is not None}
         for source, value in values.items():
             if type(value) is not kind:
                 raise CheckpointError(f"{folder}: {name} in {source}: expected {kind.__name__}, got {shown(value)}")

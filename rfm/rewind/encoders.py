@@ -27,7 +27,7 @@ from rfm.feature_cache import FeatureCache, get_or_make
 from rfm.layers.linear import speed_up
 from rfm.layers.tensors import as_tensor
 from rfm.rewind.preprocessing import ImagePreprocessor
-from rfm.rewind.pretrained import load_model, load_preprocessor, load_tokenizer
+from rfm.rewind.pretrained import IMAGE_MODELS, TEXT_MODELS, load_model, load_preprocessor, load_tokenizer
 from rfm.version_folder import IMAGE_ENCODER_FOLDER, TEXT_ENCODER_FOLDER
 from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError, Trajectory, wire
 from rfm_client.contract.named_frames import NamedFootage, NamedTrajectory
@@ -61,20 +61,17 @@ class Encoders:
         """The encoders in local folders or of Hugging Face ids. Weights that are given (a checkpoint's own) win over
         theirs.
 
-        Raises ImportError without transformers, OSError for a source that cannot be had, ValueError for one
-        that does not fit.
+        Raises ImportError without transformers, OSError for a source that cannot be had, ValueError and CheckpointError
+        for one that does not fit.
         """
         try:
             import transformers  # noqa: F401
         except ImportError as error:
             raise ImportError('raw frames need transformers: pip install ".[encoders]"') from error
+        image_model = load_model(image_source, image_weights, IMAGE_MODELS)
         preprocessor = load_preprocessor(image_source)
-        return cls(
-            load_model(image_source, image_weights),
-            preprocessor,
-            load_model(text_source, text_weights),
-            load_tokenizer(text_source),
-        )
+        text_model = load_model(text_source, text_weights, TEXT_MODELS)
+        return cls(image_model, preprocessor, text_model, load_tokenizer(text_source, text_model.config.vocab_size))
 
     @classmethod
     def load(cls, folder: Path) -> Encoders:

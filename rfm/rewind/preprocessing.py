@@ -36,7 +36,14 @@ class ImagePreprocessor:
     @classmethod
     def from_config(cls, config: Mapping[str, Any], where: str) -> ImagePreprocessor:
         """The preprocessing that preprocessor_config.json describes. Raises ValueError for other steps."""
-        crop = config.get("crop_size", {})
+        size: Any = config.get("size")
+        crop: Any = config.get("crop_size")
+        if _is_count(size) and str(config.get("image_processor_type", "Bit")).startswith(("Bit", "CLIP")):
+            size = {
+                "shortest_edge": size
+            }  # as transformers wrote it, and reads it, for processors that keep proportions
+        if _is_count(crop):
+            crop = {"height": crop, "width": crop}
         required = {
             "do_resize": True,
             "do_center_crop": True,
@@ -49,11 +56,15 @@ class ImagePreprocessor:
                 raise ValueError(f"{where}: {name}: expected {value}, got {config.get(name)}")
         if abs(config.get("rescale_factor", 0.0) - 1 / MAX_UINT8) > 1e-9:
             raise ValueError(f"{where}: rescale_factor: expected 1/255, got {config.get('rescale_factor')}")
-        if set(config.get("size", {})) != {"shortest_edge"} or set(crop) != {"height", "width"}:
+        if not (_has_counts(size, "shortest_edge") and _has_counts(crop, "height", "width")):
             expected = "size {shortest_edge} and crop_size {height, width}"
-            raise ValueError(f"{where}: expected {expected}, got {config.get('size')} and {crop}")
+            raise ValueError(f"{where}: expected {expected}, got {config.get('size')} and {config.get('crop_size')}")
+        for name in ("image_mean", "image_std"):
+            values = config.get(name)
+            if not (isinstance(values, list) and len(values) == 3 and all(type(value) is float for value in values)):
+                raise ValueError(f"{where}: {name}: expected three numbers, got {values}")
         return cls(
-            resize_px=config["size"]["shortest_edge"],
+            resize_px=size["shortest_edge"],
             crop_px=(crop["height"], crop["width"]),
             mean=tuple(config["image_mean"]),
             std=tuple(config["image_std"]),
@@ -100,3 +111,12 @@ class ImagePreprocessor:
             height, width = images.shape[-2:]
         top, left = round((height - crop_height) / 2), round((width - crop_width) / 2)
         return images[..., top : top + crop_height, left : left + crop_width]
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and value > 0
+
+
+def _has_counts(value: Any, *names: str) -> bool:
+    """Whether it is a mapping of just these names to numbers of pixels."""
+    return isinstance(value, dict) and set(value) == set(names) and all(map(_is_count, value.values()))

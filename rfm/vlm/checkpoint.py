@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -21,18 +20,15 @@ from torch import Tensor
 
 from rfm.checkpoint.content import (
     CheckpointError,
-    cut,
     expecting,
     is_there,
-    listed,
     read_json,
-    read_tensors,
     shown,
 )
 from rfm.checkpoint.files import (
+    ADAPTER_CONFIG,
     NETWORK_CONFIG,
     WEIGHTS,
-    WEIGHTS_INDEX,
     check_shapes,
     read_weights,
 )
@@ -40,30 +36,20 @@ from rfm.checkpoint.training import check_progress
 from rfm.family import NETWORK, Description, Options
 from rfm.feature_cache import FeatureCache
 from rfm.version_folder import PROCESSOR_FOLDER
+from rfm.vlm.adapter import adapted, base_of_adapter, has_adapter
+from rfm.vlm.backbone import BACKBONES, QWEN_2_5, SMOL, UNQUANTIZED, backbone_config, check_not_quantized, is_at_least
 from rfm.vlm.collator import VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP
-from rfm.vlm.lora import LORA_NAME, changed_by, merged, scaling, split
-from rfm.vlm.network import BACKBONES, SMOL, VlmConfig, VlmRewardModel, build_backbone
+from rfm.vlm.lora import LORA_NAME, Scaling, changed_by, merged, split
+from rfm.vlm.names import LORA_INSIDE, QUANTIZED, QWEN_NAMES, SMOL_NAMES, UNUSED, Renames, renamed
+from rfm.vlm.network import VlmConfig, VlmRewardModel, build_backbone
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.processor import frame_size, load_collator, save_processor
+from rfm.vlm.prompts import OF_AN_OLD_RUN
 from rfm.vlm.run_config import RunConfig
 
-ADAPTER_CONFIG = "adapter_config.json"
-ADAPTER_WEIGHTS = "adapter_model.safetensors"
-CUSTOM_HEADS = "custom_heads.safetensors"
 LORA = "lora"  # in VlmCheckpoint.parts: the factors that change the network's weights
 SETTINGS = "rfm"  # key of our own fields in an exported config.json
-EMBEDDING = "model.language_model.embed_tokens.weight"
-
-# Renames of one form, tried in order on each name; the first that matches is applied.
-_Renames = Sequence[tuple[str, str]]
-_FULL: _Renames = ()
-_SMOL: _Renames = ((r"^model\.model\.", "model."),)
-_LORA_INSIDE: _Renames = ((r"^(model\.\w+)\.base_model\.model\.", r"\1."),)
-_ADAPTER: _Renames = ((r"^base_model\.model\.", "model."),)
-_UNUSED = ("lm_head.weight", "model.lm_head.weight")  # makes text, which no reward head reads
-
-_VARIANT = re.compile(r"(-unsloth)?(-bnb-\dbit)?$")  # of one model, which Unsloth puts in the place of a base model
 
 _LAYER_COUNTS = ("num_hidden_layers", "num_layers", "depth")
 MAX_LAYERS = 1024
@@ -102,6 +88,19 @@ class VlmCheckpoint:
     def parts(self) -> dict[str, dict[str, Tensor]]:
         """All weights: the network's, and the LoRA factors that change them."""
         return {NETWORK: self.weights, LORA: self.factors}
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """That positions may be others than in training, of a Qwen2.5-VL that reads videos."""
+        version = str(self.config.backbone.get("transformers_version"))
+        major = version.partition(".")[0]
+        if self.config.family != QWEN_2_5 or self.config.multi_image or not major.isdigit() or int(major) < 5:
+            return ()
+        return (
+            f"{NETWORK_CONFIG}: transformers_version is {version}: "
+            "text behind a video stands where transformers 4 puts "
+            "it; if the run was trained with transformers 5, which puts it elsewhere, scores differ from the run's",
+        )
 
     @cached_property
     def collator(self) -> VlmCollator:
@@ -168,56 +167,28 @@ def reads(folder: Path) -> bool:
 def load(folder: Path, options: Options) -> VlmCheckpoint:
     """The checkpoint in a local folder. Raises CheckpointError."""
     with expecting("a vision-language checkpoint", folder):
-        is_adapter = _has_adapter(folder)
-        backbone = {} if is_adapter else read_json(folder / NETWORK_CONFIG)
+        is_adapter = has_adapter(folder)
+        file = folder / NETWORK_CONFIG
+        backbone = {} if is_adapter else backbone_config(read_json(file), file)
+        check_not_quantized(backbone, file, UNQUANTIZED)
         if SETTINGS in backbone:  # written by VlmCheckpoint.save, with every setting
             config = _saved_config(backbone)
-            weights, factors = _used(_renamed(read_weights(folder), _renames(config.family)))
+            weights, factors = _used(renamed(read_weights(folder), _renames(config.family)))
         else:
             run = RunConfig.of(folder)
             run.check_model_type()
             check_progress(run.sections, run.file)
+            scaling: Scaling | None
             if is_adapter:
-                backbone, tensors, scale = _adapted(folder, options.base_model or _base_of_adapter(folder, run))
+                backbone, tensors, scaling = adapted(folder, options.base_model or base_of_adapter(folder, run))
             else:
-                tensors, scale = _whole(folder, backbone, run)
-            weights, factors = _used(tensors, scale)
-            config = _trained_config(folder, backbone, run, weights, options.resize_images)
+                tensors, scaling = _whole(folder, backbone, run)
+            weights, factors = _used(tensors, scaling)
+            config = _trained_config(folder, backbone, run, weights)
     own = folder / PROCESSOR_FOLDER
     checkpoint = VlmCheckpoint(config, weights, factors, options.base_model or (own if own.is_dir() else None))
     checkpoint.check()
     return checkpoint
-
-
-def _has_adapter(folder: Path) -> bool:
-    """Whether the folder's weights are an adapter. Raises CheckpointError if there are whole weights, too."""
-    adapter = [name for name in (ADAPTER_CONFIG, ADAPTER_WEIGHTS, CUSTOM_HEADS) if is_there(folder / name)]
-    whole = [name for name in (WEIGHTS, WEIGHTS_INDEX) if is_there(folder / name)]
-    if adapter and whole:
-        raise CheckpointError(
-            f"{folder}: expected an adapter ({adapter[0]}) or whole weights ({whole[0]}), got both; move away the one "
-            "that is not meant"
-        )
-    return bool(adapter)
-
-
-def _base_of_adapter(folder: Path, run: RunConfig) -> str:
-    """The base model that the run names. Raises CheckpointError if the adapter names another."""
-    base = run.get("model.base_model_id", "")
-    if not base:
-        raise CheckpointError(f"{run.file}: expected model.base_model_id (or --base-model), got none")
-    named = read_json(folder / ADAPTER_CONFIG).get("base_model_name_or_path")
-    if named and _model_name(str(named)) != _model_name(base):
-        raise CheckpointError(
-            f"{folder / ADAPTER_CONFIG}: base_model_name_or_path: expected {cut(base)}, the model.base_model_id of "
-            f"{run.file}, got {shown(named)}; name the one that the adapter was trained on with --base-model"
-        )
-    return base
-
-
-def _model_name(base: str) -> str:
-    """What is left of a base model's id or path where the same model may have several."""
-    return _VARIANT.sub("", base.rstrip("/").rpartition("/")[2].lower())
 
 
 def _saved_config(content: Mapping[str, Any]) -> VlmConfig:
@@ -232,20 +203,18 @@ def _trained_config(
     backbone: dict[str, Any],
     run: RunConfig,
     weights: Mapping[str, Tensor],
-    resize_images: bool | None,
 ) -> VlmConfig:
-    family = backbone.get("model_type")
-    if family not in BACKBONES:
-        raise CheckpointError(f"{folder}: model_type: expected one of {', '.join(BACKBONES)}, got {shown(family)}")
-    for name in ("progress_head.4.weight", "frame_pool_attn.weight"):
-        if name not in weights:
-            raise CheckpointError(f"{folder}: expected reward heads, got no {name}")
+    family = str(backbone["model_type"])
+    if "progress_head.4.weight" not in weights:
+        raise CheckpointError(f"{folder}: expected reward heads, got no progress_head.4.weight")
+    if "frame_pool_attn.weight" not in weights:
+        raise CheckpointError(f"{folder}: expected frame_pool_attn.weight, got none: {OF_AN_OLD_RUN}")
     network = run.network()
     config = VlmConfig(
         backbone=backbone,
         progress_bins=weights["progress_head.4.weight"].shape[0],
         has_similarity="similarity_head.0.weight" in weights,
-        size_px=run.size_px(family, network["multi_image"], resize_images),
+        size_px=run.size_px(family, network["multi_image"]),
         **network,
     )
     if (family == SMOL or config.per_frame_progress_token) and not config.multi_image:
@@ -258,39 +227,33 @@ def _check_transformers(config: VlmConfig) -> None:
     """Raises CheckpointError for SmolVLM on transformers 5, which computes other image features than in training."""
     if config.family != SMOL:
         return
-    version = importlib.metadata.version("transformers")
-    if int(version.partition(".")[0]) >= 5:
+    if is_at_least(5):
         expected = "transformers < 5 for a SmolVLM checkpoint, whose scores would differ"
+        version = importlib.metadata.version("transformers")
         raise CheckpointError(f"transformers: expected {expected}, got {version}")
 
 
-def _renames(family: Any) -> _Renames:
-    return _SMOL if family == SMOL else _FULL
+def _renames(family: Any) -> Renames:
+    return SMOL_NAMES if family == SMOL else QWEN_NAMES
 
 
-def _renamed(weights: Mapping[str, Tensor], renames: _Renames) -> dict[str, Tensor]:
-    def rename(name: str) -> str:
-        for pattern, replacement in renames:
-            changed, count = re.subn(pattern, replacement, name)
-            if count:
-                return changed
-        return name
-
-    return {rename(name): tensor for name, tensor in weights.items()}
-
-
-def _whole(folder: Path, backbone: Mapping[str, Any], run: RunConfig) -> tuple[dict[str, Tensor], float]:
-    """The weights of the network by name, with LoRA factors if it has some; the scale of these."""
-    tensors, scale = read_weights(folder), 1.0
+def _whole(folder: Path, backbone: Mapping[str, Any], run: RunConfig) -> tuple[dict[str, Tensor], Scaling | None]:
+    """The weights of the network by name, with LoRA factors if it has some; what these are scaled with."""
+    tensors, scaling = read_weights(folder), None
+    quantized = next((name for name in tensors if QUANTIZED.search(name)), None)
+    if quantized is not None:
+        raise CheckpointError(f"{folder}: expected weights in full precision, got {shown(quantized)}; {UNQUANTIZED}")
     if any(LORA_NAME.fullmatch(name) for name in tensors):
-        tensors, scale = _renamed(tensors, _LORA_INSIDE), scaling(run.file, run.sections["peft"])
-    return _renamed(tensors, _renames(backbone["model_type"])), scale
+        tensors, scaling = renamed(tensors, LORA_INSIDE), Scaling.of(run.file, run.sections["peft"])
+        if is_there(folder / ADAPTER_CONFIG):
+            scaling.check_equal(Scaling.of(folder / ADAPTER_CONFIG, read_json(folder / ADAPTER_CONFIG)))
+    return renamed(tensors, _renames(backbone["model_type"])), scaling
 
 
-def _used(tensors: Mapping[str, Tensor], scale: float = 1.0) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """The weights that a reward is made with, and their LoRA factors; ``scale``: of these."""
-    weights, factors = split(tensors, scale)
-    weights = {name: tensor for name, tensor in weights.items() if name not in _UNUSED}
+def _used(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """The weights that a reward is made with, and their LoRA factors; ``scaling``: of these."""
+    weights, factors = split(tensors, scaling)
+    weights = {name: tensor for name, tensor in weights.items() if not UNUSED.fullmatch(name)}
     return weights, {name: tensor for name, tensor in factors.items() if changed_by(name) in weights}
 
 
@@ -303,42 +266,3 @@ def _check_layers(config: Any) -> None:
         count = config.get(name)
         if isinstance(count, (int, float)) and count > MAX_LAYERS:
             raise CheckpointError(f"{NETWORK_CONFIG}: {name}: expected at most {MAX_LAYERS}, got {shown(count)}")
-
-
-def _adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Tensor], float]:
-    """Configuration of the base model's backbone; its weights with those of the adapter; the scale of LoRA factors."""
-    adapter_config = read_json(folder / ADAPTER_CONFIG)
-    adapter = _renamed(read_tensors(folder / ADAPTER_WEIGHTS), _ADAPTER)
-    config, base = _read_base(base_model)
-    if EMBEDDING not in adapter:
-        raise CheckpointError(f"{folder / ADAPTER_WEIGHTS}: expected the embedding of the special tokens, got none")
-    factors = {name: tensor for name, tensor in adapter.items() if LORA_NAME.fullmatch(name)}
-    replaced = {name: tensor for name, tensor in adapter.items() if name not in factors}
-    unknown = sorted(replaced.keys() - base.keys())
-    if unknown:
-        raise CheckpointError(
-            f"{folder / ADAPTER_WEIGHTS}: expected weights of {base_model}, got also {listed(unknown)}"
-        )
-    config["text_config"]["vocab_size"] = len(replaced[EMBEDDING])
-    tensors = base | replaced | factors | read_tensors(folder / CUSTOM_HEADS)
-    return config, tensors, scaling(folder / ADAPTER_CONFIG, adapter_config)
-
-
-def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """The backbone of a base model: its configuration and its weights, named as in VlmRewardModel."""
-    import transformers
-
-    try:
-        config = transformers.AutoConfig.from_pretrained(base_model, trust_remote_code=False)  # else it asks the user
-        if config.model_type not in BACKBONES:
-            known = ", ".join(BACKBONES)
-            raise CheckpointError(f"base model {base_model}: expected one of {known}, got {config.model_type}")
-        network, loaded = getattr(transformers, BACKBONES[config.model_type]).from_pretrained(
-            base_model, use_safetensors=True, dtype="auto", output_loading_info=True
-        )
-    except (OSError, RecursionError, ValueError) as error:
-        hint = "name its folder with --base-model"
-        raise CheckpointError(f"base model {base_model}: cannot be had: {cut(str(error))} ({hint})") from error
-    if loaded["missing_keys"]:
-        raise CheckpointError(f"base model {base_model}: missing keys: {sorted(loaded['missing_keys'])}")
-    return config.to_dict(), {f"model.{name}": tensor for name, tensor in network.state_dict().items()}

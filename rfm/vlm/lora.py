@@ -7,37 +7,91 @@ bfloat16, in which W usually is: a sum in that dtype would lose them, also where
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from rfm.checkpoint.content import CheckpointError
+from rfm.checkpoint.content import CheckpointError, cut, shown
 
 LORA_NAME = re.compile(r"(?P<module>.+)\.lora_(?P<side>[AB])(\.default)?\.weight")
 _BASE_LAYER = ".base_layer."
-# Fields of adapter_config.json that would make the weight another one.
-_UNSUPPORTED_LORA = ("use_dora", "use_rslora", "lora_bias", "alpha_pattern", "rank_pattern", "fan_in_fan_out")
+_MERGE = "merge it where it was trained (merge_and_unload() of PEFT) and export the whole model that this makes"
+# How factors may begin: without a change of the base model's weights.
+_PLAIN_INITS = (True, False, "gaussian", "orthogonal")
+# Fields of adapter_config.json that change no score. Any other that is set may make another function of the factors.
+_HARMLESS = {
+    "auto_mapping", "base_model_name_or_path", "bias", "ensure_weight_tying", "exclude_modules", "inference_mode",
+    "init_lora_weights", "layers_pattern", "layers_to_transform", "lora_alpha", "lora_dropout", "megatron_core",
+    "modules_to_save", "peft_type", "peft_version", "qalora_group_size", "r", "revision", "runtime_config",
+    "target_modules", "task_type",
+    "peft_vision_encoder",  # upstream's, in config.yaml
+}  # fmt: skip
 
 
-def scaling(file: Path, config: Mapping[str, Any]) -> float:
-    """alpha / r of a LoRA configuration."""
-    unsupported = [name for name in _UNSUPPORTED_LORA if config.get(name)]
-    if unsupported:
-        raise CheckpointError(f"{file}: expected plain LoRA, got {', '.join(unsupported)}")
-    try:
-        return float(config["lora_alpha"]) / float(config["r"])
-    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-        raise CheckpointError(f"{file}: expected lora_alpha and r of the LoRA weights, got {error!r}") from error
+@dataclass(frozen=True)
+class Scaling:
+    """Rank and alpha of LoRA factors, and the file that states them."""
+
+    file: Path
+    rank: int
+    alpha: float
+
+    @classmethod
+    def of(cls, file: Path, config: Mapping[str, Any]) -> Scaling:
+        """What a LoRA configuration states. Raises CheckpointError for an adapter of another kind."""
+        kind = config.get("peft_type", "LORA")
+        if kind != "LORA":
+            raise CheckpointError(f"{file}: peft_type: expected LORA, got {shown(kind)}; {_MERGE}")
+        rank, alpha = config.get("r"), config.get("lora_alpha")
+        is_number = isinstance(alpha, (int, float)) and not isinstance(alpha, bool) and math.isfinite(alpha)
+        if type(rank) is not int or rank < 1 or not is_number:
+            got = f"lora_alpha {shown(alpha)} and r {shown(rank)}"
+            raise CheckpointError(f"{file}: expected lora_alpha and r of the LoRA weights, got {got}")
+        unsupported = sorted(name for name, value in config.items() if value and name not in _HARMLESS)
+        if unsupported:
+            raise CheckpointError(f"{file}: expected plain LoRA, got {cut(', '.join(unsupported))}; {_MERGE}")
+        return cls(file, rank, float(config["lora_alpha"]))
+
+    def check_rank(self, module: str, factor: Tensor) -> None:
+        """Raises CheckpointError for a factor A of another rank than is stated."""
+        if len(factor) != self.rank:
+            raise CheckpointError(
+                f"{self.file}: r: expected {len(factor)}, the rows of {module}.lora_A, got {self.rank}; "
+                "put in r and lora_alpha of the run that trained these factors"
+            )
+
+    def check_equal(self, other: Scaling) -> None:
+        """Raises CheckpointError if another file states it otherwise."""
+        mine, its = (f"r {each.rank} and lora_alpha {each.alpha:g}" for each in (self, other))
+        if mine != its:
+            raise CheckpointError(
+                f"{other.file}: expected {mine}, as {self.file} has it, got {its}; mend the wrong one"
+            )
 
 
-def split(tensors: Mapping[str, Tensor], scale: float = 1.0) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+def check_adapter(file: Path, config: Mapping[str, Any]) -> None:
+    """Raises CheckpointError for an adapter that changed weights which it leaves out."""
+    init, bias = config.get("init_lora_weights", True), config.get("bias", "none")
+    if init not in _PLAIN_INITS:
+        got = f"{shown(init)}, which may change the base model's weights before training"
+        raise CheckpointError(f"{file}: init_lora_weights: expected true, got {got}; {_MERGE}")
+    if bias != "none":
+        raise CheckpointError(
+            f"{file}: bias: expected none, got {shown(bias)}, which PEFT does not always save; {_MERGE}"
+        )
+
+
+def split(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """The weights, and the LoRA factors of some of them: ``<module>.lora_A.weight`` and ``<module>.lora_B.weight``.
 
-    scale: what B is multiplied with. Raises CheckpointError for factors that do not fit their weight.
+    scaling: alpha and r, by which B is multiplied; None: it has been
+    Raises CheckpointError for factors that do not fit their weight, or are of another rank.
     """
     weights: dict[str, Tensor] = {}
     pairs: dict[str, dict[str, Tensor]] = {}
@@ -50,6 +104,9 @@ def split(tensors: Mapping[str, Tensor], scale: float = 1.0) -> tuple[dict[str, 
     factors = {}
     for module, pair in pairs.items():
         _check(module, weights.get(f"{module}.weight"), pair)
+        if scaling is not None:
+            scaling.check_rank(module, pair["A"])
+        scale = 1.0 if scaling is None else scaling.alpha / scaling.rank
         factors[_name(module, "A")] = pair["A"]
         factors[_name(module, "B")] = pair["B"] if scale == 1 else scale * pair["B"].float()
     return weights, factors

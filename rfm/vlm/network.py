@@ -16,14 +16,12 @@ import torch
 from torch import Tensor, nn
 
 from rfm.layers.heads import PredictionHead
+from rfm.vlm.backbone import BACKBONES, SMOL
 from rfm.vlm.batch import VlmBatch
 from rfm.vlm.qwen import check_attention, last_hidden_state
 from rfm.vlm.vision import features
 
 Pooling: TypeAlias = Literal["mean", "boundary", "attention"]
-
-BACKBONES = {"qwen2_5_vl": "Qwen2_5_VLModel", "qwen3_vl": "Qwen3VLModel", "smolvlm": "SmolVLMModel"}
-SMOL = "smolvlm"
 
 
 @dataclass(frozen=True)

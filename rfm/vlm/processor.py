@@ -9,12 +9,20 @@ from typing import Any
 
 from rfm.checkpoint.content import CheckpointError, read_json
 from rfm.checkpoint.preprocessor import PREPROCESSOR_CONFIG
+from rfm.vlm.backbone import SMOL, is_at_least
 from rfm.vlm.collator import QwenCollator, SmolCollator, VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, Normalisation, QwenImages, SmolImages, fitted_size
-from rfm.vlm.network import SMOL, VlmConfig
-from rfm.vlm.prompts import SPECIAL_TOKENS
+from rfm.vlm.network import VlmConfig
+from rfm.vlm.prompts import OLD_SPECIAL_TOKENS, SPECIAL_TOKENS
 from rfm_client.contract import FrameSize
 
+PROCESSOR_CONFIG = "processor_config.json"
+TOKENIZER_CONFIG = "tokenizer_config.json"
+# Fields of it that transformers 4.57 and 5 read alike; all else stands in tokenizer.json.
+_KEPT = (
+    "bos_token", "clean_up_tokenization_spaces", "eos_token", "model_max_length", "pad_token", "padding_side",
+    "unk_token",
+)  # fmt: skip
 SMOL_SIZE_PX = 512  # what upstream sets, whatever the base model says; so no image is split
 
 
@@ -34,12 +42,9 @@ def load_collator(config: VlmConfig, num_tokens: int, processor: str | Path) -> 
     num_tokens: rows of the checkpoint's embedding
     processor: folder or id with the tokenizer and image preprocessing
     """
-    from transformers import AutoTokenizer
-    from transformers.utils.hub import cached_file
-
     try:
-        tokenizer = AutoTokenizer.from_pretrained(str(processor), use_fast=True, trust_remote_code=False)
-        preprocessor = read_json(Path(str(cached_file(str(processor), PREPROCESSOR_CONFIG))))
+        tokenizer = _tokenizer(processor)
+        preprocessor = _preprocessor(processor)
         tokenizer.chat_template = _chat_template(processor, tokenizer)
     except (LookupError, OSError, ValueError) as error:
         hint = "name its folder with --base-model"
@@ -47,8 +52,45 @@ def load_collator(config: VlmConfig, num_tokens: int, processor: str | Path) -> 
     tokenizer.add_tokens(list(SPECIAL_TOKENS), special_tokens=True)
     if len(tokenizer) != num_tokens:  # upstream resizes the embedding to it
         expected = f"a tokenizer of {num_tokens} tokens with the special ones, as the checkpoint's embedding"
-        raise CheckpointError(f"base model {processor}: expected {expected}, got {len(tokenizer)}")
+        is_old = num_tokens - len(tokenizer) == OLD_SPECIAL_TOKENS - len(SPECIAL_TOKENS)
+        hint = (
+            f" (with {OLD_SPECIAL_TOKENS} special tokens, as upstream before 2026-01-21, it would fit)"
+            if is_old
+            else ""
+        )
+        raise CheckpointError(f"base model {processor}: expected {expected}, got {len(tokenizer)}{hint}")
     return _collator(config, tokenizer, preprocessor, processor)
+
+
+def _tokenizer(processor: str | Path) -> Any:
+    """The tokenizer. Transformers 5 writes a configuration that 4.57 does not read, beside the same tokenizer.json."""
+    from transformers import AutoTokenizer, PreTrainedTokenizerFast
+
+    config = read_json(_cached(processor, TOKENIZER_CONFIG))
+    special = config.get("extra_special_tokens")
+    if is_at_least(5) or not isinstance(special, list):
+        return AutoTokenizer.from_pretrained(str(processor), use_fast=True, trust_remote_code=False)
+    kept = {name: config[name] for name in _KEPT if name in config}
+    file = _cached(processor, "tokenizer.json")
+    return PreTrainedTokenizerFast(tokenizer_file=str(file), additional_special_tokens=special, **kept)
+
+
+def _preprocessor(processor: str | Path) -> dict[str, Any]:
+    """The image preprocessing, of its own file, or of transformers 5's. Raises OSError, ValueError."""
+    try:
+        return read_json(_cached(processor, PREPROCESSOR_CONFIG))
+    except OSError:
+        images = read_json(_cached(processor, PROCESSOR_CONFIG)).get("image_processor")
+    if not isinstance(images, dict):
+        raise ValueError(f"expected {PREPROCESSOR_CONFIG}, or image_processor in {PROCESSOR_CONFIG}, got none")
+    return images
+
+
+def _cached(processor: str | Path, name: str) -> Path:
+    """A file of the processor, from the Hub if need be. Raises OSError."""
+    from transformers.utils.hub import cached_file
+
+    return Path(str(cached_file(str(processor), name)))
 
 
 def _chat_template(processor: str | Path, tokenizer: Any) -> str:

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from rfm.checkpoint.content import CheckpointError, read_run_config, shown
 from rfm.checkpoint.files import RUN_CONFIG, find_run_config, frame_count, trained_frames
-from rfm.vlm.network import SMOL
+from rfm.vlm.backbone import SMOL
 
 HEADS, VQA = "default", "vqa"  # values of model.model_type: reward heads, and answers in generated text
 DTYPES = ("float32", "bfloat16", "float16")
@@ -89,29 +89,19 @@ class RunConfig:
             "trained_frames": trained_frames(self.sections, self.file),
         }
 
-    def size_px(self, family: str, multi_image: bool, resize_images: bool | None) -> tuple[int, int] | None:
+    def size_px(self, family: str, multi_image: bool) -> tuple[int, int] | None:
         """Height and width to which every frame is brought; None: each frame's own size is where resizing begins.
 
-        resize_images: whether that size holds for images, too; None: refuse a checkpoint for which it matters
+        Images have none: upstream ignores the keys for them since the day that its networks have a frame_pool_attn.
         """
-        if family == SMOL:  # whose images have a size of their own
+        if family == SMOL or multi_image:
             return None
         keys = ("resized_height", "resized_width")
-        if not multi_image:
-            for key in keys:
-                if key not in self.sections["data"]:  # upstream's default was 224 first and null later
-                    raise CheckpointError(f"{self.file}: data.{key}: expected a number or null, got no such key")
+        for key in keys:
+            if key not in self.sections["data"]:  # upstream's default was 224 first and null later
+                raise CheckpointError(f"{self.file}: data.{key}: expected a number or null, got no such key")
         height, width = (frame_count(self.sections["data"].get(key), f"{self.file}: data.{key}") for key in keys)
-        if height is None or width is None:
-            return None
-        if multi_image and resize_images is None:
-            raise CheckpointError(
-                f"{self.file}: data.resized_height, data.resized_width: expected null for a multi-image checkpoint, or "
-                f"resize_images to say whether it was trained with them, got {height} and {width}: upstream brought "
-                "images to that size before 2026-01-21 and has ignored it since; export with --resize-images a run "
-                "of before that day, and with --no-resize-images a later one"
-            )
-        return (height, width) if resize_images or not multi_image else None
+        return None if height is None or width is None else (height, width)
 
     def get(self, place: str, default: Value) -> Value:
         """The value at ``section.key``, of the default's type; the default where there is none."""

@@ -150,7 +150,7 @@ BAD = {
     ),
     "too small": ("batch_size: 0", r"serve\.yaml: batch_size: expected at least 1, got 0"),
     "too small a batch": ("max_batch_size: 0", r"serve\.yaml: max_batch_size: expected at least 1, got 0"),
-    "a truth that is a number": ("resize_images: 1", r"serve\.yaml: resize_images: expected bool or null, got 1"),
+    "a truth that is a number": ("gateway: {viewer: 1}", r"serve\.yaml: gateway\.viewer: expected bool, got 1"),
     "a port that is none": ("grpc_port: 70000", r"serve\.yaml: grpc_port: expected at most 65535, got 70000"),
     "one port twice": (
         "grpc_port: 8000",

@@ -109,4 +109,4 @@ def test_a_gpu_compares(tmp_path: Path) -> None:
     said: list[str] = []
     settings = replace(serve_config(LARGE), num_gpus=1, dtype="float32")
     assert rfm_export.export(LARGE.checkpoint, tmp_path, settings, say=said.append) == 1
-    assert "on cuda:0" in said[0]
+    assert "on cuda:0" in said[-1]

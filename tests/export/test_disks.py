@@ -115,6 +115,7 @@ def test_a_full_disk_is_told_and_changes_nothing(full_disks: dict[str, FullDisk]
     )
     *notes, error = disk.errors.splitlines(keepends=True)
     assert re.fullmatch(told, error), disk.errors
+    assert notes.pop(0) == f"rfm: {REWIND.checkpoint}/config.yaml: read as the settings of the training run\n"
     assert all(note.startswith("rfm: config.yaml: model.train_") for note in notes)
 
 

@@ -358,9 +358,17 @@ def untrained(head: str) -> str:
     )
 
 
+def of_run(folder: Path) -> str:
+    return f"{folder}/config.yaml: read as the settings of the training run"
+
+
 LAST_FRAME = (
     "config.yaml: loss.predict_last_frame_progress is true: the run trained progress of the last frame alone, so "
     "progress of the frames before it means something only if the run started from a checkpoint that trained it"
+)
+QUANTIZED = (
+    "config.yaml: model.quantization is true: the run scored with its base model rounded to a few bits; the scores here "
+    "are those of the weights as they stand, so they differ from the run's"
 )
 ALL_TRAINED: dict[str, object] = {f"train_{head}_head": True for head in HEADS}
 RUNS: dict[str, tuple[str, dict[str, object], list[str]]] = {
@@ -369,6 +377,7 @@ RUNS: dict[str, tuple[str, dict[str, object], list[str]]] = {
     "a head that the network lacks": ("robometer_c1_t1_disc10", {"model": ALL_TRAINED | {"train_similarity_head": False}}, []),
     "no word of heads": ("c1_t1_disc10", {"model": dict.fromkeys(ALL_TRAINED)}, []),
     "only the last frame": ("c1_t1_disc10", {"model": ALL_TRAINED, "loss": {"predict_last_frame_progress": True}}, [LAST_FRAME]),
+    "a quantized base model": ("c1_t1_disc10", {"model": ALL_TRAINED | {"quantization": True}}, [QUANTIZED]),
     "a loss that is no mapping": ("c1_t1_disc10", {"model": ALL_TRAINED, "loss": "discrete"}, []),
 }  # fmt: skip
 
@@ -388,7 +397,21 @@ def test_an_export_says_what_the_run_did_not_train(
     (checkpoint / "config.yaml").write_text(yaml.safe_dump(run))
     said: list[str] = []
     rfm_export.export(checkpoint, tmp_path / "repository", serve_config(config), say=said.append)
-    assert said == expected
+    assert said == [of_run(checkpoint), *expected]
+
+
+def test_an_export_says_which_config_yaml_and_which_encoders_it_took(tmp_path: Path) -> None:
+    said: list[str] = []
+    settings = serve_config(FRAMES)
+    rfm_export.export(FRAMES.checkpoint, tmp_path, settings, say=said.append)
+    assert said[0] == of_run(FRAMES.checkpoint)
+    assert said[-1] == (
+        f"encoders: {settings.image_encoder} and {settings.text_encoder} are taken for those of the training run, which no "
+        "file names (their weights are the checkpoint's); upstream's are facebook/dinov2-base and "
+        "sentence-transformers/all-MiniLM-L12-v2"
+    )
+    rfm_export.export(EMBEDDINGS.checkpoint, tmp_path / "above", serve_config(EMBEDDINGS), say=said.append)
+    assert of_run(EMBEDDINGS.checkpoint.parent) in said
 
 
 def test_an_export_of_an_export_says_nothing_of_a_run(exported: Path, tmp_path: Path) -> None:
@@ -413,8 +436,9 @@ def test_upstream_s_batch_size_bounds_nothing_and_says_so(tmp_path: Path) -> Non
     assert result.exit_code == 0, result.output
     file = f"rfm: {tmp_path}/eval_config_server.yaml"
     later = "max_workers, server_url, server_port: of no effect at export, only at serve"
-    of_run = "".join(f"rfm: {note}\n" for note in map(untrained, HEADS))
-    assert result.stderr == f"{file}: {later}\n{file}: {NOTE}\n{of_run}"
+    notes = (of_run(EMBEDDINGS.checkpoint.parent), *map(untrained, HEADS))
+    told = "".join(f"rfm: {note}\n" for note in notes)
+    assert result.stderr == f"{file}: {later}\n{file}: {NOTE}\n{told}"
     assert read(tmp_path / "repository", "rfm").max_batch_size == ExportConfig().max_batch_size
 
 

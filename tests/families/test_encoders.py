@@ -3,6 +3,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,6 +19,8 @@ from torch import Tensor
 
 import goldens
 from engines import load_engine
+from rfm import families
+from rfm.checkpoint.content import CheckpointError
 from rfm.checkpoint.preprocessor import PREPROCESSOR_CONFIG
 from rfm.execution import Execution
 from rfm.rewind.encoders import Encoders, ImagePreprocessor
@@ -318,6 +322,15 @@ UNSUPPORTED = {
     "bilinear": ({"resample": 2}, "resample: expected 3, got 2"),
     "another scale": ({"rescale_factor": 1.0}, "rescale_factor: expected 1/255, got 1.0"),
     "fixed size": ({"size": {"height": 3, "width": 3}}, "expected size {shortest_edge}"),
+    "a number of a processor of squares": (
+        {"size": 64, "image_processor_type": "ViTImageProcessor"},
+        "expected size {shortest_edge} and crop_size {height, width}, got 64 and",
+    ),
+    "no size": ({"size": None}, "expected size {shortest_edge}"),
+    "a size that is a truth": ({"size": True}, "expected size {shortest_edge}"),
+    "a size of half a pixel": ({"size": {"shortest_edge": 0.5}}, "expected size {shortest_edge}"),
+    "no mean": ({"image_mean": None}, "image_mean: expected three numbers, got None"),
+    "one deviation": ({"image_std": [0.5]}, r"image_std: expected three numbers, got \[0.5\]"),
 }
 
 
@@ -335,6 +348,96 @@ def test_a_preprocessor_that_works_otherwise_is_refused(
     file.write_text(json.dumps(content))
     with pytest.raises(ValueError, match=message):
         Encoders.from_pretrained(tmp_path / "image", config.text_encoder)
+
+
+def test_sizes_may_be_numbers_as_transformers_once_wrote_them(encoders: Encoders, tmp_path: Path) -> None:
+    encoders.save(tmp_path)
+    file = tmp_path / "image_encoder" / PREPROCESSOR_CONFIG
+    content = json.loads(file.read_text())
+    file.write_text(json.dumps(content | {"size": 64, "crop_size": 56}))
+    assert Encoders.load(tmp_path).preprocessor == encoders.preprocessor
+    assert (encoders.preprocessor.resize_px, encoders.preprocessor.crop_px) == (64, (56, 56))
+
+
+def without_tokenizer(folder: Path) -> None:
+    for file in (folder / "text_encoder").iterdir():
+        if file.name not in ("config.json", "model.safetensors"):
+            file.unlink()
+
+
+def of_type(which: str, **config: Any) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        (folder / which / "config.json").write_text(json.dumps(config))
+
+    return change
+
+
+def whole_and_in_shards(folder: Path) -> None:
+    (folder / "image_encoder" / "model.safetensors.index.json").write_text('{"weight_map": {}}')
+
+
+def too_many_words(folder: Path) -> None:
+    file = folder / "text_encoder" / "tokenizer.json"
+    content = json.loads(file.read_text())
+    content["model"]["vocab"] |= {f"word{index}": 1000 + index for index in range(200)}
+    file.write_text(json.dumps(content))
+
+
+IMAGE_MODEL = r"image_encoder: model_type: expected one of dinov2, dinov2_with_registers, got "
+TEXT_MODEL = r"text_encoder: model_type: expected one of bert, .*, got "
+MISFITS: dict[str, tuple[Callable[[Path], None], str]] = {
+    "no files of a tokenizer": (without_tokenizer, r"text_encoder: expected files of a tokenizer \(tokenizer\.json, or vocab"),
+    "a tokenizer of more words": (too_many_words, r"text_encoder: expected a tokenizer of at most 180 tokens, got 3"),
+    "ViT": (of_type("image_encoder", model_type="vit"), IMAGE_MODEL + "vit"),
+    "CLIP": (of_type("image_encoder", model_type="clip"), IMAGE_MODEL + "clip"),
+    "CLIP's text": (of_type("text_encoder", model_type="clip_text_model"), TEXT_MODEL + "clip_text_model"),
+    "T5": (of_type("text_encoder", model_type="t5"), TEXT_MODEL + "t5"),
+    "encoders changed for each other": (of_type("image_encoder", model_type="bert"), IMAGE_MODEL + "bert"),
+    "weights whole and in shards": (whole_and_in_shards, r"image_encoder: expected model\.safetensors or shards, got"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "message"), MISFITS.values(), ids=MISFITS)
+def test_encoders_that_do_not_fit_are_refused(
+    encoders: Encoders, tmp_path: Path, change: Callable[[Path], None], message: str
+) -> None:
+    encoders.save(tmp_path)
+    change(tmp_path)
+    with pytest.raises((ValueError, CheckpointError), match=message):
+        Encoders.load(tmp_path)
+
+
+def test_encoders_that_are_no_folders_are_told() -> None:
+    checkpoint = families.load(goldens.config(NAME).checkpoint, image_encoder="org/nowhere", text_encoder="no/where")
+    with pytest.raises(CheckpointError, match=r"there is no folder org/nowhere nor no/where either\)"):
+        checkpoint.encoders()
+
+
+NO_ROOM = """
+import resource, sys
+room, checkpoint, image, text = sys.argv[1:]
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(room), int(room)))
+from rfm import families
+from rfm.checkpoint.content import CheckpointError
+from rfm_commands.engine_scorer import EngineScorer
+options = {"image_encoder": image, "text_encoder": text}
+families.load(checkpoint, **options).encoders()
+try:
+    EngineScorer(checkpoint, **options)
+except CheckpointError as error:
+    sys.exit(str(error))
+"""
+
+
+@pytest.mark.parametrize("room", [0, 4096])
+def test_a_full_folder_of_temporary_files_is_told(room: int) -> None:
+    """Loading needs none."""
+    config = goldens.config(NAME)
+    folders = (config.checkpoint, config.image_encoder, config.text_encoder)
+    command = [sys.executable, "-B", "-c", NO_ROOM, str(room), *map(str, folders)]
+    done = subprocess.run(command, check=False, stderr=subprocess.PIPE, text=True)
+    assert "TMPDIR: expected a folder of temporary files with room for a copy of the encoders, got: " in done.stderr
+    assert done.stderr.endswith("; name another one with it\n")
 
 
 # Of a picture of 4 x 4 pixels: the crop, and where the picture begins in it, or the crop in the picture where it is less.

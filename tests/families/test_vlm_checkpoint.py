@@ -12,12 +12,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 import yaml
 from google.protobuf import text_format
-from PIL import Image
 from safetensors.torch import load_file, save_file
 from tritonclient.grpc import model_config_pb2 as pb
 
@@ -30,11 +28,9 @@ from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.vlm import lora
 from rfm.vlm.checkpoint import VlmCheckpoint
-from rfm.vlm.images import fitted_size
 from rfm_client import (
     InvalidSampleError,
     ProgressSample,
-    Trajectory,
 )
 from rfm_client.contract.model_info import FRAME_SIZE_PARAMETER
 from vlm import BFLOAT16, PLAIN, assert_close, film, load
@@ -148,11 +144,111 @@ def change_adapter(**changes: object) -> Callable[[Path], None]:
     return spoil
 
 
-def change_layers(folder: Path) -> None:
-    file = folder / "config.json"
-    backbone = json.loads(file.read_text())
-    backbone["text_config"]["layer_types"][0] = "sliding_attention"
-    file.write_text(json.dumps(backbone))
+def change_backbone(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
+    """Changes config.json."""
+
+    def spoil(folder: Path) -> None:
+        file = folder / "config.json"
+        backbone = json.loads(file.read_text())
+        change(backbone)
+        file.write_text(json.dumps(backbone))
+
+    return spoil
+
+
+def change_text(**changes: object) -> Callable[[Path], None]:
+    return change_backbone(lambda backbone: backbone["text_config"].update(changes))
+
+
+def as_transformers_5_writes(backbone: dict[str, Any]) -> None:
+    text = backbone["text_config"]
+    text["rope_parameters"] = {"rope_type": "default"} | (text.pop("rope_scaling") or {})
+    text["rope_parameters"]["rope_theta"] = text.pop("rope_theta")
+    text["pad_token_id"] = None
+    if backbone["model_type"] != "smolvlm":
+        backbone["vision_config"]["rope_parameters"] = {"rope_theta": 10000.0, "rope_type": "axial"}
+        backbone["vision_config"]["model_type"] += "_vision"
+
+
+def as_before_text_config(backbone: dict[str, Any]) -> None:
+    text = backbone.pop("text_config")
+    sections = text["rope_scaling"]["mrope_section"]
+    for name, value in (text | {"rope_scaling": {"type": "mrope", "mrope_section": sections}}).items():
+        backbone.setdefault(name, value)
+
+
+def rename(
+    pattern: str, replacement: str | Callable[[re.Match[str]], str], file: str = "model.safetensors"
+) -> Callable[[Path], None]:
+    def change(weights: dict[str, Any]) -> None:
+        for name in [*weights]:
+            weights[re.sub(pattern, replacement, name)] = weights.pop(name)
+
+    return change_tensors(file, change)
+
+
+def beside_another_adapter(folder: Path) -> None:
+    beside_its_adapter(folder)
+    change_adapter(lora_alpha=16)(folder)
+
+
+def beside_its_adapter(folder: Path) -> None:
+    """What upstream writes of a LoRA run since its pull request 25."""
+    weights = load_file(folder / "model.safetensors")
+    adapter = {
+        f"base_model.model.{name.split('.base_model.model.')[1].replace('.default.', '.')}": tensor
+        for name, tensor in weights.items()
+        if ".lora_" in name
+    }
+    save_file(adapter, folder / "adapter_model.safetensors")
+    heads = {name: tensor for name, tensor in weights.items() if not name.startswith("model.")}
+    save_file(heads, folder / "custom_heads.safetensors")
+    shutil.copy(goldens.config(ADAPTER).checkpoint / "adapter_config.json", folder)
+    (folder / "peft_target_module.json").write_text('{"target_module": "language_model", "adapter_dir": "."}')
+
+
+FORMS: dict[str, tuple[str, Callable[[Path], None]]] = {
+    "Qwen2.5-VL of transformers 5": ("q25_mean_l2", change_backbone(as_transformers_5_writes)),
+    "Qwen3-VL of transformers 5": (PLAIN, change_backbone(as_transformers_5_writes)),
+    "SmolVLM of transformers 5": ("smol_mean_disc10", change_backbone(as_transformers_5_writes)),
+    "Qwen2.5-VL without text_config": ("q25_mean_l2", change_backbone(as_before_text_config)),
+    "layers right under the model": (
+        "q25_mean_l2",
+        rename(r"^model\.(language_model|visual)\b", lambda found: "visual" if found[1] == "visual" else "model"),
+    ),
+    "with rotary frequencies": (
+        "q25_mean_l2",
+        change_tensors(
+            "model.safetensors",
+            lambda w: w.update(
+                {
+                    "model.language_model.rotary_emb.inv_freq": torch.ones(8),
+                    "model.visual.rotary_pos_emb.inv_freq": torch.ones(4),
+                }
+            ),
+        ),
+    ),
+    "a whole model beside its adapter": (LORA_INSIDE, beside_its_adapter),
+    "an adapter around the language model": (
+        ADAPTER,
+        rename(r"^base_model\.model\.language_model\.", "base_model.model.", "adapter_model.safetensors"),
+    ),
+    "LoRA around the whole model": (
+        LORA_INSIDE,
+        rename(r"^model\.language_model\.base_model\.model\.", "model.base_model.model.language_model."),
+    ),
+}
+
+
+@pytest.mark.parametrize(("name", "change"), FORMS.values(), ids=FORMS)
+def test_a_checkpoint_in_another_form_scores_the_same(
+    copied: Callable[[str], Path], name: str, change: Callable[[Path], None]
+) -> None:
+    known, folder = load_engine(name), copied(name)
+    change(folder)
+    engine = Engine.from_checkpoint(folder, base_model=str(goldens.config(name).base_model))
+    (result,), (expected,) = (each.evaluate([ProgressSample(film(0, 3, 60, 84))]) for each in (engine, known))
+    assert_close(result, expected, 1e-6)  # sums differ with where weights lie in memory
 
 
 def drop_first(part: str) -> Callable[[dict[str, Any]], object]:
@@ -185,7 +281,7 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
         change_yaml("  resized_height: 56\n", ""),
         r"data\.resized_height: expected a number or null, got no such key",
     ),
-    "a size that is none": (PLAIN, change_yaml("resized_width: null", "resized_width: wide"), r"data\.resized_width: expected a whole number"),
+    "a size that is none": ("q25_video_last_l2", change_yaml("resized_width: 84", "resized_width: wide"), r"data\.resized_width: expected a whole number"),
     "a run of nothing": (PLAIN, lambda folder: (folder / "config.yaml").write_text("{}") and None, r"config\.yaml: model: expected the settings"),
     "text for a truth": (PLAIN, change_yaml("average_temporal_patches: false", "average_temporal_patches: 'false'"), r"average_temporal_patches: expected bool, got 'false'"),
     "a temperature of zero": (PLAIN, change_yaml("attn_temperature: 1.0", "attn_temperature: 0.0"), r"temperature: expected a number above 0, got 0.0"),
@@ -203,8 +299,58 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "another model type": (PLAIN, change_yaml("model_type: default", "model_type: dpo"), r"model_type: expected default, got 'dpo'$"),
     "layers that see few tokens": (
         "q25_mean_l2",
-        change_layers,
+        change_text(layer_types=["sliding_attention", "full_attention"]),
         r"text_config\.layer_types: expected full_attention alone, got \['full_attention', 'sliding_attention'\]",
+    ),
+    "rotary positions without a base": (
+        "smol_mean_disc10",
+        change_backbone(lambda backbone: backbone["text_config"].pop("rope_theta")),
+        r"config\.json: text_config\.rope_theta: expected a number above 0, got None; copy it from config\.json of the base",
+    ),
+    "rotary positions without sections": (PLAIN, change_text(rope_scaling=None), r"rope_scaling\.mrope_section: expected a list of numbers, got None"),
+    "two bases of rotary positions": (PLAIN, change_text(rope_parameters={"rope_theta": 1e4}), r"expected one value of rope_theta in text_config, got 10000\.0 and 5000000\.0"),
+    "two types of rotary positions": (PLAIN, change_text(rope_parameters={"rope_type": "linear"}), r"expected one value of rope_type in rope_scaling, got 'linear' and 'default'"),
+    "pairs of a head rotated": (PLAIN, change_text(rope_interleaved=True), r"text_config\.rope_interleaved: expected false, got True"),
+    **{
+        f"no {name} of the {part}": (
+            checkpoint,
+            change_backbone(lambda backbone, part=part, name=name: backbone[part].pop(name)),
+            rf"config\.json: {part}\.{name}: expected a value, got none; copy it",
+        )
+        for checkpoint, part, name in [
+            (PLAIN, "text_config", "rms_norm_eps"),
+            ("q25_mean_l2", "text_config", "num_attention_heads"),
+            ("q25_mean_l2", "vision_config", "fullatt_block_indexes"),
+            (PLAIN, "vision_config", "deepstack_visual_indexes"),
+            ("smol_mean_disc10", "vision_config", "num_attention_heads"),
+        ]
+    },
+    "half of a head rotated": (PLAIN, change_text(partial_rotary_factor=0.5), r"partial_rotary_factor: expected 1, got 0\.5"),
+    "a vision tower with other rotary positions": (
+        PLAIN,
+        change_backbone(lambda backbone: backbone["vision_config"].update(rope_parameters={"rope_theta": 100.0})),
+        r"vision_config\.rope_parameters: expected axial with a rope_theta of 10000, got {'rope_theta': 100\.0}",
+    ),
+    **{
+        f"weights of {method}": (
+            PLAIN,
+            change_backbone(lambda backbone, method=method: backbone.update(quantization_config={"quant_method": method})),
+            rf"config\.json: quantization_config: expected none, got '{method}'; export the checkpoint that was quantized",
+        )
+        for method in ("bitsandbytes", "gptq", "awq", "fp8", "compressed-tensors")
+    },
+    **{
+        f"weights with {part}": (
+            PLAIN,
+            change_tensors("model.safetensors", lambda w, part=part: w.update({f"model.language_model.layers.0.mlp.up_proj{part}": torch.ones(1)})),
+            rf"expected weights in full precision, got '.*{part}'; export the checkpoint that was quantized",
+        )
+        for part in (".weight.absmax", ".weight.quant_state.bitsandbytes__nf4", ".SCB", ".qweight", ".weight_scale_inv")
+    },
+    "a weight under two names": (
+        "q25_mean_l2",
+        change_tensors("model.safetensors", lambda w: w.update({"model.norm.weight": torch.ones(32)})),
+        r"model\.language_model\.norm\.weight: expected one weight, got .*'model\.norm\.weight'.*; remove the one",
     ),
     "LoRA without alpha": (LORA_INSIDE, change_yaml("lora_alpha: 8", "lora_beta: 8"), r"expected lora_alpha and r of the LoRA weights"),
     "half a LoRA pair": (LORA_INSIDE, change_tensors("model.safetensors", drop_first("lora_B")), r"expected a weight and LoRA factors A and B, got \['A'\]"),
@@ -213,7 +359,34 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
         change_tensors("model.safetensors", cut_first("lora_B")),
         r"expected LoRA factors of one rank, got \[\d+, 3\] and \[4, \d+\]",
     ),
-    "LoRA of another kind": (ADAPTER, change_adapter(use_dora=True), r"expected plain LoRA, got use_dora"),
+    "LoRA of another kind": (ADAPTER, change_adapter(use_dora=True), r"expected plain LoRA, got use_dora; merge it"),
+    "LoRA of another scale": (ADAPTER, change_adapter(use_rslora=True), r"expected plain LoRA, got use_rslora; merge it"),
+    "LoRA of one token's kind": (ADAPTER, change_adapter(alora_invocation_tokens=[1]), r"expected plain LoRA, got alora_invocation_tokens"),
+    "LoRA with ranks of its own": (ADAPTER, change_adapter(rank_pattern={"q_proj": 8}), r"expected plain LoRA, got rank_pattern"),
+    "LoRA with a field of the future": (ADAPTER, change_adapter(use_newlora=True), r"expected plain LoRA, got use_newlora"),
+    "an adapter that is no LoRA": (ADAPTER, change_adapter(peft_type="IA3", r=None), r"peft_type: expected LORA, got 'IA3'"),
+    **{
+        f"LoRA that begins by {init}": (ADAPTER, change_adapter(init_lora_weights=init), rf"init_lora_weights: expected true, got '{init}', .* merge it")
+        for init in ("pissa", "pissa_niter_16", "olora", "corda", "eva", "loftq", "lora_ga")
+    },
+    "an adapter with biases": (ADAPTER, change_adapter(bias="lora_only"), r"bias: expected none, got 'lora_only'"),
+    "an adapter of another rank": (ADAPTER, change_adapter(r=8), r"adapter_config\.json: r: expected 4, the rows of .*lora_A, got 8; put in r"),
+    "a run of another rank": (LORA_INSIDE, change_yaml("  r: 4", "  r: 32"), r"config\.yaml: r: expected 4, the rows of .*lora_A, got 32; put in r"),
+    "a module of another rank": (
+        LORA_INSIDE,
+        change_tensors("model.safetensors", lambda w: w.update({n: torch.cat([t, t], 0 if "_A" in n else 1) for n, t in w.items() if "layers.1.mlp.up_proj.lora_" in n})),
+        r"r: expected 8, the rows of model\.language_model\.layers\.1\.mlp\.up_proj\.lora_A, got 4",
+    ),
+    "a run and an adapter that disagree": (
+        LORA_INSIDE,
+        beside_another_adapter,
+        r"adapter_config\.json: expected r 4 and lora_alpha 8, as .*config\.yaml has it, got r 4 and lora_alpha 16",
+    ),
+    "a run of before 2026-01-21": (
+        PLAIN,
+        change_tensors("model.safetensors", lambda w: w.pop("frame_pool_attn.weight")),
+        r"expected frame_pool_attn\.weight, got none: .* before that day was trained with 8 special tokens",
+    ),
     "an adapter and whole weights": (
         ADAPTER,
         lambda folder: save_file({"any": torch.zeros(1)}, folder / "model.safetensors"),
@@ -227,7 +400,7 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "an adapter without its embedding": (
         ADAPTER,
         change_tensors("adapter_model.safetensors", drop_first("embed_tokens")),
-        r"expected the embedding of the special tokens, got none",
+        r"expected the embedding of the special tokens, got none: their rows .* are lost .*save_embedding_layers=True",
     ),
     "an adapter of another model": (
         ADAPTER,
@@ -266,10 +439,39 @@ def test_smolvlm_is_refused_where_its_scores_would_differ(monkeypatch: pytest.Mo
         checkpoint.build()
 
 
+@pytest.mark.parametrize(
+    ("name", "version", "is_told"),
+    [
+        ("q25_video_last_l2", "5.5.4", True),
+        ("q25_video_last_l2", "4.57.6", False),
+        ("q25_mean_l2", "5.5.4", False),
+        (PLAIN, "5.5.4", False),
+    ],
+)
+def test_a_video_run_of_transformers_5_is_told_about_its_positions(
+    copied: Callable[[str], Path], name: str, version: str, is_told: bool
+) -> None:
+    folder = copied(name)
+    change_backbone(lambda backbone: backbone.update(transformers_version=version))(folder)
+    notes = families.notes(folder, load(name, folder))
+    assert any(f"transformers_version is {version}: text behind a video" in note for note in notes) == is_told
+
+
 def test_a_processor_of_another_model_is_refused() -> None:
     other = str(goldens.config(ADAPTER).base_model)
     with pytest.raises(CheckpointError, match=r"expected a tokenizer of 451 tokens .*, got 447"):
         Engine.from_checkpoint(goldens.config(PLAIN).checkpoint, base_model=other)
+
+
+def test_eight_special_tokens_tell_an_old_run(copied: Callable[[str], Path]) -> None:
+    folder = copied(PLAIN)
+    three_more = lambda w: w.update({n: torch.cat([t, t[-3:]]) for n, t in w.items() if "embed_tokens" in n})  # noqa: E731
+    change_tensors("model.safetensors", three_more)(folder)
+    change_text(vocab_size=454)(folder)
+    with pytest.raises(
+        CheckpointError, match=r"tokens .*, got 451 \(with 8 special tokens, as upstream before 2026-01-21"
+    ):
+        _ = load(PLAIN, folder).collator
 
 
 def test_a_preprocessor_file_as_qwen_publishes_it_is_read(tmp_path: Path) -> None:
@@ -282,6 +484,50 @@ def test_a_preprocessor_file_as_qwen_publishes_it_is_read(tmp_path: Path) -> Non
     file.chmod(0o644)
     file.write_text(json.dumps(fields))
     Engine.from_checkpoint(goldens.config(PLAIN).checkpoint, base_model=str(base))
+
+
+def as_transformers_5_saves(base: Path) -> None:
+    """Rewrites a processor's files."""
+    config = json.loads((base / "tokenizer_config.json").read_text())
+    special = config.pop("additional_special_tokens")
+    config.pop("added_tokens_decoder")
+    config |= {"extra_special_tokens": special, "backend": "tokenizers", "tokenizer_class": "TokenizersBackend"}
+    (base / "tokenizer_config.json").write_text(json.dumps(config))
+    images = json.loads((base / "preprocessor_config.json").read_text())
+    (base / "processor_config.json").write_text(json.dumps({"image_processor": images}))
+    template = json.loads((base / "chat_template.json").read_text())["chat_template"]
+    (base / "chat_template.jinja").write_text(template)
+    for file in base.iterdir():
+        if file.name not in ("tokenizer.json", "tokenizer_config.json", "processor_config.json", "chat_template.jinja"):
+            file.unlink()
+
+
+@pytest.mark.parametrize("name", ["q25_mean_l2", PLAIN, "smol_mean_disc10"])
+def test_a_processor_of_transformers_5_reads_the_same(tmp_path: Path, name: str) -> None:
+    known, config = load_engine(name), goldens.config(name)
+    base = tmp_path / "base"
+    shutil.copytree(str(config.base_model), base, copy_function=shutil.copyfile)
+    as_transformers_5_saves(base)
+    engine = Engine.from_checkpoint(config.checkpoint, base_model=str(base))
+    load(name, base=str(base)).save(tmp_path / "saved")
+    saved = Engine.from_checkpoint(tmp_path / "saved")
+    sample = ProgressSample(film(0, 3, 60, 84))
+    (expected,) = known.evaluate([sample])
+    for other in (engine, saved):
+        (result,) = other.evaluate([sample])
+        assert_close(result, expected, 1e-6)
+
+
+def test_a_processor_without_image_settings_is_refused(tmp_path: Path) -> None:
+    base = tmp_path / "base"
+    shutil.copytree(str(goldens.config(PLAIN).base_model), base, copy_function=shutil.copyfile)
+    as_transformers_5_saves(base)
+    (base / "processor_config.json").write_text("{}")
+    expected = (
+        r"expected preprocessor_config\.json, or image_processor in processor_config\.json, got none .*--base-model"
+    )
+    with pytest.raises(CheckpointError, match=expected):
+        _ = load(PLAIN, base=str(base)).collator
 
 
 def test_a_thin_video_is_refused() -> None:
@@ -352,56 +598,25 @@ def test_sections_that_disagree_are_refused(copied: Callable[[str], Path], key: 
         load(PLAIN, folder)
 
 
-SIZED = {"resized_height": 112, "resized_width": 84}
-
-
-@pytest.fixture
-def sized(copied: Callable[[str], Path]) -> Path:
-    """A multi-image checkpoint whose run set a size for frames."""
+def test_a_size_for_images_is_ignored_as_upstream_does(copied: Callable[[str], Path], tmp_path: Path) -> None:
     folder = copied(PLAIN)
-    rewritten(folder, lambda run: run["data"].update(SIZED))
-    return folder
-
-
-def test_a_size_for_images_is_asked_about(sized: Path) -> None:
-    with pytest.raises(CheckpointError, match=r"got 112 and 84: .* --resize-images .* --no-resize-images"):
-        load(PLAIN, sized)
-
-
-@pytest.mark.parametrize(("resize_images", "side_px"), [(True, (112, 84)), (False, None)])
-def test_a_size_for_images_is_kept_or_ignored_as_told(
-    sized: Path, tmp_path: Path, resize_images: bool, side_px: tuple[int, int] | None
-) -> None:
+    rewritten(folder, lambda run: run["data"].update(resized_height=112, resized_width=84))
     base = str(goldens.config(PLAIN).base_model)
     sample = ProgressSample(film(0, 2, 48, 80))
-    resized = ProgressSample(film(0, 2, 48, 80))
-    engine = Engine.from_checkpoint(sized, base_model=base, resize_images=resize_images)
-    (result,) = engine.evaluate([sample])
-    plain = load_engine(PLAIN)
-    if side_px is not None:  # what the checkpoint without a size says of frames that were brought to it before
-        frames = sample.trajectory.frames
-        assert frames is not None
-        fitted = fitted_size(*side_px, 32)
-        small = np.stack(
-            [np.asarray(Image.fromarray(f).resize(fitted[::-1], Image.Resampling.BICUBIC)) for f in frames]
-        )
-        resized = ProgressSample(Trajectory(frames=small, task=sample.trajectory.task))
-    (expected,) = plain.evaluate([resized])
+    (result,) = Engine.from_checkpoint(folder, base_model=base).evaluate([sample])
+    (expected,) = load_engine(PLAIN).evaluate([sample])
     assert_close(result, expected, 1e-6)
 
-    serve = ExportConfig(num_gpus=0, torch_threads=1, base_model=base, resize_images=resize_images)
-    rfm_export.export(sized, tmp_path / "repository", serve)
+    rfm_export.export(folder, tmp_path / "repository", ExportConfig(num_gpus=0, torch_threads=1, base_model=base))
     text = (tmp_path / "repository" / "rfm_frames" / "config.pbtxt").read_text()
-    told = text_format.Parse(text, pb.ModelConfig()).parameters[FRAME_SIZE_PARAMETER].string_value
-    assert told == ("" if side_px is None else "exact 128x96")
+    assert text_format.Parse(text, pb.ModelConfig()).parameters[FRAME_SIZE_PARAMETER].string_value == ""
     exported = families.load(tmp_path / "repository" / "rfm_frames" / "1" / "checkpoint")
     assert isinstance(exported, VlmCheckpoint)
-    assert exported.config.size_px == side_px
+    assert exported.config.size_px is None
 
 
-@pytest.mark.parametrize("resize_images", [True, False, None])
-def test_a_size_for_videos_always_holds(resize_images: bool | None) -> None:
-    checkpoint = families.load(goldens.config("q25_video_last_l2").checkpoint, resize_images=resize_images)
+def test_a_size_for_videos_holds() -> None:
+    checkpoint = families.load(goldens.config("q25_video_last_l2").checkpoint)
     assert isinstance(checkpoint, VlmCheckpoint)
     assert checkpoint.config.size_px == (56, 84)
 
@@ -442,8 +657,8 @@ OTHER_BASES = (
 )
 SAME_BASES = (
     "/scratch/models/Qwen2.5-VL-3B-Instruct/",
-    "unsloth/qwen2.5-vl-3b-instruct-unsloth-bnb-4bit",
-    "unsloth/Qwen2.5-VL-3B-Instruct-bnb-4bit",
+    "unsloth/qwen2.5-vl-3b-instruct-unsloth",
+    "unsloth/Qwen2.5-VL-3B-Instruct",
     None,
     "",
 )  # fmt: skip
@@ -457,6 +672,27 @@ def test_an_adapter_on_another_base_model_is_asked_about(copied: Callable[[str],
     with pytest.raises(CheckpointError, match=rf"{re.escape(expected)}, .*, got '{re.escape(base)}'; .* --base-model"):
         families.load(folder)
     assert load(ADAPTER, folder).config == load(ADAPTER).config  # which names --base-model
+
+
+@pytest.mark.parametrize(
+    "base", ["unsloth/qwen2.5-vl-3b-instruct-unsloth-bnb-4bit", "/models/Qwen2.5-VL-3B-Instruct-bnb-4bit/"]
+)
+def test_an_adapter_on_weights_of_few_bits_is_refused(copied: Callable[[str], Path], base: str) -> None:
+    folder = copied(ADAPTER)
+    name_base(folder, base)
+    expected = rf"adapter_config\.json: base_model_name_or_path: expected weights in full precision, got '{re.escape(base)}'; .*"
+    with pytest.raises(CheckpointError, match=expected + r"m\.dequantize\(\).* with --base-model$"):
+        families.load(folder)
+    assert load(ADAPTER, folder).config == load(ADAPTER).config  # which names --base-model
+
+
+def test_a_base_model_of_few_bits_is_refused(tmp_path: Path) -> None:
+    base = tmp_path / "base"
+    shutil.copytree(str(goldens.config(ADAPTER).base_model), base, copy_function=shutil.copyfile)
+    change_backbone(lambda config: config.update(quantization_config={"quant_method": "bitsandbytes"}))(base)
+    expected = rf"base model {base}: config\.json: quantization_config: expected none, got 'bitsandbytes'; .*dequantize"
+    with pytest.raises(CheckpointError, match=expected):
+        load(ADAPTER, base=str(base))
 
 
 @pytest.mark.parametrize("base", SAME_BASES)

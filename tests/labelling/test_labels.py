@@ -78,15 +78,6 @@ def test_a_checkpoint_is_another_with_other_settings(tmp_path: Path, file: str) 
     assert facts().settings_digest != before.settings_digest
 
 
-def test_a_checkpoint_is_another_where_frames_are_resized_otherwise() -> None:
-    golden = goldens.config("q25_video_last_l2")
-    scorers = [
-        EngineScorer(str(golden.checkpoint), base_model=str(golden.base_model), resize_images=resizes)
-        for resizes in (True, False)
-    ]
-    assert len({scorer.checkpoint().settings_digest for scorer in scorers}) == 2
-
-
 def columns(file: Path) -> dict[str, np.ndarray[Any, Any]]:
     return {name: column.to_numpy() for name, column in zip(*table_of(file), strict=True)}
 

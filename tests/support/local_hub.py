@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from urllib.parse import unquote
 
 
 def commit_of(revision: str) -> str:
@@ -35,6 +36,9 @@ def hub(repositories: Mapping[str, Mapping[str, Path]], kind: str = "models") ->
             place = "" if kind == "models" else f"/{kind}"
             words = self.path.removeprefix(f"/api/{kind}" if self.path.startswith("/api/") else place).split("/")
             repository = "/".join(words[1:3])
+            if repository not in repositories:  # what newer clients ask of the Hub itself
+                self._send(404, b"", with_body)
+                return
             revisions = repositories[repository]
             folders = {**revisions, **{commit_of(name): folder for name, folder in revisions.items()}}
             api, files = f"/api/{kind}/{repository}", f"{place}/{repository}/resolve/"
@@ -52,11 +56,16 @@ def hub(repositories: Mapping[str, Mapping[str, Path]], kind: str = "models") ->
                 siblings = [{"rfilename": name} for name in names]
                 told = {"id": repository, "sha": _commit(revisions, revision), "siblings": siblings}
                 self._send(200, json.dumps(told).encode(), with_body)
+            elif self.path.startswith(f"{api}/tree/"):
+                revision = self.path.removeprefix(f"{api}/tree/").partition("?")[0]
+                told = [_told(file, folders[revision]) for file in folders[revision].rglob("*") if file.is_file()]
+                self._send(200, json.dumps(told).encode(), with_body)
             else:
                 revision, _, name = self.path.removeprefix(files).partition("/")
-                file = folders[revision] / name
+                file = folders[revision] / unquote(name)
                 if not file.is_file():
-                    self._send(404, b"", with_body, {"X-Error-Code": "EntryNotFound"})
+                    of_commit = {"X-Repo-Commit": _commit(revisions, revision)}
+                    self._send(404, b"", with_body, {"X-Error-Code": "EntryNotFound", **of_commit})
                     return
                 content = file.read_bytes()
                 etag = f'"{hashlib.sha1(content).hexdigest()}"'
@@ -83,6 +92,11 @@ def hub(repositories: Mapping[str, Mapping[str, Path]], kind: str = "models") ->
         server.shutdown()
         thread.join()
         server.server_close()
+
+
+def _told(file: Path, folder: Path) -> dict[str, object]:
+    oid = hashlib.sha1(file.read_bytes()).hexdigest()
+    return {"type": "file", "path": str(file.relative_to(folder)), "size": file.stat().st_size, "oid": oid}
 
 
 def _commit(revisions: Mapping[str, Path], revision: str) -> str:

@@ -141,6 +141,10 @@ class ToyCheckpoint:
     def parts(self) -> dict[str, dict[str, Tensor]]:
         return {NETWORK: self.weights}
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return ()
+
     def encoders(self) -> Palette:
         return Palette(torch.full((self.config.num_colours,), 1 / 255))
 

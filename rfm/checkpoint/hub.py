@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: MIT
+"""Where a checkpoint is: a local folder, or a repository of the Hugging Face Hub."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import shlex
+from collections.abc import Iterable
+from pathlib import Path
+
+from rfm.checkpoint.content import CheckpointError, cut, is_there, shown
+from rfm.checkpoint.files import RUN_CONFIG, WEIGHTS
+from rfm.checkpoint.pickles import pickled_weights
+
+_SOURCE = "a folder that exists or a Hugging Face id org/name[/subfolder][@tag]"
+_ID = re.compile(r"(?P<repo>\w[\w.-]*/\w[\w.-]*)(?:/(?P<subfolder>[\w=.+-]+(?:/[\w=.+-]+)*))?(?:@(?P<tag>.+))?")
+_FILES = ["*.safetensors", "*.json", "*.yaml", "*.yml", "*.txt"]
+_BEST_TAG = re.compile(r"best-.*?-(-?\d+\.\d+)-step-\d+")
+
+
+def find(source: str | Path) -> Path:
+    """The local folder of a checkpoint, fetched from the Hub if need be. An existing path wins over an id."""
+    try:
+        path = Path(source).expanduser()
+        if str(source) and path.is_dir():
+            return path
+        if path.is_file():
+            raise CheckpointError(f"checkpoint: expected {_SOURCE}, got the file {path}: name {path.parent}")
+    except (OSError, RuntimeError) as error:
+        got = f"{shown(str(source))}: {type(error).__name__}"
+        raise CheckpointError(f"checkpoint: expected {_SOURCE}, got {got}") from error
+    match = _ID.fullmatch(str(source))
+    if match is None or ".." in Path(source).parts:
+        raise CheckpointError(f"checkpoint: expected {_SOURCE}, got {shown(str(source))}{_near(path)}")
+    return _fetch(match["repo"], match["subfolder"] or "", match["tag"], path)
+
+
+def commit_of(folder: Path) -> str:
+    """The commit of a checkpoint in the Hub's cache: the name of its snapshot."""
+    return next((path.name for path in (folder, *folder.parents) if path.parent.name == "snapshots"), folder.name)
+
+
+def best_tag(tags: Iterable[str]) -> str | None:
+    """The tag ``best-<metric>-<score>-step-<n>`` of the highest score, the first of equals; None if there is none."""
+    scores = {tag: float(match[1]) for tag in tags if (match := _BEST_TAG.search(tag))}
+    return max(scores, key=scores.__getitem__, default=None)
+
+
+def _fetch(repo_id: str, subfolder: str, tag: str | None, path: Path) -> Path:
+    """The folder in the Hub's cache, with all but pickles. ``path``: where a local folder of this name would be."""
+    from huggingface_hub import HfApi, snapshot_download
+
+    patterns = _FILES
+    if subfolder:
+        above = subfolder.rpartition("/")[0]
+        patterns = [*(f"{subfolder}/{pattern}" for pattern in _FILES), f"{above}/{RUN_CONFIG}".lstrip("/")]
+    try:
+        if tag is None:
+            tag = best_tag(ref.name for ref in HfApi().list_repo_refs(repo_id).tags)
+        folder = Path(snapshot_download(repo_id, revision=tag, allow_patterns=patterns)) / subfolder
+        if not any(folder.glob("**/*.safetensors")):
+            _refuse_pickles(repo_id, subfolder, tag)
+        if not subfolder and not is_there(folder / RUN_CONFIG):  # upstream's uploader tags a commit of before it
+            _fetch_run_config_of_main(repo_id)
+    except _failures() as error:
+        where = f"{repo_id}@{tag or 'latest'}"
+        raise CheckpointError(
+            f"{where}: cannot be fetched: {cut(str(error))}; there is no folder {path.absolute()} either{_near(path)}; "
+            f"name one, or see to the Hub's name, login and network{_cached(repo_id, subfolder)}"
+        ) from error
+    if not folder.is_dir():
+        raise CheckpointError(
+            f"{repo_id}@{tag or 'main'}: expected the folder {subfolder}, got none of this name{_near(path)}"
+        )
+    return folder
+
+
+def _failures() -> tuple[type[Exception], ...]:
+    """What huggingface_hub raises; from version 1 on it lets errors of httpx through."""
+    from huggingface_hub.errors import HfHubHTTPError, HFValidationError
+
+    try:
+        import httpx
+    except ImportError:
+        return HfHubHTTPError, HFValidationError, OSError
+    return HfHubHTTPError, HFValidationError, OSError, httpx.HTTPError
+
+
+def _refuse_pickles(repo_id: str, subfolder: str, tag: str | None) -> None:
+    """Raises CheckpointError if all weights are pickles, which are not fetched."""
+    from huggingface_hub import HfApi
+
+    files = [Path(file.rfilename) for file in HfApi().model_info(repo_id, revision=tag).siblings or ()]
+    names = pickled_weights((file.name for file in files if file.parent == Path(subfolder)), "pytorch_model")
+    if names:
+        revision = "" if tag is None else f" --revision {shlex.quote(tag)}"
+        fetch = f"hf download {repo_id}{revision} --local-dir FOLDER"
+        raise CheckpointError(
+            f"{repo_id}@{tag or 'main'}: expected {WEIGHTS}, got {cut(', '.join(names))}: pickles may run code when "
+            f"they are loaded, so none is fetched. If you trust who made it: {fetch}, then name "
+            f"{Path('FOLDER', subfolder)} as the checkpoint, and you are told how to convert it"
+        )
+
+
+def _near(path: Path) -> str:
+    """Folders beside a path that is none, whose names are like its own."""
+    try:
+        names = [beside.name for beside in path.parent.iterdir() if beside.is_dir()]
+    except OSError:
+        return ""
+    alike = difflib.get_close_matches(path.name, names)
+    return f" (but {', '.join(str(path.parent / name) for name in alike)})" if alike else ""
+
+
+def _cached(repo_id: str, subfolder: str) -> str:
+    """Ids of what the Hub's cache has of a repository, which need no network."""
+    from huggingface_hub.constants import HF_HUB_CACHE
+
+    refs = Path(HF_HUB_CACHE) / f"models--{repo_id.replace('/', '--')}" / "refs"
+    within = f"/{subfolder}" if subfolder else ""
+    names = [f"{repo_id}{within}@{file.relative_to(refs)}" for file in sorted(refs.rglob("*")) if file.is_file()]
+    return f"; without it, name a revision that is in the cache: {', '.join(names)}" if names else ""
+
+
+def _fetch_run_config_of_main(repo_id: str) -> None:
+    """Fetches main's config.yaml into the Hub's cache, where ``find_run_config`` looks. Even main may have none."""
+    from huggingface_hub import _CACHED_NO_EXIST, hf_hub_download, try_to_load_from_cache
+    from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
+
+    try:
+        hf_hub_download(repo_id, RUN_CONFIG)
+    except LocalEntryNotFoundError:  # the Hub was not reached; earlier it may have been
+        if try_to_load_from_cache(repo_id, RUN_CONFIG) is not _CACHED_NO_EXIST:
+            raise
+    except EntryNotFoundError:
+        return

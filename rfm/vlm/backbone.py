@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: MIT
+"""config.json of a backbone, in the form that both transformers 4.57 and 5 read alike.
+
+Transformers 5 keeps all of a rotary embedding in ``rope_parameters``, which 4.57 ignores; before 4.52 a Qwen2.5-VL had
+no ``text_config``. No weight shows how positions were rotated, so nothing about that is left to a default.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from rfm.checkpoint.content import CheckpointError, shown
+
+SMOL, QWEN_2_5 = "smolvlm", "qwen2_5_vl"
+BACKBONES = {QWEN_2_5: "Qwen2_5_VLModel", "qwen3_vl": "Qwen3VLModel", SMOL: "SmolVLMModel"}
+VISION_THETA = 10_000.0  # which transformers 4.57 has in its code, for each backbone
+
+# What no shape of a weight shows, and transformers has defaults for.
+_NEEDED = {
+    SMOL: (("num_attention_heads", "rms_norm_eps"), ("num_attention_heads",)),
+    QWEN_2_5: (("num_attention_heads", "rms_norm_eps"), ("num_heads", "window_size", "fullatt_block_indexes")),
+    "qwen3_vl": (("num_attention_heads", "rms_norm_eps"), ("num_heads", "deepstack_visual_indexes")),
+}
+# Of a Qwen2.5-VL whose text model's fields stand beside the others.
+_NOT_OF_TEXT = (
+    "architectures", "dtype", "image_token_id", "model_type", "tie_word_embeddings", "torch_dtype",
+    "transformers_version", "video_token_id", "vision_config", "vision_end_token_id", "vision_start_token_id",
+    "vision_token_id",
+)  # fmt: skip
+_ROPE = ("rope_theta", "rope_scaling", "rope_parameters", "partial_rotary_factor")
+UNQUANTIZED = (
+    "export the checkpoint that was quantized (its scores differ), or load this one with the code that trained it, "
+    "call dequantize() of its model and save that"
+)
+DEQUANTIZED = (
+    "where bitsandbytes is installed, write its weights in full precision into a new folder: python -c "
+    "\"from transformers import AutoModelForImageTextToText as M; m = M.from_pretrained('{base}', device_map='auto'); "
+    "m.dequantize(); m.save_pretrained('NEW_FOLDER')\"; copy its tokenizer and processor files there, and name it "
+    "with --base-model"
+)
+_COPY = "copy it from config.json of the base model"
+
+
+def is_at_least(version: int) -> bool:
+    """Whether the installed transformers is of that major version, or a later one."""
+    return int(importlib.metadata.version("transformers").partition(".")[0]) >= version
+
+
+def backbone_config(content: Mapping[str, Any], where: object) -> dict[str, Any]:
+    """The same configuration, with ``rope_theta`` and ``rope_scaling`` in its ``text_config``.
+
+    where: its file. Raises CheckpointError for what it does not say of positions, or says twice.
+    """
+    family = content.get("model_type")
+    if family not in BACKBONES:
+        raise CheckpointError(f"{where}: model_type: expected one of {', '.join(BACKBONES)}, got {shown(family)}")
+    config = _nested(content) if family == QWEN_2_5 and "text_config" not in content else {**content}
+    for part, needed in zip(("text_config", "vision_config"), _NEEDED[family], strict=True):
+        if not isinstance(config.get(part), dict):
+            raise CheckpointError(f"{where}: {part}: expected settings of the backbone, got {shown(config.get(part))}")
+        for name in needed:
+            if config[part].get(name) is None:
+                raise CheckpointError(f"{where}: {part}.{name}: expected a value, got none; {_COPY}")
+    config["text_config"] = _text(config["text_config"], family, f"{where}: text_config")
+    config["vision_config"] = _vision(config["vision_config"], f"{where}: vision_config")
+    return config
+
+
+def check_not_quantized(config: Mapping[str, Any], where: object, remedy: str) -> None:
+    """Raises CheckpointError, which ends in ``remedy``, for a configuration of weights of fewer bits."""
+    for part in (config, config.get("text_config")):
+        found = part.get("quantization_config") if isinstance(part, dict) else None
+        if found:
+            method = found.get("quant_method") if isinstance(found, dict) else found
+            raise CheckpointError(f"{where}: quantization_config: expected none, got {shown(method)}; {remedy}")
+
+
+def _nested(content: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of the text model in a ``text_config``, where transformers has them since 4.52."""
+    rest = {name: value for name, value in content.items() if name in _NOT_OF_TEXT}
+    text = {name: value for name, value in content.items() if name not in _NOT_OF_TEXT}
+    return rest | {"text_config": text | {"model_type": f"{QWEN_2_5}_text"}}
+
+
+def _text(config: dict[str, Any], family: str, where: str) -> dict[str, Any]:
+    rope = _rope(config, where)
+    theta = rope.pop("rope_theta", None)
+    if type(theta) not in (int, float) or not 0 < theta < math.inf:
+        raise CheckpointError(f"{where}.rope_theta: expected a number above 0, got {shown(theta)}; {_COPY}")
+    if family != SMOL and not isinstance(rope.get("mrope_section"), list):
+        got = shown(rope.get("mrope_section"))
+        raise CheckpointError(f"{where}.rope_scaling.mrope_section: expected a list of numbers, got {got}; {_COPY}")
+    rest = {name: value for name, value in config.items() if name not in _ROPE}
+    return rest | {"rope_theta": float(theta), "rope_scaling": None if rope == {"rope_type": "default"} else rope}
+
+
+def _rope(config: dict[str, Any], where: str) -> dict[str, Any]:
+    """All that is said of the rotary embedding, in either form. Raises CheckpointError where the forms disagree."""
+    rope: dict[str, Any] = {}
+    for part in ("rope_parameters", "rope_scaling"):
+        section = config.get(part) or {}
+        if not isinstance(section, dict):
+            raise CheckpointError(f"{where}.{part}: expected a mapping, got {shown(section)}")
+        _add(rope, section, where, part)
+    _add(rope, {name: config.get(name) for name in ("rope_theta", "partial_rotary_factor")}, where, "text_config")
+    if config.get("rope_interleaved"):
+        raise CheckpointError(
+            f"{where}.rope_interleaved: expected false, got {shown(config['rope_interleaved'])}; {_COPY}"
+        )
+    partial = rope.pop("partial_rotary_factor", 1)
+    if partial != 1:
+        raise CheckpointError(f"{where}.partial_rotary_factor: expected 1, got {shown(partial)}; {_COPY}")
+    return {"rope_type": "default"} | rope
+
+
+def _add(rope: dict[str, Any], section: Mapping[str, Any], where: str, part: str) -> None:
+    for name, value in section.items():
+        name = "rope_type" if name == "type" else name  # its older name
+        value = "default" if name == "rope_type" and value == "mrope" else value  # so too
+        if value is not None and rope.setdefault(name, value) != value:
+            got = f"{shown(rope[name])} and {shown(value)}"
+            raise CheckpointError(f"{where}: expected one value of {name} in {part}, got {got}; {_COPY}")
+
+
+def _vision(config: dict[str, Any], where: str) -> dict[str, Any]:
+    """Without the rotary embedding, which transformers 5 writes as 4.57 has it in its code."""
+    rope = config.get("rope_parameters") or {}
+    theta = rope.get("rope_theta", VISION_THETA) if isinstance(rope, dict) else rope
+    kind = rope.get("rope_type", "axial") if isinstance(rope, dict) else rope
+    if theta != VISION_THETA or kind not in ("axial", "default"):
+        expected = "axial with a rope_theta of 10000"
+        raise CheckpointError(f"{where}.rope_parameters: expected {expected}, got {shown(rope)}; {_COPY}")
+    return {name: value for name, value in config.items() if name != "rope_parameters"}
