@@ -25,6 +25,7 @@ from gateways import Gateway, poll, running
 from rfm.launch.process import Endpoints
 from rfm_client.data.orientation import ORIENTATIONS, Orientation, turned
 from toy_world import Task, make_clip
+from toy_world.video import write_video
 from viewer_requests import by_command_line
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
@@ -65,7 +66,7 @@ def stage(demo_server: Endpoints, tmp_path_factory: pytest.TempPathFactory) -> I
     videos, downloads = folder / "videos", folder / "downloads"
     videos.mkdir()
     for name, (kind, seed) in CLIPS.items():
-        clip.write(videos / f"{name}.mp4", make_clip(kind, Task("red", "bowl"), seed).frames, FPS)
+        write_video(videos / f"{name}.mp4", make_clip(kind, Task("red", "bowl"), seed).frames, FPS)  # as the demo does
     long = make_clip("success", Task("red", "bowl"), 2_000_000, num_frames=200)
     clip.write(videos / "long.mp4", long.frames, FPS)
     (videos / "broken.mp4").write_text("no video")
