@@ -120,7 +120,7 @@ def test_labels_of_another_recipe_are_refused_with_the_setting_that_differs(
 
     notes = Notes()
     label(open_dataset(TOY), scorer, LabelOptions(**{**changed, "overwrite": True}), notes)
-    assert f"--overwrite: {got}" in notes.lines
+    assert any(line.startswith(f"--overwrite: {got}; its labels of ") for line in notes.lines)
     assert notes.lines[-1].startswith("1 of the dataset's 10 episodes have labels; LeRobot's reader")
     assert parquet.read_table(output / PROGRESS)["episode_index"].unique().to_pylist() == [3]
 

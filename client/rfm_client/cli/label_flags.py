@@ -112,9 +112,9 @@ class LabelFlags:
         ),
     ] = None
     workers: Annotated[int, typer.Option(min=1, help="Episodes under way at a time.")] = DEFAULT_WORKERS
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace labels that were made of something else.")] = (
-        False
-    )
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace labels of another recipe; those of the same are kept.")
+    ] = False
     in_place: Annotated[bool, typer.Option("--in-place", help="Write the labels into the HDF5 file itself.")] = False
     engine: Annotated[Engine, typer.Option(help="threads: in this process. ray: by actors of a Ray cluster.")] = (
         "threads"

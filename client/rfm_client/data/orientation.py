@@ -16,7 +16,11 @@ ORIENTATIONS: tuple[Orientation, ...] = get_args(Orientation)
 
 
 def turned(frames: UInt8Array, orientation: Orientation) -> UInt8Array:
-    """uint8 [..., H, W, 3], turned: ``rotate90`` is a quarter turn clockwise; ``flip-vertical`` puts the top below."""
+    """uint8 [..., H, W, 3], turned: ``rotate90`` is a quarter turn clockwise; ``flip-vertical`` puts the top below.
+
+    Raises ValueError for another orientation.
+    """
+    check_orientation(orientation)
     if orientation == "none":
         return frames
     views = {
@@ -27,6 +31,12 @@ def turned(frames: UInt8Array, orientation: Orientation) -> UInt8Array:
         "rotate270": np.swapaxes(frames, -3, -2)[..., ::-1, :, :],
     }
     return np.ascontiguousarray(views[orientation])
+
+
+def check_orientation(orientation: str) -> None:
+    """Raises ValueError for what is no orientation."""
+    if orientation not in ORIENTATIONS:
+        raise ValueError(f"orient: expected one of {', '.join(ORIENTATIONS)}, got {orientation!r}")
 
 
 @dataclass(frozen=True)
@@ -41,8 +51,8 @@ class Orient:
 
     def __post_init__(self) -> None:
         for orientation in (self.default, *self.cameras.values()):
-            if orientation is not None and orientation not in ORIENTATIONS:
-                raise ValueError(f"orient: expected one of {', '.join(ORIENTATIONS)}, got {orientation!r}")
+            if orientation is not None:
+                check_orientation(orientation)
 
     @classmethod
     def parse(cls, texts: Iterable[str]) -> Orient:

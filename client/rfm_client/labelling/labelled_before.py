@@ -22,7 +22,7 @@ Reader: TypeAlias = Callable[[Sequence[Item]], Iterator[tuple[Item, Columns]]]
 
 OF_ANOTHER_PROGRAM = "labels of another program"
 _NO_RECIPE = {"writer"}  # of provenance: what does not decide the labels of an episode
-_NO_RECIPE_OF_DATASET = {"digest", "revision"}
+_NO_RECIPE_OF_DATASET = {"digest", "revision", "source"}  # the digests of the episodes tell it from another one
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,8 @@ def joined(plan: Plan, dataset: Dataset, files: Sequence[LabelFile], overwrite: 
         except DatasetError as error:
             if not overwrite:
                 raise DatasetError(f"{error}: choose another {file.option}, or --overwrite") from error
-            watch.note(f"--overwrite: {error}")
+            lost = f"; its labels of {len(file.digests)} episodes are replaced" if file.digests else ""
+            watch.note(f"--overwrite: {error}{lost}")
         else:
             known = more
     if len(known) > len(chosen):

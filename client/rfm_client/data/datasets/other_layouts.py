@@ -55,6 +55,8 @@ def _of_files(path: Path) -> str | None:
         loop = f'for f in {found}; do rfm-client label "$f"; done'
         is_aloha = _is_aloha(next(iter(path.glob(str(found.relative_to(path))))))
         return ALOHA if is_aloha else f"a folder of HDF5 files, each a dataset of its own: {loop}"
+    if _glob(path, _FILMS):
+        return None
     if found := _glob(path, _PICTURES):
         encoding = "ffmpeg -framerate 10 -i - -c:v libx264rgb -crf 0"
         if found.parent == path:
