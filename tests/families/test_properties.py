@@ -251,7 +251,6 @@ def loads_or_refuses(original: Path, file: str, content: bytes) -> None:
         (copy / file).write_bytes(content)
         try:
             checkpoint = families.load(copy)
-            families.check(copy, checkpoint)
             checkpoint.build()
         except CheckpointError as error:
             assert 0 < len(str(error)) < 10_000
