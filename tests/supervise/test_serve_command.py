@@ -223,7 +223,7 @@ def test_a_server_at_an_ipv6_address_is_watched_and_reached_like_any_other() -> 
     with nothing_left_behind(), subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
         try:
             poll(lambda: answers(f"http://[::1]:{gateway}") or process.poll() is not None)
-            assert httpx.get(f"http://[::1]:{status}/ready").json()["ready"]
+            poll(lambda: httpx.get(f"http://[::1]:{status}/ready").json()["ready"])
             assert "nv_inference_count" in httpx.get(endpoints.metrics_url).text
             assert httpx.get(f"http://[::1]:{gateway}/health").json()["status"] == "healthy"
             scores = []
