@@ -86,7 +86,6 @@ def load_from(folder: Path, family: Family, options: Options) -> Checkpoint:
     checkpoint = family.load(folder, options)
     for weights in checkpoint.parts.values():
         check_finite(weights)
-    training.check_run(folder, checkpoint.description.progress_bins, checkpoint.config)
     return checkpoint
 
 

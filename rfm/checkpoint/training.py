@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rfm.checkpoint.content import CheckpointError, read_run_config, shown
-from rfm.checkpoint.files import RUN_CONFIG, WEIGHTS, find_run_config, not_of
+from rfm.checkpoint.files import RUN_CONFIG, WEIGHTS, find_run_config
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 PROGRESS, PREFERENCE, SUCCESS, SIMILARITY = HEADS = ("progress", "preference", "success", "similarity")
-_SHOWN = ("video_feature_dim", "text_feature_dim", "hidden_dim", "num_layers")  # of a ReWiND network, by its weights
 _RELATIVE = "relative"  # how upstream's names of increments begin
 
 
@@ -63,25 +62,6 @@ def constant_heads(weights: Mapping[str, Tensor], answered: Collection[str]) -> 
         for head, weight in heads.items()
         if weight is not None and not weight.any()
     ]
-
-
-def check_run(folder: Path, progress_bins: int, network: object) -> None:
-    """Raises CheckpointError for a config.yaml from outside ``folder`` that says other things than the weights show.
-
-    In the folder itself it may: the weights decide.
-    network: the configuration that the weights show
-    """
-    file = find_run_config(folder)
-    if file is None or file.is_relative_to(folder):
-        return
-    run = read_run_config(file)
-    loss, rewind = _section(run, "loss"), _section(_section(run, "model"), "rewind")
-    bins = {"l2": 1, "discrete": loss.get("progress_discrete_bins")}.get(str(loss.get("progress_loss_type")))
-    pairs = {f"model.rewind.{name}": (getattr(network, name, None), rewind.get(name)) for name in _SHOWN}
-    pairs["loss.progress_discrete_bins"] = (progress_bins, bins)
-    for place, (shows, says) in pairs.items():
-        if None not in (shows, says) and shows != says:
-            raise not_of(folder, f"whose weights show {place} {shows}", shown(says), file)
 
 
 def check_progress(run: Mapping[str, Any], file: Path) -> None:

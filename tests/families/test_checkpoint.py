@@ -88,8 +88,6 @@ OTHER_RUNS = {
     "a vision-language one": (CONTINUOUS, WITH_IMAGES, "whose network is 'rewind_transformer', got model.base_model_id 'Qwen/"),
     "a ReWiND one": (WITH_IMAGES, CONTINUOUS, "whose network is 'qwen3_vl', got model.base_model_id 'rewind_transformer'"),
     "one of another backbone": ("q25_mean_l2", WITH_IMAGES, "whose network is 'qwen2_5_vl', got model.base_model_id 'Qwen/Qwen3-VL"),
-    "one of another head": ("q25_mean_l2", "q25_video_avg_disc10", "whose weights show loss.progress_discrete_bins 1, got 10"),
-    "one of other widths": (IN_RUN_FOLDER, CONTINUOUS, "whose weights show model.rewind.hidden_dim 64, got 32"),
 }  # fmt: skip
 
 
