@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rfm.parameters import DEFAULT_HANG_S
 from rfm_client.contract.addresses import MAX_PORT, is_loopback
 from rfm_client.contract.names import DEFAULT_MODEL
 from rfm_client.contract.settings import ConfigError, Settings, setting
@@ -23,7 +24,6 @@ DEFAULT_HOST = "127.0.0.1"
 DEFAULT_TOKEN_BUDGET = 16_384
 DEFAULT_SAMPLE_TOKENS = 131_072
 DEFAULT_FEATURE_CACHE_MB = 256  # 80,000 embeddings of 768 numbers; of a 4B Qwen3-VL 170 frames of 256x256
-DEFAULT_QUEUE_SIZE = 1024  # as many as a gateway lets wait
 MAX_OF_A_MACHINE = 4096  # GPUs, instances, threads
 MAX_INT32 = 2**31 - 1
 MAX_NAME = 100  # characters; it becomes the name of a folder
@@ -42,7 +42,12 @@ class ExportConfig(Settings):
     num_gpus: int | None = setting(
         None, "GPUs, with as many instances on each; else all, or the CPU. 0: the CPU.", least=0, **_OF_A_MACHINE
     )
-    instances: int = setting(1, "Of each model, on each GPU or on the CPU (see rfm tune).", least=1, **_OF_A_MACHINE)
+    instances: int | None = setting(
+        None,
+        "Of each model, on each GPU or on the CPU; else 2 on each GPU of a model that scores embeddings, and 1.",
+        least=1,
+        **_OF_A_MACHINE,
+    )
     torch_threads: int = setting(
         0, "CPU threads of each instance. 0: the instances of a model share the cores.", least=0, **_OF_A_MACHINE
     )
@@ -62,7 +67,7 @@ class ExportConfig(Settings):
         None, "Folder or id of a vision-language checkpoint's base model; else the one that it names."
     )
     max_queue_size: int | None = setting(
-        DEFAULT_QUEUE_SIZE, "Requests that may wait for a model; more are rejected at once. null: any number.", **_COUNT
+        None, "Requests that may wait for a model; more are rejected at once. Else any number.", **_COUNT
     )
     queue_timeout_ms: int | None = setting(
         None, "Longest that a request waits before it is rejected, if it asks for no less; else any time.", **_COUNT
@@ -113,7 +118,11 @@ class ServeConfig(Settings):
     grpc_key: Path | None = setting(None, "The certificate's key (PEM).")
     grpc_client_ca: Path | None = setting(None, "Authorities (PEM) of gRPC's clients, which then need a certificate.")
     canary_s: int = setting(2, "Seconds from one health probe of a model to the next.", **_COUNT)
-    hang_s: int = setting(30, "Seconds without progress after which a model is loaded again.", **_COUNT)
+    hang_s: int = setting(
+        DEFAULT_HANG_S,
+        "Seconds without progress of a batch after which Triton is started again.",
+        **_COUNT,
+    )
     triton_silent_s: int = setting(
         10, "Seconds that Triton may give no answer before it is killed and restarted.", **_COUNT
     )

@@ -10,16 +10,18 @@ from pathlib import Path
 ZOMBIE, STOPPED = "Z", "T"  # states
 
 _PROC = Path("/proc")
-_STATE, _PARENT, _STARTED = 0, 1, 19  # places in /proc/<pid>/stat behind the process' name, which may hold anything
+_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+_STATE, _PARENT, _GROUP, _USER, _SYSTEM = 0, 1, 2, 11, 12  # places in /proc/PID/stat behind the process' name
 
 
 @dataclass(frozen=True)
 class ProcessStat:
-    """State, parent's id and start of a process. started_ticks: by the kernel's clock; no other of this id has it"""
+    """State, parent, group and CPU time of a process."""
 
     state: str
     parent: int
-    started_ticks: int
+    group: int
+    cpu_s: float
 
 
 def all_pids() -> list[int]:
@@ -42,10 +44,10 @@ def stat_of(pid: int) -> ProcessStat | None:
         fields = (_PROC / str(pid) / "stat").read_text().rpartition(")")[2].split()
     except (FileNotFoundError, ProcessLookupError):
         return None
-    return ProcessStat(fields[_STATE], int(fields[_PARENT]), int(fields[_STARTED]))
+    ticks = int(fields[_USER]) + int(fields[_SYSTEM])
+    return ProcessStat(fields[_STATE], int(fields[_PARENT]), int(fields[_GROUP]), ticks / _TICKS_PER_S)
 
 
-def is_alive(pid: int) -> bool:
-    """Whether there is a process of this id that has not ended."""
-    stat = stat_of(pid)
-    return stat is not None and stat.state != ZOMBIE
+def cpu_s_of_group(group: int) -> float:
+    """CPU time of all processes of a group, in seconds."""
+    return sum(stat.cpu_s for pid in all_pids() if (stat := stat_of(pid)) is not None and stat.group == group)

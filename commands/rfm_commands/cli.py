@@ -171,6 +171,7 @@ def serve(
             accepts_known_vulnerabilities=accept_known_vulnerabilities,
             more_arguments=more_arguments or (),
             ends_with_parent=True,
+            hang_s=config.serve.hang_s,
         )
         status = _supervisor(server, config).run()
     except (AdminKeyError, ServerStartError, OSError) as error:

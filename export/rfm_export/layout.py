@@ -93,6 +93,7 @@ def generated_models(
     description: Description, encoders: EncodersDescription | None, version: Version
 ) -> list[GeneratedModel]:
     """The models of a checkpoint and its encoders, if it has some; an ensemble stands behind what it is made of."""
+    version = replace(version, settings=_with_instances(description, version))
     name, widths = version.settings.name, description.widths
     outputs = wire.score_outputs(description.progress_bins if description.progress_bins > 1 else None)
     cache_mb = version.settings.feature_cache_mb
@@ -117,6 +118,12 @@ def generated_models(
         GeneratedModel(ensemble_config(frames, version.settings, version.number, encoder, scorer), version.number)
     )
     return models
+
+
+def _with_instances(description: Description, version: Version) -> ExportConfig:
+    """The settings with a number of instances. Two small networks keep a GPU busy: one scores while the other reads."""
+    several = description.widths is not None and version.num_gpus > 0
+    return replace(version.settings, instances=version.settings.instances or (2 if several else 1))
 
 
 def lay_out(config: pb.ModelConfig, **changed: int) -> None:

@@ -10,9 +10,9 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from rfm.journal import SHARED_MEMORY
 from rfm.launch.installation import ServerStartError
 
+SHARED_MEMORY = Path("/dev/shm")
 BACKENDS_PREFIX = "rfm-backends-"
 # The Python backend's regions have this name. Newer Tritons let no client map a region with it.
 REGION_PREFIX = "triton_python_backend_shm_region_rfm"

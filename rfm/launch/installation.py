@@ -24,7 +24,11 @@ _STUB = "triton_python_backend_stub"
 
 
 class ServerStartError(Exception):
-    """tritonserver cannot be started: the reason in one line."""
+    """tritonserver cannot be started: the reason in one line. model: that which is to blame; None: none is"""
+
+    def __init__(self, reason: str, model: str | None = None) -> None:
+        super().__init__(reason)
+        self.model = model
 
 
 @dataclass(frozen=True)

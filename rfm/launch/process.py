@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -11,12 +12,16 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from http import HTTPStatus
 from pathlib import Path
 from types import TracebackType
-from typing import IO
+from typing import IO, Any
+from urllib.parse import quote
+
+from google.protobuf import text_format
+from tritonclient.grpc.model_config_pb2 import ModelConfig
 
 from rfm.config import DEFAULT_HOST, ServeConfig
-from rfm.journal import all_wait, journals_of_the_dead, restore_journals
 from rfm.launch.admin_key import VARIABLE, http_headers, new_key, restrictions
 from rfm.launch.cleanup import NEEDS_ROOM, Claim
 from rfm.launch.ending import EXIT_TIMEOUT_S, end, ending_with_parent
@@ -24,17 +29,18 @@ from rfm.launch.http import NO_ANSWER, Http
 from rfm.launch.installation import Installation, ServerStartError
 from rfm.launch.listen_address import check_before_start, check_version
 from rfm.launch.ports import free_ports
-from rfm.launch.repository_api import INDEX_PATH, RepositoryApi, versions_of
-from rfm.launch.repository_folder import models_in, no_models
-from rfm.launch.tls import GrpcTls, OwnTls
+from rfm.launch.repository_api import INDEX_PATH, versions_of
+from rfm.launch.repository_folder import CONFIG_FILE, models_in, no_models
+from rfm.launch.tls import GrpcTls
 from rfm.launch.triton_options import check_arguments, size_limits
+from rfm.parameters import HANG_VARIABLE
+from rfm.proc import cpu_s_of_group
 from rfm_client.contract.listening import check_free, in_url
 from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
 
 POLL_S = 0.1
-STALLED_S = 30.0  # within which Triton takes up processes that have loaded,
-PATIENT_S = 600.0  # or, where that was too short, has loaded models of other backends
-MAX_REPEATS = 3  # of a start that Triton spoils: a machine that stands still for a second may do so again
+STALLED_S = 60.0  # without use of the CPU: a start that Triton has spoilt
+LOAD_S = 1800.0
 ANSWER_TIMEOUT_S = 10.0  # of one that starts
 NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # a `load` would load all versions anew: their folders have changed
 SECRETS = (VARIABLE, GATEWAY_KEY_VARIABLE)  # variables that neither Triton nor a model process needs
@@ -44,7 +50,11 @@ _REMEDIES = {  # by what Triton, PyTorch or the system say of a model that is no
     ),
     "No space left on device": NEEDS_ROOM,
 }
+_WORK_S = 0.05  # of the CPU: what waits uses less in STALLED_S
 _REGIONS = "--backend-config=python,shm-region-prefix-name="
+
+
+Config = Mapping[str, Any]
 
 
 def short_spin(environment: Mapping[str, str]) -> dict[str, str]:
@@ -112,20 +122,17 @@ class Endpoints:
 
 
 class SpoiltStartError(ServerStartError):
-    """Triton has lost one of the processes that load: it was not heard of for a second, and Triton 2.51 has ended.
+    """Triton has lost a model process that loads, and has ended, or waits for ever.
 
-    That happens where a virtual machine stands still, or all processors are taken.
+    Triton 2.51 does so where a machine stands still for a second.
     """
-
-
-class StalledStartError(SpoiltStartError):
-    """The same, but Triton waits for ever for the process to end. Or models of other backends load for so long."""
 
 
 class TritonServer:
     """A tritonserver on ``repository`` with every model of it loaded. A context manager that stops it.
 
     http_threads: threads that read HTTP requests; None: Triton's choice
+    hang_s: after how many seconds without progress of a batch a model process ends itself; None: DEFAULT_HANG_S
     log: where Triton's log goes; None: this process's standard output and error
     admin_key: what requests to the restricted APIs must show (``admin_key``); None: a new one, known to this alone
     ends_with_parent: it is killed when the thread that starts it ends, be it by kill -9
@@ -140,6 +147,7 @@ class TritonServer:
         installation: Installation,
         *,
         http_threads: int | None = None,
+        hang_s: int | None = None,
         log: IO[bytes] | None = None,
         admin_key: str | None = None,
         accepts_known_vulnerabilities: bool = False,
@@ -150,16 +158,14 @@ class TritonServer:
         self.repository = repository
         self._installation = installation
         self._http_threads = http_threads
+        self._hang_s = hang_s
         self._log = log
         self._admin_key = admin_key or new_key()
         self._accepts_known_vulnerabilities = accepts_known_vulnerabilities
         self._more_arguments = tuple(more_arguments)
         self._ends_with_parent = ends_with_parent
         self._claim: Claim | None = None
-        self._journals: Mapping[str, bytes] = {}
-        self._own_tls: OwnTls | None = None
         self._process: subprocess.Popen[bytes] | None = None
-        self._loading: frozenset[str] = frozenset()  # what it is to load at its start
 
     @property
     def models(self) -> list[str]:
@@ -183,11 +189,6 @@ class TritonServer:
         """The key that requests to the restricted APIs must show."""
         return self._admin_key
 
-    def repository_api(self) -> RepositoryApi:
-        """The model-repository API of the server, once it is started. A context manager."""
-        options = {} if self._own_tls is None else self._own_tls.options
-        return RepositoryApi(self.endpoints.grpc_url, self._admin_key, options)
-
     def signal(self, number: int) -> None:
         """Sends a signal to the process, if it runs."""
         if self._process is not None:
@@ -198,30 +199,24 @@ class TritonServer:
         with suppress(ProcessLookupError):
             os.killpg(self.pid, signal.SIGKILL)
 
-    def remember_the_dead(self) -> None:
-        """Keeps for the next start what model processes were working on that are dead now. All else is forgotten."""
-        if self._claim is not None:
-            self._journals = journals_of_the_dead(self._claim.region_prefix)
-
-    def start(self, restored: Collection[str] | None = None) -> None:
+    def start(self, models: Collection[str] | None = None) -> None:
         """Starts the process. Raises ServerStartError for what is known to be wrong before.
 
-        restored: models that it loads, and ``wait_ready`` does not insist on; None: all, and it does
+        models: that it loads; None: all
         """
-        models = self.models
-        self._loading = frozenset(models if restored is None else ())
-        if not models:
+        there = self.models
+        if not there:
             raise ServerStartError(no_models(self.repository))
-        own = self._arguments(sorted(models if restored is None else restored))
+        own = self._arguments(sorted(there if models is None else models))
         check_arguments(self._more_arguments, [*own, _REGIONS])
-        self._check_listen_address()
+        check_before_start(self.endpoints.host, self._installation, accepted=self._accepts_known_vulnerabilities)
+        if self.endpoints.grpc_tls is not None:
+            self.endpoints.grpc_tls.check()
         self.endpoints.check_free()
         self._claim = Claim()
-        restore_journals(self._claim.region_prefix, self._journals)
-        self._journals = {}
         arguments = [*own, f"{_REGIONS}{self._claim.region_prefix}"]
         arguments += self._installation.lay_out_backends(self._claim.backends)
-        arguments += self._own_tls.arguments(self._claim.backends) if self._own_tls else []
+        arguments += self.endpoints.grpc_tls.arguments() if self.endpoints.grpc_tls else []
         arguments += [*size_limits(self._installation, self._more_arguments), *self._more_arguments]
         try:
             self._process = subprocess.Popen(
@@ -239,51 +234,45 @@ class TritonServer:
             program = self._installation.executable
             raise ServerStartError(f"tritonserver: expected a program at {program}, got: {error.strerror}") from error
 
-    def start_ready(self, restored: Collection[str] | None = None) -> None:
-        """Starts the process, and returns when every model is ready. Repeats a start that Triton has spoilt.
-        Raises ServerStartError. Arguments as of ``start``.
-        """
-        stalled_s = STALLED_S
-        for _ in range(MAX_REPEATS):
-            try:
-                self.start(restored)
-                self.wait_ready(stalled_s)
-                return
-            except SpoiltStartError as error:
-                self.stop()
-                if isinstance(error, StalledStartError):
-                    stalled_s = PATIENT_S
-        self.start(restored)
-        self.wait_ready(PATIENT_S)
+    def start_ready(self, served: Mapping[str, Config] | None = None) -> None:
+        """Starts the process, and returns when every model is ready. Repeats a start once that Triton has spoilt.
 
-    def wait_ready(self, stalled_s: float = PATIENT_S) -> None:
-        """Returns when every model is ready. Raises ServerStartError with the reason of one that is not.
-
-        stalled_s: Triton has spoilt its start if all model processes have loaded, and wait for so long. After PATIENT_S
-            that is no StalledStartError any more: another start would end the same
+        served: configurations of the models, which may name other versions than their files by now; None: all models,
+            as their files say
+        Raises ServerStartError.
         """
+        try:
+            self._start_ready(served)
+        except SpoiltStartError:
+            self.stop()
+            self._start_ready(served)
+
+    def wait_ready(self, models: Collection[str] | None = None) -> None:
+        """Returns when ``models`` are ready (None: all). Raises ServerStartError with the reason of one that is not."""
         assert self._process is not None  # started
-        assert self._claim is not None
-        last_work_s = time.monotonic()
         triton = Http(self.endpoints.http_host, self.endpoints.http_port)
         headers = http_headers(self._admin_key)
+        started_s = worked_s = time.monotonic()
+        cpu_s = 0.0
         while self._process.poll() is None:
             try:
                 version = triton.get_json("/v2", ANSWER_TIMEOUT_S).get("version", "")
                 index = triton.get_json(INDEX_PATH, ANSWER_TIMEOUT_S, method="POST", headers=headers)
             except NO_ANSWER:  # Triton gives none while it loads
-                if not all_wait(self._claim.region_prefix):
-                    last_work_s = time.monotonic()
-                elif time.monotonic() - last_work_s > stalled_s:
+                now_s, used_s = time.monotonic(), cpu_s_of_group(self.pid)
+                if used_s - cpu_s > _WORK_S:
+                    cpu_s, worked_s = used_s, now_s
+                if now_s - worked_s > STALLED_S or now_s - started_s > LOAD_S:
                     self.kill()
-                    why = "tritonserver: expected to be ready, got processes that wait"
-                    raise (StalledStartError(why) if stalled_s < PATIENT_S else ServerStartError(why)) from None
+                    raise SpoiltStartError("tritonserver: expected to be ready, got processes that wait") from None
                 time.sleep(POLL_S)
                 continue
-            failed = [entry for entry in versions_of(index) if not entry.is_ready and entry.name in self._loading]
+            wanted = self.models if models is None else models
+            failed = [entry for entry in versions_of(index) if not entry.is_ready and entry.name in wanted]
             if failed:
                 reasons = "; ".join(f"{entry.name}: {entry.reason or 'not loaded'}" for entry in failed)
-                raise ServerStartError(f"models: expected all to be ready, got {reasons}{_remedy(reasons)}")
+                why = f"models: expected all to be ready, got {reasons}{_remedy(reasons)}"
+                raise ServerStartError(why, failed[0].name)
             check_version(self.endpoints.host, version, accepted=self._accepts_known_vulnerabilities)
             return
         kind = SpoiltStartError if self._process.returncode == -signal.SIGABRT else ServerStartError
@@ -333,13 +322,35 @@ class TritonServer:
     def _environment(self) -> dict[str, str]:
         """Environment of tritonserver: that of this process, without its secrets."""
         own = {name: value for name, value in os.environ.items() if name not in SECRETS}
-        return {**short_spin(own), **own, **self._installation.environment, **NO_BYTECODE}
+        hang = {} if self._hang_s is None else {HANG_VARIABLE: str(self._hang_s)}
+        return {**short_spin(own), **own, **self._installation.environment, **NO_BYTECODE, **hang}
 
-    def _check_listen_address(self) -> None:
-        check_before_start(self.endpoints.host, self._installation, accepted=self._accepts_known_vulnerabilities)
-        if self.endpoints.grpc_tls is not None:
-            self.endpoints.grpc_tls.check()
-            self._own_tls = OwnTls(self.endpoints.grpc_tls)
+    def _start_ready(self, served: Mapping[str, Config] | None) -> None:
+        """As ``start_ready``. Triton loads by itself what its files name, and is asked to load the rest."""
+        if served is None:
+            self.start()
+            self.wait_ready()
+            return
+        as_in_file = [name for name in served if names_the_same_versions(self.repository, name, served[name])]
+        if len(as_in_file) < len(served):  # an ensemble loads its parts with it, as their files say
+            as_in_file = []
+        self.start(as_in_file)
+        self.wait_ready(as_in_file)
+        others = sorted(served.keys() - set(as_in_file), key=lambda name: "ensemble_scheduling" in served[name])
+        for name in others:
+            self._load(name, served[name])
+
+    def _load(self, name: str, config: Config) -> None:
+        """Has Triton load a model with this configuration, over HTTP: its gRPC port may ask for a certificate."""
+        triton = Http(self.endpoints.http_host, self.endpoints.http_port)
+        body = json.dumps({"parameters": {"config": json.dumps(config)}}).encode()
+        path = f"/v2/repository/models/{quote(name, safe='')}/load"
+        try:
+            status, text = triton.request("POST", path, LOAD_S, body, headers=http_headers(self._admin_key))
+        except NO_ANSWER as error:
+            raise ServerStartError(f"models: expected {name} to load, got: {error}", name) from error
+        if status != HTTPStatus.OK:
+            raise ServerStartError(f"models: expected {name} to load, got: {text}", name)
 
     def _wait(self) -> int:
         """Waits for the server to end and clears away what it leaves; gives its exit status."""
@@ -359,6 +370,15 @@ class TritonServer:
 def _remedy(reasons: str) -> str:
     """What to do where models are not loaded for ``reasons``, behind a semicolon; empty: that is not known."""
     return next((f"; {remedy}" for said, remedy in _REMEDIES.items() if re.search(said, reasons)), "")
+
+
+def names_the_same_versions(repository: Path, model: str, config: Config) -> bool:
+    """Whether the model's file names the versions of ``config``."""
+    try:
+        file = text_format.Parse((repository / model / CONFIG_FILE).read_text(), ModelConfig())
+    except (OSError, UnicodeDecodeError, text_format.ParseError):
+        return False
+    return bool(list(file.version_policy.specific.versions) == config["version_policy"]["specific"]["versions"])
 
 
 def _of_http_server(host: str) -> str:

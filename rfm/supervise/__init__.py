@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""What runs beside Triton, which ``rfm.launch`` has started: watches it, and heals what it does not heal itself.
+"""What runs beside Triton, which ``rfm.launch`` has started. Every fault has one cure: Triton is started again.
 
-- Watch: ``triton_watch`` (does Triton answer, what does it serve?), ``model_processes`` (do they live, and get on?),
-  ``model_probe`` (does a model answer?).
-- Heal: ``model_states`` is the table of states, events and actions of a model; ``model_watch`` feeds it and acts;
-  ``model_reload`` unloads and loads; ``back_off`` chooses the pauses between starts.
-- Together: ``served_models`` holds all models of one Triton, ``supervisor`` Triton itself and the ``gateway_process``;
-  ``status`` is what others see of it. They are one thread; what may wait runs ``background`` calls.
+``watch`` finds faults and knows what is served: by Triton's answers, by its ``processes``, and by a ``probe`` of each
+model. The ``supervisor`` starts Triton again, and the ``gateway_process``, with pauses of ``back_off``. ``status`` is
+what others see of it.
 """

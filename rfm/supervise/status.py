@@ -8,7 +8,6 @@ import socket
 import sys
 import threading
 from collections.abc import Mapping
-from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -19,25 +18,22 @@ from rfm.launch.installation import ServerStartError
 from rfm_client.contract.listening import check_free
 
 NO_REASON = ""  # the reason why a model is not ready, of one that is
-REQUEST_S = 5.0  # from its connection to its answer
-MOST_CONNECTIONS = 16  # one more takes the place of the oldest
+REQUEST_S = 5.0  # that a connection may be silent
 
 _BUCKETS_S = tuple(digit * 10.0**power for power in range(-3, 2) for digit in (1, 2, 5))
 
 
 class Status:
-    """What is known of the models. The supervisor calls ``record`` and its kin, the status port the rest."""
+    """Which models are ready, and why others are not."""
 
     def __init__(self) -> None:
         self._reasons: Mapping[str, str] = {}
-        self._probed: set[str] = set()  # models that have a probe
         self._registry = CollectorRegistry()
         labelled: dict[str, Any] = {"labelnames": ["model"], "registry": self._registry}
         self._ready = Gauge("rfm_serve_ready", "1: the model is ready.", **labelled)
         self._reason = Gauge(
             "rfm_serve_not_ready", "1: the model is not ready, and why.", ["model", "reason"], registry=self._registry
         )
-        self._probe_ok = Gauge("rfm_serve_canary_ok", "1: the last health probe was answered.", **labelled)
         self.probe_seconds = Histogram(
             "rfm_serve_canary_seconds",
             "From a health probe to its answer.",
@@ -47,13 +43,8 @@ class Status:
         )
         self.restarts = Counter(
             "rfm_serve_restarts",
-            "What was started again because it was dead or hung: triton, gateway, or a model.",
+            "Why Triton was started again: a model by name, or triton itself; gateway: the gateway was.",
             ["what"],
-            registry=self._registry,
-        )
-        self.poison_refused = Counter(
-            "rfm_serve_poison_refused",
-            "Requests that were refused because they had ended the model's process.",
             registry=self._registry,
         )
 
@@ -69,20 +60,10 @@ class Status:
                 self._reason.labels(model, reason).set(1)
         for model in gone:
             self._ready.remove(model)
-        for model in gone & self._probed:
-            self._probed.remove(model)
-            self._probe_ok.remove(model)
 
     def record_down(self, reason: str) -> None:
         """Records why no model is ready."""
         self.record(dict.fromkeys(self._reasons, reason))
-        for model in self._probed:
-            self.record_probe(model, is_ok=False)
-
-    def record_probe(self, model: str, *, is_ok: bool) -> None:
-        """Records whether a model's last probe was answered."""
-        self._probed.add(model)
-        self._probe_ok.labels(model).set(is_ok)
 
     @property
     def ready(self) -> tuple[bool, dict[str, Any]]:
@@ -105,7 +86,7 @@ class StatusServer:
             check_free(host, port, "status", port_option="--status-port")
         except ValueError as error:
             raise ServerStartError(str(error)) from None
-        self._server = _BoundedServer((host, port), _handler(status))
+        self._server = _Server((host, port), _handler(status))
         self._thread = threading.Thread(target=self._server.serve_forever, name="rfm-status", daemon=True)
         self._thread.start()
 
@@ -116,34 +97,12 @@ class StatusServer:
         self._thread.join()
 
 
-class _BoundedServer(ThreadingHTTPServer):
-    """An HTTP server that drops slow connections, after REQUEST_S or as soon as another caller needs the thread."""
-
+class _Server(ThreadingHTTPServer):
     daemon_threads = True
-    request_queue_size = 8 * MOST_CONNECTIONS  # connections beyond this number have to try again after a second
 
     def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
-        self._open: dict[socket.socket, None] = {}  # the oldest first
-        self._lock = threading.Lock()
         self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
         super().__init__(address, handler)
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        deadline = threading.Timer(REQUEST_S, _cut, [request])
-        deadline.daemon = True  # nobody waits for it at the end
-        with self._lock:
-            self._open[request] = None
-            if len(self._open) > MOST_CONNECTIONS:
-                oldest = next(iter(self._open))
-                del self._open[oldest]
-                _cut(oldest)
-        try:
-            deadline.start()
-            super().process_request_thread(request, client_address)
-        finally:
-            deadline.cancel()
-            with self._lock:
-                self._open.pop(request, None)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Logs nothing: a caller that leaves without an answer is no fault."""
@@ -151,13 +110,10 @@ class _BoundedServer(ThreadingHTTPServer):
             super().handle_error(request, client_address)
 
 
-def _cut(connection: socket.socket) -> None:
-    with suppress(OSError):  # it is closed
-        connection.shutdown(socket.SHUT_RDWR)
-
-
 def _handler(status: Status) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
+        timeout = REQUEST_S
+
         def do_GET(self) -> None:
             if self.path == "/live":
                 self._answer(HTTPStatus.OK, b"{}", "application/json")

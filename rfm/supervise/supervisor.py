@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What ``rfm serve`` runs: Triton, and perhaps a gateway, kept answering until a signal stops it."""
+"""Triton and what belongs to it, kept answering until a signal stops it."""
 
 from __future__ import annotations
 
@@ -13,20 +13,13 @@ from types import FrameType
 from rfm.launch import cleanup
 from rfm.launch.ending import stop_signals_to
 from rfm.launch.installation import ServerStartError
-from rfm.launch.process import (
-    MAX_REPEATS,
-    PATIENT_S,
-    POLL_S,
-    STALLED_S,
-    SpoiltStartError,
-    StalledStartError,
-    TritonServer,
-)
-from rfm.supervise.back_off import BackOff
+from rfm.launch.process import POLL_S, TritonServer
+from rfm.supervise.back_off import BackOff, CrashLoopError
 from rfm.supervise.gateway_process import GatewayProcess
-from rfm.supervise.served_models import ServedModels
 from rfm.supervise.status import Status, StatusServer
-from rfm.supervise.triton_watch import Config, names_the_same_versions
+from rfm.supervise.watch import TRITON, Config, Watch, parts_of
+
+GATEWAY = "gateway"
 
 
 class Supervisor:
@@ -34,9 +27,7 @@ class Supervisor:
 
     gateway: command line of a gateway that runs beside the server; None: there is none
     status_port: of the status (``status``), on the server's host; None: there is none
-    canary_s: how often each model is probed
-    hang_s: how long a model may take to get one forward pass further, or answer nobody, before it counts as hung
-    triton_silent_s: how long Triton may give no answer to several looks in a row before it is killed
+    canary_s, hang_s, triton_silent_s: as Watch has them
     say: takes what happened, a line each
     """
 
@@ -54,24 +45,23 @@ class Supervisor:
         self._server = server
         self._gateway = None if gateway is None else GatewayProcess(gateway)
         self._status_port = status_port
-        self._triton_silent_s = triton_silent_s
         self._say = say
         self._status = Status()
-        self._new_models = partial(
-            ServedModels, server, self._status, say, canary_s=canary_s, hang_s=hang_s, triton_silent_s=triton_silent_s
+        self._new_watch = partial(
+            Watch, server, self._status, canary_s=canary_s, hang_s=hang_s, silent_s=triton_silent_s
         )
         self._is_to_stop = threading.Event()
         self._back_off = BackOff("tritonserver")
-        self._stalled_s = STALLED_S
-        self._models: ServedModels | None = None  # None: it is started, or has ended
-        self._configs: dict[str, Config] | None = None  # the configurations served last; None: those in the files
+        self._watch: Watch | None = None  # None: Triton is started, or has ended
+        self._served: dict[str, Config] | None = None  # last; None: nothing yet
+        self._left_out: dict[str, str] = {}  # models that kept ending Triton, and how
 
     def run(self) -> int:
         """Gives Triton's exit status. Raises ServerStartError for what does not start, or ends again and again."""
         for path in cleanup.clear():
             self._say(f"removed {path}, which a server left that was killed")
         self._status.record(dict.fromkeys(self._server.models, "it is loaded"))
-        for what in ("triton", *self._server.models, *(() if self._gateway is None else ("gateway",))):
+        for what in (TRITON, *self._server.models, *(() if self._gateway is None else (GATEWAY,))):
             self._status.restarts.labels(what)  # 0, so that already the first is an increase
         port, host = self._status_port, self._server.endpoints.host
         with (
@@ -82,13 +72,13 @@ class Supervisor:
 
     def _stop(self, number: int, _frame: FrameType | None) -> None:
         self._is_to_stop.set()
-        if self._models is None:  # it loads, and would not look
+        if self._watch is None:  # it loads, and would not look
             self._server.signal(signal.SIGTERM if number == signal.SIGHUP else number)
 
     def _serve(self) -> int:
         try:
-            self._start_first()
-            if self._gateway is not None and self._models is not None:
+            self._start()
+            if self._gateway is not None and self._watch is not None:
                 self._gateway.start()
             while not self._is_to_stop.wait(POLL_S):
                 self._look()
@@ -99,91 +89,83 @@ class Supervisor:
             self._status.record_down("it is stopping")
             if self._gateway is not None:  # the gateway answers its requests in flight before the server stops
                 self._gateway.stop()
-            self._close_models()
+            self._close_watch()
             status = self._server.stop()
         return status
 
-    def _start_first(self) -> None:
-        for _ in range(MAX_REPEATS):
-            try:
-                self._start()
-                return
-            except SpoiltStartError as error:
-                self._count("triton", str(error))
-                self._server.stop()
-        self._stalled_s = PATIENT_S
-        self._start()
-
     def _start(self) -> None:
-        """Starts Triton, and looks after its models from now on. Raises ServerStartError.
+        """Starts Triton, and looks after it from now on. Raises ServerStartError.
 
-        What was served before is served again, whatever was exported since. A model that cannot be loaded then does
-        not keep the others from being served.
+        What was served before is served again, whatever was exported since.
         """
-        self._server.start(self._restored())
-        if self._is_to_stop.is_set():  # before there was a process to pass it to
+        self._server.start_ready(self._served)
+        if self._is_to_stop.is_set():
             return
-        try:
-            self._server.wait_ready(self._stalled_s)
-        except StalledStartError:
-            self._stalled_s = PATIENT_S  # if models of other backends are slow, they have their time from now on
-            raise
-        ends = self._server.endpoints
-        urls = f"{ends.grpc_url}, {ends.http_url}, metrics at {ends.metrics_url}"
-        if self._configs is None:
+        if self._served is None:
+            ends = self._server.endpoints
+            urls = f"{ends.grpc_url}, {ends.http_url}, metrics at {ends.metrics_url}"
             self._say(f"ready: {', '.join(self._server.models)} at {urls}")
         self._back_off.started()
-        self._models = self._new_models(restored=self._configs or {})
-
-    def _restored(self) -> list[str] | None:
-        """The models that Triton loads by itself, before it answers anybody; None: all, for it never served any.
-
-        It can do so by their files alone. Where one of those names other versions by now, all are loaded afterwards.
-        """
-        if self._configs is None:
-            return None
-        is_so = all(names_the_same_versions(self._server.repository, *each) for each in self._configs.items())
-        return list(self._configs) if is_so else []
+        self._watch = self._new_watch(served=self._served or {})
 
     def _look(self) -> None:
-        """Starts again whatever has ended. Raises CrashLoopError."""
-        if self._models is not None and self._models.is_silent:
-            self._server.kill()
-            self._start_again(f"no answer for {self._triton_silent_s:g} s")
-        elif self._models is not None and (why := self._models.owing) is not None:
-            self._server.remember_the_dead()
-            self._server.kill()
-            self._start_again(why)
-        elif self._server.exit_status is not None:
-            self._start_again(f"exit status {self._server.exit_status}")
+        """Starts again what has ended. Raises CrashLoopError."""
+        if self._watch is None:
+            return
+        if self._server.exit_status is not None:
+            self._start_again(TRITON, f"exit status {self._server.exit_status}")
+        elif self._watch.fault is not None:
+            self._start_again(*self._watch.fault)
         if self._gateway is not None and (why := self._gateway.look()):
-            self._count("gateway", why)
-        if self._models is not None:
-            for model, why in self._models.look():
-                self._count(model, why)
+            self._count(GATEWAY, why)
+        if self._watch is not None and self._watch.reasons:
+            self._status.record({**self._left_out, **self._watch.reasons})
 
-    def _start_again(self, why: str) -> None:
-        """Returns when Triton is ready, or a signal has come. Raises CrashLoopError."""
+    def _start_again(self, what: str, why: str) -> None:
+        """Returns when Triton is ready, or a signal has come. Raises CrashLoopError.
+
+        what: the model that is to blame, or TRITON
+        """
         while not self._is_to_stop.is_set():
-            self._count("triton", why)
-            self._close_models()
-            self._status.record_down(f"tritonserver is started again, after {why}")
+            self._count(what, why)
+            self._close_watch()
+            self._status.record_down(f"tritonserver is started again: {what}: {why}")
+            self._server.kill()
             self._server.stop()  # what is left of it
-            if self._is_to_stop.wait(self._back_off.pause_s(why)):
+            try:
+                pause_s = self._back_off.pause_s(f"{what}: {why}")
+            except CrashLoopError:
+                if not self._leaves_out(what, why):
+                    raise
+                pause_s = 0.0
+            if self._is_to_stop.wait(pause_s):
                 return
             try:
                 self._start()
                 return
             except ServerStartError as error:
-                why = str(error)
+                what, why = error.model or TRITON, str(error)
+
+    def _leaves_out(self, what: str, why: str) -> bool:
+        """Whether others are served without the model ``what``, and what is made of it, from now on."""
+        served = self._served or {}
+        users = [name for name, config in served.items() if what in parts_of(config)]
+        others = {name: config for name, config in served.items() if name not in (what, *users)}
+        if what not in served or not others:
+            return False
+        self._say(f"{what} is left out, since it kept ending: {why}")
+        reason = f"it is left out, since {what} kept ending: {why}; `rfm models load` takes it in"
+        self._left_out |= dict.fromkeys([what, *users], reason)
+        self._served = others
+        self._back_off = BackOff("tritonserver")
+        return True
 
     def _count(self, what: str, why: str) -> None:
         self._status.restarts.labels(what).inc()
-        self._say(f"{what} is started again: {why}")
+        self._say(f"{GATEWAY if what == GATEWAY else TRITON} is started again: {what}: {why}")
 
-    def _close_models(self) -> None:
-        if self._models is not None:
-            if self._models.configs is not None:
-                self._configs = self._models.configs
-            self._models.close()
-            self._models = None
+    def _close_watch(self) -> None:
+        if self._watch is not None:
+            self._served = self._watch.served or self._served
+            self._watch.close()
+            self._watch = None

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""What every model.py has in common: requests are read as they come, scored together, and answered one by one."""
+"""What every model.py has in common: the requests that Triton hands over are read, scored together and answered."""
 
 from __future__ import annotations
 
 import json
-import math
-import time
+import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -15,33 +14,22 @@ from typing import Any, Generic, TypeAlias, TypeVar
 import torch
 
 from rfm.execution import Execution
-from rfm.journal import NO_DIGEST
-from rfm.parameters import BUDGET_PARAMETER, QUEUE_SIZE_PARAMETER, QUEUE_TIMEOUT_PARAMETER
+from rfm.parameters import BUDGET_PARAMETER, DEFAULT_HANG_S, HANG_VARIABLE, OLD_QUEUE_PARAMETERS
 from rfm.probe import blank_question
-from rfm.triton_model.exit import exit_with_triton
+from rfm.triton_model.guard import Guard, end
 from rfm.triton_model.metrics import Counted, Metrics
-from rfm.triton_model.other_instances import OtherInstances
-from rfm.triton_model.pipeline import Bounds, Pipeline, Stages
-from rfm.triton_model.placement import Placement, num_instances, use_threads
-from rfm.triton_model.quarantine import Quarantine
-from rfm.triton_model.request import SAMPLE_TYPES, Origins, RejectedError, Request
-from rfm.triton_model.request_digest import digest
+from rfm.triton_model.pipeline import Pipeline, Stages
+from rfm.triton_model.placement import Placement, use_threads
+from rfm.triton_model.request import SAMPLE_TYPES, Request
 from rfm.triton_model.request_log import RequestLog
-from rfm.triton_model.self_check import SelfCheck
-from rfm.triton_model.triton_queue import TritonQueue
 from rfm.triton_model.weights import check_digest
 from rfm_client.contract import InvalidSampleError, RewardError, wire
 from rfm_client.contract.model_info import DIGEST_PARAMETER, NETWORK_PARAMETER, REVISION_PARAMETER, SOURCE_PARAMETER
 from rfm_client.contract.named_frames import NamedFootage
 from rfm_client.contract.samples import Footage
-from rfm_client.contract.triton import QUEUE_FULL
 from rfm_client.contract.wire import Tensors
 
-MS_PER_S = 1e3
 MAX_INT32 = 2**31 - 1
-AT_ONCE_S = 50e-3  # what takes longer is done by another thread, so that meanwhile others can be rejected
-UNSEEN_S = 0.25  # for so long others may wait in Triton unseen: each look at them costs the time to send answers apart
-CHEAP_ANSWER_S = {"cpu": 5e-3, "cuda": 0.2e-3}  # one that takes less is not worth the time that sending it takes
 
 Question = TypeVar("Question")
 Answer = TypeVar("Answer")
@@ -53,71 +41,52 @@ class BatchModel(Generic[Question, Answer]):
 
     A subclass says how a request's tensors are read (``decode``), what is done with a question when it comes
     (``prepare``), how questions are answered (``answer``) and how the answers of one request are written (``encode``).
-    One that ``works_ahead`` says, too, what can be done before a question's turn comes (``work_ahead``).
+
+    A subclass that ``works_ahead`` has a ``Pipeline``, and says what it can do before a question's turn
+    (``work_ahead``). Any other scores in ``execute``.
     """
 
     def initialize(self, args: Mapping[str, str]) -> None:
         """Called once by Triton when the model is loaded."""
-        exit_with_triton()
         config = json.loads(args["model_config"])
         settings = {name: value["string_value"] for name, value in config["parameters"].items()}
         placement = Placement.of(args, config, settings)
         version = Path(args["model_repository"], args["model_version"])
+        self._pipeline: Pipeline[Request[Question], Scored[Question]] | None = None
+        self._is_executing = False
+        self._guard = Guard(float(os.environ.get(HANG_VARIABLE) or DEFAULT_HANG_S), lambda: self._is_working)
         check_digest(version, settings.get(DIGEST_PARAMETER, ""))
         placement.run(lambda: self.load(version, placement.device, settings))
         model = {"model": args["model_name"], "version": args["model_version"]}
         labels = {**model, "device": str(placement.device), "instance": args["model_instance_name"]}
         names = [spec["name"] for spec in config["input"]]
         self._log = RequestLog(model)
-        self._metrics = Metrics(labels, _checkpoint(settings), _sample_types(names))
-        num_preparing = placement.num_preparing if self.works_ahead else 0
-        self._quarantine = Quarantine.of_this_process(args["model_name"], config["max_batch_size"], num_preparing)
-        other_instances = OtherInstances.of_this_process(args["model_name"]) if num_instances(config) > 1 else None
-        self.start(config, settings, other_instances, placement.apply, placement.device.type, num_preparing)
-
-    def start(
-        self,
-        config: Mapping[str, Any],
-        settings: Mapping[str, str],
-        other_instances: OtherInstances | None = None,
-        begin: Callable[[], None] = lambda: None,
-        device: str = "cpu",
-        num_preparing: int = 0,
-    ) -> None:
-        """Begins to take requests. Weights, log, metrics and quarantine are there.
-
-        begin: called in the thread that scores; the thread of ``execute`` computes nothing with several threads
-        device: type of the one that computes; answers that are cheap there are given together
-        num_preparing: threads that work ahead
-        """
-        self._cheap_answer_s, self._is_on_cpu = CHEAP_ANSWER_S[device], device == "cpu"
-        self._sample_s = math.inf  # what each sample of the last group took; inf: there was none
-        bounds = _bounds(config, settings)
-        self._max_batch, self._max_waiting = bounds.batch_samples, bounds.waiting_jobs
-        self._max_ahead = min(self._max_batch, bounds.waiting_jobs or self._max_batch)
-        self._patience_s = (int(settings.get(QUEUE_TIMEOUT_PARAMETER) or 0) / MS_PER_S) or None
-        self._self_check = SelfCheck(self._score_blank, self._log.report_end)
-        self._triton_queue = TritonQueue()
+        self._metrics = Metrics(labels, _checkpoint(settings), _sample_types(names), lambda: self._guard.num_steps)
         self._blank_tensors = blank_question(config)
-        warmups = config.get("model_warmup", [])
-        self._origins = Origins(sum(max(warmup.get("count", 0), 1) for warmup in warmups), digest(self._blank_tensors))
-        self._other_instances = other_instances
+        self._num_warmups = sum(max(warmup.get("count", 0), 1) for warmup in config.get("model_warmup", []))
+        if any(settings.get(name) for name in OLD_QUEUE_PARAMETERS):
+            self._log.note(f"{', '.join(OLD_QUEUE_PARAMETERS)} of an older export have no effect: export again")
+        if not self.works_ahead:
+            placement.apply()
+            return
         stages = Stages(
+            self._work_ahead,
             self._score,
             self._send,
-            self._self_check.end,
-            begin,
+            fail=lambda: end("its pipeline has failed"),
             begin_preparing=partial(use_threads, 1),  # there are as many threads as this instance has cores
-            prepare=self._work_ahead,
-            num_preparing=num_preparing,
+            begin_scoring=placement.apply,
+            num_preparing=placement.num_preparing,
         )
-        self._pipeline = Pipeline(stages, bounds)
+        batch_tokens = int(settings.get(BUDGET_PARAMETER) or MAX_INT32)
+        self._pipeline = Pipeline(stages, config["max_batch_size"], batch_tokens)
 
     def finalize(self) -> None:
         """Called once by Triton when the model is unloaded."""
-        self._pipeline.close()
-        self._quarantine.close()
+        if self._pipeline is not None:
+            self._pipeline.close()
         self._metrics.close()
+        self._guard.close()
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
         """Loads the weights in the folder ``version`` onto ``device``."""
@@ -151,105 +120,45 @@ class BatchModel(Generic[Question, Answer]):
         raise NotImplementedError
 
     def execute(self, requests: Sequence[Any]) -> list[Any] | None:
-        """Called by Triton with requests. Gives their responses; None: they are sent as they come."""
-        called_s = time.monotonic()
-        self._self_check.wait_if_ending()
-        batch = [self._received(inference) for inference in requests]
-        self._triton_queue.called(called_s, len(batch), sum(request.num_bytes for request in batch))
-        if self._is_on_cpu and self._are_cheap(batch, self._pipeline.num_samples_waiting):
-            self._pipeline.wait_for(lambda: self._pipeline.is_idle, AT_ONCE_S)
-        if self._pipeline.is_idle and self._is_better_at_once(batch):
-            responses = self._responses_to(batch)
-            self._triton_queue.returned(len(responses))
-            return responses
-        self._take_in(batch, requests)
-        if self._other_instances is not None:
-            self._other_instances.wait_for_turn(self._pipeline, self._max_ahead)
-        self._triton_queue.returned(0)
-        return None
-
-    def _take_in(self, batch: Sequence[Request[Question]], requests: Sequence[Any]) -> None:
-        """Has requests wait for their turn, or answers why they cannot."""
-        self._quarantine.owe(len(batch))
+        """Called by Triton with requests. Gives their responses; None: they are sent when they are scored."""
+        batch: list[Request[Question]] = [Request.of(inference) for inference in requests]
+        pipeline = self._pipeline
+        if pipeline is None:
+            return self._responses(batch, self._score)
+        if len(batch) == 1 and pipeline.is_idle:  # Triton hands the next request to another instance meanwhile
+            return self._responses(batch, pipeline.run)
         for request, inference in zip(batch, requests, strict=True):
             request.outlive(inference)
             self._read(request)
-        failed = [request for request in batch if request.error is not None]
-        failed += self._put([request for request in batch if request.error is None])
-        if failed:
-            self._send(failed, [(failed, Execution())])
+        pipeline.put(batch)
+        return None
 
-    def _is_better_at_once(self, batch: Sequence[Request[Question]]) -> bool:
-        """Whether requests are better scored while ``execute`` waits, and answered together.
+    @property
+    def _is_working(self) -> bool:
+        return self._is_executing if self._pipeline is None else not self._pipeline.is_idle
 
-        To send a response takes a tenth of a millisecond longer than to give it back. But to wait here keeps Triton
-        from handing over more, and an accelerator waits until it does. A full batch says that more wait; some of them
-        may have to be rejected. Of what waits behind a batch that is not full, nothing is known; so there is a look at
-        them before they may have waited for too long.
-
-        Where the process dies, Triton 2.51 fails the requests of ``execute``, and never those that are to be answered
-        later. So all are answered at once while a suspect may kill the process.
-        """
-        if self._quarantine.has_suspects or self._sample_s == math.inf:
-            return True
-        return self._take_less(batch, AT_ONCE_S) if len(batch) == 1 else self._are_cheap(batch)
-
-    def _are_cheap(self, batch: Sequence[Request[Question]], num_waiting: int = 0) -> bool:
-        """Whether the answers take little time, a request on average, and all together with ``num_waiting`` samples."""
-        return self._take_less(batch, min(AT_ONCE_S, self._cheap_answer_s * len(batch)), num_waiting)
-
-    def _take_less(self, batch: Sequence[Request[Question]], limit_s: float, num_waiting: int = 0) -> bool:
-        """Whether requests that are no full batch probably take less than ``limit_s``, and with ``num_waiting`` other
-        samples less than AT_ONCE_S, and than those who may wait in Triton can be left alone.
-        """
-        num_samples, most = sum(each.num_samples for each in batch), max(each.num_samples for each in batch)
-        if num_samples + most > self._max_batch:  # one more like them would not fit
-            return False
-        # Unseen, none shall wait for longer than it may wait here, behind requests as large as these.
-        request_s = self._sample_s * num_samples / len(batch)
-        queue_s = math.inf if self._max_waiting is None else request_s * self._max_waiting
-        longest_s = min(UNSEEN_S, queue_s, self._patience_s or math.inf)
-        left_s = min(AT_ONCE_S, longest_s - self._triton_queue.unseen_s)
-        return self._sample_s * num_samples < limit_s and self._sample_s * (num_samples + num_waiting) < left_s
-
-    def _responses_to(self, batch: Sequence[Request[Question]]) -> list[Any]:
-        """Reads the requests, waits until they are scored, and answers them."""
+    def _responses(
+        self, batch: list[Request[Question]], score: Callable[[list[Request[Question]]], Scored[Question]]
+    ) -> list[Any]:
+        """Triton's responses to requests that are scored meanwhile."""
         for request in batch:
             self._read(request)
-        scored: Scored[Question] = []
-        if failed := [request for request in batch if request.error is not None]:
-            scored.append((failed, Execution()))
-        if ready := [request for request in batch if request.error is None]:
-            scored += self._pipeline.run(ready)
+        self._is_executing = True
+        scored = score(batch)
+        self._is_executing = False
         responses = [self._response(request) for request in batch]
         self._count(scored)
         return responses
 
-    def _put(self, batch: Sequence[Request[Question]]) -> list[Request[Question]]:
-        """Has requests wait for their turn. Gives those for which there is no room, with the error that says so."""
-        rejected = self._pipeline.put(batch)
-        self._metrics.num_waiting = self._pipeline.num_waiting
-        for request in rejected:
-            request.error = RejectedError(f"{QUEUE_FULL}: {self._pipeline.num_waiting} requests wait already")
-        return rejected
-
-    def _received(self, inference: Any) -> Request[Question]:
-        """A request with its tensors, or with an error."""
-        request: Request[Question] = Request.of(inference)
-        try:
-            request.receive(inference)
-        except Exception as error:  # noqa: BLE001  whatever went wrong with it costs no other its answer
-            request.fail(error)
-        return request
-
     def _read(self, request: Request[Question]) -> None:
-        """The first stage: the request's questions are prepared, or it has an error."""
+        """Decodes and prepares the questions of a request, or notes why it has none."""
+        if self._num_warmups and not request.request_id:  # Triton warms the instance up before it lets callers in
+            self._num_warmups -= 1
+            request.is_counted = False
         if request.error is not None:
             return
         try:
-            self._origins.find(request)
             request.questions = self.decode(request.tensors)
-            self._quarantine.check(request.digest)
             self._prepare(request)
         except RewardError as error:
             request.error = error
@@ -269,32 +178,33 @@ class BatchModel(Generic[Question, Answer]):
         request.num_tokens = sum(num_tokens)
 
     def _work_ahead(self, request: Request[Question]) -> None:
-        """Beside the scoring of others: what takes long of a request. Not while a suspect may end the process, for
-        which others would be blamed. What is not done here is done in the request's turn.
-        """
-        if self._quarantine.has_suspects:
-            return
-        with self._quarantine.preparing(request.digest), suppress(Exception):  # its turn will show what is wrong
+        """Beside the scoring of others: what takes long of a request. What fails here fails again in its turn."""
+        with suppress(Exception):
             for prepared in request.prepared:
                 self.work_ahead(prepared)
 
-    def _score(self, batch: Sequence[Request[Question]]) -> Scored[Question]:
-        """The second stage: the answers, or the error, of each request."""
-        self._metrics.num_waiting = self._pipeline.num_waiting
-        if self._self_check.is_ending:  # those that wait are told while there is somebody to tell them
-            for request in batch:
-                request.error = RejectedError("the instance is broken, and ends")
-            return [(batch, Execution())]
+    def _score(self, batch: list[Request[Question]]) -> Scored[Question]:
+        """The answers, or the error, of each request."""
         for request in batch:
-            request.begin()
-        with self._metrics.at_work_on(batch), self._self_check.around(batch):
-            return self._scored(batch)
+            if request.error is None:
+                request.check_wanted()
+        failed = [request for request in batch if request.error is not None]
+        good = [request for request in batch if request.error is None]
+        scored: Scored[Question] = [(failed, Execution())] if failed else []
+        if good:
+            scored += self._scored(good)
+            self._guard.look_at(good, self._score_blank)
+        return scored
 
-    def _scored(self, batch: Sequence[Request[Question]]) -> Scored[Question]:
+    def _scored(self, batch: list[Request[Question]]) -> Scored[Question]:
         """Scores the requests together or, if that fails, each alone: what breaks one costs no other its answer."""
-        execution = Execution(on_forward=self._quarantine.renew)
+        self._guard.step()
+        execution = Execution(on_forward=self._guard.step)
         try:
-            self._answer_together(batch, execution)
+            answers = iter(self.answer([each for request in batch for each in request.prepared], execution))
+            for request in batch:
+                request.answers = [next(answers) for _ in request.prepared]
+                request.error = _first_error(request.answers)
         except Exception as error:  # noqa: BLE001  the request boundary: whatever happened, every request is answered
             if len(batch) > 1:
                 self._log.report_batch(batch, error)
@@ -303,25 +213,10 @@ class BatchModel(Generic[Question, Answer]):
             execution = Execution()
         return [(batch, execution)]
 
-    def _answer_together(self, batch: Sequence[Request[Question]], execution: Execution) -> None:
-        for request in batch:
-            request.error = request.given_up(self._sample_s) or request.out_of_patience(self._patience_s)
-        for group in self._quarantine.groups([request for request in batch if request.error is None]):
-            questions = [question for request in group for question in request.prepared]
-            started_s = time.perf_counter()
-            with self._quarantine.at_work_on([request.digest for request in group]):
-                answers = iter(self.answer(questions, execution))
-            took_s = time.perf_counter() - started_s
-            self._sample_s = took_s / len(questions)
-            for request in group:
-                request.answers = [next(answers) for _ in request.prepared]
-                request.error = _first_error(request.answers)
-
-    def _send(self, batch: Sequence[Request[Question]], scored: Scored[Question]) -> None:
-        """The third stage: encodes, sends and counts."""
-        for request in batch:
+    def _send(self, scored: Scored[Question]) -> None:
+        """Answers requests of the pipeline."""
+        for request in [request for part, _ in scored for request in part]:
             request.send(self._response(request))
-            self._quarantine.owe(-1)
         self._count(scored)
 
     def _response(self, request: Request[Question]) -> Any:
@@ -347,8 +242,7 @@ class BatchModel(Generic[Question, Answer]):
             questions = [self.prepare(question)[0] for question in self.decode(self._blank_tensors)]
         except InvalidSampleError:  # a checkpoint may refuse blank frames
             return
-        with self._quarantine.at_work_on([NO_DIGEST]):  # a hang is noticed, and no request is a suspect
-            error = _first_error(self.answer(questions, Execution(on_forward=self._quarantine.renew)))
+        error = _first_error(self.answer(questions, Execution(on_forward=self._guard.step)))
         if error is not None and not isinstance(error, InvalidSampleError):
             raise error
 
@@ -362,16 +256,6 @@ def _first_error(answers: Sequence[Any]) -> RewardError | None:
 def _located(error: RewardError, index: int, count: int) -> RewardError:
     """The error of the question ``index`` of a request of ``count`` questions."""
     return error.inside(f"samples[{index}]") if isinstance(error, InvalidSampleError) and count > 1 else error
-
-
-def _bounds(config: Mapping[str, Any], settings: Mapping[str, str]) -> Bounds:
-    """How much an instance takes at a time, as it was exported; what an older export does not say is unbounded."""
-    batch_samples = config["max_batch_size"]
-    batch_tokens = int(settings.get(BUDGET_PARAMETER) or MAX_INT32)
-    waiting = int(settings.get(QUEUE_SIZE_PARAMETER) or 0) or None
-    # An idle instance, to which Triton hands a full batch, has room for it.
-    share = None if waiting is None else max(math.ceil(waiting / num_instances(config)), min(waiting, batch_samples))
-    return Bounds(batch_samples, batch_tokens, batch_samples, share)
 
 
 def _sample_types(input_names: Sequence[str]) -> list[str]:

@@ -10,8 +10,8 @@ from __future__ import annotations
 import threading
 import traceback
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Collection, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -25,11 +25,9 @@ IDLE_INTERVAL_S = 5.0  # while no request comes
 COUNTER, GAUGE, HISTOGRAM = "COUNTER", "GAUGE", "HISTOGRAM"  # as Triton names them
 FRAMES, RETRIES = "frames_total", "out_of_memory_retries_total"
 BATCH_SAMPLES, BATCH_PADDING = "batch_samples", "batch_padding_ratio"
-WAIT_SECONDS, COLLATE_SECONDS, FORWARD_SECONDS = "wait_seconds", "collate_seconds", "forward_seconds"
-
-BATCH_REQUESTS, WAITING_REQUESTS = "batch_requests", "waiting_requests"
+COLLATE_SECONDS, FORWARD_SECONDS = "collate_seconds", "forward_seconds"
 ENCODED, FOUND, MISSED = "frames_encoded_total", "feature_cache_hits_total", "feature_cache_misses_total"
-CACHE_BYTES = "feature_cache_bytes"
+CACHE_BYTES, PASSES = "feature_cache_bytes", "forward_passes_total"
 
 SAMPLES_BUCKETS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0)
 PADDING_BUCKETS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
@@ -40,17 +38,12 @@ _TOTALS = {
     RETRIES: "Forward passes that ran out of memory and were tried again in halves.",
     ENCODED: "Frames that went through an encoder or a vision tower.",
     FOUND: "Frames of a batch, each once, whose features were kept.",
+    PASSES: "Forward passes, and batches begun.",
     MISSED: "Frames of a batch, each once, whose features were not kept, and had to be made.",
-}
-_GAUGES = {
-    BATCH_REQUESTS: "Requests of the batch that is worked on now; 0: idle.",
-    WAITING_REQUESTS: "Requests that wait in the model for their turn.",
-    CACHE_BYTES: "Bytes of the features that are kept.",
 }
 _HISTOGRAMS = {
     BATCH_SAMPLES: ("Samples of one execution.", SAMPLES_BUCKETS),
     BATCH_PADDING: ("Share of the token slots of an execution's forward passes that were padding.", PADDING_BUCKETS),
-    WAIT_SECONDS: ("The longest wait in the model of one execution's requests, for their turn.", BUCKETS_S),
     COLLATE_SECONDS: ("Of one execution, in which batches were made and no forward pass ran.", BUCKETS_S),
     FORWARD_SECONDS: ("Of one execution's forward passes.", BUCKETS_S),
 }
@@ -63,13 +56,11 @@ class Counted:
     samples: how many, by (sample type, outcome)
     num_frames: of the samples that were scored
     num_executed: samples that ``execution`` was about
-    wait_s: the longest that one of the requests had waited for its turn
     """
 
     samples: Counter[tuple[str, str]] = field(default_factory=Counter)
     num_frames: int = 0
     num_executed: int = 0
-    wait_s: float = 0.0
     execution: Execution = field(default_factory=Execution)
 
     @classmethod
@@ -84,7 +75,6 @@ class Counted:
             if request.outcome == SCORED:
                 counted.num_frames += request.num_frames
             counted.num_executed += len(request.answers)
-            counted.wait_s = max(counted.wait_s, request.waited_s)
         return counted
 
     def totals(self) -> dict[str, int]:
@@ -101,7 +91,6 @@ class Counted:
         return {
             BATCH_SAMPLES: self.num_executed,
             BATCH_PADDING: self.execution.padding_ratio,
-            WAIT_SECONDS: self.wait_s,
             COLLATE_SECONDS: self.execution.collate_s,
             FORWARD_SECONDS: self.execution.forward_s,
         }
@@ -113,12 +102,18 @@ class Metrics:
     labels: the labels that name the instance
     checkpoint: labels of rfm_checkpoint_info
     sample_types: the types of samples that the model scores
-    num_waiting: requests that wait for their turn; to be set when it changes
+    num_steps: gives how many forward passes were made so far
     """
 
-    def __init__(self, labels: Mapping[str, str], checkpoint: Mapping[str, str], sample_types: Collection[str]) -> None:
-        self.num_waiting = 0
-        self._at_work = self._cache_bytes = 0
+    def __init__(
+        self,
+        labels: Mapping[str, str],
+        checkpoint: Mapping[str, str],
+        sample_types: Collection[str],
+        num_steps: Callable[[], int],
+    ) -> None:
+        self._num_steps, self._num_told_steps = num_steps, num_steps()
+        self._cache_bytes = 0
         self._queue: SimpleQueue[Counted | None] = SimpleQueue()  # None only wakes the thread
         self._closing = threading.Event()
         self._has_failed = False
@@ -130,15 +125,6 @@ class Metrics:
             return
         self._thread = threading.Thread(target=self._flush_for_ever, name="rfm-metrics", daemon=True)
         self._thread.start()
-
-    @contextmanager
-    def at_work_on(self, batch: Iterable[Request[Any]]) -> Iterator[None]:
-        """A context in which the gauge of requests in work counts the callers' requests of the batch."""
-        self._set_at_work(sum(request.is_counted for request in batch))
-        try:
-            yield
-        finally:
-            self._set_at_work(0)
 
     def add(self, counted: Counted) -> None:
         """Counts what came of a batch."""
@@ -154,11 +140,6 @@ class Metrics:
         self._thread.join()
         self._flush(is_served=False)
 
-    def _set_at_work(self, num_requests: int) -> None:
-        if self._thread is not None and num_requests != self._at_work:
-            self._at_work = num_requests
-            self._queue.put(None)
-
     def _flush_for_ever(self) -> None:
         while not self._closing.is_set():
             first = None
@@ -173,8 +154,10 @@ class Metrics:
             self._series.add(batches)
             for batch in batches:
                 self._cache_bytes = batch.execution.cache_bytes or self._cache_bytes
-            waiting, cached = self.num_waiting, self._cache_bytes
-            self._series.show(at_work=self._at_work, waiting=waiting, cached=cached, is_served=is_served)
+            num_steps = self._num_steps()
+            self._series.step(num_steps - self._num_told_steps)
+            self._num_told_steps = num_steps
+            self._series.show(cached=self._cache_bytes, is_served=is_served)
         except Exception:  # noqa: BLE001  requests are answered all the same
             self._log_once()
 
@@ -205,15 +188,12 @@ class _Series:
             name: self._family(name, HISTOGRAM, description).Metric(labels=dict(labels), buckets=list(buckets))
             for name, (description, buckets) in _HISTOGRAMS.items()
         }
-        self._gauges = {
-            name: self._family(name, GAUGE, description).Metric(labels=dict(labels))
-            for name, description in _GAUGES.items()
-        }
-        self._shown = dict.fromkeys(_GAUGES, -1)
+        kept = self._family(CACHE_BYTES, GAUGE, "Bytes of the features that are kept.")
+        self._cache_bytes = kept.Metric(labels=dict(labels))
         info = self._family("checkpoint_info", GAUGE, "1: the checkpoint is served.")
         model = {name: labels[name] for name in ("model", "version")}
         self._checkpoint = info.Metric(labels={**model, **checkpoint})
-        self.show(at_work=0, waiting=0, cached=0, is_served=True)
+        self.show(cached=0, is_served=True)
 
     def _family(self, name: str, kind: str, description: str) -> Any:
         import triton_python_backend_utils as pb_utils
@@ -236,12 +216,14 @@ class _Series:
         for name, total in totals.items():
             self._totals[name].increment(total)
 
-    def show(self, *, at_work: int, waiting: int, cached: int, is_served: bool) -> None:
-        """Sets the gauges whose values have changed."""
-        for name, value in {BATCH_REQUESTS: at_work, WAITING_REQUESTS: waiting, CACHE_BYTES: cached}.items():
-            if value != self._shown[name]:
-                self._gauges[name].set(value)
-                self._shown[name] = value
+    def step(self, num_steps: int) -> None:
+        """Adds forward passes. They count while a batch goes on: by them ``rfm serve`` knows that it does not hang."""
+        if num_steps:
+            self._totals[PASSES].increment(num_steps)
+
+    def show(self, *, cached: int, is_served: bool) -> None:
+        """Sets the gauges."""
+        self._cache_bytes.set(cached)
         # Every time: where a model is reloaded, the instance that goes says 0 when the one that comes has said 1.
         self._checkpoint.set(float(is_served))
 

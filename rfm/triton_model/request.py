@@ -1,18 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""One request: who sent it, what it asks and what became of it."""
+"""One request: what it asks and what became of it."""
 
 from __future__ import annotations
 
-import math
-import time
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
-from enum import Enum
 from typing import Any, Generic, TypeVar
 
-from rfm.journal import NO_DIGEST
-from rfm.triton_model.request_digest import digest
 from rfm_client.contract import (
     InferenceFailedError,
     InvalidSampleError,
@@ -28,9 +23,7 @@ from rfm_client.contract.samples import Footage
 
 Question = TypeVar("Question")
 
-SCORED, REFUSED, FAILED = "scored", "refused", "failed"  # what becomes of a request
-CANCELLED, REJECTED = "cancelled", "rejected"  # by the client; by the server, which takes no more
-OUTCOMES = (SCORED, REFUSED, FAILED, CANCELLED, REJECTED)
+OUTCOMES = SCORED, REFUSED, FAILED, CANCELLED = "scored", "refused", "failed", "cancelled"
 
 SAMPLE_TYPES = {
     ProgressSample: "progress",
@@ -40,25 +33,11 @@ SAMPLE_TYPES = {
     Footage: "encode",
     NamedFootage: "encode",
 }
-US_PER_S = 1e6
-WORTH_CHECKING_S = 10e-3  # for one answer: to ask Triton's process takes 0.1 ms a request
 UNKNOWN_TYPE = "unknown"  # of the samples of a request that could not be decoded
 
 
-class Origin(Enum):
-    """Who sent a request. Metrics count callers' requests alone, and no other can be quarantined."""
-
-    CALLER = "a caller"
-    WARM_UP = "Triton, before it lets callers in"
-    PROBE = "a health probe"
-
-
 class CancelledError(RewardError):
-    """The client has cancelled the request: nobody waits for its answer."""
-
-
-class RejectedError(RewardError):
-    """The model takes no more: it has no room for the request, no time before the request's ran out, or is ending."""
+    """The client has cancelled the request: nothing waits for its answer."""
 
 
 @dataclass(eq=False)
@@ -67,14 +46,9 @@ class Request(Generic[Question]):
 
     request_id: the id that the client chose; empty if it chose none
     outputs: names of the outputs that the client wants
-    is_cancelled: asks Triton whether the client has cancelled
-    sender: Triton's, which takes the response; None: ``execute`` gives it back
-    arrived_s: by time.monotonic, when the model got it
-    waited_s: seconds from then until its turn
-    patience_s: seconds that it may wait for its turn; None: any time
-    num_samples: known when its tensors are read
+    is_counted: whether metrics count it: a caller sent it, no warm-up and no health probe
+    sender: Triton's, which takes the response; None: ``execute`` returns the response
     num_tokens: of all its samples, known when they are prepared
-    digest: names its inputs in the quarantine
     questions: none unless it could be decoded
     prepared: one a question, once they are there
     answers: one a question, once they are there
@@ -83,16 +57,11 @@ class Request(Generic[Question]):
 
     request_id: str
     outputs: Collection[str]
-    is_cancelled: Callable[[], bool]
+    is_counted: bool = True
     sender: Any = None
-    arrived_s: float = field(default_factory=time.monotonic)
-    waited_s: float = 0.0
-    patience_s: float | None = None
-    origin: Origin = Origin.CALLER
     tensors: wire.Tensors = field(default_factory=dict)
     num_samples: int = 1
     num_tokens: int = 0
-    digest: bytes = NO_DIGEST
     questions: Sequence[Question] = ()
     prepared: Sequence[Any] = ()
     answers: Sequence[Any] = ()
@@ -100,52 +69,31 @@ class Request(Generic[Question]):
 
     @classmethod
     def of(cls, inference: Any) -> Request[Question]:
-        """What Triton hands over as ``inference``, without its tensors."""
-        request = cls(inference.request_id(), inference.requested_output_names(), inference.is_cancelled)
-        if timeout_us := inference.timeout():
-            request.patience_s = timeout_us / US_PER_S
+        """The request that Triton hands over as ``inference``. Its tensors are views of Triton's memory."""
+        request_id = inference.request_id()
+        request = cls(request_id, inference.requested_output_names(), not request_id.startswith(PROBE_PREFIX))
+        try:
+            request.tensors = {tensor.name(): tensor.as_numpy() for tensor in inference.inputs()}
+            request.num_samples = len(request.tensors[wire.NUM_FRAMES])
+        except Exception as error:  # noqa: BLE001  whatever went wrong with it costs no other its answer
+            request.fail(error)
         return request
 
-    def receive(self, inference: Any) -> None:
-        """Takes the tensors, which are views of Triton's memory."""
-        self.tensors = {tensor.name(): tensor.as_numpy() for tensor in inference.inputs()}
-        self.num_samples = len(self.tensors[wire.NUM_FRAMES])
-
     def outlive(self, inference: Any) -> None:
-        """Makes it a request that is answered after ``execute``, when Triton's memory of its tensors may be gone."""
+        """Prepare for an answer after ``execute``, when Triton's memory of the tensors may be gone."""
         self.sender = inference.get_response_sender()
-        self.is_cancelled = self.sender.is_cancelled
         try:
             self.tensors = {name: array.copy() for name, array in self.tensors.items()}
         except MemoryError as error:
             self.fail(error)
 
-    def begin(self) -> None:
-        """Notes that its turn has come."""
-        self.waited_s = time.monotonic() - self.arrived_s
-
-    def given_up(self, answer_s: float) -> CancelledError | None:
-        """The error of a request that its client has cancelled; else None.
-
-        Triton is only asked where an answer, which takes ``answer_s``, is worth a question.
-        """
-        if answer_s < WORTH_CHECKING_S or not self.is_cancelled():
-            return None
-        return CancelledError("cancelled by the client")
-
-    def out_of_patience(self, patience_s: float | None) -> RejectedError | None:
-        """The error of a request that had waited for longer than ``patience_s``, or than itself said; else None."""
-        if not self.may_be_rejected:
-            return None
-        own_s = math.inf if self.patience_s is None else self.patience_s
-        least_s = min(own_s, math.inf if patience_s is None else patience_s)
-        if self.waited_s <= least_s:
-            return None
-        of_whom = "queue_timeout_ms" if least_s == patience_s else "its own timeout"
-        return RejectedError(f"the request has waited for longer than {least_s:g} s ({of_whom})")
+    def check_wanted(self) -> None:
+        """Note an error if the client has cancelled. To ask Triton takes 0.1 ms."""
+        if self.sender is not None and self.sender.is_cancelled():
+            self.error = CancelledError("cancelled by the client")
 
     def fail(self, cause: Exception) -> None:
-        """Notes that something went wrong of which clients need not know more."""
+        """Note that something went wrong of which clients need not know more."""
         self.error = InferenceFailedError("scoring failed; the server's log has the reason")
         self.error.__cause__ = cause
 
@@ -162,31 +110,15 @@ class Request(Generic[Question]):
         codes = {
             InvalidSampleError: pb_utils.TritonError.INVALID_ARG,
             CancelledError: pb_utils.TritonError.CANCELLED,
-            RejectedError: pb_utils.TritonError.UNAVAILABLE,
         }
         code = next((codes[kind] for kind in codes if isinstance(self.error, kind)), pb_utils.TritonError.INTERNAL)
         return pb_utils.InferenceResponse(error=pb_utils.TritonError(str(self.error), code))
 
     def send(self, response: Any) -> None:
-        """Sends the response, which is the only one to this request."""
+        """Send the response, which is the only one to this request."""
         import triton_python_backend_utils as pb_utils
 
         self.sender.send(response, flags=pb_utils.TRITONSERVER_RESPONSE_COMPLETE_FINAL)
-
-    @property
-    def num_bytes(self) -> int:
-        """Bytes of its tensors."""
-        return sum(array.nbytes for array in self.tensors.values())
-
-    @property
-    def is_counted(self) -> bool:
-        """Whether the metrics count this request: a caller sent it."""
-        return self.origin is Origin.CALLER
-
-    @property
-    def may_be_rejected(self) -> bool:
-        """Whether there may be no room for it. A probe always finds some: a busy model is a healthy one."""
-        return self.is_counted
 
     @property
     def sample_types(self) -> Counter[str]:
@@ -198,7 +130,7 @@ class Request(Generic[Question]):
     @property
     def num_frames(self) -> int:
         """Frames of all trajectories that it asks about."""
-        return sum(_num_frames(question) for question in self.questions)
+        return sum(trajectory.num_frames for question in self.questions for trajectory in question.trajectories)  # type: ignore[attr-defined]
 
     @property
     def outcome(self) -> str:
@@ -207,37 +139,4 @@ class Request(Generic[Question]):
             return SCORED
         if isinstance(self.error, CancelledError):
             return CANCELLED
-        if isinstance(self.error, RejectedError):
-            return REJECTED
         return REFUSED if isinstance(self.error, InvalidSampleError) else FAILED
-
-
-class Origins:
-    """Finds out who sent a request.
-
-    num_warmups: requests with which Triton warms the instance up, before anybody else is let in
-    blank: digest of the inputs of a health probe
-    """
-
-    def __init__(self, num_warmups: int, blank: bytes) -> None:
-        self._num_warmups = num_warmups
-        self._blank = blank
-
-    def find(self, request: Request[Any]) -> None:
-        """Notes who sent the request, and its digest if it is a caller's.
-
-        The first without an id are warm-ups. Anybody can say to be a probe, which asks the blank question.
-        """
-        if self._num_warmups and not request.request_id:
-            self._num_warmups -= 1
-            request.origin = Origin.WARM_UP
-            return
-        of_tensors = digest(request.tensors)
-        if request.request_id.startswith(PROBE_PREFIX) and of_tensors == self._blank:
-            request.origin = Origin.PROBE
-        else:
-            request.digest = of_tensors
-
-
-def _num_frames(question: Any) -> int:
-    return sum(trajectory.num_frames for trajectory in question.trajectories)

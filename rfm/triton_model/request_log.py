@@ -36,9 +36,11 @@ class RequestLog:
         fields = {"request_ids": [request.request_id for request in batch], "error": repr(error)}
         self._write(FAILED, fields, error, event="batch_failed")
 
-    def report_end(self, error: BaseException) -> None:
-        """Writes down that the process ends, since it cannot score any more."""
-        self._write(FAILED, {"error": repr(error)}, error, event="instance_broken")
+    def note(self, text: str) -> None:
+        """Writes down what the one who serves the model may want to know."""
+        import triton_python_backend_utils as pb_utils
+
+        pb_utils.Logger.log_info(json.dumps({"event": "note", **self._labels, "note": text}))
 
     def _write(
         self, outcome: str, fields: Mapping[str, Any], cause: BaseException | None, event: str | None = None

@@ -21,7 +21,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from rfm.checkpoint.preprocessor import MAX_UINT8, PIL_BICUBIC
-from rfm.steps import one_step_further
 from rfm_client.contract.samples import UInt8Array
 
 MERGE = 2
@@ -140,7 +139,6 @@ class QwenImages:
             planes = frame.movedim(-1, 0)[None].float()
             planes = F.interpolate(planes, last_size, mode="bicubic", antialias=True).clamp_(0, MAX_UINT8).round_()
             scaled[index] = planes[0].movedim(0, -1)
-            one_step_further()
         return scaled
 
     def patches(self, frames: Tensor, shots: Tensor | None, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -232,5 +230,4 @@ def _to_sizes(frames: UInt8Array, sizes: Sequence[tuple[int, int]], resample: in
         for size in sizes:
             frame = resized(frame, *size, resample)
         sized[index] = frame
-        one_step_further()
     return torch.from_numpy(sized)

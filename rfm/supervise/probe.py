@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: MIT
+"""A health probe: one blank request to a model every few seconds."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Mapping
+from http import HTTPStatus
+from typing import Any
+
+from tritonclient.utils import np_to_triton_dtype
+
+from rfm.launch.http import NO_ANSWER, Http
+from rfm.probe import blank_question
+from rfm_client.contract import wire
+from rfm_client.contract.names import PROBE_PREFIX
+
+BROKEN_COUNT = 3  # failures in a row of a model that could answer the same probe before
+SHARE = 0.1  # of a model's time at most
+
+_OUTPUTS = (wire.PROGRESS, wire.VIDEO_EMBEDDINGS)
+
+
+class Probe:
+    """Probes a model every ``interval_s`` in a thread of its own, or less often if an answer takes long.
+
+    hang_s: how long the model may answer nothing before it counts as hung
+    observe: takes how long each answer took, in seconds
+    """
+
+    def __init__(
+        self, http: Http, model: str, interval_s: float, hang_s: float, observe: Callable[[float], None]
+    ) -> None:
+        self._http, self._model, self._interval_s, self._hang_s = http, model, interval_s, hang_s
+        self._observe = observe
+        self._waiting_since_s = time.monotonic()
+        self._num_failures: int | None = None  # in a row; None: it has never succeeded
+        self.has_answered = False
+        self._closed = threading.Event()
+        threading.Thread(target=self._run, name=f"rfm-probe-{model}", daemon=True).start()
+
+    def close(self) -> None:
+        """Send no more probes."""
+        self._closed.set()
+
+    def fault(self, progress_s: float) -> str | None:
+        """Why the model has to be started again; None: it need not.
+
+        progress_s: when Triton last counted an answer or a forward pass of the model, by time.monotonic. A busy model
+            answers a probe late
+        """
+        if self._num_failures is not None and self._num_failures >= BROKEN_COUNT:
+            return f"it has failed at {BROKEN_COUNT} health probes in a row"
+        if time.monotonic() - max(self._waiting_since_s, progress_s) > self._hang_s:
+            return f"it has answered nothing for {self._hang_s:g} s"
+        return None
+
+    def _run(self) -> None:
+        body: bytes | None = None
+        while not self._closed.is_set():
+            started_s, took_s = time.monotonic(), 0.0
+            try:
+                body = body or self._request()
+                path = f"/v2/models/{self._model}/infer"
+                status, _ = self._http.request("POST", path, 2 * self._hang_s, body)
+            except NO_ANSWER:
+                pass  # the probe stays open
+            else:
+                if status != HTTPStatus.SERVICE_UNAVAILABLE:  # it waited in a queue that is full
+                    took_s = time.monotonic() - started_s
+                    self._take(status, took_s)
+            self._closed.wait(max(self._interval_s, took_s / SHARE))
+            if took_s:
+                self._waiting_since_s = time.monotonic()
+
+    def _take(self, status: int, took_s: float) -> None:
+        self.has_answered = True
+        self._waiting_since_s = float("inf")
+        self._observe(took_s)
+        if status < HTTPStatus.INTERNAL_SERVER_ERROR:
+            self._num_failures = 0
+        elif self._num_failures is not None:  # else it answers; blank frames need not give a readable answer
+            self._num_failures += 1
+
+    def _request(self) -> bytes:
+        config = self._http.get_json(f"/v2/models/{self._model}/config")
+        outputs = [{"name": output["name"]} for output in config["output"] if output["name"] in _OUTPUTS]
+        inputs = [
+            {
+                "name": name,
+                "shape": array.shape,
+                "datatype": np_to_triton_dtype(array.dtype),
+                "data": [item.decode() if isinstance(item, bytes) else item for item in array.ravel().tolist()],
+            }
+            for name, array in blank_question(config).items()
+        ]
+        return json.dumps({"id": f"{PROBE_PREFIX}-{self._model}", "inputs": inputs, "outputs": outputs}).encode()
+
+
+def can_be_probed(config: Mapping[str, Any]) -> bool:
+    """Whether a model, of which this is the configuration, is one of ours that has processes of its own."""
+    names = {tensor["name"] for tensor in config["input"]}
+    return config.get("backend") == "python" and wire.NUM_FRAMES in names

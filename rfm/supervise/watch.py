@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: MIT
+"""Looks at a Triton that runs: what does it serve, which models are ready, and has something died or hung?
+
+| fault | seen by |
+|---|---|
+| Triton answers nothing | no answer of ``/metrics`` |
+| a model process is dead or stopped | ``processes`` |
+| a model hangs outside of a batch, or its requests fail before they reach model.py | its ``probe`` |
+
+A process that hangs in a batch, or whose device is broken, ends itself (``rfm.triton_model.guard``).
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
+from typing import Any
+from urllib.parse import quote
+
+from rfm.launch.admin_key import http_headers
+from rfm.launch.http import NO_ANSWER, Http
+from rfm.launch.process import TritonServer
+from rfm.launch.repository_api import INDEX_PATH, LOADING, READY, UNLOADING, ModelVersion, versions_of
+from rfm.supervise.probe import Probe, can_be_probed
+from rfm.supervise.processes import ModelProcesses
+from rfm.supervise.status import NO_REASON, Status
+
+LOOK_S = 0.5
+LOOKS = 3  # without any answer, at least, before Triton is started again
+
+_TIMEOUT_S = 1.5
+_INDEX_TIMEOUT_S = 5.0
+_PROGRESS = re.compile(  # counts that grow while a model gets on
+    r'^(?:nv_inference_request_success|rfm_forward_passes_total)\{[^}]*\bmodel="(?P<model>[^"]+)".*\} (?P<count>\S+)$',
+    re.MULTILINE,
+)
+
+TRITON = "triton"
+
+Config = Mapping[str, Any]
+
+
+class Watch:
+    """Looks every LOOK_S in a thread of its own, until it is closed.
+
+    canary_s: how often each model is probed
+    hang_s: how long a model may answer nothing before it counts as hung
+    silent_s: how long Triton may answer nothing to LOOKS looks in a row
+    served: configurations of what the server is to serve; more is found
+    """
+
+    def __init__(
+        self,
+        server: TritonServer,
+        status: Status,
+        *,
+        canary_s: float,
+        hang_s: float,
+        silent_s: float,
+        served: Mapping[str, Config],
+    ) -> None:
+        endpoints = server.endpoints
+        self._http = Http(endpoints.http_host, endpoints.http_port)
+        self._metrics = Http(endpoints.host, endpoints.metrics_port)
+        self._headers = http_headers(server.admin_key)
+        self._new_probe = partial(Probe, self._http, interval_s=canary_s, hang_s=hang_s)
+        self._silent_s = silent_s
+        self._status = status
+        self._processes = ModelProcesses(server.pid)
+        self._probes: dict[str, Probe] = {}
+        self._counts: dict[str, float] = {}
+        self._progress_s: dict[str, float] = {}  # when a model's count last grew
+        self._ready: dict[str, list[int]] = {}  # versions by model, as Triton last told
+        self._going: set[str] = set()  # that somebody loads or unloads
+        self._leaving: set[str] = set()
+        self.served = dict(served)
+        self.reasons: dict[str, str] = dict.fromkeys(served, "it is loaded")
+        self.fault: tuple[str, str] | None = None  # of what, and which
+        self._closed = threading.Event()
+        threading.Thread(target=self._run, name="rfm-watch", daemon=True).start()
+
+    def close(self) -> None:
+        """Look no more."""
+        self._closed.set()
+        for probe in list(self._probes.values()):
+            probe.close()
+
+    def _run(self) -> None:
+        num_failed, answered_s = 0, time.monotonic()
+        while not self._closed.wait(LOOK_S) and self.fault is None:
+            try:
+                _, text = self._metrics.request("GET", "/metrics", min(_TIMEOUT_S, self._silent_s / LOOKS))
+            except NO_ANSWER:
+                num_failed += 1
+                if num_failed >= LOOKS and time.monotonic() - answered_s >= self._silent_s:
+                    self.fault = TRITON, f"no answer for {self._silent_s:g} s"
+                continue
+            num_failed, answered_s = 0, time.monotonic()
+            self._note_progress(text)
+            with suppress(*NO_ANSWER):  # while the threads of HTTP wait for models that are loaded
+                self._keep_up()
+            self.fault = self._processes.fault(self._ready.keys() - self._going) or self._probed()
+
+    def _note_progress(self, metrics: str) -> None:
+        counts: Counter[str] = Counter()
+        for match in _PROGRESS.finditer(metrics):
+            counts[match["model"]] += float(match["count"])  # type: ignore[assignment]
+        for model, count in counts.items():
+            if count != self._counts.get(model):
+                self._counts[model], self._progress_s[model] = count, time.monotonic()
+
+    def _probed(self) -> tuple[str, str] | None:
+        probed = {name: probe.fault(self._progress_s.get(name, 0.0)) for name, probe in self._probes.items()}
+        return next(((name, why) for name, why in probed.items() if why is not None), None)
+
+    def _keep_up(self) -> None:
+        """Reads what Triton serves now. Raises one of NO_ANSWER."""
+        index = self._http.get_json(INDEX_PATH, _INDEX_TIMEOUT_S, method="POST", headers=self._headers)
+        versions = versions_of(index)
+        for model in {entry.name for entry in versions}:
+            self._keep_up_with(model, [entry for entry in versions if entry.name == model])
+        self.reasons = {name: self._reason(name, versions) for name in self.served}
+
+    def _keep_up_with(self, model: str, versions: Sequence[ModelVersion]) -> None:
+        ready = [entry.version or 1 for entry in versions if entry.state == READY]
+        is_going = any(entry.state in (LOADING, UNLOADING) for entry in versions)
+        is_settled = len(ready) > 0 and not is_going
+        if is_settled and ready != self._ready.get(model):
+            path = f"/v2/models/{quote(model, safe='')}/versions/{max(ready)}/config"
+            self.served[model] = serving_just(self._http.get_json(path), ready)
+            self._status.restarts.labels(model)  # 0, so that already the first is an increase
+            self._forget(model)
+            if can_be_probed(self.served[model]):
+                observe = self._status.probe_seconds.labels(model).observe
+                self._probes[model] = self._new_probe(model, observe=observe)
+        (self._going.add if is_going else self._going.discard)(model)
+        if is_settled:
+            self._ready[model] = ready
+        elif not ready:
+            self._forget(model)
+        is_unloaded = all(entry.is_unloaded for entry in versions)
+        if is_unloaded and model in self._leaving:
+            self.served.pop(model, None)
+        self._leaving = self._leaving | {model} if is_unloaded else self._leaving - {model}
+
+    def _forget(self, model: str) -> None:
+        """Ends the probes of a model whose processes are others now."""
+        self._ready.pop(model, None)
+        if model in self._probes:
+            self._probes.pop(model).close()
+
+    def _reason(self, model: str, versions: Collection[ModelVersion]) -> str:
+        """Why the model is not ready; NO_REASON if it is."""
+        if model not in self._ready:
+            told = [entry.reason for entry in versions if entry.name == model and entry.reason]
+            return next(iter(told), "it is not loaded")
+        probe = self._probes.get(model)
+        if probe is not None and not probe.has_answered:
+            return "it has not answered a health probe yet"
+        reasons = {part: self._reason(part, versions) for part in parts_of(self.served[model]) if part in self.served}
+        return next((f"{part}: {reason}" for part, reason in reasons.items() if reason != NO_REASON), NO_REASON)
+
+
+def parts_of(config: Config) -> list[str]:
+    """The models that an ensemble is made of; none of another model."""
+    return [step["model_name"] for step in config.get("ensemble_scheduling", {}).get("step", [])]
+
+
+def serving_just(config: Config, versions: Sequence[int]) -> Config:
+    """A model's configuration, for these versions alone: a file may name others by now."""
+    return {**config, "version_policy": {"specific": {"versions": list(versions)}}}
