@@ -26,8 +26,7 @@ from rfm_client.transport.deadline import Deadline, check_timeout
 from rfm_client.transport.host_names import of_urls
 from rfm_client.transport.in_flight import InFlight
 from rfm_client.transport.one_process import OneProcess
-from rfm_client.transport.server import PROBE_TIMEOUT_S
-from rfm_client.transport.servers import Servers
+from rfm_client.transport.servers import PROBE_TIMEOUT_S, Servers
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -44,8 +43,6 @@ class ClientOptions(AccessOptions, total=False):
     timeout_s: the longest that a call may take, retries included, at most 1e9; there is no endless wait (60)
     retry: send again what failed because a server was down, restarting or full, until the time is up (True)
     max_in_flight: requests under way at a time (128); more wait their turn
-    join: concurrent calls about one sample with embeddings share requests while the servers are busy (False: a sample
-        that ends its process may end one more when it was joined, and a caller who asks alone gains nothing)
     shared_memory: large inputs go through memory that client and server map, if both are on one host (False)
     ca_file, client_certificate, client_key, headers, api_key: as Access has them
     """
@@ -54,7 +51,6 @@ class ClientOptions(AccessOptions, total=False):
     timeout_s: float
     retry: bool
     max_in_flight: int
-    join: bool
     shared_memory: bool
 
 
@@ -86,7 +82,7 @@ class AsyncRewardClient(OneProcess):
         check_timeout(self._timeout_s)
         self._servers = Servers(transports or fixed, retry=options.get("retry", True), names=names)
         in_flight = InFlight(options.get("max_in_flight", DEFAULT_IN_FLIGHT))
-        self._scorer = Scorer(self._model, self._servers, in_flight, join=options.get("join", False))
+        self._scorer = Scorer(self._model, self._servers, in_flight)
         self._windows = WindowScorer(self._model, self._scorer)
         self._is_closed = False
         self._loop: asyncio.AbstractEventLoop | None = None  # that it was first used in

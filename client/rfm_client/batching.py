@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.samples import Sample, stackable
 
 MAX_REQUEST_BYTES = 8 * 2**20  # more gains nothing: Triton puts requests together
-_FEW_BYTES = 2**18  # of padding in a joint request, which cost nothing
 
 
 def model_of(sample: Sample, model: str) -> str:
@@ -44,22 +43,6 @@ def parts(samples: Mapping[int, Sample], group: Sequence[int], max_batch_size: i
             part, longest = [], sizes
         part.append(index)
     yield part
-
-
-def num_together(sizes: Iterable[int], most: int) -> int:
-    """How many of the first samples one request takes, in the order in which they came: ``most`` at most, as many
-    bytes as MAX_REQUEST_BYTES, and no more of padding than of samples if that is much. At least one.
-
-    sizes: bytes of each sample's frame positions
-    """
-    longest = total = count = 0
-    for size in sizes:
-        longest, total = max(longest, size), total + size
-        padded = (count + 1) * longest
-        if count and (count == most or padded > min(MAX_REQUEST_BYTES, max(_FEW_BYTES, 2 * total))):
-            break
-        count += 1
-    return count
 
 
 def padded_bytes(samples: Sequence[Sample]) -> int:

@@ -42,8 +42,6 @@ class Call:
 
     outputs: beside the scores that the samples ask for
     request_ids: one for each request
-    is_named: the caller has chosen how they begin
-    is_joint: it stands for several calls, which know nothing of each other
     """
 
     deadline: Deadline
@@ -51,8 +49,6 @@ class Call:
     request_ids: Iterator[str]
     subsample: bool = False
     resize: bool = False
-    is_named: bool = False
-    is_joint: bool = False
 
     @classmethod
     def of(cls, options: CallOptions, deadline: Deadline) -> Call:
@@ -60,14 +56,12 @@ class Call:
         check_known(options, CallOptions)
         optional = {wire.PROGRESS_LOGITS: options.get("logits", False), wire.TIMING_MS: options.get("timing", False)}
         outputs = tuple(name for name, wanted in optional.items() if wanted)
-        request_id = options.get("request_id")
         return cls(
             deadline,
             outputs,
-            new_request_ids(request_id),
+            new_request_ids(options.get("request_id")),
             subsample=options.get("subsample", False),
             resize=options.get("resize", False),
-            is_named=request_id is not None,
         )
 
 

@@ -8,17 +8,16 @@ import itertools
 from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping, Sequence
 from copy import copy
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from rfm_client.batching import groups, model_of, padded_bytes, parts
 from rfm_client.call import Call, new_request_ids
 from rfm_client.contract import wire
-from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, RewardError, ServerUnavailableError
+from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, RewardError
 from rfm_client.contract.names import encoder_name
 from rfm_client.contract.results import Result
 from rfm_client.contract.samples import Sample, Trajectory
 from rfm_client.data.fitting import FittedSample, fitted, whole, with_frame_indices
-from rfm_client.joining import Joining, Outcome
 from rfm_client.model_infos import ModelInfos
 from rfm_client.transport.calls import Answer
 from rfm_client.transport.deadline import Deadline
@@ -27,6 +26,7 @@ from rfm_client.transport.off_loop import off_loop
 from rfm_client.transport.servers import Servers
 
 Answered = TypeVar("Answered")
+Outcome: TypeAlias = Result | RewardError
 
 _EMBEDDINGS = (wire.VIDEO_EMBEDDINGS, wire.TEXT_EMBEDDING)
 
@@ -35,21 +35,18 @@ class Scorer:
     """Scores samples on the servers of one client, for one event loop.
 
     model: name of the model that scores embeddings
-    join: samples of concurrent calls may share a request
     """
 
-    def __init__(self, model: str, servers: Servers, in_flight: InFlight, *, join: bool) -> None:
+    def __init__(self, model: str, servers: Servers, in_flight: InFlight) -> None:
         self._model = model
         self._servers = servers
         self._in_flight = in_flight
         self.model_infos = ModelInfos(servers)
-        self._join = join
-        self._joining = Joining(self._request, self.model_infos, servers)
 
     async def result(self, sample: Sample, call: Call) -> Result:
         """The result of one sample. Raises RewardError."""
         fit = await self._fitted(sample, call)
-        outcome = await self._outcome(fit.sample, call)
+        (outcome,) = await self._request(model_of(fit.sample, self._model), [fit.sample], call)
         if isinstance(outcome, RewardError):
             raise outcome
         return with_frame_indices(outcome, fit.frame_indices)
@@ -89,20 +86,12 @@ class Scorer:
         # in a thread: resizing takes a while, and other calls wait for this event loop
         return await asyncio.to_thread(fitted, sample, info, subsample=call.subsample, resize=call.resize)
 
-    async def _outcome(self, sample: Sample, call: Call) -> Outcome:
-        """The outcome of one sample, which goes with those of other calls if it may."""
-        model = model_of(sample, self._model)
-        if self._join and model == self._model and not call.is_named:
-            return await self._joining.outcome(model, sample, call)
-        (outcome,) = await self._request(model, [sample], call)
-        return outcome
-
     async def _scored(
         self, model: str, group: Sequence[int], samples: Mapping[int, Sample], call: Call
     ) -> Iterable[tuple[int, Outcome]]:
         """The outcomes of a group of samples that fit the same arrays, with their indices."""
         if len(group) == 1:
-            return [(group[0], await self._outcome(samples[group[0]], call))]
+            return zip(group, await self._request(model, [samples[group[0]]], call), strict=True)
         try:
             limit = (await self.model_infos.get(model, call.deadline)).max_batch_size
         except RewardError as error:
@@ -112,28 +101,19 @@ class Scorer:
         return zip(group, itertools.chain(*answered), strict=True)
 
     async def _request(self, model: str, samples: Sequence[Sample], call: Call) -> Sequence[Outcome]:
-        """One request. It fails whole if one sample cannot be scored; then each sample is sent alone.
-
-        A request that is refused because it has ended its process is not taken apart: all its samples fail. But samples
-        of several calls are asked about alone as soon as a process, or the connection, ends under them.
-        """
+        """One request. It fails whole if one sample cannot be scored; then each sample is sent alone."""
         request_id = next(call.request_ids)
-        is_joint = call.is_joint and len(samples) > 1
         outputs, tensors = (*wire.outputs_for(samples), *call.outputs), partial(wire.encode_samples, samples)
         size, deadline = padded_bytes(samples), call.deadline
         try:
-            answer = await self.infer(model, size, tensors, outputs, deadline, request_id, retry_ended=not is_joint)
+            answer = await self.infer(model, size, tensors, outputs, deadline, request_id)
             return wire.decode_results(answer.tensors, samples, answer.model_version)
         except (InvalidSampleError, InferenceFailedError) as error:
             error.request_id = request_id
             if len(samples) == 1:
                 return [error]
-            if isinstance(error, InvalidSampleError) and error.is_deadly and not is_joint:
-                return for_each(error, len(samples))  # alone, the one that is would end two more processes
         except RewardError as error:
-            if not (is_joint and isinstance(error, ServerUnavailableError) and error.may_have_ended_server):
-                return for_each(error, len(samples))
-            self._joining.stay_apart()
+            return for_each(error, len(samples))
         alone = await asyncio.gather(*(self._request(model, [sample], call) for sample in samples))
         return [outcome for (outcome,) in alone]
 
@@ -145,8 +125,6 @@ class Scorer:
         outputs: Collection[str],
         deadline: Deadline,
         request_id: str,
-        *,
-        retry_ended: bool = True,
     ) -> Answer:
         """The model's outputs for the tensors, which are made when it is the request's turn. Raises RewardError.
 
@@ -154,9 +132,7 @@ class Scorer:
         """
         async with self._in_flight.room(num_bytes, deadline):  # tensors are made in turn, so they do not pile up
             inputs = await off_loop(num_bytes, tensors)
-            answer = await self._servers.infer(
-                model, inputs, outputs, deadline, request_id=request_id, retry_ended=retry_ended
-            )
+            answer = await self._servers.infer(model, inputs, outputs, deadline, request_id=request_id)
         self.model_infos.note_answer(model, answer.model_version)
         return answer
 

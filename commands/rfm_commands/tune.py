@@ -181,7 +181,7 @@ async def _measure_latencies(
             if answered_s <= end_s:
                 latencies_s.append(answered_s - sent_s)
 
-    async with AsyncRewardClient(url, model=model, max_in_flight=2 * callers, join=False) as client:
+    async with AsyncRewardClient(url, model=model, max_in_flight=2 * callers) as client:
         await client.score(next(samples))
         end_s = time.perf_counter() + seconds
         await asyncio.gather(*(call(end_s) for _ in range(callers)))

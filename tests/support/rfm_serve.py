@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -18,10 +16,9 @@ from typing import Any
 import httpx
 from prometheus_client.parser import text_string_to_metric_families
 
-from rfm.journal import SHARED_MEMORY
+from rfm.launch.cleanup import SHARED_MEMORY
 from rfm.launch.process import Endpoints
-from rfm.proc import STOPPED
-from rfm.supervise.model_processes import ModelProcess, ProcessWatch
+from rfm.proc import ZOMBIE, arguments_of, stat_of
 from rfm_client import RewardClient
 
 RFM = Path(sys.executable).parent / "rfm"
@@ -45,22 +42,14 @@ def children(pid: int, program: str) -> list[int]:
     ]
 
 
-def kill_while_idle(process: ModelProcess) -> None:
-    """Ends the process while it owes no answer, not even to a probe: else Triton would be started again with it."""
-
-    def is_stopped_idle() -> bool:
-        os.kill(process.pid, signal.SIGSTOP)
-        wait_for(lambda: process.state == STOPPED)
-        journal = process.journal
-        is_idle = journal is not None and not journal.num_owed and not journal.busy_s
-        if not is_idle:
-            os.kill(process.pid, signal.SIGCONT)  # it gets on until the next look
-        return is_idle
-
-    try:
-        wait_for(is_stopped_idle)
-    finally:
-        process.kill()
+def model_processes(triton: int, model: str = MODEL) -> list[int]:
+    """The processes of a model that live, of the tritonserver ``triton``."""
+    found = []
+    for pid in children(triton, "triton_python"):
+        stat, words = stat_of(pid), arguments_of(pid)
+        if stat is not None and stat.state != ZOMBIE and len(words) > 1 and f"/{model}/" in words[1]:
+            found.append(pid)
+    return sorted(found)
 
 
 @dataclass
@@ -90,12 +79,8 @@ class Serving:
         (pid,) = children(self.process.pid, "tritonserver")
         return pid
 
-    @property
-    def model_processes(self) -> list[ModelProcess]:
-        return self.model_processes_of(MODEL)
-
-    def model_processes_of(self, model: str) -> list[ModelProcess]:
-        return [process for process in ProcessWatch(self.triton, PATIENCE_S).of_model(model) if process.is_alive]
+    def model_processes(self, model: str = MODEL) -> list[int]:
+        return model_processes(self.triton, model)
 
     def reasons(self) -> dict[str, str]:
         """Why models are not ready, of all that it knows; empty: they are."""

@@ -16,8 +16,6 @@ No error is ever replaced by a number.
 
 from __future__ import annotations
 
-DEADLY = "request: expected one that the model survives"  # how a server begins to refuse one that it does not
-
 
 class RewardError(Exception):
     """Base of every error that this library raises.
@@ -38,11 +36,6 @@ class RewardError(Exception):
 
 class InvalidSampleError(RewardError, ValueError):
     """A sample that cannot be scored, reported as ``where: expected X, got Y``."""
-
-    @property
-    def is_deadly(self) -> bool:
-        """Whether the server refuses the request because its process has ended more than once while it had it."""
-        return self.message.startswith(DEADLY)
 
     @classmethod
     def at(cls, where: str, expected: str, got: str) -> InvalidSampleError:

@@ -35,8 +35,6 @@ NOT_READY = "is not ready"  # of a version
 LOST_REGION = "Unable to find shared memory region"  # of a server that was started again
 REGION_IN_USE = "it is currently in use"  # of a region to unmap: tests/client/test_shared_memory_faults.py
 RESTRICTED = "is restricted, expecting header"  # of an API that wants a key
-QUEUE_FULL = "the queue is full"  # of a model, in which as many requests wait as may
-TRITON_QUEUE_FULL = "Exceeds maximum queue size"  # of Triton, for a model with a queue policy, as older exports have
 
 _NO_CONNECTION = re.compile("failed to connect|errors resolving|resolution failed")  # of gRPC itself: nothing was sent
 _LOST_CONNECTION = re.compile("Socket closed|Connection reset|Broken pipe|connection termination")  # or of a proxy
@@ -62,11 +60,6 @@ def is_unreachable(status: str, message: str) -> bool:
 def is_absent(message: str) -> bool:
     """Whether Triton says that a model, or its version, is not loaded."""
     return any(words in message for words in (UNKNOWN_MODEL, NO_VERSIONS, NOT_READY))
-
-
-def is_full(message: str) -> bool:
-    """Whether a request was rejected because too many waited already, in Triton or in the model."""
-    return QUEUE_FULL in message or TRITON_QUEUE_FULL in message
 
 
 def error_of(status: str, message: str, bad_request: type[errors.RewardError]) -> errors.RewardError:

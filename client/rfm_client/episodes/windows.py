@@ -154,9 +154,7 @@ class WindowScorer:
         sent = [pixels for digest, pixels in new.items() if digest not in self._remembered]
         try:
             results = await self._request(windows, sent, call)
-        except (InvalidSampleError, InferenceFailedError) as error:
-            if isinstance(error, InvalidSampleError) and error.is_deadly:
-                return for_each(error, len(windows))
+        except (InvalidSampleError, InferenceFailedError):
             self._remembered.forget(digests)
             return await self._in_whole(windows, digests, call)
         except RewardError as error:

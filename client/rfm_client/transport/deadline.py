@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterable
 
 if sys.version_info >= (3, 11):
     from asyncio import timeout as timeout
@@ -46,8 +45,3 @@ class Deadline:
     def exceeded(self, where: str = "") -> DeadlineExceededError:
         """The error of a call that came to its end, while it waited for the server ``where``."""
         return DeadlineExceededError(f"{where}{': ' if where else ''}no answer within {self.timeout_s:g} s")
-
-
-def latest(deadlines: Iterable[Deadline]) -> Deadline:
-    """The one that comes last."""
-    return max(deadlines, key=lambda deadline: deadline.at_s)

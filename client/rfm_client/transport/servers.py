@@ -1,20 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Several servers of one checkpoint as one: the least busy gets the request, one that fails is left out for a while.
 
-A request may end the process that works on it. Sent from server to server it would end one process after the other.
-So a request that was with server S when a process of S ended waits for S, since S alone knows which request caused it:
-its journal lets the others through and refuses a request that has ended its process twice. Once S is loaded anew, the
-request stays with S. If nobody heals S within half of the time that is left, and HEALED_WITHIN_S at most, the request
-goes to a server that is not known to be dead. If a process ends there too, the request fails. Either way it ends two
-processes at most: two of S, or one of S and one of another. Requests that were with S beside it wait as long, and are
-answered if S is healed in that time. No request is sent to a server that is known to be dead, where others are.
-
-A request under which the connection to S ends is treated likewise, for ``rfm serve`` restarts Triton when a process has
-died that owed answers. A request that ends Triton itself is in no journal: it ends S again and again, but no other.
-
-A client of one server sends the request to that server again, after pauses, and its journal bounds it. A URL behind
-which a load balancer picks the server counts as one server: there the bound holds for each server, not for all
-together. Give such servers a URL each, or over gRPC a host name that resolves to all their addresses.
+A request may end the process that works on it. So a request under which a process, or the connection, ended is sent
+once more, when a server can be back; then it fails. One request ends at most two processes.
 """
 
 from __future__ import annotations
@@ -22,8 +10,10 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
+import random
 import time
-from collections.abc import Awaitable, Callable, Collection, Sequence
+from collections.abc import Awaitable, Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TypeVar
 
 from rfm_client.contract.errors import (
@@ -41,22 +31,122 @@ from rfm_client.transport.calls import LATE, Answer, Transport, TritonTransport
 from rfm_client.transport.deadline import Deadline
 from rfm_client.transport.host_names import REFRESH_S, Name
 from rfm_client.transport.ports import OF_A_PORT, wrong_port
-from rfm_client.transport.server import HEALED_WITHIN_S, LONGEST_RETRY_PAUSE_S, Server, pause_s
 
 Answered = TypeVar("Answered")
 Request = Callable[[Transport, float], Awaitable[Answered]]
 
+FIRST_PAUSE_S = 0.1
+LONGEST_PAUSE_S = 2.0
+LONGEST_REST_S = 30.0  # of a server that says that it is ready and fails again and again
+RESTART_S = 15.0  # longer than `rfm serve` takes to notice that a process has ended, and to start Triton again
+SPREAD_S = 1.0  # over which requests come back, so that one that ends its process again takes few others with it
+PROBE_TIMEOUT_S = 2.0
+_POLL_S = 0.2
+
 logger = logging.getLogger("rfm_client")
+
+
+class Server:
+    """One server of several: its transport, its load and its failures.
+
+    failures: how often it was left out since the last success
+    has_answered: it has ever had a success
+    comeback: ends when the server says that it is ready again; None: it was never left out
+    is_gone: it gets no more requests, and is closed as soon as nothing uses it
+    """
+
+    _moments = itertools.count(1)
+
+    def __init__(self, transport: Transport) -> None:
+        self.transport = transport
+        self.outstanding = 0
+        self.last_request = 0
+        self.failures = 0
+        self.has_answered = False
+        self.comeback: asyncio.Task[None] | None = None
+        self.is_gone = False
+        self._closing: asyncio.Task[None] | None = None
+
+    @property
+    def is_left_out(self) -> bool:
+        """Whether the server gets no requests until it says that it is ready."""
+        return self.comeback is not None and not self.comeback.done()
+
+    @contextmanager
+    def request_under_way(self) -> Iterator[None]:
+        """A context in which a request to this server is under way."""
+        self.outstanding += 1
+        self.last_request = next(self._moments)
+        try:
+            yield
+        finally:
+            self.outstanding -= 1
+            self._close_if_unused()
+
+    def leave_out(self, model: str, error: RewardError) -> None:
+        """Leave the server out until it says that it is ready. The more often it failed, the later it is asked."""
+        if self.is_left_out or self.is_gone:  # else it is the same failure
+            return
+        self.failures += 1
+        if isinstance(error, ServerUnavailableError) and error.may_have_ended_server:
+            comeback = self._back(model, was_down=not isinstance(error, ProcessEndedError))
+        else:
+            comeback = self._rest(model)
+        self.comeback = asyncio.create_task(comeback)
+
+    def remove(self) -> None:
+        """Send it no more requests."""
+        self.is_gone = True
+        if self.comeback is not None:
+            self.comeback.cancel()
+        self._close_if_unused()
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether nothing of it is left."""
+        return self._closing is not None and self._closing.done()
+
+    async def close(self) -> None:
+        """Close the connection, even if calls still use it."""
+        self.is_gone = True
+        if self.comeback is not None:
+            self.comeback.cancel()
+        if self._closing is None:
+            self._closing = asyncio.create_task(self.transport.close())
+        await self._closing
+
+    def _close_if_unused(self) -> None:
+        if self.is_gone and not self.outstanding and self._closing is None:
+            self._closing = asyncio.create_task(self.transport.close())
+
+    async def _rest(self, model: str) -> None:
+        await asyncio.sleep(pause_s(self.failures - 1, LONGEST_REST_S))
+        for attempt in itertools.count():
+            if await self.transport.is_ready(model, PROBE_TIMEOUT_S):
+                return
+            await asyncio.sleep(pause_s(attempt, LONGEST_PAUSE_S))
+
+    async def _back(self, model: str, *, was_down: bool) -> None:
+        """Return when the server is ready again after a process or the connection ended.
+
+        Triton 2.51 says that a dead model is ready, so it must have said the opposite before, for RESTART_S at most.
+        """
+        until_s = time.monotonic() + RESTART_S
+        while True:
+            is_ready = await self.transport.is_ready(model, PROBE_TIMEOUT_S)
+            if is_ready and (was_down or time.monotonic() >= until_s):
+                return
+            was_down = was_down or not is_ready
+            await asyncio.sleep(_POLL_S)
 
 
 class Servers:
     """Sends each request to one of several servers, for one event loop.
 
     retry: a request that fails because a server is down, restarting or full is sent again until the deadline: at once
-        to another server or, when there is none, after pauses that grow. (One under which a server has ended waits for
-        that one, see above.) A request that a server denies or fails
-        at, or whose model it lacks, is sent once to each other one. A score depends on the request alone, so
-        sending it twice is safe.
+        to another server or, when there is none, after pauses that grow. A request that a server denies or fails at, or
+        whose model it lacks, is sent once to each other one. A score depends on the request alone, so sending it twice
+        is safe
     names: whose addresses are servers, too
     """
 
@@ -85,18 +175,14 @@ class Servers:
         deadline: Deadline,
         *,
         request_id: str,
-        retry_ended: bool = True,
     ) -> Answer:
-        """The named ``outputs`` of ``model`` for ``inputs``. Raises RewardError, which names the request.
-
-        retry_ended: False: it is not sent again when a process ends that has it
-        """
+        """The named ``outputs`` of ``model`` for ``inputs``. Raises RewardError, which names the request."""
 
         def request(server: Transport, left_s: float) -> Awaitable[Answer]:
             return server.infer(model, inputs, outputs, left_s, request_id=request_id)
 
         try:
-            return await self._request(model, request, deadline, retry_ended=retry_ended)
+            return await self._request(model, request, deadline)
         except RewardError as error:
             error.request_id = request_id
             await self._look_at_ports(error)
@@ -104,13 +190,12 @@ class Servers:
 
     async def model_info(self, model: str, deadline: Deadline) -> ModelInfo:
         """What a server says of ``model``. Raises RewardError."""
-        self._keep_up()
 
         def request(server: Transport, left_s: float) -> Awaitable[ModelInfo]:
             return server.model_info(model, left_s)
 
         try:
-            return await self._request_among(None, model, request, deadline)
+            return await self._request(model, request, deadline)
         except RewardError as error:
             await self._look_at_ports(error)
             raise
@@ -166,55 +251,14 @@ class Servers:
             self._looking_up.cancel()
         await asyncio.gather(*(server.close() for server in (*self._servers, *self._gone)))
 
-    async def _request(
-        self, model: str, request: Request[Answered], deadline: Deadline, *, retry_ended: bool = True
-    ) -> Answered:
-        """The answer to a request, retried as the module's docstring says."""
+    async def _request(self, model: str, request: Request[Answered], deadline: Deadline) -> Answered:
+        """The answer to a request, sent again as the class's docstring says."""
         self._keep_up()
-        try:
-            is_told = not retry_ended or len(self._servers) > 1
-            return await self._request_among(None, model, request, deadline, raise_ended=is_told)
-        except _EndedAtError as ended:
-            first, error = ended.server, ended.error
-        if not self._retry or not retry_ended or deadline.ends_within(0):
-            raise error
-        if await first.is_healed(min(HEALED_WITHIN_S, deadline.remaining_s() / 2)):
-            try:
-                return await self._request_among(first, model, request, deadline)
-            except (AccessDeniedError, InferenceFailedError, ModelNotFoundError):
-                pass  # another server may do better
-            except ServerUnavailableError:
-                if not first.is_gone or deadline.ends_within(0):
-                    raise
-        try:
-            return await self._request_among(None, model, request, deadline, raise_ended=True)
-        except _EndedAtError as ended:
-            where = f"{first.transport.url} and {ended.server.transport.url}"
-            message = f"{where}: each lost its process or the connection under this request, so no other is asked"
-            is_process = isinstance(error, ProcessEndedError) or isinstance(ended.error, ProcessEndedError)
-            kind = ProcessEndedError if is_process else ServerUnavailableError
-            raise kind(f"{message}: {ended.error.message}") from ended.error
-
-    async def _request_among(
-        self,
-        only: Server | None,
-        model: str,
-        request: Request[Answered],
-        deadline: Deadline,
-        *,
-        raise_ended: bool = False,
-    ) -> Answered:
-        """The answer of the server ``only`` or, if that is None, of any.
-
-        raise_ended: raise _EndedAtError where a process of the model, or the connection, has ended; else send the
-            request again
-        """
         refusals: dict[Server, RewardError] = {}
         failures: dict[Server, ServerUnavailableError] = {}
+        has_ended = False  # a process, or the connection, under this request
         for attempt in itertools.count():
-            server = only or await self._living(refusals, deadline)
-            if server.is_gone:
-                raise ServerUnavailableError(f"{server.transport.url}: its name does not stand for it any more")
+            server = self._least_busy(refusals)
             left_s = deadline.remaining_s()
             try:
                 with server.request_under_way():
@@ -235,15 +279,20 @@ class Servers:
                 if not self._retry:
                     self._leave_out(server, model, error)
                     raise
-                if only or refusals.keys() >= set(self._servers):
+                if refusals.keys() >= set(self._servers):
                     break
             except ServerUnavailableError as error:
                 self._record_failure(server, model, error)
                 failures[server] = error
-                if raise_ended and error.may_have_ended_server:
-                    raise _EndedAtError(server, error) from error
-                has_other = only is None and self._has_other({server, *refusals})
-                await self._pause(0.0 if has_other else pause_s(attempt, LONGEST_RETRY_PAUSE_S), deadline, error)
+                if error.may_have_ended_server and has_ended:
+                    message = f"a process or the connection ended under this request twice: {error.message}"
+                    raise type(error)(f"{server.transport.url}: {message}") from error
+                has_other = self._has_other({server, *refusals})
+                if error.may_have_ended_server:
+                    has_ended = True
+                    await self._wait_for_comeback(server, deadline, error, has_other=has_other)
+                else:
+                    await self._pause(0.0 if has_other else pause_s(attempt, LONGEST_PAUSE_S), deadline, error)
         raise min(refusals.values(), key=lambda error: isinstance(error, ModelNotFoundError))  # which says the least
 
     async def _look_at_ports(self, error: RewardError) -> None:
@@ -271,19 +320,20 @@ class Servers:
         if deadline.ends_within(0):  # the pause took longer than it should have
             raise error
 
-    async def _living(self, refusals: Collection[Server], deadline: Deadline) -> Server:
-        """The least busy that is not known to be dead, as soon as there is one. Of the only server nothing is known."""
-        for attempt in itertools.count():
-            server = self._least_busy(refusals)
-            if not server.is_dead:
-                return server
-            error = ProcessEndedError(f"{self}: every process of the model has ended, and none is loaded anew yet")
-            await self._pause(pause_s(attempt, LONGEST_RETRY_PAUSE_S), deadline, error)
-        raise AssertionError("it counts for ever")
+    async def _wait_for_comeback(
+        self, server: Server, deadline: Deadline, error: ServerUnavailableError, *, has_other: bool
+    ) -> None:
+        """Returns when a request under which ``server`` has ended can be sent once more. Raises ``error`` if it cannot.
+
+        has_other: another server can take it
+        """
+        if self._retry and not has_other and server.comeback is not None:
+            await asyncio.wait({server.comeback}, timeout=deadline.remaining_s())
+        await self._pause(random.uniform(0.0, SPREAD_S), deadline, error)
 
     def _least_busy(self, avoided: Collection[Server]) -> Server:
-        def rank(server: Server) -> tuple[bool, bool, bool, int, int]:
-            return server in avoided, server.is_dead, server.is_left_out, server.outstanding, server.last_request
+        def rank(server: Server) -> tuple[bool, bool, int, int]:
+            return server in avoided, server.is_left_out, server.outstanding, server.last_request
 
         return min(self._servers, key=rank)
 
@@ -294,17 +344,10 @@ class Servers:
         self._leave_out(server, model, error)
 
     def _leave_out(self, server: Server, model: str, error: RewardError) -> None:
-        """Leaves a server out until it is ready, or healed. The only server stays in."""
-        if not server.is_left_out:  # else it is the same failure
-            server.failures += 1
-        if len(self._servers) == 1:
-            return
-        if isinstance(error, ProcessEndedError):
-            server.leave_out_dead(model)
-        elif isinstance(error, ServerUnavailableError) and error.may_have_ended_server:
-            server.leave_out_lost(model)
-        else:
-            server.leave_out(model)
+        """Leaves a server out until it is ready. To the only one requests are sent all the same."""
+        has_ended = isinstance(error, ServerUnavailableError) and error.may_have_ended_server
+        if len(self._servers) > 1 or has_ended:
+            server.leave_out(model, error)
 
     # Names
 
@@ -333,10 +376,7 @@ class Servers:
         self._gone = [*(server for server in self._gone if not server.is_closed), *removed]
 
 
-class _EndedAtError(Exception):
-    """A process of the model, or the connection, ended at ``server`` when it had the request, or before."""
-
-    def __init__(self, server: Server, error: ServerUnavailableError) -> None:
-        super().__init__(server, error)
-        self.server = server
-        self.error = error
+def pause_s(attempt: int, longest_s: float) -> float:
+    """Doubles from try to try; half of it is chance, so that callers do not come back all at once."""
+    pause_s = min(longest_s, FIRST_PAUSE_S * 2.0 ** min(attempt, 16))
+    return random.uniform(pause_s / 2, pause_s)
