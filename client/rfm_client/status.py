@@ -35,12 +35,12 @@ METRICS_PORT = 8002
 METRICS_OPTION = "--metrics-url"
 DEVICE_METRICS = "nv_cpu_utilization, nv_gpu_utilization, nv_*_memory_*_bytes"
 _PROCESSOR = "CPU"
-WAITING_METRICS = ("nv_inference_pending_request_count", "rfm_waiting_requests")  # in Triton, in the model
+PENDING_METRIC = "nv_inference_pending_request_count"
 
 _DEVICE_METRIC = re.compile("nv_(cpu|gpu)_(utilization|memory_used_bytes|memory_total_bytes)")
 _REQUESTS_METRIC = "nv_inference_request_success_total"
 _COMPUTE_METRIC = "nv_inference_compute_infer_duration_us_total"
-_BATCH_SAMPLES_METRIC, _WAIT_METRIC = "rfm_batch_samples", "rfm_wait_seconds"  # histograms
+_BATCH_SAMPLES_METRIC = "rfm_batch_samples"
 _SAMPLES_METRIC, _REFUSED = "rfm_samples_total", "refused"  # by outcome
 _SCORING_METRICS = ("rfm_collate_seconds", "rfm_forward_seconds")
 _SAMPLED_METRIC = "nv_cpu_memory_used_bytes"
@@ -59,13 +59,11 @@ class Batches:
     """The batches in which a model has scored callers' requests, as it tells itself; all its instances together.
 
     count, samples: of batches, and of the samples in them
-    wait_ms: of each batch the longest time that one of its requests had waited in the model, added up
     scoring_ms: of all batches, in which they were collated and forward passes ran
     """
 
     count: int
     samples: int
-    wait_ms: float
     scoring_ms: float
 
 
@@ -73,10 +71,9 @@ class Batches:
 class ModelStatus:
     """One version of a model.
 
-    Triton hands requests to a model, which may keep them waiting and put them into other batches. Only the model knows
-    of that, and tells it as ``batches``.
+    A model that prepares ahead makes batches itself, of which only ``batches`` tell.
 
-    requests_pending: requests that wait for their turn now, in Triton or in the model; None: the metrics do not say
+    requests_pending: requests that wait in Triton's queue now; None: the metrics do not say
     requests_succeeded, requests_failed, last_used_s and the next two lines: since the model was loaded, warm-up
         included
     samples, executions: of all requests together, as Triton has handed them over
@@ -114,12 +111,8 @@ class ModelStatus:
 
     @property
     def queue_ms_per_request(self) -> float | None:
-        """How long a request waits for its turn: in Triton's queue, then in the model. None before the first.
-
-        In the model it is the wait of a batch's first request, so others wait for less.
-        """
-        in_model_ms = self.batches.wait_ms / self.batches.count if self.batches and self.batches.count else 0.0
-        return self.queue_ms / self.requests_succeeded + in_model_ms if self.requests_succeeded else None
+        """How long a request waits in Triton's queue. None before the first."""
+        return self.queue_ms / self.requests_succeeded if self.requests_succeeded else None
 
     @property
     def compute_ms_per_batch(self) -> float | None:
@@ -355,7 +348,7 @@ def _read_metrics(url: str, timeout_s: float) -> _Metrics:
             )
             for name, values in devices.items()
         ),
-        pending={version: int(count) for version, count in _totals(samples, *WAITING_METRICS).items()},
+        pending={version: int(count) for version, count in _totals(samples, PENDING_METRIC).items()},
         batches=_batches(samples),
         refused={version: int(count) for version, count in _totals(refused, _SAMPLES_METRIC).items()},
     )
@@ -378,14 +371,10 @@ def _totals(samples: list[Any], *names: str) -> dict[_Version, float]:
 def _batches(samples: list[Any]) -> dict[_Version, Batches]:
     """What each version tells of its batches; nothing of models that are not ours, or older."""
     num_samples = _totals(samples, f"{_BATCH_SAMPLES_METRIC}_sum")
-    waits_s = _totals(samples, f"{_WAIT_METRIC}_sum")
     scoring_s = _totals(samples, *(f"{name}_sum" for name in _SCORING_METRICS))
     return {
-        version: Batches(
-            int(count), int(num_samples[version]), waits_s[version] * _MS_PER_S, scoring_s[version] * _MS_PER_S
-        )
+        version: Batches(int(count), int(num_samples[version]), scoring_s[version] * _MS_PER_S)
         for version, count in _totals(samples, f"{_BATCH_SAMPLES_METRIC}_count").items()
-        if version in waits_s
     }
 
 

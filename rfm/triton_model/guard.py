@@ -19,6 +19,7 @@ from rfm.triton_model.request import FAILED, SCORED, Request
 
 FAILED_BATCHES = 3  # in a row, before the blank sample is scored
 _LOOK_S = 1.0
+_STDERR = 2
 
 
 class Guard:
@@ -77,10 +78,10 @@ class Guard:
             is_getting_on = not self._is_working() or self.num_steps != seen
             if is_getting_on and time.monotonic() - armed_s > self._hang_s / 10:
                 seen, armed_s = self.num_steps, time.monotonic()
-                faulthandler.dump_traceback_later(self._hang_s, exit=True)
+                faulthandler.dump_traceback_later(self._hang_s, file=_STDERR, exit=True)
             if os.getppid() != self._triton:
                 os._exit(1)
-            self._closed.wait(_LOOK_S)
+            self._closed.wait(min(_LOOK_S, self._hang_s / 10))
 
 
 def end(why: str) -> None:

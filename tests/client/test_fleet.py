@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rfm.supervise.model_processes import ModelProcess, ProcessWatch
 
 from faulty_servers import url_of
 from one_model import OneModelServer, answered
 from patients import DEADLY, MARK, Callers, make_repository, references, trajectory
 from rfm.launch.process import Endpoints
-from rfm.supervise.model_processes import ModelProcess, ProcessWatch
 from rfm_client import (
     AsyncRewardClient,
     InvalidSampleError,

@@ -13,18 +13,17 @@ import tritonclient.grpc
 from tritonclient.utils import InferenceServerException
 
 from faulty_servers import heavy, ours_in_dev_shm, regions, trajectory, url_of
-from mixtures import assert_same
+from mixtures import assert_same, wait_until_at_work
 from one_model import OneModelServer
 from patients import answering_after, make_repository
 from rfm.launch.process import Endpoints
-from rfm.supervise.model_processes import ProcessWatch
 from rfm_client import (
     DeadlineExceededError,
     ProgressSample,
     RewardClient,
 )
 from rfm_client.contract.triton import REGION_IN_USE
-from rfm_serve import MODEL, PATIENCE_S, wait_for
+from rfm_serve import MODEL
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
@@ -79,13 +78,12 @@ def test_shared_memory_serves_many_callers(repository: Path) -> None:
 def test_memory_is_given_back_as_soon_as_no_request_uses_it(tmp_path: Path, protocol: str) -> None:
     """Triton refuses to unmap it earlier, and does not do so later by itself."""
     endpoints = Endpoints.free()
-    with OneModelServer(make_repository(tmp_path, more_code=answering_after(0.7)), endpoints) as server:
+    with OneModelServer(make_repository(tmp_path, more_code=answering_after(0.7)), endpoints):
         with RewardClient(url_of(endpoints, protocol), shared_memory=True) as client:
             client.progress(heavy(), frame_steps=2)
             (region,) = regions(endpoints)
             scored = client.submit(ProgressSample(heavy(), frame_steps=2))
-            (process,) = ProcessWatch(server.pid, PATIENCE_S).of_model(MODEL)
-            wait_for(lambda: process.journal is not None and process.journal.busy_s > 0)
+            wait_until_at_work(MODEL)
             with (
                 tritonclient.grpc.InferenceServerClient(url_of(endpoints, "grpc").removeprefix("grpc://")) as triton,
                 pytest.raises(InferenceServerException, match=REGION_IN_USE),

@@ -21,10 +21,10 @@ from one_model import BriefServer
 from rfm.launch.installation import find_installation
 from rfm.launch.process import Endpoints, TritonServer
 from rfm.launch.repository_api import RepositoryApi
-from rfm.supervise.model_processes import ProcessWatch
 from rfm_client import RewardClient
 from rfm_commands.rollout import Rollout, previous_version
 from rfm_export.publish import staging
+from rfm_serve import model_processes
 from trajectories import random_trajectory
 
 pytestmark = pytest.mark.triton
@@ -140,10 +140,10 @@ def test_triton_does_not_see_what_is_staged(kind: type[TritonServer], tmp_path: 
             client.progress(random_trajectory(0, 3))
 
 
-def living(watch: ProcessWatch) -> list[int]:
+def living(triton: int) -> list[int]:
     """Processes of ``rfm``, as soon as those of one load alone are alive."""
     deadline_s = time.monotonic() + PATIENCE_S
-    while len(found := [process.pid for process in watch.of_model("rfm") if process.is_alive]) > 1:
+    while len(found := model_processes(triton)) > 1:
         assert time.monotonic() < deadline_s, found
         time.sleep(POLL_S)
     return found
@@ -154,12 +154,11 @@ def test_an_export_changes_no_model_of_another_name(tmp_path: Path) -> None:
     repository = tmp_path / "repository"
     export(repository)
     with served(repository, tmp_path / "log") as server, RepositoryApi(server.endpoints.grpc_url, KEY) as api:
-        watch = ProcessWatch(server.pid, HANG_S)
         api.load("rfm")  # the first load after the start is a new one anyway
-        before = living(watch)
+        before = living(server.pid)
         export(repository, "another")
         api.load("rfm")
-        assert living(watch) == before != []
+        assert living(server.pid) == before != []
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from rfm.steps import telling
 
 import goldens
 from engines import load_engine
@@ -19,7 +20,6 @@ from reference_server import Served
 from rfm.engine import Engine
 from rfm.execution import Execution
 from rfm.predictor import RowScores
-from rfm.steps import telling
 from rfm.vlm.batch import VlmBatch
 from rfm.vlm.collator import QWEN3, VISION_START, VlmRow
 from rfm.vlm.images import Grid

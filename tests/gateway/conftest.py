@@ -26,8 +26,7 @@ from gateway_requests import (
 from one_model import BriefServer
 from proxies import Proxy
 from rfm.config import ExportConfig
-from rfm.journal import SHARED_MEMORY
-from rfm.launch.cleanup import REGION_PREFIX
+from rfm.launch.cleanup import REGION_PREFIX, SHARED_MEMORY
 from rfm.launch.installation import find_installation
 from rfm.launch.process import Endpoints
 from rfm.rewind.checkpoint import RewindCheckpoint

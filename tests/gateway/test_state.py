@@ -43,7 +43,7 @@ from gateway_requests import (
 )
 from gateways import WITHIN_S, Gateway, answers, free_port, poll, running
 from rfm.checkpoint.content import read_run_config
-from rfm.journal import SHARED_MEMORY
+from rfm.launch.cleanup import SHARED_MEMORY
 from rfm.launch.process import Endpoints
 from rfm.rewind.network import RewindTransformer
 from rfm_client import (

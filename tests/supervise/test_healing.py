@@ -20,23 +20,23 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from prometheus_client.parser import text_string_to_metric_families
-
 from clock import Clock
-from one_model import BriefServer, OneModelServer
-from patients import CALLERS, DEADLY, MARK, TOLERANCE, Callers, answering_after, make_repository, trajectory
-from rfm.journal import SHARED_MEMORY
-from rfm.launch import cleanup
-from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints
-from rfm.proc import is_alive
-from rfm.supervise import back_off
-from rfm.supervise.back_off import BackOff, CrashLoopError
+from prometheus_client.parser import text_string_to_metric_families
 from rfm.supervise.model_processes import ProcessWatch
 from rfm.supervise.model_reload import OwedAnswersError, Reload
 from rfm.triton_model.quarantine import Quarantine
 from rfm.triton_model.request_digest import digest
 from rfm.triton_model.self_check import FAILED_BATCHES
+
+from commands import is_alive
+from one_model import BriefServer, OneModelServer
+from patients import CALLERS, DEADLY, MARK, TOLERANCE, Callers, answering_after, make_repository, trajectory
+from rfm.launch import cleanup
+from rfm.launch.cleanup import SHARED_MEMORY
+from rfm.launch.installation import find_installation
+from rfm.launch.process import Endpoints
+from rfm.supervise import back_off
+from rfm.supervise.back_off import BackOff, CrashLoopError
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,

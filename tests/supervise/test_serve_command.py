@@ -21,7 +21,7 @@ import torch
 
 import clip
 import rfm_export
-from commands import EXIT_S, REPOSITORY, RFM, command, nothing_left_behind, wait_for_http
+from commands import EXIT_S, REPOSITORY, RFM, command, is_alive, nothing_left_behind, wait_for_http
 from gateways import answers, poll
 from paths import ROOT
 from rfm.config import ExportConfig
@@ -29,7 +29,6 @@ from rfm.launch import installation
 from rfm.launch.installation import ServerStartError, find_installation
 from rfm.launch.ports import free_ports
 from rfm.launch.process import Endpoints, TritonServer
-from rfm.proc import is_alive
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_serve import children, serving, wait_for
 

@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+import torch
 
 from rfm.execution import Execution
 from rfm.triton_model.batch_model import BatchModel
 from rfm.triton_model.metrics import Counted
-from rfm.triton_model.quarantine import Quarantine
-from rfm.triton_model.request import Request as ModelRequest
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,
@@ -71,7 +70,6 @@ class Request:
     tensors: wire.Tensors
     id: str = ""
     is_given_up: bool = False
-    timeout_us: int = 0
     responses: list[Response] = field(default_factory=list)
 
     def request_id(self) -> str:
@@ -82,9 +80,6 @@ class Request:
 
     def requested_output_names(self) -> list[str]:
         return ["progress"]
-
-    def timeout(self) -> int:
-        return self.timeout_us
 
     def get_response_sender(self) -> Request:
         return self
@@ -103,29 +98,38 @@ class Response:
     error: Any = None
 
 
+MODELS: list[Model] = []  # of the test that runs
+
+
 class Model(BatchModel[Sample, Result]):
     """Scores each frame with how many there are."""
 
-    def __init__(
-        self,
-        folder: Path,
-        warmups: int = 0,
-        settings: Mapping[str, str] = MappingProxyType({}),
-        num_instances: int = 1,
-    ) -> None:
+    def __init__(self, folder: Path, warmups: int = 0, settings: Mapping[str, str] = MappingProxyType({})) -> None:
+        MODELS.append(self)
         self.counted: list[Counted] = []
-        self.at_work: list[int] = []
         self.batches: list[int] = []
         self.logged: list[str] = []
-        self._quarantine = Quarantine(folder / "1_batch", (), 8)
-        self._metrics = SimpleNamespace(at_work_on=self.working, add=self.counted.append, close=lambda: None)  # type: ignore[assignment]
+        parameters = {name: {"string_value": value} for name, value in {"torch_threads": "1", **settings}.items()}
+        config = CONFIG | {"parameters": parameters, "model_warmup": [{"count": 1}] * warmups}
+        self.initialize(
+            {
+                "model_config": json.dumps(config),
+                "model_repository": str(folder),
+                "model_version": "1",
+                "model_name": "rfm",
+                "model_instance_name": "rfm_0_0",
+                "model_instance_kind": "CPU",
+                "model_instance_device_id": "0",
+            }
+        )
+        self._metrics = SimpleNamespace(add=self.counted.append, close=lambda: None)  # type: ignore[assignment]
         self._log = SimpleNamespace(  # type: ignore[assignment]
             report=lambda request: self.logged.append(str(request.error)),
             report_batch=lambda batch, error: self.logged.append(f"{len(batch)}: {error}"),
-            report_end=lambda error: self.logged.append(f"ended: {error}"),
         )
-        instances = {"instance_group": [{"count": num_instances}]}
-        self.start(CONFIG | instances | {"model_warmup": [{"count": 1}] * warmups}, settings)
+
+    def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
+        """There is nothing to load."""
 
     def respond(self, requests: Sequence[Request]) -> list[Response]:
         """What becomes of requests of which Triton hands over all at once."""
@@ -137,12 +141,6 @@ class Model(BatchModel[Sample, Result]):
         """Hands the requests over, as Triton does, and keeps the responses that come at once."""
         for request, response in zip(requests, self.execute(requests) or (), strict=False):
             request.responses.append(response)
-
-    @contextmanager
-    def working(self, batch: Sequence[ModelRequest[Sample]]) -> Iterator[None]:
-        self.at_work.append(sum(request.is_counted for request in batch))
-        yield
-        self.at_work.append(0)
 
     def decode(self, tensors: wire.Tensors) -> list[Sample]:
         return wire.decode_samples(tensors)
@@ -171,7 +169,7 @@ class Model(BatchModel[Sample, Result]):
 
 
 @pytest.fixture(autouse=True)
-def backend(monkeypatch: pytest.MonkeyPatch) -> None:
+def backend(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     def error_of(message: str, code: str) -> tuple[str, str]:
         return code, message
 
@@ -183,8 +181,12 @@ def backend(monkeypatch: pytest.MonkeyPatch) -> None:
         TritonError=error_of,
         Tensor=lambda name, array: (name, array.tolist()),
         TRITONSERVER_RESPONSE_COMPLETE_FINAL=FINAL,
+        Logger=SimpleNamespace(log_error=print, log_info=print, log_verbose=print),
     )
     monkeypatch.setitem(sys.modules, "triton_python_backend_utils", module)  # type: ignore[arg-type]
+    yield
+    while MODELS:
+        MODELS.pop().finalize()
 
 
 def request(*num_frames: int, **more: Any) -> Request:

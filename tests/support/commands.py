@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from paths import ROOT
-from rfm.journal import SHARED_MEMORY
-from rfm.launch.cleanup import REGION_PREFIX
+from rfm.launch.cleanup import REGION_PREFIX, SHARED_MEMORY
 from rfm.launch.process import Endpoints
-from rfm.proc import is_alive
+from rfm.proc import ZOMBIE, stat_of
 from rfm_client import RewardClient
 
 REPOSITORY = ROOT / "model_repository"
@@ -28,6 +27,12 @@ RFM = Path(sys.executable).parent / "rfm"
 EXIT_S = 60
 RUN = "RFM_TEST_RUN"
 OWNER = re.compile(rf"{REGION_PREFIX}_(\d+)_")
+
+
+def is_alive(pid: int) -> bool:
+    """Whether there is a process of this id that has not ended."""
+    stat = stat_of(pid)
+    return stat is not None and stat.state != ZOMBIE
 
 
 def command(repository: Path, endpoints: Endpoints) -> list[str]:

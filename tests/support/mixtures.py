@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Callable
 
@@ -14,8 +13,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 import goldens
 from reference_server import Served
-from rfm.journal import SHARED_MEMORY, Journal
-from rfm.launch.cleanup import REGION_PREFIX
+from rfm.proc import all_pids, arguments_of, stat_of
 from rfm_client import (
     PreferenceSample,
     ProgressSample,
@@ -66,14 +64,14 @@ def counts(served: Served, model: str) -> tuple[int, int]:
 
 
 def wait_until_at_work(model: str) -> None:
-    """Returns when a process of the model works on a request."""
-    name = re.compile(rf"{REGION_PREFIX}_\d+_[0-9a-f]+_[^_]+_{model}_batch")
+    """Returns when a process of the model computes."""
 
-    def is_at_work() -> bool:
-        files = (file for file in SHARED_MEMORY.iterdir() if name.fullmatch(file.name))
-        return any(journal.busy_s > 0 for file in files if (journal := Journal.open(file)) is not None)
+    def cpu_s() -> float:
+        ours = [pid for pid in all_pids() if any(f"/{model}/" in word for word in arguments_of(pid)[:2])]
+        return sum(stat.cpu_s for pid in ours if (stat := stat_of(pid)) is not None)
 
-    wait_for(is_at_work)
+    before_s = cpu_s()
+    wait_for(lambda: cpu_s() > before_s + 0.05)
 
 
 def assert_same(left: object, right: object) -> None:

@@ -47,8 +47,8 @@ TritonPythonModel.answer = deadly
 """
 
 
-def answering_after(seconds: float) -> str:
-    """Code for a model.py whose answers take so much longer."""
+def answering_after(seconds: float, began: Path | None = None) -> str:
+    """Code for a model.py whose answers take so much longer. began: a file that is there once it works on one"""
     return f"""
 
 _prompt_answer = TritonPythonModel.answer
@@ -56,7 +56,10 @@ _prompt_answer = TritonPythonModel.answer
 
 def late(self, questions, execution):
     import time
+    from pathlib import Path
 
+    if {str(began)!r} != "None":
+        Path({str(began)!r}).touch()
     time.sleep({seconds})
     return _prompt_answer(self, questions, execution)
 

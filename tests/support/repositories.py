@@ -36,11 +36,13 @@ def configure(model: Path, *, instances: int = 1, batch_size: int = 64, **parame
     file.write_text(render(config))
 
 
-def bound_triton_s_queue(model: Path, size: int) -> None:
-    """Changes an exported model's configuration: Triton lets so many requests wait, as in older exports."""
+def bound_queue(model: Path, *, max_queue_size: int = 0, timeout_ms: int = 0) -> None:
+    """Changes an exported model's configuration: so many requests may wait in Triton, and so long; 0: any."""
     file = model / CONFIG_FILE
     config = parse(file.read_text())
-    config.dynamic_batching.default_queue_policy.max_queue_size = size
+    policy = config.dynamic_batching.default_queue_policy
+    policy.max_queue_size, policy.default_timeout_microseconds = max_queue_size, 1000 * timeout_ms
+    policy.allow_timeout_override = True
     file.write_text(render(config))
 
 

@@ -4,11 +4,9 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,7 +18,6 @@ from rfm.execution import Execution
 from rfm.probe import blank_question
 from rfm.triton_model import batch_model
 from rfm.triton_model.placement import Placement, use_threads
-from rfm.triton_model.request import WORTH_CHECKING_S
 from rfm_client import (
     FrameScores,
     InferenceFailedError,
@@ -33,7 +30,7 @@ from rfm_client import (
 )
 from rfm_client.contract import wire
 from rfm_client.contract.names import PROBE_PREFIX
-from rfm_serve import PATIENCE_S, wait_for
+from rfm_serve import PATIENCE_S
 from trajectories import random_trajectory
 
 
@@ -41,7 +38,6 @@ def test_requests_are_answered_together_and_each_gets_its_own(tmp_path: Path) ->
     model = Model(tmp_path)
     responses = model.respond([request(1), request(5, 1), request(6)])
     assert model.batches == [4]
-    assert model.at_work == [3, 0]
     tensors = [response.output_tensors for response in responses]
     assert tensors[0] == [("progress", [[1]])]
     ((name, ((*five,), (one, *padding))),) = tensors[1]
@@ -90,55 +86,17 @@ def test_a_request_that_breaks_a_batch_is_found(tmp_path: Path) -> None:
         None, ("internal", "scoring failed; the server's log has the reason"), None,
     ]  # fmt: skip
     assert model.batches == [3, 1, 1, 1]
-    assert model.at_work == [3, 0]
     assert model.logged == ["3: made up", "scoring failed; the server's log has the reason"]
     assert model.samples == {("progress", "scored"): 2, ("progress", "failed"): 1}
-
-
-@pytest.mark.parametrize("answer_s", [WORTH_CHECKING_S, 0.0])
-def test_a_cancelled_request_costs_nothing_where_it_is_worth_a_question(tmp_path: Path, answer_s: float) -> None:
-    model = Model(tmp_path)
-    model._sample_s = answer_s
-    cancelled, _ = model.respond([request(1, is_given_up=True), request(5)])
-    if answer_s:
-        assert cancelled.error == ("cancelled", "cancelled by the client")
-        assert model.batches == [1]
-        assert model.samples == {("progress", "cancelled"): 1, ("progress", "scored"): 1}
-    else:
-        assert cancelled.error is None
-        assert model.batches == [2]
-
-
-def test_the_first_batch_asks_who_has_cancelled(tmp_path: Path) -> None:
-    model = Model(tmp_path)
-    (cancelled,) = model.respond([request(1, is_given_up=True)])
-    assert cancelled.error is not None
-    assert model.batches == []
-
-
-def test_what_an_answer_takes_is_that_of_a_question(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    times = iter([10.0, 16.0])
-    monkeypatch.setattr(
-        batch_model, "time", SimpleNamespace(monotonic=time.monotonic, perf_counter=lambda: next(times))
-    )
-    model = Model(tmp_path)
-    model.respond([request(1), request(1, 1)])
-    assert model._sample_s == 2
-
-
-def test_what_is_refused_when_it_comes_has_not_waited(tmp_path: Path) -> None:
-    model = Model(tmp_path)
-    model.respond([Request(request(1).tensors | {"num_frames": np.zeros((1, 2), np.int32)})])
-    assert [counted.wait_s for counted in model.counted] == [0.0]
 
 
 def test_warm_ups_and_probes_are_not_counted(tmp_path: Path) -> None:
     model = Model(tmp_path, warmups=2)
     blank = Request(blank_question(CONFIG), id=f"{PROBE_PREFIX}-rfm")
     model.respond([request(1), request(5), blank])
-    assert (model.at_work, model.samples) == ([0, 0], {})
+    assert model.samples == {}
     model.respond([request(1), request(1, id="caller")])
-    assert (model.at_work, model.samples) == ([0, 0, 2, 0], {("progress", "scored"): 2})
+    assert model.samples == {("progress", "scored"): 2}
 
 
 def test_a_caller_is_no_warm_up(tmp_path: Path) -> None:
@@ -261,22 +219,26 @@ def test_a_thread_computes_with_its_own_number_of_threads_whatever_others_set() 
         assert seen.result() == 3
 
 
-def test_all_forward_passes_are_made_in_one_thread(tmp_path: Path) -> None:
-    """Warm-ups, requests for which ``execute`` waits, and those answered later: else OpenMP has two teams."""
+def test_requests_are_scored_in_the_thread_that_calls_execute(tmp_path: Path) -> None:
+    """Warm-ups, too: else OpenMP has two teams of threads."""
     model = Model(tmp_path, warmups=1)
     threads = []
     answer = model.answer
 
     def watched(questions: Sequence[Sample], execution: Execution) -> Any:
-        threads.append(threading.current_thread().name)
+        threads.append(threading.current_thread())
         return answer(questions, execution)
 
     model.answer = watched  # type: ignore[method-assign]
-    assert model.execute([request(1)]) is not None
-    model._sample_s = 1.0  # so long that they are answered later
-    later = [request(5), request(6)]
-    assert model.execute(later) is None
-    wait_for(lambda: all(each.responses for each in later))
-    assert [each.responses[0].error for each in later] == [None, None]
-    assert len(threads) >= 2
-    assert set(threads) == {"rfm-score"}
+    model.execute([request(1)])
+    model.execute([request(5), request(6)])
+    assert threads == [threading.current_thread()] * 2
+
+
+@pytest.mark.parametrize("parameter", ["max_queue_size", "queue_timeout_ms"])
+def test_an_older_export_s_bound_of_the_queue_is_ignored_with_a_note(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], parameter: str
+) -> None:
+    model = Model(tmp_path, settings={parameter: "1"})
+    assert "of an older export have no effect: export again" in capsys.readouterr().out
+    assert [response.error for response in model.respond([request(1), request(5)])] == [None, None]

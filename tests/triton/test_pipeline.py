@@ -1,239 +1,201 @@
 # SPDX-License-Identifier: MIT
-"""The pipeline by itself: what is scored together, when, and what finds no room."""
+"""A model that works ahead: what is scored together, when ``execute`` returns, and what becomes of what goes wrong."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
-from rfm.triton_model.pipeline import Bounds, Pipeline, Stages
+from batch_models import BREAKS, CONFIG, MODELS, REFUSED, Model, Request, backend, request  # noqa: F401  a fixture
+from rfm.execution import Execution
+from rfm.triton_model.pipeline import Pipeline, Stages
+from rfm_client import Result, RewardError, Sample
 from rfm_serve import PATIENCE_S, wait_for
 
-BOUNDS = Bounds(batch_samples=4, batch_tokens=100, ahead_samples=4)
+MAX_BATCH = 8
+assert CONFIG["max_batch_size"] == MAX_BATCH
+
+
+class Ahead(Model):
+    """Works ahead, and answers when it may."""
+
+    def __init__(self, folder: Path, **more: Any) -> None:
+        self.may_answer, self.may_prepare = threading.Event(), threading.Event()
+        self.may_prepare.set()
+        self.prepared: list[int] = []
+        self.threads: set[str] = set()
+        super().__init__(folder, **more)
+
+    @property
+    def works_ahead(self) -> bool:
+        return True
+
+    def prepare(self, question: Sample) -> tuple[Sample, int]:
+        return question, question.trajectories[0].num_frames
+
+    def work_ahead(self, prepared: Sample) -> None:
+        assert self.may_prepare.wait(PATIENCE_S)
+        self.prepared.append(prepared.trajectories[0].num_frames)
+
+    def answer(self, questions: Sequence[Sample], execution: Execution) -> list[Result | RewardError]:
+        self.threads.add(threading.current_thread().name)
+        outcome = super().answer(questions, execution)
+        assert self.may_answer.wait(PATIENCE_S)
+        return outcome
+
+    def finalize(self) -> None:
+        self.may_prepare.set()
+        super().finalize()
+
+    def begin(self) -> list[Request]:
+        """Has it score two requests, which are not answered before ``open``."""
+        first = [request(1), request(1)]
+        self.take(first)
+        wait_for(lambda: sum(self.batches) == 2 or len(self.batches) == 1)
+        return first
+
+    def open(self, *requests: Request) -> None:
+        self.may_answer.set()
+        wait_for(lambda: all(len(request.responses) == 1 for request in requests))
+
+    @property
+    def pipeline(self) -> Pipeline[Any, Any]:
+        assert self._pipeline is not None
+        return self._pipeline
+
+
+def test_a_lone_request_on_an_idle_model_is_answered_by_execute(tmp_path: Path) -> None:
+    model = Ahead(tmp_path)
+    model.may_answer.set()
+    lone = request(5)
+    model.take([lone])
+    assert [response.error for response in lone.responses] == [None]
+    assert model.prepared == []  # what is not prepared ahead is prepared in its turn
+
+
+def test_what_comes_while_a_batch_is_scored_is_prepared_and_makes_up_the_next(tmp_path: Path) -> None:
+    model = Ahead(tmp_path)
+    first = model.begin()
+    later = [request(count) for count in (5, 6, 7)]
+    for each in later:
+        model.take([each])
+    wait_for(lambda: sorted(model.prepared)[-3:] == [5, 6, 7])
+    model.open(*first, *later)
+    assert model.batches[-1] == 3
+    assert model.threads == {"rfm-score"}
+    assert model.samples == {("progress", "scored"): 5}
+
+
+def test_what_is_not_prepared_waits_for_another_batch(tmp_path: Path) -> None:
+    model = Ahead(tmp_path)
+    first = model.begin()
+    model.may_prepare.clear()
+    late = [request(5), request(6)]
+    model.take(late)
+    model.may_answer.set()
+    wait_for(lambda: all(each.responses for each in first))
+    assert not any(each.responses for each in late)
+    model.may_prepare.set()
+    model.open(*late)
+
+
+def test_execute_returns_when_less_than_a_batch_waits(tmp_path: Path) -> None:
+    model = Ahead(tmp_path)
+    first = model.begin()
+    full = [request(5) for _ in range(MAX_BATCH)]
+    with ThreadPoolExecutor(1) as pool:
+        taken = pool.submit(model.take, full)
+        wait_for(lambda: len(model.prepared) >= MAX_BATCH)
+        assert not taken.done()  # the rest waits in Triton, where another instance can take it
+        model.open(*first, *full)
+        taken.result(PATIENCE_S)
+
+
+def test_a_batch_has_no_more_tokens_than_its_budget(tmp_path: Path) -> None:
+    model = Ahead(tmp_path, settings={"token_budget": "12"})
+    first = model.begin()
+    later = [request(5), request(6)]  # two frames more are too many
+    model.take(later)
+    more = request(7)
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(model.take, [more])
+        wait_for(lambda: 6 in model.prepared)
+        model.open(*first, *later, more)
+    assert model.batches[-2:] == [2, 1]
+
+
+def test_refused_failed_and_cancelled_requests_fail_alone(tmp_path: Path) -> None:
+    model = Ahead(tmp_path)
+    first = model.begin()
+    unreadable = Request(request(1).tensors | {"num_frames": np.zeros((1, 2), np.int32)})
+    requests = [request(REFUSED), request(BREAKS), unreadable, request(5, is_given_up=True), request(6)]
+    model.take(requests)
+    model.open(*first, *requests)
+    assert [response.error and response.error[0] for each in requests for response in each.responses] == [
+        "invalid", "internal", "invalid", "cancelled", None,
+    ]  # fmt: skip
+
+
+def test_a_request_for_which_there_is_no_memory_fails_alone(tmp_path: Path) -> None:
+    model = Ahead(tmp_path)
+    model.may_answer.set()
+
+    class Large(np.ndarray):  # type: ignore[type-arg]
+        def copy(self, order: Any = None) -> Any:
+            raise MemoryError
+
+    large = request(5)
+    large.tensors["video_embeddings"] = large.tensors["video_embeddings"].view(Large)
+    failed, scored = model.respond([large, request(6)])
+    assert failed.error == ("internal", "scoring failed; the server's log has the reason")
+    assert scored.error is None
+
+
+def test_a_model_is_unloaded_when_all_are_answered(tmp_path: Path) -> None:
+    model = Ahead(tmp_path)
+    requests = [*model.begin(), request(5)]
+    model.take(requests[-1:])
+    with ThreadPoolExecutor(1) as pool:
+        unloaded = pool.submit(model.finalize)
+        wait_for(lambda: 5 in model.prepared)
+        assert not unloaded.done()
+        model.may_answer.set()
+        unloaded.result(PATIENCE_S)
+    assert all(len(each.responses) == 1 for each in requests)
+
+
+@pytest.fixture(autouse=True)
+def _all_may_answer() -> Iterator[None]:
+    yield
+    for model in MODELS:
+        model.may_answer.set()  # type: ignore[attr-defined]
 
 
 @dataclass(eq=False)
 class Job:
     num_samples: int = 1
     num_tokens: int = 1
-    may_be_rejected: bool = True
-    may_be_prepared: threading.Event = field(default_factory=threading.Event)
 
 
-@dataclass
-class Work:
-    """What a pipeline was seen to do. ``may_score``: batches are scored when it is set."""
+@pytest.mark.parametrize("stage", ["score", "reply"])
+def test_a_stage_that_breaks_is_told(stage: str) -> None:
+    """The model process ends then: nothing would be answered any more."""
+    told = threading.Event()
 
-    may_score: threading.Event = field(default_factory=threading.Event)
-    prepared: list[Job] = field(default_factory=list)
-    batches: list[list[Job]] = field(default_factory=list)
-    replied: list[Job] = field(default_factory=list)
-    failures: list[str] = field(default_factory=list)
-    threads: set[str] = field(default_factory=set)
+    def broken(*_: object) -> None:
+        raise SystemError
 
-    def prepare(self, job: Job) -> None:
-        assert job.may_be_prepared.wait(PATIENCE_S)
-        self.prepared.append(job)
+    def scored(batch: list[Job]) -> list[Job]:
+        return batch
 
-    def score(self, batch: list[Job]) -> list[int]:
-        self.batches.append(batch)
-        self.threads.add(threading.current_thread().name)
-        assert self.may_score.wait(PATIENCE_S)
-        return [job.num_tokens for job in batch]
-
-    def reply(self, batch: list[Job], scored: list[int]) -> None:
-        assert scored == [job.num_tokens for job in batch]
-        self.replied += batch
-
-    def fail(self, error: BaseException) -> None:
-        self.failures.append(repr(error))
-
-
-@contextmanager
-def running(work: Work, bounds: Bounds = BOUNDS, num_preparing: int = 0) -> Iterator[Pipeline[Job, list[int]]]:
-    pipeline = Pipeline(
-        Stages(work.score, work.reply, work.fail, prepare=work.prepare, num_preparing=num_preparing), bounds
-    )
-    try:
-        yield pipeline
-    finally:
-        work.may_score.set()
-        pipeline.close()
-
-
-@contextmanager
-def busy(work: Work, bounds: Bounds = BOUNDS, num_preparing: int = 0) -> Iterator[Pipeline[Job, list[int]]]:
-    """A pipeline that has begun to score one job."""
-    with running(work, bounds, num_preparing) as pipeline:
-        first = Job()
-        first.may_be_prepared.set()
-        pipeline.put([first])
-        wait_for(lambda: len(work.batches) == 1)
-        yield pipeline
-
-
-def sizes(work: Work) -> list[list[int]]:
-    return [[job.num_samples for job in batch] for batch in work.batches]
-
-
-def test_a_batch_holds_what_waits_up_to_its_samples() -> None:
-    work = Work()
-    with busy(work) as pipeline:
-        assert pipeline.put([Job(2), Job(1), Job(1), Job(3), Job(2), Job(9), Job(1)]) == []
-    assert sizes(work) == [[1], [2, 1, 1], [3], [2], [9], [1]]  # in order; what is larger than a batch is one
-    assert work.replied == [job for batch in work.batches for job in batch]
-
-
-def test_a_batch_holds_what_waits_up_to_its_tokens() -> None:
-    work = Work()
-    with busy(work) as pipeline:
-        pipeline.put(
-            [Job(num_tokens=60), Job(num_tokens=40), Job(num_tokens=41), Job(num_tokens=60), Job(num_tokens=1)]
-        )
-    assert [[job.num_tokens for job in batch] for batch in work.batches[1:]] == [[60, 40], [41], [60, 1]]
-
-
-def test_what_finds_no_room_is_given_back_and_what_may_not_be_rejected_finds_some() -> None:
-    work = Work()
-    with busy(work, Bounds(4, 100, 4, waiting_jobs=2)) as pipeline:
-        waiting, late, urgent = [Job(), Job()], [Job(), Job()], Job(may_be_rejected=False)
-        assert pipeline.put(waiting) == []
-        assert pipeline.put([late[0], urgent, late[1]]) == late
-        assert pipeline.num_waiting == 3
-    assert work.batches[1:] == [[*waiting, urgent]]
-
-
-def test_jobs_are_prepared_beside_the_scoring_but_not_too_many() -> None:
-    work = Work()
-    with busy(work, num_preparing=2) as pipeline:
-        jobs = [Job(2) for _ in range(4)]
-        for job in jobs:
-            job.may_be_prepared.set()
-        pipeline.put(jobs)
-        wait_for(lambda: len(work.prepared) == 3)
-        assert work.prepared[1:] == jobs[:2]  # four samples ahead of their turn, while the first job is scored
-        assert len(work.batches) == 1
-    assert work.batches[1:] == [jobs[:2], jobs[2:]]
-
-
-def test_no_more_is_prepared_ahead_than_the_tokens_of_a_batch() -> None:
-    work = Work()
-    with busy(work, num_preparing=2) as pipeline:
-        jobs = [Job(num_tokens=60), Job(num_tokens=40), Job(num_tokens=1)]
-        for job in jobs:
-            job.may_be_prepared.set()
-        pipeline.put(jobs)
-        wait_for(lambda: len(work.prepared) == 3)
-        assert set(work.prepared[1:]) == set(jobs[:2])
-        assert pipeline.num_waiting == 3
-    assert work.batches[1:] == [jobs[:2], jobs[2:]]
-
-
-def test_a_batch_does_not_wait_for_a_job_that_is_still_prepared_behind_it() -> None:
-    work = Work()
-    with busy(work, num_preparing=2) as pipeline:
-        ready, slow = Job(), Job()
-        ready.may_be_prepared.set()
-        pipeline.put([ready, slow])
-        wait_for(lambda: ready in work.prepared)
-        work.may_score.set()
-        wait_for(lambda: ready in work.replied)
-        assert pipeline.num_waiting == 1
-        slow.may_be_prepared.set()
-    assert work.batches[1:] == [[ready], [slow]]
-
-
-def test_an_idle_pipeline_scores_at_once_in_the_thread_that_scores_all() -> None:
-    work = Work()
-    with running(work) as pipeline:
-        work.may_score.set()
-        jobs, later = [Job(num_tokens=2), Job(num_tokens=3)], Job()
-        assert pipeline.is_idle
-        assert pipeline.run(jobs) == [2, 3]
-        assert work.replied == []
-        assert pipeline.is_idle
-        pipeline.put([later])
-        wait_for(lambda: work.replied == [later])
-        assert pipeline.run([Job(9)]) == [1]
-    assert work.threads == {"rfm-score"}
-    assert sizes(work) == [[1, 1], [1], [9]]
-
-
-def test_who_runs_jobs_gets_the_error_and_nothing_is_scored_any_more() -> None:
-    work = Work()
-
-    def broken(batch: list[Job]) -> list[int]:
-        raise MemoryError
-
-    pipeline = Pipeline(Stages(broken, work.reply, work.fail), BOUNDS)
-    for _ in range(2):
-        with pytest.raises(MemoryError):
-            pipeline.run([Job()])
-        wait_for(lambda: work.failures == ["MemoryError()"])
-
-
-@pytest.mark.parametrize("is_early", [True, False])
-def test_who_runs_jobs_does_not_wait_for_a_thread_that_could_not_begin(is_early: bool) -> None:
-    work, may_begin = Work(), threading.Event()
-
-    def begin() -> None:
-        assert may_begin.wait(PATIENCE_S)
-        raise MemoryError
-
-    pipeline = Pipeline(Stages(work.score, work.reply, work.fail, begin=begin), BOUNDS)
-    if is_early:
-        may_begin.set()
-        wait_for(lambda: work.failures == ["MemoryError()"])
-    with ThreadPoolExecutor(1) as pool:
-        ran = pool.submit(pipeline.run, [Job()])
-        assert is_early or not pipeline.wait_for(ran.done, 0.05)
-        may_begin.set()
-        with pytest.raises(MemoryError):
-            ran.result(PATIENCE_S)
-
-
-def test_nothing_is_scored_beside_what_another_thread_scores() -> None:
-    work = Work()
-    with running(work) as pipeline, ThreadPoolExecutor(1) as pool:
-        alone, other = Job(), Job()
-        ran = pool.submit(pipeline.run, [alone])
-        wait_for(lambda: work.batches == [[alone]])
-        assert not pipeline.is_idle
-        pipeline.put([other])
-        assert not pipeline.wait_for(lambda: len(work.batches) > 1, 0.05)
-        work.may_score.set()
-        assert ran.result(PATIENCE_S) == [1]
-    assert work.batches == [[alone], [other]]
-
-
-def test_closing_waits_for_all_replies() -> None:
-    work = Work()
-    with busy(work) as pipeline, ThreadPoolExecutor(1) as pool:
-        jobs = [Job(3), Job(3)]
-        pipeline.put(jobs)
-        closed = pool.submit(pipeline.close)
-        assert not pipeline.wait_for(closed.done, 0.05)
-        work.may_score.set()
-        closed.result(PATIENCE_S)
-        assert work.replied[1:] == jobs
-
-
-@pytest.mark.parametrize("stage", ["score", "reply", "prepare"])
-def test_a_stage_that_raises_is_told(stage: str) -> None:
-    work = Work()
-
-    def broken(*_arguments: object) -> list[int]:
-        raise MemoryError(stage)
-
-    setattr(work, stage, broken)
-    work.may_score.set()
-    pipeline = Pipeline(Stages(work.score, work.reply, work.fail, prepare=work.prepare, num_preparing=1), BOUNDS)
-    job = Job()
-    job.may_be_prepared.set()
-    pipeline.put([job])
-    wait_for(lambda: work.failures == [f"MemoryError('{stage}')"])
+    score = broken if stage == "score" else scored
+    pipeline = Pipeline(Stages(lambda job: None, score, broken, fail=told.set), MAX_BATCH, MAX_BATCH)  # type: ignore[arg-type]
+    pipeline.put([Job(), Job()])
+    assert told.wait(PATIENCE_S)

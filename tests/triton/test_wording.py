@@ -19,11 +19,10 @@ from commands import REPOSITORY
 from faulty_servers import url_of
 from one_model import BriefServer, OneModelServer
 from patients import answering_after, make_repository
-from repositories import bound_triton_s_queue, kill_model
+from repositories import bound_queue, kill_model
 from rfm.launch.installation import find_installation
 from rfm.launch.process import Endpoints
 from rfm.launch.repository_api import RepositoryApi
-from rfm.supervise.model_processes import ProcessWatch
 from rfm_client import (
     InvalidSampleError,
     ModelNotFoundError,
@@ -34,7 +33,7 @@ from rfm_client import (
     ServerUnavailableError,
 )
 from rfm_client.contract import triton, wire
-from rfm_serve import MODEL, PATIENCE_S, wait_for
+from rfm_serve import wait_for
 from trajectories import random_trajectory
 
 pytestmark = pytest.mark.triton
@@ -137,23 +136,13 @@ def test_triton_says_so_in_these_words(asked: Triton, name: str) -> None:
 
 
 SLOW = answering_after(0.3)
-SCORED_IN_EXECUTE = "\nTritonPythonModel._is_better_at_once = lambda self, requests: True\n"  # so Triton's queue fills
-FULL = {
-    "the model": (1, triton.QUEUE_FULL),
-    "the model, of several instances": (2, triton.QUEUE_FULL),
-    "Triton, as of older exports": (2, triton.TRITON_QUEUE_FULL),
-}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", FULL)
-def test_a_full_queue_says_so_in_these_words(tmp_path: Path, protocol: str, name: str) -> None:
-    instances, phrase = FULL[name]
-    of_triton = phrase == triton.TRITON_QUEUE_FULL
-    code = SLOW + (SCORED_IN_EXECUTE if of_triton else "")
-    repository = make_repository(tmp_path, more_code=code, instances=instances, batch_size=1, max_queue_size=1)
-    if of_triton:
-        bound_triton_s_queue(repository / "rfm", 1)
+@pytest.mark.parametrize("instances", [1, 2])
+def test_a_full_queue_says_so_in_these_words(tmp_path: Path, protocol: str, instances: int) -> None:
+    repository = make_repository(tmp_path, more_code=SLOW, instances=instances, batch_size=1)
+    bound_queue(repository / "rfm", max_queue_size=1)
     with (
         (tmp_path / "tritonserver.log").open("wb") as log,
         BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
@@ -172,24 +161,24 @@ def test_a_full_queue_says_so_in_these_words(tmp_path: Path, protocol: str, name
         told = {outcome for outcome in callers.map(lambda _: ask(), range(12)) if outcome is not None}
     assert told
     for status, message in told:
-        assert phrase in message
-        assert triton.is_full(message)
+        assert "Exceeds maximum queue size" in message
         assert status in triton.UNAVAILABLE
         assert type(triton.error_of(status, message, InvalidSampleError)) is ServerUnavailableError
 
 
 @pytest.mark.slow
 def test_a_connection_that_ends_under_a_request_is_told_from_one_that_is_refused(tmp_path: Path, protocol: str) -> None:
-    repository = make_repository(tmp_path, more_code=SLOW)
+    began = tmp_path / "began"
+    repository = make_repository(tmp_path, more_code=answering_after(0.3, began))
     with (
         OneModelServer(repository, Endpoints.free()) as server,
         RewardClient(url_of(server.endpoints, protocol), retry=False) as client,
     ):
         sample = ProgressSample(random_trajectory(0, 2, *DIMS))
         client.evaluate([sample])
-        (process,) = ProcessWatch(server.pid, PATIENCE_S).of_model(MODEL)
+        began.unlink()
         future = client.submit(sample)
-        wait_for(lambda: process.journal is not None and process.journal.busy_s > 0)
+        wait_for(began.exists)
         server.kill()
         under_way = future.exception()
         (refused,) = client.evaluate([sample], return_errors=True)

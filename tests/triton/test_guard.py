@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: MIT
+"""A model process that ends by itself: each in a process of its own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+PATIENCE_S = 60.0
+GUARD = """
+    import os, sys, threading, time
+    from types import SimpleNamespace
+    from rfm.triton_model.guard import Guard
+    WORKS = threading.Event()
+    guard = Guard(1.0, WORKS.is_set)
+"""
+
+
+def run(code: str) -> subprocess.CompletedProcess[str]:
+    program = textwrap.dedent(GUARD) + textwrap.dedent(code)
+    return subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+
+
+def test_a_batch_that_hangs_ends_the_process_and_the_log_says_where() -> None:
+    ended = run("""
+        def hanging():
+            time.sleep(3600)
+        WORKS.set()
+        hanging()
+    """)
+    assert ended.returncode == 1
+    assert "Timeout" in ended.stderr and "in hanging" in ended.stderr
+
+
+def test_a_hang_that_holds_python_s_lock_ends_the_process() -> None:
+    ended = run("""
+        import ctypes
+        WORKS.set()
+        ctypes.PyDLL(None).sleep(3600)  # unlike CDLL, it keeps the lock
+    """)
+    assert ended.returncode == 1
+    assert "Timeout" in ended.stderr
+
+
+def test_a_batch_that_gets_on_and_a_model_that_waits_go_on() -> None:
+    ended = run("""
+        WORKS.set()
+        for _ in range(30):
+            time.sleep(0.1)
+            guard.step()
+        WORKS.clear()
+        time.sleep(2)
+        guard.close()
+        sys.exit(7)
+    """)
+    assert ended.returncode == 7, ended.stderr
+
+
+BATCHES = """
+    scored = SimpleNamespace(outcome="scored", is_counted=False)
+    failed = SimpleNamespace(outcome="failed", is_counted=True)
+    refused = SimpleNamespace(outcome="refused", is_counted=True)
+    def broken():
+        raise RuntimeError("a lost device")
+"""
+
+
+@pytest.mark.parametrize(
+    ("batches", "blank", "status"),
+    [
+        ("[[scored], [failed], [failed, refused], [failed]]", "broken", 1),
+        ("[[scored], [failed], [failed], [failed, scored], [failed]]", "broken", 7),
+        ("[[scored], [failed], [failed], [failed]]", "lambda: None", 7),
+        ("[[failed], [failed], [failed]]", "broken", 7),
+        ("[[scored], [refused], [refused], [refused]]", "broken", 7),
+    ],
+    ids=["broken", "not in a row", "the inputs fail", "it never scored the blank sample", "refused"],
+)
+def test_an_instance_that_fails_at_the_blank_sample_after_three_failed_batches_ends(
+    batches: str, blank: str, status: int
+) -> None:
+    ended = run(f"""{BATCHES}
+    for batch in {batches}:
+        guard.look_at(batch, {blank})
+    os._exit(7)
+    """)
+    assert ended.returncode == status, ended.stderr
+    assert ("a lost device" in ended.stderr) == (status == 1)
+
+
+def test_a_model_process_ends_with_triton() -> None:
+    code = textwrap.dedent(GUARD) + "print('runs', flush=True); time.sleep(3600)"
+    parent = subprocess.Popen(
+        [sys.executable, "-c", f"import subprocess, sys; subprocess.run([sys.executable, '-c', {code!r}])"],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert parent.stdout is not None
+    with parent.stdout as told:
+        assert told.readline() == "runs\n"
+        parent.kill()
+        parent.wait(PATIENCE_S)
+        assert told.read() == ""  # ends when the model process, which has inherited it, has ended
