@@ -144,7 +144,7 @@ class Supervisor:
                 self._start()
                 return
             except ServerStartError as error:
-                what, why = error.model or TRITON, str(error)
+                what, why = error.model or what, str(error)  # Triton 2.51 itself ends with a process that loads
 
     def _leaves_out(self, what: str, why: str) -> bool:
         """Whether others are served without the model ``what``, and what is made of it, from now on."""

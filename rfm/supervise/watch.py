@@ -12,6 +12,7 @@ A process that hangs in a batch, or whose device is broken, ends itself (``rfm.t
 
 from __future__ import annotations
 
+import logging
 import re
 import threading
 import time
@@ -41,6 +42,8 @@ _PROGRESS = re.compile(  # counts that grow while a model gets on
 )
 
 TRITON = "triton"
+
+logger = logging.getLogger(__name__)
 
 Config = Mapping[str, Any]
 
@@ -97,14 +100,18 @@ class Watch:
                 _, text = self._metrics.request("GET", "/metrics", min(_TIMEOUT_S, self._silent_s / LOOKS))
             except NO_ANSWER:
                 num_failed += 1
+                self.reasons = dict.fromkeys(self.served, "tritonserver gives no answer")
                 if num_failed >= LOOKS and time.monotonic() - answered_s >= self._silent_s:
                     self.fault = TRITON, f"no answer for {self._silent_s:g} s"
                 continue
             num_failed, answered_s = 0, time.monotonic()
-            self._note_progress(text)
-            with suppress(*NO_ANSWER):  # while the threads of HTTP wait for models that are loaded
-                self._keep_up()
-            self.fault = self._processes.fault(self._ready.keys() - self._going) or self._probed()
+            try:
+                self._note_progress(text)
+                with suppress(*NO_ANSWER):  # while the threads of HTTP wait for models that are loaded
+                    self._keep_up()
+                self.fault = self._processes.fault(self._ready.keys() - self._going) or self._probed()
+            except Exception:  # the next look may do better; without looks nothing would be healed
+                logger.exception("an unexpected error")
 
     def _note_progress(self, metrics: str) -> None:
         counts: Counter[str] = Counter()

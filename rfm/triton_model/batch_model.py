@@ -141,9 +141,9 @@ class BatchModel(Generic[Question, Answer]):
         self, batch: list[Request[Question]], score: Callable[[list[Request[Question]]], Scored[Question]]
     ) -> list[Any]:
         """Triton's responses to requests that are scored meanwhile."""
+        self._is_executing = True
         for request in batch:
             self._read(request)
-        self._is_executing = True
         scored = score(batch)
         self._is_executing = False
         responses = [self._response(request) for request in batch]

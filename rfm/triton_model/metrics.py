@@ -20,7 +20,7 @@ from rfm.execution import Execution
 from rfm.triton_model.request import OUTCOMES, SCORED, UNKNOWN_TYPE, Request
 
 FLUSH_INTERVAL_S = 0.25
-IDLE_INTERVAL_S = 5.0  # while no request comes
+IDLE_INTERVAL_S = 1.0  # while no batch ends
 
 COUNTER, GAUGE, HISTOGRAM = "COUNTER", "GAUGE", "HISTOGRAM"  # as Triton names them
 FRAMES, RETRIES = "frames_total", "out_of_memory_retries_total"

@@ -1,127 +1,112 @@
 # SPDX-License-Identifier: MIT
-"""Faults that ``rfm serve`` survives: dead and hung processes, poison, more requests than can be served."""
+"""Faults that ``rfm serve`` survives, each by the same cure: Triton is started again."""
 
 from __future__ import annotations
 
-import asyncio
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
-from clock import Clock
-from prometheus_client.parser import text_string_to_metric_families
-from rfm.supervise.model_processes import ProcessWatch
-from rfm.supervise.model_reload import OwedAnswersError, Reload
-from rfm.triton_model.quarantine import Quarantine
-from rfm.triton_model.request_digest import digest
-from rfm.triton_model.self_check import FAILED_BATCHES
 
+import rollout
+from clock import Clock
 from commands import is_alive
-from one_model import BriefServer, OneModelServer
-from patients import CALLERS, DEADLY, MARK, TOLERANCE, Callers, answering_after, make_repository, trajectory
+from one_model import BriefServer
+from patients import CALLERS, DEADLY, MARK, TOLERANCE, Callers, make_repository, references, trajectory
+from repositories import bound_queue
 from rfm.launch import cleanup
 from rfm.launch.cleanup import SHARED_MEMORY
 from rfm.launch.installation import find_installation
 from rfm.launch.process import Endpoints
+from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
 from rfm.supervise import back_off
 from rfm.supervise.back_off import BackOff, CrashLoopError
-from rfm_client import (
-    InferenceFailedError,
-    InvalidSampleError,
-    ProgressSample,
-    RewardClient,
-    ServerUnavailableError,
-)
-from rfm_client.contract import triton, wire
-from rfm_client.transport.calls import Answer, connect
+from rfm.supervise.status import NO_REASON
+from rfm.triton_model.guard import FAILED_BATCHES
+from rfm_client import InferenceFailedError, RewardClient, ServerUnavailableError
+from rfm_commands.rollout import Rollout
 from rfm_serve import MODEL, PATIENCE_S, RFM, TRUTH_S, Serving, children, serving, wait_for
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
-SLOW = f"""
+__all__ = ["references"]  # a fixture
 
-_answer = TritonPythonModel.answer
-
-
-def slow(self, questions, execution):
-    import time
-
-    time.sleep(0.5 * sum(q.sample.trajectories[0].text_embedding[0] == {MARK} for q in questions))
-    return _answer(self, questions, execution)
+KEY = "a-key-that-only-tests-know"
+OTHER = f"{MODEL}_b"
+HANG_S = 3
 
 
-TritonPythonModel.answer = slow
-"""
-CHEAP = f"""
+def answering(body: str) -> str:
+    """Code for a model.py that does something before it answers. ``marked``: whether a question is marked"""
+    return f"""
 
-from rfm.triton_model import batch_model
-
-batch_model.CHEAP_ANSWER_S = {{"cpu": {PATIENCE_S}}}  # every answer counts as cheap, however slow the machine is
-"""
-BREAKS = """
-
-_answer = TritonPythonModel.answer
-_broken = []
+_plain_answer = TritonPythonModel.answer
 
 
-def breaking(self, questions, execution):
-    import os
+def answer(self, questions, execution):
+    import os, time
 
-    if os.path.exists({trigger!r}):
-        try:
-            os.unlink({trigger!r})  # one process can
-            _broken.append(True)
-        except FileNotFoundError:
-            pass
-    if _broken:
-        raise RuntimeError("CUDA error: device-side assert triggered")
-    return _answer(self, questions, execution)
+    marked = any(q.sample.trajectories[0].text_embedding[0] == {MARK} for q in questions)
+    {body}
+    return _plain_answer(self, questions, execution)
 
 
-TritonPythonModel.answer = breaking
-"""
-STICKY = answering_after(0.3)
-FAILS = f"""
-
-_answer = TritonPythonModel.answer
-
-
-def failing(self, questions, execution):
-    if any(q.sample.trajectories[0].text_embedding[0] == {MARK} for q in questions):
-        raise RuntimeError("a kernel that does not like this sample")
-    return _answer(self, questions, execution)
-
-
-TritonPythonModel.answer = failing
+TritonPythonModel.answer = answer
 """
 
 
-def num_restarts(served: Serving, what: str) -> float:
-    """Restarts of Triton, or of a model: a process that owes answers when it ends takes Triton along."""
-    restarts = {name: served.metric("rfm_serve_restarts_total", what=name) for name in (MODEL, "triton")}
-    return sum(restarts.values()) if what == MODEL else restarts[what]
+@contextmanager
+def administered(repository: Path, **settings: int) -> Iterator[tuple[Serving, RepositoryApi]]:
+    """The repository is served, with these settings, and ready; and the API that changes what is."""
+    key_file, config = repository.parent / "key", repository.parent / "serve.yaml"
+    key_file.touch(0o600)
+    key_file.write_text(KEY)
+    config.write_text("".join(f"{name}: {value}\n" for name, value in settings.items()))
+    with serving(repository, f"--admin-key-file={key_file}", f"--config={config}") as served:
+        served.wait_ready()
+        with RepositoryApi(served.endpoints.grpc_url, KEY) as api:
+            yield served, api
+
+
+def change(file: Path, pattern: str, wanted: str) -> None:
+    text, count = re.subn(pattern, wanted, file.read_text())
+    assert count == 1, pattern
+    file.write_text(text)
+
+
+def restarts(served: Serving, what: str) -> float:
+    return served.metric("rfm_serve_restarts_total", what=what)
+
+
+def add_other(repository: Path, more_code: str = "") -> Path:
+    """A second model; its model.py."""
+    shutil.copytree(repository / MODEL, repository / OTHER)
+    change(repository / OTHER / "config.pbtxt", f'name: "{MODEL}"', f'name: "{OTHER}"')
+    code = repository / OTHER / "1" / "model.py"
+    code.write_text(code.read_text() + more_code)
+    return code
 
 
 def test_dead_and_hung_processes_are_healed_and_no_call_is_lost(
     tmp_path: Path, references: list[np.ndarray[Any, Any]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     def kill_a_stub(served: Serving) -> None:
-        served.model_processes[0].kill()
+        os.kill(served.model_processes()[0], signal.SIGKILL)
 
     def stop_a_stub(served: Serving) -> None:
-        os.kill(served.model_processes[0].pid, signal.SIGSTOP)
+        os.kill(served.model_processes()[0], signal.SIGSTOP)
 
     def kill_triton(served: Serving) -> None:
         os.kill(served.triton, signal.SIGKILL)
@@ -134,7 +119,7 @@ def test_dead_and_hung_processes_are_healed_and_no_call_is_lost(
         with served.client() as client, Callers(client, references) as callers:
             for fault, what in faults.items():
                 callers.wait_for_all()
-                before = num_restarts(served, what)
+                before = restarts(served, what)
                 fault(served)
                 told_s = served.wait_ready(False, TRUTH_S)
                 answer = served.ready()
@@ -143,7 +128,7 @@ def test_dead_and_hung_processes_are_healed_and_no_call_is_lost(
                 assert served.metric("rfm_serve_ready", model=MODEL) == 0
                 back_s = told_s + served.wait_ready(True, 10 + 2 * load_s + 5)
                 callers.wait_for_all()
-                assert num_restarts(served, what) == before + 1
+                assert restarts(served, what) == before + 1
                 with capsys.disabled():
                     print(f"\n{fault.__name__}: not ready after {told_s:.1f} s, back after {back_s:.1f} s", end="")
         with capsys.disabled():
@@ -174,7 +159,7 @@ def test_a_server_that_is_killed_leaves_nothing_running_and_the_next_removes_the
     try:
         served = Serving(killed, endpoints, f"http://127.0.0.1:{port}", tmp_path / "none")
         served.wait_ready()
-        started = [served.triton, *(process.pid for process in served.model_processes)]
+        started = [served.triton, *served.model_processes()]
         assert len(started) == 2
     finally:
         killed.kill()
@@ -216,7 +201,9 @@ def test_what_a_killed_container_left_is_removed_and_what_a_living_one_has_is_no
     try:
         wait_for(folders)
         names += [folder.name.removeprefix("rfm-backends-").replace("-", "_") for folder in folders()]
-        wait_for(lambda: any(path.name.endswith("_rfm_batch") for path in left()))  # a model process of it runs
+        wait_for(
+            lambda: any(not path.name.endswith("_lock") and path.parent == SHARED_MEMORY for path in left())
+        )  # a model process of it runs
         own = left()
         assert not own & set(cleanup.clear())
         assert own <= left()
@@ -227,119 +214,172 @@ def test_what_a_killed_container_left_is_removed_and_what_a_living_one_has_is_no
     assert not own & left()
 
 
-def test_a_request_that_kills_the_model_twice_is_refused_and_its_neighbours_are_served(
+def test_a_request_that_ends_its_process_fails_after_two_and_others_are_answered(
     tmp_path: Path, references: list[np.ndarray[Any, Any]]
 ) -> None:
     with serving(make_repository(tmp_path, more_code=DEADLY)) as served:
         served.wait_ready()
-        with served.client() as client, Callers(client, references) as callers:
-            callers.wait_for_all()
-            with pytest.raises(InvalidSampleError, match="request: expected one that the model survives, got one that"):
-                client.progress(trajectory(99, mark=MARK))  # sent again and again, until it is refused
-            served.wait_ready()
-            callers.wait_for_all()
-            with pytest.raises(InvalidSampleError, match="ended its process 2 times: it is refused for 10 minutes"):
+        with served.client() as client:
+            with pytest.raises(ServerUnavailableError, match="ended under this request twice"):
                 client.progress(trajectory(99, mark=MARK))
-        assert (callers.lost, callers.wrong) == ([], [])
-        # The first death takes Triton along if the process owed answers, as it may under load.
-        restarts = [served.metric("rfm_serve_restarts_total", what=what) for what in (MODEL, "triton")]
-        assert restarts in ([2, 0], [1, 1]), served.said
-        wait_for(lambda: served.metric("rfm_serve_poison_refused_total") == 2)
-
-
-@pytest.mark.parametrize(("number", "times"), [(signal.SIGKILL, 1), (signal.SIGSTOP, 2)])
-def test_who_waits_for_a_process_that_dies_or_stops_is_answered_by_the_next(
-    tmp_path: Path, references: list[np.ndarray[Any, Any]], number: signal.Signals, times: int
-) -> None:
-    """Answers that take long are sent later. Triton never tells those who wait for them that they will not come.
-
-    What a stopped process works on is no suspect: it may be stopped as often as you like.
-    """
-    with (
-        serving(make_repository(tmp_path, more_code=STICKY)) as served,
-        served.client(timeout_s=PATIENCE_S) as client,
-        ThreadPoolExecutor(8) as pool,
-    ):
-        for _ in range(times):
             served.wait_ready()
-            client.progress(trajectory(0))  # from now on it is known how long answers take
-            waiting = [pool.submit(client.progress, trajectory(seed)) for seed in range(6)]
-            (process,) = served.model_processes
-            wait_for(lambda process=process: process.journal is not None and process.journal.num_owed > 1)  # type: ignore[misc]
-            os.kill(process.pid, number)
-            for future, expected in zip(waiting, references, strict=False):
-                np.testing.assert_allclose(future.result().progress, expected, rtol=0, atol=TOLERANCE)
-        assert served.metric("rfm_serve_restarts_total", what="triton") == times
-        assert served.metric("rfm_serve_restarts_total", what=MODEL) == 0
+            np.testing.assert_allclose(client.progress(trajectory(0)).progress, references[0], rtol=0, atol=TOLERANCE)
+        assert restarts(served, MODEL) == 2
 
 
-def test_a_reload_that_ends_a_process_says_what_it_owed(tmp_path: Path) -> None:
-    """A stopped process that Triton takes for dead is ended by the unload, so nobody finds it dead later."""
-    with (
-        OneModelServer(make_repository(tmp_path, more_code=STICKY), Endpoints.free()) as server,
-        ThreadPoolExecutor(6) as pool,
-        RewardClient(server.endpoints.grpc_url, retry=False) as client,
-    ):
-        (process,) = ProcessWatch(server.pid, PATIENCE_S).of_model(MODEL)
-        client.progress(trajectory(0))
-        waiting = [pool.submit(client.progress, trajectory(seed)) for seed in range(6)]
-        wait_for(lambda: process.journal is not None and process.journal.num_owed > 1)
-        os.kill(process.pid, signal.SIGSTOP)
-        with server.repository_api() as api:
-            config = api.config(MODEL, 1)
-        with pytest.raises(OwedAnswersError, match=r"processes of rfm have ended, and owe [2-6] answers"):
-            Reload(MODEL, server, config, is_out=False, was_hung=False).load([process])
-        assert not process.is_alive
-        server.kill()
-        assert any(isinstance(future.exception(), ServerUnavailableError) for future in waiting)
-
-
-def test_a_suspect_is_remembered_when_triton_is_started_again(tmp_path: Path) -> None:
-    """The first death takes Triton along, since answers are owed; the second one only its process."""
-    with serving(make_repository(tmp_path, more_code=STICKY + DEADLY)) as served:
-        served.wait_ready()
-        with served.client(timeout_s=PATIENCE_S) as client:
-            client.progress(trajectory(0))
-            with pytest.raises(InvalidSampleError, match="ended its process 2 times: it is refused for 10 minutes"):
-                client.progress(trajectory(99, mark=MARK))
-        assert served.metric("rfm_serve_restarts_total", what="triton") == 1
-        assert served.metric("rfm_serve_restarts_total", what=MODEL) == 1
-
-
-def test_one_broken_instance_of_several_is_found_and_healed(
+def test_a_batch_that_hangs_ends_its_process_and_is_asked_again(
     tmp_path: Path, references: list[np.ndarray[Any, Any]]
 ) -> None:
     trigger = tmp_path / "trigger"
-    repository = make_repository(tmp_path, more_code=BREAKS.format(trigger=str(trigger)), instances=2)
-    with serving(repository) as served, served.client() as client:
-        served.wait_ready()
-        with Callers(client, references) as callers:
-            for count in (1, 2):
-                callers.wait_for_all()
-                trigger.touch()
-                wait_for(lambda count=count: served.metric("rfm_serve_restarts_total", what=MODEL) == count)  # type: ignore[misc]
-                served.wait_ready()
-                failed = list(callers.lost)
-                callers.lost.clear()
-                assert 0 < len(failed) <= FAILED_BATCHES * CALLERS
-                assert {type(error) for error in failed} == {InferenceFailedError}
-                callers.wait_for_all()
+    hangs = f"""if os.path.exists({str(trigger)!r}):
+        os.unlink({str(trigger)!r})
+        time.sleep(3600)"""
+    with administered(make_repository(tmp_path, more_code=answering(hangs), instances=2), hang_s=HANG_S) as (served, _):
+        with served.client() as client, Callers(client, references) as callers:
+            callers.wait_for_all()
+            trigger.touch()
+            wait_for(lambda: restarts(served, MODEL) == 1)
+            served.wait_ready()
+            callers.wait_for_all()
         assert (callers.lost, callers.wrong) == ([], [])
-        assert served.metric("rfm_serve_poison_refused_total") == 0  # nobody is blamed
-    assert served.log.read_text().count("instance_broken") == 2
+    assert "Timeout (0:00:03)!" in served.log.read_text()
+
+
+def test_a_batch_that_gets_on_may_take_long(tmp_path: Path) -> None:
+    gets_on = f"""for _ in range({4 * HANG_S} if marked else 0):
+        time.sleep(0.5)
+        execution.on_forward()"""
+    with administered(make_repository(tmp_path, more_code=answering(gets_on)), hang_s=HANG_S) as (served, _):
+        with served.client() as client:
+            assert np.isfinite(client.progress(trajectory(0, mark=MARK)).progress).all()
+        assert restarts(served, MODEL) == restarts(served, "triton") == 0
+
+
+def test_one_broken_instance_of_several_ends_and_is_healed(
+    tmp_path: Path, references: list[np.ndarray[Any, Any]]
+) -> None:
+    trigger = tmp_path / "trigger"
+    breaks = f"""if os.path.exists({str(trigger)!r}):
+        os.unlink({str(trigger)!r})
+        type(self).is_broken = True
+    if getattr(self, "is_broken", False):
+        raise RuntimeError("CUDA error: device-side assert triggered")"""
+    with serving(make_repository(tmp_path, more_code=answering(breaks), instances=2)) as served:
+        served.wait_ready()
+        with served.client() as client, Callers(client, references) as callers:
+            callers.wait_for_all()
+            trigger.touch()
+            wait_for(lambda: restarts(served, MODEL) == 1)
+            served.wait_ready()
+            assert 0 < len(callers.lost) <= FAILED_BATCHES * CALLERS
+            assert {type(error) for error in callers.lost} == {InferenceFailedError}
+            callers.lost.clear()
+            callers.wait_for_all()
+        assert (callers.lost, callers.wrong) == ([], [])
+    assert "instance is broken" in served.log.read_text()
 
 
 def test_samples_that_fail_do_not_end_the_instance(tmp_path: Path, references: list[np.ndarray[Any, Any]]) -> None:
-    with serving(make_repository(tmp_path, more_code=FAILS)) as served, served.client(retry=False) as client:
+    fails = """if marked:
+        raise RuntimeError("a kernel that does not like this sample")"""
+    with serving(make_repository(tmp_path, more_code=answering(fails))) as served, served.client(retry=False) as client:
         served.wait_ready()
-        before = served.model_processes
+        before = served.model_processes()
         for _ in range(4 * FAILED_BATCHES):
             with pytest.raises(InferenceFailedError, match="scoring failed"):
                 client.progress(trajectory(99, mark=MARK))
         np.testing.assert_allclose(client.progress(trajectory(0)).progress, references[0], rtol=0, atol=TOLERANCE)
-        assert served.model_processes == before
-        assert served.metric("rfm_serve_restarts_total") == 0
+        assert served.model_processes() == before
     assert served.said == []
+
+
+def test_what_was_served_is_served_again_and_not_what_was_exported_since(tmp_path: Path) -> None:
+    repository, samples = tmp_path / "repository", rollout.questions()
+    rollout.export(rollout.WITH_ENCODERS.checkpoint, repository)
+    expected = rollout.answers(rollout.WITH_ENCODERS.checkpoint, samples)
+    parts = (MODEL, "rfm_encoder", "rfm_frames")
+    with administered(repository) as (served, _):
+        rollout.export(rollout.other_checkpoint(tmp_path / "other"), repository)
+        os.kill(served.triton, signal.SIGKILL)
+        served.wait_ready(False)
+        served.wait_ready()
+        assert served.reasons() == dict.fromkeys(parts, NO_REASON)
+        with served.client() as client:
+            for got, wanted in zip(client.evaluate(samples), expected, strict=True):
+                assert rollout.difference(got, wanted) <= rollout.TOLERANCE
+        with RepositoryApi(served.endpoints.grpc_url, KEY) as again:
+            assert [again.ready_versions(part) for part in parts] == [[1]] * 3
+            Rollout(repository, MODEL, again, lambda _: None).to(2)
+            assert [again.ready_versions(part) for part in parts] == [[2]] * 3
+        served.wait_ready()
+        assert (restarts(served, "triton"), restarts(served, MODEL)) == (1, 0)
+
+
+def test_models_come_and_go(tmp_path: Path) -> None:
+    repository = make_repository(tmp_path)
+    with administered(repository) as (served, api):
+        add_other(repository)
+        api.load(OTHER)
+        wait_for(lambda: served.reasons() == {MODEL: NO_REASON, OTHER: NO_REASON})
+        os.kill(served.model_processes(OTHER)[0], signal.SIGKILL)
+        wait_for(lambda: restarts(served, OTHER) == 1)
+        wait_for(lambda: served.reasons() == {MODEL: NO_REASON, OTHER: NO_REASON})
+        with RepositoryApi(served.endpoints.grpc_url, KEY) as again:
+            again.unload(OTHER)
+            wait_for(lambda: served.reasons() == {MODEL: NO_REASON})
+            os.kill(served.triton, signal.SIGKILL)
+            wait_for(lambda: restarts(served, "triton") == 1)
+            served.wait_ready()
+            assert served.reasons() == {MODEL: NO_REASON}
+
+
+def test_a_version_that_does_not_load_costs_the_other_nothing(
+    tmp_path: Path, references: list[np.ndarray[Any, Any]]
+) -> None:
+    repository = make_repository(tmp_path)
+    model = repository / MODEL
+    shutil.copytree(model / "1", model / "2")
+    with (model / "2" / "model.py").open("a") as code:
+        code.write("\n\nimport os\n\nos._exit(1)\n")
+    with administered(repository) as (served, api), served.client() as client:
+        change(model / "config.pbtxt", r"versions: 1", "versions: 1 versions: 2")
+        with Callers(client, references) as callers:
+            with pytest.raises(RepositoryApiError):
+                api.load(MODEL)
+            callers.wait_for_all()
+        assert (callers.lost, callers.wrong) == ([], [])
+        assert restarts(served, MODEL) == 0
+
+
+def test_a_model_that_keeps_ending_is_left_out_and_named_and_the_other_serves(tmp_path: Path) -> None:
+    trigger = tmp_path / "trigger"
+    repository = make_repository(tmp_path)
+    add_other(
+        repository,
+        answering(f"""if os.path.exists({str(trigger)!r}):
+        os._exit(1)"""),
+    )
+    with administered(repository) as (served, _), served.client() as client:
+        trigger.touch()
+        wait_for(lambda: served.reasons().get(OTHER, "").startswith("it is left out"))
+        wait_for(lambda: served.reasons().get(MODEL) == NO_REASON)
+        assert not served.is_ready()
+        assert np.isfinite(client.progress(trajectory(0)).progress).all()
+        trigger.unlink()
+        with RepositoryApi(served.endpoints.grpc_url, KEY) as api:
+            api.load(OTHER)
+        served.wait_ready()
+    assert any(line.startswith(f"rfm: {OTHER} is left out, since it kept ending: ") for line in served.said)
+
+
+def test_a_triton_that_does_not_answer_is_started_again(tmp_path: Path) -> None:
+    with serving(make_repository(tmp_path), "--triton-silent-s=3") as served:
+        served.wait_ready()
+        os.kill(served.triton, signal.SIGSTOP)
+        wait_for(lambda: not served.is_ready())
+        wait_for(lambda: restarts(served, "triton") == 1)
+        served.wait_ready()
+    assert served.said == ["rfm: triton is started again: triton: no answer for 3 s"]
 
 
 def test_a_crash_loop_ends_with_its_reason(tmp_path: Path) -> None:
@@ -406,10 +446,10 @@ def test_starts_that_fail_are_a_crash_loop_however_long_it_ran_before(
         ends.pause_s("it does not start")
 
 
-@pytest.mark.parametrize("instances", [1, 2])
-def test_a_full_queue_refuses_at_once_and_a_long_wait_is_cut_short(tmp_path: Path, instances: int) -> None:
-    bounds = {"max_queue_size": 4, "queue_timeout_ms": 1500}
-    repository = make_repository(tmp_path, more_code=SLOW, instances=instances, batch_size=2, **bounds)
+def test_a_full_queue_refuses_at_once_and_a_long_wait_is_cut_short(tmp_path: Path) -> None:
+    """By Triton's own policy; with one instance, Triton 2.51 notices a free one half a second late."""
+    repository = make_repository(tmp_path, more_code=answering("time.sleep(0.5 * marked)"), instances=2, batch_size=2)
+    bound_queue(repository / MODEL, max_queue_size=4, timeout_ms=600)
     with (
         (tmp_path / "log").open("wb") as log,
         BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
@@ -419,98 +459,20 @@ def test_a_full_queue_refuses_at_once_and_a_long_wait_is_cut_short(tmp_path: Pat
         ThreadPoolExecutor(64) as pool,
     ):
         slow = trajectory(0, mark=MARK)
-        client.progress(slow)
 
-        def ask(which: RewardClient) -> tuple[float, Exception | None]:
-            started_s = time.monotonic()
+        def ask(which: RewardClient) -> Exception | None:
             try:
                 which.progress(slow)
-                return time.monotonic() - started_s, None
             except ServerUnavailableError as error:
-                return time.monotonic() - started_s, error
+                return error
+            return None
 
         outcomes = [future.result() for future in [pool.submit(ask, which) for which in (client, over_http) * 12]]
-        full = [took_s for took_s, error in outcomes if error is not None and triton.QUEUE_FULL in str(error)]
-        late = [took_s for took_s, error in outcomes if error is not None and "has waited for longer" in str(error)]
-        served = [took_s for took_s, error in outcomes if error is None]
-        assert len(full) + len(late) + len(served) == len(outcomes)
-        # Each instance works on a batch, four requests wait, and each instance may begin another batch.
-        assert len(full) >= len(outcomes) - 2 * instances - 4 - 2 * instances
-        wait_for(lambda: rejected(server.endpoints.metrics_url) == len(full) + len(late))
-        assert served
-        assert max(served) < PATIENCE_S / 4
-        assert sorted(full)[len(full) // 2] < max(served)  # they did not wait for anybody
+        full = [error for error in outcomes if error is not None and "Exceeds maximum queue size" in str(error)]
+        assert full
+        assert outcomes.count(None) >= 4
         # Who tries again is served in the end.
-        assert [future.result()[1] for future in [pool.submit(ask, patient) for _ in range(12)]] == [None] * 12
-
-
-def test_a_full_queue_refuses_cheap_requests_that_triton_hands_over_one_by_one(tmp_path: Path) -> None:
-    """Every other request has one more input, so none shares a batch with the next, however many wait in Triton."""
-    repository = make_repository(tmp_path, more_code=CHEAP, max_queue_size=4)
-    with (repository / MODEL / "config.pbtxt").open("a") as config:
-        config.write('input { name: "more" data_type: TYPE_FP32 dims: [ 1 ] optional: true }\n')
-    inputs = wire.encode_samples([ProgressSample(trajectory(0))])
-    others = inputs | {"more": np.zeros((1, 1), np.float32)}
-
-    async def outcomes(url: str) -> list[Answer | BaseException]:
-        server = connect(url)
-        try:
-            await server.infer(MODEL, inputs, ["progress"], PATIENCE_S)
-            asked = [server.infer(MODEL, each, ["progress"], PATIENCE_S) for each in [inputs, others] * 128]
-            return await asyncio.gather(*asked, return_exceptions=True)
-        finally:
-            await server.close()
-
-    with (
-        (tmp_path / "log").open("wb") as log,
-        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
-    ):
-        came = asyncio.run(outcomes(server.endpoints.grpc_url))
-        errors = [outcome for outcome in came if isinstance(outcome, BaseException)]
-        assert 0 < len(errors) < len(came)
-        assert all(triton.QUEUE_FULL in str(error) for error in errors)
-        wait_for(lambda: rejected(server.endpoints.metrics_url) == len(errors))
-
-
-def rejected(metrics_url: str) -> float:
-    """Samples that a model has counted as rejected."""
-    families = text_string_to_metric_families(httpx.get(metrics_url).text)
-    counted = (sample for family in families if family.name == "rfm_samples" for sample in family.samples)
-    return sum(sample.value for sample in counted if sample.labels.get("outcome") == "rejected")
-
-
-def test_a_journal_outlives_its_process_and_tells_what_it_was_working_on(tmp_path: Path) -> None:
-    tensors = {"a": np.arange(100_000, dtype=np.float32), "task": np.array([[b"stack"]], np.object_)}
-    first = digest(tensors)
-    assert first == digest({name: array.copy() for name, array in tensors.items()})
-    changed = dict(tensors, a=tensors["a"].copy())
-    changed["a"] += 1
-    others = [digest(changed), digest(dict(tensors, task=np.array([[b"sort"]], np.object_)))]
-    assert len({first, *others}) == 3
-
-    def die(name: str) -> None:
-        """A process that dies while it works on two requests."""
-        code = "import os, sys; from pathlib import Path; from rfm.triton_model.quarantine import Quarantine; folder = Path(sys.argv[1])\n"
-        code += "own = Quarantine(folder / sys.argv[2], sorted(folder.glob('*_batch')), 4)\n"
-        code += "with own.at_work_on([bytes.fromhex(word) for word in sys.argv[3:]]): os._exit(1)"
-        words = [told.hex() for told in (first, others[0])]
-        subprocess.run([sys.executable, "-c", code, tmp_path, name, *words], check=False, timeout=PATIENCE_S)
-
-    die("1_batch")
-    one = Quarantine(tmp_path / "2_batch", tmp_path.glob("1_batch"), 4)
-    assert [one.is_suspect(told) for told in (first, *others)] == [True, True, False]
-    one.check(first)
-    with one.at_work_on([others[0]]):
-        pass
-    assert [one.is_suspect(told) for told in (first, *others)] == [True, False, False]
-    one.close()
-    die("3_batch")
-    two = Quarantine(tmp_path / "4_batch", sorted(tmp_path.glob("*_batch")), 4)
-    with pytest.raises(InvalidSampleError, match="ended its process 2 times"):
-        two.check(first)
-    two.check(others[0])  # once: it was survived meanwhile
-    assert two.is_suspect(others[0])
-    two.close()
+        assert [future.result() for future in [pool.submit(ask, patient) for _ in range(12)]] == [None] * 12
 
 
 def test_the_status_port_names_a_taken_port(tmp_path: Path) -> None:
