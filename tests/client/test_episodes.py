@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import os
+import signal
 import time
 import urllib.request
 from collections.abc import Iterator, Sequence
@@ -470,8 +472,8 @@ def test_an_episode_goes_on_when_the_process_that_knew_its_frames_was_killed(
         served.wait_ready()
         with client.episode(TASK, frames=4) as episode:
             scores = [episode.add(frame) for frame in frames[:5]]
-            (process,) = served.model_processes_of(killed)
-            process.kill()
+            (process,) = served.model_processes(killed)
+            os.kill(process, signal.SIGKILL)
             while len(scores) < len(frames):
                 with suppress(ServerUnavailableError, ProcessEndedError):  # then the episode has not grown
                     scores.append(episode.add(frames[len(scores)]))

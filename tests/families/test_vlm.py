@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from rfm.steps import telling
 
 import goldens
 from engines import load_engine
@@ -483,19 +482,3 @@ def test_dense_mode_encodes_each_shot_once(name: str) -> None:
     shown = [np.linspace(0, t, 4).astype(int) for t in range(5)]
     pairs = {tuple(pair) for picked in shown for pair in picked.reshape(-1, 2).tolist()}
     assert execution.num_encoded == (5 if name.startswith("q3") else 2 * len(pairs))
-
-
-@pytest.mark.parametrize("size", [(60, 90), (600, 400)], ids=["small", "large"])
-@pytest.mark.parametrize("name", [PLAIN, "q25_video_avg_disc10", "smol_mean_disc10"])
-def test_each_frame_that_is_brought_to_size_is_a_step_also_beside_a_forward_pass(
-    name: str, size: tuple[int, int]
-) -> None:
-    engine, steps = load_engine(name), []
-    alone = Engine(engine.predictor, token_budget=1)  # each sample is a batch of its own
-    prepared = [alone.prepare(ProgressSample(film(seed, 3, *size))) for seed in range(2)]
-    with telling(lambda: steps.append(None)):
-        alone.work_ahead(alone.prepare(ProgressSample(film(2, 3, *size))))
-        ahead = len(steps)
-        alone.score(prepared, Execution())
-    assert ahead >= 3
-    assert len(steps) == 3 * ahead

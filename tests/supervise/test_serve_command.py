@@ -122,7 +122,7 @@ def test_neither_triton_nor_a_model_process_has_a_key_in_its_environment(
     with serving(repository, f"--gateway-port={Endpoints.free().http_port}") as served:
         served.wait_ready()
         (gateway,) = [pid for pid in children(served.process.pid, ".") if pid != served.triton]
-        for pid in (served.triton, *(process.pid for process in served.model_processes)):
+        for pid in (served.triton, *served.model_processes()):
             assert not [word for word in environment(pid) if "a-secret-of-" in word]
             assert "GOMP_SPINCOUNT=10000" in environment(pid)
         assert [word for word in environment(gateway) if "a-secret-of-" in word] == [

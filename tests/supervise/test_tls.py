@@ -10,9 +10,6 @@ from pathlib import Path
 
 import httpx
 import pytest
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from typer.testing import CliRunner
 
 import rfm_export
@@ -21,7 +18,7 @@ from engines import serve_config
 from repositories import kill_model
 from rfm.launch.installation import find_installation
 from rfm.launch.process import Endpoints, TritonServer
-from rfm.launch.tls import GrpcTls, OwnTls
+from rfm.launch.tls import GrpcTls
 from rfm_client import ServerUnavailableError
 from rfm_client.status import read_status
 from rfm_client.transport.access import Access
@@ -35,7 +32,6 @@ from secured import (
     Papers,
     client,
     denied_at_once,
-    refused_to_serve,
     scores_right,
 )
 
@@ -102,12 +98,12 @@ def test_a_client_without_a_certificate_is_refused(mutual: Endpoints, papers: Pa
         assert not asked.is_ready()
 
 
-def test_http_beside_tls_listens_on_loopback_alone(papers: Papers, tmp_path: Path) -> None:
+def test_http_beside_tls_listens_on_loopback_alone(papers: Papers) -> None:
     tls = GrpcTls(papers.certificate, papers.key)
     endpoints = Endpoints("10.0.0.1", 8000, 8001, 8002, tls)
     arguments = TritonServer(REPOSITORY, endpoints, find_installation())._arguments(["rfm"])
     assert {"--http-address=127.0.0.1", "--grpc-address=10.0.0.1"} <= set(arguments)
-    assert "--grpc-use-ssl=true" in OwnTls(tls).arguments(tmp_path)
+    assert "--grpc-use-ssl=true" in tls.arguments()
     assert endpoints.http_url == "http://127.0.0.1:8000"
 
 
@@ -130,7 +126,7 @@ def test_tls_on_one_side_alone_gives_no_connection(mutual: Endpoints, papers: Pa
 
 
 @pytest.mark.parametrize("with_client_ca", [False, True], ids=["server", "mutual"])
-def test_rfm_serve_itself_loads_over_grpc_with_tls(papers: Papers, tmp_path: Path, with_client_ca: bool) -> None:
+def test_rfm_serve_heals_with_tls(papers: Papers, tmp_path: Path, with_client_ca: bool) -> None:
     """It is told of no certificate for itself. `rfm models` is, and shows that there is no other way in."""
     repository, endpoints = tmp_path / "model_repository", Endpoints.free()
     rfm_export.export(PLAIN.checkpoint, repository, serve_config(PLAIN))
@@ -148,7 +144,7 @@ def test_rfm_serve_itself_loads_over_grpc_with_tls(papers: Papers, tmp_path: Pat
         kill_model(repository)
         with client(endpoints.grpc_url, **papers.client) as asked:  # it asks again until the model is back
             scores_right(asked)
-        assert "rfm: rfm is started again: its process is dead" in (tmp_path / "log").read_text()
+        assert "rfm: triton is started again: rfm: a process of it is dead" in (tmp_path / "log").read_text()
         list_models = ["list", "--url", endpoints.grpc_url, "--admin-key-file", str(key_file)]
         own = ["--client-certificate", str(papers.client_certificate), "--client-key", str(papers.client_key)]
         trusted = ["--ca-file", str(papers.ca), *own]
@@ -161,22 +157,3 @@ def test_rfm_serve_itself_loads_over_grpc_with_tls(papers: Papers, tmp_path: Pat
     finally:
         process.terminate()
         process.wait(EXIT_S)  # Triton 2.51 gives 1 where a request met the dead process
-
-
-def test_a_certificate_that_names_no_host_is_told_before_anything_starts(papers: Papers, tmp_path: Path) -> None:
-    """gRPC's clients could trust no server that has it."""
-    named = x509.load_pem_x509_certificate(papers.certificate.read_bytes())
-    key = serialization.load_pem_private_key(papers.key.read_bytes(), None)
-    assert isinstance(key, rsa.RSAPrivateKey | ec.EllipticCurvePrivateKey)
-    nobody = x509.CertificateBuilder(
-        named.issuer,
-        x509.Name([]),
-        key.public_key(),
-        1,
-        named.not_valid_before_utc,
-        named.not_valid_after_utc,
-    ).sign(key, hashes.SHA256())
-    file = tmp_path / "nobody.pem"
-    file.write_bytes(nobody.public_bytes(serialization.Encoding.PEM))
-    told = refused_to_serve("--grpc-certificate", file, "--grpc-key", papers.key)
-    assert told == f"rfm: grpc_certificate: expected a certificate that names a host, got none at {file}\n"
