@@ -16,8 +16,9 @@ _STATE, _PARENT, _GROUP, _USER, _SYSTEM = 0, 1, 2, 11, 12  # places in /proc/PID
 
 @dataclass(frozen=True)
 class ProcessStat:
-    """State, parent, group and CPU time of a process."""
+    """Name, state, parent, group and CPU time of a process. The name, at most 15 characters, is a zombie's, too"""
 
+    name: str
     state: str
     parent: int
     group: int
@@ -41,11 +42,14 @@ def arguments_of(pid: int) -> list[str]:
 def stat_of(pid: int) -> ProcessStat | None:
     """What there is to know of the process; None: there is none of this id."""
     try:
-        fields = (_PROC / str(pid) / "stat").read_text().rpartition(")")[2].split()
+        head, _, tail = (_PROC / str(pid) / "stat").read_text().rpartition(")")
     except (FileNotFoundError, ProcessLookupError):
         return None
+    fields = tail.split()
     ticks = int(fields[_USER]) + int(fields[_SYSTEM])
-    return ProcessStat(fields[_STATE], int(fields[_PARENT]), int(fields[_GROUP]), ticks / _TICKS_PER_S)
+    return ProcessStat(
+        head.partition("(")[2], fields[_STATE], int(fields[_PARENT]), int(fields[_GROUP]), ticks / _TICKS_PER_S
+    )
 
 
 def cpu_s_of_group(group: int) -> float:

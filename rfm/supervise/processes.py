@@ -12,6 +12,8 @@ from pathlib import Path
 from rfm.proc import STOPPED, ZOMBIE, all_pids, arguments_of, stat_of
 
 _PROGRAM = "triton_python_backend_stub"
+_NAME = _PROGRAM[:15]  # as the kernel keeps it
+UNKNOWN = ""
 _FAULTS = {ZOMBIE: "a process of it is dead", STOPPED: "a process of it is stopped"}
 
 
@@ -24,7 +26,10 @@ class ModelProcesses:
         self._suspects: set[int] = set()
 
     def fault(self, settled: Collection[str]) -> tuple[str, str] | None:
-        """A model of ``settled`` with a process that is dead or stopped now and was so at the last look, and which."""
+        """A model of ``settled`` with a process that is dead or stopped now and was so at the last look, and which.
+
+        The model of a process that died before the first look is UNKNOWN.
+        """
         states = self._states()
         suspects = {pid for pid, state in states.items() if state in _FAULTS and self._models[pid] in settled}
         confirmed = suspects & self._suspects
@@ -39,6 +44,8 @@ class ModelProcesses:
                 model = _model_of(pid)
                 if model is not None:
                     self._models[pid] = model
+                elif stat.name == _NAME:
+                    self._models.setdefault(pid, UNKNOWN)
                 if pid in self._models:
                     states[pid] = stat.state
         self._models = {pid: model for pid, model in self._models.items() if pid in states}

@@ -16,7 +16,6 @@ import logging
 import re
 import threading
 import time
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -28,7 +27,7 @@ from rfm.launch.http import NO_ANSWER, Http
 from rfm.launch.process import TritonServer
 from rfm.launch.repository_api import INDEX_PATH, LOADING, READY, UNLOADING, ModelVersion, versions_of
 from rfm.supervise.probe import Probe, can_be_probed
-from rfm.supervise.processes import ModelProcesses
+from rfm.supervise.processes import UNKNOWN, ModelProcesses
 from rfm.supervise.status import NO_REASON, Status
 
 LOOK_S = 0.5
@@ -88,7 +87,7 @@ class Watch:
         threading.Thread(target=self._run, name="rfm-watch", daemon=True).start()
 
     def close(self) -> None:
-        """Look no more."""
+        """End the looks and the probes."""
         self._closed.set()
         for probe in list(self._probes.values()):
             probe.close()
@@ -109,17 +108,22 @@ class Watch:
                 self._note_progress(text)
                 with suppress(*NO_ANSWER):  # while the threads of HTTP wait for models that are loaded
                     self._keep_up()
-                self.fault = self._processes.fault(self._ready.keys() - self._going) or self._probed()
+                self.fault = self._dead() or self._probed()
             except Exception:  # the next look may do better; without looks nothing would be healed
                 logger.exception("an unexpected error")
 
     def _note_progress(self, metrics: str) -> None:
-        counts: Counter[str] = Counter()
+        counts: dict[str, float] = {}
         for match in _PROGRESS.finditer(metrics):
-            counts[match["model"]] += float(match["count"])  # type: ignore[assignment]
+            counts[match["model"]] = counts.get(match["model"], 0.0) + float(match["count"])
         for model, count in counts.items():
             if count != self._counts.get(model):
                 self._counts[model], self._progress_s[model] = count, time.monotonic()
+
+    def _dead(self) -> tuple[str, str] | None:
+        settled = self._ready.keys() - self._going
+        found = self._processes.fault(settled if self._going else {*settled, UNKNOWN})
+        return found and (found[0] or TRITON, found[1])
 
     def _probed(self) -> tuple[str, str] | None:
         probed = {name: probe.fault(self._progress_s.get(name, 0.0)) for name, probe in self._probes.items()}

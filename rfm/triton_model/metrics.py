@@ -222,7 +222,7 @@ class _Series:
             self._totals[PASSES].increment(num_steps)
 
     def show(self, *, cached: int, is_served: bool) -> None:
-        """Sets the gauges."""
+        """Sets the gauges to these values."""
         self._cache_bytes.set(cached)
         # Every time: where a model is reloaded, the instance that goes says 0 when the one that comes has said 1.
         self._checkpoint.set(float(is_served))

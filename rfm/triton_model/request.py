@@ -130,7 +130,7 @@ class Request(Generic[Question]):
     @property
     def num_frames(self) -> int:
         """Frames of all trajectories that it asks about."""
-        return sum(trajectory.num_frames for question in self.questions for trajectory in question.trajectories)  # type: ignore[attr-defined]
+        return sum(trajectory.num_frames for question in self.questions for trajectory in question.trajectories)  # type: ignore[attr-defined]  # all questions have some
 
     @property
     def outcome(self) -> str:

@@ -28,7 +28,6 @@ from rfm.launch.repository_api import RepositoryApi
 from rfm.triton_model.metrics import BUCKETS_S, PADDING_BUCKETS, SAMPLES_BUCKETS
 from rfm.triton_model.request import OUTCOMES, UNKNOWN_TYPE
 from rfm_client import (
-    DeadlineExceededError,
     InferenceFailedError,
     InvalidSampleError,
     PreferenceSample,
@@ -48,14 +47,13 @@ pytestmark = pytest.mark.triton
 PLAIN, FILM = goldens.config("c1_t1_disc10"), goldens.config("enc_c1_t1_disc10")
 MODEL, TWICE, SLOW = "rfm", "twice", "slow"  # MODEL has encoders, TWICE two instances
 WIDTHS, PLAIN_WIDTHS = (48, 32), (768, 384)
-UNTIL_CANCELLED, TO_FAIL = "until-cancelled", "to-fail"
+TO_FAIL = "to-fail"
 KEY = "0123456789abcdef"
 PATIENCE_S = 30.0
 TYPES = ("progress", "preference", "similarity")
 HISTOGRAMS = {
     "batch_samples": SAMPLES_BUCKETS,
     "batch_padding_ratio": PADDING_BUCKETS,
-    "wait_seconds": BUCKETS_S,
     "collate_seconds": BUCKETS_S,
     "forward_seconds": BUCKETS_S,
 }
@@ -115,23 +113,22 @@ class Running:
         return self.scrape_when(lambda scraped: scraped.samples(model) == counts)
 
 
-# A request of a certain id is worked on until it is cancelled, which Triton does itself with those that only wait.
-SLOWED = f"""
-
-import time
+# A request of a certain id fails.
+FAILING = f"""
 
 
 class TritonPythonModel(TritonPythonModel):
-    def _answer_together(self, batch, execution):
-        ends_s = time.monotonic() + {PATIENCE_S}
-        for request in batch:
-            if request.request_id.startswith("{UNTIL_CANCELLED}"):
-                while not request.is_cancelled() and time.monotonic() < ends_s:
-                    time.sleep(0.01)
-                self._sample_s = 1.0
-        super()._answer_together(batch, execution)
-        if any(request.request_id.startswith("{TO_FAIL}") for request in batch):
+    def _scored(self, batch):
+        self.is_to_fail = any(request.request_id.startswith("{TO_FAIL}") for request in batch)
+        try:
+            return super()._scored(batch)
+        finally:
+            self.is_to_fail = False
+
+    def answer(self, questions, execution):
+        if self.is_to_fail:
             raise ZeroDivisionError("a fault of the model's")
+        return super().answer(questions, execution)
 """
 
 
@@ -148,7 +145,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     rfm_export.export(FILM.checkpoint, repository, serve_config(FILM, MODEL))
     rfm_export.export(PLAIN.checkpoint, repository, replace(serve_config(PLAIN, TWICE), instances=2))
     rfm_export.export(PLAIN.checkpoint, repository, serve_config(PLAIN, SLOW))
-    append(repository / SLOW, SLOWED)
+    append(repository / SLOW, FAILING)
     with (
         log.open("wb") as lines,
         BriefServer(repository, Endpoints.free(), find_installation(), log=lines, admin_key=KEY) as server,
@@ -279,7 +276,7 @@ def test_histograms_add_up_to_what_each_execution_took(running: Running) -> None
 
 def test_metrics_have_their_kinds_buckets_and_labels(running: Running) -> None:
     scraped = running.scrape()
-    kinds = {"samples": "counter", "frames": "counter", "out_of_memory_retries": "counter", "batch_requests": "gauge"}
+    kinds = {"samples": "counter", "frames": "counter", "out_of_memory_retries": "counter", "forward_passes": "counter"}
     for name, kind in {**kinds, **dict.fromkeys(HISTOGRAMS, "histogram")}.items():
         assert scraped.family(f"rfm_{name}").type == kind
     instances = {MODEL: 1, f"{MODEL}_encoder": 1, TWICE: 2, SLOW: 1}
@@ -340,38 +337,13 @@ def test_health_probes_and_warm_up_are_not_counted(running: Running) -> None:
         for _ in range(3):
             client.progress(blank, request_id=PROBE_PREFIX)
             client.encode(blank_film, request_id=f"{PROBE_PREFIX}-probe")
-        with pytest.raises(InvalidSampleError):
-            client.evaluate([too_long()], request_id=PROBE_PREFIX)  # no probe asks that
         ask_raw(running, sample_type=0, count=2)  # without an id, as warm-up; but that is over
         client.encode(film())
-    running.after(MODEL, {"progress scored": 2, "progress refused": 1}, before)
+    running.after(MODEL, {"progress scored": 2}, before)
     after = running.after(f"{MODEL}_encoder", {"encode scored": 1}, before)
     for name, change in {"batch_samples": 1, "forward_seconds": 1, "collate_seconds": 1}.items():
         counts = [scraped.value(f"rfm_{name}_count", model=MODEL) for scraped in (before, after)]
         assert counts[1] - counts[0] == change
-
-
-def test_cancelled_samples_are_counted_as_such(running: Running) -> None:
-    before = running.scrape()
-    samples = mixed(6, PLAIN_WIDTHS)
-    with running.client(SLOW) as client, ThreadPoolExecutor(1) as pool:
-        asking = pool.submit(client.evaluate, samples, request_id=UNTIL_CANCELLED, timeout_s=2.0)
-        with pytest.raises(DeadlineExceededError):
-            asking.result()
-    after = running.after(SLOW, {f"{kind} cancelled": 2 for kind in TYPES}, before)
-    assert after.value("rfm_frames_total", model=SLOW) == before.value("rfm_frames_total", model=SLOW)
-    executions = "rfm_batch_samples_count"
-    assert after.value(executions, model=SLOW) == before.value(executions, model=SLOW)
-
-
-def test_the_batch_at_work_is_told_while_it_is(running: Running) -> None:
-    with running.client(SLOW) as client, ThreadPoolExecutor(1) as pool:
-        asking = pool.submit(client.evaluate, mixed(3, PLAIN_WIDTHS), request_id=UNTIL_CANCELLED, timeout_s=3.0)
-        running.scrape_when(lambda scraped: scraped.value("rfm_batch_requests", model=SLOW) == 1)
-        assert not asking.done()
-        with pytest.raises(DeadlineExceededError):
-            asking.result()
-    running.scrape_when(lambda scraped: scraped.value("rfm_batch_requests", model=SLOW) == 0)
 
 
 def test_the_served_checkpoint_is_told(running: Running) -> None:
@@ -428,7 +400,7 @@ BROKEN = """
 
 import rfm.triton_model.metrics as metrics
 
-metrics._TOTALS["batch_requests"] = "A counter."
+metrics._TOTALS["feature_cache_bytes"] = "A counter."
 """
 
 

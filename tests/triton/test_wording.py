@@ -187,10 +187,6 @@ def test_a_connection_that_ends_under_a_request_is_told_from_one_that_is_refused
     assert [error.may_have_ended_server for error in (under_way, refused)] == [True, False], (under_way, refused)
 
 
-def test_what_waited_for_too_long_did_not_meet_a_full_queue() -> None:
-    assert not triton.is_full("the request has waited for longer than 0.02 s (queue_timeout_ms)")
-
-
 def test_a_request_id_is_no_part_of_the_error(asked: Triton) -> None:
     status, message = failure(lambda: asked.infer(width=65))
     assert "a-request" not in triton.error_of(status, message, InvalidSampleError).message
