@@ -53,7 +53,8 @@ def python_config(
     for spec, tensor in zip(interface.inputs, config.input, strict=True):
         tensor.allow_ragged_batch = spec.ragged
     config.dynamic_batching.SetInParent()
-    _bound_queue(config.dynamic_batching, settings)
+    if settings.max_queue_size is not None or settings.queue_timeout_ms is not None:
+        _bound_queue(config.dynamic_batching, settings)
     kind = pb.ModelInstanceGroup.KIND_GPU if num_gpus else pb.ModelInstanceGroup.KIND_CPU
     config.instance_group.add(count=settings.instances or 1, kind=kind, gpus=range(num_gpus))
     config.parameters[BUDGET_PARAMETER].string_value = str(settings.token_budget)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -20,7 +21,7 @@ from rfm.triton_model.guard import Guard, end
 from rfm.triton_model.metrics import Counted, Metrics
 from rfm.triton_model.pipeline import Pipeline, Stages
 from rfm.triton_model.placement import Placement, use_threads
-from rfm.triton_model.request import SAMPLE_TYPES, Request
+from rfm.triton_model.request import SAMPLE_TYPES, CancelledError, Request
 from rfm.triton_model.request_log import RequestLog
 from rfm.triton_model.weights import check_digest
 from rfm_client.contract import InvalidSampleError, RewardError, wire
@@ -29,6 +30,7 @@ from rfm_client.contract.named_frames import NamedFootage
 from rfm_client.contract.samples import Footage
 from rfm_client.contract.wire import Tensors
 
+GIVEN_UP_S = 0.1  # clients may have given up behind a batch that took longer; Triton 2.51 hands their requests over
 MAX_INT32 = 2**31 - 1
 
 Question = TypeVar("Question")
@@ -53,7 +55,7 @@ class BatchModel(Generic[Question, Answer]):
         placement = Placement.of(args, config, settings)
         version = Path(args["model_repository"], args["model_version"])
         self._pipeline: Pipeline[Request[Question], Scored[Question]] | None = None
-        self._is_executing = False
+        self._is_executing, self._batch_s = False, 0.0  # what the last batch took
         self._guard = Guard(float(os.environ.get(HANG_VARIABLE) or DEFAULT_HANG_S), lambda: self._is_working)
         check_digest(version, settings.get(DIGEST_PARAMETER, ""))
         placement.run(lambda: self.load(version, placement.device, settings))
@@ -185,9 +187,9 @@ class BatchModel(Generic[Question, Answer]):
 
     def _score(self, batch: list[Request[Question]]) -> Scored[Question]:
         """The answers, or the error, of each request."""
-        for request in batch:
-            if request.error is None:
-                request.check_wanted()
+        for request in batch if self._batch_s > GIVEN_UP_S else ():
+            if request.error is None and request.is_cancelled():
+                request.error = CancelledError("cancelled by the client")
         failed = [request for request in batch if request.error is not None]
         good = [request for request in batch if request.error is None]
         scored: Scored[Question] = [(failed, Execution())] if failed else []
@@ -199,7 +201,7 @@ class BatchModel(Generic[Question, Answer]):
     def _scored(self, batch: list[Request[Question]]) -> Scored[Question]:
         """Scores the requests together or, if that fails, each alone: what breaks one costs no other its answer."""
         self._guard.step()
-        execution = Execution(on_forward=self._guard.step)
+        started_s, execution = time.monotonic(), Execution(on_forward=self._guard.step)
         try:
             answers = iter(self.answer([each for request in batch for each in request.prepared], execution))
             for request in batch:
@@ -211,6 +213,7 @@ class BatchModel(Generic[Question, Answer]):
                 return [scored for request in batch for scored in self._scored([request])]
             batch[0].fail(error)
             execution = Execution()
+        self._batch_s = time.monotonic() - started_s
         return [(batch, execution)]
 
     def _send(self, scored: Scored[Question]) -> None:

@@ -19,7 +19,7 @@ from faulty_servers import heavy, ours_in_dev_shm, regions, trajectory, url_of
 from mixtures import assert_same
 from one_model import OneModelServer, answered
 from proxies import Proxy
-from repositories import configure
+from repositories import bound_queue, configure
 from rfm.launch.process import Endpoints
 from rfm_client import (
     DeadlineExceededError,
@@ -29,7 +29,6 @@ from rfm_client import (
     RewardClient,
     ServerUnavailableError,
 )
-from rfm_client.contract import triton
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
@@ -96,26 +95,6 @@ def test_calls_survive_a_restart_of_the_server(repository: Path, protocol: str) 
             outcomes.wait_for(ProgressResult)
         assert outcomes.errors == []
         assert_same(expected, client.progress(trajectory(0)))
-
-
-def test_calls_that_share_requests_survive_that_one_of_two_servers_is_killed(
-    tmp_path: Path, repository: Path, protocol: str
-) -> None:
-    both = [Endpoints.free(), Endpoints.free()]
-    configure(repository / "rfm", instances=2)
-    other_repository = shutil.copytree(repository, tmp_path / "other" / "model_repository")
-    urls = [url_of(endpoints, protocol) for endpoints in both]
-    # Half of its time each call that was under way waits for the server that was killed.
-    with ExitStack() as servers, RewardClient(urls, timeout_s=PATIENCE_S / 3, join=True) as client:
-        first = servers.enter_context(OneModelServer(repository, both[0]))
-        servers.enter_context(OneModelServer(other_repository, both[1]))
-        assert client.model_info().instances == 2
-        with calling(client, threads=32) as outcomes:
-            outcomes.wait_for(ProgressResult, 500)
-            assert sum(answered(endpoints) for endpoints in both) < 450
-            first.kill()
-            outcomes.wait_for(ProgressResult, 500)
-        assert outcomes.errors == []
 
 
 def test_without_retries_a_restart_is_an_error(repository: Path, protocol: str) -> None:
@@ -245,7 +224,8 @@ def test_a_client_with_another_dev_shm_takes_nothing_back(
 
 @pytest.fixture
 def short_queue(repository: Path) -> Path:
-    configure(repository / "rfm", batch_size=1, max_queue_size=1)
+    configure(repository / "rfm", batch_size=1)
+    bound_queue(repository / "rfm", max_queue_size=1)
     return repository
 
 
@@ -259,7 +239,7 @@ def test_a_full_queue_is_waited_for(short_queue: Path, protocol: str) -> None:
             answers = client.evaluate(samples)
     refused = [outcome for outcome in outcomes if isinstance(outcome, Exception)]
     assert {type(error) for error in refused} == {ServerUnavailableError}
-    assert triton.QUEUE_FULL in str(refused[0])
+    assert "Exceeds maximum queue size" in str(refused[0])
     assert len(answers) == len(samples)
     for outcome, answer in zip(outcomes, answers, strict=True):
         if not isinstance(outcome, Exception):
