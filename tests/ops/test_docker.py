@@ -33,6 +33,7 @@ from engines import serve_config
 from paths import ROOT
 from rfm.launch.installation import find_installation
 from rfm.launch.process import Endpoints
+from rfm_commands.config import Config
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
@@ -209,6 +210,12 @@ def aliases_of(service: dict[str, Any]) -> list[str]:
 
 def is_ours(service: dict[str, Any]) -> bool:
     return str(service["image"]).startswith("rfm-triton:")
+
+
+def test_the_example_configuration_lets_more_wait_than_a_batch() -> None:
+    export = Config.from_yaml(DOCKER / "serve.yaml").export
+    assert export.max_queue_size is not None
+    assert export.max_queue_size > 2 * export.max_batch_size
 
 
 def test_the_dockerfile_is_clean() -> None:

@@ -26,11 +26,9 @@ from rfm_client import (
     ProgressSample,
     RewardError,
     Sample,
-    ServerUnavailableError,
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.contract import triton
 from rfm_gateway.scoring import FRAME_STEPS
 
 TOLERANCE = 1e-5  # of numbers up to 1; of a larger one, which only similarity can be, this share of it
@@ -46,7 +44,7 @@ Connect = Callable[[], AbstractAsyncContextManager[Ask]]
 
 
 class RefusedError(Exception):
-    """The caller was told at once that this call is not answered."""
+    """The gateway told the caller at once that this call is not answered."""
 
 
 class BrokenOffError(Exception):
@@ -111,20 +109,15 @@ def numbers(result: object) -> Numbers:
     return np.concatenate([[result.similarity], result.reference.progress, result.other.progress])  # type: ignore[attr-defined]
 
 
-def direct(url: str, **options: Any) -> Connect:
-    """The client, of these options. Without retries, calls that a queue turns away count as refused."""
+def direct(url: str) -> Connect:
+    """The client as it is by default."""
 
     @asynccontextmanager
     async def connect() -> AsyncIterator[Ask]:
-        async with AsyncRewardClient(url, **options) as client:
+        async with AsyncRewardClient(url) as client:
 
             async def ask(sample: Sample) -> Numbers:
-                try:
-                    return numbers(await client.score(sample))
-                except ServerUnavailableError as error:
-                    if not options.get("retry", True) and triton.is_full(str(error)):
-                        raise RefusedError from error
-                    raise
+                return numbers(await client.score(sample))
 
             yield ask
 
@@ -136,7 +129,7 @@ def through_gateway(url: str) -> Connect:
 
     @asynccontextmanager
     async def connect() -> AsyncIterator[Ask]:
-        bodies: dict[int, bytes] = {}  # by sample: callers of an overloaded server have no time to make them
+        bodies: dict[int, bytes] = {}  # by sample
         connector, timeout = aiohttp.TCPConnector(limit=0), aiohttp.ClientTimeout(PATIENCE_S)
         headers = {"Content-Type": "application/json"}
         async with aiohttp.ClientSession(connector=connector, timeout=timeout, headers=headers) as session:
@@ -179,17 +172,11 @@ class Tally:
     exam: Exam
     asked: int = 0
     answered: int = 0
+    refused: int = 0
     wrong: int = 0
     broken_off: int = 0
     lost: list[str] = field(default_factory=list)
-    ended_s: array[float] = field(default_factory=lambda: array("d"))  # of answered calls, by time.perf_counter
-    latencies_s: array[float] = field(default_factory=lambda: array("d"))
-    refusals_s: array[float] = field(default_factory=lambda: array("d"))  # from the call to its refusal
-
-    @property
-    def refused(self) -> int:
-        """Calls."""
-        return len(self.refusals_s)
+    latencies_s: array[float] = field(default_factory=lambda: array("d"))  # of answered calls
 
     @property
     def p99_s(self) -> float:
@@ -200,11 +187,10 @@ class Tally:
         """Asks, and counts; whether there was an answer."""
         number %= len(self.exam.samples)
         self.asked += 1
-        started_s = time.perf_counter()
         try:
             got = await ask(self.exam.samples[number])
         except RefusedError:
-            self.refusals_s.append(time.perf_counter() - started_s)
+            self.refused += 1
             return False
         except BrokenOffError:
             self.broken_off += 1
@@ -212,8 +198,7 @@ class Tally:
         except Exception as error:  # noqa: BLE001  whatever it is, the call is lost
             self.lost.append(repr(error))
             return False
-        self.ended_s.append(time.perf_counter())
-        self.latencies_s.append(self.ended_s[-1] - due_s)
+        self.latencies_s.append(time.perf_counter() - due_s)
         self.answered += 1
         self.wrong += not self.exam.is_right(number, got)
         return True
@@ -223,12 +208,11 @@ class Tally:
             self.exam,
             self.asked + other.asked,
             self.answered + other.answered,
+            self.refused + other.refused,
             self.wrong + other.wrong,
             self.broken_off + other.broken_off,
             self.lost + other.lost,
-            self.ended_s + other.ended_s,
             self.latencies_s + other.latencies_s,
-            self.refusals_s + other.refusals_s,
         )
 
 
@@ -293,20 +277,3 @@ def closed_loop(connect: Connect, exam: Exam, callers: int, seconds: float) -> t
         time.sleep(seconds)
         rate_per_s = (asking.tally.answered - first) / (time.perf_counter() - started_s)
     return asking.tally, rate_per_s
-
-
-async def open_loop(connect: Connect, exam: Exam, rate_per_s: float, seconds: float) -> tuple[Tally, float]:
-    """Calls at random moments (Poisson), however long they take; with how late the latest of them was made."""
-    tally, calls, latest_s = Tally(exam), set(), 0.0
-    random = np.random.default_rng(0)
-    async with connect() as ask:
-        await ask(exam.samples[0])  # it is connected
-        due_s = time.perf_counter() + np.cumsum(random.exponential(1 / rate_per_s, int(rate_per_s * seconds)))
-        for number, moment_s in enumerate(due_s.tolist()):
-            await asyncio.sleep(max(moment_s - time.perf_counter(), 0))
-            latest_s = max(latest_s, time.perf_counter() - moment_s)
-            call = asyncio.create_task(tally.call(ask, number, moment_s))
-            calls.add(call)
-            call.add_done_callback(calls.discard)
-        await asyncio.gather(*calls)
-    return tally, latest_s

@@ -67,14 +67,10 @@ TESTS: dict[str, tuple[str, ...]] = {
         "test_vlm_checkpoint",
     ),
     "client/rfm_client/contract/wire.py": ("test_wire", "test_samples", "test_properties"),
-    "rfm/triton_model/batch_model.py": ("test_batch_model", "test_batches", "test_poison", "test_logs"),
-    "rfm/triton_model/other_instances.py": ("test_other_instances",),
-    "rfm/triton_model/triton_queue.py": ("test_triton_queue", "test_batches"),
-    "rfm/triton_model/request.py": ("test_batch_model", "test_batches", "test_poison"),
-    "rfm/supervise/model_states.py": ("test_model_states",),
-    "rfm/supervise/model_watch.py": ("test_model_watch",),
-    "rfm/supervise/model_reload.py": ("test_model_watch",),
-    "rfm/supervise/model_probe.py": ("test_model_probe",),
+    "rfm/triton_model/batch_model.py": ("test_batch_model", "test_pipeline", "test_logs"),
+    "rfm/triton_model/guard.py": ("test_guard",),
+    "rfm/triton_model/pipeline.py": ("test_pipeline",),
+    "rfm/triton_model/request.py": ("test_batch_model", "test_pipeline"),
 }
 
 
