@@ -6,8 +6,8 @@
 What it shows depends little on the machine: the share of the time in which the accelerator is busy, and what a request
 costs of the CPU, in the server and in its callers. Rounds are interleaved, so a machine that drifts hits all alike.
 
-All servers get embeddings. This one gets them from callers of one program, too, whose calls share requests, and raw
-frames for a tiny checkpoint on a Qwen3-VL backbone: preparing them is as real as ever.
+All servers get embeddings; this one with the instances of its default export for a GPU, and with one. It gets raw frames,
+too, for a tiny checkpoint on a Qwen3-VL backbone: preparing them is as real as ever.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ import statistics
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import psutil
 from bench import DEMO, RESULTS, ROOT, machine
 from contestants import PEER_SCRIPTS, Callers, running_peer
-from load import JOINED, Load
+from load import Load
 from rich.console import Console
 
 import rfm_export
@@ -41,16 +41,16 @@ BATCH_S, ROW_S = 4e-3, 0.5e-3
 VLM = ROOT / "tests" / "golden" / "vlm"
 VLM_CHECKPOINT, VLM_BASE = VLM / "q3_tok_disc10" / "checkpoint", VLM / "bases" / "q3"
 VLM_BATCH_S, VLM_ROW_S = 0.0, 30e-3
-CHEAP_ANSWER_S = 0.2e-3  # as on a GPU: the CPU is free while it computes
 FRAMES = (16, 16)
-OURS, OURS_JOINED, OURS_VLM = "this server", "this server, joined", "this server, frames"
-WAYS = {OURS: "gRPC", OURS_JOINED: JOINED, OURS_VLM: "gRPC"}
+OURS, OURS_ONE, OURS_VLM = "this server", "this server, one instance", "this server, frames"
+OURS_VLM_LARGE = "this server, large frames"
+VLM_LOADS = ((16, 256), (4, 256), (16, 480))  # callers, pixels
 SIMULATED = """
 
 import sys
 
 sys.path.insert(0, {peers!r})
-_load, _start = TritonPythonModel.load, TritonPythonModel.start
+_load = TritonPythonModel.load
 
 
 def load(self, version, device, settings):
@@ -62,12 +62,7 @@ def load(self, version, device, settings):
     simulate(self.engine, Path({file!r}), {batch_s}, {row_s})
 
 
-def start(self, *arguments, **options):
-    _start(self, *arguments, **options)
-    self._cheap_answer_s, self._is_on_cpu = {cheap_answer_s}, False  # while an accelerator computes, the CPU is free
-
-
-TritonPythonModel.load, TritonPythonModel.start = load, start
+TritonPythonModel.load = load
 """
 US_PER_S = 1e6
 
@@ -94,9 +89,11 @@ def main() -> None:
     parser.add_argument("--peers", nargs="*", default=["LitServe", "mosec"], choices=["LitServe", "mosec"])
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder for the results")
     arguments = parser.parse_args()
-    names = [OURS, OURS_JOINED, *arguments.peers]
+    names = [OURS, OURS_ONE, *arguments.peers]
     loads = [(name, Load(callers, arguments.seconds, FRAMES)) for callers in arguments.callers for name in names]
-    loads.append((OURS_VLM, Load(callers=16, seconds=2 * arguments.seconds, frames=(8, 8), frame_px=256)))
+    for callers, px in VLM_LOADS:
+        name = OURS_VLM if px == VLM_LOADS[0][1] else OURS_VLM_LARGE
+        loads.append((name, Load(callers=callers, seconds=2 * arguments.seconds, frames=(8, 8), frame_px=px)))
     rows = []
     with TemporaryDirectory(prefix="rfm-accelerator-") as folder, contestants(Path(folder), arguments.peers) as of_name:
         for number in range(arguments.rounds):
@@ -139,7 +136,8 @@ def contestants(folder: Path, peers: list[str]) -> Iterator[Mapping[str, Contest
     config = ExportConfig(num_gpus=0, torch_threads=1)
     of_vlm = ExportConfig(num_gpus=0, torch_threads=1, base_model=str(VLM_BASE))
     servers = {
-        OURS: ours(folder / "embeddings", CHECKPOINT, config, BATCH_S, ROW_S),
+        OURS: ours(folder / "embeddings", CHECKPOINT, replace(config, instances=2), BATCH_S, ROW_S),
+        OURS_ONE: ours(folder / "one", CHECKPOINT, config, BATCH_S, ROW_S),
         OURS_VLM: ours(folder / "frames", VLM_CHECKPOINT, of_vlm, VLM_BATCH_S, VLM_ROW_S),
         **{peer: theirs(folder / peer, peer) for peer in peers},
     }
@@ -149,10 +147,10 @@ def contestants(folder: Path, peers: list[str]) -> Iterator[Mapping[str, Contest
             before = set(psutil.Process().children(recursive=True))
             url, ledger = stack.enter_context(server)
             processes = list(set(psutil.Process().children(recursive=True)) - before)
-            for way in (OURS, OURS_JOINED) if name == OURS else (name,):
-                callers = Callers(WAYS.get(way, way), url, widths)
-                stack.callback(callers.close)
-                made[way] = Contestant(callers, ledger, processes)
+            callers = Callers(name if name in peers else "gRPC", url, widths)
+            stack.callback(callers.close)
+            made[name] = Contestant(callers, ledger, processes)
+        made[OURS_VLM_LARGE] = made[OURS_VLM]
         yield made
 
 
@@ -165,7 +163,7 @@ def ours(
     folder.mkdir()
     rfm_export.export(checkpoint, repository, config)
     (model,) = repository.glob("*/1/model.py")
-    times_s = {"batch_s": batch_s, "row_s": row_s, "cheap_answer_s": CHEAP_ANSWER_S}
+    times_s = {"batch_s": batch_s, "row_s": row_s}
     model.write_text(model.read_text() + SIMULATED.format(peers=sys.path[0], file=str(file), **times_s))
     with temporary_server(repository, folder / "triton.log") as endpoints:
         yield endpoints.grpc_url, Ledger(file)
@@ -191,9 +189,9 @@ def table(rows: list[dict[str, object]]) -> str:
         f"# A simulated accelerator: {1e3 * BATCH_S:g} ms a batch and {1e3 * ROW_S:g} ms a sample, asleep",
         "",
         "Medians of the rounds. busy: share of the time; us: CPU microseconds a sample, of all of the server's",
-        f"processes, and of its callers' process. {OURS_JOINED}: of callers of one program, which share requests.",
-        f"{OURS_VLM}: 8 of 256 x 256 a sample, a tiny checkpoint on a Qwen3-VL backbone, {1e3 * VLM_ROW_S:g} ms a",
-        "sample, preparation included.",
+        f"processes, and of its callers' process. {OURS} has two instances.",
+        "Frames: 8 of 256 x 256 a sample (large: 480 x 480), a tiny checkpoint on a Qwen3-VL backbone,",
+        f"{1e3 * VLM_ROW_S:g} ms a sample, preparation included.",
         "",
         "| callers | server | busy | samples/s | p50 ms | p99 ms | server us | client us |",
         "|---|---|---|---|---|---|---|---|",

@@ -25,7 +25,7 @@ from tempfile import TemporaryDirectory
 import report
 import torch
 from contestants import PEER_SCRIPTS, BareEngine, Callers, Checkpoint, contestants
-from load import JOINED, SHARED_MEMORY, Load
+from load import SHARED_MEMORY, Load
 from rich.console import Console
 
 import rfm_export
@@ -69,7 +69,7 @@ class Scenario:
 
 QUICK = (
     Scenario("1 caller", Load(1, 0, UNIFORM), ("gRPC",), with_peers=True),
-    Scenario("32 callers", Load(32, 0, UNIFORM), ("gRPC", JOINED, "gateway"), with_peers=True),
+    Scenario("32 callers", Load(32, 0, UNIFORM), ("gRPC", "gateway"), with_peers=True),
     Scenario("32 callers, 8 or 9 frames", Load(32, 0, AS_LONG_AS_MIXED)),
     Scenario("32 callers, 1 to 16 frames, all types", Load(32, 0, MIXED, mixed=True)),
 )
@@ -126,7 +126,7 @@ def _rounds(
     console: Console,
 ) -> list[dict[str, object]]:
     """A row a measurement."""
-    ours = ("gRPC", JOINED, "HTTP", SHARED_MEMORY, "gateway")
+    ours = ("gRPC", "HTTP", SHARED_MEMORY, "gateway")
     ways = [way for way in callers if way in scenario.ways or (scenario.with_peers and way not in ours)]
     batch_sizes = (1,) if scenario.load.callers == 1 else BARE_BATCH_SIZES
     load = scenario.load

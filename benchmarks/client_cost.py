@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the Python client costs: CPU of its process for each request, and what joining calls gains.
+"""What the Python client costs: CPU of its process for each request.
 
     rfm serve --repository model_repository
     python benchmarks/client_cost.py
@@ -32,18 +32,16 @@ RESULTS = Path(__file__).parent / "results"
 NUM_FRAMES = 16
 NUM_SAMPLES = 64
 MS_PER_S, US_PER_S = 1e3, 1e6
-APART, JOINED = "apart", "joined"
 MEASURE = "measure"  # the first word of a process that measures
 
 
 @dataclass(frozen=True)
 class Way:
-    """How the server is asked. style: asyncio or threads; join: as the client's option"""
+    """How the server is asked. style: asyncio or threads"""
 
     protocol: str
     style: str
     callers: int
-    join: str
 
 
 @dataclass(frozen=True)
@@ -104,13 +102,13 @@ def measure_when_told(way: Way, url: str) -> None:
     """Answers a number of seconds, a line of standard input, with a measurement, a line of JSON."""
     samples = _samples(url)
     if way.style == "threads":
-        with RewardClient(url, join=way.join == JOINED) as client:
+        with RewardClient(url) as client:
             for line in sys.stdin:
                 print(json.dumps(asdict(_by_threads(client, way.callers, samples, float(line)))), flush=True)
         return
 
     async def measure() -> None:
-        async with AsyncRewardClient(url, join=way.join == JOINED) as client:
+        async with AsyncRewardClient(url) as client:
             for line in sys.stdin:
                 print(json.dumps(asdict(await _by_tasks(client, way.callers, samples, float(line)))), flush=True)
 
@@ -179,28 +177,20 @@ def measure_all(ways: Sequence[Way], urls: dict[str, str], rounds: int, seconds:
 
 
 def table(rows: dict[Way, list[Measured]]) -> list[str]:
-    """Medians of each way, and of the ratios within a round what joining gains."""
+    """Medians of each way."""
 
     def median(way: Way, column: str) -> str:
         values = [getattr(measured, column) for measured in rows[way]]
         digits = 2 if column == "p50_ms" else 0
         return f"{statistics.median(values):.{digits}f} ({min(values):.{digits}f}..{max(values):.{digits}f})"
 
-    def gain(way: Way, column: str) -> str:
-        if way.join == APART:
-            return ""
-        apart = rows[Way(way.protocol, way.style, way.callers, APART)]
-        pairs = zip(rows[way], apart, strict=True)
-        return f"{statistics.median(getattr(one, column) / getattr(other, column) for one, other in pairs):.2f}"
-
     lines = [
-        "| | callers | | CPU us a call | samples/s | p50 ms | CPU, joined / apart | samples/s | p50 |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| | callers | CPU us a call | samples/s | p50 ms |",
+        "|---|---|---|---|---|",
     ]
     for way in rows:
         medians = [median(way, column) for column in ("cpu_us", "samples_per_s", "p50_ms")]
-        gains = [gain(way, column) for column in ("cpu_us", "samples_per_s", "p50_ms")]
-        cells = [f"{way.protocol}, {way.style}", str(way.callers), way.join, *medians, *gains]
+        cells = [f"{way.protocol}, {way.style}", str(way.callers), *medians]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
 
@@ -215,11 +205,10 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=RESULTS, help="folder for the results")
     options = parser.parse_args()
     ways = [
-        Way(protocol, style, callers, join)
+        Way(protocol, style, callers)
         for protocol in ("gRPC", "HTTP")
         for style in ("asyncio", "threads")
         for callers in (1, 32)
-        for join in (APART, JOINED)
     ]
     rows = measure_all(ways, {"gRPC": options.grpc, "HTTP": options.http}, options.rounds, options.seconds)
     lines = [
@@ -227,7 +216,7 @@ def main() -> None:
         "",
         f"Calls about one sample of {NUM_FRAMES} frames with embeddings. CPU is that of the client's process, in user "
         f"and kernel. Medians of {options.rounds} interleaved rounds of {options.seconds:g} s, with the smallest and "
-        "largest. Ratios: medians of those within a round. The server runs on the same cores.",
+        "largest. The server runs on the same cores.",
         "",
         *table(rows),
     ]

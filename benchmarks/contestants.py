@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from load import JOINED, SHARED_MEMORY, Load, Measured, samples
+from load import SHARED_MEMORY, Load, Measured, samples
 
 from rfm.engine import Engine
 from rfm.launch.process import Endpoints
@@ -120,7 +120,6 @@ def contestants(
         stack.enter_context(_running(gateway, gateway_port, log_folder / f"gateway_{checkpoint.name}.log"))
         urls = {
             "gRPC": endpoints.grpc_url,
-            JOINED: endpoints.grpc_url,
             "HTTP": endpoints.http_url,
             SHARED_MEMORY: endpoints.grpc_url,
             "gateway": f"http://127.0.0.1:{gateway_port}",

@@ -4,7 +4,7 @@
 Closed loop: each caller asks about one sample at a time and waits for the answer. Open loop: samples are asked about at
 random moments (Poisson), however long the answers take, so that a slow answer does not hide those that wait behind it;
 a latency counts from the moment that a sample should have been sent. The callers stand for as many clients, so our
-client does not join their calls. Only as JOINED the callers are one program's, whose client has ``join=True``.
+client does not join their calls.
 """
 
 from __future__ import annotations
@@ -47,7 +47,6 @@ PEERS = {
     "mosec": clients.mosec,
 }
 SHARED_MEMORY = "shared memory"
-JOINED = "gRPC, joined"
 
 
 @dataclass(frozen=True)
@@ -114,7 +113,7 @@ async def connected(way: str, url: str) -> AsyncIterator[Ask]:
             yield PEERS[way](session, url)
         return
     async with AsyncRewardClient(
-        url, shared_memory=way == SHARED_MEMORY, max_in_flight=IN_FLIGHT, retry=False, join=way == JOINED
+        url, shared_memory=way == SHARED_MEMORY, max_in_flight=IN_FLIGHT, retry=False
     ) as client:
 
         async def ask(samples: Sequence[Sample]) -> list[float]:

@@ -247,7 +247,7 @@ def test_requests_in_flight_are_bounded(served: Served) -> None:
             return getattr(self.inner, name)
 
     transport = Counting()
-    with RewardClient("", transports=[transport], model=MODEL, max_in_flight=3, join=False) as client:  # type: ignore[list-item]
+    with RewardClient("", transports=[transport], model=MODEL, max_in_flight=3) as client:  # type: ignore[list-item]
         pending = [client.submit(sample) for sample in mixed_samples(30)]
         for future in pending:
             future.result()

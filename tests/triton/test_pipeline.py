@@ -55,10 +55,10 @@ class Ahead(Model):
         super().finalize()
 
     def begin(self) -> list[Request]:
-        """Has it score two requests, which are not answered before ``open``."""
+        """Has it score one or two requests, which are not answered before ``open``."""
         first = [request(1), request(1)]
         self.take(first)
-        wait_for(lambda: sum(self.batches) == 2 or len(self.batches) == 1)
+        wait_for(lambda: self.batches)
         return first
 
     def open(self, *requests: Request) -> None:
@@ -88,7 +88,7 @@ def test_what_comes_while_a_batch_is_scored_is_prepared_and_makes_up_the_next(tm
         model.take([each])
     wait_for(lambda: sorted(model.prepared)[-3:] == [5, 6, 7])
     model.open(*first, *later)
-    assert model.batches[-1] == 3
+    assert model.batches in ([2, 3], [1, 4])
     assert model.threads == {"rfm-score"}
     assert model.samples == {("progress", "scored"): 5}
 
@@ -128,10 +128,11 @@ def test_a_batch_has_no_more_tokens_than_its_budget(tmp_path: Path) -> None:
         pool.submit(model.take, [more])
         wait_for(lambda: 6 in model.prepared)
         model.open(*first, *later, more)
-    assert model.batches[-2:] == [2, 1]
+    assert model.batches in ([2, 2, 1], [1, 3, 1])
 
 
-def test_refused_failed_and_cancelled_requests_fail_alone(tmp_path: Path) -> None:
+def test_refused_failed_and_cancelled_requests_fail_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rfm.triton_model.batch_model.GIVEN_UP_S", -1.0)  # after any batch clients may have given up
     model = Ahead(tmp_path)
     first = model.begin()
     unreadable = Request(request(1).tensors | {"num_frames": np.zeros((1, 2), np.int32)})
