@@ -6,8 +6,8 @@
 What it shows depends little on the machine: the share of the time in which the accelerator is busy, and what a request
 costs of the CPU, in the server and in its callers. Rounds are interleaved, so a machine that drifts hits all alike.
 
-All servers get embeddings; this one with the instances of its default export for a GPU, and with one. It gets raw frames,
-too, for a tiny checkpoint on a Qwen3-VL backbone: preparing them is as real as ever.
+All servers get embeddings; this one with the instances of its default export for a GPU, and with one. It gets raw
+frames, too, for a tiny checkpoint on a Qwen3-VL backbone: preparing them is as real as ever.
 """
 
 from __future__ import annotations

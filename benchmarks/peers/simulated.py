@@ -7,6 +7,7 @@ were of, stands in a file that others read.
 
 from __future__ import annotations
 
+import fcntl
 import json
 import mmap
 import struct
@@ -31,18 +32,22 @@ class Ledger:
     def __init__(self, file: Path) -> None:
         if not file.exists():
             file.write_bytes(_LEDGER.pack(0.0, 0))
-        with file.open("r+b") as content:
-            self._memory = mmap.mmap(content.fileno(), 0)
+        self._file = file.open("r+b")
+        self._memory = mmap.mmap(self._file.fileno(), 0)
 
     def read(self) -> tuple[float, int]:
         """Seconds in forward passes, and rows in them, since the beginning."""
         busy_s, num_rows = _LEDGER.unpack_from(self._memory)
         return float(busy_s), int(num_rows)
 
-    def add(self, busy_s: float, num_rows: int) -> None:
-        """Counts one more forward pass."""
+    def run(self, duration_s: float, num_rows: int) -> None:
+        """Sleeps, as one forward pass; several instances take turns."""
+        fcntl.flock(self._file, fcntl.LOCK_EX)
+        started_s = time.perf_counter()
+        time.sleep(duration_s)
         before = self.read()
-        _LEDGER.pack_into(self._memory, 0, before[0] + busy_s, before[1] + num_rows)
+        _LEDGER.pack_into(self._memory, 0, before[0] + time.perf_counter() - started_s, before[1] + num_rows)
+        fcntl.flock(self._file, fcntl.LOCK_UN)
 
 
 def simulate(engine: Engine, file: Path, batch_s: float, row_s: float) -> Engine:
@@ -50,9 +55,7 @@ def simulate(engine: Engine, file: Path, batch_s: float, row_s: float) -> Engine
     ledger, num_bins = Ledger(file), engine.predictor.network.config.progress_bins
 
     def score(rows: Sequence[Any], batch: Any) -> list[RowScores]:
-        started_s = time.perf_counter()
-        time.sleep(batch_s + row_s * len(rows))
-        ledger.add(time.perf_counter() - started_s, len(rows))
+        ledger.run(batch_s + row_s * len(rows), len(rows))
         return [_half(row, num_bins) for row in rows]
 
     engine.predictor.score = score  # type: ignore[method-assign]  # only the forward pass is replaced

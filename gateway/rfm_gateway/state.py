@@ -26,7 +26,7 @@ from rfm_gateway import schema
 
 HEALTH_TIMEOUT_S = 3.5  # of all probes; with HEALTH_KEPT_S less than the 5 s within which it is to be true
 PROBE_TIMEOUT_S = 1.5  # of that: a model that takes longer may be busy
-STALL_S = 30.0  # a busy model that finishes nothing for so long does not work: what rfm serve calls a hang
+STALL_S = 30.0  # a busy model that finishes nothing for so long is not healthy
 HEALTH_KEPT_S = 1.0  # so that probes, which need no key, do not keep the models busy
 STATUS_TIMEOUT_S = 5.0
 MS_PER_S = 1e3

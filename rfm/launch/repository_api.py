@@ -73,7 +73,7 @@ class ModelVersion:
 class RepositoryApi:
     """The server at ``url`` (grpc://host:port, or grpcs:// with TLS). A context manager.
 
-    options: of tritonclient's gRPC client, as Access and OwnTls have them
+    options: of tritonclient's gRPC client, as Access has them
     Its methods raise RepositoryApiError, and so does the constructor for another kind of URL.
     """
 
