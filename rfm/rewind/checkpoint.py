@@ -16,7 +16,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from rfm.checkpoint.content import CheckpointError, cut, is_there, read_json, read_run_config, shown
+from rfm.checkpoint.content import CheckpointError, cut, is_there, misfits, read_json, read_run_config, shown
 from rfm.checkpoint.files import (
     MAX_COUNT,
     NETWORK_CONFIG,
@@ -135,11 +135,11 @@ class RewindCheckpoint:
                 image_weights=self.image_encoder or None,
                 text_weights=self.text_encoder or None,
             )
-        except (ImportError, OSError, ValueError) as error:
+        except (ImportError, OSError, *misfits()) as error:
             absent = [source for source in (image_source, text_source) if not Path(source).is_dir()]
             here = f"; there is no folder {' nor '.join(absent)} either" if absent else ""
             hint = f"name local folders with --image-encoder and --text-encoder{here}"
-            raise CheckpointError(f"{where}: {error} ({hint})") from error
+            raise CheckpointError(f"{where}: {cut(str(error))} ({hint})") from error
         widths, expected = (encoders.video_feature_dim, encoders.text_feature_dim), self.description.widths
         if widths != expected:
             raise CheckpointError(f"{where}: expected widths {expected}, got {widths}")
