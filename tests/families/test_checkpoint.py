@@ -696,9 +696,10 @@ for source in sys.argv[1:]:
 """
 UNTAGGED, TAGGED, WITHOUT = "org/name", f"org/other@{TAG}", "org/without"  # repositories of their own
 IN_SUBFOLDER, PICKLED, PICKLED_WITHIN = "org/runs/one/ckpt=5@v1", "org/pickled", "org/runs/pickled@v1"
+LATE, LATE_ABOVE = "org/late/one/ckpt@v1", "org/late/two/ckpt@v1"
 NOT_THERE, ABSENT = "org/runs/none@v1", "org/absent/folder@v1"
-FROM_HUB = (UNTAGGED, TAGGED, WITHOUT, IN_SUBFOLDER, PICKLED, PICKLED_WITHIN, NOT_THERE)
-OFFLINE = (f"{UNTAGGED}@{TAG}", TAGGED, IN_SUBFOLDER, UNTAGGED, ABSENT, f"{WITHOUT}@{TAG}")
+FROM_HUB = (UNTAGGED, TAGGED, WITHOUT, IN_SUBFOLDER, PICKLED, PICKLED_WITHIN, NOT_THERE, LATE, LATE_ABOVE)
+OFFLINE = (f"{UNTAGGED}@{TAG}", TAGGED, IN_SUBFOLDER, UNTAGGED, ABSENT, f"{WITHOUT}@{TAG}", LATE, LATE_ABOVE)
 
 
 @pytest.fixture(scope="module")
@@ -716,6 +717,11 @@ def from_hub(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     shutil.copytree(tag, runs / "one" / "ckpt=5")
     (runs / "one" / "ckpt=5" / "config.yaml").rename(runs / "one" / "config.yaml")
     (tag / "config.yaml").rename(main / "config.yaml")
+    late, late_main = folder / "late", folder / "late_main"
+    for run, place in (("one", "one/ckpt"), ("two", "two")):
+        shutil.copytree(tag, late / run / "ckpt")
+        (late_main / place).mkdir(parents=True)
+        shutil.copy(main / "config.yaml", late_main / place)
     shutil.copy(main / "config.yaml", without / "README.md")
     torch.save({}, pickled / "pytorch_model.bin")
     torch.save({}, pickled / "optimizer.pt")
@@ -723,6 +729,7 @@ def from_hub(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     mains = {UNTAGGED: main, TAGGED: main, WITHOUT: without}
     repositories = {source.partition("@")[0]: {"main": files, TAG: tag} for source, files in mains.items()}
     repositories |= {PICKLED: {"main": pickled}, "org/runs": {"main": main, "v1": runs}}
+    repositories["org/late"] = {"main": late_main, "v1": late}
     environment = {**os.environ, "HF_HOME": str(folder / "cache")}
 
     def say(sources: tuple[str, ...], offline: str) -> list[str]:
@@ -736,10 +743,10 @@ def from_hub(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return told | {f"offline {source}": line for source, line in zip(OFFLINE, say(OFFLINE, "1"), strict=True)}
 
 
-IN_CACHE = [f"offline {source}" for source in (f"{UNTAGGED}@{TAG}", TAGGED, IN_SUBFOLDER)]
+IN_CACHE = [f"offline {source}" for source in (f"{UNTAGGED}@{TAG}", TAGGED, IN_SUBFOLDER, LATE, LATE_ABOVE)]
 
 
-@pytest.mark.parametrize("source", [UNTAGGED, TAGGED, IN_SUBFOLDER, *IN_CACHE])
+@pytest.mark.parametrize("source", [UNTAGGED, TAGGED, IN_SUBFOLDER, LATE, LATE_ABOVE, *IN_CACHE])
 def test_config_yaml_is_found_on_main_of_the_hub_s_repository(from_hub: dict[str, str], source: str) -> None:
     expected = asdict(families.load(goldens.config(WITH_IMAGES).checkpoint).config)
     assert expected["multi_image"] and expected["per_frame_progress_token"]
