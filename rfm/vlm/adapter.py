@@ -13,7 +13,7 @@ from rfm.checkpoint.content import CheckpointError, cut, is_there, listed, read_
 from rfm.checkpoint.files import ADAPTER_CONFIG, NETWORK_CONFIG, WEIGHTS, WEIGHTS_INDEX, check_one_form
 from rfm.checkpoint.pickles import refuse_pickles
 from rfm.vlm.backbone import BACKBONES, DEQUANTIZED, backbone_config, check_not_quantized
-from rfm.vlm.lora import LORA_NAME, Scaling, check_adapter
+from rfm.vlm.lora import LORA_NAME, MERGE, Scaling, check_adapter
 from rfm.vlm.names import ADAPTER_NAMES, QWEN_NAMES, renamed
 from rfm.vlm.run_config import RunConfig
 
@@ -27,6 +27,8 @@ _NO_EMBEDDING = (
     "lost with the run; save the whole model where it was trained (save_model() of the trainer), or the adapter with "
     "save_pretrained(..., save_embedding_layers=True)"
 )
+# In names of SmolVLM's weights, of LoRA of an embedding, and of an embedding that PEFT saves in two ways at once.
+_OTHER = re.compile(r"\.(text_model|lora_embedding_[AB]|modules_to_save|original_module)(\.|$)")
 _VARIANT = re.compile(r"-unsloth$")  # of one model, which Unsloth puts in the place of a base model
 _FEW_BITS = re.compile(r"-bnb-\dbit/?$")  # how Unsloth names a base model of fewer bits, which it trains on
 
@@ -80,6 +82,10 @@ def adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Te
     if not is_there(folder / ADAPTER_WEIGHTS):
         refuse_pickles(folder, ADAPTER_WEIGHTS, Path(ADAPTER_WEIGHTS).stem)
     adapter = renamed(renamed(read_tensors(folder / ADAPTER_WEIGHTS), ADAPTER_NAMES), QWEN_NAMES)
+    other = next((name for name in adapter if _OTHER.search(name)), None)
+    if other is not None:
+        expected = "LoRA factors of linear layers of a Qwen backbone"
+        raise CheckpointError(f"{folder / ADAPTER_WEIGHTS}: expected {expected}, got {shown(other)}; {MERGE}")
     if EMBEDDING not in adapter:
         raise CheckpointError(f"{folder / ADAPTER_WEIGHTS}: {_NO_EMBEDDING}")
     config, base = _read_base(base_model)
