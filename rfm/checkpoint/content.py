@@ -54,11 +54,11 @@ class CheckpointError(Exception):
     """A checkpoint that cannot be loaded: what is wrong with which file, and what to do about it."""
 
 
-def misfits() -> tuple[type[Exception], ...]:
-    """Errors of libraries about content that they did not expect. Those of transformers 5 are huggingface_hub's."""
+def misfits(*others: type[Exception]) -> tuple[type[Exception], ...]:
+    """``others``, and errors of libraries about content that they did not expect: transformers 5 raises the Hub's."""
     from huggingface_hub import errors
 
-    return (*_MISFITS, getattr(errors, "StrictDataclassError", ValueError))
+    return (*others, *_MISFITS, getattr(errors, "StrictDataclassError", ValueError))
 
 
 @contextmanager

@@ -82,7 +82,7 @@ def _plain(name: str) -> str:
 
 
 def _places_on_main(home: Path) -> list[Path]:
-    """``home``, and the folder above a subfolder, in the Hub's cache of main: the snapshot of the commit in refs/main."""
+    """``home``, and the folder above a subfolder, in the Hub's cache of main: the snapshot that refs/main names."""
     snapshot = next((path for path in (home, *home.parents) if path.parent.name == "snapshots"), home)
     main = snapshot.parent.parent / "refs" / "main"
     if snapshot.parent.name != "snapshots" or not is_there(main):

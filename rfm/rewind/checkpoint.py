@@ -135,7 +135,7 @@ class RewindCheckpoint:
                 image_weights=self.image_encoder or None,
                 text_weights=self.text_encoder or None,
             )
-        except (ImportError, OSError, *misfits()) as error:
+        except misfits(ImportError, OSError) as error:
             absent = [source for source in (image_source, text_source) if not Path(source).is_dir()]
             here = f"; there is no folder {' nor '.join(absent)} either" if absent else ""
             hint = f"name local folders with --image-encoder and --text-encoder{here}"
