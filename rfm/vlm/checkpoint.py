@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -30,11 +30,12 @@ from rfm.checkpoint.files import (
     NETWORK_CONFIG,
     WEIGHTS,
     check_shapes,
+    has_head,
     read_weights,
 )
 from rfm.checkpoint.nf4 import dequantize
 from rfm.checkpoint.training import check_progress
-from rfm.family import NETWORK, Description, Options
+from rfm.family import NETWORK, Description, Options, config_fields
 from rfm.feature_cache import FeatureCache
 from rfm.version_folder import PROCESSOR_FOLDER
 from rfm.vlm.adapter import adapted, base_of_adapter, has_adapter
@@ -95,6 +96,8 @@ class VlmCheckpoint:
             frames_per_value=1 if self.config.multi_image else FRAMES_PER_GROUP,
             keeps_features=self.config.family != SMOL,
             is_large=True,
+            has_preference=self.config.has_preference,
+            has_success=self.config.has_success,
         )
 
     @property
@@ -153,7 +156,7 @@ class VlmCheckpoint:
         """Writes weights and LoRA factors, one config.json that says all, and the processor."""
         collator = self.collator  # first: what is missing is reported before the weights are written
         folder.mkdir(parents=True)
-        settings = {name: value for name, value in asdict(self.config).items() if name != "backbone"}
+        settings = {name: value for name, value in config_fields(self.config).items() if name != "backbone"}
         config = {**self.config.backbone, SETTINGS: settings}
         (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
         tensors = {name: tensor.contiguous() for name, tensor in (self.weights | self.factors).items()}
@@ -244,6 +247,8 @@ def _trained_config(
         progress_bins=weights["progress_head.4.weight"].shape[0],
         has_similarity="similarity_head.0.weight" in weights,
         size_px=run.size_px(family, network["multi_image"]),
+        has_preference=has_head(weights, "preference"),
+        has_success=has_head(weights, "success"),
         **network,
     )
     if (family == SMOL or config.per_frame_progress_token) and not config.multi_image:
