@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +25,15 @@ from rfm.checkpoint.files import (
     check_shapes,
     find_run_config,
     frame_count,
+    has_head,
     read_weights,
     take_prefix,
     trained_frames,
 )
 from rfm.checkpoint.training import check_progress
-from rfm.family import NETWORK, Description, Options
+from rfm.family import NETWORK, Description, Options, config_fields
 from rfm.feature_cache import FeatureCache
+from rfm.rewind import first_code
 from rfm.rewind.encoders import Encoders
 from rfm.rewind.network import RewindConfig, RewindTransformer
 from rfm.rewind.predictor import RewindPredictor
@@ -67,6 +69,7 @@ class RewindCheckpoint:
     image_encoder, text_encoder: encoder weights without their prefix; empty if the checkpoint has none
     image_source, text_source: folders or ids of the encoders that the user names; None: the usual ones, if the
         checkpoint has weights of encoders
+    assumed: a line for the user on what was taken for granted of the network; None: nothing was
     """
 
     config: RewindConfig
@@ -75,6 +78,7 @@ class RewindCheckpoint:
     text_encoder: dict[str, Tensor] = field(default_factory=dict)
     image_source: str | None = None
     text_source: str | None = None
+    assumed: str | None = None
 
     @property
     def description(self) -> Description:
@@ -87,6 +91,8 @@ class RewindCheckpoint:
             max_frames=self.config.max_frames,
             trained_frames=self.config.trained_frames,
             trained_padding=self.config.trained_padding,
+            has_preference=self.config.has_preference,
+            has_success=self.config.has_success,
         )
 
     @property
@@ -96,15 +102,17 @@ class RewindCheckpoint:
 
     @property
     def notes(self) -> list[str]:
-        """A line on the encoders, of which no file of a training run says which they were."""
+        """A line on what was assumed of the network, and one on the encoders, which no file of a run names."""
+        lines = [] if self.assumed is None else [self.assumed]
         if not self._has_encoders:
-            return []
+            return lines
         known = (
             "their weights are the checkpoint's" if self.image_encoder and self.text_encoder else "only widths agree"
         )
         return [
+            *lines,
             f"encoders: {self._image_source} and {self._text_source} are taken for those of the training run, which no "
-            f"file names ({known}); upstream's are {USUAL_IMAGE_ENCODER} and {USUAL_TEXT_ENCODER}"
+            f"file names ({known}); upstream's are {USUAL_IMAGE_ENCODER} and {USUAL_TEXT_ENCODER}",
         ]
 
     @property
@@ -158,7 +166,7 @@ class RewindCheckpoint:
     def save(self, folder: Path) -> None:
         """Writes network and configuration in the layout that ``load`` reads, without encoders."""
         folder.mkdir(parents=True)
-        config = {"model_type": MODEL_TYPE, **asdict(self.config)}
+        config = {"model_type": MODEL_TYPE, **config_fields(self.config)}
         (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
         tensors = {name: tensor.contiguous() for name, tensor in self.network.items()}
         save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
@@ -186,16 +194,44 @@ def reads(folder: Path) -> bool:
 def load(folder: Path, options: Options) -> RewindCheckpoint:
     """The checkpoint in a local folder. Raises CheckpointError."""
     network = read_weights(folder)
+    if (renamed := first_code.renamed(network)) is not None:
+        return _of_first_code(folder, renamed, options)
     image_encoder = take_prefix(network, IMAGE_ENCODER_PREFIX)
     text_encoder = take_prefix(network, TEXT_ENCODER_PREFIX)
     sources = options.image_encoder, options.text_encoder
-    checkpoint = RewindCheckpoint(_rewind_config(folder, network), network, image_encoder, text_encoder, *sources)
+    config = _rewind_config(folder, network, _stated(folder), _trained_frames(folder))
+    for name in _unread(config):
+        network.pop(name, None)
+    checkpoint = RewindCheckpoint(config, network, image_encoder, text_encoder, *sources)
     checkpoint.check()
     return checkpoint
 
 
-def _rewind_config(folder: Path, weights: Mapping[str, Tensor]) -> RewindConfig:
+def _of_first_code(folder: Path, weights: dict[str, Tensor], options: Options) -> RewindCheckpoint:
+    if options.image_encoder or options.text_encoder:
+        raise CheckpointError(
+            f"{folder}: encoders: expected none for a checkpoint of the first ReWiND code, which crops frames and does "
+            "not resize them; encode frames as it does, and send video_embeddings and text_embedding"
+        )
     stated = _stated(folder)
+    settings = {**first_code.SETTINGS, **stated}
+    config = _rewind_config(folder, weights, settings, settings["max_len"])
+    checkpoint = RewindCheckpoint(config, weights, assumed=first_code.note(stated))
+    checkpoint.check()
+    return checkpoint
+
+
+def _unread(config: RewindConfig) -> list[str]:
+    """Weights that upstream's network has, and that are read for the sake of heads alone that this one lacks."""
+    return [
+        *([] if config.has_preference else ["preference_token"]),
+        *([] if config.has_pairs else ["first_embedding_B"]),
+    ]
+
+
+def _rewind_config(
+    folder: Path, weights: Mapping[str, Tensor], stated: Mapping[str, Any], trained_frames: int | None
+) -> RewindConfig:
     has_progress_tokens = "prog_token_A" in weights
     try:
         max_len = _shape(weights, "prog_token_A", 3)[1] if has_progress_tokens else _required(stated, "max_len", folder)
@@ -211,8 +247,10 @@ def _rewind_config(folder: Path, weights: Mapping[str, Tensor]) -> RewindConfig:
             use_per_frame_progress_token=has_progress_tokens,
             progress_bins=_shape(weights, "progress_head.4.weight", 2)[0],
             has_similarity="similarity_head.0.weight" in weights,
-            trained_frames=_trained_frames(folder),
+            trained_frames=trained_frames,
             trained_padding=_trained_padding(folder),
+            has_preference=has_head(weights, "preference"),
+            has_success=has_head(weights, "success"),
         )
     except KeyError as error:
         raise CheckpointError(f"{folder}: expected a ReWiND checkpoint, which has {error}") from error

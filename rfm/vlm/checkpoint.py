@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -30,14 +30,26 @@ from rfm.checkpoint.files import (
     NETWORK_CONFIG,
     WEIGHTS,
     check_shapes,
+    has_head,
     read_weights,
 )
+from rfm.checkpoint.nf4 import dequantize
 from rfm.checkpoint.training import check_progress
-from rfm.family import NETWORK, Description, Options
+from rfm.family import NETWORK, Description, Options, config_fields
 from rfm.feature_cache import FeatureCache
 from rfm.version_folder import PROCESSOR_FOLDER
 from rfm.vlm.adapter import adapted, base_of_adapter, has_adapter
-from rfm.vlm.backbone import BACKBONES, QWEN_2_5, SMOL, UNQUANTIZED, backbone_config, check_not_quantized, is_at_least
+from rfm.vlm.backbone import (
+    BACKBONES,
+    NF4,
+    QWEN_2_5,
+    SMOL,
+    UNQUANTIZED,
+    backbone_config,
+    check_not_quantized,
+    is_at_least,
+    quantization,
+)
 from rfm.vlm.collator import VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm.vlm.lora import LORA_NAME, Scaling, changed_by, merged, split
@@ -62,12 +74,14 @@ class VlmCheckpoint:
     weights: of VlmRewardModel, without LoRA
     factors: of LoRA, as ``rfm.vlm.lora.split`` names them; none: the weights are whole
     processor: folder or id with its tokenizer and image preprocessing; None: those of the base model that it names
+    num_nf4: weights that were rounded to NF4 in its files
     """
 
     config: VlmConfig
     weights: dict[str, Tensor]
     factors: dict[str, Tensor]
     processor: str | Path | None = None
+    num_nf4: int = 0
 
     @property
     def description(self) -> Description:
@@ -82,6 +96,8 @@ class VlmCheckpoint:
             frames_per_value=1 if self.config.multi_image else FRAMES_PER_GROUP,
             keeps_features=self.config.family != SMOL,
             is_large=True,
+            has_preference=self.config.has_preference,
+            has_success=self.config.has_success,
         )
 
     @property
@@ -91,7 +107,18 @@ class VlmCheckpoint:
 
     @property
     def notes(self) -> Sequence[str]:
-        """That positions may be others than in training, of a Qwen2.5-VL that reads videos."""
+        """That weights were rounded; that a Qwen2.5-VL which reads videos may have other positions than in training."""
+        return [*self._note_on_nf4(), *self._note_on_positions()]
+
+    def _note_on_nf4(self) -> Sequence[str]:
+        if not self.num_nf4:
+            return ()
+        return (
+            f"{WEIGHTS}: {self.num_nf4} weights are rounded to 4 bits (NF4 of bitsandbytes): scores are those of the "
+            "rounded weights; if they were rounded after training, those of the full checkpoint differ",
+        )
+
+    def _note_on_positions(self) -> Sequence[str]:
         version = str(self.config.backbone.get("transformers_version"))
         major = version.partition(".")[0]
         if self.config.family != QWEN_2_5 or self.config.multi_image or not major.isdigit() or int(major) < 5:
@@ -129,7 +156,7 @@ class VlmCheckpoint:
         """Writes weights and LoRA factors, one config.json that says all, and the processor."""
         collator = self.collator  # first: what is missing is reported before the weights are written
         folder.mkdir(parents=True)
-        settings = {name: value for name, value in asdict(self.config).items() if name != "backbone"}
+        settings = {name: value for name, value in config_fields(self.config).items() if name != "backbone"}
         config = {**self.config.backbone, SETTINGS: settings}
         (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
         tensors = {name: tensor.contiguous() for name, tensor in (self.weights | self.factors).items()}
@@ -170,6 +197,9 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
         is_adapter = has_adapter(folder)
         file = folder / NETWORK_CONFIG
         backbone = {} if is_adapter else backbone_config(read_json(file), file)
+        is_nf4, num_nf4 = quantization(backbone) == NF4, 0
+        if is_nf4:
+            del backbone["quantization_config"]
         check_not_quantized(backbone, file, UNQUANTIZED)
         if SETTINGS in backbone:  # written by VlmCheckpoint.save, with every setting
             config = _saved_config(backbone)
@@ -182,11 +212,13 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
             if is_adapter:
                 backbone, tensors, scaling = adapted(folder, options.base_model or base_of_adapter(folder, run))
             else:
-                tensors, scaling = _whole(folder, backbone, run)
+                tensors, num_nf4 = _in_full_precision(folder, is_nf4)
+                tensors, scaling = _whole(tensors, folder, backbone, run)
             weights, factors = _used(tensors, scaling)
             config = _trained_config(folder, backbone, run, weights)
     own = folder / PROCESSOR_FOLDER
-    checkpoint = VlmCheckpoint(config, weights, factors, options.base_model or (own if own.is_dir() else None))
+    processor = options.base_model or (own if own.is_dir() else None)
+    checkpoint = VlmCheckpoint(config, weights, factors, processor, num_nf4)
     checkpoint.check()
     return checkpoint
 
@@ -215,6 +247,8 @@ def _trained_config(
         progress_bins=weights["progress_head.4.weight"].shape[0],
         has_similarity="similarity_head.0.weight" in weights,
         size_px=run.size_px(family, network["multi_image"]),
+        has_preference=has_head(weights, "preference"),
+        has_success=has_head(weights, "success"),
         **network,
     )
     if (family == SMOL or config.per_frame_progress_token) and not config.multi_image:
@@ -237,12 +271,24 @@ def _renames(family: Any) -> Renames:
     return SMOL_NAMES if family == SMOL else QWEN_NAMES
 
 
-def _whole(folder: Path, backbone: Mapping[str, Any], run: RunConfig) -> tuple[dict[str, Tensor], Scaling | None]:
-    """The weights of the network by name, with LoRA factors if it has some; what these are scaled with."""
-    tensors, scaling = read_weights(folder), None
+def _in_full_precision(folder: Path, is_nf4: bool) -> tuple[dict[str, Tensor], int]:
+    """The tensors in the folder, and the number of those that were in NF4; is_nf4: config.json says that some are."""
+    tensors = read_weights(folder)
+    num_nf4 = dequantize(tensors)
     quantized = next((name for name in tensors if QUANTIZED.search(name)), None)
     if quantized is not None:
         raise CheckpointError(f"{folder}: expected weights in full precision, got {shown(quantized)}; {UNQUANTIZED}")
+    if is_nf4 and not num_nf4:
+        got = "none; if they are meant in full precision, remove it"
+        raise CheckpointError(f"{folder / NETWORK_CONFIG}: quantization_config: expected weights in NF4, got {got}")
+    return tensors, num_nf4
+
+
+def _whole(
+    tensors: dict[str, Tensor], folder: Path, backbone: Mapping[str, Any], run: RunConfig
+) -> tuple[dict[str, Tensor], Scaling | None]:
+    """The weights of the network by name, with LoRA factors if it has some; what these are scaled with."""
+    scaling = None
     if any(LORA_NAME.fullmatch(name) for name in tensors):
         tensors, scaling = renamed(tensors, LORA_INSIDE), Scaling.of(run.file, run.sections["peft"])
         if is_there(folder / ADAPTER_CONFIG):

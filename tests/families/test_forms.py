@@ -165,7 +165,10 @@ ROTARY = tuple(
         "no num_attention_heads of the text_config",
     )
 )
-BY_NAME = tuple(f"{SPOILED}[weights {which}]" for which in ("of gptq", "of awq", "of fp8", "with .SCB"))
+BY_NAME = (
+    *(f"{SPOILED}[weights of {method}]" for method in ("gptq", "awq", "fp8")),
+    "test_other_types_of_bitsandbytes_are_refused_by_name",
+)
 RANKS = tuple(f"{SPOILED}[{what} of another rank]" for what in ("an adapter", "a run", "a module"))
 OTHER_ENCODERS = (
     "test_encoders_that_do_not_fit_are_refused",
@@ -185,6 +188,7 @@ ROWS: dict[str, tuple[str, ...]] = {
     "a Hugging Face repository": ("test_what_a_hub_s_repository_lacks_is_told[pickles alone]",),
     "weights that are inf": ("test_weights_that_are_no_numbers_are_refused_at_every_door",),
     "a head that is 0": ("test_a_head_of_zeros_is_told",),
+    "no head of": ("test_what_is_there_is_scored_as_with_all_heads_and_the_rest_refused_alone",),
     "a run of before": (f"{SPOILED}[a run of before 2026-01-21]", "test_eight_special_tokens_tell_an_old_run"),
     "`config.yml`": PLACES,
     "no `config.yaml`": ("test_without_config_yaml_nothing_is_guessed",),
@@ -199,6 +203,7 @@ ROWS: dict[str, tuple[str, ...]] = {
     "tokenizer and processor": ("test_a_processor_of_transformers_5_reads_the_same",),
     "a Qwen2.5-VL that reads videos": ("test_a_video_run_of_transformers_5_is_told_about_its_positions",),
     "SmolVLM with": ("test_smolvlm_is_refused_where_its_scores_would_differ",),
+    "weights in NF4": ("test_an_export_scores_as_the_values_of_its_weights",),
     "weights of GPTQ": BY_NAME,
     "an adapter as PEFT": ("test_plain_lora_of_peft_is_taken", f"{SAME}[an adapter around the language model]"),
     "PiSSA or OLoRA": (f"test_plain_lora_of_peft_is_taken[{CONVERTED}]",),
@@ -214,6 +219,7 @@ ROWS: dict[str, tuple[str, ...]] = {
         "test_an_adapter_on_weights_of_few_bits_is_refused",
         "test_a_base_model_of_few_bits_is_refused",
     ),
+    "a checkpoint of the first": ("test_a_checkpoint_of_the_first_rewind_code_has_its_scores",),
     "ReWiND's": ("test_a_null_is_a_key_that_is_not_there",),
     "an image encoder": ("test_sizes_may_be_numbers_as_transformers_once_wrote_them",),
     "encoders of other": OTHER_ENCODERS,
@@ -227,11 +233,8 @@ def test_each_row_of_the_table_has_a_test() -> None:
     forms = [line.split(" | ")[0].removeprefix("| ") for line in section.splitlines() if line.startswith("| ")][1:]
     assert len(forms) == len(ROWS)
     assert [form for form, row in zip(forms, ROWS, strict=True) if not form.startswith(row)] == []
-    files = [
-        str(Path(__file__).with_name(f"test_{name}.py"))
-        for name in ("checkpoint", "encoders", "forms", "vlm_checkpoint")
-    ]
-    command = [sys.executable, "-m", "pytest", "--collect-only", "-o", "addopts=-q --import-mode=importlib", *files]
+    families = str(Path(__file__).parent)
+    command = [sys.executable, "-m", "pytest", "--collect-only", "-o", "addopts=-q --import-mode=importlib", families]
     collected = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
     known = {line.partition("::")[2] for line in collected.splitlines()}
     known |= {name.partition("[")[0] for name in known}
