@@ -615,6 +615,17 @@ def test_a_size_for_images_is_ignored_as_upstream_does(copied: Callable[[str], P
     assert exported.config.size_px is None
 
 
+def test_videos_are_not_pooled_as_images_are(copied: Callable[[str], Path]) -> None:
+    """Upstream takes the mean of a group of frames, whatever frame_pooling says."""
+    folder = copied("q25_video_avg_disc10")
+    rewritten(folder, lambda run: run["model"].update(frame_pooling="attention", frame_pooling_attn_temperature=0.01))
+    base = str(goldens.config("q25_video_avg_disc10").base_model)
+    sample = ProgressSample(film(0, 4, 48, 80))
+    (result,) = Engine.from_checkpoint(folder, base_model=base).evaluate([sample])
+    (expected,) = load_engine("q25_video_avg_disc10").evaluate([sample])
+    assert_close(result, expected, 1e-6)
+
+
 def test_a_size_for_videos_holds() -> None:
     checkpoint = families.load(goldens.config("q25_video_last_l2").checkpoint)
     assert isinstance(checkpoint, VlmCheckpoint)
