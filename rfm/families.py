@@ -9,6 +9,7 @@ from pathlib import Path
 
 from rfm.checkpoint import training
 from rfm.checkpoint.content import CheckpointError, read_run_config
+from rfm.checkpoint.decision import assumed
 from rfm.checkpoint.files import check_finite
 from rfm.checkpoint.hub import best_tag, find
 from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options
@@ -98,4 +99,4 @@ def notes(folder: Path, checkpoint: Checkpoint, answered: Collection[str] = trai
     has_similarity = checkpoint.description.has_similarity
     heads = [head for head in answered if head != training.SIMILARITY or has_similarity]
     of_weights = training.constant_heads(checkpoint.parts[NETWORK], heads)
-    return [*training.notes(folder, heads), *of_weights, *checkpoint.notes]
+    return [*training.notes(folder, heads), *of_weights, *checkpoint.notes, *assumed(checkpoint.decisions())]

@@ -48,7 +48,9 @@ def has_adapter(folder: Path) -> bool:
 
 
 def base_of_adapter(folder: Path, run: RunConfig) -> str:
-    """The base model that the run names. Raises CheckpointError if the adapter names another."""
+    """The base model that the run names. Raises CheckpointError if the adapter names another, or the run began with a
+    checkpoint, whose weights its adapter may change in place of the base model's.
+    """
     base = run.get("model.base_model_id", "")
     if not base:
         raise CheckpointError(f"{run.file}: expected model.base_model_id (or --base-model), got none")
@@ -56,15 +58,22 @@ def base_of_adapter(folder: Path, run: RunConfig) -> str:
     if isinstance(named, str) and _FEW_BITS.search(named):
         expected = f"base_model_name_or_path: expected weights in full precision, got {shown(named)}"
         raise CheckpointError(f"{folder / ADAPTER_CONFIG}: {expected}; {DEQUANTIZED.format(base=named)}")
-    if named and _model_name(str(named)) != _model_name(base):
+    if named and model_name(str(named)) != model_name(base):
         raise CheckpointError(
             f"{folder / ADAPTER_CONFIG}: base_model_name_or_path: expected {cut(base)}, the model.base_model_id of "
             f"{run.file}, got {shown(named)}; name the one that the adapter was trained on with --base-model"
         )
+    began_with = run.get("training.load_from_checkpoint", "")
+    if began_with:
+        raise CheckpointError(
+            f"{run.file}: training.load_from_checkpoint: expected none beside an adapter, got {shown(began_with)}: the "
+            f"adapter may change its weights in place of those of {cut(base)}; name the folder of the weights that it "
+            "changes with --base-model, with the base model's tokenizer and processor files in it"
+        )
     return base
 
 
-def _model_name(base: str) -> str:
+def model_name(base: str) -> str:
     """What is left of a base model's id or path where the same model may have several."""
     return _VARIANT.sub("", base.rstrip("/").rpartition("/")[2].lower())
 

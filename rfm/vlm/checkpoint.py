@@ -25,6 +25,7 @@ from rfm.checkpoint.content import (
     read_json,
     shown,
 )
+from rfm.checkpoint.decision import Decision
 from rfm.checkpoint.files import (
     ADAPTER_CONFIG,
     NETWORK_CONFIG,
@@ -46,6 +47,8 @@ from rfm.vlm.network import VlmConfig, VlmRewardModel, build_backbone
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.processor import frame_size, load_collator, save_processor
 from rfm.vlm.prompts import OF_AN_OLD_RUN
+from rfm.vlm.provenance import of_export, of_processor, of_run
+from rfm.vlm.published import check_published, differences, is_published
 from rfm.vlm.run_config import RunConfig
 
 LORA = "lora"  # in VlmCheckpoint.parts: the factors that change the network's weights
@@ -61,13 +64,17 @@ class VlmCheckpoint:
 
     weights: of VlmRewardModel, without LoRA
     factors: of LoRA, as ``rfm.vlm.lora.split`` names them; none: the weights are whole
-    processor: folder or id with its tokenizer and image preprocessing; None: those of the base model that it names
+    processor: its own folder of tokenizer and image preprocessing; None: those of the base model are taken
+    base_model: folder or id that the caller names; None: the one that the checkpoint names
+    settings: what decided its configuration
     """
 
     config: VlmConfig
     weights: dict[str, Tensor]
     factors: dict[str, Tensor]
-    processor: str | Path | None = None
+    processor: Path | None = None
+    base_model: str | None = None
+    settings: tuple[Decision, ...] = ()
 
     @property
     def description(self) -> Description:
@@ -91,7 +98,31 @@ class VlmCheckpoint:
 
     @property
     def notes(self) -> Sequence[str]:
-        """That positions may be others than in training, of a Qwen2.5-VL that reads videos."""
+        """That prompts, images or positions may be others than in training."""
+        return [*self._of_processor(), *self._of_positions()]
+
+    def decisions(self) -> list[Decision]:
+        """What decided each setting. Raises CheckpointError if the processor cannot be had."""
+        return [*self.settings, *of_processor(self.collator, PROCESSOR_FOLDER if self._is_own else self._source)]
+
+    @property
+    def _source(self) -> str | Path:
+        """Folder or id of the processor."""
+        return self.base_model or self.processor or self.config.base_model_id
+
+    @property
+    def _is_own(self) -> bool:
+        """Whether the processor is the checkpoint's own, as an export has it."""
+        return self._source == self.processor
+
+    def _of_processor(self) -> Sequence[str]:
+        """That it is not as published: the run may have been trained with it, or not."""
+        found = [] if self._is_own else differences(self.collator)
+        known = f"the published processors of {self.config.family}"
+        return [f"base model {self._source}: differs from {known} in {'; '.join(found)}"] if found else []
+
+    def _of_positions(self) -> Sequence[str]:
+        """That they may be others than in training, of a Qwen2.5-VL that reads videos."""
         version = str(self.config.backbone.get("transformers_version"))
         major = version.partition(".")[0]
         if self.config.family != QWEN_2_5 or self.config.multi_image or not major.isdigit() or int(major) < 5:
@@ -106,7 +137,10 @@ class VlmCheckpoint:
     def collator(self) -> VlmCollator:
         """What makes batches of samples. Raises CheckpointError if the processor cannot be had or does not fit."""
         embedding = next(t for name, t in self.weights.items() if name.endswith("embed_tokens.weight"))
-        return load_collator(self.config, len(embedding), self.processor or self.config.base_model_id)
+        collator = load_collator(self.config, len(embedding), self._source)
+        if self.base_model is not None and is_published(self.config.base_model_id, self.config.family):
+            check_published(collator, self.base_model)
+        return collator
 
     def encoders(self) -> None:
         """None: the network reads raw frames, and needs no encoders."""
@@ -174,6 +208,7 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
         if SETTINGS in backbone:  # written by VlmCheckpoint.save, with every setting
             config = _saved_config(backbone)
             weights, factors = _used(renamed(read_weights(folder), _renames(config.family)))
+            settings = of_export(config, options.base_model)
         else:
             run = RunConfig.of(folder)
             run.check_model_type()
@@ -185,8 +220,10 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
                 tensors, scaling = _whole(folder, backbone, run)
             weights, factors = _used(tensors, scaling)
             config = _trained_config(folder, backbone, run, weights)
+            settings = of_run(config, run, options.base_model, scaling, is_adapter=is_adapter)
     own = folder / PROCESSOR_FOLDER
-    checkpoint = VlmCheckpoint(config, weights, factors, options.base_model or (own if own.is_dir() else None))
+    processor = own if own.is_dir() else None
+    checkpoint = VlmCheckpoint(config, weights, factors, processor, options.base_model, settings)
     checkpoint.check()
     return checkpoint
 

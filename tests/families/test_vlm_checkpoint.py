@@ -632,8 +632,12 @@ def test_a_size_for_videos_holds() -> None:
     assert checkpoint.config.size_px == (56, 84)
 
 
-def test_the_processor_s_chat_template_wins_over_the_tokenizer_s(tmp_path: Path) -> None:
+def test_the_processor_s_chat_template_wins_over_the_tokenizer_s(
+    copied: Callable[[str], Path], tmp_path: Path
+) -> None:
     """Upstream prompts by the processor."""
+    folder = copied(PLAIN)
+    rewritten(folder, lambda run: run["model"].update(base_model_id="org/own-qwen3-vl"))
     base = tmp_path / "base"
     shutil.copytree(str(goldens.config(PLAIN).base_model), base, copy_function=shutil.copyfile)
     file = base / "tokenizer_config.json"
@@ -641,10 +645,10 @@ def test_the_processor_s_chat_template_wins_over_the_tokenizer_s(tmp_path: Path)
     file.write_text(json.dumps(json.loads(file.read_text()) | other))
 
     def prompt() -> str:
-        template = str(load(PLAIN, base=str(base)).collator.tokenizer.chat_template)
-        with tempfile.TemporaryDirectory() as folder:
-            saved = Path(folder, "saved")
-            load(PLAIN, base=str(base)).save(saved)
+        template = str(load(PLAIN, folder, str(base)).collator.tokenizer.chat_template)
+        with tempfile.TemporaryDirectory() as saving:
+            saved = Path(saving, "saved")
+            load(PLAIN, folder, str(base)).save(saved)
             assert families.load(saved).collator.tokenizer.chat_template == template
         return template
 
