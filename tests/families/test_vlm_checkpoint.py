@@ -632,9 +632,7 @@ def test_a_size_for_videos_holds() -> None:
     assert checkpoint.config.size_px == (56, 84)
 
 
-def test_the_processor_s_chat_template_wins_over_the_tokenizer_s(
-    copied: Callable[[str], Path], tmp_path: Path
-) -> None:
+def test_the_processor_s_chat_template_wins_over_the_tokenizer_s(copied: Callable[[str], Path], tmp_path: Path) -> None:
     """Upstream prompts by the processor."""
     folder = copied(PLAIN)
     rewritten(folder, lambda run: run["model"].update(base_model_id="org/own-qwen3-vl"))
