@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from rfm.checkpoint.decision import OF_WEIGHTS, TRAINED_WITH_PADDING, Decision, source_name
 from rfm.checkpoint.files import ADAPTER_CONFIG, NETWORK_CONFIG
 from rfm.version_folder import PROCESSOR_FOLDER
@@ -95,7 +93,8 @@ def _positions(config: VlmConfig) -> list[Decision]:
     """What decides positions behind a video, which transformers changed, of a Qwen2.5-VL."""
     if config.family != QWEN_2_5 or config.multi_image:
         return []
-    version: Any = config.backbone.get("transformers_version")
+    version = config.backbone.get("transformers_version")
     stated = f"{NETWORK_CONFIG}: transformers_version {version}"
-    source = stated if version else "default: no file names the transformers of the run"
-    return [Decision("positions_behind_videos", "as transformers 4", source, is_assumed=version is None)]
+    source = stated if str(version).startswith("4.") else "default: no file names transformers 4"
+    is_assumed = version is None  # of a later version, VlmCheckpoint.notes tells
+    return [Decision("positions_behind_videos", "as transformers 4", source, is_assumed=is_assumed)]

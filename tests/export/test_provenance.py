@@ -156,6 +156,25 @@ def test_what_config_yaml_does_not_say_is_assumed_aloud(
     assert line.endswith("; rfm export --explain shows what decided each setting")
 
 
+@pytest.mark.parametrize(
+    ("version", "source", "is_assumed"),
+    [
+        ("4.57.6", "config.json: transformers_version 4.57.6", False),
+        ("5.5.4", "default: no file names transformers 4", False),  # a line of its own tells
+        (None, "default: no file names transformers 4", True),
+    ],
+)
+def test_positions_behind_videos_say_what_decided_them(
+    vlm: Callable[[str], tuple[Path, Path]], version: str | None, source: str, is_assumed: bool
+) -> None:
+    folder, base = vlm(VIDEO)
+    rewritten(folder / "config.json", lambda config: config.update(transformers_version=version))
+    decisions, said = explained(folder, base)
+    name = "positions_behind_videos"
+    assert decisions[name] == Decision(name, "as transformers 4", source, is_assumed=is_assumed)
+    assert len(said) == (version != "4.57.6")
+
+
 def test_a_config_yaml_above_the_checkpoint_is_named_so() -> None:
     decisions, said = explained(goldens.config(REWIND).checkpoint)
     assert said == []
