@@ -13,7 +13,7 @@ from rfm.checkpoint.content import CheckpointError, cut, is_there, listed, read_
 from rfm.checkpoint.files import ADAPTER_CONFIG, NETWORK_CONFIG, WEIGHTS, WEIGHTS_INDEX, check_one_form
 from rfm.checkpoint.pickles import refuse_pickles
 from rfm.vlm.backbone import BACKBONES, DEQUANTIZED, backbone_config, check_not_quantized
-from rfm.vlm.lora import LORA_NAME, Scaling, check_adapter
+from rfm.vlm.lora import LORA_NAME, MERGE, Scaling, check_adapter
 from rfm.vlm.names import ADAPTER_NAMES, QWEN_NAMES, renamed
 from rfm.vlm.run_config import RunConfig
 
@@ -67,8 +67,8 @@ def base_of_adapter(folder: Path, run: RunConfig) -> str:
     if began_with:
         raise CheckpointError(
             f"{run.file}: training.load_from_checkpoint: expected none beside an adapter, got {shown(began_with)}: the "
-            f"adapter may change its weights in place of those of {cut(base)}; name the folder of the weights that it "
-            "changes with --base-model, with the base model's tokenizer and processor files in it"
+            f"adapter may change its weights in place of those of {cut(base)}; {MERGE}; if it does change those of "
+            f"{cut(base)}, name them with --base-model"
         )
     return base
 
@@ -126,7 +126,7 @@ def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
         hint = "name its folder with --base-model"
         raise CheckpointError(f"base model {base_model}: cannot be had: {cut(str(error))} ({hint})") from error
     if loaded["missing_keys"]:
-        raise CheckpointError(f"base model {base_model}: missing keys: {sorted(loaded['missing_keys'])}")
+        raise CheckpointError(f"base model {base_model}: missing keys: {listed(sorted(loaded['missing_keys']))}")
     config = backbone_config(network.config.to_dict(), base_model)
     config.pop("transformers_version", None)  # the one installed here, which says nothing of the training
     return config, {f"model.{name}": tensor for name, tensor in network.state_dict().items()}
