@@ -6,7 +6,7 @@ A package that holds a ``FAMILY`` is one."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from rfm.predictor import Predictor
 
 NETWORK = "network"  # in Checkpoint.parts: the weights of the network that scores
+_USUAL_HEADS = ("has_preference", "has_success")  # fields of configurations
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,23 @@ class Description:
     frames_per_value: int = 1
     keeps_features: bool = False
     is_large: bool = False
+    has_preference: bool = True
+    has_success: bool = True
+
+    @property
+    def lacks(self) -> frozenset[str]:
+        """Names of the heads that the network has not."""
+        heads = {"preference": self.has_preference, "success": self.has_success, "similarity": self.has_similarity}
+        return frozenset(name for name, is_there in heads.items() if not is_there)
+
+
+def config_fields(config: Any) -> dict[str, Any]:
+    """The fields of a network's configuration, as files and digests have them.
+
+    The heads of preference and of success are named only where they are missing, as before networks could lack them.
+    """
+    fields = asdict(config)
+    return {name: value for name, value in fields.items() if name not in _USUAL_HEADS or not value}
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from rfm.checkpoint.decision import is_folder, source_name
 from rfm.checkpoint.digest import settings_digest, weights_digest
 from rfm.checkpoint.files import find_run_config
 from rfm.checkpoint.hub import commit_of
-from rfm.family import NETWORK, Checkpoint, EncodersDescription
+from rfm.family import NETWORK, Checkpoint, EncodersDescription, config_fields
 from rfm.parameters import DTYPE_PARAMETER
 from rfm_client.contract.model_info import (
     DIGEST_PARAMETER,
@@ -113,6 +113,6 @@ def _network(checkpoint: Checkpoint) -> dict[str, Any]:
         parameters[name.partition(".")[0]] += tensor.numel()
     return {
         "class": checkpoint.description.network_class,
-        "config": asdict(checkpoint.config),
+        "config": config_fields(checkpoint.config),
         "parameters": dict(parameters),
     }

@@ -207,13 +207,12 @@ def check_keys(expected: Iterable[str], got: Iterable[str]) -> None:
     missing, unexpected = sorted(set(expected) - set(got)), sorted(set(got) - set(expected))
     if missing or unexpected:
         named = [listed(names) if names else "none" for names in (missing, unexpected)]
-        raise CheckpointError(f"{WEIGHTS}: missing keys: {named[0]}; unexpected keys: {named[1]}{_lost_heads(missing)}")
+        raise CheckpointError(f"{WEIGHTS}: missing keys: {named[0]}; unexpected keys: {named[1]}")
 
 
-def _lost_heads(missing: Iterable[str]) -> str:
-    """Which heads are missing, for a message; they are missing where a network was trained without them."""
-    heads = sorted({name.partition(".")[0].removesuffix("_head") for name in missing if "_head." in name})
-    return f"; a checkpoint without the head of {' and '.join(heads)} is not served yet" if heads else ""
+def has_head(weights: Iterable[str], head: str) -> bool:
+    """Whether there are weights of the head of ``head``; one of which some are missing is refused later."""
+    return any(name.startswith(f"{head}_head.") for name in weights)
 
 
 def _below(folder: Path) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,14 +34,15 @@ from rfm.checkpoint.files import (
     check_shapes,
     find_run_config,
     frame_count,
+    has_head,
     read_weights,
     take_prefix,
     trained_frames,
 )
 from rfm.checkpoint.training import check_progress
-from rfm.family import NETWORK, Description, Options
+from rfm.family import NETWORK, Description, Options, config_fields
 from rfm.feature_cache import FeatureCache
-from rfm.rewind import usual
+from rfm.rewind import first_code, usual
 from rfm.rewind.encoders import Encoders
 from rfm.rewind.network import RewindConfig, RewindTransformer
 from rfm.rewind.predictor import RewindPredictor
@@ -65,7 +66,7 @@ _LIMITS = {
 _LAYERS = "transformer.layers."
 _OF_WEIGHTS = (
     "video_feature_dim", "text_feature_dim", "hidden_dim", "num_layers", "use_per_frame_progress_token",
-    "progress_bins", "has_similarity",
+    "progress_bins", "has_similarity", "has_preference", "has_success",
 )  # fmt: skip
 _STATED_TYPES: dict[str, type] = {"num_attention_heads": int, "max_len": int, "causal_mask": bool}
 
@@ -100,6 +101,8 @@ class RewindCheckpoint:
             max_frames=self.config.max_frames,
             trained_frames=self.config.trained_frames,
             trained_padding=self.config.trained_padding,
+            has_preference=self.config.has_preference,
+            has_success=self.config.has_success,
         )
 
     @property
@@ -199,7 +202,7 @@ class RewindCheckpoint:
     def save(self, folder: Path) -> None:
         """Writes network and configuration in the layout that ``load`` reads, without encoders."""
         folder.mkdir(parents=True)
-        config = {"model_type": MODEL_TYPE, **asdict(self.config)}
+        config = {"model_type": MODEL_TYPE, **config_fields(self.config)}
         (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
         tensors = {name: tensor.contiguous() for name, tensor in self.network.items()}
         save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
@@ -227,27 +230,51 @@ def reads(folder: Path) -> bool:
 def load(folder: Path, options: Options) -> RewindCheckpoint:
     """The checkpoint in a local folder. Raises CheckpointError."""
     network = read_weights(folder)
+    if (renamed := first_code.renamed(network)) is not None:
+        return _of_first_code(folder, renamed, options)
     image_encoder = take_prefix(network, IMAGE_ENCODER_PREFIX)
     text_encoder = take_prefix(network, TEXT_ENCODER_PREFIX)
     sources = options.image_encoder, options.text_encoder
-    stated = _stated(folder)
+    stated = {**_stated(folder), "trained_frames": _trained_frames(folder)}
     config = _rewind_config(folder, network, stated)
-    settings = _settings(folder, config, stated)
-    checkpoint = RewindCheckpoint(config, network, image_encoder, text_encoder, *sources, settings)
+    for name in _unread(config):
+        network.pop(name, None)
+    checkpoint = RewindCheckpoint(config, network, image_encoder, text_encoder, *sources, _settings(config, stated))
     checkpoint.check()
     return checkpoint
 
 
-def _settings(folder: Path, config: RewindConfig, stated: Mapping[str, Decision]) -> tuple[Decision, ...]:
+def _of_first_code(folder: Path, weights: dict[str, Tensor], options: Options) -> RewindCheckpoint:
+    if options.image_encoder or options.text_encoder:
+        raise CheckpointError(
+            f"{folder}: encoders: expected none for a checkpoint of the first ReWiND code, which crops frames and does "
+            "not resize them; encode frames as it does, and send video_embeddings and text_embedding"
+        )
+    stated = {**first_code.SETTINGS, **_stated(folder)}
+    stated["trained_frames"] = Decision("trained_frames", stated["max_len"].value, "max_len")
+    config = _rewind_config(folder, weights, stated)
+    checkpoint = RewindCheckpoint(config, weights, settings=_settings(config, stated))
+    checkpoint.check()
+    return checkpoint
+
+
+def _settings(config: RewindConfig, stated: Mapping[str, Decision]) -> tuple[Decision, ...]:
     """What decided each setting of the network, and the clients' defaults."""
     of_weights = (*_OF_WEIGHTS, *(["max_len"] if config.use_per_frame_progress_token else []))
     padding = Decision("trained_padding", config.trained_padding, NETWORK_CONFIG)
     return (
         *(Decision(name, getattr(config, name), OF_WEIGHTS) for name in of_weights),
         *(decision for name, decision in stated.items() if name not in of_weights),
-        _trained_frames(folder),
         TRAINED_WITH_PADDING if config.trained_padding is None else padding,
     )
+
+
+def _unread(config: RewindConfig) -> list[str]:
+    """Weights that upstream's network has, and that are read for the sake of heads alone that this one lacks."""
+    return [
+        *([] if config.has_preference else ["preference_token"]),
+        *([] if config.has_pairs else ["first_embedding_B"]),
+    ]
 
 
 def _rewind_config(folder: Path, weights: Mapping[str, Tensor], stated: Mapping[str, Decision]) -> RewindConfig:
@@ -266,8 +293,10 @@ def _rewind_config(folder: Path, weights: Mapping[str, Tensor], stated: Mapping[
             use_per_frame_progress_token=has_progress_tokens,
             progress_bins=_shape(weights, "progress_head.4.weight", 2)[0],
             has_similarity="similarity_head.0.weight" in weights,
-            trained_frames=_trained_frames(folder).value,
+            trained_frames=stated["trained_frames"].value,
             trained_padding=_trained_padding(folder),
+            has_preference=has_head(weights, "preference"),
+            has_success=has_head(weights, "success"),
         )
     except KeyError as error:
         raise CheckpointError(f"{folder}: expected a ReWiND checkpoint, which has {error}") from error

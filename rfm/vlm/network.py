@@ -53,6 +53,8 @@ class VlmConfig:
     size_px: tuple[int, int] | None
     base_model_id: str
     trained_frames: int | None = None
+    has_preference: bool = True
+    has_success: bool = True
 
     @property
     def family(self) -> str:
@@ -93,8 +95,8 @@ class VlmOutput:
     """
 
     progress: Tensor
-    success: Tensor
-    preference: Tensor
+    success: Tensor | None
+    preference: Tensor | None
     similarity: Tensor | None
     made: Tensor | None = None
 
@@ -108,8 +110,10 @@ class VlmRewardModel(nn.Module):
         self.model = backbone
         width = config.hidden_dim
         self.progress_head = PredictionHead(width, config.progress_bins)
-        self.success_head = PredictionHead(width, 1)
-        self.preference_head = PredictionHead(width, 1)
+        if config.has_success:
+            self.success_head = PredictionHead(width, 1)
+        if config.has_preference:
+            self.preference_head = PredictionHead(width, 1)
         if config.has_similarity:
             self.similarity_head = PredictionHead(width, 1)
         self.frame_pool_attn = nn.Linear(width, 1, bias=False)
@@ -130,8 +134,8 @@ class VlmRewardModel(nn.Module):
         queries = hidden[batch.query_rows, batch.query_tokens]
         return VlmOutput(
             self.progress_head(frames),
-            self.success_head(frames).squeeze(-1),
-            self.preference_head(queries).squeeze(-1),
+            self.success_head(frames).squeeze(-1) if self.config.has_success else None,
+            self.preference_head(queries).squeeze(-1) if self.config.has_preference else None,
             self.similarity_head(queries).squeeze(-1) if self.config.has_similarity else None,
             made,
         )

@@ -54,6 +54,13 @@ def of_export(config: VlmConfig, base_model: str | None) -> tuple[Decision, ...]
     )
 
 
+def of_rounding(num_nf4: int) -> list[Decision]:
+    """The decision about weights in NF4, which may have been rounded after training. ``num_nf4``: how many they are."""
+    rounded = f"{num_nf4} in NF4 of bitsandbytes"
+    source = f"{OF_WEIGHTS}, rounded in training too"
+    return [Decision("rounded_weights", rounded, source, is_assumed=True)] if num_nf4 else []
+
+
 def of_processor(collator: VlmCollator, source: object) -> list[Decision]:
     """The decisions about prompts and images. ``source``: folder or id of the processor."""
     name = f"processor of {source_name(str(source))}" if source != PROCESSOR_FOLDER else f"{PROCESSOR_FOLDER}/"
@@ -63,7 +70,8 @@ def of_processor(collator: VlmCollator, source: object) -> list[Decision]:
 
 
 def _of_weights(config: VlmConfig) -> list[Decision]:
-    return [Decision(name, getattr(config, name), OF_WEIGHTS) for name in ("progress_bins", "has_similarity")]
+    names = ("progress_bins", "has_similarity", "has_preference", "has_success")
+    return [Decision(name, getattr(config, name), OF_WEIGHTS) for name in names]
 
 
 def _deciding(config: VlmConfig) -> list[str]:

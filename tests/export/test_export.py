@@ -368,7 +368,7 @@ LAST_FRAME = (
 )
 QUANTIZED = (
     "config.yaml: model.quantization is true: the run scored with its base model rounded to a few bits; the scores here "
-    "are those of the weights as they stand, so they differ from the run's"
+    "are those of the weights as they stand, so they differ from the run's unless these are rounded alike"
 )
 ALL_TRAINED: dict[str, object] = {f"train_{head}_head": True for head in HEADS}
 RUNS: dict[str, tuple[str, dict[str, object], list[str]]] = {

@@ -89,6 +89,8 @@ def test_every_setting_of_a_vision_language_checkpoint_says_what_decided_it(
         "base_model": "--base-model",
         "progress_bins": "weights",
         "has_similarity": "weights",
+        "has_preference": "weights",
+        "has_success": "weights",
         "dtype": "config.yaml: model.torch_dtype",
         "multi_image": "config.yaml: model.use_multi_image, data.use_multi_image",
         "per_frame_progress_token": "config.yaml: model.use_per_frame_progress_token, data.use_per_frame_progress_token",
@@ -181,7 +183,7 @@ def test_a_config_yaml_above_the_checkpoint_is_named_so() -> None:
         **dict.fromkeys(
             (
                 "video_feature_dim", "text_feature_dim", "hidden_dim", "num_layers", "use_per_frame_progress_token",
-                "progress_bins", "has_similarity", "max_len",
+                "progress_bins", "has_similarity", "has_preference", "has_success", "max_len",
             ),
             "weights",
         ),

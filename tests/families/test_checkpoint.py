@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import os
@@ -33,6 +34,7 @@ from rfm.engine import Engine
 from rfm.rewind.network import RewindConfig
 from rfm.vlm.network import VlmConfig
 from rfm_commands.engine_scorer import EngineScorer
+from spoilt import run_the_command
 
 CONTINUOUS = "legacy_keys_l2"  # lacks causal_mask and use_per_frame_progress_token
 MISMATCHED = "h40_L3_H5_c1_t1_disc5_cfgmismatch"  # its configs say l2 and 32 bins, its weights 5 bins
@@ -234,13 +236,6 @@ SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
         change_weights(lambda w: w.update(surplus=w.pop("success_head.4.bias"))),
         r"missing keys: \['success_head.4.bias'\]; unexpected keys: \['surplus'\]",
     ),
-    "no head of preference, and none of success": (
-        change_weights(
-            lambda w: [w.pop(name) for name in list(w) if name.startswith(("preference_head", "success_head"))]
-        ),
-        r"missing keys: \['preference_head.0.bias', .*; a checkpoint without the head of preference and success is not "
-        r"served yet",
-    ),
     "no head of progress": (
         change_weights(lambda w: [w.pop(name) for name in list(w) if name.startswith("progress_head")]),
         r"expected a ReWiND checkpoint, which has 'progress_head.4.weight'",
@@ -405,6 +400,12 @@ PICKLES: dict[str, tuple[Callable[[Path], None], str]] = {
         "it's.pt",
     ),
     "in data-parallel": (in_data_parallel, "rewind.pth"),
+    "with the arguments of the run": (
+        lambda folder: torch.save(
+            {"args": argparse.Namespace(max_length=16), "model_state_dict": take_weights(folder)}, folder / "last.pth"
+        ),
+        "last.pth",
+    ),
     "weights that share memory": (sharing_memory, "model.pt"),
 }
 
@@ -423,15 +424,6 @@ def test_the_conversion_that_the_refusal_of_a_pickle_names_works(
     after = families.load(folder)
     assert after.config == before.config
     assert all(torch.equal(after.network[name], before.network[name]) for name in before.network)
-
-
-def run_the_command(load: Callable[[Path], object], folder: Path) -> None:
-    """What the refusal of ``load`` says to type."""
-    with pytest.raises(CheckpointError) as refusal:
-        load(folder)
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    (command,) = re.findall(r"python -c .*", str(refusal.value))
-    subprocess.run(["bash", "-c", command], check=True, env={**os.environ, "PATH": path})
 
 
 def test_the_conversion_of_a_pickled_adapter_works(tmp_path: Path) -> None:

@@ -345,7 +345,7 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
             change_tensors("model.safetensors", lambda w, part=part: w.update({f"model.language_model.layers.0.mlp.up_proj{part}": torch.ones(1)})),
             rf"expected weights in full precision, got '.*{part}'; export the checkpoint that was quantized",
         )
-        for part in (".weight.absmax", ".weight.quant_state.bitsandbytes__nf4", ".SCB", ".qweight", ".weight_scale_inv")
+        for part in (".weight.absmax", ".weight.quant_state.bitsandbytes__fp4", ".SCB", ".qweight", ".weight_scale_inv")
     },
     "a weight under two names": (
         "q25_mean_l2",
