@@ -9,6 +9,7 @@ from pathlib import Path
 
 from rfm.checkpoint import training
 from rfm.checkpoint.content import CheckpointError, read_run_config
+from rfm.checkpoint.decision import assumed
 from rfm.checkpoint.files import WEIGHTS, check_finite
 from rfm.checkpoint.hub import best_tag, find
 from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options
@@ -100,4 +101,5 @@ def notes(folder: Path, checkpoint: Checkpoint, answered: Collection[str] = trai
     missing = [head for head in answered if head in lacks - {training.SIMILARITY}]  # most have no head of similarity
     without = [f"{WEIGHTS}: there is no head of {' and '.join(missing)}: served without"] if missing else []
     of_weights = training.constant_heads(checkpoint.parts[NETWORK], heads)
-    return [*without, *training.notes(folder, heads), *of_weights, *checkpoint.notes]
+    of_run = training.notes(folder, heads)
+    return [*without, *of_run, *of_weights, *checkpoint.notes, *assumed(checkpoint.decisions())]

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from rfm.checkpoint.decision import Decision
 from rfm.feature_cache import FeatureCache
 from rfm_client.contract import FrameSize, RewardError
 from rfm_client.contract.named_frames import NamedFootage
@@ -147,7 +148,10 @@ class Checkpoint(Protocol):
 
     @property
     def notes(self) -> Sequence[str]:
-        """A line for the user on each thing that decides scores, was assumed, and could not be checked."""
+        """A line for the user on each thing that contradicts what is known of the training run."""
+
+    def decisions(self) -> Sequence[Decision]:
+        """What decided each thing that scores depend on. Raises CheckpointError for files that cannot be had."""
 
     def encoders(self) -> FrameEncoders | None:
         """The checkpoint's encoders; None: it has none. Raises CheckpointError if they cannot be had or do not fit."""

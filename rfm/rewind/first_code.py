@@ -7,17 +7,19 @@ https://github.com/Jiahui-3205/ReWiND_Release. D width.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from torch import Tensor
 
 from rfm.checkpoint.content import CheckpointError
-from rfm.checkpoint.files import NETWORK_CONFIG
+from rfm.checkpoint.decision import Decision
 
 _FIRST_FRAME = "first_pos_embed"  # [1, D]; added to the first frame
 _UNREAD = "class_token"  # a parameter that its network never reads
 # Its network always has so many heads and a causal mask. Its training script shows 16 frames unless told otherwise.
-SETTINGS: Mapping[str, Any] = {"num_attention_heads": 8, "causal_mask": True, "max_len": 16}
+SETTINGS = {
+    name: Decision(name, value, "default of the first ReWiND code", is_assumed=True)
+    for name, value in {"num_attention_heads": 8, "causal_mask": True, "max_len": 16}.items()
+}
 
 
 def renamed(weights: Mapping[str, Tensor]) -> dict[str, Tensor] | None:
@@ -29,14 +31,3 @@ def renamed(weights: Mapping[str, Tensor]) -> dict[str, Tensor] | None:
     if first.dim() != 2:
         raise CheckpointError(f"{_FIRST_FRAME}: expected 2 axes, got {list(first.shape)}")
     return {**kept, "first_embedding_A": first[None]}
-
-
-def note(stated: Mapping[str, Any]) -> str | None:
-    """A line for the user on what no file says, so that the first code decides it. ``stated``: what files say."""
-    assumed = [f"{name} {value}" for name, value in SETTINGS.items() if name not in stated]
-    if not assumed:
-        return None
-    return (
-        f"a checkpoint of the first ReWiND code: {', '.join(assumed)} are assumed, as in that code; if the run had "
-        f"another --max_length, state it as max_len in {NETWORK_CONFIG}"
-    )

@@ -25,6 +25,7 @@ from rfm.checkpoint.content import (
     read_json,
     shown,
 )
+from rfm.checkpoint.decision import Decision
 from rfm.checkpoint.files import (
     ADAPTER_CONFIG,
     NETWORK_CONFIG,
@@ -58,6 +59,8 @@ from rfm.vlm.network import VlmConfig, VlmRewardModel, build_backbone
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.processor import frame_size, load_collator, save_processor
 from rfm.vlm.prompts import OF_AN_OLD_RUN
+from rfm.vlm.provenance import of_export, of_processor, of_rounding, of_run
+from rfm.vlm.published import check_published, differences, is_published
 from rfm.vlm.run_config import RunConfig
 
 LORA = "lora"  # in VlmCheckpoint.parts: the factors that change the network's weights
@@ -73,15 +76,17 @@ class VlmCheckpoint:
 
     weights: of VlmRewardModel, without LoRA
     factors: of LoRA, as ``rfm.vlm.lora.split`` names them; none: the weights are whole
-    processor: folder or id with its tokenizer and image preprocessing; None: those of the base model that it names
-    num_nf4: weights that were rounded to NF4 in its files
+    processor: its own folder of tokenizer and image preprocessing; None: those of the base model are taken
+    base_model: folder or id that the caller names; None: the one that the checkpoint names
+    settings: what decided its configuration
     """
 
     config: VlmConfig
     weights: dict[str, Tensor]
     factors: dict[str, Tensor]
-    processor: str | Path | None = None
-    num_nf4: int = 0
+    processor: Path | None = None
+    base_model: str | None = None
+    settings: tuple[Decision, ...] = ()
 
     @property
     def description(self) -> Description:
@@ -107,18 +112,31 @@ class VlmCheckpoint:
 
     @property
     def notes(self) -> Sequence[str]:
-        """That weights were rounded; that a Qwen2.5-VL which reads videos may have other positions than in training."""
-        return [*self._note_on_nf4(), *self._note_on_positions()]
+        """That prompts, images or positions may be others than in training."""
+        return [*self._of_processor(), *self._of_positions()]
 
-    def _note_on_nf4(self) -> Sequence[str]:
-        if not self.num_nf4:
-            return ()
-        return (
-            f"{WEIGHTS}: {self.num_nf4} weights are rounded to 4 bits (NF4 of bitsandbytes): scores are those of the "
-            "rounded weights; if they were rounded after training, those of the full checkpoint differ",
-        )
+    def decisions(self) -> list[Decision]:
+        """What decided each setting. Raises CheckpointError if the processor cannot be had."""
+        return [*self.settings, *of_processor(self.collator, PROCESSOR_FOLDER if self._is_own else self._source)]
 
-    def _note_on_positions(self) -> Sequence[str]:
+    @property
+    def _source(self) -> str | Path:
+        """Folder or id of the processor."""
+        return self.base_model or self.processor or self.config.base_model_id
+
+    @property
+    def _is_own(self) -> bool:
+        """Whether the processor is the checkpoint's own, as an export has it."""
+        return self._source == self.processor
+
+    def _of_processor(self) -> Sequence[str]:
+        """That it is not as published: the run may have been trained with it, or not."""
+        found = [] if self._is_own else differences(self.collator)
+        known = f"the published processors of {self.config.family}"
+        return [f"base model {self._source}: differs from {known} in {'; '.join(found)}"] if found else []
+
+    def _of_positions(self) -> Sequence[str]:
+        """That they may be others than in training, of a Qwen2.5-VL that reads videos."""
         version = str(self.config.backbone.get("transformers_version"))
         major = version.partition(".")[0]
         if self.config.family != QWEN_2_5 or self.config.multi_image or not major.isdigit() or int(major) < 5:
@@ -133,7 +151,10 @@ class VlmCheckpoint:
     def collator(self) -> VlmCollator:
         """What makes batches of samples. Raises CheckpointError if the processor cannot be had or does not fit."""
         embedding = next(t for name, t in self.weights.items() if name.endswith("embed_tokens.weight"))
-        return load_collator(self.config, len(embedding), self.processor or self.config.base_model_id)
+        collator = load_collator(self.config, len(embedding), self._source)
+        if self.base_model is not None and is_published(self.config.base_model_id, self.config.family):
+            check_published(collator, self.base_model)
+        return collator
 
     def encoders(self) -> None:
         """None: the network reads raw frames, and needs no encoders."""
@@ -204,6 +225,7 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
         if SETTINGS in backbone:  # written by VlmCheckpoint.save, with every setting
             config = _saved_config(backbone)
             weights, factors = _used(renamed(read_weights(folder), _renames(config.family)))
+            settings = of_export(config, options.base_model)
         else:
             run = RunConfig.of(folder)
             run.check_model_type()
@@ -216,9 +238,11 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
                 tensors, scaling = _whole(tensors, folder, backbone, run)
             weights, factors = _used(tensors, scaling)
             config = _trained_config(folder, backbone, run, weights)
+            settings = of_run(config, run, options.base_model, scaling, is_adapter=is_adapter)
+            settings = (*settings, *of_rounding(num_nf4))
     own = folder / PROCESSOR_FOLDER
-    processor = options.base_model or (own if own.is_dir() else None)
-    checkpoint = VlmCheckpoint(config, weights, factors, processor, num_nf4)
+    processor = own if own.is_dir() else None
+    checkpoint = VlmCheckpoint(config, weights, factors, processor, options.base_model, settings)
     checkpoint.check()
     return checkpoint
 

@@ -32,7 +32,7 @@ class VlmConfig:
     dtype: of all parameters, heads included
     multi_image: each frame is an image of its own; else a trajectory is one video
     per_frame_progress_token: a progress token behind each image carries its state
-    frame_pooling: else, how an image's tokens make up its state; boundary: the last one
+    frame_pooling: else, how an image's tokens make up its state; boundary: the last one. Videos are not pooled so
     pooling_temperature: of attention pooling
     average_temporal_patches: in video mode, a group's tokens are averaged; else the token behind them is read
     progress_in_preference: questions of preference ask for progress too
@@ -60,6 +60,16 @@ class VlmConfig:
     def family(self) -> str:
         """Name of the backbone's kind: a key of BACKBONES."""
         return str(self.backbone["model_type"])
+
+    @property
+    def pools_images(self) -> bool:
+        """Whether the tokens of an image are pooled, as ``frame_pooling`` says. Upstream heeds it in images alone."""
+        return self.multi_image and not self.per_frame_progress_token
+
+    @property
+    def pools_by_attention(self) -> bool:
+        """Whether the attention of frame_pool_attn weighs the tokens of an image."""
+        return self.pools_images and self.frame_pooling == "attention"
 
     @property
     def pads_left(self) -> bool:
@@ -140,7 +150,7 @@ class VlmRewardModel(nn.Module):
         span = torch.arange(len(spans), device=spans.device).repeat_interleave(lengths, output_size=num_tokens)
         offset = torch.arange(num_tokens, device=spans.device) - (lengths.cumsum(0) - lengths)[span]
         states = hidden[rows[span], starts[span] + offset]
-        if self.config.frame_pooling == "attention" and not self.config.per_frame_progress_token:
+        if self.config.pools_by_attention:
             scores = self.frame_pool_attn(states).squeeze(-1) / self.config.pooling_temperature
             states = states * _softmax_of_each(scores, lengths, span).unsqueeze(-1)
             return _of_each("sum", states.float(), lengths).to(hidden.dtype)

@@ -23,6 +23,7 @@ import rfm_export
 from engines import serve_config
 from rfm import families
 from rfm.checkpoint.content import CheckpointError
+from rfm.checkpoint.decision import Decision
 from rfm.engine import Engine
 from rfm.family import Checkpoint
 from rfm_client import (
@@ -189,8 +190,10 @@ def test_a_checkpoint_of_the_first_rewind_code_has_its_scores(tmp_path: Path) ->
     assert checkpoint.description.lacks == {"preference", "success", "similarity"}
     lacking, line = families.notes(tmp_path / "run", checkpoint)
     assert lacking == "model.safetensors: there is no head of preference and success: served without"
+    source = "(default of the first ReWiND code)"
     assert line.startswith(
-        "a checkpoint of the first ReWiND code: num_attention_heads 8, causal_mask True, max_len 16 are assumed"
+        "assumed, and not shown by the checkpoint: "
+        f"num_attention_heads 8 {source}; causal_mask true {source}; max_len 16 {source}; scores differ"
     )
     random = np.random.default_rng(0)
     trajectories = [random_trajectory(random, length, (12, 6), task="") for length in (1, 2, 9, 16)]
@@ -218,7 +221,12 @@ def test_a_checkpoint_of_the_first_rewind_code_is_exported_and_labels(tmp_path: 
     assert exported.config.trained_frames == 32
     scorer = EngineScorer(str(tmp_path / "run"))
     assert scorer.checkpoint().max_frames == 32
-    assert "max_len" not in scorer.notes[1].partition("if the run")[0]
+    assert "causal_mask" in scorer.notes[1]
+    assert "max_len" not in scorer.notes[1]
+    decisions = {each.name: each for each in families.load(tmp_path / "run").decisions()}
+    assert decisions["max_len"] == Decision("max_len", 32, "config.json")
+    assert decisions["trained_frames"] == Decision("trained_frames", 32, "max_len")
+    assert decisions["has_success"] == Decision("has_success", False, "weights")
 
 
 def test_a_checkpoint_of_the_first_rewind_code_takes_no_encoders(tmp_path: Path) -> None:

@@ -162,7 +162,7 @@ def test_an_export_scores_as_the_values_of_its_weights(tmp_path: Path, name: str
     few_bits, full = in_both_forms(name, tmp_path)
     said: list[str] = []
     rfm_export.export(few_bits, tmp_path / "repository", serve_config(goldens.config(name)), say=said.append)
-    note = "weights are rounded to 4 bits (NF4 of bitsandbytes): scores are those of the rounded weights"
+    note = "in NF4 of bitsandbytes (weights, rounded in training too)"
     assert sum(note in line for line in said) == 1
     exported = tmp_path / "repository" / "rfm_frames" / "1" / "checkpoint"
     assert "quantization_config" not in json.loads((exported / "config.json").read_text())
@@ -197,4 +197,5 @@ def test_nf4_weights_need_no_word_in_config_json(tmp_path: Path) -> None:
     """A trainer that saves weights alone leaves the configuration of the base model."""
     few_bits, full = in_both_forms(PLAIN, tmp_path)
     shutil.copyfile(full / "config.json", few_bits / "config.json")
-    assert load(PLAIN, few_bits).num_nf4 > 0
+    assert "rounded_weights" in [each.name for each in load(PLAIN, few_bits).decisions()]
+    assert "rounded_weights" not in [each.name for each in load(PLAIN, full).decisions()]
