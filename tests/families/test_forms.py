@@ -215,13 +215,22 @@ ROWS: dict[str, tuple[str, ...]] = {
     "an adapter without": (f"{SPOILED}[an adapter without its embedding]",),
     "`r` that": RANKS,
     "an adapter that names": ("test_an_adapter_on_another_base_model_is_asked_about",),
+    "an adapter of a run": ("test_an_adapter_of_a_run_that_began_with_a_checkpoint_needs_its_base_named",),
     "an adapter on a base": (
         "test_an_adapter_on_weights_of_few_bits_is_refused",
         "test_a_base_model_of_few_bits_is_refused",
     ),
+    "`--base-model` with": (
+        "test_a_processor_that_is_not_the_published_one_of_the_run_is_refused",
+        "test_special_tokens_in_another_order_are_refused",
+    ),
     "a checkpoint of the first": ("test_a_checkpoint_of_the_first_rewind_code_has_its_scores",),
     "ReWiND's": ("test_a_null_is_a_key_that_is_not_there",),
     "an image encoder": ("test_sizes_may_be_numbers_as_transformers_once_wrote_them",),
+    "other encoders": (
+        "test_encoders_that_are_not_upstream_s_are_told",
+        "test_a_text_encoder_as_wide_as_upstream_s_is_compared",
+    ),
     "encoders of other": OTHER_ENCODERS,
 }
 
@@ -233,8 +242,8 @@ def test_each_row_of_the_table_has_a_test() -> None:
     forms = [line.split(" | ")[0].removeprefix("| ") for line in section.splitlines() if line.startswith("| ")][1:]
     assert len(forms) == len(ROWS)
     assert [form for form, row in zip(forms, ROWS, strict=True) if not form.startswith(row)] == []
-    families = str(Path(__file__).parent)
-    command = [sys.executable, "-m", "pytest", "--collect-only", "-o", "addopts=-q --import-mode=importlib", families]
+    folders = [str(ROOT / "tests" / name) for name in ("families", "export")]
+    command = [sys.executable, "-m", "pytest", "--collect-only", "-o", "addopts=-q --import-mode=importlib", *folders]
     collected = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
     known = {line.partition("::")[2] for line in collected.splitlines()}
     known |= {name.partition("[")[0] for name in known}
