@@ -6,7 +6,7 @@ WORKERS := --numprocesses 2 --dist loadgroup
 TOOL := PYTHONPATH=tests/support:tools/faults $(BIN)/python
 
 # `make help` shows the first line of the comment above each target.
-.PHONY: help demo test test-all check parity rollout bench bench-full perf chaos chaos-full soak format model_repository clean \
+.PHONY: help demo test test-all test-newest check parity rollout bench bench-full perf chaos chaos-full soak format model_repository clean \
   ops-check ops-tools audit lock mutate
 
 # What can be made: this list.
@@ -26,6 +26,14 @@ test: check
 test-all: check ops-tools
 	$(BIN)/pytest $(WORKERS) -m "not gpu and not alone"
 	$(BIN)/pytest -m alone
+
+# Test scoring with the newest transformers. Needs the network.
+# The other tests use the pinned one.
+test-newest: $(INSTALLED)
+	$(BIN)/pip install --quiet --disable-pip-version-check --upgrade --target $(VENV)/newest --no-deps \
+	  "transformers<6" "huggingface_hub<2" tokenizers
+	PYTHONPATH=$(CURDIR)/$(VENV)/newest $(BIN)/python -m pytest $(WORKERS) -m "not gpu and not slow and not triton" \
+	  tests/families
 
 # Lint, format, types, generated files; no tests.
 check: $(INSTALLED)

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from rfm.checkpoint import training
 from rfm.checkpoint.content import CheckpointError, read_run_config
-from rfm.checkpoint.files import check_finite
+from rfm.checkpoint.decision import assumed
+from rfm.checkpoint.files import WEIGHTS, check_finite
 from rfm.checkpoint.hub import best_tag, find
 from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options
 
@@ -92,10 +93,13 @@ def load_from(folder: Path, family: Family, options: Options) -> Checkpoint:
 def notes(folder: Path, checkpoint: Checkpoint, answered: Collection[str] = training.HEADS) -> list[str]:
     """A line for the user on each thing that decides the scores of the checkpoint in ``folder``, and may be wrong.
 
-    answered: heads of which its answers are made; those that it lacks do not count
+    answered: heads of which its answers are made; of those that it lacks only that is said
     Raises CheckpointError for a config.yaml that cannot be read.
     """
-    has_similarity = checkpoint.description.has_similarity
-    heads = [head for head in answered if head != training.SIMILARITY or has_similarity]
+    lacks = checkpoint.description.lacks
+    heads = [head for head in answered if head not in lacks]
+    missing = [head for head in answered if head in lacks - {training.SIMILARITY}]  # most have no head of similarity
+    without = [f"{WEIGHTS}: there is no head of {' and '.join(missing)}: served without"] if missing else []
     of_weights = training.constant_heads(checkpoint.parts[NETWORK], heads)
-    return [*training.notes(folder, heads), *of_weights, *checkpoint.notes]
+    of_run = training.notes(folder, heads)
+    return [*without, *of_run, *of_weights, *checkpoint.notes, *assumed(checkpoint.decisions())]

@@ -6,10 +6,11 @@ A package that holds a ``FAMILY`` is one."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from rfm.checkpoint.decision import Decision
 from rfm.feature_cache import FeatureCache
 from rfm_client.contract import FrameSize, RewardError
 from rfm_client.contract.named_frames import NamedFootage
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from rfm.predictor import Predictor
 
 NETWORK = "network"  # in Checkpoint.parts: the weights of the network that scores
+_USUAL_HEADS = ("has_preference", "has_success")  # fields of configurations
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,23 @@ class Description:
     frames_per_value: int = 1
     keeps_features: bool = False
     is_large: bool = False
+    has_preference: bool = True
+    has_success: bool = True
+
+    @property
+    def lacks(self) -> frozenset[str]:
+        """Names of the heads that the network has not."""
+        heads = {"preference": self.has_preference, "success": self.has_success, "similarity": self.has_similarity}
+        return frozenset(name for name, is_there in heads.items() if not is_there)
+
+
+def config_fields(config: Any) -> dict[str, Any]:
+    """The fields of a network's configuration, as files and digests have them.
+
+    The heads of preference and of success are named only where they are missing, as before networks could lack them.
+    """
+    fields = asdict(config)
+    return {name: value for name, value in fields.items() if name not in _USUAL_HEADS or not value}
 
 
 @dataclass(frozen=True)
@@ -129,7 +148,10 @@ class Checkpoint(Protocol):
 
     @property
     def notes(self) -> Sequence[str]:
-        """A line for the user on each thing that decides scores, was assumed, and could not be checked."""
+        """A line for the user on each thing that contradicts what is known of the training run."""
+
+    def decisions(self) -> Sequence[Decision]:
+        """What decided each thing that scores depend on. Raises CheckpointError for files that cannot be had."""
 
     def encoders(self) -> FrameEncoders | None:
         """The checkpoint's encoders; None: it has none. Raises CheckpointError if they cannot be had or do not fit."""

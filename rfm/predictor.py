@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -13,8 +13,17 @@ from torch import Tensor
 
 from rfm.execution import Execution
 from rfm.layers.heads import progress_from_logits
-from rfm_client.contract import FrameScores, InferenceFailedError, RewardError, Sample
+from rfm_client.contract import (
+    FrameScores,
+    InferenceFailedError,
+    InvalidSampleError,
+    PreferenceSample,
+    RewardError,
+    Sample,
+    SimilaritySample,
+)
 from rfm_client.contract.named_frames import NamedProgressSample
+from rfm_client.contract.samples import Float32Array
 
 Row = TypeVar("Row")
 Batch = TypeVar("Batch")
@@ -58,24 +67,50 @@ class RowScores:
     query: float | None = None
 
 
-def are_finite(frames: Iterable[FrameScores], queries: Iterable[float]) -> bool:
-    """Whether all scores of frames and all answers to questions are numbers."""
-    arrays = (array for scores in frames for array in (scores.progress, scores.success))
+def are_finite(frames: Iterable[FrameScores], queries: Iterable[float], *, has_success: bool = True) -> bool:
+    """Whether all scores of frames and all answers to questions are numbers.
+
+    has_success: the network predicts success
+    """
+    names = ("progress", "success") if has_success else ("progress",)
+    arrays = (getattr(scores, name) for scores in frames for name in names)
     return all(np.isfinite(array).all() for array in arrays) and bool(np.isfinite(list(queries)).all())
 
 
-def checked(rows: Iterable[RowScores]) -> list[RowScores | RewardError]:
+def checked(rows: Iterable[RowScores], *, has_success: bool = True) -> list[RowScores | RewardError]:
     """The rows, with an error in place of one that has a score that is not finite."""
     failed = InferenceFailedError("the network gave a score that is not finite")
-    return [row if are_finite(row.frames, [] if row.query is None else [row.query]) else failed for row in rows]
+
+    def is_good(row: RowScores) -> bool:
+        return are_finite(row.frames, [] if row.query is None else [row.query], has_success=has_success)
+
+    return [row if is_good(row) else failed for row in rows]
 
 
-def frame_scores(progress_logits: Tensor, success_logits: Tensor) -> FrameScores:
+def check_type(sample: Sample | NamedProgressSample, config: Any) -> None:
+    """Raises InvalidSampleError for a question about two trajectories that the network has no head for.
+
+    config: its configuration
+    """
+    heads = {"preference": config.has_preference, "similarity": config.has_similarity}
+    asked = {PreferenceSample: "preference", SimilaritySample: "similarity"}.get(type(sample))
+    if asked is not None and not heads[asked]:
+        supported = " or ".join(["progress", *(name for name, is_there in heads.items() if is_there)])
+        raise InvalidSampleError.at("sample_type", f"{supported} (this checkpoint has no {asked} head)", asked)
+
+
+def no_success(progress: Float32Array) -> Float32Array:
+    """What stands for success beside this progress, where the network does not predict it: NaN."""
+    return np.full_like(progress, np.nan)
+
+
+def frame_scores(progress_logits: Tensor, success_logits: Tensor | None) -> FrameScores:
     """Scores on the CPU, from progress logits [..., K] and success logits [...]; with the logits where K > 1."""
     discrete = progress_logits.shape[-1] > 1
+    progress = progress_from_logits(progress_logits).cpu().numpy()
     return FrameScores(
-        progress=progress_from_logits(progress_logits).cpu().numpy(),
-        success=success_logits.sigmoid().float().cpu().numpy(),
+        progress=progress,
+        success=no_success(progress) if success_logits is None else success_logits.sigmoid().float().cpu().numpy(),
         progress_logits=progress_logits.float().cpu().numpy() if discrete else None,
     )
 

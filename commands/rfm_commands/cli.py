@@ -16,6 +16,7 @@ import typer
 from rich.console import Console
 
 from rfm.checkpoint.content import CheckpointError
+from rfm.checkpoint.decision import table
 from rfm.config import ExportConfig, ServeConfig
 from rfm.launch.admin_key import AdminKeyError, take_key
 from rfm.launch.installation import ServerStartError, find_installation
@@ -105,6 +106,9 @@ def export(
         ),
     ] = None,
     check: Annotated[bool, typer.Option("--check", help="Write nothing; compare with what would be written.")] = False,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Write nothing; print what decides each setting of the checkpoint.")
+    ] = False,
     *,
     given: Given,
 ) -> None:
@@ -124,6 +128,9 @@ def export(
             return
         if settings.checkpoint is None:
             _fail("--checkpoint: expected a checkpoint, here or as export.checkpoint in --config, got none")
+        if explain:
+            typer.echo(table(rfm_export.explain(settings.checkpoint, settings, say=_say)))
+            return
         version = rfm_export.export(
             settings.checkpoint,
             repository,

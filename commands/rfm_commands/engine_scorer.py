@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,7 +18,7 @@ from rfm.checkpoint.content import CheckpointError
 from rfm.checkpoint.digest import settings_digest, weights_digest
 from rfm.engine import Engine
 from rfm.execution import Execution
-from rfm.family import Checkpoint, FrameEncoders
+from rfm.family import Checkpoint, FrameEncoders, config_fields
 from rfm_client import ProgressResult, ProgressSample, RewardError, Trajectory
 from rfm_client.contract.samples import Footage, UInt8Array
 from rfm_client.labelling import CheckpointFacts
@@ -101,7 +100,7 @@ def _settings_digest(
     checkpoint: Checkpoint, encoders: FrameEncoders | None, folders: Sequence[Path], told: Mapping[str, Any]
 ) -> str:
     """Of all that decides the scores beside the folders' weights, encoders of the Hub with their weights."""
-    told = {**told, "network": asdict(checkpoint.config)}
+    told = {**told, "network": config_fields(checkpoint.config)}
     if encoders is None:
         return settings_digest(folders, told)
     try:

@@ -10,12 +10,12 @@ from typing import Any
 
 from google.protobuf.text_format import ParseError
 
+from rfm.checkpoint.decision import source_name
 from rfm.launch.repository_folder import CONFIG_FILE
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.settings import settings_of
 from rfm_commands.config import LIFETIMES, Config
 from rfm_commands.tune import Setting
-from rfm_export.about import source_name
 from rfm_export.pbtxt import exported_settings
 from rfm_export.publish import read_config
 from rfm_gateway.config import GatewayConfig

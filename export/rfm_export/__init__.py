@@ -5,15 +5,15 @@ from typing import TYPE_CHECKING, Any
 
 from rfm_export.errors import ExportDiffersError, ExportError
 
-__all__ = ["ExportDiffersError", "ExportError", "check", "export"]
+__all__ = ["ExportDiffersError", "ExportError", "check", "explain", "export"]
 
 if TYPE_CHECKING:
-    from rfm_export.exporter import check, export
+    from rfm_export.exporter import check, explain, export
 else:
 
     def __getattr__(name: str) -> Any:
-        """``check`` and ``export`` when they are first asked for: they need PyTorch, which takes seconds to import."""
-        if name not in ("check", "export"):
+        """A function of the exporter when it is first asked for: it needs PyTorch, which takes seconds to import."""
+        if name not in ("check", "explain", "export"):
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         from rfm_export import exporter
 

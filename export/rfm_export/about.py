@@ -8,17 +8,18 @@ import math
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.checkpoint.content import read_run_config
+from rfm.checkpoint.decision import is_folder, source_name
 from rfm.checkpoint.digest import settings_digest, weights_digest
 from rfm.checkpoint.files import find_run_config
 from rfm.checkpoint.hub import commit_of
-from rfm.family import NETWORK, Checkpoint, EncodersDescription
+from rfm.family import NETWORK, Checkpoint, EncodersDescription, config_fields
 from rfm.parameters import DTYPE_PARAMETER
 from rfm_client.contract.model_info import (
     DIGEST_PARAMETER,
@@ -29,7 +30,6 @@ from rfm_client.contract.model_info import (
     SOURCE_PARAMETER,
 )
 
-_NAMED_PARTS = 2  # of a path; the whole path may be private
 _SECRET = re.compile(r"(^|_)(token|secret|password|key)$", re.IGNORECASE)  # such as hub_token, wandb_api_key
 
 
@@ -54,7 +54,7 @@ class Origin:
         """
         file = find_run_config(folder)
         run_config = "" if file is None else json.dumps(_public(read_run_config(file)))
-        return cls(source_name(source), "" if _is_folder(source) else commit_of(folder), run_config)
+        return cls(source_name(source), "" if is_folder(source) else commit_of(folder), run_config)
 
     @classmethod
     def from_config(cls, config: pb.ModelConfig) -> Origin:
@@ -67,11 +67,6 @@ class Origin:
         """Where the checkpoint is from, as parameters of config.pbtxt by name."""
         of_run = {RUN_CONFIG_PARAMETER: self.run_config} if self.run_config else {}
         return {SOURCE_PARAMETER: self.source, REVISION_PARAMETER: self.revision, **of_run}
-
-
-def source_name(source: str | Path) -> str:
-    """How models name the source of a checkpoint: by the end of a folder's path, or the Hub id."""
-    return "/".join(Path(source).expanduser().resolve().parts[-_NAMED_PARTS:]) if _is_folder(source) else str(source)
 
 
 def about(checkpoint: Checkpoint, origin: Origin) -> dict[str, str]:
@@ -97,10 +92,6 @@ def record_digests(config: pb.ModelConfig, version: int, repository: Path) -> No
     config.parameters[SETTINGS_DIGEST_PARAMETER].string_value = settings_digest(folders, told)
 
 
-def _is_folder(source: str | Path) -> bool:
-    return bool(str(source)) and Path(source).expanduser().is_dir()
-
-
 def _public(value: Any) -> Any:
     """A value of YAML as JSON can hold it, without the texts whose keys name a secret."""
     if isinstance(value, dict):
@@ -122,6 +113,6 @@ def _network(checkpoint: Checkpoint) -> dict[str, Any]:
         parameters[name.partition(".")[0]] += tensor.numel()
     return {
         "class": checkpoint.description.network_class,
-        "config": asdict(checkpoint.config),
+        "config": config_fields(checkpoint.config),
         "parameters": dict(parameters),
     }

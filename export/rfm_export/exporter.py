@@ -15,6 +15,7 @@ from google.protobuf.text_format import ParseError
 from safetensors import SafetensorError
 
 from rfm import families
+from rfm.checkpoint.decision import Decision, write
 from rfm.checkpoint.files import check_links, find_run_config
 from rfm.config import ExportConfig
 from rfm.engine import Engine
@@ -36,12 +37,14 @@ class _Source:
     """What one export is made of.
 
     encoders: of the checkpoint; None: it has none
+    decisions: what decided the scores
     """
 
     family: Family
     checkpoint: Checkpoint
     encoders: FrameEncoders | None
     origin: Origin
+    decisions: Sequence[Decision] = ()
 
 
 def export(
@@ -82,6 +85,20 @@ def export(
     return version.number
 
 
+def explain(
+    source: str | Path,
+    settings: ExportConfig,
+    *,
+    family: str | None = None,
+    say: Callable[[str], object] | None = None,
+) -> Sequence[Decision]:
+    """What decided each thing that the scores of the checkpoint at ``source`` would depend on; writes nothing.
+
+    others: as of ``export``. Raises CheckpointError.
+    """
+    return _load(source, settings, family, say).decisions
+
+
 def _load(
     source: str | Path, settings: ExportConfig, family: str | None, say: Callable[[str], object] | None
 ) -> _Source:
@@ -91,12 +108,20 @@ def _load(
     options = Options(settings.base_model, settings.image_encoder, settings.text_encoder)
     checkpoint = families.load_from(folder, kind, options)
     check_links(folder)
+    encoders = checkpoint.encoders()
     if say is not None:
         run_config = find_run_config(folder)
         of_run = [] if run_config is None else [f"{run_config}: read as the settings of the training run"]
         for note in (*of_run, *families.notes(folder, checkpoint)):
             say(note)
-    return _Source(kind, checkpoint, checkpoint.encoders(), Origin.of(source, folder))
+    decisions = [*checkpoint.decisions(), *_told(settings)]
+    return _Source(kind, checkpoint, encoders, Origin.of(source, folder), decisions)
+
+
+def _told(settings: ExportConfig) -> Iterator[Decision]:
+    """What the caller decides of any checkpoint."""
+    if settings.dtype is not None:
+        yield Decision("served_dtype", settings.dtype, "--dtype")
 
 
 def _check_gpus(num_gpus: int | None) -> None:
@@ -121,7 +146,9 @@ def _needing_disk(repository: Path) -> Iterator[None]:
 
 def _stage(source: _Source, models: Sequence[GeneratedModel], version: Version, staged: Path) -> None:
     """Writes all files of the version."""
-    source.checkpoint.save(_checkpoint_folder(source.checkpoint.description, version, staged))
+    folder = _checkpoint_folder(source.checkpoint.description, version, staged)
+    source.checkpoint.save(folder)
+    write(source.decisions, folder)
     if source.encoders is not None:
         source.encoders.save(_encoders_folder(version, staged))
     for path, content in _generated(models, staged).items():

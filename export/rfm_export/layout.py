@@ -188,10 +188,9 @@ def _python_model(interface: Interface, template: str, version: Version, warmups
 def _warmups(description: Description) -> list[Warmup]:
     """One sample of each type that the checkpoint can score."""
     trajectory = blank_trajectory(description.widths, task=WARMUP_TASK)
-    samples: dict[str, Sample] = {
-        "progress": ProgressSample(trajectory),
-        "preference": PreferenceSample(trajectory, trajectory),
-    }
+    samples: dict[str, Sample] = {"progress": ProgressSample(trajectory)}
+    if description.has_preference:
+        samples["preference"] = PreferenceSample(trajectory, trajectory)
     if description.has_similarity:
         samples["similarity"] = SimilaritySample(trajectory, trajectory)
     return [Warmup(name, wire.encode_samples([sample])) for name, sample in samples.items()]

@@ -54,12 +54,19 @@ class CheckpointError(Exception):
     """A checkpoint that cannot be loaded: what is wrong with which file, and what to do about it."""
 
 
+def misfits(*others: type[Exception]) -> tuple[type[Exception], ...]:
+    """``others``, and errors of libraries about content that they did not expect: transformers 5 raises the Hub's."""
+    from huggingface_hub import errors
+
+    return (*others, *_MISFITS, getattr(errors, "StrictDataclassError", ValueError))
+
+
 @contextmanager
 def expecting(what: str, where: object) -> Iterator[None]:
     """Turns whatever code raises of content that does not fit into a CheckpointError."""
     try:
         yield
-    except _MISFITS as error:
+    except misfits() as error:
         raise CheckpointError(f"{where}: expected {what}, got {type(error).__name__}: {cut(str(error))}") from error
 
 

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from rfm.checkpoint.decision import PROVENANCE
+
 DIGEST_DIGITS = 16  # of 64: enough to identify a checkpoint, and to find damage
 
 # Of files beside the weights that decide scores: configuration, tokenizer, image processor.
@@ -30,12 +32,16 @@ def weights_digest(folders: Iterable[Path]) -> str:
 def settings_digest(folders: Iterable[Path], told: Mapping[str, Any]) -> str:
     """The first digits of the SHA-256 of what decides scores beside the weights. Raises OSError.
 
-    folders: whose files of SETTINGS_SUFFIXES count, with their paths
+    folders: whose files of SETTINGS_SUFFIXES count, with their paths; but for PROVENANCE, which decides nothing
     told: what no file says, as JSON can hold it
     """
     digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
     for folder in folders:
-        for file in sorted(file for file in folder.rglob("*") if file.suffix in SETTINGS_SUFFIXES and file.is_file()):
+        for file in sorted(file for file in folder.rglob("*") if _counts(file)):
             content = file.read_bytes()
             digest.update(f"{file.relative_to(folder).as_posix()} {len(content)}\n".encode() + content)
     return digest.hexdigest()[:DIGEST_DIGITS]
+
+
+def _counts(file: Path) -> bool:
+    return file.suffix in SETTINGS_SUFFIXES and file.name != PROVENANCE and file.is_file()

@@ -43,12 +43,12 @@ _NAMES = (WEIGHTS, WEIGHTS_INDEX, "adapter_model.safetensors")  # of weights in 
 
 
 def find_run_config(folder: Path) -> Path | None:
-    """The training run's configuration in the checkpoint's folder, its parent or main's snapshot in the Hub's cache.
+    """The training run's configuration in the checkpoint's folder, its parent, or there on main in the Hub's cache.
 
     Raises CheckpointError for one from outside the folder that is of another kind of network.
     """
     home = folder.resolve()
-    for place in (folder, home.parent, *_snapshot_of_main(home)):
+    for place in (folder, home.parent, *_places_on_main(home)):
         file = next((place / name for name in RUN_CONFIGS if is_there(place / name)), None)
         if file is not None:
             if place != folder:
@@ -81,14 +81,18 @@ def _plain(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
-def _snapshot_of_main(home: Path) -> list[Path]:
-    """Where the Hub's cache has main: the snapshot of the commit in refs/main, beside ``home``."""
-    main = home.parent.parent / "refs" / "main"
-    if home.parent.name != "snapshots" or not is_there(main):
+def _places_on_main(home: Path) -> list[Path]:
+    """``home``, and the folder above a subfolder, in the Hub's cache of main: the snapshot that refs/main names."""
+    snapshot = next((path for path in (home, *home.parents) if path.parent.name == "snapshots"), home)
+    main = snapshot.parent.parent / "refs" / "main"
+    if snapshot.parent.name != "snapshots" or not is_there(main):
         return []
     with main.open("rb") as file:
         commit = file.read(_COMMIT_DIGITS + 1)
-    return [home.parent / commit.decode()] if re.fullmatch(rb"[0-9a-f]+", commit) else []
+    if not re.fullmatch(rb"[0-9a-f]+", commit):
+        return []
+    place = snapshot.parent / commit.decode() / home.relative_to(snapshot)
+    return [place] if home == snapshot else [place, place.parent]
 
 
 def check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> None:
@@ -207,13 +211,12 @@ def check_keys(expected: Iterable[str], got: Iterable[str]) -> None:
     missing, unexpected = sorted(set(expected) - set(got)), sorted(set(got) - set(expected))
     if missing or unexpected:
         named = [listed(names) if names else "none" for names in (missing, unexpected)]
-        raise CheckpointError(f"{WEIGHTS}: missing keys: {named[0]}; unexpected keys: {named[1]}{_lost_heads(missing)}")
+        raise CheckpointError(f"{WEIGHTS}: missing keys: {named[0]}; unexpected keys: {named[1]}")
 
 
-def _lost_heads(missing: Iterable[str]) -> str:
-    """Which heads are missing, for a message; they are missing where a network was trained without them."""
-    heads = sorted({name.partition(".")[0].removesuffix("_head") for name in missing if "_head." in name})
-    return f"; a checkpoint without the head of {' and '.join(heads)} is not served yet" if heads else ""
+def has_head(weights: Iterable[str], head: str) -> bool:
+    """Whether there are weights of the head of ``head``; one of which some are missing is refused later."""
+    return any(name.startswith(f"{head}_head.") for name in weights)
 
 
 def _below(folder: Path) -> str:

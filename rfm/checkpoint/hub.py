@@ -51,18 +51,20 @@ def _fetch(repo_id: str, subfolder: str, tag: str | None, path: Path) -> Path:
     """The folder in the Hub's cache, with all but pickles. ``path``: where a local folder of this name would be."""
     from huggingface_hub import HfApi, snapshot_download
 
-    patterns = _FILES
+    patterns, run_configs = _FILES, [RUN_CONFIG]
     if subfolder:
         above = subfolder.rpartition("/")[0]
-        patterns = [*(f"{subfolder}/{pattern}" for pattern in _FILES), f"{above}/{RUN_CONFIG}".lstrip("/")]
+        run_configs = [f"{subfolder}/{RUN_CONFIG}", f"{above}/{RUN_CONFIG}".lstrip("/")]
+        patterns = [*(f"{subfolder}/{pattern}" for pattern in _FILES), run_configs[1]]
     try:
         if tag is None:
             tag = best_tag(ref.name for ref in HfApi().list_repo_refs(repo_id).tags)
-        folder = Path(snapshot_download(repo_id, revision=tag, allow_patterns=patterns)) / subfolder
+        snapshot = Path(snapshot_download(repo_id, revision=tag, allow_patterns=patterns))
+        folder = snapshot / subfolder
         if not any(folder.glob("**/*.safetensors")):
             _refuse_pickles(repo_id, subfolder, tag)
-        if not subfolder and not is_there(folder / RUN_CONFIG):  # upstream's uploader tags a commit of before it
-            _fetch_run_config_of_main(repo_id)
+        if not any(is_there(snapshot / name) for name in run_configs):  # upstream's uploader tags a commit of before it
+            _fetch_run_config_of_main(repo_id, run_configs)
     except _failures() as error:
         where = f"{repo_id}@{tag or 'latest'}"
         raise CheckpointError(
@@ -123,15 +125,19 @@ def _cached(repo_id: str, subfolder: str) -> str:
     return f"; without it, name a revision that is in the cache: {', '.join(names)}" if names else ""
 
 
-def _fetch_run_config_of_main(repo_id: str) -> None:
-    """Fetches main's config.yaml into the Hub's cache, where ``find_run_config`` looks. Even main may have none."""
+def _fetch_run_config_of_main(repo_id: str, names: Iterable[str]) -> None:
+    """Fetches the first of main's files of these names into the Hub's cache, where ``find_run_config`` looks. Even main
+    may have none.
+    """
     from huggingface_hub import _CACHED_NO_EXIST, hf_hub_download, try_to_load_from_cache
     from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
 
-    try:
-        hf_hub_download(repo_id, RUN_CONFIG)
-    except LocalEntryNotFoundError:  # the Hub was not reached; earlier it may have been
-        if try_to_load_from_cache(repo_id, RUN_CONFIG) is not _CACHED_NO_EXIST:
-            raise
-    except EntryNotFoundError:
-        return
+    for name in names:
+        try:
+            hf_hub_download(repo_id, name)
+            return
+        except LocalEntryNotFoundError:  # the Hub was not reached; earlier it may have been
+            if try_to_load_from_cache(repo_id, name) is not _CACHED_NO_EXIST:
+                raise
+        except EntryNotFoundError:
+            pass

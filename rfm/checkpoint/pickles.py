@@ -14,7 +14,8 @@ _PICKLES = ("*.bin", "*.pt", "*.pth", "*.ckpt", "*.pkl")
 # What training leaves beside weights, to go on from.
 _STATES = ("optimizer*", "*optim_states*", "scheduler*", "rng_state*", "random_states*", "scaler*", "training_args*")
 _CONVERT = (
-    "import functools, sys, torch, safetensors.torch as s; "
+    "import argparse, functools, sys, torch, safetensors.torch as s; "
+    "torch.serialization.add_safe_globals([argparse.Namespace]); "
     "load = lambda file: functools.reduce("
     "lambda d, key: d[key] if isinstance(d.get(key), dict) else d, "
     "('state_dict', 'model_state_dict', 'model', 'module'), "

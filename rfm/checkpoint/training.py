@@ -49,7 +49,8 @@ def notes(folder: Path, answered: Collection[str] = HEADS) -> list[str]:
     if _section(run, "model").get("quantization") is True:
         lines.append(
             f"{RUN_CONFIG}: model.quantization is true: the run scored with its base model rounded to a few bits; the "
-            "scores here are those of the weights as they stand, so they differ from the run's"
+            "scores here are those of the weights as they stand, so they differ from the run's unless these are "
+            "rounded alike"
         )
     return lines
 

@@ -7,8 +7,9 @@ Where configuration and weights disagree, the weights decide.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,15 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from rfm.checkpoint.content import CheckpointError, cut, is_there, read_json, read_run_config, shown
+from rfm.checkpoint.content import CheckpointError, cut, is_there, misfits, read_json, read_run_config, shown
+from rfm.checkpoint.decision import (
+    OF_UPSTREAM,
+    OF_WEIGHTS,
+    TRAINED_WITH_PADDING,
+    Decision,
+    file_name,
+    source_name,
+)
 from rfm.checkpoint.files import (
     MAX_COUNT,
     NETWORK_CONFIG,
@@ -25,13 +34,15 @@ from rfm.checkpoint.files import (
     check_shapes,
     find_run_config,
     frame_count,
+    has_head,
     read_weights,
     take_prefix,
     trained_frames,
 )
 from rfm.checkpoint.training import check_progress
-from rfm.family import NETWORK, Description, Options
+from rfm.family import NETWORK, Description, Options, config_fields
 from rfm.feature_cache import FeatureCache
+from rfm.rewind import first_code, usual
 from rfm.rewind.encoders import Encoders
 from rfm.rewind.network import RewindConfig, RewindTransformer
 from rfm.rewind.predictor import RewindPredictor
@@ -39,9 +50,6 @@ from rfm.rewind.predictor import RewindPredictor
 MODEL_TYPE = "rewind_transformer"
 IMAGE_ENCODER_PREFIX = "image_encoder."
 TEXT_ENCODER_PREFIX = "text_encoder."
-# What upstream's checkpoints with encoders were trained from.
-USUAL_IMAGE_ENCODER = "facebook/dinov2-base"
-USUAL_TEXT_ENCODER = "sentence-transformers/all-MiniLM-L12-v2"
 
 # Upstream's configurations of before causal_mask, when no network had one, state all of these.
 _FIRST_FIELDS = {"video_feature_dim", "text_feature_dim", "hidden_dim", "num_layers", "num_attention_heads", "max_len"}
@@ -56,6 +64,10 @@ _LIMITS = {
     "progress_bins": MAX_COUNT,
 }
 _LAYERS = "transformer.layers."
+_OF_WEIGHTS = (
+    "video_feature_dim", "text_feature_dim", "hidden_dim", "num_layers", "use_per_frame_progress_token",
+    "progress_bins", "has_similarity", "has_preference", "has_success",
+)  # fmt: skip
 _STATED_TYPES: dict[str, type] = {"num_attention_heads": int, "max_len": int, "causal_mask": bool}
 
 
@@ -67,6 +79,7 @@ class RewindCheckpoint:
     image_encoder, text_encoder: encoder weights without their prefix; empty if the checkpoint has none
     image_source, text_source: folders or ids of the encoders that the user names; None: the usual ones, if the
         checkpoint has weights of encoders
+    settings: what decided its configuration
     """
 
     config: RewindConfig
@@ -75,6 +88,7 @@ class RewindCheckpoint:
     text_encoder: dict[str, Tensor] = field(default_factory=dict)
     image_source: str | None = None
     text_source: str | None = None
+    settings: tuple[Decision, ...] = ()
 
     @property
     def description(self) -> Description:
@@ -87,6 +101,8 @@ class RewindCheckpoint:
             max_frames=self.config.max_frames,
             trained_frames=self.config.trained_frames,
             trained_padding=self.config.trained_padding,
+            has_preference=self.config.has_preference,
+            has_success=self.config.has_success,
         )
 
     @property
@@ -96,16 +112,38 @@ class RewindCheckpoint:
 
     @property
     def notes(self) -> list[str]:
-        """A line on the encoders, of which no file of a training run says which they were."""
+        """A line on each encoder that is as wide as upstream's and another one."""
         if not self._has_encoders:
             return []
-        known = (
-            "their weights are the checkpoint's" if self.image_encoder and self.text_encoder else "only widths agree"
-        )
+        sources = (usual.IMAGE_ENCODER, self._image_source), (usual.TEXT_ENCODER, self._text_source)
+        found = [usual.differences(facts) for facts in self._facts()]
         return [
-            f"encoders: {self._image_source} and {self._text_source} are taken for those of the training run, which no "
-            f"file names ({known}); upstream's are {USUAL_IMAGE_ENCODER} and {USUAL_TEXT_ENCODER}"
+            f"{source}: differs from upstream's {known} in {'; '.join(names)}: scores are right only if the run's "
+            "embeddings were made with it"
+            for (known, source), names in zip(sources, found, strict=True)
+            if names
         ]
+
+    def decisions(self) -> list[Decision]:
+        """What decided each setting, and the encoders, which no file of a training run names."""
+        if not self._has_encoders:
+            return [*self.settings]
+        taken = (
+            ("image_encoder", self._image_source, self.image_source, self.image_encoder),
+            ("text_encoder", self._text_source, self.text_source, self.text_encoder),
+        )
+        decided = [*self.settings]
+        for (name, source, named, weights), facts in zip(taken, self._facts(), strict=True):
+            option = f"--{name.replace('_', '-')}" if named else OF_UPSTREAM
+            whose = "weights of the checkpoint" if weights else "only its width agrees"
+            decided.append(Decision(name, source_name(source), f"{option}; {whose}", is_assumed=True))
+            decided.append(Decision(f"{name}_settings", facts, f"files of {source_name(source)}"))
+        return decided
+
+    def _facts(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """What the files of the image encoder and of the text encoder say. Raises CheckpointError."""
+        with self._having_encoders():
+            return usual.image_facts(self._image_source), usual.text_facts(self._text_source)
 
     @property
     def _has_encoders(self) -> bool:
@@ -113,11 +151,11 @@ class RewindCheckpoint:
 
     @property
     def _image_source(self) -> str:
-        return self.image_source or USUAL_IMAGE_ENCODER
+        return self.image_source or usual.IMAGE_ENCODER
 
     @property
     def _text_source(self) -> str:
-        return self.text_source or USUAL_TEXT_ENCODER
+        return self.text_source or usual.TEXT_ENCODER
 
     def encoders(self) -> Encoders | None:
         """The encoders of a checkpoint that has them, or for which the user names them; else None.
@@ -126,24 +164,30 @@ class RewindCheckpoint:
         """
         if not self._has_encoders:
             return None
-        image_source, text_source = self._image_source, self._text_source
-        where = f"encoders {image_source} and {text_source}"
-        try:
+        with self._having_encoders():
             encoders = Encoders.from_pretrained(
-                image_source,
-                text_source,
+                self._image_source,
+                self._text_source,
                 image_weights=self.image_encoder or None,
                 text_weights=self.text_encoder or None,
             )
-        except (ImportError, OSError, ValueError) as error:
-            absent = [source for source in (image_source, text_source) if not Path(source).is_dir()]
-            here = f"; there is no folder {' nor '.join(absent)} either" if absent else ""
-            hint = f"name local folders with --image-encoder and --text-encoder{here}"
-            raise CheckpointError(f"{where}: {error} ({hint})") from error
         widths, expected = (encoders.video_feature_dim, encoders.text_feature_dim), self.description.widths
         if widths != expected:
+            where = f"encoders {self._image_source} and {self._text_source}"
             raise CheckpointError(f"{where}: expected widths {expected}, got {widths}")
         return encoders
+
+    @contextmanager
+    def _having_encoders(self) -> Iterator[None]:
+        """Turns what is raised of encoders that cannot be had into a CheckpointError."""
+        sources = (self._image_source, self._text_source)
+        try:
+            yield
+        except misfits(ImportError, OSError) as error:
+            absent = [source for source in sources if not Path(source).is_dir()]
+            here = f"; there is no folder {' nor '.join(absent)} either" if absent else ""
+            hint = f"name local folders with --image-encoder and --text-encoder{here}"
+            raise CheckpointError(f"encoders {' and '.join(sources)}: {cut(str(error))} ({hint})") from error
 
     def predictor(
         self, device: torch.device, dtype: torch.dtype | None = None, cache: FeatureCache[Any] | None = None
@@ -158,7 +202,7 @@ class RewindCheckpoint:
     def save(self, folder: Path) -> None:
         """Writes network and configuration in the layout that ``load`` reads, without encoders."""
         folder.mkdir(parents=True)
-        config = {"model_type": MODEL_TYPE, **asdict(self.config)}
+        config = {"model_type": MODEL_TYPE, **config_fields(self.config)}
         (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
         tensors = {name: tensor.contiguous() for name, tensor in self.network.items()}
         save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
@@ -186,16 +230,54 @@ def reads(folder: Path) -> bool:
 def load(folder: Path, options: Options) -> RewindCheckpoint:
     """The checkpoint in a local folder. Raises CheckpointError."""
     network = read_weights(folder)
+    if (renamed := first_code.renamed(network)) is not None:
+        return _of_first_code(folder, renamed, options)
     image_encoder = take_prefix(network, IMAGE_ENCODER_PREFIX)
     text_encoder = take_prefix(network, TEXT_ENCODER_PREFIX)
     sources = options.image_encoder, options.text_encoder
-    checkpoint = RewindCheckpoint(_rewind_config(folder, network), network, image_encoder, text_encoder, *sources)
+    stated = {**_stated(folder), "trained_frames": _trained_frames(folder)}
+    config = _rewind_config(folder, network, stated)
+    for name in _unread(config):
+        network.pop(name, None)
+    checkpoint = RewindCheckpoint(config, network, image_encoder, text_encoder, *sources, _settings(config, stated))
     checkpoint.check()
     return checkpoint
 
 
-def _rewind_config(folder: Path, weights: Mapping[str, Tensor]) -> RewindConfig:
-    stated = _stated(folder)
+def _of_first_code(folder: Path, weights: dict[str, Tensor], options: Options) -> RewindCheckpoint:
+    if options.image_encoder or options.text_encoder:
+        raise CheckpointError(
+            f"{folder}: encoders: expected none for a checkpoint of the first ReWiND code, which crops frames and does "
+            "not resize them; encode frames as it does, and send video_embeddings and text_embedding"
+        )
+    stated = {**first_code.SETTINGS, **_stated(folder)}
+    stated["trained_frames"] = Decision("trained_frames", stated["max_len"].value, "max_len")
+    config = _rewind_config(folder, weights, stated)
+    checkpoint = RewindCheckpoint(config, weights, settings=_settings(config, stated))
+    checkpoint.check()
+    return checkpoint
+
+
+def _settings(config: RewindConfig, stated: Mapping[str, Decision]) -> tuple[Decision, ...]:
+    """What decided each setting of the network, and the clients' defaults."""
+    of_weights = (*_OF_WEIGHTS, *(["max_len"] if config.use_per_frame_progress_token else []))
+    padding = Decision("trained_padding", config.trained_padding, NETWORK_CONFIG)
+    return (
+        *(Decision(name, getattr(config, name), OF_WEIGHTS) for name in of_weights),
+        *(decision for name, decision in stated.items() if name not in of_weights),
+        TRAINED_WITH_PADDING if config.trained_padding is None else padding,
+    )
+
+
+def _unread(config: RewindConfig) -> list[str]:
+    """Weights that upstream's network has, and that are read for the sake of heads alone that this one lacks."""
+    return [
+        *([] if config.has_preference else ["preference_token"]),
+        *([] if config.has_pairs else ["first_embedding_B"]),
+    ]
+
+
+def _rewind_config(folder: Path, weights: Mapping[str, Tensor], stated: Mapping[str, Decision]) -> RewindConfig:
     has_progress_tokens = "prog_token_A" in weights
     try:
         max_len = _shape(weights, "prog_token_A", 3)[1] if has_progress_tokens else _required(stated, "max_len", folder)
@@ -211,8 +293,10 @@ def _rewind_config(folder: Path, weights: Mapping[str, Tensor]) -> RewindConfig:
             use_per_frame_progress_token=has_progress_tokens,
             progress_bins=_shape(weights, "progress_head.4.weight", 2)[0],
             has_similarity="similarity_head.0.weight" in weights,
-            trained_frames=_trained_frames(folder),
+            trained_frames=stated["trained_frames"].value,
             trained_padding=_trained_padding(folder),
+            has_preference=has_head(weights, "preference"),
+            has_success=has_head(weights, "success"),
         )
     except KeyError as error:
         raise CheckpointError(f"{folder}: expected a ReWiND checkpoint, which has {error}") from error
@@ -225,12 +309,12 @@ def _rewind_config(folder: Path, weights: Mapping[str, Tensor]) -> RewindConfig:
     return config
 
 
-def _required(stated: Mapping[str, Any], name: str, folder: Path) -> Any:
+def _required(stated: Mapping[str, Decision], name: str, folder: Path) -> Any:
     """Raises CheckpointError for a value that neither weights nor configurations hold."""
     if name not in stated:
         places = f"{NETWORK_CONFIG} or model.rewind of {RUN_CONFIG}"
         raise CheckpointError(f"{folder}: {name}: expected it in {places}, got it in neither; weights do not tell it")
-    return stated[name]
+    return stated[name].value
 
 
 def _shape(weights: Mapping[str, Tensor], name: str, rank: int) -> torch.Size:
@@ -241,14 +325,18 @@ def _shape(weights: Mapping[str, Tensor], name: str, rank: int) -> torch.Size:
     return shape
 
 
-def _trained_frames(folder: Path) -> int | None:
+def _trained_frames(folder: Path) -> Decision:
     """The most frames of a trajectory in training, as ``save`` wrote it to config.json, else as config.yaml has it."""
     if is_there(folder / NETWORK_CONFIG):
         saved = read_json(folder / NETWORK_CONFIG).get("trained_frames")
         if saved is not None:
-            return frame_count(saved, f"{folder / NETWORK_CONFIG}: trained_frames")
-    run_config = find_run_config(folder)
-    return None if run_config is None else trained_frames(read_run_config(run_config), run_config)
+            frames = frame_count(saved, f"{folder / NETWORK_CONFIG}: trained_frames")
+            return Decision("trained_frames", frames, NETWORK_CONFIG)
+    file = find_run_config(folder)
+    if file is None:
+        return Decision("trained_frames", None, "no file says it")
+    source = f"{file_name(file, folder)}: data.max_frames"
+    return Decision("trained_frames", trained_frames(read_run_config(file), file), source)
 
 
 def _trained_padding(folder: Path) -> bool | None:
@@ -260,9 +348,10 @@ def _trained_padding(folder: Path) -> bool | None:
     return padding
 
 
-def _stated(folder: Path) -> dict[str, Any]:
+def _stated(folder: Path) -> dict[str, Decision]:
     """What config.json and config.yaml say of the network. Both may lack a field; neither may contradict the other."""
     sources: dict[str, dict[str, Any]] = {}
+    places = {NETWORK_CONFIG: NETWORK_CONFIG}
     if is_there(folder / NETWORK_CONFIG):
         sources[NETWORK_CONFIG] = read_json(folder / NETWORK_CONFIG)
     run_config = find_run_config(folder)
@@ -274,12 +363,13 @@ def _stated(folder: Path) -> dict[str, Any]:
         if not isinstance(network, dict):
             raise CheckpointError(f"{run_config}: model.rewind: expected a mapping, got {shown(network)}")
         sources[RUN_CONFIG] = network
+        places[RUN_CONFIG] = f"{file_name(run_config, folder)}: model.rewind"
     model_type = sources.get(NETWORK_CONFIG, {}).get("model_type", MODEL_TYPE)
     if model_type != MODEL_TYPE:
         raise CheckpointError(
             f"{folder / NETWORK_CONFIG}: model_type: expected {MODEL_TYPE}, got {cut(str(model_type))}"
         )
-    stated: dict[str, Any] = {}
+    stated: dict[str, Decision] = {}
     for name, kind in _STATED_TYPES.items():
         values = {source: content[name] for source, content in sources.items() if content.get(name) is not None}
         for source, value in values.items():
@@ -288,7 +378,8 @@ def _stated(folder: Path) -> dict[str, Any]:
         if name != "max_len" and len(set(values.values())) > 1:  # weights show max_len where it matters
             raise CheckpointError(f"{folder}: {name}: expected {' and '.join(values)} to agree, got {values}")
         if values:
-            stated[name] = next(iter(values.values()))
+            stated[name] = Decision(name, next(iter(values.values())), " and ".join(places[each] for each in values))
     if any(content.keys() >= _FIRST_FIELDS for content in sources.values()):
-        stated.setdefault("causal_mask", False)
+        older = Decision("causal_mask", False, f"{OF_UPSTREAM} of before causal_mask", is_assumed=True)
+        stated.setdefault("causal_mask", older)
     return stated

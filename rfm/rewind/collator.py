@@ -15,6 +15,7 @@ import torch
 
 from rfm.dense_mode import prefix_indices
 from rfm.layers.tensors import as_tensor
+from rfm.predictor import check_type
 from rfm.rewind.network import RewindBatch, RewindConfig
 from rfm.rewind.packing import rounded_up
 from rfm_client.contract import InvalidSampleError, ProgressSample, Sample, SimilaritySample, Trajectory
@@ -64,9 +65,7 @@ class RewindCollator:
 
     def rows(self, sample: Sample) -> list[Row]:
         """The rows of a sample of embeddings. Raises InvalidSampleError if the checkpoint cannot score it."""
-        if isinstance(sample, SimilaritySample) and not self.config.has_similarity:
-            supported = "progress or preference (this checkpoint has no similarity head)"
-            raise InvalidSampleError.at("sample_type", supported, "similarity")
+        check_type(sample, self.config)
         frame_steps = sample.frame_steps if isinstance(sample, ProgressSample) else 0
         if sample.trajectories[0].frames is not None:
             raise InvalidSampleError.at("frames", "video_embeddings (no encoders are loaded)", "frames")

@@ -48,6 +48,13 @@ class RewindConfig:
     has_similarity: bool
     trained_frames: int | None = None
     trained_padding: bool | None = None
+    has_preference: bool = True
+    has_success: bool = True
+
+    @property
+    def has_pairs(self) -> bool:
+        """Whether there are questions about two trajectories that the network can answer."""
+        return self.has_preference or self.has_similarity
 
     @property
     def max_frames(self) -> int | None:
@@ -142,7 +149,7 @@ class RewindOutput:
     """Raw scores of a RewindBatch: progress logits [F, K], success logits [F], query logits [Q]."""
 
     progress: Tensor
-    success: Tensor
+    success: Tensor | None
     query: Tensor
 
 
@@ -217,16 +224,19 @@ class RewindTransformer(nn.Module):
         self.video_proj = Linear(config.video_feature_dim, width)
         self.text_proj = Linear(config.text_feature_dim, width)
         self.first_embedding_A = nn.Parameter(torch.randn(1, 1, width))
-        self.first_embedding_B = nn.Parameter(torch.randn(1, 1, width))
+        if config.has_pairs:
+            self.first_embedding_B = nn.Parameter(torch.randn(1, 1, width))
         if config.use_per_frame_progress_token:
             self.text_position_embedding = nn.Parameter(torch.randn(1, 1, width))
             self.prog_token_A = nn.Parameter(torch.randn(1, config.max_len, width))
             self.prog_token_B = nn.Parameter(torch.randn(1, config.max_len, width))
         self.transformer = Encoder(config)
         self.progress_head = PredictionHead(width, config.progress_bins)
-        self.success_head = PredictionHead(width, 1)
-        self.preference_token = nn.Parameter(torch.randn(1, 1, width))
-        self.preference_head = PredictionHead(width, 1)
+        if config.has_success:
+            self.success_head = PredictionHead(width, 1)
+        if config.has_preference:
+            self.preference_token = nn.Parameter(torch.randn(1, 1, width))
+            self.preference_head = PredictionHead(width, 1)
         if config.has_similarity:
             self.similarity_token = nn.Parameter(torch.randn(1, 1, width))
             self.similarity_head = PredictionHead(width, 1)
@@ -236,8 +246,9 @@ class RewindTransformer(nn.Module):
         hidden = self.transformer(self._tokens(batch), batch.packing, batch.read_at)
         num_frames, num_queries = len(batch.frame_at), len(batch.query_at)
         query = self._query_scores(hidden[num_frames : num_frames + num_queries], batch)
-        progress, success = self.progress_head(hidden), self.success_head(hidden).squeeze(-1)
-        return RewindOutput(progress[:num_frames], success[:num_frames], query)
+        progress = self.progress_head(hidden)[:num_frames]
+        success = self.success_head(hidden).squeeze(-1)[:num_frames] if self.config.has_success else None
+        return RewindOutput(progress, success, query)
 
     def _tokens(self, batch: RewindBatch) -> Tensor:
         """[N + room, D], what the transformer reads."""
@@ -261,10 +272,14 @@ class RewindTransformer(nn.Module):
         """[Q or 1, D]: the tokens whose outputs answer the rows' questions."""
         if batch.is_similarity is None:
             return self.preference_token[0]
+        if not self.config.has_preference:
+            return self.similarity_token[0]
         return torch.where(batch.is_similarity[:, None], self.similarity_token[0], self.preference_token[0])
 
     def _query_scores(self, hidden: Tensor, batch: RewindBatch) -> Tensor:
         """[Q] logits of the query tokens' [Q, D]."""
+        if not self.config.has_preference:
+            return self.similarity_head(hidden).squeeze(-1) if self.config.has_similarity else hidden[:, 0]
         preference = self.preference_head(hidden).squeeze(-1)
         if batch.is_similarity is None:
             return preference

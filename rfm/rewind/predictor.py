@@ -68,6 +68,7 @@ class RewindPredictor:
                 query = next(questions)[0 if row.is_similarity else 1]
             scored.append(RowScores(of_trajectories, query))
             start = end
-        if are_finite([frames], logits):  # of all rows at once, which is faster
+        has_success = output.success is not None
+        if are_finite([frames], logits, has_success=has_success):  # of all rows at once, which is faster
             return list(scored)
-        return checked(scored)
+        return checked(scored, has_success=has_success)

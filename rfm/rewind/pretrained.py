@@ -20,6 +20,13 @@ TEXT_MODELS = ("bert", "distilbert", "mpnet", "roberta", "xlm-roberta")  # of se
 _LOADING_PROBLEMS = ("missing_keys", "unexpected_keys", "mismatched_keys")  # as transformers reports a load
 
 
+def load_config(source: str | Path) -> Any:
+    """The configuration of a model. Raises OSError and ValueError."""
+    from transformers import AutoConfig
+
+    return AutoConfig.from_pretrained(str(source), trust_remote_code=False)  # None would ask the user
+
+
 def load_preprocessor(source: str | Path) -> ImagePreprocessor:
     """The preprocessing of an image model. Raises OSError, ValueError, CheckpointError."""
     from transformers.utils.hub import cached_file
@@ -51,10 +58,10 @@ def load_model(source: str | Path, weights: Mapping[str, Tensor] | None, known: 
     known: the types of models that may be there
     Raises OSError, CheckpointError, and ValueError for another type, or weights that do not fit to the letter.
     """
-    from transformers import AutoConfig, AutoModel
+    from transformers import AutoModel
 
     options = {"dtype": torch.float32, "output_loading_info": True}
-    config = AutoConfig.from_pretrained(str(source), trust_remote_code=False)  # None would ask the user
+    config = load_config(source)
     if config.model_type not in known:
         raise ValueError(f"{source}: model_type: expected one of {', '.join(known)}, got {config.model_type}")
     if Path(source).is_dir():

@@ -13,7 +13,7 @@ from rfm.checkpoint.content import CheckpointError, cut, is_there, listed, read_
 from rfm.checkpoint.files import ADAPTER_CONFIG, NETWORK_CONFIG, WEIGHTS, WEIGHTS_INDEX, check_one_form
 from rfm.checkpoint.pickles import refuse_pickles
 from rfm.vlm.backbone import BACKBONES, DEQUANTIZED, backbone_config, check_not_quantized
-from rfm.vlm.lora import LORA_NAME, Scaling, check_adapter
+from rfm.vlm.lora import LORA_NAME, MERGE, Scaling, check_adapter
 from rfm.vlm.names import ADAPTER_NAMES, QWEN_NAMES, renamed
 from rfm.vlm.run_config import RunConfig
 
@@ -27,6 +27,8 @@ _NO_EMBEDDING = (
     "lost with the run; save the whole model where it was trained (save_model() of the trainer), or the adapter with "
     "save_pretrained(..., save_embedding_layers=True)"
 )
+# In names of SmolVLM's weights, of LoRA of an embedding, and of an embedding that PEFT saves in two ways at once.
+_OTHER = re.compile(r"\.(text_model|lora_embedding_[AB]|modules_to_save|original_module)(\.|$)")
 _VARIANT = re.compile(r"-unsloth$")  # of one model, which Unsloth puts in the place of a base model
 _FEW_BITS = re.compile(r"-bnb-\dbit/?$")  # how Unsloth names a base model of fewer bits, which it trains on
 
@@ -48,7 +50,9 @@ def has_adapter(folder: Path) -> bool:
 
 
 def base_of_adapter(folder: Path, run: RunConfig) -> str:
-    """The base model that the run names. Raises CheckpointError if the adapter names another."""
+    """The base model that the run names. Raises CheckpointError if the adapter names another, or the run began with a
+    checkpoint, whose weights its adapter may change in place of the base model's.
+    """
     base = run.get("model.base_model_id", "")
     if not base:
         raise CheckpointError(f"{run.file}: expected model.base_model_id (or --base-model), got none")
@@ -56,15 +60,22 @@ def base_of_adapter(folder: Path, run: RunConfig) -> str:
     if isinstance(named, str) and _FEW_BITS.search(named):
         expected = f"base_model_name_or_path: expected weights in full precision, got {shown(named)}"
         raise CheckpointError(f"{folder / ADAPTER_CONFIG}: {expected}; {DEQUANTIZED.format(base=named)}")
-    if named and _model_name(str(named)) != _model_name(base):
+    if named and model_name(str(named)) != model_name(base):
         raise CheckpointError(
             f"{folder / ADAPTER_CONFIG}: base_model_name_or_path: expected {cut(base)}, the model.base_model_id of "
             f"{run.file}, got {shown(named)}; name the one that the adapter was trained on with --base-model"
         )
+    began_with = run.get("training.load_from_checkpoint", "")
+    if began_with:
+        raise CheckpointError(
+            f"{run.file}: training.load_from_checkpoint: expected none beside an adapter, got {shown(began_with)}: the "
+            f"adapter may change its weights in place of those of {cut(base)}; {MERGE}; if it does change those of "
+            f"{cut(base)}, name them with --base-model"
+        )
     return base
 
 
-def _model_name(base: str) -> str:
+def model_name(base: str) -> str:
     """What is left of a base model's id or path where the same model may have several."""
     return _VARIANT.sub("", base.rstrip("/").rpartition("/")[2].lower())
 
@@ -80,6 +91,10 @@ def adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Te
     if not is_there(folder / ADAPTER_WEIGHTS):
         refuse_pickles(folder, ADAPTER_WEIGHTS, Path(ADAPTER_WEIGHTS).stem)
     adapter = renamed(renamed(read_tensors(folder / ADAPTER_WEIGHTS), ADAPTER_NAMES), QWEN_NAMES)
+    other = next((name for name in adapter if _OTHER.search(name)), None)
+    if other is not None:
+        expected = "LoRA factors of linear layers of a Qwen backbone"
+        raise CheckpointError(f"{folder / ADAPTER_WEIGHTS}: expected {expected}, got {shown(other)}; {MERGE}")
     if EMBEDDING not in adapter:
         raise CheckpointError(f"{folder / ADAPTER_WEIGHTS}: {_NO_EMBEDDING}")
     config, base = _read_base(base_model)
@@ -117,7 +132,7 @@ def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
         hint = "name its folder with --base-model"
         raise CheckpointError(f"base model {base_model}: cannot be had: {cut(str(error))} ({hint})") from error
     if loaded["missing_keys"]:
-        raise CheckpointError(f"base model {base_model}: missing keys: {sorted(loaded['missing_keys'])}")
+        raise CheckpointError(f"base model {base_model}: missing keys: {listed(sorted(loaded['missing_keys']))}")
     config = backbone_config(network.config.to_dict(), base_model)
     config.pop("transformers_version", None)  # the one installed here, which says nothing of the training
     return config, {f"model.{name}": tensor for name, tensor in network.state_dict().items()}

@@ -30,6 +30,7 @@ _NOT_OF_TEXT = (
     "transformers_version", "video_token_id", "vision_config", "vision_end_token_id", "vision_start_token_id",
     "vision_token_id",
 )  # fmt: skip
+NF4 = "bitsandbytes nf4"  # as ``quantization`` names it
 _ROPE = ("rope_theta", "rope_scaling", "rope_parameters", "partial_rotary_factor")
 UNQUANTIZED = (
     "export the checkpoint that was quantized (its scores differ), or load this one with the code that trained it, "
@@ -69,13 +70,21 @@ def backbone_config(content: Mapping[str, Any], where: object) -> dict[str, Any]
     return config
 
 
+def quantization(config: Any) -> str | None:
+    """How weights were rounded to fewer bits: the method and, of bitsandbytes, the type; None: they were not."""
+    found = config.get("quantization_config") if isinstance(config, dict) else None
+    if not found or not isinstance(found, dict):
+        return str(found) if found else None
+    method = str(found.get("quant_method"))
+    kind = "int8" if found.get("load_in_8bit") else found.get("bnb_4bit_quant_type")
+    return f"{method} {kind}" if kind and method == "bitsandbytes" else method
+
+
 def check_not_quantized(config: Mapping[str, Any], where: object, remedy: str) -> None:
     """Raises CheckpointError, which ends in ``remedy``, for a configuration of weights of fewer bits."""
     for part in (config, config.get("text_config")):
-        found = part.get("quantization_config") if isinstance(part, dict) else None
-        if found:
-            method = found.get("quant_method") if isinstance(found, dict) else found
-            raise CheckpointError(f"{where}: quantization_config: expected none, got {shown(method)}; {remedy}")
+        if (found := quantization(part)) is not None:
+            raise CheckpointError(f"{where}: quantization_config: expected none, got {shown(found)}; {remedy}")
 
 
 def _nested(content: Mapping[str, Any]) -> dict[str, Any]:

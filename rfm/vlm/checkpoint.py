@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -25,19 +25,32 @@ from rfm.checkpoint.content import (
     read_json,
     shown,
 )
+from rfm.checkpoint.decision import Decision
 from rfm.checkpoint.files import (
     ADAPTER_CONFIG,
     NETWORK_CONFIG,
     WEIGHTS,
     check_shapes,
+    has_head,
     read_weights,
 )
+from rfm.checkpoint.nf4 import dequantize
 from rfm.checkpoint.training import check_progress
-from rfm.family import NETWORK, Description, Options
+from rfm.family import NETWORK, Description, Options, config_fields
 from rfm.feature_cache import FeatureCache
 from rfm.version_folder import PROCESSOR_FOLDER
 from rfm.vlm.adapter import adapted, base_of_adapter, has_adapter
-from rfm.vlm.backbone import BACKBONES, QWEN_2_5, SMOL, UNQUANTIZED, backbone_config, check_not_quantized, is_at_least
+from rfm.vlm.backbone import (
+    BACKBONES,
+    NF4,
+    QWEN_2_5,
+    SMOL,
+    UNQUANTIZED,
+    backbone_config,
+    check_not_quantized,
+    is_at_least,
+    quantization,
+)
 from rfm.vlm.collator import VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm.vlm.lora import LORA_NAME, Scaling, changed_by, merged, split
@@ -46,6 +59,8 @@ from rfm.vlm.network import VlmConfig, VlmRewardModel, build_backbone
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.processor import frame_size, load_collator, save_processor
 from rfm.vlm.prompts import OF_AN_OLD_RUN
+from rfm.vlm.provenance import of_export, of_processor, of_rounding, of_run
+from rfm.vlm.published import check_published, differences, is_published
 from rfm.vlm.run_config import RunConfig
 
 LORA = "lora"  # in VlmCheckpoint.parts: the factors that change the network's weights
@@ -61,13 +76,17 @@ class VlmCheckpoint:
 
     weights: of VlmRewardModel, without LoRA
     factors: of LoRA, as ``rfm.vlm.lora.split`` names them; none: the weights are whole
-    processor: folder or id with its tokenizer and image preprocessing; None: those of the base model that it names
+    processor: its own folder of tokenizer and image preprocessing; None: those of the base model are taken
+    base_model: folder or id that the caller names; None: the one that the checkpoint names
+    settings: what decided its configuration
     """
 
     config: VlmConfig
     weights: dict[str, Tensor]
     factors: dict[str, Tensor]
-    processor: str | Path | None = None
+    processor: Path | None = None
+    base_model: str | None = None
+    settings: tuple[Decision, ...] = ()
 
     @property
     def description(self) -> Description:
@@ -82,6 +101,8 @@ class VlmCheckpoint:
             frames_per_value=1 if self.config.multi_image else FRAMES_PER_GROUP,
             keeps_features=self.config.family != SMOL,
             is_large=True,
+            has_preference=self.config.has_preference,
+            has_success=self.config.has_success,
         )
 
     @property
@@ -91,7 +112,31 @@ class VlmCheckpoint:
 
     @property
     def notes(self) -> Sequence[str]:
-        """That positions may be others than in training, of a Qwen2.5-VL that reads videos."""
+        """That prompts, images or positions may be others than in training."""
+        return [*self._of_processor(), *self._of_positions()]
+
+    def decisions(self) -> list[Decision]:
+        """What decided each setting. Raises CheckpointError if the processor cannot be had."""
+        return [*self.settings, *of_processor(self.collator, PROCESSOR_FOLDER if self._is_own else self._source)]
+
+    @property
+    def _source(self) -> str | Path:
+        """Folder or id of the processor."""
+        return self.base_model or self.processor or self.config.base_model_id
+
+    @property
+    def _is_own(self) -> bool:
+        """Whether the processor is the checkpoint's own, as an export has it."""
+        return self._source == self.processor
+
+    def _of_processor(self) -> Sequence[str]:
+        """That it is not as published: the run may have been trained with it, or not."""
+        found = [] if self._is_own else differences(self.collator)
+        known = f"the published processors of {self.config.family}"
+        return [f"base model {self._source}: differs from {known} in {'; '.join(found)}"] if found else []
+
+    def _of_positions(self) -> Sequence[str]:
+        """That they may be others than in training, of a Qwen2.5-VL that reads videos."""
         version = str(self.config.backbone.get("transformers_version"))
         major = version.partition(".")[0]
         if self.config.family != QWEN_2_5 or self.config.multi_image or not major.isdigit() or int(major) < 5:
@@ -106,7 +151,10 @@ class VlmCheckpoint:
     def collator(self) -> VlmCollator:
         """What makes batches of samples. Raises CheckpointError if the processor cannot be had or does not fit."""
         embedding = next(t for name, t in self.weights.items() if name.endswith("embed_tokens.weight"))
-        return load_collator(self.config, len(embedding), self.processor or self.config.base_model_id)
+        collator = load_collator(self.config, len(embedding), self._source)
+        if self.base_model is not None and is_published(self.config.base_model_id, self.config.family):
+            check_published(collator, self.base_model)
+        return collator
 
     def encoders(self) -> None:
         """None: the network reads raw frames, and needs no encoders."""
@@ -129,7 +177,7 @@ class VlmCheckpoint:
         """Writes weights and LoRA factors, one config.json that says all, and the processor."""
         collator = self.collator  # first: what is missing is reported before the weights are written
         folder.mkdir(parents=True)
-        settings = {name: value for name, value in asdict(self.config).items() if name != "backbone"}
+        settings = {name: value for name, value in config_fields(self.config).items() if name != "backbone"}
         config = {**self.config.backbone, SETTINGS: settings}
         (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
         tensors = {name: tensor.contiguous() for name, tensor in (self.weights | self.factors).items()}
@@ -170,10 +218,14 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
         is_adapter = has_adapter(folder)
         file = folder / NETWORK_CONFIG
         backbone = {} if is_adapter else backbone_config(read_json(file), file)
+        is_nf4, num_nf4 = quantization(backbone) == NF4, 0
+        if is_nf4:
+            del backbone["quantization_config"]
         check_not_quantized(backbone, file, UNQUANTIZED)
         if SETTINGS in backbone:  # written by VlmCheckpoint.save, with every setting
             config = _saved_config(backbone)
             weights, factors = _used(renamed(read_weights(folder), _renames(config.family)))
+            settings = of_export(config, options.base_model)
         else:
             run = RunConfig.of(folder)
             run.check_model_type()
@@ -182,11 +234,15 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
             if is_adapter:
                 backbone, tensors, scaling = adapted(folder, options.base_model or base_of_adapter(folder, run))
             else:
-                tensors, scaling = _whole(folder, backbone, run)
+                tensors, num_nf4 = _in_full_precision(folder, is_nf4)
+                tensors, scaling = _whole(tensors, folder, backbone, run)
             weights, factors = _used(tensors, scaling)
             config = _trained_config(folder, backbone, run, weights)
+            settings = of_run(config, run, options.base_model, scaling, is_adapter=is_adapter)
+            settings = (*settings, *of_rounding(num_nf4))
     own = folder / PROCESSOR_FOLDER
-    checkpoint = VlmCheckpoint(config, weights, factors, options.base_model or (own if own.is_dir() else None))
+    processor = own if own.is_dir() else None
+    checkpoint = VlmCheckpoint(config, weights, factors, processor, options.base_model, settings)
     checkpoint.check()
     return checkpoint
 
@@ -215,6 +271,8 @@ def _trained_config(
         progress_bins=weights["progress_head.4.weight"].shape[0],
         has_similarity="similarity_head.0.weight" in weights,
         size_px=run.size_px(family, network["multi_image"]),
+        has_preference=has_head(weights, "preference"),
+        has_success=has_head(weights, "success"),
         **network,
     )
     if (family == SMOL or config.per_frame_progress_token) and not config.multi_image:
@@ -237,12 +295,24 @@ def _renames(family: Any) -> Renames:
     return SMOL_NAMES if family == SMOL else QWEN_NAMES
 
 
-def _whole(folder: Path, backbone: Mapping[str, Any], run: RunConfig) -> tuple[dict[str, Tensor], Scaling | None]:
-    """The weights of the network by name, with LoRA factors if it has some; what these are scaled with."""
-    tensors, scaling = read_weights(folder), None
+def _in_full_precision(folder: Path, is_nf4: bool) -> tuple[dict[str, Tensor], int]:
+    """The tensors in the folder, and the number of those that were in NF4; is_nf4: config.json says that some are."""
+    tensors = read_weights(folder)
+    num_nf4 = dequantize(tensors)
     quantized = next((name for name in tensors if QUANTIZED.search(name)), None)
     if quantized is not None:
         raise CheckpointError(f"{folder}: expected weights in full precision, got {shown(quantized)}; {UNQUANTIZED}")
+    if is_nf4 and not num_nf4:
+        got = "none; if they are meant in full precision, remove it"
+        raise CheckpointError(f"{folder / NETWORK_CONFIG}: quantization_config: expected weights in NF4, got {got}")
+    return tensors, num_nf4
+
+
+def _whole(
+    tensors: dict[str, Tensor], folder: Path, backbone: Mapping[str, Any], run: RunConfig
+) -> tuple[dict[str, Tensor], Scaling | None]:
+    """The weights of the network by name, with LoRA factors if it has some; what these are scaled with."""
+    scaling = None
     if any(LORA_NAME.fullmatch(name) for name in tensors):
         tensors, scaling = renamed(tensors, LORA_INSIDE), Scaling.of(run.file, run.sections["peft"])
         if is_there(folder / ADAPTER_CONFIG):

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from rfm.feature_cache import FeatureCache
+from rfm.predictor import check_type
 from rfm.vlm.batch import FramesOfOneSize, QwenPixels, SmolPixels, VlmBatch
 from rfm.vlm.chat import Chat, Visual
 from rfm.vlm.film import Film, Indices, Shot, SizedFrames, named_frames
@@ -119,9 +120,7 @@ class VlmCollator:
 
         Raises InvalidSampleError if the checkpoint cannot score it.
         """
-        if isinstance(sample, SimilaritySample) and not self.config.has_similarity:
-            supported = "progress or preference (this checkpoint has no similarity head)"
-            raise InvalidSampleError.at("sample_type", supported, "similarity")
+        check_type(sample, self.config)
         frame_steps = sample.frame_steps if isinstance(sample, (ProgressSample, NamedProgressSample)) else 0
         films = tuple(_film(trajectory, frame_steps) for trajectory in sample.trajectories)
         self._check_task(sample.trajectories[0].task)

@@ -21,7 +21,7 @@ from rfm.checkpoint.content import CheckpointError, cut, shown
 
 LORA_NAME = re.compile(r"(?P<module>.+)\.lora_(?P<side>[AB])(\.default)?\.weight")
 _BASE_LAYER = ".base_layer."
-_MERGE = "merge it where it was trained (merge_and_unload() of PEFT) and export the whole model that this makes"
+MERGE = "merge it where it was trained (merge_and_unload() of PEFT) and export the whole model that this makes"
 # How factors may begin: without a change of the base model's weights.
 _PLAIN_INITS = (True, False, "gaussian", "orthogonal")
 # Fields of adapter_config.json that change no score. Any other that is set may make another function of the factors.
@@ -47,7 +47,7 @@ class Scaling:
         """What a LoRA configuration states. Raises CheckpointError for an adapter of another kind."""
         kind = config.get("peft_type", "LORA")
         if kind != "LORA":
-            raise CheckpointError(f"{file}: peft_type: expected LORA, got {shown(kind)}; {_MERGE}")
+            raise CheckpointError(f"{file}: peft_type: expected LORA, got {shown(kind)}; {MERGE}")
         rank, alpha = config.get("r"), config.get("lora_alpha")
         is_number = isinstance(alpha, (int, float)) and not isinstance(alpha, bool) and math.isfinite(alpha)
         if type(rank) is not int or rank < 1 or not is_number:
@@ -55,7 +55,7 @@ class Scaling:
             raise CheckpointError(f"{file}: expected lora_alpha and r of the LoRA weights, got {got}")
         unsupported = sorted(name for name, value in config.items() if value and name not in _HARMLESS)
         if unsupported:
-            raise CheckpointError(f"{file}: expected plain LoRA, got {cut(', '.join(unsupported))}; {_MERGE}")
+            raise CheckpointError(f"{file}: expected plain LoRA, got {cut(', '.join(unsupported))}; {MERGE}")
         return cls(file, rank, float(config["lora_alpha"]))
 
     def check_rank(self, module: str, factor: Tensor) -> None:
@@ -80,10 +80,10 @@ def check_adapter(file: Path, config: Mapping[str, Any]) -> None:
     init, bias = config.get("init_lora_weights", True), config.get("bias", "none")
     if init not in _PLAIN_INITS:
         got = f"{shown(init)}, which may change the base model's weights before training"
-        raise CheckpointError(f"{file}: init_lora_weights: expected true, got {got}; {_MERGE}")
+        raise CheckpointError(f"{file}: init_lora_weights: expected true, got {got}; {MERGE}")
     if bias != "none":
         raise CheckpointError(
-            f"{file}: bias: expected none, got {shown(bias)}, which PEFT does not always save; {_MERGE}"
+            f"{file}: bias: expected none, got {shown(bias)}, which PEFT does not always save; {MERGE}"
         )
 
 
@@ -139,8 +139,7 @@ def _check(module: str, weight: Tensor | None, pair: Mapping[str, Tensor]) -> No
         raise CheckpointError(f"{module}: expected a weight and LoRA factors A and B, got {sorted(pair)}")
     shapes = [list(pair[side].shape) for side in ("B", "A")]
     if [len(shape) for shape in shapes] != [2, 2] or [shapes[0][0], shapes[1][1]] != list(weight.shape):
-        raise CheckpointError(
-            f"{module}: expected LoRA factors of {list(weight.shape)}, got {shapes[0]} and {shapes[1]}"
-        )
+        got = f"{shapes[0]} and {shapes[1]}"
+        raise CheckpointError(f"{module}: expected LoRA factors of {list(weight.shape)}, got {got}; {MERGE}")
     if shapes[0][1] != shapes[1][0]:
         raise CheckpointError(f"{module}: expected LoRA factors of one rank, got {shapes[0]} and {shapes[1]}")

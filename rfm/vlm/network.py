@@ -32,7 +32,7 @@ class VlmConfig:
     dtype: of all parameters, heads included
     multi_image: each frame is an image of its own; else a trajectory is one video
     per_frame_progress_token: a progress token behind each image carries its state
-    frame_pooling: else, how an image's tokens make up its state; boundary: the last one
+    frame_pooling: else, how an image's tokens make up its state; boundary: the last one. Videos are not pooled so
     pooling_temperature: of attention pooling
     average_temporal_patches: in video mode, a group's tokens are averaged; else the token behind them is read
     progress_in_preference: questions of preference ask for progress too
@@ -53,11 +53,23 @@ class VlmConfig:
     size_px: tuple[int, int] | None
     base_model_id: str
     trained_frames: int | None = None
+    has_preference: bool = True
+    has_success: bool = True
 
     @property
     def family(self) -> str:
         """Name of the backbone's kind: a key of BACKBONES."""
         return str(self.backbone["model_type"])
+
+    @property
+    def pools_images(self) -> bool:
+        """Whether the tokens of an image are pooled, as ``frame_pooling`` says. Upstream heeds it in images alone."""
+        return self.multi_image and not self.per_frame_progress_token
+
+    @property
+    def pools_by_attention(self) -> bool:
+        """Whether the attention of frame_pool_attn weighs the tokens of an image."""
+        return self.pools_images and self.frame_pooling == "attention"
 
     @property
     def pads_left(self) -> bool:
@@ -83,8 +95,8 @@ class VlmOutput:
     """
 
     progress: Tensor
-    success: Tensor
-    preference: Tensor
+    success: Tensor | None
+    preference: Tensor | None
     similarity: Tensor | None
     made: Tensor | None = None
 
@@ -98,8 +110,10 @@ class VlmRewardModel(nn.Module):
         self.model = backbone
         width = config.hidden_dim
         self.progress_head = PredictionHead(width, config.progress_bins)
-        self.success_head = PredictionHead(width, 1)
-        self.preference_head = PredictionHead(width, 1)
+        if config.has_success:
+            self.success_head = PredictionHead(width, 1)
+        if config.has_preference:
+            self.preference_head = PredictionHead(width, 1)
         if config.has_similarity:
             self.similarity_head = PredictionHead(width, 1)
         self.frame_pool_attn = nn.Linear(width, 1, bias=False)
@@ -120,8 +134,8 @@ class VlmRewardModel(nn.Module):
         queries = hidden[batch.query_rows, batch.query_tokens]
         return VlmOutput(
             self.progress_head(frames),
-            self.success_head(frames).squeeze(-1),
-            self.preference_head(queries).squeeze(-1),
+            self.success_head(frames).squeeze(-1) if self.config.has_success else None,
+            self.preference_head(queries).squeeze(-1) if self.config.has_preference else None,
             self.similarity_head(queries).squeeze(-1) if self.config.has_similarity else None,
             made,
         )
@@ -136,7 +150,7 @@ class VlmRewardModel(nn.Module):
         span = torch.arange(len(spans), device=spans.device).repeat_interleave(lengths, output_size=num_tokens)
         offset = torch.arange(num_tokens, device=spans.device) - (lengths.cumsum(0) - lengths)[span]
         states = hidden[rows[span], starts[span] + offset]
-        if self.config.frame_pooling == "attention" and not self.config.per_frame_progress_token:
+        if self.config.pools_by_attention:
             scores = self.frame_pool_attn(states).squeeze(-1) / self.config.pooling_temperature
             states = states * _softmax_of_each(scores, lengths, span).unsqueeze(-1)
             return _of_each("sum", states.float(), lengths).to(hidden.dtype)

@@ -15,7 +15,7 @@ from rfm.execution import Execution, memory_errors
 from rfm.feature_cache import FeatureCache
 from rfm.layers.heads import progress_from_logits
 from rfm.layers.linear import speed_up
-from rfm.predictor import RowScores, checked, part_of
+from rfm.predictor import RowScores, checked, no_success, part_of
 from rfm.vlm.batch import Layout, VlmBatch
 from rfm.vlm.collator import VlmCollator, VlmRow
 from rfm.vlm.images import FRAMES_PER_GROUP
@@ -102,7 +102,7 @@ class VlmPredictor:
         if batch.layout is not None and may_keep:
             with suppress(torch.OutOfMemoryError), memory_errors():  # the scores are there
                 self._keep(rows, batch.layout, output.made)
-        return checked(of_rows)
+        return checked(of_rows, has_success=output.success is not None)
 
     def _output(self, batch: VlmBatch) -> VlmOutput:
         """What the network gives. If its memory does not do, nothing stays in the cache: another attempt will come."""
@@ -149,13 +149,20 @@ def _read(output: VlmOutput) -> tuple[FrameScores, list[float], list[float], boo
     """The scores of all frames, preference and similarity of all questions, and whether all that was made of shots is
     finite, read from the device at once.
     """
-    made = [progress_from_logits(output.progress), output.success.sigmoid(), output.preference.sigmoid()]
-    made += [output.progress] if output.progress.shape[-1] > 1 else []
-    made += [] if output.similarity is None else [output.similarity]
-    made += [] if output.made is None else [output.made.isfinite().all()]
-    read = torch.cat([each.float().flatten() for each in made]).cpu().split([each.numel() for each in made])
-    progress, success, preference, *rest = (each.view(of.shape) for each, of in zip(read, made, strict=True))
-    logits = rest.pop(0).numpy() if output.progress.shape[-1] > 1 else None
-    scores = FrameScores(progress=progress.numpy(), success=success.numpy(), progress_logits=logits)
-    is_finite = True if output.made is None else bool(rest.pop())
-    return scores, preference.tolist(), rest[0].tolist() if rest else [], is_finite
+    made = {
+        "progress": progress_from_logits(output.progress),
+        "success": None if output.success is None else output.success.sigmoid(),
+        "preference": None if output.preference is None else output.preference.sigmoid(),
+        "logits": output.progress if output.progress.shape[-1] > 1 else None,
+        "similarity": output.similarity,
+        "is_finite": None if output.made is None else output.made.isfinite().all(),
+    }
+    there = {name: tensor for name, tensor in made.items() if tensor is not None}
+    parts = torch.cat([each.float().flatten() for each in there.values()]).cpu()
+    split = parts.split([each.numel() for each in there.values()])
+    read = {name: part.view(of.shape).numpy() for (name, of), part in zip(there.items(), split, strict=True)}
+    progress = read["progress"]
+    success = read["success"] if "success" in read else no_success(progress)
+    scores = FrameScores(progress=progress, success=success, progress_logits=read.get("logits"))
+    preference, similarity = (read[name].tolist() if name in read else [] for name in ("preference", "similarity"))
+    return scores, preference, similarity, bool(read.get("is_finite", True))

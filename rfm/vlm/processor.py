@@ -9,8 +9,17 @@ from typing import Any
 
 from rfm.checkpoint.content import CheckpointError, read_json
 from rfm.checkpoint.preprocessor import PREPROCESSOR_CONFIG
-from rfm.vlm.backbone import SMOL, is_at_least
-from rfm.vlm.collator import QwenCollator, SmolCollator, VlmCollator
+from rfm.vlm.backbone import QWEN_2_5, SMOL, is_at_least
+from rfm.vlm.collator import (
+    IMAGE_PAD,
+    QWEN3,
+    SMOL_IMAGE,
+    VIDEO_PAD,
+    VISION_START,
+    QwenCollator,
+    SmolCollator,
+    VlmCollator,
+)
 from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, Normalisation, QwenImages, SmolImages, fitted_size
 from rfm.vlm.network import VlmConfig
 from rfm.vlm.prompts import OLD_SPECIAL_TOKENS, SPECIAL_TOKENS
@@ -23,6 +32,9 @@ _KEPT = (
     "bos_token", "clean_up_tokenization_spaces", "eos_token", "model_max_length", "pad_token", "padding_side",
     "unk_token",
 )  # fmt: skip
+# Fields of a backbone's config.json that number its tokens.
+_OF_QWEN = {"image_token_id": IMAGE_PAD, "video_token_id": VIDEO_PAD, "vision_start_token_id": VISION_START}
+_STATED_TOKENS = {QWEN_2_5: _OF_QWEN, QWEN3: _OF_QWEN, SMOL: {"image_token_id": SMOL_IMAGE}}
 SMOL_SIZE_PX = 512  # what upstream sets, whatever the base model says; so no image is split
 
 
@@ -59,7 +71,23 @@ def load_collator(config: VlmConfig, num_tokens: int, processor: str | Path) -> 
             else ""
         )
         raise CheckpointError(f"base model {processor}: expected {expected}, got {len(tokenizer)}{hint}")
+    _check_tokens(config, tokenizer, processor)
     return _collator(config, tokenizer, preprocessor, processor)
+
+
+def _check_tokens(config: VlmConfig, tokenizer: Any, processor: str | Path) -> None:
+    """Raises CheckpointError for tokens that do not stand where the checkpoint was trained with them."""
+    first = len(tokenizer) - len(SPECIAL_TOKENS)
+    expected = {token: first + index for index, token in enumerate(SPECIAL_TOKENS)}
+    stated = {token: config.backbone.get(name) for name, token in _STATED_TOKENS[config.family].items()}
+    expected |= {token: number for token, number in stated.items() if type(number) is int}
+    for token, number in expected.items():
+        got = tokenizer.convert_tokens_to_ids(token)
+        if got != number:
+            raise CheckpointError(
+                f"base model {processor}: {token}: expected token {number}, with which the checkpoint was trained, got "
+                f"{got}; name the base model as it was published with --base-model"
+            )
 
 
 def _tokenizer(processor: str | Path) -> Any:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from rfm.checkpoint.content import CheckpointError, read_run_config, shown
+from rfm.checkpoint.decision import OF_UPSTREAM, Decision, file_name
 from rfm.checkpoint.files import RUN_CONFIG, find_run_config, frame_count, trained_frames
 from rfm.vlm.backbone import SMOL
 
@@ -19,6 +20,18 @@ HEADS, VQA = "default", "vqa"  # values of model.model_type: reward heads, and a
 DTYPES = ("float32", "bfloat16", "float16")
 POOLINGS = ("mean", "boundary", "attention")
 _SECTIONS = ("model", "data", "training", "peft")
+# Where a run's configuration has the fields of VlmConfig that it decides; of two keys both count.
+SETTINGS = {
+    "dtype": ("model.torch_dtype",),
+    "multi_image": ("model.use_multi_image", "data.use_multi_image"),
+    "per_frame_progress_token": ("model.use_per_frame_progress_token", "data.use_per_frame_progress_token"),
+    "frame_pooling": ("model.frame_pooling",),
+    "pooling_temperature": ("model.frame_pooling_attn_temperature",),
+    "average_temporal_patches": ("model.average_temporal_patches",),
+    "progress_in_preference": ("training.predict_pref_progress",),
+    "size_px": ("data.resized_height", "data.resized_width"),
+    "trained_frames": ("data.max_frames",),
+}
 _DROPPED = ("pairwise_progress", "use_progress_token")  # other ways to prompt that upstream once had
 
 Value = TypeVar("Value", bool, str, float)
@@ -29,9 +42,11 @@ class RunConfig:
     """The sections of a run's config.yaml. A null is a key that is not there, as it is upstream.
 
     file: where it lies
+    name: its path as seen from the checkpoint's folder
     """
 
     file: Path
+    name: str
     sections: dict[str, dict[str, Any]]
 
     @classmethod
@@ -53,7 +68,7 @@ class RunConfig:
                 raise CheckpointError(f"{file}: {name}: expected a mapping, got {shown(section)}")
         if not sections["model"]:
             raise CheckpointError(f"{file}: model: expected the settings of the training run, got none")
-        return cls(file, sections)
+        return cls(file, file_name(file, folder), sections)
 
     def check_model_type(self) -> None:
         """Raises CheckpointError for a checkpoint that upstream does not score by reward heads as they are today."""
@@ -79,8 +94,8 @@ class RunConfig:
             raise CheckpointError(f"{where}: expected a number above 0, got {shown(temperature)}")
         return {
             "dtype": self._one_of("model.torch_dtype", "bfloat16", DTYPES),
-            "multi_image": self._of_either("use_multi_image"),
-            "per_frame_progress_token": self._of_either("use_per_frame_progress_token"),
+            "multi_image": self._of_either("multi_image"),
+            "per_frame_progress_token": self._of_either("per_frame_progress_token"),
             "frame_pooling": self._one_of("model.frame_pooling", "mean", POOLINGS),
             "pooling_temperature": temperature,
             "average_temporal_patches": self.get("model.average_temporal_patches", False),
@@ -103,6 +118,21 @@ class RunConfig:
         height, width = (frame_count(self.sections["data"].get(key), f"{self.file}: data.{key}") for key in keys)
         return None if height is None or width is None else (height, width)
 
+    def decision(self, setting: str, value: Any) -> Decision:
+        """What decided one of SETTINGS: its keys, or upstream's default where the file has none of them."""
+        places = SETTINGS[setting]
+        there = [place for place in places if self.states(place)]
+        if value is None:
+            return Decision(setting, value, f"{self.name}: no {' and '.join(places)}")
+        if not there:
+            return Decision(setting, value, f"{OF_UPSTREAM}, as {self.name} has no {places[0]}", is_assumed=True)
+        return Decision(setting, value, f"{self.name}: {', '.join(there)}")
+
+    def states(self, place: str) -> bool:
+        """Whether there is a value at ``section.key``."""
+        section, _, key = place.partition(".")
+        return self.sections[section].get(key) is not None
+
     def get(self, place: str, default: Value) -> Value:
         """The value at ``section.key``, of the default's type; the default where there is none."""
         section, _, key = place.partition(".")
@@ -121,9 +151,9 @@ class RunConfig:
             raise CheckpointError(f"{self.file}: {place}: expected one of {known}, got {shown(value)}")
         return value
 
-    def _of_either(self, key: str) -> bool:
+    def _of_either(self, setting: str) -> bool:
         """Upstream has it twice: its network reads that of ``model``, its collator that of ``data``."""
-        places = [f"{name}.{key}" for name in ("model", "data") if self.sections[name].get(key) is not None]
+        places = [place for place in SETTINGS[setting] if self.states(place)]
         values = {place: self.get(place, False) for place in places}
         if len(set(values.values())) > 1:
             got = " and ".join(f"{place} {str(value).lower()}" for place, value in values.items())

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import goldens
 from rfm_client import (
     BatchTiming,
     FrameScores,
@@ -148,8 +149,8 @@ def lacking(name: str, row: int, at: slice) -> wire.Tensors:
     [
         ("progress", 0, slice(0, 2)),  # what was asked
         ("progress", 1, slice(0, 1)),  # all of a pair's first trajectory
-        ("success", 0, slice(0, 2)),
         ("success", 0, slice(1, 2)),  # a part
+        ("success", 1, slice(0, 2)),  # a pair's first trajectory, and a part of its second
         ("progress", 1, slice(2, 3)),
         ("preference", 1, slice(0, 1)),
         ("similarity", 2, slice(0, 1)),
@@ -161,6 +162,17 @@ def test_a_score_that_lacks_is_an_error(name: str, row: int, at: slice) -> None:
     tensors = lacking(name, row, at)
     with pytest.raises(InferenceFailedError, match=f"{name}: expected "):
         wire.decode_results(tensors, samples)
+
+
+@pytest.mark.parametrize("row", [0, 1])
+def test_success_that_lacks_at_all_frames_is_not_predicted(row: int) -> None:
+    samples, sent = results()
+    result = wire.decode_results(lacking("success", row, slice(0, None)), samples)[row]
+    for got, expected in zip(goldens.frame_scores(result), goldens.frame_scores(sent[row]), strict=True):
+        assert got.progress.tolist() == expected.progress.tolist()
+        assert (len(got.success), np.isnan(got.success).all()) == (len(expected.success), True)
+        with pytest.raises(ValueError, match=r"^success: expected .* this checkpoint does not predict it$"):
+            got.succeeded()
 
 
 @pytest.mark.parametrize("shape", [(3,), (2, 5)], ids=str)

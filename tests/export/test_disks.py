@@ -116,6 +116,7 @@ def test_a_full_disk_is_told_and_changes_nothing(full_disks: dict[str, FullDisk]
     *notes, error = disk.errors.splitlines(keepends=True)
     assert re.fullmatch(told, error), disk.errors
     assert notes.pop(0) == f"rfm: {REWIND.checkpoint}/config.yaml: read as the settings of the training run\n"
+    assert notes.pop().startswith("rfm: assumed, and not shown by the checkpoint: causal_mask false (")
     assert all(note.startswith("rfm: config.yaml: model.train_") for note in notes)
 
 

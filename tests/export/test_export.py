@@ -365,7 +365,7 @@ LAST_FRAME = (
 )
 QUANTIZED = (
     "config.yaml: model.quantization is true: the run scored with its base model rounded to a few bits; the scores here "
-    "are those of the weights as they stand, so they differ from the run's"
+    "are those of the weights as they stand, so they differ from the run's unless these are rounded alike"
 )
 ALL_TRAINED: dict[str, object] = {f"train_{head}_head": True for head in HEADS}
 RUNS: dict[str, tuple[str, dict[str, object], list[str]]] = {
@@ -403,9 +403,10 @@ def test_an_export_says_which_config_yaml_and_which_encoders_it_took(tmp_path: P
     rfm_export.export(FRAMES.checkpoint, tmp_path, settings, say=said.append)
     assert said[0] == of_run(FRAMES.checkpoint)
     assert said[-1] == (
-        f"encoders: {settings.image_encoder} and {settings.text_encoder} are taken for those of the training run, which no "
-        "file names (their weights are the checkpoint's); upstream's are facebook/dinov2-base and "
-        "sentence-transformers/all-MiniLM-L12-v2"
+        "assumed, and not shown by the checkpoint: "
+        "image_encoder encoders/image_encoder (--image-encoder; weights of the checkpoint); "
+        "text_encoder encoders/text_encoder (--text-encoder; weights of the checkpoint); "
+        "scores differ from the run's if it had others; rfm export --explain shows what decided each setting"
     )
     rfm_export.export(EMBEDDINGS.checkpoint, tmp_path / "above", serve_config(EMBEDDINGS), say=said.append)
     assert of_run(EMBEDDINGS.checkpoint.parent) in said

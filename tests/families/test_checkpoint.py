@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import os
@@ -33,6 +34,7 @@ from rfm.engine import Engine
 from rfm.rewind.network import RewindConfig
 from rfm.vlm.network import VlmConfig
 from rfm_commands.engine_scorer import EngineScorer
+from spoilt import run_the_command
 
 CONTINUOUS = "legacy_keys_l2"  # lacks causal_mask and use_per_frame_progress_token
 MISMATCHED = "h40_L3_H5_c1_t1_disc5_cfgmismatch"  # its configs say l2 and 32 bins, its weights 5 bins
@@ -234,13 +236,6 @@ SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
         change_weights(lambda w: w.update(surplus=w.pop("success_head.4.bias"))),
         r"missing keys: \['success_head.4.bias'\]; unexpected keys: \['surplus'\]",
     ),
-    "no head of preference, and none of success": (
-        change_weights(
-            lambda w: [w.pop(name) for name in list(w) if name.startswith(("preference_head", "success_head"))]
-        ),
-        r"missing keys: \['preference_head.0.bias', .*; a checkpoint without the head of preference and success is not "
-        r"served yet",
-    ),
     "no head of progress": (
         change_weights(lambda w: [w.pop(name) for name in list(w) if name.startswith("progress_head")]),
         r"expected a ReWiND checkpoint, which has 'progress_head.4.weight'",
@@ -405,6 +400,12 @@ PICKLES: dict[str, tuple[Callable[[Path], None], str]] = {
         "it's.pt",
     ),
     "in data-parallel": (in_data_parallel, "rewind.pth"),
+    "with the arguments of the run": (
+        lambda folder: torch.save(
+            {"args": argparse.Namespace(max_length=16), "model_state_dict": take_weights(folder)}, folder / "last.pth"
+        ),
+        "last.pth",
+    ),
     "weights that share memory": (sharing_memory, "model.pt"),
 }
 
@@ -423,15 +424,6 @@ def test_the_conversion_that_the_refusal_of_a_pickle_names_works(
     after = families.load(folder)
     assert after.config == before.config
     assert all(torch.equal(after.network[name], before.network[name]) for name in before.network)
-
-
-def run_the_command(load: Callable[[Path], object], folder: Path) -> None:
-    """What the refusal of ``load`` says to type."""
-    with pytest.raises(CheckpointError) as refusal:
-        load(folder)
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    (command,) = re.findall(r"python -c .*", str(refusal.value))
-    subprocess.run(["bash", "-c", command], check=True, env={**os.environ, "PATH": path})
 
 
 def test_the_conversion_of_a_pickled_adapter_works(tmp_path: Path) -> None:
@@ -696,9 +688,10 @@ for source in sys.argv[1:]:
 """
 UNTAGGED, TAGGED, WITHOUT = "org/name", f"org/other@{TAG}", "org/without"  # repositories of their own
 IN_SUBFOLDER, PICKLED, PICKLED_WITHIN = "org/runs/one/ckpt=5@v1", "org/pickled", "org/runs/pickled@v1"
+LATE, LATE_ABOVE = "org/late/one/ckpt@v1", "org/late/two/ckpt@v1"
 NOT_THERE, ABSENT = "org/runs/none@v1", "org/absent/folder@v1"
-FROM_HUB = (UNTAGGED, TAGGED, WITHOUT, IN_SUBFOLDER, PICKLED, PICKLED_WITHIN, NOT_THERE)
-OFFLINE = (f"{UNTAGGED}@{TAG}", TAGGED, IN_SUBFOLDER, UNTAGGED, ABSENT, f"{WITHOUT}@{TAG}")
+FROM_HUB = (UNTAGGED, TAGGED, WITHOUT, IN_SUBFOLDER, PICKLED, PICKLED_WITHIN, NOT_THERE, LATE, LATE_ABOVE)
+OFFLINE = (f"{UNTAGGED}@{TAG}", TAGGED, IN_SUBFOLDER, UNTAGGED, ABSENT, f"{WITHOUT}@{TAG}", LATE, LATE_ABOVE)
 
 
 @pytest.fixture(scope="module")
@@ -716,6 +709,11 @@ def from_hub(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     shutil.copytree(tag, runs / "one" / "ckpt=5")
     (runs / "one" / "ckpt=5" / "config.yaml").rename(runs / "one" / "config.yaml")
     (tag / "config.yaml").rename(main / "config.yaml")
+    late, late_main = folder / "late", folder / "late_main"
+    for run, place in (("one", "one/ckpt"), ("two", "two")):
+        shutil.copytree(tag, late / run / "ckpt")
+        (late_main / place).mkdir(parents=True)
+        shutil.copy(main / "config.yaml", late_main / place)
     shutil.copy(main / "config.yaml", without / "README.md")
     torch.save({}, pickled / "pytorch_model.bin")
     torch.save({}, pickled / "optimizer.pt")
@@ -723,6 +721,7 @@ def from_hub(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     mains = {UNTAGGED: main, TAGGED: main, WITHOUT: without}
     repositories = {source.partition("@")[0]: {"main": files, TAG: tag} for source, files in mains.items()}
     repositories |= {PICKLED: {"main": pickled}, "org/runs": {"main": main, "v1": runs}}
+    repositories["org/late"] = {"main": late_main, "v1": late}
     environment = {**os.environ, "HF_HOME": str(folder / "cache")}
 
     def say(sources: tuple[str, ...], offline: str) -> list[str]:
@@ -736,10 +735,10 @@ def from_hub(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return told | {f"offline {source}": line for source, line in zip(OFFLINE, say(OFFLINE, "1"), strict=True)}
 
 
-IN_CACHE = [f"offline {source}" for source in (f"{UNTAGGED}@{TAG}", TAGGED, IN_SUBFOLDER)]
+IN_CACHE = [f"offline {source}" for source in (f"{UNTAGGED}@{TAG}", TAGGED, IN_SUBFOLDER, LATE, LATE_ABOVE)]
 
 
-@pytest.mark.parametrize("source", [UNTAGGED, TAGGED, IN_SUBFOLDER, *IN_CACHE])
+@pytest.mark.parametrize("source", [UNTAGGED, TAGGED, IN_SUBFOLDER, LATE, LATE_ABOVE, *IN_CACHE])
 def test_config_yaml_is_found_on_main_of_the_hub_s_repository(from_hub: dict[str, str], source: str) -> None:
     expected = asdict(families.load(goldens.config(WITH_IMAGES).checkpoint).config)
     assert expected["multi_image"] and expected["per_frame_progress_token"]

@@ -413,6 +413,16 @@ def test_encoders_that_are_no_folders_are_told() -> None:
         checkpoint.encoders()
 
 
+def test_an_encoder_s_settings_of_another_type_are_told(encoders: Encoders, tmp_path: Path) -> None:
+    encoders.save(tmp_path)
+    file = tmp_path / "image_encoder" / "config.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"hidden_size": "x"}))
+    sources = {which: str(tmp_path / which) for which in ("image_encoder", "text_encoder")}
+    checkpoint = families.load(goldens.config(NAME).checkpoint, **sources)
+    with pytest.raises(CheckpointError, match=r"^encoders .* \(name local folders with --image-encoder"):
+        checkpoint.encoders()
+
+
 NO_ROOM = """
 import resource, sys
 room, checkpoint, image, text = sys.argv[1:]

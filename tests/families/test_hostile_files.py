@@ -237,9 +237,11 @@ def refused(checkpoint: Path, repository: Path, message: str, *options: str) -> 
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 1, result.output
     assert isinstance(result.exception, SystemExit)
-    assert re.search(message, result.stderr), result.stderr
-    assert result.stderr.startswith("rfm: ")
-    assert len(result.stderr) < 10_000
+    below_bar = result.stderr.rpartition("\r")[2].partition("\n")[2]  # of transformers 5, which loads a base model
+    line = below_bar or result.stderr
+    assert re.search(message, line), result.stderr
+    assert line.startswith("rfm: ")
+    assert len(line) < 10_000
     assert files_in(repository) == before
     assert not list(repository.parent.glob(".*export*"))
     assert (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - largest_kib) * 1024 < MOST_MEMORY_BYTES

@@ -45,6 +45,9 @@ VARIANTS = {
     "one wide layer": replace(SMALL, num_layers=1, hidden_dim=64, num_attention_heads=8),
     "many narrow layers": replace(SMALL, num_layers=5, hidden_dim=4, num_attention_heads=1),
     "no similarity": replace(SMALL, has_similarity=False),
+    "no preference": replace(SMALL, has_preference=False),
+    "no success": replace(SMALL, has_success=False),
+    "progress alone": replace(SMALL, has_similarity=False, has_preference=False, has_success=False),
 }
 
 
@@ -106,7 +109,10 @@ def reference_scores(network: RewindTransformer, sample: Sample) -> list[Tensor]
             scores.append(logits.squeeze(-1).sigmoid())
         else:
             scores.append(logits.softmax(-1) @ torch.linspace(0, 1, config.progress_bins))
-        scores.append(network.success_head(hidden[positions]).squeeze(-1).sigmoid())
+        if config.has_success:
+            scores.append(network.success_head(hidden[positions]).squeeze(-1).sigmoid())
+        else:
+            scores.append(torch.full([len(positions)], torch.nan))
     if isinstance(sample, PreferenceSample):
         scores.append(network.preference_head(hidden[-1]).sigmoid())
     elif isinstance(sample, SimilaritySample):
@@ -123,7 +129,8 @@ def numbers(outcome: Outcome) -> np.ndarray:
 
 def samples_for(config: RewindConfig) -> list[Sample]:
     samples: list[Sample] = [ProgressSample(trajectory(t, t)) for t in (1, 2, 5, 8)]
-    samples += [PreferenceSample(trajectory(a, a), trajectory(b + 50, b)) for a, b in ((1, 1), (3, 6), (8, 2))]
+    if config.has_preference:
+        samples += [PreferenceSample(trajectory(a, a), trajectory(b + 50, b)) for a, b in ((1, 1), (3, 6), (8, 2))]
     if config.has_similarity:
         samples += [SimilaritySample(trajectory(a, a), trajectory(b + 70, b)) for a, b in ((1, 4), (6, 6))]
     return samples

@@ -345,7 +345,7 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
             change_tensors("model.safetensors", lambda w, part=part: w.update({f"model.language_model.layers.0.mlp.up_proj{part}": torch.ones(1)})),
             rf"expected weights in full precision, got '.*{part}'; export the checkpoint that was quantized",
         )
-        for part in (".weight.absmax", ".weight.quant_state.bitsandbytes__nf4", ".SCB", ".qweight", ".weight_scale_inv")
+        for part in (".weight.absmax", ".weight.quant_state.bitsandbytes__fp4", ".SCB", ".qweight", ".weight_scale_inv")
     },
     "a weight under two names": (
         "q25_mean_l2",
@@ -615,14 +615,27 @@ def test_a_size_for_images_is_ignored_as_upstream_does(copied: Callable[[str], P
     assert exported.config.size_px is None
 
 
+def test_videos_are_not_pooled_as_images_are(copied: Callable[[str], Path]) -> None:
+    """Upstream takes the mean of a group of frames, whatever frame_pooling says."""
+    folder = copied("q25_video_avg_disc10")
+    rewritten(folder, lambda run: run["model"].update(frame_pooling="attention", frame_pooling_attn_temperature=0.01))
+    base = str(goldens.config("q25_video_avg_disc10").base_model)
+    sample = ProgressSample(film(0, 4, 48, 80))
+    (result,) = Engine.from_checkpoint(folder, base_model=base).evaluate([sample])
+    (expected,) = load_engine("q25_video_avg_disc10").evaluate([sample])
+    assert_close(result, expected, 1e-6)
+
+
 def test_a_size_for_videos_holds() -> None:
     checkpoint = families.load(goldens.config("q25_video_last_l2").checkpoint)
     assert isinstance(checkpoint, VlmCheckpoint)
     assert checkpoint.config.size_px == (56, 84)
 
 
-def test_the_processor_s_chat_template_wins_over_the_tokenizer_s(tmp_path: Path) -> None:
+def test_the_processor_s_chat_template_wins_over_the_tokenizer_s(copied: Callable[[str], Path], tmp_path: Path) -> None:
     """Upstream prompts by the processor."""
+    folder = copied(PLAIN)
+    rewritten(folder, lambda run: run["model"].update(base_model_id="org/own-qwen3-vl"))
     base = tmp_path / "base"
     shutil.copytree(str(goldens.config(PLAIN).base_model), base, copy_function=shutil.copyfile)
     file = base / "tokenizer_config.json"
@@ -630,10 +643,10 @@ def test_the_processor_s_chat_template_wins_over_the_tokenizer_s(tmp_path: Path)
     file.write_text(json.dumps(json.loads(file.read_text()) | other))
 
     def prompt() -> str:
-        template = str(load(PLAIN, base=str(base)).collator.tokenizer.chat_template)
-        with tempfile.TemporaryDirectory() as folder:
-            saved = Path(folder, "saved")
-            load(PLAIN, base=str(base)).save(saved)
+        template = str(load(PLAIN, folder, str(base)).collator.tokenizer.chat_template)
+        with tempfile.TemporaryDirectory() as saving:
+            saved = Path(saving, "saved")
+            load(PLAIN, folder, str(base)).save(saved)
             assert families.load(saved).collator.tokenizer.chat_template == template
         return template
 

@@ -3,14 +3,20 @@
 
 from __future__ import annotations
 
+import os
+import re
 import shutil
-from collections.abc import Callable
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
 import goldens
+from rfm.checkpoint.content import CheckpointError
 
 WEIGHTS = "model.safetensors"
 
@@ -35,3 +41,24 @@ def weights(change: Callable[[dict[str, torch.Tensor]], object]) -> Spoil:
         save_file(tensors, folder / WEIGHTS)
 
     return spoil
+
+
+def run_the_command(load: Callable[[Path], object], folder: Path) -> None:
+    """What the refusal of ``load`` says to type."""
+    with pytest.raises(CheckpointError) as refusal:
+        load(folder)
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    (command,) = re.findall(r"python -c .*", str(refusal.value))
+    subprocess.run(["bash", "-c", command], check=True, env={**os.environ, "PATH": path})
+
+
+def without(name: str, heads: Sequence[str], target: Path) -> Path:
+    """A copy of a reference checkpoint whose heads are cut off."""
+    source = goldens.config(name).checkpoint
+    shutil.copytree(source, target, copy_function=shutil.copyfile)
+    if not (target / "config.yaml").exists():
+        shutil.copyfile(source.parent / "config.yaml", target / "config.yaml")
+    weights = load_file(target / "model.safetensors")
+    cut = tuple(f"{head}_head." for head in heads)
+    save_file({key: w for key, w in weights.items() if not key.startswith(cut)}, target / "model.safetensors")
+    return target

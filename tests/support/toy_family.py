@@ -17,6 +17,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from rfm.checkpoint.decision import Decision
 from rfm.checkpoint.files import NETWORK_CONFIG, WEIGHTS
 from rfm.dense_mode import prefix_indices
 from rfm.execution import Execution
@@ -144,6 +145,9 @@ class ToyCheckpoint:
     @property
     def notes(self) -> tuple[str, ...]:
         return ()
+
+    def decisions(self) -> list[Decision]:
+        return [Decision("num_colours", self.config.num_colours, NETWORK_CONFIG)]
 
     def encoders(self) -> Palette:
         return Palette(torch.full((self.config.num_colours,), 1 / 255))

@@ -30,7 +30,7 @@ class FrameScores:
     """Scores of each frame of one trajectory.
 
     progress: float32 [T], share of the task done, 0..1
-    success: float32 [T], probability that the task is done
+    success: float32 [T], probability that the task is done; NaN throughout: the checkpoint does not predict it
     progress_logits: float32 [T, K], raw scores of the progress bins; only of discrete checkpoints, on request
     frame_indices: int64 [T], which frames of the trajectory were scored; None: all of them
     """

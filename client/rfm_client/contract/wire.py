@@ -292,7 +292,8 @@ def decode_results(
 ) -> list[Result]:
     """The results of the samples of one request, which ``model_version`` answered.
 
-    Raises InferenceFailedError for an answer that lacks a score: a missing reward is no reward of 0 or NaN.
+    Raises InferenceFailedError for an answer that lacks a score: a missing reward is no reward of 0 or NaN. Success
+    alone may be NaN, at all frames: then the checkpoint does not predict it.
     """
     return [_decode_result(tensors, row, sample, model_version) for row, sample in enumerate(samples)]
 
@@ -482,17 +483,23 @@ def _scores_between(tensors: Mapping[str, npt.NDArray[Any]], row: int, positions
     logits = _present(tensors, PROGRESS_LOGITS, row, positions) if PROGRESS_LOGITS in tensors else None
     return FrameScores(
         progress=_present(tensors, PROGRESS, row, positions),
-        success=_present(tensors, SUCCESS, row, positions),
+        success=_present(tensors, SUCCESS, row, positions, may_lack=True),
         progress_logits=logits,
     )
 
 
-def _present(tensors: Mapping[str, npt.NDArray[Any]], name: str, row: int, positions: slice) -> Float32Array:
-    """One row's scores at some positions. Raises InferenceFailedError unless all are there and finite."""
+def _present(
+    tensors: Mapping[str, npt.NDArray[Any]], name: str, row: int, positions: slice, *, may_lack: bool = False
+) -> Float32Array:
+    """One row's scores at some positions. Raises InferenceFailedError unless all are there and finite.
+
+    may_lack: they may also be NaN throughout, of a checkpoint that does not predict them
+    """
     scores, count = tensors[name], positions.stop - positions.start
     if scores.ndim < 2 or row >= len(scores):
         raise InferenceFailedError(f"{name}: expected scores of sample {row}, got an array {list(scores.shape)}")
     part: Float32Array = scores[row, positions]
-    if len(part) != count or not np.isfinite(part).all():
+    is_good = np.isfinite(part).all() or (may_lack and np.isnan(part).all())
+    if len(part) != count or not is_good:
         raise InferenceFailedError(f"{name}: expected {count} finite scores, got {part.tolist()}")
     return part

@@ -252,7 +252,8 @@ class AsyncEpisodes(OneProcess):
             fused = fuse([each.success for each in shown], axis=0)
             success[index] = fused[-1]
             whole = replace(shown[0], success=np.asarray(fused, np.float32))
-            succeeded[index] = whole.succeeded(last=rule.last, threshold=rule.threshold)
+            is_predicted = not np.isnan(fused).any()
+            succeeded[index] = is_predicted and whole.succeeded(last=rule.last, threshold=rule.threshold)
         step = np.array([len(next(iter(kept.values()))) - 1 for kept in self._frames], np.int64)
         return StepScores(progress, success, succeeded, step, ms)
 

@@ -16,8 +16,8 @@ class StepScore:
     """The score of one episode at its newest frame.
 
     progress: share of the task done, 0..1
-    success: probability that the task is done
-    succeeded: what the success rule says
+    success: probability that the task is done; NaN: the checkpoint does not predict it
+    succeeded: what the success rule says; never true without success
     step: number of the frame, from 0
     ms: how long the answer took, milliseconds
     """

@@ -41,7 +41,8 @@ class RewardOptions:
     scale: factor of what is paid
     add_to_env_reward: the environment's own reward is added; otherwise it is replaced
     every: steps from one scoring to the next; in between, absolute holds its value and delta is 0
-    terminate_on_success: terminates the episode when an answer says success, except one about the frame of the reset
+    terminate_on_success: terminates the episode when an answer says success, except one about the frame of the reset.
+        The reset raises ValueError if the checkpoint does not predict success
     frames_from: where frames, uint8 [H, W, 3], come from. None: ``render()``; or a key of the observation; or what
         takes one environment's observation and gives its frame
     cameras: each is scored, and the scores fused: keys, of the observation or of what ``frames_from`` says, that hold a
@@ -315,6 +316,9 @@ class Episode:
         self._known_step = step
         self._progress, self._success = progress, float(frames.success[-1])
         rule = self._options.terminate_on_success
+        if rule is not None and np.isnan(frames.success).any():
+            expected = "None with a checkpoint that does not predict success"
+            raise ValueError(f"terminate_on_success: expected {expected}, got {rule}")
         if rule is not None and step > 0:
             self.succeeded |= frames.succeeded(last=rule.last, threshold=rule.threshold)
         self._watching.add(step, self._frames[step][0].pixels, frames, asked_s)

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: MIT
+"""A served checkpoint that has neither a success head nor a preference head, as every door shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import requests
+
+import goldens
+import rfm_export
+from engines import serve_config
+from environments import MODEL, TASK, cart_pole, play
+from gateways import running
+from one_model import BriefServer
+from reference_server import Served
+from rfm.launch.installation import find_installation
+from rfm.launch.process import Endpoints
+from rfm_client import InvalidSampleError, PreferenceSample, ProgressResult, ProgressSample, RewardClient, Trajectory
+from rfm_client.gym import RewardModelWrapper, RewardOptions, SuccessRule
+from spoilt import without
+
+pytestmark = pytest.mark.triton
+
+
+@pytest.fixture(scope="module")
+def endpoints(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Endpoints]:
+    folder = tmp_path_factory.mktemp("without")
+    checkpoint = without(MODEL, ["preference", "success"], folder / "checkpoint")
+    rfm_export.export(checkpoint, folder / "model_repository", serve_config(goldens.config(MODEL), MODEL))
+    with BriefServer(folder / "model_repository", Endpoints.free(), find_installation()) as server:
+        yield server.endpoints
+
+
+@pytest.fixture
+def without_heads(endpoints: Endpoints, protocol: str) -> Iterator[RewardClient]:
+    with RewardClient(endpoints.grpc_url if protocol == "grpc" else endpoints.http_url, model=MODEL) as client:
+        yield client
+
+
+def film(seed: int, count: int) -> Trajectory:
+    frames = np.random.default_rng(seed).integers(0, 256, (count, 40, 56, 3), np.uint8)
+    return Trajectory(frames=frames, task=TASK)
+
+
+def test_progress_is_what_it_was_and_a_preference_fails_alone(
+    without_heads: RewardClient, served: Served, protocol: str
+) -> None:
+    good = ProgressSample(film(0, 3))
+    first, refused, last = without_heads.evaluate(
+        [good, PreferenceSample(film(1, 2), film(2, 3)), good], return_errors=True
+    )
+    assert isinstance(refused, InvalidSampleError)
+    assert "sample_type: expected progress or similarity (this checkpoint has no preference head)" in str(refused)
+    with served.client(protocol, MODEL) as client:
+        expected = client.progress(good.trajectory)
+    for result in (first, last):
+        assert isinstance(result, ProgressResult)
+        np.testing.assert_allclose(result.progress, expected.progress, rtol=0, atol=1e-5)
+        assert np.isnan(result.success).all()
+
+
+def test_an_episode_has_progress_and_never_succeeds(without_heads: RewardClient) -> None:
+    with without_heads.episode(TASK, success=SuccessRule(threshold=0)) as episode:
+        scores = [episode.add(frame) for frame in film(3, 3).positions]
+    assert all(np.isfinite(score.progress) and np.isnan(score.success) for score in scores)
+    assert not any(score.succeeded for score in scores)
+
+
+@pytest.mark.parametrize("blocking", [True, False])
+def test_an_environment_is_rewarded_but_not_ended_by_success(without_heads: RewardClient, blocking: bool) -> None:
+    options = RewardOptions(terminate_on_success=SuccessRule(), blocking=blocking)
+    env = RewardModelWrapper(cart_pole(), without_heads, TASK, options)
+    with pytest.raises(
+        ValueError, match=r"^terminate_on_success: expected None with a checkpoint that does not predict"
+    ):
+        env.reset(seed=0)
+    rewards, infos = play(RewardModelWrapper(cart_pole(), without_heads, TASK, RewardOptions(blocking=blocking)))
+    assert np.isfinite(rewards).all()
+    assert all(np.isnan(info["reward_model"]["success"]) for info in infos)
+
+
+def test_the_gateway_answers_progress_alone(endpoints: Endpoints, tmp_path: Path) -> None:
+    frames = film(4, 3).positions.tolist()
+    sample = {"sample_type": "progress", "trajectory": {"frames": frames, "task": TASK}}
+    with running(endpoints, tmp_path, MODEL) as gateway:
+        answer = requests.post(f"{gateway.url}/evaluate_batch", json={"samples": [sample]}).json()
+    assert len(answer["outputs_progress"]["progress_pred"][0]) == 3
+    assert answer["outputs_success"] is None

@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: MIT
+"""Weights that bitsandbytes rounded to NF4: the values that it makes of them, or a refusal."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+import goldens
+import rfm_export
+from engines import load_engine, serve_config
+from paths import GOLDEN
+from rfm.checkpoint import nf4
+from rfm.checkpoint.content import CheckpointError
+from rfm.engine import Engine
+from rfm_client import ProgressSample
+from vlm import PLAIN, assert_close, film, load
+
+WEIGHTS = GOLDEN / "nf4" / "weights.safetensors"
+CASES = ("nested", "plain", "float32", "blocks_across_rows", "odd")
+STATE = "weight.quant_state.bitsandbytes__nf4"
+LORA_INSIDE = "q3_lora_full_disc10"
+
+
+def case(name: str) -> dict[str, Tensor]:
+    return {
+        key.removeprefix(f"{name}."): tensor for key, tensor in load_file(WEIGHTS).items() if key.startswith(f"{name}.")
+    }
+
+
+@pytest.mark.parametrize("values_at_once", [nf4._VALUES_AT_ONCE, 128])
+@pytest.mark.parametrize("name", CASES)
+def test_values_are_bitsandbytes_own(name: str, values_at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nf4, "_VALUES_AT_ONCE", values_at_once)
+    tensors = case(name)
+    expected = tensors.pop("expected")
+    assert nf4.dequantize(tensors) == 1
+    assert tensors.keys() == {"weight"}
+    assert tensors["weight"].dtype == expected.dtype
+    assert torch.equal(tensors["weight"], expected)
+
+
+def test_other_weights_stay_as_they_are() -> None:
+    tensors = {"weight": torch.ones(2, 2)}
+    assert nf4.dequantize(tensors) == 0
+    assert torch.equal(tensors["weight"], torch.ones(2, 2))
+
+
+def as_bytes(text: bytes) -> Tensor:
+    return torch.frombuffer(bytearray(text), dtype=torch.uint8)
+
+
+def stating(**changes: object) -> Callable[[dict[str, Tensor]], object]:
+    """Changes the quant state; None takes the key out."""
+
+    def spoil(tensors: dict[str, Tensor]) -> None:
+        state = json.loads(tensors[STATE].numpy().tobytes()) | changes
+        tensors[STATE] = as_bytes(
+            json.dumps({key: value for key, value in state.items() if value is not None}).encode()
+        )
+
+    return spoil
+
+
+SPOILED: dict[str, tuple[Callable[[dict[str, Tensor]], object], str]] = {
+    "no scales": (lambda t: t.pop("weight.absmax"), r"weight\.absmax: expected 257 numbers of torch\.uint8, got none; copy this checkpoint again, or export the full checkpoint that was rounded to NF4$"),
+    "a scale too few": (lambda t: t.update({"weight.absmax": t["weight.absmax"][1:]}), r"weight\.absmax: expected 257 numbers of torch\.uint8, got 256 of"),
+    "scales of another type": (lambda t: t.update({"weight.absmax": t["weight.absmax"].float()}), r"weight\.absmax: expected 257 .*uint8, got 257 of torch\.float32"),
+    "no codes": (lambda t: t.pop("weight.quant_map"), r"weight\.quant_map: expected 16 numbers"),
+    "codes of another type": (lambda t: t["weight.quant_map"].mul_(0.5), r"weight\.quant_map: expected the codes of NF4, got \[-0\.5"),
+    "no scales of scales": (lambda t: t.pop("weight.nested_absmax"), r"weight\.nested_absmax: expected 2 numbers of torch\.float32, got none"),
+    "no codes of scales": (lambda t: t.pop("weight.nested_quant_map"), r"weight\.nested_quant_map: expected 256 numbers"),
+    "no weight": (lambda t: t.pop("weight"), r"^weight: expected 4112 numbers of torch\.uint8, got none"),
+    "another weight": (lambda t: t.update(weight=t["weight"][:-1]), r"^weight: expected 4112 numbers of torch\.uint8, got 4111"),
+    "no JSON": (lambda t: t.update({STATE: as_bytes(b"{")}), r"^weight: expected quant_state.* in JSON, got "),
+    "bytes that are no text": (lambda t: t.update({STATE: as_bytes(b"\xff\xfe\xfd")}), r"expected quant_state.* in JSON, got "),
+    "no JSON object": (lambda t: t.update({STATE: as_bytes(b"[]")}), r"expected quant_state.* in JSON, got \[\]"),
+    "nested JSON without end": (lambda t: t.update({STATE: as_bytes(b"[" * 60_000)}), r"expected quant_state.* in JSON, got "),
+    "a huge state": (lambda t: t.update({STATE: as_bytes(b" " * 100_000)}), r"expected quant_state.* in JSON, got \[100000\] of torch\.uint8"),
+    "a state of numbers": (lambda t: t.update({STATE: torch.ones(4)}), r"expected quant_state.* in JSON, got \[4\] of torch\.float32"),
+    "no shape": (stating(shape=None), r"expected the shape of the weight in its quant_state, got None"),
+    "a shape of nothing": (stating(shape=[0, 32]), r"expected the shape of the weight in its quant_state, got \[0, 32\]"),
+    "another shape": (stating(shape=[2**40, 2**40]), r"expected .* numbers"),
+    "another type of 4 bits": (stating(quant_type="fp4"), r"expected quant_type nf4 in its quant_state, got 'fp4'"),
+    "a block of no size": (stating(blocksize=0), r"expected blocksize 32 or 64 or .* in its quant_state, got 0"),
+    "a block of half a size": (stating(blocksize=32.0), r"expected blocksize 32 or .*, got 32\.0"),
+    "blocks of another size": (stating(blocksize=64), r"weight\.nested_absmax: expected 1 numbers of torch\.float32, got 2 of"),
+    "no block size": (stating(blocksize=None), r"expected blocksize 32 or .*, got None"),
+    "a type that is none": (stating(dtype="int8"), r"expected dtype bfloat16 or float16 or float32 in its quant_state, got 'int8'"),
+    "no offset": (stating(nested_offset=None), r"weight\.absmax: expected 257 numbers of torch\.float32, got 257 of torch\.uint8"),
+    "an offset in words": (stating(nested_offset="none"), r"expected a number as nested_offset of its quant_state, got 'none'"),
+    "scales of another type of number": (stating(nested_dtype="float16"), r"expected nested_dtype float32 in its quant_state, got 'float16'"),
+    "scales without blocks": (stating(nested_blocksize=None), r"expected nested_blocksize 32 or .*, got None"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("spoil", "expected"), SPOILED.values(), ids=SPOILED)
+def test_parts_that_do_not_fit_are_refused(spoil: Callable[[dict[str, Tensor]], object], expected: str) -> None:
+    tensors = case("nested")
+    spoil(tensors)
+    with pytest.raises(CheckpointError, match=expected):
+        nf4.dequantize(tensors)
+
+
+def rounded(name: str, weight: Tensor) -> tuple[dict[str, Tensor], Tensor]:
+    """The parts of the weight in NF4, and the values that these stand for."""
+    codes, blocksize = case("plain")["weight.quant_map"], 64
+    blocks = torch.nn.functional.pad(weight.float().flatten(), (0, -weight.numel() % blocksize)).view(-1, blocksize)
+    scales = blocks.abs().amax(1)
+    nearest = (blocks[..., None] / scales.clamp(min=1e-30)[:, None, None] - codes).abs().argmin(-1)
+    values = (codes[nearest] * scales[:, None]).flatten()[: weight.numel()].view(weight.shape).bfloat16()
+    packed = (nearest.flatten()[0::2] * 16 + nearest.flatten()[1::2]).byte()[: (weight.numel() + 1) // 2, None]
+    state = {"quant_type": "nf4", "blocksize": blocksize, "dtype": "bfloat16", "shape": [*weight.shape]}
+    parts = {"": packed, ".absmax": scales, ".quant_map": codes.clone()}
+    parts[".quant_state.bitsandbytes__nf4"] = as_bytes(json.dumps(state).encode())
+    return {name + part: tensor.contiguous() for part, tensor in parts.items()}, values
+
+
+def in_both_forms(name: str, folder: Path) -> tuple[Path, Path]:
+    """A reference checkpoint with the linear weights of its backbone and heads in NF4; with these weights' values."""
+    few_bits: dict[str, Tensor] = {}
+    full: dict[str, Tensor] = {}
+    for key, tensor in load_file(goldens.config(name).checkpoint / "model.safetensors").items():
+        few_bits[key] = full[key] = tensor
+        if tensor.ndim == 2 and not any(part in key for part in ("embed", "lora_", "norm")):
+            few_bits.pop(key)
+            parts, full[key] = rounded(key, tensor)
+            few_bits |= parts
+    places = folder / "nf4", folder / "full"
+    for place, tensors in zip(places, (few_bits, full), strict=True):
+        shutil.copytree(goldens.config(name).checkpoint, place, copy_function=shutil.copyfile)
+        save_file(tensors, place / "model.safetensors", {"format": "pt"})
+    change_config(places[0], "nf4")
+    return places
+
+
+def change_config(folder: Path, kind: str) -> None:
+    """Names the quantization in config.json as transformers does for bitsandbytes."""
+    is_int8 = kind == "int8"
+    quantization: dict[str, Any] = {
+        "quant_method": "bitsandbytes",
+        "load_in_4bit": not is_int8,
+        "load_in_8bit": is_int8,
+        "bnb_4bit_quant_type": "fp4" if is_int8 else kind,
+        "bnb_4bit_compute_dtype": "bfloat16",
+        "bnb_4bit_use_double_quant": False,
+    }
+    config = json.loads((folder / "config.json").read_text()) | {"quantization_config": quantization}
+    (folder / "config.json").write_text(json.dumps(config))
+
+
+@pytest.mark.parametrize("name", [PLAIN, LORA_INSIDE])
+def test_an_export_scores_as_the_values_of_its_weights(tmp_path: Path, name: str) -> None:
+    few_bits, full = in_both_forms(name, tmp_path)
+    said: list[str] = []
+    rfm_export.export(few_bits, tmp_path / "repository", serve_config(goldens.config(name)), say=said.append)
+    note = "in NF4 of bitsandbytes (weights, rounded in training too)"
+    assert sum(note in line for line in said) == 1
+    exported = tmp_path / "repository" / "rfm_frames" / "1" / "checkpoint"
+    assert "quantization_config" not in json.loads((exported / "config.json").read_text())
+
+    base_model = str(goldens.config(name).base_model)
+    engines = [Engine.from_checkpoint(exported), Engine.from_checkpoint(full, base_model=base_model), load_engine(name)]
+    (result,), (expected,), (unrounded,) = (engine.evaluate([ProgressSample(film(0, 3, 60, 84))]) for engine in engines)
+    assert_close(result, expected, 1e-6)
+    with pytest.raises(AssertionError):
+        assert_close(result, unrounded, 1e-2)
+
+
+@pytest.mark.parametrize("kind", ["fp4", "int8"])
+def test_other_types_of_bitsandbytes_are_refused_by_name(tmp_path: Path, kind: str) -> None:
+    few_bits, _ = in_both_forms(PLAIN, tmp_path)
+    change_config(few_bits, kind)
+    with pytest.raises(CheckpointError, match=f"quantization_config: expected none, got 'bitsandbytes {kind}'; export"):
+        load(PLAIN, few_bits)
+
+
+def test_full_weights_that_config_json_calls_nf4_are_refused(tmp_path: Path) -> None:
+    _, full = in_both_forms(PLAIN, tmp_path)
+    change_config(full, "nf4")
+    expected = (
+        r"config\.json: quantization_config: expected weights in NF4, got none; if they are meant in full precision"
+    )
+    with pytest.raises(CheckpointError, match=expected):
+        load(PLAIN, full)
+
+
+def test_nf4_weights_need_no_word_in_config_json(tmp_path: Path) -> None:
+    """A trainer that saves weights alone leaves the configuration of the base model."""
+    few_bits, full = in_both_forms(PLAIN, tmp_path)
+    shutil.copyfile(full / "config.json", few_bits / "config.json")
+    assert "rounded_weights" in [each.name for each in load(PLAIN, few_bits).decisions()]
+    assert "rounded_weights" not in [each.name for each in load(PLAIN, full).decisions()]
