@@ -160,7 +160,7 @@ def checkpoint(size: str, folder: Path, threads: int) -> Checkpoint:
         RewindCheckpoint(DEFAULT_SIZE, RewindTransformer(DEFAULT_SIZE).state_dict()).save(source)
         settings = ExportConfig(num_gpus=0, torch_threads=threads)
     rfm_export.export(source, repository, settings)
-    return Checkpoint(size, source, repository, settings.instances, settings.torch_threads, encoders)
+    return Checkpoint(size, source, repository, settings.instances or 1, settings.torch_threads, encoders)
 
 
 def machine() -> dict[str, object]:
