@@ -68,7 +68,7 @@ perf: $(INSTALLED)
 	$(BIN)/python benchmarks/perf_analyzer.py --size default
 
 # Cause faults while callers ask, ten minutes.
-# Processes killed and stopped, full memory and disks, overload, broken requests, killed exports.
+# Processes killed, stopped and hung, full memory and disks, malformed requests, killed exports.
 chaos: $(INSTALLED)
 	$(TOOL) tools/faults/chaos.py
 	$(TOOL) tools/faults/fuzz.py

@@ -22,6 +22,7 @@ from rfm_serve import MODEL, children, wait_for
 
 SILENT_S = 10.0  # as rfm serve has it by default
 STOPPED_S = 5.0
+LOOP_S = 120.0  # six starts of Triton and more, with back-off
 SLOW_CONNECTIONS = 100
 SLOW_CALLERS = 8
 SLOW_S = 10.0
@@ -83,7 +84,7 @@ def crash_loop(site: Site) -> list[Row]:
     before = site.restarts(OTHER)
     with site.callers() as callers:
         trigger = site.trigger("die", OTHER)
-        took_s = wait_for(lambda: site.served.reasons().get(OTHER, "").startswith("it is left out"))
+        took_s = wait_for(lambda: site.served.reasons().get(OTHER, "").startswith("it is left out"), LOOP_S)
         took_s += wait_for(lambda: site.served.reasons().get(MODEL) == NO_REASON)
         callers.wait_for_all()
         trigger.unlink()

@@ -149,12 +149,6 @@ class Trial:
                 return number
         raise NotServableError(f"expected the scores of one of the checkpoints, got {scores}")
 
-    def _arguments(self, number: int) -> list[str]:
-        return [
-            *("export", "--checkpoint", str(self.checkpoints[number % 2]), "--repository", str(self.repository)),
-            *("--image-encoder", str(CHECKPOINT.image_encoder), "--text-encoder", str(CHECKPOINT.text_encoder)),
-        ]
-
     def _export_whole(self, number: int) -> np.ndarray[Any, Any]:
         """The scores of what was exported."""
         started_s = time.perf_counter()
