@@ -163,6 +163,7 @@ def load(self, version, device, settings):
         import time
 
         while Path({gate!r}).exists():
+            Path({gate!r} + ".at_work").touch()
             time.sleep(0.01)
         return score(rows, batch)
 
@@ -187,10 +188,11 @@ class Gated:
         self.gate.touch()
         try:
             caller = post_body(self.gateway, progress(FIRST))
-            poll(lambda: self.metric("rfm_batch_requests") == 1)
+            poll(self.gate.with_name(f"{self.gate.name}.at_work").exists)
             yield caller
         finally:
             self.gate.unlink()
+            self.gate.with_name(f"{self.gate.name}.at_work").unlink(missing_ok=True)
 
     def metric(self, name: str, **labels: str) -> float:
         families = text_string_to_metric_families(requests.get(self.endpoints.metrics_url).text)
