@@ -162,7 +162,8 @@ class Supervisor:
 
     def _count(self, what: str, why: str) -> None:
         self._status.restarts.labels(what).inc()
-        self._say(f"{GATEWAY if what == GATEWAY else TRITON} is started again: {what}: {why}")
+        restarted = GATEWAY if what == GATEWAY else TRITON
+        self._say(f"{restarted} is started again: {why if what == restarted else f'{what}: {why}'}")
 
     def _close_watch(self) -> None:
         if self._watch is not None:
