@@ -165,6 +165,7 @@ class TritonServer:
         self._more_arguments = tuple(more_arguments)
         self._ends_with_parent = ends_with_parent
         self._claim: Claim | None = None
+        self._signal: int | None = None  # that was sent last
         self._process: subprocess.Popen[bytes] | None = None
 
     @property
@@ -190,7 +191,8 @@ class TritonServer:
         return self._admin_key
 
     def signal(self, number: int) -> None:
-        """Sends a signal to the process, if it runs."""
+        """Sends a signal to the process, and to one that is being started."""
+        self._signal = number
         if self._process is not None:
             self._process.send_signal(number)
 
@@ -233,6 +235,9 @@ class TritonServer:
             self._release()
             program = self._installation.executable
             raise ServerStartError(f"tritonserver: expected a program at {program}, got: {error.strerror}") from error
+
+        if self._signal is not None:
+            self._process.send_signal(self._signal)
 
     def start_ready(self, served: Mapping[str, Config] | None = None) -> None:
         """Starts the process, and returns when every model is ready. Repeats a start once that Triton has spoilt.
@@ -373,11 +378,13 @@ def _remedy(reasons: str) -> str:
 
 
 def names_the_same_versions(repository: Path, model: str, config: Config) -> bool:
-    """Whether the model's file names the versions of ``config``."""
+    """Whether the model's file names the versions of ``config``, or none."""
     try:
         file = text_format.Parse((repository / model / CONFIG_FILE).read_text(), ModelConfig())
     except (OSError, UnicodeDecodeError, text_format.ParseError):
         return False
+    if not file.version_policy.HasField("specific"):  # of a model that is not ours
+        return True
     return bool(list(file.version_policy.specific.versions) == config["version_policy"]["specific"]["versions"])
 
 

@@ -20,8 +20,8 @@ class CrashLoopError(ServerStartError):
 class BackOff:
     """The pauses before one thing is started again: none at first, longer ones where the starts follow closely."""
 
-    def __init__(self, what: str) -> None:
-        self._what = what
+    def __init__(self, what: str, steady_s: float = STEADY_S) -> None:
+        self._what, self._steady_s = what, steady_s
         self._row = 0
         self._running_since_s: float | None = None  # None: it has ended
 
@@ -34,11 +34,11 @@ class BackOff:
 
         Raises CrashLoopError when it is one.
         """
-        if self._running_since_s is not None and time.monotonic() - self._running_since_s >= STEADY_S:
+        if self._running_since_s is not None and time.monotonic() - self._running_since_s >= self._steady_s:
             self._row = 0
         self._running_since_s = None  # a start that failed does not count as running, however long it took
         self._row += 1
         if self._row > MOST:
-            got = f"{self._row} ends, each within {STEADY_S:g} s of a start; the last: {reason}"
+            got = f"{self._row} ends, each within {self._steady_s:g} s of a start; the last: {reason}"
             raise CrashLoopError(f"{self._what}: expected to run, got {got}")
         return 0.0 if self._row == 1 else min(_FIRST_PAUSE_S * 2.0 ** (self._row - 2), LONGEST_PAUSE_S)

@@ -17,7 +17,7 @@ from rfm.probe import blank_question
 from rfm_client.contract import wire
 from rfm_client.contract.names import PROBE_PREFIX
 
-BROKEN_COUNT = 3  # failures in a row of a model that could answer the same probe before
+BROKEN_COUNT, BROKEN_S = 3, 30.0  # failures in a row, and their time, of a model that could answer the probe before
 SHARE = 0.1  # of a model's time at most
 
 _OUTPUTS = (wire.PROGRESS, wire.VIDEO_EMBEDDINGS)
@@ -37,6 +37,7 @@ class Probe:
         self._observe = observe
         self._waiting_since_s = time.monotonic()
         self._num_failures: int | None = None  # in a row; None: it has never succeeded
+        self._succeeded_s = 0.0  # when it last did
         self.has_answered = False
         self._closed = threading.Event()
         threading.Thread(target=self._run, name=f"rfm-probe-{model}", daemon=True).start()
@@ -51,7 +52,8 @@ class Probe:
         progress_s: when Triton last counted an answer or a forward pass of the model, by time.monotonic. A busy model
             answers a probe late
         """
-        if self._num_failures is not None and self._num_failures >= BROKEN_COUNT:
+        fails_s = time.monotonic() - self._succeeded_s
+        if self._num_failures is not None and self._num_failures >= BROKEN_COUNT and fails_s >= BROKEN_S:
             return f"it has failed at {BROKEN_COUNT} health probes in a row"
         if time.monotonic() - max(self._waiting_since_s, progress_s) > self._hang_s:
             return f"it has answered nothing for {self._hang_s:g} s"
@@ -80,7 +82,7 @@ class Probe:
         self._waiting_since_s = float("inf")
         self._observe(took_s)
         if status < HTTPStatus.INTERNAL_SERVER_ERROR:
-            self._num_failures = 0
+            self._num_failures, self._succeeded_s = 0, time.monotonic()
         elif self._num_failures is not None:  # else it answers; blank frames need not give a readable answer
             self._num_failures += 1
 

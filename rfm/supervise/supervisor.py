@@ -14,7 +14,7 @@ from rfm.launch import cleanup
 from rfm.launch.ending import stop_signals_to
 from rfm.launch.installation import ServerStartError
 from rfm.launch.process import POLL_S, TritonServer
-from rfm.supervise.back_off import BackOff, CrashLoopError
+from rfm.supervise.back_off import STEADY_S, BackOff, CrashLoopError
 from rfm.supervise.gateway_process import GatewayProcess
 from rfm.supervise.status import Status, StatusServer
 from rfm.supervise.watch import TRITON, Config, Watch, parts_of
@@ -51,7 +51,8 @@ class Supervisor:
             Watch, server, self._status, canary_s=canary_s, hang_s=hang_s, silent_s=triton_silent_s
         )
         self._is_to_stop = threading.Event()
-        self._back_off = BackOff("tritonserver")
+        self._new_back_off = partial(BackOff, "tritonserver", STEADY_S + hang_s)
+        self._back_off = self._new_back_off()
         self._watch: Watch | None = None  # None: Triton is started, or has ended
         self._served: dict[str, Config] | None = None  # last; None: nothing yet
         self._left_out: dict[str, str] = {}  # models that kept ending Triton, and how
@@ -119,6 +120,8 @@ class Supervisor:
         if self._gateway is not None and (why := self._gateway.look()):
             self._count(GATEWAY, why)
         if self._watch is not None and self._watch.reasons:
+            back = self._left_out.keys() & self._watch.reasons.keys()
+            self._left_out = {model: why for model, why in self._left_out.items() if model not in back}
             self._status.record({**self._left_out, **self._watch.reasons})
 
     def _start_again(self, what: str, why: str) -> None:
@@ -157,7 +160,7 @@ class Supervisor:
         reason = f"it is left out, since {what} kept ending: {why}; `rfm models load` takes it in"
         self._left_out |= dict.fromkeys([what, *users], reason)
         self._served = others
-        self._back_off = BackOff("tritonserver")
+        self._back_off = self._new_back_off()
         return True
 
     def _count(self, what: str, why: str) -> None:

@@ -145,10 +145,12 @@ class Watch:
             path = f"/v2/models/{quote(model, safe='')}/versions/{max(ready)}/config"
             self.served[model] = serving_just(self._http.get_json(path), ready)
             self._status.restarts.labels(model)  # 0, so that already the first is an increase
+            before = self._probes.get(model)
             self._forget(model)
             if can_be_probed(self.served[model]):
                 observe = self._status.probe_seconds.labels(model).observe
                 self._probes[model] = self._new_probe(model, observe=observe)
+                self._probes[model].has_answered = before is not None and before.has_answered  # Triton warmed it up
         (self._going.add if is_going else self._going.discard)(model)
         if is_settled:
             self._ready[model] = ready

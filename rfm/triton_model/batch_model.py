@@ -240,14 +240,14 @@ class BatchModel(Generic[Question, Answer]):
             self._metrics.add(Counted.of(part, execution))
 
     def _score_blank(self) -> None:
-        """Raises the error of an instance that cannot score the blank sample."""
+        """Raises what an instance whose device is broken raises. A sample that is refused, or for which there is no
+        memory now, is an answer.
+        """
         try:
             questions = [self.prepare(question)[0] for question in self.decode(self._blank_tensors)]
         except InvalidSampleError:  # a checkpoint may refuse blank frames
             return
-        error = _first_error(self.answer(questions, Execution(on_forward=self._guard.step)))
-        if error is not None and not isinstance(error, InvalidSampleError):
-            raise error
+        self.answer(questions, Execution(on_forward=self._guard.step))
 
 
 def _first_error(answers: Sequence[Any]) -> RewardError | None:

@@ -222,9 +222,9 @@ def test_a_request_that_ends_its_process_fails_after_two_and_others_are_answered
         with served.client() as client:
             with pytest.raises(ServerUnavailableError, match="ended under this request twice"):
                 client.progress(trajectory(99, mark=MARK))
+            wait_for(lambda: restarts(served, MODEL) == 2)
             served.wait_ready()
             np.testing.assert_allclose(client.progress(trajectory(0)).progress, references[0], rtol=0, atol=TOLERANCE)
-        assert restarts(served, MODEL) == 2
 
 
 def test_a_batch_that_hangs_ends_its_process_and_is_asked_again(
@@ -405,7 +405,7 @@ def test_a_server_that_is_killed_again_and_again_is_given_up(tmp_path: Path) -> 
 
         wait_for(kill)
     assert served.process.returncode == 1
-    wanted = r"rfm: tritonserver: expected to run, got 6 ends, each within 60 s of a start; the last: .*exit status -9"
+    wanted = r"rfm: tritonserver: expected to run, got 6 ends, each within 180 s of a start; the last: .*exit status -9"
     assert re.fullmatch(wanted, served.said[-1]), served.said
     assert len(killed) == back_off.MOST + 1
 

@@ -129,18 +129,24 @@ def test_pairs_are_counted_with_all_their_frames(tmp_path: Path) -> None:
     assert counted.num_frames == 12
 
 
-@pytest.mark.parametrize("kind", [None, InvalidSampleError, InferenceFailedError])
-def test_only_a_refusal_of_the_blank_sample_is_no_failure(tmp_path: Path, kind: type[RewardError] | None) -> None:
-    """A checkpoint may refuse blank frames; an instance that fails at them is broken."""
+@pytest.mark.parametrize(
+    "error", [None, InvalidSampleError("made up"), InferenceFailedError("no memory"), RuntimeError]
+)
+def test_only_an_exception_at_the_blank_sample_says_that_an_instance_is_broken(
+    tmp_path: Path, error: Exception | type[Exception] | None
+) -> None:
+    """A checkpoint may refuse blank frames, and memory may be short for a moment; a lost device raises."""
 
     class Blank(Model):
         def answer(self, questions: Sequence[Sample], execution: Execution) -> list[Result | RewardError]:
+            if error is RuntimeError:
+                raise RuntimeError("CUDA error")
             score = np.zeros(questions[0].trajectories[0].num_frames, np.float32)
-            return [ProgressResult(progress=score, success=score) if kind is None else kind("made up")]
+            return [error if isinstance(error, RewardError) else ProgressResult(progress=score, success=score)]
 
     model = Blank(tmp_path)
-    if kind is InferenceFailedError:
-        with pytest.raises(InferenceFailedError, match="made up"):
+    if error is RuntimeError:
+        with pytest.raises(RuntimeError, match="CUDA error"):
             model._score_blank()
     else:
         model._score_blank()

@@ -5,7 +5,7 @@
     +-- InvalidSampleError        the sample is at fault; sending it again gives the same answer
     +-- ServerError               the server is at fault, or cannot be reached
         +-- ServerUnavailableError    no connection, not ready, or its queue is full
-            +-- ProcessEndedError     a process of the model has ended, perhaps because of this request
+            +-- ProcessEndedError     a process, or the connection, has ended, perhaps because of this request
         +-- DeadlineExceededError     no answer within the time that the caller gave
         +-- ModelNotFoundError        the server does not serve a model of that name
         +-- AccessDeniedError         server and client do not trust each other: certificate, key, or TLS on one side
@@ -64,7 +64,7 @@ class ServerUnavailableError(ServerError):
 
 
 class ProcessEndedError(ServerUnavailableError):
-    """A process of the model had ended when the request reached it, or while it worked on the request."""
+    """A process of the model had ended when the request reached it, or it or the connection ended under the request."""
 
     may_have_ended_server = True
 

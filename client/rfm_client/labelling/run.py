@@ -15,6 +15,7 @@ from rfm_client.contract.errors import (
     InferenceFailedError,
     InvalidSampleError,
     ModelNotFoundError,
+    ProcessEndedError,
     RewardError,
     ServerUnavailableError,
 )
@@ -131,9 +132,10 @@ class Run:
                     claims.give_back(item)
         except _StoppedError:
             return _Fate.NOT_NOW
-        except NOT_ABOUT_ONE_EPISODE as error:
-            return self._stop(error)
         except RewardError as error:
+            is_of_one = isinstance(error, ProcessEndedError)  # after the client has asked twice
+            if isinstance(error, NOT_ABOUT_ONE_EPISODE) and not is_of_one:
+                return self._stop(error)
             with self._lock:
                 self._failures.append(Failure(item.episode, error))
             self._watch.failed(item.episode, error)

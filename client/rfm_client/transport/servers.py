@@ -285,7 +285,7 @@ class Servers:
                 failures[server] = error
                 if error.may_have_ended_server and has_ended:
                     message = f"a process or the connection ended under this request twice: {error.message}"
-                    raise type(error)(f"{server.transport.url}: {message}") from error
+                    raise ProcessEndedError(f"{server.transport.url}: {message}") from error
                 has_other = self._has_other({server, *refusals})
                 if error.may_have_ended_server:
                     has_ended = True
