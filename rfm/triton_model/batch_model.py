@@ -187,8 +187,9 @@ class BatchModel(Generic[Question, Answer]):
 
     def _score(self, batch: list[Request[Question]]) -> Scored[Question]:
         """The answers, or the error, of each request."""
-        for request in batch if self._batch_s > GIVEN_UP_S else ():
-            if request.error is None and request.is_cancelled():
+        may_have_given_up = self._batch_s > GIVEN_UP_S
+        for request in batch:
+            if may_have_given_up and request.error is None and request.is_cancelled():
                 request.error = CancelledError("cancelled by the client")
         failed = [request for request in batch if request.error is not None]
         good = [request for request in batch if request.error is None]

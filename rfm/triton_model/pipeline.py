@@ -31,7 +31,7 @@ Scored = TypeVar("Scored")
 class Stages(Generic[SomeJob, Scored]):
     """What is done with jobs. An exception of ``prepare`` is ignored; any other ends the process, by ``fail``.
 
-    prepare: of one job, in one of ``num_preparing`` threads
+    prepare: of one job, in one of ``num_preparing`` threads; of a model its ``work_ahead``
     score: of a batch, always in the same thread: libgomp has a team of threads for each thread that computes
     reply: with what ``score`` gave
     begin_preparing, begin_scoring: called once in each thread of that kind
