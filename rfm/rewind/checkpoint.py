@@ -250,7 +250,8 @@ def _of_first_code(folder: Path, weights: dict[str, Tensor], options: Options) -
             f"{folder}: encoders: expected none for a checkpoint of the first ReWiND code, which crops frames and does "
             "not resize them; encode frames as it does, and send video_embeddings and text_embedding"
         )
-    stated = {**first_code.SETTINGS, **_stated(folder)}
+    read = {name: decision for name, decision in _stated(folder).items() if not decision.is_assumed}
+    stated = {**first_code.SETTINGS, **read}
     stated["trained_frames"] = Decision("trained_frames", stated["max_len"].value, "max_len")
     config = _rewind_config(folder, weights, stated)
     checkpoint = RewindCheckpoint(config, weights, settings=_settings(config, stated))

@@ -73,7 +73,7 @@ class Probe:
                 if status != HTTPStatus.SERVICE_UNAVAILABLE:  # it waited in a queue that is full
                     took_s = time.monotonic() - started_s
                     self._take(status, took_s)
-            self._closed.wait(max(self._interval_s, took_s / SHARE))
+            self._closed.wait(max(self._interval_s, min(took_s / SHARE, self._hang_s)))
             if took_s:
                 self._waiting_since_s = time.monotonic()
 

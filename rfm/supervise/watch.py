@@ -89,10 +89,15 @@ class Watch:
     def close(self) -> None:
         """End the looks and the probes."""
         self._closed.set()
-        for probe in list(self._probes.values()):
-            probe.close()
 
     def _run(self) -> None:
+        try:
+            self._look()
+        finally:
+            for probe in self._probes.values():
+                probe.close()
+
+    def _look(self) -> None:
         num_failed, answered_s = 0, time.monotonic()
         while not self._closed.wait(LOOK_S) and self.fault is None:
             try:

@@ -55,7 +55,8 @@ class BatchModel(Generic[Question, Answer]):
         placement = Placement.of(args, config, settings)
         version = Path(args["model_repository"], args["model_version"])
         self._pipeline: Pipeline[Request[Question], Scored[Question]] | None = None
-        self._is_executing, self._batch_s = False, 0.0  # what the last batch took
+        self._is_executing = False
+        self._batch_s = 0.0  # what the last batch took
         self._guard = Guard(float(os.environ.get(HANG_VARIABLE) or DEFAULT_HANG_S), lambda: self._is_working)
         check_digest(version, settings.get(DIGEST_PARAMETER, ""))
         placement.run(lambda: self.load(version, placement.device, settings))
@@ -76,7 +77,7 @@ class BatchModel(Generic[Question, Answer]):
             self._score,
             self._send,
             fail=lambda: end("its pipeline has failed"),
-            begin_preparing=partial(use_threads, 1),  # there are as many threads as this instance has cores
+            begin_preparing=partial(use_threads, 1),  # on a GPU there is a thread for each core of the instance
             begin_scoring=placement.apply,
             num_preparing=placement.num_preparing,
         )
@@ -137,18 +138,20 @@ class BatchModel(Generic[Question, Answer]):
 
     @property
     def _is_working(self) -> bool:
-        return self._is_executing if self._pipeline is None else not self._pipeline.is_idle
+        return self._is_executing or (self._pipeline is not None and not self._pipeline.is_idle)
 
     def _responses(
         self, batch: list[Request[Question]], score: Callable[[list[Request[Question]]], Scored[Question]]
     ) -> list[Any]:
-        """Triton's responses to requests that are scored meanwhile."""
+        """Scores the requests by ``score``, and gives Triton's responses."""
         self._is_executing = True
-        for request in batch:
-            self._read(request)
-        scored = score(batch)
-        self._is_executing = False
-        responses = [self._response(request) for request in batch]
+        try:
+            for request in batch:
+                self._read(request)
+            scored = score(batch)
+            responses = [self._response(request) for request in batch]
+        finally:
+            self._is_executing = False
         self._count(scored)
         return responses
 
@@ -186,7 +189,7 @@ class BatchModel(Generic[Question, Answer]):
                 self.work_ahead(prepared)
 
     def _score(self, batch: list[Request[Question]]) -> Scored[Question]:
-        """The answers, or the error, of each request."""
+        """Gives each request its answers or its error, and tells what was spent on them."""
         may_have_given_up = self._batch_s > GIVEN_UP_S
         for request in batch:
             if may_have_given_up and request.error is None and request.is_cancelled():
@@ -195,14 +198,16 @@ class BatchModel(Generic[Question, Answer]):
         good = [request for request in batch if request.error is None]
         scored: Scored[Question] = [(failed, Execution())] if failed else []
         if good:
+            started_s = time.monotonic()
             scored += self._scored(good)
+            self._batch_s = time.monotonic() - started_s
             self._guard.look_at(good, self._score_blank)
         return scored
 
     def _scored(self, batch: list[Request[Question]]) -> Scored[Question]:
         """Scores the requests together or, if that fails, each alone: what breaks one costs no other its answer."""
         self._guard.step()
-        started_s, execution = time.monotonic(), Execution(on_forward=self._guard.step)
+        execution = Execution(on_forward=self._guard.step)
         try:
             answers = iter(self.answer([each for request in batch for each in request.prepared], execution))
             for request in batch:
@@ -214,7 +219,6 @@ class BatchModel(Generic[Question, Answer]):
                 return [scored for request in batch for scored in self._scored([request])]
             batch[0].fail(error)
             execution = Execution()
-        self._batch_s = time.monotonic() - started_s
         return [(batch, execution)]
 
     def _send(self, scored: Scored[Question]) -> None:

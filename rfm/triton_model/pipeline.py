@@ -2,7 +2,7 @@
 """Jobs are prepared, scored and replied to, each beside the others. No Triton in it.
 
 For models whose samples take long to prepare: a device that scores has the next batch ready. Other models score in
-``execute``, which costs half of the CPU.
+``execute``, which takes half as much CPU time for a request.
 """
 
 from __future__ import annotations
@@ -70,7 +70,8 @@ class Pipeline(Generic[SomeJob, Scored]):
     @property
     def is_idle(self) -> bool:
         """Whether no job waits and none is scored."""
-        return not (self._is_scoring or self._waiting)
+        with self._changed:
+            return not (self._is_scoring or self._waiting)
 
     def put(self, jobs: Iterable[SomeJob]) -> None:
         """Take jobs in. Returns when no more than one batch waits behind the one that is scored."""

@@ -229,6 +229,17 @@ def test_a_checkpoint_of_the_first_rewind_code_is_exported_and_labels(tmp_path: 
     assert decisions["has_success"] == Decision("has_success", False, "weights")
 
 
+def test_a_checkpoint_of_the_first_rewind_code_is_causal_whatever_upstream_s_older_files_mean(tmp_path: Path) -> None:
+    """Upstream's configurations of before causal_mask, when no network of theirs had one, state all of these."""
+    first_code(tmp_path / "run")
+    run_the_command(families.load, tmp_path / "run")
+    fields = ("video_feature_dim", "text_feature_dim", "hidden_dim", "num_layers", "num_attention_heads", "max_len")
+    config = families.load(tmp_path / "run").config
+    (tmp_path / "run" / "config.json").write_text(json.dumps({name: getattr(config, name) for name in fields}))
+    assert families.load(tmp_path / "run").config == config
+    assert config.causal_mask
+
+
 def test_a_checkpoint_of_the_first_rewind_code_takes_no_encoders(tmp_path: Path) -> None:
     first_code(tmp_path / "run")
     run_the_command(families.load, tmp_path / "run")

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -17,6 +18,7 @@ from batch_models import BREAKS, CONFIG, FAILS, REFUSED, WIDTHS, Model, Request,
 from rfm.execution import Execution
 from rfm.probe import blank_question
 from rfm.triton_model import batch_model
+from rfm.triton_model.batch_model import GIVEN_UP_S
 from rfm.triton_model.placement import Placement, use_threads
 from rfm_client import (
     FrameScores,
@@ -88,6 +90,22 @@ def test_a_request_that_breaks_a_batch_is_found(tmp_path: Path) -> None:
     assert model.batches == [3, 1, 1, 1]
     assert model.logged == ["3: made up", "scoring failed; the server's log has the reason"]
     assert model.samples == {("progress", "scored"): 2, ("progress", "failed"): 1}
+
+
+def test_behind_a_batch_that_took_long_a_cancelled_request_is_not_scored(tmp_path: Path) -> None:
+    """Also if the batch was split, and its last request alone took no time."""
+
+    class Slow(Model):
+        def answer(self, questions: Sequence[Sample], execution: Execution) -> list[Result | RewardError]:
+            time.sleep(2 * GIVEN_UP_S if len(questions) > 1 else 0.0)
+            return super().answer(questions, execution)
+
+    model = Slow(tmp_path)
+    model.respond([request(1), request(BREAKS)])
+    cancelled, scored = model.respond([request(5, is_given_up=True), request(6)])
+    assert cancelled.error == ("cancelled", "cancelled by the client")
+    assert scored.error is None
+    assert model.samples[("progress", "cancelled")] == 1
 
 
 def test_warm_ups_and_probes_are_not_counted(tmp_path: Path) -> None:

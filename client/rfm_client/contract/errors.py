@@ -21,9 +21,12 @@ class RewardError(Exception):
     """Base of every error that this library raises.
 
     request_id: the id of the failed request in the server's log, at the end of the message; None: none was sent
+    may_have_ended_server: a process of the model had ended, or the connection ended under the request, which may be
+        why
     """
 
     request_id: str | None = None
+    may_have_ended_server = False
 
     @property
     def message(self) -> str:
@@ -54,13 +57,7 @@ class ServerError(RewardError):
 
 
 class ServerUnavailableError(ServerError):
-    """The server cannot be reached, is not ready, or refuses more work for now.
-
-    may_have_ended_server: a process of the model had ended, or the connection ended under the request, which may be
-        why
-    """
-
-    may_have_ended_server = False
+    """The server cannot be reached, is not ready, or refuses more work for now."""
 
 
 class ProcessEndedError(ServerUnavailableError):

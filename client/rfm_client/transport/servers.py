@@ -87,7 +87,7 @@ class Server:
         """Leave the server out until it says that it is ready. The more often it failed, the later it is asked."""
         if self.is_left_out or self.is_gone:
             return
-        if isinstance(error, ServerUnavailableError) and error.may_have_ended_server:
+        if error.may_have_ended_server:
             comeback = self._back(model, was_down=not isinstance(error, ProcessEndedError))
         else:
             comeback = self._rest(model)
@@ -345,8 +345,7 @@ class Servers:
     def _leave_out(self, server: Server, model: str, error: RewardError) -> None:
         """Leaves a server out until it is ready. To the only one requests are sent all the same."""
         server.failures += not server.is_left_out  # else it is the same failure
-        has_ended = isinstance(error, ServerUnavailableError) and error.may_have_ended_server
-        if len(self._servers) > 1 or has_ended:
+        if len(self._servers) > 1 or error.may_have_ended_server:
             server.leave_out(model, error)
 
     # Names
