@@ -85,7 +85,7 @@ def asked(endpoints_and_repository: tuple[Endpoints, Path], protocol: str) -> It
 
 
 PHRASES: dict[str, tuple[Callable[[Triton], Any], str, type[RewardError], str]] = {
-    "an unknown model": (lambda t: t.infer("nowhere"), triton.UNKNOWN_MODEL, ModelNotFoundError, "nowhere"),
+    "an unknown model": (lambda t: t.infer("nowhere"), "unknown model", ModelNotFoundError, "nowhere"),
     "a lost region": (lambda t: t.infer(region="gone"), triton.LOST_REGION, ServerUnavailableError, "gone"),
     "another width": (
         lambda t: t.infer(width=65),
@@ -196,11 +196,6 @@ def test_a_restricted_api_wants_its_key(asked: Triton) -> None:
     status, message = failure(asked.client.get_model_repository_index)
     assert triton.RESTRICTED in message
     assert triton.is_denied(status, message)
-
-
-def test_a_version_that_is_not_there_is_absent(asked: Triton) -> None:
-    _, message = failure(lambda: asked.infer(version="7"))
-    assert triton.is_absent(message)
 
 
 @pytest.mark.slow

@@ -29,9 +29,7 @@ _ERRORS: dict[tuple[str, ...], type[errors.RewardError]] = {
 _ERROR_OF = {status: error for statuses, error in _ERRORS.items() for status in statuses}
 
 PROCESS_ENDED = "is not healthy"  # "Stub process 'rfm_0_0' is not healthy."
-UNKNOWN_MODEL = "unknown model"
 NO_VERSIONS = "no available versions"  # of a model that is being loaded again, or failed
-NOT_READY = "is not ready"  # of a version
 LOST_REGION = "Unable to find shared memory region"  # of a server that was started again
 REGION_IN_USE = "it is currently in use"  # of a region to unmap: tests/client/test_shared_memory_faults.py
 RESTRICTED = "is restricted, expecting header"  # of an API that wants a key
@@ -55,11 +53,6 @@ def is_denied(status: str, message: str) -> bool:
 def is_unreachable(status: str, message: str) -> bool:
     """Whether gRPC found no connection to the server."""
     return status == "StatusCode.UNAVAILABLE" and _NO_CONNECTION.search(message) is not None
-
-
-def is_absent(message: str) -> bool:
-    """Whether Triton says that a model, or its version, is not loaded."""
-    return any(words in message for words in (UNKNOWN_MODEL, NO_VERSIONS, NOT_READY))
 
 
 def error_of(status: str, message: str, bad_request: type[errors.RewardError]) -> errors.RewardError:
