@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +29,22 @@ class ProcessStat:
 def all_pids() -> list[int]:
     """The ids of all processes."""
     return [int(folder.name) for folder in _PROC.glob("[0-9]*")]
+
+
+def children_of(pid: int) -> list[int]:
+    """The processes that the process has started, zombies included.
+
+    A machine may have thousands of processes, so the kernel's lists of each thread's children are read, where it has
+    such lists.
+    """
+    threads = _PROC / str(pid) / "task"
+    if not (threads / str(pid) / "children").exists():
+        return [child for child in all_pids() if (stat := stat_of(child)) is not None and stat.parent == pid]
+    found: list[int] = []
+    for file in threads.glob("*/children"):
+        with suppress(FileNotFoundError, ProcessLookupError):  # the thread has ended
+            found += map(int, file.read_text().split())
+    return found
 
 
 def arguments_of(pid: int) -> list[str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
-from rfm.proc import STOPPED, ZOMBIE, all_pids, arguments_of, stat_of
+from rfm.proc import STOPPED, ZOMBIE, arguments_of, children_of, stat_of
 
 _PROGRAM = "triton_python_backend_stub"
 _NAME = _PROGRAM[:15]  # as the kernel keeps it
@@ -38,9 +38,9 @@ class ModelProcesses:
 
     def _states(self) -> dict[int, str]:
         states = {}
-        for pid in all_pids():
+        for pid in children_of(self._triton_pid):
             stat = stat_of(pid)
-            if stat is not None and stat.parent == self._triton_pid:
+            if stat is not None:
                 model = _model_of(pid)
                 if model is not None:
                     self._models[pid] = model
