@@ -302,7 +302,7 @@ def test_after_a_frame_that_could_not_be_kept_an_episode_needs_a_reset(
     if is_last and autoreset:
         env.step(0)  # which is the reset
     else:
-        with pytest.raises(ResetNeeded, match="since the episode has ended" if is_last else "since a frame was lost"):
+        with pytest.raises(ResetNeeded, match="the episode has ended" if is_last else "a frame was lost|a reset before it"):
             env.step(0)
         env.reset()
     env.step(0)

@@ -22,7 +22,7 @@ from gateways import Gateway, running
 from live_reports import Json, episode, identity, jpeg, picture, report, step
 from rfm.launch.process import Endpoints
 from rfm_client import LiveView
-from rfm_client.episodes import StepScore, live_reports
+from rfm_client.episodes import StepScore, live
 from rfm_gateway.memory import Memory
 from rfm_gateway.viewer import live_report
 from rfm_gateway.viewer.live import FORGOTTEN_AFTER_S, MOST_EPISODES, MOST_POINTS, LiveEpisodes
@@ -303,12 +303,12 @@ def test_a_frame_of_an_episode_that_is_not_known_is_left_out() -> None:
 
 
 def test_a_whole_report_of_the_client_is_within_the_limits() -> None:
-    noise = np.random.default_rng(0).integers(0, 256, (live_reports.LONGEST_PX, live_reports.LONGEST_PX, 3), np.uint8)
+    noise = np.random.default_rng(0).integers(0, 256, (live.LONGEST_PX, live.LONGEST_PX, 3), np.uint8)
     about = {key: value for key, value in episode(1, task="a" * 300).items() if key not in ("ended", "steps")}
-    entries = [({**about, "id": identity(n % 300)}, step(n)) for n in range(live_reports.MOST_STEPS)]
-    frames = {identity(n): noise for n in range(live_reports.MOST_FRAMES)}
-    body = live_reports._body(entries, frames)  # type: ignore[arg-type]
+    entries = [({**about, "id": identity(n % 300)}, step(n)) for n in range(live.MOST_STEPS)]
+    frames = {identity(n): noise for n in range(live.MOST_FRAMES)}
+    body = live.report_body(entries, frames)  # type: ignore[arg-type]
     assert len(body) < live_report.MOST_BODY_BYTES
     with Memory(2**30).share() as share:
         news, pictures = read_report(body, share)
-    assert (len(news), len(pictures)) == (300, live_reports.MOST_FRAMES)
+    assert (len(news), len(pictures)) == (300, live.MOST_FRAMES)

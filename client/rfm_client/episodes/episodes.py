@@ -1,32 +1,254 @@
 # SPDX-License-Identifier: MIT
-"""Episodes that grow frame by frame, for code that waits. N episodes, H x W pixels."""
+"""Episodes that grow frame by frame, for asyncio and for code that waits. N episodes, H x W pixels."""
 
 from __future__ import annotations
 
-from collections.abc import Coroutine, Sequence
+import asyncio
+import math
+import os
+import time
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any
 
-from rfm_client.episodes.async_episodes import AsyncEpisode, AsyncEpisodes
-from rfm_client.episodes.frames import copied
-from rfm_client.episodes.scores import StepScore, StepScores
+import numpy as np
+
+from rfm_client.contract.errors import InvalidSampleError
+from rfm_client.contract.frame_size import FrameSize
+from rfm_client.contract.samples import as_array
+from rfm_client.data.sampling import Sampling
+from rfm_client.episodes.scoring import EpisodeFrames, EpisodeOptions, StepQuestion, StepScore, StepScores, copied
+from rfm_client.episodes.windows import NamedFrame
+from rfm_client.transport.deadline import Deadline
 from rfm_client.transport.one_process import OneProcess
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-Given = TypeVar("Given")
+    from rfm_client.async_client import AsyncRewardClient
+    from rfm_client.transport.loop_thread import LoopThread
 
 
-class Loop(Protocol):
-    """The event loop of a client, in a thread of its own."""
+class AsyncEpisodes(OneProcess):
+    """N episodes that grow side by side, as those of vectorised environments; as few requests a step as fit. An async
+    context manager that closes it.
 
-    def wait(self, work: Coroutine[Any, Any, Given]) -> Given:
-        """What the coroutine gives."""
+    All frames of the running episodes are kept, as later ones are shown with them.
 
-    def start(self, work: Coroutine[Any, Any, Given]) -> Future[Given]:
-        """What the coroutine will give."""
+    tasks: of each episode
+    timeout_s: the longest that a step may take, retries included; None: the client's
+    """
+
+    def __init__(
+        self, client: AsyncRewardClient, tasks: Sequence[str], options: EpisodeOptions, timeout_s: float | None = None
+    ) -> None:
+        if not tasks:
+            raise ValueError("episodes: expected at least one, got none")
+        self._client, self._options, self._timeout_s = client, options, timeout_s
+        self._tasks = list(tasks)
+        self._episodes = [self._new(index) for index in range(len(tasks))]
+        self._adding = asyncio.Lock()
+
+    def __len__(self) -> int:
+        return len(self._tasks)
+
+    async def add(self, frames: Any, mask: npt.ArrayLike | None = None) -> StepScores:
+        """Adds a frame to each episode, and gives the scores of the episodes so far.
+
+        frames: uint8 [N, H, W, 3], an array, a torch tensor or a sequence of frames; with cameras, such by name
+        mask: bool [N], which episodes have a new frame; None: all
+
+        Raises RewardError, ``episodes[3].frame: expected X, got Y``. Then no episode has grown: the step may be tried
+        again.
+        """
+        asked_s = time.perf_counter()
+        deadline = None if self._timeout_s is None else Deadline(self._timeout_s)
+        async with self._adding:
+            indices = _indices(mask, len(self))
+            sampling, size = await self._shown(deadline)
+            new = await self._checked(frames, indices, size)
+            added = [self._episodes[index] for index in indices]
+            for episode, frame in zip(added, new, strict=True):
+                episode.append(frame)
+            try:
+                question = StepQuestion(added, sampling, asked_s)
+                outcomes = await self._client.score_windows(question.windows, timeout_s=_left_s(deadline))
+                scores = question.scores(outcomes)
+            except BaseException:
+                for episode in added:
+                    episode.pop()
+                raise
+            for episode, score in zip(added, scores, strict=True):
+                episode.report(score)
+            return self._gathered(dict(zip(indices, scores, strict=True)))
+
+    async def reset(self, mask: npt.ArrayLike | None = None, task: str | Sequence[str] | None = None) -> None:
+        """Begins new episodes, when no step is open.
+
+        mask: bool [N], which ones; None: all
+        task: of all of these, or of each; None: as before
+        """
+        async with self._adding:
+            indices = _indices(mask, len(self))
+            tasks = [task] * len(indices) if task is None or isinstance(task, str) else list(task)
+            if len(tasks) != len(indices):
+                raise ValueError(f"task: expected one for each of {len(indices)} episodes, got {len(tasks)}")
+            for index, new in zip(indices, tasks, strict=True):
+                self._episodes[index].end()
+                self._tasks[index] = self._tasks[index] if new is None else new
+                self._episodes[index] = self._new(index)
+
+    async def close(self) -> None:
+        """Returns when no step is open. Who watches is told that the episodes have ended."""
+        async with self._adding:
+            for episode in self._episodes:
+                episode.end()
+
+    async def __aenter__(self) -> AsyncEpisodes:
+        return self
+
+    async def __aexit__(self, *_raised: object) -> None:
+        await self.close()
+
+    def _new(self, index: int) -> EpisodeFrames:
+        where = f"episodes[{index}]" if len(self) > 1 else ""
+        return EpisodeFrames(self._tasks[index], self._options, index, where)
+
+    async def _shown(self, deadline: Deadline | None) -> tuple[Sampling, FrameSize | None]:
+        """What the checkpoint is shown. The client knows it, until another version of the checkpoint answers."""
+        if not self._options.needs_model_info:
+            return self._options.sampling_for(None), None
+        info = await self._client.model_info(frames=True, timeout_s=_left_s(deadline))
+        return self._options.sampling_for(info), info.frame_size if self._options.resize else None
+
+    async def _checked(
+        self, frames: Any, indices: Sequence[int], size: FrameSize | None
+    ) -> list[tuple[NamedFrame, ...]]:
+        """The new frames of these episodes, in as many threads as there are processors."""
+
+        def checked(some: Sequence[int]) -> list[tuple[NamedFrame, ...]]:
+            return [self._episodes[index].checked(self._given(frames, index), size) for index in some]
+
+        count = max(1, math.ceil(len(indices) / (os.cpu_count() or 1)))
+        parts = [indices[first : first + count] for first in range(0, len(indices), count)]
+        making = [asyncio.create_task(asyncio.to_thread(checked, part)) for part in parts]
+        await asyncio.gather(*making, return_exceptions=True)  # then the first error is raised, not the quickest
+        return [frame for part in making for frame in part.result()]
+
+    def _given(self, frames: Any, index: int) -> Any:
+        """The new frame of one episode; with cameras, such by name. Raises InvalidSampleError."""
+        cameras = self._options.cameras
+        if not cameras and isinstance(frames, Mapping):
+            expected = "frames of one camera (cameras=... names several)"
+            raise InvalidSampleError.at("frames", expected, f"frames of {sorted(frames)}")
+        if not cameras:
+            return self._one_of(frames, index, "frames")
+        if not isinstance(frames, Mapping) or set(frames) != set(cameras):
+            got = sorted(frames) if isinstance(frames, Mapping) else type(frames).__name__
+            raise InvalidSampleError.at("frames", f"frames of the cameras {list(cameras)}", str(got))
+        return {camera: self._one_of(frames[camera], index, f"frames[{camera!r}]") for camera in cameras}
+
+    def _one_of(self, frames: Any, index: int, where: str) -> Any:
+        if not hasattr(frames, "__len__") or len(frames) != len(self):
+            got = f"{len(frames)}" if hasattr(frames, "__len__") else type(frames).__name__
+            raise InvalidSampleError.at(where, f"a frame of each of {len(self)} episodes", got)
+        return frames[index]
+
+    def _gathered(self, scores: Mapping[int, StepScore]) -> StepScores:
+        """The scores of all episodes; of those without one, none."""
+        progress, success = (np.full(len(self), np.nan, np.float32) for _ in range(2))
+        succeeded = np.zeros(len(self), bool)
+        for index, score in scores.items():
+            progress[index], success[index], succeeded[index] = score.progress, score.success, score.succeeded
+        steps = np.array([episode.step for episode in self._episodes], np.int64)
+        return StepScores(
+            progress, success, succeeded, steps, max((score.ms for score in scores.values()), default=0.0)
+        )
+
+
+class AsyncEpisode(OneProcess):
+    """One episode that grows, for asyncio. Built by ``AsyncRewardClient.episode``. An async context manager that closes
+    it.
+    """
+
+    def __init__(
+        self, client: AsyncRewardClient, task: str, options: EpisodeOptions, timeout_s: float | None = None
+    ) -> None:
+        self._episodes = AsyncEpisodes(client, [task], options, timeout_s)
+        self._waiting: tuple[Any, asyncio.Future[StepScore]] | None = None
+        self._asking: asyncio.Task[None] | None = None
+
+    async def add(self, frame: Any) -> StepScore:
+        """Adds a frame, uint8 [H, W, 3] or such by camera, and gives the score of the episode so far. It waits for a
+        question that is open; a frame that waits for that, too, is dropped.
+
+        Raises RewardError. Then the episode has not grown: the step may be tried again.
+        """
+        await self._settle()
+        return await self._add(frame)
+
+    def add_nowait(self, frame: Any) -> asyncio.Future[StepScore]:
+        """Adds a frame, and gives the score to come. While a question is open the frame waits; if another comes
+        meanwhile, the newer one takes its place, and the older's answer is cancelled: that frame is not part of the
+        episode.
+        """
+        frame = copied(frame)
+        answer: asyncio.Future[StepScore] = asyncio.get_running_loop().create_future()
+        if self._asking is None or self._asking.done():
+            self._asking = asyncio.create_task(self._ask(frame, answer))
+        else:
+            self._drop_waiting()
+            self._waiting = frame, answer
+        return answer
+
+    async def reset(self, task: str | None = None) -> None:
+        """Begins a new episode, when no question is open; a frame that waits is dropped. ``task``: None: as before."""
+        await self._settle()
+        await self._episodes.reset(task=task)
+
+    async def close(self) -> None:
+        """Returns when no question is open; a frame that waits is dropped. Who watches is told that it has ended."""
+        await self._settle()
+        await self._episodes.close()
+
+    async def __aenter__(self) -> AsyncEpisode:
+        return self
+
+    async def __aexit__(self, *_raised: object) -> None:
+        await self.close()
+
+    async def _settle(self) -> None:
+        self._drop_waiting()
+        if self._asking is not None and not self._asking.done():
+            await asyncio.wait({self._asking})  # who stops to wait does not stop the question
+
+    async def _add(self, frame: Any) -> StepScore:
+        frames = {camera: [each] for camera, each in frame.items()} if isinstance(frame, Mapping) else [frame]
+        return (await self._episodes.add(frames)).of(0)
+
+    def _drop_waiting(self) -> None:
+        if self._waiting is not None:
+            self._waiting[1].cancel()
+            self._waiting = None
+
+    async def _ask(self, frame: Any, answer: asyncio.Future[StepScore]) -> None:
+        """Asks about a frame, and then about the newest until none waits."""
+        waiting: tuple[Any, asyncio.Future[StepScore]] | None = (frame, answer)
+        while waiting is not None:
+            frame, answer = waiting
+            try:
+                score = await self._add(frame)
+            except Exception as error:  # noqa: BLE001  whatever it is, who waits for the answer is told
+                if not answer.done():
+                    answer.set_exception(error)
+            except BaseException:
+                answer.cancel()
+                self._drop_waiting()
+                raise
+            else:
+                if not answer.done():
+                    answer.set_result(score)
+            waiting, self._waiting = self._waiting, None
 
 
 class Episodes(OneProcess):
@@ -35,20 +257,14 @@ class Episodes(OneProcess):
     A context manager that closes it.
     """
 
-    def __init__(self, episodes: AsyncEpisodes, loop: Loop, client: object) -> None:
+    def __init__(self, episodes: AsyncEpisodes, loop: LoopThread, client: object) -> None:
         self._episodes, self._loop, self._client = episodes, loop, client
 
     def __len__(self) -> int:
         return len(self._episodes)
 
     def add(self, frames: Any, mask: npt.ArrayLike | None = None) -> StepScores:
-        """Adds a frame to each episode, and gives the scores of the episodes so far.
-
-        frames: uint8 [N, H, W, 3], an array, a torch tensor or a sequence of frames; with cameras, such by name
-        mask: bool [N], which episodes have a new frame; None: all
-
-        Raises RewardError. Then no episode has grown: the step may be tried again.
-        """
+        """As ``AsyncEpisodes.add``. Raises RewardError. Then no episode has grown: the step may be tried again."""
         return self._loop.wait(self._episodes.add(frames, mask))
 
     def reset(self, mask: npt.ArrayLike | None = None, task: str | Sequence[str] | None = None) -> None:
@@ -62,34 +278,25 @@ class Episodes(OneProcess):
     def __enter__(self) -> Episodes:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_raised: object) -> None:
         self.close()
 
 
 class Episode(OneProcess):
-    """One episode that grows. Built by ``RewardClient.episode``, whose client lives as long as this. A context manager
-    that closes it.
+    """AsyncEpisode without ``await``. Built by ``RewardClient.episode``, whose client lives as long as this.
+
+    A context manager that closes it.
     """
 
-    def __init__(self, episode: AsyncEpisode, loop: Loop, client: object) -> None:
+    def __init__(self, episode: AsyncEpisode, loop: LoopThread, client: object) -> None:
         self._episode, self._loop, self._client = episode, loop, client
 
     def add(self, frame: Any) -> StepScore:
-        """Adds a frame, uint8 [H, W, 3] or such by camera, and gives the score of the episode so far. It waits for a
-        question that is open; a frame that waits for that, too, is dropped.
-
-        Raises RewardError. Then the episode has not grown: the step may be tried again.
-        """
+        """As ``AsyncEpisode.add``. Raises RewardError. Then the episode has not grown: the step may be tried again."""
         return self._loop.wait(self._episode.add(frame))
 
     def add_nowait(self, frame: Any) -> Future[StepScore]:
-        """Adds a frame and returns at once. While a question is open the frame waits; if another comes meanwhile, the
-        newer one takes its place, and the older's future is cancelled: that frame is not part of the episode.
-
-        The future raises RewardError.
-        """
+        """As ``AsyncEpisode.add_nowait``; returns at once. The future raises RewardError."""
         frame = copied(frame)
 
         async def answer() -> StepScore:
@@ -108,7 +315,19 @@ class Episode(OneProcess):
     def __enter__(self) -> Episode:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_raised: object) -> None:
         self.close()
+
+
+def _left_s(deadline: Deadline | None) -> float | None:
+    return None if deadline is None else deadline.remaining_s()
+
+
+def _indices(mask: npt.ArrayLike | None, count: int) -> list[int]:
+    """Which of the episodes a mask names. Raises ValueError for a mask that is none."""
+    if mask is None:
+        return list(range(count))
+    array = np.asarray(as_array(mask))
+    if array.dtype != np.bool_ or array.shape != (count,):
+        raise ValueError(f"mask: expected bool [{count}], got {array.dtype} {list(array.shape)}")
+    return [int(index) for index in np.flatnonzero(array)]

@@ -1,45 +1,68 @@
 # SPDX-License-Identifier: MIT
 """Episodes that somebody watches while they run: their newest frames and scores go to the page of a gateway.
 
-Whoever adds a step never waits for that: a thread reports, a few times a second, what has come since.
+Whoever adds a step never waits for that: a thread reports, a few times a second, what has come since. A report holds
+the steps that have come, 2000 at most, and the newest frame of each of the 16 episodes whose picture is oldest. So what
+a report costs has a bound, however many environments there are.
 """
 
 from __future__ import annotations
 
+import atexit
+import base64
+import json
+import logging
 import math
 import operator
+import os
+import threading
+import time
 import uuid
 import weakref
-from types import TracebackType
-from typing import TYPE_CHECKING
+from collections import deque
+from collections.abc import Mapping
+from http.client import HTTPConnection, HTTPException, HTTPSConnection
+from typing import TYPE_CHECKING, Any, TypeAlias
+from urllib.parse import urlsplit
 
 import numpy as np
 
 from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.resize import load_pillow
-from rfm_client.episodes.live_reports import Address, Reporter
-from rfm_client.episodes.scores import StepScore
+from rfm_client.data.resize import as_jpeg, load_pillow
 from rfm_client.transport.access import Access, AccessOptions
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-MOST_LETTERS = 2000  # that a gateway takes
+    from rfm_client.episodes.scoring import StepScore
+
+PATH = "/live/reports"
+REPORT_EVERY_S = 0.25
+TRY_AGAIN_AFTER_S = 5.0
+ANSWER_WITHIN_S = 5.0
+CLOSE_WITHIN_S = 2.0
+MOST_STEPS_KEPT = 10_000  # of all episodes together; the newest
+MOST_STEPS = 2_000  # of one report
+MOST_FRAMES = 16  # of one report
+MOST_FRAMES_KEPT = 128  # as many episodes as a gateway keeps
+MOST_RUNNING = 1024  # of which it is known that they run; the newest
+MOST_ANSWER_BYTES = 300  # what a warning shows
+MOST_LETTERS = 2000  # of a text that a gateway takes
+LONGEST_PX = 256  # the longer side of a frame that is reported
+
+About: TypeAlias = Mapping[str, Any]  # which episode it is
+Entry: TypeAlias = tuple[About, Mapping[str, Any] | None]  # one of its steps; None: it has ended
+
+logger = logging.getLogger(__name__)
 
 
 class LiveEpisode:
     """One episode that is watched. Built by ``LiveView.episode``."""
 
-    def __init__(self, view: LiveView, task: str, env: int, threshold: float) -> None:
-        self._view = view
-        self._about = {
-            "id": uuid.uuid4().hex,
-            "name": _shown(view.name),
-            "env": operator.index(env),
-            "task": _shown(task),
-            "threshold": _or_none(threshold),
-        }
+    def __init__(self, view: LiveView, reporter: Reporter, about: About) -> None:
+        self._view = view  # which reports as long as somebody holds it
+        self._reporter, self._about = reporter, about
         self._has_ended = False
 
     def add(self, frame: UInt8Array, score: StepScore) -> None:
@@ -51,12 +74,12 @@ class LiveEpisode:
             return
         scores = {"progress": _or_none(score.progress), "success": _or_none(score.success)}
         step = {"step": score.step, **scores, "succeeded": score.succeeded, "ms": score.ms}
-        self._view._reporter.add(self._about, step, np.asarray(frame))
+        self._reporter.add(self._about, step, np.asarray(frame))
 
     def end(self) -> None:
         """Has it reported that no step will follow. Returns at once, and raises nothing."""
         self._has_ended = True
-        self._view._reporter.end(self._about)
+        self._reporter.end(self._about)
 
 
 class LiveView:
@@ -79,7 +102,7 @@ class LiveView:
         load_pillow()
         self.name = name
         self._url, self._options = url, access
-        self._reporter = Reporter(Address.of(url, Access.of(access)))
+        self._reporter = Reporter(url, Access.of(access))
         weakref.finalize(self, self._reporter.stop).atexit = False  # the reporter closes itself then
 
     def episode(self, task: str, env: int = 0, threshold: float = 0.5) -> LiveEpisode:
@@ -92,24 +115,188 @@ class LiveView:
         checked_count("env", env, least=0)
         if threshold != math.inf:
             checked_share("threshold", threshold)
-        return LiveEpisode(self, task, env, threshold)
+        about = {"name": _shown(self.name), "task": _shown(task)}
+        numbers = {"env": operator.index(env), "threshold": _or_none(threshold)}
+        return LiveEpisode(self, self._reporter, {"id": uuid.uuid4().hex, **about, **numbers})
 
     def close(self) -> None:
         """Ends the episodes, and returns when the last report has gone out, or after two seconds. What comes later is
         not reported.
         """
-        self._reporter.close()
+        self._reporter.finish()
+        self._reporter.join(CLOSE_WITHIN_S)
 
     def __enter__(self) -> LiveView:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_raised: object) -> None:
         self.close()
 
     def __reduce__(self) -> tuple[object, ...]:
         return _rebuilt, (self._url, self.name, self._options)
+
+
+class Reporter:
+    """Reports to one gateway, in a thread of its own. Raises ValueError for a URL that is none."""
+
+    def __init__(self, url: str, access: Access) -> None:
+        self._url, self._access = url, access
+        self._parts = urlsplit(url)
+        is_plain = "@" not in self._parts.netloc and not self._parts.query and not self._parts.fragment
+        if self._parts.scheme not in ("http", "https") or not self._parts.hostname or not is_plain:
+            raise ValueError(f"url: expected http://host:port or https://host:port of a gateway, got {url!r}")
+        if self._parts.scheme == "http" and access.uses_tls:
+            raise ValueError(f"url: expected https://host:port with certificates, got {url!r}")
+        self._port = self._parts.port  # raises ValueError for one out of range
+        self._headers = {**access.shown, "content-type": "application/json"}
+        self._steps: deque[Entry] = deque(maxlen=MOST_STEPS_KEPT)
+        self._frames: dict[str, UInt8Array] = {}  # by episode; first the one that has waited longest
+        self._running: dict[str, About] = {}
+        self._lock = threading.Lock()
+        self._has_more, self._stopping = threading.Event(), threading.Event()
+        self._is_away = False
+        self._process_id = os.getpid()
+        self._thread = threading.Thread(target=self._run, name="rfm-live-view", daemon=True)
+        self._thread.start()
+        _open.add(self)
+
+    def add(self, about: About, step: Mapping[str, Any], frame: UInt8Array) -> None:
+        """Has a step reported, and ``frame`` unless a newer one comes before."""
+        if self._stopping.is_set() or self._was_forked():
+            return
+        with self._lock:
+            self._steps.append((about, step))
+            self._frames[about["id"]], self._running[about["id"]] = frame, about
+            for kept, most in ((self._frames, MOST_FRAMES_KEPT), (self._running, MOST_RUNNING)):
+                if len(kept) > most:
+                    del kept[next(iter(kept))]
+        self._has_more.set()
+
+    def end(self, about: About) -> None:
+        """Has it reported that an episode has ended, if it runs."""
+        if self._was_forked():
+            return
+        with self._lock:
+            if self._running.pop(about["id"], None) is not None:
+                self._steps.append((about, None))
+            if self._is_away:  # large frames of past episodes must not pile up
+                self._frames.pop(about["id"], None)
+        self._has_more.set()
+
+    def finish(self) -> None:
+        """Has it reported that all episodes have ended, and then ends the thread. Returns at once."""
+        if self._was_forked():
+            return
+        with self._lock:
+            running = list(self._running.values())
+        for about in running:
+            self.end(about)
+        self.stop()
+
+    def join(self, timeout_s: float) -> None:
+        """Returns when the thread has ended, or after so long."""
+        if self._process_id == os.getpid():
+            self._thread.join(timeout_s)
+
+    def stop(self) -> None:
+        """Ends the thread as soon as what is left has been reported, or cannot be."""
+        self._stopping.set()
+        self._has_more.set()
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            self._has_more.wait()
+            self._has_more.clear()
+            has_arrived = self._report()
+            if self._steps or self._frames:
+                self._has_more.set()
+            self._stopping.wait(REPORT_EVERY_S if has_arrived else TRY_AGAIN_AFTER_S)
+        while (self._steps or self._frames) and self._report():
+            continue
+
+    def _report(self) -> bool:
+        """Reports what there is, and says whether it has arrived. What has not is kept, unless it cannot arrive."""
+        with self._lock:
+            steps = [self._steps.popleft() for _ in range(min(len(self._steps), MOST_STEPS))]
+            frames = {key: self._frames.pop(key) for key in list(self._frames)[:MOST_FRAMES]}
+        if not steps and not frames:
+            return True
+        try:
+            body = report_body(steps, frames)
+        except (OSError, TypeError, ValueError):  # which must not keep later steps from being reported
+            logger.exception("%s: a live report has failed, and is dropped", self._url)
+            return True
+        try:
+            status, text = self._post(body)
+        except (OSError, HTTPException, ValueError) as error:  # ValueError: of a host's name
+            status, text = None, str(error) or type(error).__name__
+        if status is not None and status < 300:
+            self._is_away = False
+            return True
+        self._warn(text if status is None else f"{status} {text}")
+        if status is None or status >= 500:  # others would be refused again
+            with self._lock:
+                self._steps = deque([*steps, *self._steps], MOST_STEPS_KEPT)
+                self._frames = {key: frame for key, frame in frames.items() if key in self._running} | self._frames
+        return False
+
+    def _post(self, body: bytes) -> tuple[int, str]:
+        """Status and text of the gateway's answer."""
+        host = self._parts.hostname or ""
+        connection = (
+            HTTPSConnection(host, self._port, timeout=ANSWER_WITHIN_S, context=self._access.ssl_context)
+            if self._parts.scheme == "https"
+            else HTTPConnection(host, self._port, timeout=ANSWER_WITHIN_S)
+        )
+        try:
+            connection.request("POST", self._parts.path.rstrip("/") + PATH, body, self._headers)
+            answer = connection.getresponse()
+            return answer.status, answer.read(MOST_ANSWER_BYTES).decode(errors="replace")
+        finally:
+            connection.close()
+
+    def _was_forked(self) -> bool:
+        """Whether this process has no thread that reports, since it was forked. It is told once."""
+        if self._process_id == os.getpid() or self._stopping.is_set():
+            return self._process_id != os.getpid()
+        self._stopping.set()
+        told = "%s: this LiveView was made in process %d, which forked this one: make one in each process"
+        logger.warning(told, self._url, self._process_id)
+        return True
+
+    def _warn(self, reason: str) -> None:
+        """Logs why reports do not arrive, once until they do."""
+        if not self._is_away:
+            expected = "%s: expected a gateway that takes live reports, got %s; episodes go on, and are not shown"
+            logger.warning(expected, self._url, reason)
+        self._is_away = True
+
+
+_open: weakref.WeakSet[Reporter] = weakref.WeakSet()
+
+
+@atexit.register
+def _close_all() -> None:
+    """Has the last steps reported before the process ends. A worker of multiprocessing ends without this."""
+    reporters = list(_open)
+    for reporter in reporters:
+        reporter.finish()
+    deadline_s = time.monotonic() + CLOSE_WITHIN_S
+    for reporter in reporters:
+        reporter.join(max(0.0, deadline_s - time.monotonic()))
+
+
+def report_body(steps: list[Entry], frames: Mapping[str, UInt8Array]) -> bytes:
+    """A report as a gateway takes it: JSON of episodes with their new steps, and of JPEG frames by episode."""
+    episodes: dict[str, dict[str, Any]] = {}
+    for about, step in steps:
+        told = episodes.setdefault(about["id"], {**about, "ended": False, "steps": []})
+        if step is None:
+            told["ended"] = True
+        else:
+            told["steps"].append(step)
+    pictures = {key: base64.b64encode(as_jpeg(frame, LONGEST_PX)).decode() for key, frame in frames.items()}
+    return json.dumps({"episodes": list(episodes.values()), "frames": pictures}, allow_nan=False).encode()
 
 
 def _rebuilt(url: str, name: str, access: AccessOptions) -> LiveView:

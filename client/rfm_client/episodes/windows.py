@@ -71,29 +71,6 @@ class Window:
         return NamedTrajectory(tuple(frame.digest for frame in self.frames), {}, self.task)
 
 
-class Remembered:
-    """Digests of the frames that the servers have been sent."""
-
-    def __init__(self) -> None:
-        self._digests: OrderedDict[bytes, None] = OrderedDict()
-
-    def __contains__(self, digest: bytes) -> bool:
-        return digest in self._digests
-
-    def add(self, digests: Iterable[bytes]) -> None:
-        """Remembers digests; the oldest are forgotten if there are too many."""
-        for digest in digests:
-            self._digests[digest] = None
-            self._digests.move_to_end(digest)
-        while len(self._digests) > MAX_REMEMBERED:
-            self._digests.popitem(last=False)
-
-    def forget(self, digests: Iterable[bytes]) -> None:
-        """Forgets digests that a server does not know."""
-        for digest in digests:
-            self._digests.pop(digest, None)
-
-
 class WindowScorer:
     """Scores windows for one client, in its event loop.
 
@@ -103,7 +80,7 @@ class WindowScorer:
     def __init__(self, model: str, scorer: Scorer) -> None:
         self._model = frames_name(model)
         self._scorer = scorer
-        self._remembered = Remembered()
+        self._remembered: OrderedDict[bytes, None] = OrderedDict()  # digests of frames that the servers have been sent
 
     async def outcomes(self, windows: Sequence[Window], call: Call) -> list[Result | RewardError]:
         """The result or error of each window."""
@@ -115,15 +92,12 @@ class WindowScorer:
             return await self._whole(windows, call)
         num_new = sum(w.num_bytes // len(w.frames) for w in windows)  # about one frame of each is new
         await off_loop(num_new, lambda: [frame.digest for window in windows for frame in window.frames])
+        outcomes: dict[int, Result | RewardError] = {}
         parts = list(self._parts(windows, info.max_batch_size))
-        asked = [self._outcomes([windows[index] for index in part], call) for part in parts]
-        answered = await asyncio.gather(*asked)
-        found = {
-            index: outcome
-            for part, of_part in zip(parts, answered, strict=True)
-            for index, outcome in zip(part, of_part, strict=True)
-        }
-        return [found[index] for index in range(len(windows))]
+        answered = await asyncio.gather(*(self._outcomes([windows[index] for index in part], call) for part in parts))
+        for part, of_part in zip(parts, answered, strict=True):
+            outcomes.update(zip(part, of_part, strict=True))
+        return [outcomes[index] for index in range(len(windows))]
 
     def _parts(self, windows: Sequence[Window], limit: int) -> Iterator[list[int]]:
         """Indices of the windows of each request: frames of one size, at most ``limit`` windows, and MAX_NEW_BYTES
@@ -154,22 +128,24 @@ class WindowScorer:
         sent = [pixels for digest, pixels in new.items() if digest not in self._remembered]
         try:
             results = await self._request(windows, sent, call)
-        except (InvalidSampleError, InferenceFailedError):
-            self._remembered.forget(digests)
-            return await self._in_whole(windows, digests, call)
+        except (InvalidSampleError, InferenceFailedError):  # perhaps as the server does not know them: all are sent
+            for digest in digests:
+                self._remembered.pop(digest, None)
+            outcomes = await self._whole(windows, call)
+            if not any(isinstance(outcome, RewardError) for outcome in outcomes):
+                self._remember(digests)
+            return outcomes
         except RewardError as error:
             return for_each(error, len(windows))
-        self._remembered.add(digests)
+        self._remember(digests)
         return results
 
-    async def _in_whole(
-        self, windows: Sequence[Window], digests: Sequence[bytes], call: Call
-    ) -> Sequence[Result | RewardError]:
-        """The outcomes, all pixels sent; after that the server knows them."""
-        outcomes = await self._whole(windows, call)
-        if not any(isinstance(outcome, RewardError) for outcome in outcomes):
-            self._remembered.add(digests)
-        return outcomes
+    def _remember(self, digests: Iterable[bytes]) -> None:
+        for digest in digests:
+            self._remembered[digest] = None
+            self._remembered.move_to_end(digest)
+        while len(self._remembered) > MAX_REMEMBERED:
+            self._remembered.popitem(last=False)
 
     async def _request(
         self, windows: Sequence[Window], sent: Sequence[UInt8Array], call: Call

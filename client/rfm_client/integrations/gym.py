@@ -28,7 +28,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.integrations.episode import ClientSource, Episode, Info, RewardOptions, Scorer
+from rfm_client.integrations.rewards import ClientSource, Info, PaidEpisode, Payer, RewardOptions
 
 try:
     import gymnasium
@@ -67,11 +67,11 @@ class RewardModelWrapper(gymnasium.Wrapper):
         check_kind(env, gymnasium.Env)
         check_frame_source(options, env.render_mode, env.observation_space)
         super().__init__(env)
-        self._scorer = Scorer(client, options)
+        self._payer = Payer(client, options)
         self._options = options
         self._task = task
         self._autoresets = _autoresets(env)
-        self._episode: Episode | None = None
+        self._episode: PaidEpisode | None = None
         self._is_whole = False  # all frames of the episode are kept
         self._has_ended = False
 
@@ -93,9 +93,9 @@ class RewardModelWrapper(gymnasium.Wrapper):
             return observation, 0.0, terminated, truncated, self._begin(observation, info)
         if self._has_ended:
             _check_shows_its_end(info)
-        episode.add(self._frame(observation), self._scorer.fit)
+        episode.add(self._frame(observation))
         self._is_whole = True
-        self._scorer.score({episode: self._has_ended})
+        self._payer.score({episode: self._has_ended})
         reward = episode.reward(float(env_reward))
         scores = {**episode.info(), "env_reward": float(env_reward)}
         return observation, reward, bool(terminated or episode.succeeded), truncated, {**info, INFO: scores}
@@ -104,7 +104,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
         """Cancels what is open, and closes the environment, and the client if it was made here."""
         if self._episode is not None:
             self._episode.end()
-        self._scorer.close()
+        self._payer.close()
         super().close()
 
     def _begin(self, observation: Any, info: Info) -> Info:
@@ -112,13 +112,12 @@ class RewardModelWrapper(gymnasium.Wrapper):
         if self._episode is not None:
             self._episode.end()
         task = self._task if isinstance(self._task, str) else self._task(info)
-        self._episode = Episode(self._options, task)
-        self._episode.add(self._frame(observation), self._scorer.fit)
+        self._episode = self._payer.begin(task, self._frame(observation))
         self._is_whole = True
-        self._scorer.score({self._episode: False})
+        self._payer.score({self._episode: False})
         return {**info, INFO: self._episode.info()}
 
-    def _checked_episode(self) -> Episode:
+    def _checked_episode(self) -> PaidEpisode:
         """The episode whose next frame the next step shows. Raises ResetNeeded if there is none."""
         if self._episode is None:
             raise ResetNeeded("step: expected a reset before it")

@@ -13,11 +13,11 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWra
 from gymnasium.vector.utils import iterate
 
 from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.contract.samples import UInt8Array
-from rfm_client.integrations.episode import ClientSource, Episode, Info, RewardOptions, Scorer
+from rfm_client.episodes.scoring import copied
 from rfm_client.integrations.gym import DEFAULTS, INFO, LOST, check_frame_source, check_kind
+from rfm_client.integrations.rewards import ClientSource, Info, PaidEpisode, Payer, RewardOptions
 
-Episodes: TypeAlias = dict[int, Episode]  # by number of their environment
+OfEnvs: TypeAlias = dict[int, PaidEpisode]  # by number of the environment
 Mask: TypeAlias = npt.NDArray[np.bool_]
 
 _INSTEAD_OF_SAME_STEP = "make the vector with autoreset_mode=AutoresetMode.NEXT_STEP"
@@ -54,11 +54,11 @@ class RewardModelVectorWrapper(VectorWrapper):
         if len(tasks) != env.num_envs:
             raise ValueError(f"task: expected one for each of the {env.num_envs} environments, got {len(tasks)}")
         super().__init__(env)  # a wrapper that is refused must not close the environments when it is collected
-        self._scorer = Scorer(client, options)
+        self._payer = Payer(client, options)
         self._options = options
         self._autoreset_mode = autoreset_mode
         self._tasks = tasks
-        self._episodes: dict[int, Episode] = {}
+        self._episodes: OfEnvs = {}
         self._whole: Mask = np.zeros(env.num_envs, np.bool_)  # all frames of the episode are kept
         self._ended: Mask = np.zeros(env.num_envs, np.bool_)
 
@@ -74,8 +74,8 @@ class RewardModelVectorWrapper(VectorWrapper):
         for episode in [self._episodes[index] for index in indices if index in self._episodes]:
             episode.end()
         shown = self._shown(observations)
-        fresh = {index: self._begin(index, shown[index])[0] for index in indices}
-        self._scorer.score(dict.fromkeys(fresh.values(), False))
+        fresh = {index: self._begin(index, self._frame(shown[index])) for index in indices}
+        self._payer.score(dict.fromkeys(fresh.values(), False))
         return observations, self._with_scores(infos, fresh)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, Info]:
@@ -86,7 +86,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         observations, env_rewards, terminations, truncations, infos = self.env.step(actions)
         self._ended = ended = terminations | truncations
         stepped, fresh, final = self._added(self._shown(observations), infos, resetting)
-        self._scorer.score(
+        self._payer.score(
             {episode: bool(ended[index]) for index, episode in stepped.items()} | dict.fromkeys(fresh.values(), False)
         )
         rewards = np.zeros(self.num_envs)
@@ -100,7 +100,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         """Cancels what is open, and closes the environments, and the client if it was made here."""
         for episode in self._episodes.values():
             episode.end()
-        self._scorer.close()
+        self._payer.close()
         super().close(**kwargs)
 
     def _check_can_reset(self, twice: Mask) -> None:
@@ -134,7 +134,7 @@ class RewardModelVectorWrapper(VectorWrapper):
     def _succeeded(self) -> Mask:
         return np.array([episode.succeeded for _, episode in sorted(self._episodes.items())], np.bool_)
 
-    def _added(self, shown: Sequence[Any], infos: Info, resetting: Mask) -> tuple[Episodes, Episodes, Collection[int]]:
+    def _added(self, shown: Sequence[Any], infos: Info, resetting: Mask) -> tuple[OfEnvs, OfEnvs, Collection[int]]:
         """Adds the frames of a step, each as soon as it is made: it may be drawn into the array of the one before.
 
         The episodes that went on, those that began, and the environments that did both (SAME_STEP).
@@ -143,23 +143,26 @@ class RewardModelVectorWrapper(VectorWrapper):
         stepped = {index: self._episodes[index] for index in np.flatnonzero(~resetting).tolist()}
         last = {}
         for index, episode in stepped.items():
-            last[index] = episode.add(self._frame(final.get(index, shown[index])), self._scorer.fit)
+            frame = self._frame(final.get(index, shown[index]))
+            if index in final:
+                last[index] = frame = copied(frame)
+            episode.add(frame)
             self._whole[index] = index not in final
         fresh = {}
         for index in (*np.flatnonzero(resetting).tolist(), *final):
             if index not in final:
                 self._episodes[index].end()
-            fresh[index], first = self._begin(index, shown[index])
+            frame = self._frame(shown[index])
+            fresh[index] = self._begin(index, frame)
             if index in final:
-                _check_differ(index, last[index], first)
+                _check_differ(index, last[index], copied(frame))
         return stepped, fresh, final
 
-    def _begin(self, index: int, shown: Any) -> tuple[Episode, Sequence[UInt8Array]]:
-        """A new episode and its first frame, of each camera."""
-        self._episodes[index] = Episode(self._options, self._tasks[index], index)
-        frames = self._episodes[index].add(self._frame(shown), self._scorer.fit)
+    def _begin(self, index: int, frame: Any) -> PaidEpisode:
+        """A new episode, whose first frame this is."""
+        self._episodes[index] = self._payer.begin(self._tasks[index], frame, index)
         self._whole[index] = True
-        return self._episodes[index], frames
+        return self._episodes[index]
 
     def _shown(self, observations: Any) -> Sequence[Any]:
         """What each environment shows: its rendered frame, or its observation."""
@@ -184,15 +187,16 @@ class RewardModelVectorWrapper(VectorWrapper):
             raise InvalidSampleError.at("infos", expected, f"none in {list(infos)}; {_INSTEAD_OF_SAME_STEP}")
         return final
 
-    def _with_scores(self, infos: Info, fresh: Mapping[int, Episode]) -> Info:
+    def _with_scores(self, infos: Info, fresh: OfEnvs) -> Info:
         for index, episode in fresh.items():
             infos = self._add_info(infos, {INFO: episode.info()}, index)
         return infos
 
 
-def _check_differ(index: int, last: Sequence[UInt8Array], first: Sequence[UInt8Array]) -> None:
+def _check_differ(index: int, last: Any, first: Any) -> None:
     """Raises InvalidSampleError where a reset has drawn over the last frame of the episode before."""
-    if any(np.array_equal(*pair) for pair in zip(last, first, strict=True)):
+    of_cameras = [(last[camera], first[camera]) for camera in last] if isinstance(last, Mapping) else [(last, first)]
+    if any(np.array_equal(*pair) for pair in of_cameras):
         got = "the first frame of the next one: the environment seems to draw into the array that it has returned"
         remedy = f"let it return a copy of its observation, or {_INSTEAD_OF_SAME_STEP}"
         raise InvalidSampleError.at(f"final_obs[{index}]", "the last frame of the ended episode", f"{got}; {remedy}")

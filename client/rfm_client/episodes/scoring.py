@@ -1,0 +1,292 @@
+# SPDX-License-Identifier: MIT
+"""How the steps of an episode are scored: the options, the frames so far, the questions about them, and the scores.
+
+Nothing here sends anything: ``episodes.py`` and the Gymnasium wrappers do. N episodes, H x W pixels.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import TYPE_CHECKING, Any, TypedDict, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.contract.errors import InvalidSampleError, RewardError
+from rfm_client.contract.frame_size import FrameSize
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.numbers import checked_count, checked_share
+from rfm_client.contract.results import SUCCESS_THRESHOLD, FrameScores, ProgressResult, Result
+from rfm_client.contract.samples import Float32Array, UInt8Array, as_array
+from rfm_client.data.camera_fusion import FUSES, Fuse, check_fuse, checked_cameras
+from rfm_client.data.orientation import Orient, Orientation, turned
+from rfm_client.data.prefixes import of_frames
+from rfm_client.data.resize import resize_frames
+from rfm_client.data.sampling import Prefix, Rule, Sampling
+from rfm_client.episodes.windows import NamedFrame, Window
+
+if TYPE_CHECKING:
+    from rfm_client.episodes.live import LiveEpisode, LiveView
+
+
+@dataclass(frozen=True)
+class SuccessRule:
+    """A scored step succeeds when most of the last frames shown to the model have a success of ``threshold`` or more.
+    Raises ValueError.
+
+    threshold: a probability, 0..1
+    last: how many frames vote. Padding and repeated frames count once.
+    """
+
+    threshold: float = SUCCESS_THRESHOLD
+    last: int = 1
+
+    def __post_init__(self) -> None:
+        checked_share("threshold", self.threshold)
+        checked_count("last", self.last)
+
+
+class EpisodeSettings(TypedDict, total=False):
+    """The fields of EpisodeOptions, as arguments."""
+
+    sampling: Rule | None
+    frames: int | None
+    cameras: Sequence[str]
+    fuse: Fuse
+    orient: Orientation | Mapping[str, Orientation]
+    resize: bool
+    success: SuccessRule
+    live: LiveView | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeOptions:
+    """How each step of an episode is scored. Raises ValueError for contradictory options.
+
+    sampling: which frames of the episode so far a model is shown: a rule of ``rfm_client.data.sampling``; None: that of
+        the checkpoint's training
+    frames: the rule's number of frames; None: the checkpoint's ``ModelInfo.max_frames``. If it has none, a rule
+        that needs a number raises ValueError at the first step
+    cameras: names of the cameras whose frames each step brings; none: there is one, without a name
+    fuse: how the scores of several cameras become one
+    orient: how frames are turned so that they are upright, before all else: an Orientation, or such by camera; a camera
+        that is not named: not at all
+    resize: frames are made as small as the checkpoint reads them before they are kept and sent (needs Pillow);
+        ReWiND's scores differ slightly from those of the frames as they are
+    success: when a step counts as a success
+    live: where each step is reported to, of several cameras the first one's frame; it delays nothing
+    """
+
+    sampling: Rule | None = None
+    frames: int | None = None
+    cameras: Sequence[str] = ()
+    fuse: Fuse = "mean"
+    orient: Orientation | Mapping[str, Orientation] = "none"
+    resize: bool = False
+    success: SuccessRule = SuccessRule()
+    live: LiveView | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cameras", checked_cameras(self.cameras))
+        check_fuse(self.fuse)
+        Sampling.of(self.sampling, self.frames, trained_frames=1)  # whether rule and number go together
+        unknown = [camera for camera in self._orient.cameras if camera not in self.cameras]
+        if unknown:
+            cameras = list(self.cameras)
+            expected = f"some of the cameras {cameras}" if cameras else "one orientation, as cameras names none"
+            raise ValueError(f"orient: expected {expected}, got {', '.join(map(repr, unknown))}")
+
+    @property
+    def orientations(self) -> list[Orientation]:
+        """How the frames of each camera are turned."""
+        said = self._orient
+        return [said.cameras.get(camera, said.default or "none") for camera in self.cameras or ("",)]
+
+    @property
+    def needs_model_info(self) -> bool:
+        """Whether it depends on the checkpoint what is shown."""
+        return self.resize or self.sampling is None or self.frames is None
+
+    def sampling_for(self, info: ModelInfo | None) -> Sampling:
+        """The rule with its number of frames. info: of the checkpoint, if ``needs_model_info``. Raises ValueError."""
+        if info is None:
+            return Sampling.of(self.sampling, self.frames, None)
+        return Sampling.of(self.sampling, self.frames, info.max_frames, trained_padding=info.trained_padding)
+
+    @property
+    def _orient(self) -> Orient:
+        return Orient(cameras=self.orient) if isinstance(self.orient, Mapping) else Orient(self.orient)
+
+
+@dataclass(frozen=True)
+class StepScore:
+    """The score of one episode at its newest frame.
+
+    progress: share of the task done, 0..1
+    success: probability that the task is done; NaN: the checkpoint does not predict it
+    succeeded: what the success rule says; never true without success
+    step: number of the frame, from 0
+    ms: how long the answer took, milliseconds
+    """
+
+    progress: float
+    success: float
+    succeeded: bool
+    step: int
+    ms: float
+
+
+@dataclass(frozen=True, eq=False)
+class StepScores:
+    """The scores of N episodes, each at its newest frame.
+
+    progress, success: float32 [N], as of StepScore; NaN where ``mask`` left an episode out
+    succeeded: bool [N]; False there
+    step: int64 [N], number of each newest frame, from 0; -1: the episode has none yet
+    ms: how long the answer took, milliseconds
+    """
+
+    progress: Float32Array
+    success: Float32Array
+    succeeded: npt.NDArray[np.bool_]
+    step: npt.NDArray[np.int64]
+    ms: float
+
+    def of(self, index: int) -> StepScore:
+        """The score of one episode."""
+        numbers = float(self.progress[index]), float(self.success[index])
+        return StepScore(*numbers, bool(self.succeeded[index]), int(self.step[index]), self.ms)
+
+
+class EpisodeFrames:
+    """The frames of one episode so far, what they are asked, and who watches.
+
+    index: number of the episode among those beside it, from 0
+    where: how errors name it, as ``episodes[3]``; empty: not at all
+    """
+
+    def __init__(self, task: str, options: EpisodeOptions, index: int = 0, where: str = "") -> None:
+        self.task = task
+        self._options, self._index, self._where = options, index, where
+        self._orientations = options.orientations
+        self._frames: list[tuple[NamedFrame, ...]] = []  # of each camera
+        self._live: LiveEpisode | None = None
+
+    @property
+    def step(self) -> int:
+        """Number of the newest frame, from 0; -1: there is none yet."""
+        return len(self._frames) - 1
+
+    def checked(self, frame: Any, size: FrameSize | None = None) -> tuple[NamedFrame, ...]:
+        """A copy of the next frame of each camera, upright. Raises InvalidSampleError.
+
+        frame: uint8 [H, W, 3]; with cameras, such by name
+        size: what the checkpoint reads: frames are made as small
+        """
+        cameras = self._options.cameras
+        given = {f"frame[{camera!r}]": frame[camera] for camera in cameras} if cameras else {"frame": frame}
+        firsts = self._frames[0] if self._frames else (None,) * len(given)
+        kept = []
+        try:
+            for (where, each), orientation, first in zip(given.items(), self._orientations, firsts, strict=True):
+                pixels = turned(checked_frame(each, where), orientation)
+                if size is not None:
+                    pixels = resize_frames(pixels[np.newaxis], size)[0]
+                if first is not None and first.pixels.shape != pixels.shape:
+                    expected = f"uint8 {list(first.pixels.shape)}, as the episode's first"
+                    expected += "" if size is None else ", or a reset"  # by now another checkpoint may be served
+                    raise InvalidSampleError.at(where, expected, f"uint8 {list(pixels.shape)}")
+                kept.append(NamedFrame(pixels))
+        except InvalidSampleError as error:
+            raise self.located(error) from None
+        return tuple(kept)
+
+    def append(self, frame: tuple[NamedFrame, ...]) -> None:
+        """Adds what ``checked`` gave."""
+        self._frames.append(frame)
+
+    def pop(self) -> None:
+        """Takes the newest frame back."""
+        self._frames.pop()
+
+    def windows(self, prefix: Prefix) -> list[Window]:
+        """What each camera's prefix is asked. Raises InvalidSampleError for a task that is none."""
+        shown = [self._frames[index] for index in prefix.indices]
+        return [Window(of_camera, self.task) for of_camera in zip(*shown, strict=True)]
+
+    def score(self, step: int, prefix: Prefix, outcomes: Sequence[Result | RewardError], ms: float) -> StepScore:
+        """The score of a step of the answers to its ``windows``. Raises the RewardError of one that failed; ValueError
+        if the checkpoint does not predict progress.
+        """
+        for outcome in outcomes:
+            if isinstance(outcome, RewardError):
+                raise self.located(outcome)
+        shown = [of_frames(result, prefix) for result in cast("Sequence[ProgressResult]", outcomes)]
+        fuse, rule = FUSES[self._options.fuse], self._options.success
+        fused = FrameScores(
+            progress=fuse([each.progress for each in shown], axis=0),
+            success=fuse([each.success for each in shown], axis=0),
+        )
+        is_predicted = not np.isnan(fused.success).any()
+        succeeded = is_predicted and fused.succeeded(last=rule.last, threshold=rule.threshold)
+        return StepScore(fused.last_progress, float(fused.success[-1]), succeeded, step, ms)
+
+    def report(self, score: StepScore) -> None:
+        """Tells who watches the score of a step."""
+        view = self._options.live
+        if view is not None:
+            self._live = self._live or view.episode(self.task, self._index, self._options.success.threshold)
+            self._live.add(self._frames[score.step][0].pixels, score)
+
+    def end(self) -> None:
+        """Tells who watches that no step will follow."""
+        if self._live is not None:
+            self._live.end()
+            self._live = None
+
+    def located(self, error: RewardError) -> RewardError:
+        """The error, which says which episode it is about if a sample is at fault."""
+        return error.inside(self._where) if self._where and isinstance(error, InvalidSampleError) else error
+
+
+class StepQuestion:
+    """What is asked about the newest frames of some episodes at a time.
+
+    asked_s: since when the caller waits, by ``time.perf_counter``
+
+    Raises InvalidSampleError for a task that is none.
+    """
+
+    def __init__(self, episodes: Sequence[EpisodeFrames], sampling: Sampling, asked_s: float) -> None:
+        self._asked_s = asked_s
+        prefixes = [sampling.prefix(episode.step) for episode in episodes]
+        self._asked = [
+            (each, each.step, prefix, each.windows(prefix)) for each, prefix in zip(episodes, prefixes, strict=True)
+        ]
+        self.windows = [window for *_, windows in self._asked for window in windows]
+
+    def scores(self, outcomes: Sequence[Result | RewardError]) -> list[StepScore]:
+        """The score of each episode, of the outcomes of ``windows``. Raises RewardError."""
+        left, ms = iter(outcomes), (time.perf_counter() - self._asked_s) * 1e3
+        return [
+            episode.score(step, prefix, list(islice(left, len(windows))), ms)
+            for episode, step, prefix, windows in self._asked
+        ]
+
+
+def checked_frame(frame: Any, where: str) -> UInt8Array:
+    """A copy of a frame: an environment may draw into the same array again. Raises InvalidSampleError."""
+    kept = copied(frame)
+    if kept.dtype != np.uint8 or kept.ndim != 3 or kept.shape[2] != 3 or 0 in kept.shape:
+        raise InvalidSampleError.at(where, "uint8 [H, W, 3]", f"{kept.dtype} {list(kept.shape)}")
+    return cast(UInt8Array, kept)
+
+
+def copied(frame: Any) -> Any:
+    """A copy of a frame, or of such by camera, that may be scored later."""
+    if isinstance(frame, Mapping):
+        return {camera: np.array(as_array(each)) for camera, each in frame.items()}
+    return np.array(as_array(frame))
