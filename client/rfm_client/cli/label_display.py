@@ -21,8 +21,7 @@ from rfm_client.cli.show import print_tables, table
 from rfm_client.contract.errors import RewardError
 from rfm_client.data.datasets.opening import open_dataset
 from rfm_client.data.datasets.protocol import Dataset, Episode
-from rfm_client.integrations.episode_recordings import record_episodes
-from rfm_client.integrations.recording import load_rerun
+from rfm_client.integrations.recording import load_rerun, record_episodes
 from rfm_client.labelling.episode_scores import episode_columns
 from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.frame_memory import FrameMemory

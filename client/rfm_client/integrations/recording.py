@@ -1,22 +1,26 @@
 # SPDX-License-Identifier: MIT
 """Frames and their scores as a recording of Rerun (.rrd): one timeline, on which the curves and the film move together.
 
-Needs ``rfm-client[rerun]``. T frames, S of them scored.
+Needs ``rfm-client[rerun]``; labelled episodes need ``rfm-client[label]``, too. T frames, S of them scored.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.results import FrameScores
 from rfm_client.contract.samples import UInt8Array
+
+if TYPE_CHECKING:
+    from rfm_client.data.datasets.protocol import Dataset
+    from rfm_client.labelling.finished_episodes import Parts
+    from rfm_client.labelling.plan import Item, Plan
 
 TIME = "video_time"  # a timeline: seconds of the video
 FRAME = "frame"  # or, where they are not known, the number of the frame
@@ -90,9 +94,7 @@ class Recording:
     def __enter__(self) -> Recording:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_raised: object) -> None:
         self.close()
 
     def _open(self) -> None:
@@ -108,3 +110,33 @@ class Recording:
 
     def _log(self, parts: Sequence[str], what: Any, *, static: bool = False) -> None:
         self._stream.log(list(parts), what, static=static, strict=True)  # or it would only warn of an error
+
+
+def record_episodes(folder: Path, dataset: Dataset, plan: Plan, parts: Parts) -> Iterator[Path]:
+    """The file of each episode of the plan that is labelled, as it is written. The frames are decoded once more.
+
+    Of several cameras each has its frames and its own scores beside the fused ones.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    finished = parts.finished(plan.items)
+    for item in plan.items:
+        if item.key in finished:
+            yield _record(folder, dataset, item, parts.read(item), plan.recipe.cameras)
+
+
+def _record(folder: Path, dataset: Dataset, item: Item, labels: Any, cameras: Sequence[str]) -> Path:
+    file = folder / f"episode_{item.episode.index:06d}.rrd"
+    with Recording(file) as recording:
+        films = {camera: dataset.frames(item.episode, camera) for camera in cameras}
+        recording.add((), _scores(labels, ""), films if len(films) > 1 else {"": films[cameras[0]]})
+        for camera in films if len(films) > 1 else ():
+            recording.add((camera,), _scores(labels, f".{camera}"), {})
+    return file
+
+
+def _scores(labels: Any, suffix: str) -> FrameScores:
+    """The columns of a part whose names end so; NaN: not predicted."""
+    progress = labels[PROGRESS + suffix].to_numpy()
+    name = SUCCESS + suffix
+    success = labels[name].to_numpy() if name in labels.column_names else np.full_like(progress, np.nan)
+    return FrameScores(progress=progress, success=success)
