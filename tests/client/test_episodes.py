@@ -115,56 +115,45 @@ def recorded(served: Served) -> Iterator[tuple[Recording, RewardClient]]:
         yield transport, client
 
 
-def of_rule(rule: Rule, frames: int = 5) -> Sampling:
-    """The rule with few frames; ``all`` takes no number, and the first ReWiND code's rules have their own."""
-    return Sampling(rule, None if rule == "all" or rule.startswith("rewind") else frames)
+def settled(model: str, rule: Rule) -> tuple[Sampling, UInt8Array, float]:
+    """A rule with few frames, a film longer than that, and how far scores may differ."""
+    if model != MODEL:
+        return Sampling(rule, 4), film(3, 40, (56, 84)), VLM_TOLERANCE
+    frames = film(RULES.index(rule), 16 if rule == "all" else 40)  # the checkpoint takes 16 frames
+    return Sampling(rule, None if rule == "all" or rule.startswith("rewind") else 7), frames, TOLERANCE
 
 
-@pytest.mark.parametrize("rule", RULES)
-def test_steps_have_the_scores_of_the_whole(served: Served, protocol: str, rule: Rule) -> None:
-    count = 16 if rule == "all" else 40  # the checkpoint takes 16 frames
-    sampling, frames = of_rule(rule, 7), film(RULES.index(rule), count)
-    given = None if rule == "all" else sampling.frames
-    with served.client(protocol, MODEL) as client, client.episode(TASK, sampling=rule, frames=given) as episode:
-        assert_same(online(episode, frames), offline(client, frames, sampling))
+STEPPED = [
+    *((MODEL, rule, "grpc") for rule in RULES),
+    *((model, rule, "http") for model in (IMAGES, VIDEO) for rule in ("rint_pad", "linspace_trunc")),
+    (IMAGES, "rint_pad", "grpc"),
+]
 
 
-@pytest.mark.parametrize("rule", ["rint_pad", "linspace_trunc"])
-@pytest.mark.parametrize("model", [IMAGES, VIDEO])
-def test_steps_of_a_vision_language_checkpoint_have_the_scores_of_the_whole(
-    served: Served, protocol: str, model: str, rule: Rule
-) -> None:
-    sampling, frames = of_rule(rule, 4), film(3, 40, (56, 84))
-    with served.client(protocol, model) as client, client.episode(TASK, sampling=rule, frames=4) as episode:
+@pytest.mark.parametrize(("model", "rule", "protocol"), STEPPED)
+def test_steps_have_the_scores_of_the_whole(served: Served, model: str, rule: Rule, protocol: str) -> None:
+    sampling, frames, tolerance = settled(model, rule)
+    number = None if rule == "all" else sampling.frames
+    with served.client(protocol, model) as client, client.episode(TASK, sampling=rule, frames=number) as episode:
         assert client.model_info(frames=True).by_digest
-        assert_same(online(episode, frames), offline(client, frames, sampling), VLM_TOLERANCE)
+        assert_same(online(episode, frames), offline(client, frames, sampling), tolerance)
 
 
-@pytest.mark.parametrize("model", [IMAGES, VIDEO])
-def test_a_step_of_a_vision_language_checkpoint_sends_its_new_frame_alone(served: Served, model: str) -> None:
-    transport, frames = Recording(served.url("grpc")), film(4, 12, (56, 84))
-    before = counted(served.endpoints, "frames_encoded_total", f"{model}_frames")
+@pytest.mark.parametrize(
+    ("model", "encodes"), [(MODEL, f"{MODEL}_encoder"), (IMAGES, f"{IMAGES}_frames"), (VIDEO, f"{VIDEO}_frames")]
+)
+def test_a_step_sends_and_encodes_its_new_frame_alone(served: Served, model: str, encodes: str) -> None:
+    transport, frames = Recording(served.url("grpc")), film(100, 12, (56, 84))
+    before = counted(served.endpoints, "frames_encoded_total", encodes)
     with RewardClient([], transports=[transport], model=model) as client, client.episode(TASK, frames=4) as episode:
         for frame in frames:
             episode.add(frame)
     assert [len(inputs[wire.FRAMES][0]) for inputs in transport.requests] == [1] * len(frames)
-    encoded = counted(served.endpoints, "frames_encoded_total", f"{model}_frames") - before
+    assert max(transport.num_bytes) < frames[0].nbytes + 512
+    encoded = counted(served.endpoints, "frames_encoded_total", encodes) - before
     shown = [Sampling("rint_pad", 4).prefix(t).indices for t in range(len(frames))]
     pairs = {tuple(pair) for indices in shown for pair in indices.reshape(-1, 2).tolist()}
-    assert encoded == (len(frames) if model == IMAGES else 2 * len(pairs))
-
-
-def test_a_step_sends_and_encodes_its_new_frame_alone(served: Served, recorded: tuple[Recording, RewardClient]) -> None:
-    transport, client = recorded
-    frames = film(100, 24, (64, 96))
-    before = counted(served.endpoints, "frames_encoded_total")
-    with client.episode(TASK, frames=8) as episode:
-        for frame in frames:
-            episode.add(frame)
-    assert counted(served.endpoints, "frames_encoded_total") - before == len(frames)
-    assert [len(inputs[wire.FRAMES][0]) for inputs in transport.requests] == [1] * len(frames)
-    assert max(transport.num_bytes) < frames[0].nbytes + 512
-    assert counted(served.endpoints, "feature_cache_hits_total") >= 7 * 16
+    assert encoded == (2 * len(pairs) if model == VIDEO else len(frames))
 
 
 def test_equal_frames_of_another_episode_are_not_encoded_again(
@@ -179,17 +168,10 @@ def test_equal_frames_of_another_episode_are_not_encoded_again(
         np.testing.assert_allclose(online(episode, frames), first, atol=TOLERANCE)  # sent again: another client
     with client.episode(TASK, frames=4) as episode:
         np.testing.assert_allclose(online(episode, frames), first, atol=TOLERANCE)  # not even sent
+    with served.client("http", MODEL) as plain:
+        plain.progress(Trajectory(frames=frames[::-1], task=TASK))  # a caller of plain tensors uses the cache, too
     assert counted(served.endpoints, "frames_encoded_total") == before
     assert [inputs[wire.FRAMES].shape for inputs in transport.requests[-5:]] == [(1, 1, 1, 1, 3)] * 5
-
-
-def test_callers_of_plain_tensors_notice_nothing_and_fill_the_cache_too(served: Served) -> None:
-    frames = film(102, 6)
-    with served.client("grpc", MODEL) as client:
-        client.progress(Trajectory(frames=frames, task=TASK))
-        before = counted(served.endpoints, "frames_encoded_total")
-        client.progress(Trajectory(frames=frames[::-1], task=TASK))
-        assert counted(served.endpoints, "frames_encoded_total") == before
 
 
 def test_episodes_side_by_side_are_one_request_and_score_alike(
@@ -281,21 +263,14 @@ def test_a_frame_that_is_wrong_leaves_the_episode_as_it_was(served: Served) -> N
             episode.add(np.zeros((2, 2, 3)))
         with pytest.raises(InvalidSampleError, match=r"expected uint8 \[40, 56, 3\], as the episode's first, got"):
             episode.add(film(0, 1, (8, 8))[0])
-        assert_same(online_from(episode, frames[1:], 1), later(offline(client, frames, Sampling("rint_pad", 4)), 1))
+        scores = [episode.add(frame) for frame in frames[1:]]
+        assert [score.step for score in scores] == [1, 2]
+        expected = offline(client, frames, Sampling("rint_pad", 4)).progress[1:]
+        np.testing.assert_allclose([score.progress for score in scores], expected, rtol=0, atol=TOLERANCE)
         episodes = client.episodes(2, TASK, frames=4)
         with pytest.raises(InvalidSampleError, match=r"^episodes\[1\]\.frame: expected uint8 \[H, W, 3\]"):
             episodes.add([frames[0], np.zeros((2, 2, 3))])
         assert episodes.add(frames[:2]).step.tolist() == [0, 0]
-
-
-def online_from(episode: Episode, frames: UInt8Array, step: int) -> tuple[list[float], list[float]]:
-    scores = [episode.add(frame) for frame in frames]
-    assert scores[0].step == step
-    return [score.progress for score in scores], [score.success for score in scores]
-
-
-def later(result: ProgressResult, start: int) -> ProgressResult:
-    return ProgressResult(progress=result.progress[start:], success=result.success[start:])
 
 
 def test_the_newest_frame_takes_the_place_of_one_that_waits(served: Served) -> None:
@@ -313,23 +288,6 @@ def test_the_newest_frame_takes_the_place_of_one_that_waits(served: Served) -> N
             episode.add_nowait(np.zeros((2, 2, 3))).result()
         episode.reset("open the drawer")
         assert episode.add(frames[0]).step == 0
-
-
-def test_an_episode_for_asyncio_scores_alike(served: Served) -> None:
-    frames = film(109, 4)
-
-    async def play() -> list[float]:
-        async with (
-            AsyncRewardClient(served.url("grpc"), model=MODEL) as client,
-            client.episode(TASK, frames=4) as episode,
-        ):
-            scores = [await episode.add(frame) for frame in frames[:3]]
-            scores.append(await episode.add_nowait(frames[3]))
-            return [score.progress for score in scores]
-
-    with served.client("grpc", MODEL) as client:
-        expected = offline(client, frames, Sampling("rint_pad", 4))
-    np.testing.assert_allclose(asyncio.run(play()), expected.progress, rtol=0, atol=TOLERANCE)
 
 
 def test_frames_stay_in_the_order_in_which_they_were_added(served: Served) -> None:
@@ -416,25 +374,31 @@ def test_a_request_of_very_many_frames_is_refused_before_memory_is_taken(served:
             asyncio.run(ask(**more))
 
 
-def test_a_task_or_model_that_is_not_there_is_told(served: Served) -> None:
-    frames = film(110, 1)
-    with served.client("grpc", MODEL) as client, pytest.raises(InvalidSampleError, match=r"task: expected a task"):
-        client.episode(" ", frames=4).add(frames[0])
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "no task": ({"task": " "}, "task: expected a task"),
+    "not UTF-8": ({"task": "\ud800"}, "task: expected text that UTF-8 can encode"),
+    "a camera": ({"cameras": "front"}, "^cameras: expected a sequence of names, got 'front'$"),
+    "a camera's frame": ({"frame": {"a": film(0, 1)[0]}}, r"^frames: .* of one camera .*, got frames of \['a'\]"),
+    "orient": (
+        {"cameras": ["front"], "orient": {"wrist": "rotate180"}},
+        r"^orient: expected some of the cameras \['front'\], got 'wrist'$",
+    ),
+}
+
+
+@pytest.mark.parametrize(("given", "message"), REFUSED.values(), ids=REFUSED)
+def test_what_cannot_be_right_is_refused(served: Served, given: dict[str, Any], message: str) -> None:
+    given = {"task": TASK, "frame": film(0, 1)[0], "frames": 4, **given}
+    with served.client("grpc", MODEL) as client, pytest.raises(ValueError, match=message):
+        frame = given.pop("frame")
+        client.episode(**given).add(frame)
+
+
+def test_a_model_that_is_not_served_is_told(served: Served) -> None:
     with served.client("grpc", "nobody") as client, pytest.raises(ModelNotFoundError):
-        client.episode(TASK, frames=4).add(frames[0])
+        client.episode(TASK, frames=4).add(film(0, 1)[0])
     with served.client("grpc", MODEL) as client, pytest.raises(ValueError, match="expected one for each of 3 episodes"):
         client.episodes(3, ["a", "b"])
-    with pytest.raises(ValueError, match=r"cameras: expected a sequence of names, got 'front'"):
-        client.episode(TASK, cameras="front")
-    with pytest.raises(ValueError, match=r"^orient: expected some of the cameras \['front'\], got 'wrist'$"):
-        client.episode(TASK, cameras=["front"], orient={"wrist": "rotate180"})
-    with served.client("grpc", MODEL) as client:
-        with pytest.raises(
-            InvalidSampleError, match=r"frames: expected frames of one camera .*, got frames of \['a'\]"
-        ):
-            client.episode(TASK, frames=4).add({"a": frames[0]})
-        with pytest.raises(InvalidSampleError, match="task: expected text that UTF-8 can encode"):
-            client.episode("\ud800", frames=4).add(frames[0])
 
 
 def repository_of(folder: Path, checkpoint: str = MODEL, **changes: Any) -> Path:
@@ -442,21 +406,6 @@ def repository_of(folder: Path, checkpoint: str = MODEL, **changes: Any) -> Path
     repository = folder / "model_repository"
     rfm_export.export(config.checkpoint, repository, replace(serve_config(config, MODEL), **changes))
     return repository
-
-
-@pytest.mark.slow
-def test_an_episode_goes_on_when_its_server_was_restarted(tmp_path: Path, protocol: str) -> None:
-    repository, endpoints = repository_of(tmp_path), Endpoints.free()
-    frames = film(111, 9)
-    url = endpoints.grpc_url if protocol == "grpc" else endpoints.http_url
-    with RewardClient(url, model=MODEL) as client, client.episode(TASK, frames=4) as episode:
-        with BriefServer(repository, endpoints, find_installation()):
-            before = [episode.add(frame) for frame in frames[:4]]
-        with BriefServer(repository, endpoints, find_installation()):
-            after = [episode.add(frame) for frame in frames[4:]]
-            scores = [*before, *after]
-            expected = offline(client, frames, Sampling("rint_pad", 4))
-    assert_same(([score.progress for score in scores], [score.success for score in scores]), expected)
 
 
 @pytest.mark.slow
@@ -483,34 +432,17 @@ def test_an_episode_goes_on_when_the_process_that_knew_its_frames_was_killed(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("checkpoint", "encoder", "tolerance"),
-    [(MODEL, f"{MODEL}_encoder", TOLERANCE), (IMAGES, f"{MODEL}_frames", VLM_TOLERANCE)],
-)
-def test_an_episode_goes_on_between_two_instances_that_know_different_frames(
-    tmp_path: Path, checkpoint: str, encoder: str, tolerance: float
+def test_servers_and_instances_that_know_different_frames_and_a_server_without_a_cache_score_alike(
+    tmp_path: Path,
 ) -> None:
-    """As on two GPUs."""
-    repository, endpoints, frames = repository_of(tmp_path, checkpoint), Endpoints.free(), film(119, 12)
-    configure(repository / encoder, instances=2)
-    with (
-        BriefServer(repository, endpoints, find_installation()),
-        RewardClient(endpoints.grpc_url, model=MODEL) as client,
-    ):
-        for _ in range(3):
-            with client.episode(TASK, frames=4) as episode:
-                assert_same(online(episode, frames), offline(client, frames, Sampling("rint_pad", 4)), tolerance)
-
-
-@pytest.mark.slow
-def test_two_servers_that_know_different_frames_and_one_without_a_cache_score_alike(tmp_path: Path) -> None:
     frames = film(112, 12)
-    caching = repository_of(tmp_path / "caching")
+    two_instances = repository_of(tmp_path / "two")  # as on two GPUs
+    configure(two_instances / f"{MODEL}_encoder", instances=2)
     plain = repository_of(tmp_path / "plain", feature_cache_mb=0)
     first, second, third = Endpoints.free(), Endpoints.free(), Endpoints.free()
     with (
-        BriefServer(caching, first, find_installation()),
-        BriefServer(caching, second, find_installation()),
+        BriefServer(two_instances, first, find_installation()),
+        BriefServer(two_instances, second, find_installation()),
         BriefServer(plain, third, find_installation()),
         RewardClient([each.grpc_url for each in (first, second, third)], model=MODEL) as client,
     ):

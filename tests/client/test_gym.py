@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Rewards for one Gymnasium environment."""
+"""Rewards for one Gymnasium environment, with steps that wait for their answers and steps that do not."""
 
 from __future__ import annotations
 
-from functools import partial
+import subprocess
+import sys
 from typing import Any
 
 import gymnasium as gym
@@ -16,86 +17,54 @@ from environments import (
     MAX_FRAMES,
     MODEL,
     PUSH_RIGHT,
-    SIZE,
     TASK,
     Camera,
+    LateClient,
     assert_close,
     cart_pole,
     cart_pole_with_pixels,
     play,
+    play_on,
     progress,
     scores,
     two_cameras,
 )
 from reference_server import Served
-from rfm_client import (
-    InvalidSampleError,
-    ModelNotFoundError,
-    RewardClient,
-    Trajectory,
-)
-from rfm_client.contract.samples import UInt8Array
+from rfm_client import InvalidSampleError, ModelNotFoundError, RewardClient, ServerUnavailableError, Trajectory
 from rfm_client.gym import RewardModelWrapper, RewardOptions, SuccessRule
 
 
-def test_each_step_is_paid_the_progress_of_its_frame(client: RewardClient) -> None:
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"mode": "delta"},
+        {"scale": 10.0, "add_to_env_reward": True},
+        {"every": 3},
+        {"every": 3, "mode": "delta"},
+        {"max_frames": 3},
+    ],
+    ids=str,
+)
+def test_each_step_is_paid_by_the_scores_of_its_episode(client: RewardClient, options: dict[str, Any]) -> None:
     camera = Camera(cart_pole())
-    rewards, infos = play(RewardModelWrapper(camera, client, TASK))
-    (film,) = camera.films
-    assert len(rewards) >= 8
-    assert_close(rewards, progress(client, film, range(1, len(film))))
-    assert len({frame.tobytes() for frame in film}) > len(film) // 2  # the first steps look the same
-    for step, info in enumerate(infos):
-        answer = scores(client, film, step)
-        told = info["reward_model"]
-        assert_close([told["progress"], told["success"]], [answer.progress[-1], answer.success[-1]])
-        assert (told["step"], told["lag"], told["skipped"]) == (step, 0, 0)
-    assert "env_reward" not in infos[0]["reward_model"]
-    assert [info["reward_model"]["env_reward"] for info in infos[1:]] == [1.0] * len(rewards)
-
-
-def test_delta_pays_the_change_since_the_step_before(client: RewardClient) -> None:
-    camera = Camera(cart_pole())
-    rewards, _ = play(RewardModelWrapper(camera, client, TASK, RewardOptions(mode="delta")))
-    values = progress(client, camera.films[0], range(len(rewards) + 1))
-    assert_close(rewards, np.diff(values))
-    assert_close(sum(rewards), values[-1] - values[0])
-
-
-def test_the_reward_is_scaled_and_the_environment_s_is_added_as_it_is(client: RewardClient) -> None:
-    camera = Camera(cart_pole())
-    rewards, _ = play(RewardModelWrapper(camera, client, TASK, RewardOptions(scale=10, add_to_env_reward=True)))
-    assert_close(rewards, 1 + 10 * np.array(progress(client, camera.films[0], range(1, len(rewards) + 1))))
-
-
-@pytest.mark.parametrize("mode", ["absolute", "delta"])
-def test_every_third_step_and_the_last_are_scored(client: RewardClient, mode: Any) -> None:
-    camera = Camera(cart_pole())
-    rewards, infos = play(RewardModelWrapper(camera, client, TASK, RewardOptions(mode=mode, every=3)))
-    last = len(rewards)
-    assert last % 3 != 0
-    newest = [step if step == last else step - step % 3 for step in range(last + 1)]
-    values = progress(client, camera.films[0], newest)
-    assert_close(rewards, values[1:] if mode == "absolute" else np.diff(values))
-    assert [info["reward_model"]["step"] for info in infos] == newest
-    assert [info["reward_model"]["lag"] for info in infos] == [step - known for step, known in enumerate(newest)]
-
-
-@pytest.mark.parametrize(("max_frames", "sent"), [(None, MAX_FRAMES), (3, 3)])
-def test_a_long_episode_is_sent_evenly(client: RewardClient, max_frames: int | None, sent: int) -> None:
-    camera = Camera(cart_pole(max_episode_steps=MAX_FRAMES + 5))
-    env = RewardModelWrapper(camera, client, TASK, RewardOptions(max_frames=max_frames))
-    env.reset(seed=0)
-    rewards = [float(env.step(action)[1]) for action in [0, 1] * ((MAX_FRAMES + 5) // 2)]
-    assert_close(rewards, progress(client, camera.films[0], range(1, len(rewards) + 1), sent))
-
-
-def test_episodes_do_not_see_each_other_s_frames(client: RewardClient) -> None:
-    camera = Camera(cart_pole())
-    env = RewardModelWrapper(camera, client, TASK, RewardOptions(mode="delta"))
-    for seed, film_index in ((1, 0), (2, 1)):
-        rewards, _ = play(env, seed)
-        assert_close(rewards, np.diff(progress(client, camera.films[film_index], range(len(rewards) + 1))))
+    env = RewardModelWrapper(camera, client, TASK, RewardOptions(**options))
+    every, max_frames = options.get("every", 1), options.get("max_frames", MAX_FRAMES)
+    for seed in range(2):
+        rewards, infos = play(env, seed)
+        film, last = camera.films[seed], len(rewards)
+        assert last >= 8
+        assert every == 1 or seed or last % every != 0  # the last step is scored nevertheless
+        newest = [step if step == last else step - step % every for step in range(last + 1)]
+        answers = {step: scores(client, film, step, max_frames) for step in newest}
+        values = np.array([answers[step].progress[-1] for step in newest])
+        expected = np.diff(values) if options.get("mode") == "delta" else values[1:]
+        assert_close(rewards, options.get("scale", 1) * expected + options.get("add_to_env_reward", False))
+        for step, (known, info) in enumerate(zip(newest, infos, strict=True)):
+            told = info["reward_model"]
+            assert_close([told["progress"], told["success"]], [answers[known].progress[-1], answers[known].success[-1]])
+            assert (told["step"], told["lag"], told["skipped"]) == (known, step - known, 0)
+            assert told.get("env_reward") == (1.0 if step else None)
 
 
 def test_an_episode_ends_where_most_of_the_last_frames_succeed(client: RewardClient) -> None:
@@ -127,35 +96,31 @@ def test_the_task_may_depend_on_the_reset(client: RewardClient) -> None:
         assert_close(told, client.progress(Trajectory(frames=frames, task=task)).last_progress)
 
 
-def test_gymnasium_s_own_check_passes(served: Served) -> None:
-    connect = partial(RewardClient, served.url("grpc"), model=MODEL)
+def test_gymnasium_s_own_check_passes_and_close_closes_only_a_client_that_it_made(served: Served) -> None:
+    made: list[RewardClient] = []
+
+    def connect() -> RewardClient:
+        made.append(served.client("grpc", MODEL))
+        return made[-1]
+
     env = RewardModelWrapper(cart_pole(), connect, TASK)
+    assert made == []
     with pytest.warns(UserWarning) as warnings:
         check_env(env, skip_render_check=True, skip_close_check=True)  # which would make it anew, from its name
     assert all("different from the unwrapped" in str(w.message) or "infinity" in str(w.message) for w in warnings)
-    env.close()
-
-
-def test_outer_wrappers_may_ask_for_the_spec(client: RewardClient) -> None:
-    spec = RecordEpisodeStatistics(RewardModelWrapper(cart_pole(), client, TASK)).spec
+    spec = RecordEpisodeStatistics(env).spec  # outer wrappers may ask for it
     assert spec is not None
     assert spec.id == "CartPole-v1"
-
-
-def brightened(observation: dict[str, Any]) -> UInt8Array:
-    return np.asarray(255 - observation["pixels"], np.uint8)
-
-
-@pytest.mark.parametrize("source", ["pixels", brightened])
-def test_frames_may_come_from_the_observation(client: RewardClient, source: Any) -> None:
-    env = RewardModelWrapper(cart_pole_with_pixels(), client, TASK, RewardOptions(frames_from=source))
-    observation, _ = env.reset(seed=0)
-    film = [observation]
-    for _ in range(3):
-        observation, reward, *_ = env.step(PUSH_RIGHT)
-        film.append(observation)
-    frames = [each["pixels"] if source == "pixels" else 255 - each["pixels"] for each in film]
-    assert_close(reward, progress(client, frames, [3]))
+    for _ in range(2):
+        env.close()
+    (client,) = made
+    with pytest.raises(RuntimeError, match="closed"):
+        client.is_ready()
+    with served.client("grpc", MODEL) as own:
+        env = RewardModelWrapper(cart_pole(), own, TASK)
+        env.reset()
+        env.close()
+        assert own.is_ready()
 
 
 @pytest.mark.parametrize("blocking", [True, False])
@@ -176,50 +141,7 @@ def test_several_cameras_are_scored_apart_and_fused(client: RewardClient, fuse: 
     assert_close(rewards if blocking else rewards[-1], expected if blocking else expected[-1])
 
 
-def test_cameras_may_be_keys_of_the_observation(client: RewardClient) -> None:
-    env = RewardModelWrapper(cart_pole_with_pixels(), client, TASK, RewardOptions(cameras=["pixels"]))
-    observation, info = env.reset(seed=0)
-    assert_close(info["reward_model"]["progress"], progress(client, [observation["pixels"]], [0])[0])
-
-
-def test_a_camera_that_shows_nothing_is_told(client: RewardClient) -> None:
-    options = RewardOptions(frames_from=two_cameras, cameras=["front", "top"])
-    expected = r"^frames: expected a frame of each of the cameras \['front', 'top'\], got \['front', 'wrist'\]$"
-    with pytest.raises(InvalidSampleError, match=expected):
-        RewardModelWrapper(cart_pole_with_pixels(), client, TASK, options).reset()
-    options = RewardOptions(frames_from="pixels", cameras=["front"])
-    with pytest.raises(InvalidSampleError, match=r"the cameras \['front'\], got ndarray$"):
-        RewardModelWrapper(cart_pole_with_pixels(), client, TASK, options).reset()
-
-
-def test_frames_may_be_drawn_into_the_same_array(client: RewardClient) -> None:
-    camera = Camera(cart_pole())
-    canvas = np.empty((SIZE[1], SIZE[0], 3), np.uint8)
-
-    def draw(_: Any) -> UInt8Array:
-        canvas[:] = camera.films[-1][-1]
-        return canvas
-
-    rewards, _ = play(RewardModelWrapper(camera, client, TASK, RewardOptions(frames_from=draw)))
-    assert_close(rewards, progress(client, camera.films[0], range(1, len(rewards) + 1)))
-
-
-def test_a_frame_that_is_none_is_refused(client: RewardClient) -> None:
-    env = RewardModelWrapper(cart_pole(), client, TASK, RewardOptions(frames_from=lambda state: state))
-    with pytest.raises(InvalidSampleError, match=r"^frame: expected uint8 \[H, W, 3\], got float32 \[4\]$"):
-        env.reset()
-
-
-def test_a_frame_of_another_size_is_refused(client: RewardClient) -> None:
-    env = RewardModelWrapper(cart_pole(), client, TASK)
-    env.reset()
-    env.unwrapped.screen_width, env.unwrapped.screen = 80, None  # type: ignore[attr-defined]
-    message = r"^frame: expected uint8 \[160, 240, 3\], as the episode's first, got uint8 \[160, 80, 3\]$"
-    with pytest.raises(InvalidSampleError, match=message):
-        env.step(PUSH_RIGHT)
-
-
-BAD_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
+REFUSED_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
     "mode": ({"mode": "relative"}, "^mode: expected 'absolute' or 'delta', got 'relative'$"),
     "every": ({"every": 0}, "^every: expected at least 1, got 0$"),
     "max_pending": ({"max_pending": 0}, "^max_pending: expected at least 1, got 0$"),
@@ -234,15 +156,10 @@ BAD_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
-@pytest.mark.parametrize(("options", "message"), BAD_OPTIONS.values(), ids=BAD_OPTIONS)
-def test_bad_options_are_refused(client: RewardClient, options: dict[str, Any], message: str) -> None:
+@pytest.mark.parametrize(("options", "message"), REFUSED_OPTIONS.values(), ids=REFUSED_OPTIONS)
+def test_options_that_cannot_be_right_are_refused(client: RewardClient, options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         RewardModelWrapper(cart_pole(), client, TASK, RewardOptions(**options))
-
-
-def test_no_votes_at_all_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"^last: expected at least 1, got 0$"):
-        SuccessRule(last=0)
 
 
 def test_an_environment_that_renders_nothing_is_refused(client: RewardClient) -> None:
@@ -250,11 +167,32 @@ def test_an_environment_that_renders_nothing_is_refused(client: RewardClient) ->
         RewardModelWrapper(gym.make("CartPole-v1"), client, TASK)
 
 
-def test_a_step_needs_a_reset(client: RewardClient) -> None:
-    env = cart_pole()
+REFUSED_FRAMES: dict[str, tuple[dict[str, Any], str]] = {
+    "none": ({"frames_from": lambda seen: seen["state"]}, r"^frame: expected uint8 \[H, W, 3\], got float32 \[4\]$"),
+    "a camera is missing": (
+        {"frames_from": two_cameras, "cameras": ["front", "top"]},
+        r"^frames: expected a frame of each of the cameras \['front', 'top'\], got \['front', 'wrist'\]$",
+    ),
+    "no cameras": ({"frames_from": "pixels", "cameras": ["front"]}, r"the cameras \['front'\], got ndarray$"),
+}
+
+
+@pytest.mark.parametrize(("options", "message"), REFUSED_FRAMES.values(), ids=REFUSED_FRAMES)
+def test_an_observation_without_the_frame_is_refused(
+    client: RewardClient, options: dict[str, Any], message: str
+) -> None:
+    env = RewardModelWrapper(cart_pole_with_pixels(), client, TASK, RewardOptions(**options))
+    with pytest.raises(InvalidSampleError, match=message):
+        env.reset()
+
+
+def test_a_frame_of_another_size_is_refused(client: RewardClient) -> None:
+    env = RewardModelWrapper(cart_pole(), client, TASK)
     env.reset()
-    with pytest.raises(gym.error.ResetNeeded, match=r"^step: expected a reset before it$"):
-        RewardModelWrapper(env, client, TASK).step(PUSH_RIGHT)
+    env.unwrapped.screen_width, env.unwrapped.screen = 80, None  # type: ignore[attr-defined]
+    message = r"^frame: expected uint8 \[160, 240, 3\], as the episode's first, got uint8 \[160, 80, 3\]$"
+    with pytest.raises(InvalidSampleError, match=message):
+        env.step(PUSH_RIGHT)
 
 
 def test_a_model_that_is_not_served_is_no_reward(served: Served) -> None:
@@ -262,8 +200,132 @@ def test_a_model_that_is_not_served_is_no_reward(served: Served) -> None:
         env = RewardModelWrapper(cart_pole(), client, TASK, RewardOptions(max_frames=4))
         with pytest.raises(ModelNotFoundError, match="not_served"):
             env.reset()
-        with pytest.raises(ModelNotFoundError, match="not_served"):
-            env.step(PUSH_RIGHT)
+
+
+def test_the_client_does_not_need_gymnasium() -> None:
+    check = "import sys, rfm_client; print('gymnasium' in sys.modules); sys.modules['gymnasium'] = None; import rfm_client.gym"
+    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True)
+    assert done.stdout == "False\n"
+    assert done.stderr.strip().endswith(
+        'ImportError: rfm_client.gym needs gymnasium >= 1.1: pip install "./client[gym]"'
+    )
+
+
+# Steps that do not wait: the test lets answers come when it wants.
+
+
+def not_blocking(late: LateClient, **options: Any) -> tuple[RewardModelWrapper, Camera]:
+    camera = Camera(cart_pole())
+    env = RewardModelWrapper(camera, late, TASK, RewardOptions(sampling="all", blocking=False, **options))
+    env.reset(seed=0)
+    return env, camera
+
+
+# After which step which answers come, and which of them is the newest in use at the next one.
+COMING: list[tuple[tuple[int, ...], int]] = [((), 0), ((), 0), ((2,), 2), ((1,), 2), ((3, 4), 4), ((), 4)]
+
+
+@pytest.mark.parametrize("mode", ["absolute", "delta"])
+def test_a_step_goes_on_with_the_newest_answer_that_has_come(client: RewardClient, late: LateClient, mode: Any) -> None:
+    env, camera = not_blocking(late, mode=mode, max_pending=6)
+    late.hold(*range(1, 7))
+    rewards, told = [], []
+    for come, _ in COMING:
+        late.let_come(*come)
+        _, reward, _, _, info = env.step(PUSH_RIGHT)
+        rewards.append(reward)
+        told.append(info["reward_model"])
+    newest = [step for _, step in COMING]
+    values = progress(client, camera.films[0], [0, *newest], None)
+    assert_close(rewards, values[1:] if mode == "absolute" else np.diff(values))
+    assert [each["step"] for each in told] == newest
+    assert [each["lag"] for each in told] == [step - known for step, known in enumerate(newest, 1)]
+    assert [each["skipped"] for each in told] == [0] * len(COMING)
+    env.close()
+
+
+def test_with_too_many_questions_open_a_step_is_skipped_and_counted(late: LateClient) -> None:
+    env, _ = not_blocking(late, max_pending=2)
+    late.hold(1, 2, 5)
+    skipped = [env.step(PUSH_RIGHT)[4]["reward_model"]["skipped"] for _ in range(4)]
+    assert skipped == [0, 0, 1, 2]
+    late.let_come(1, 2)
+    told = env.step(PUSH_RIGHT)[4]["reward_model"]
+    assert (told["step"], told["lag"], told["skipped"]) == (2, 3, 2)
+    assert sorted(late.answers) == [1, 2, 5]
+    env.reset()
+    assert env.step(PUSH_RIGHT)[4]["reward_model"]["skipped"] == 0
+
+
+def test_the_last_step_waits_so_that_late_rewards_add_up(client: RewardClient, late: LateClient) -> None:
+    env, camera = not_blocking(late, mode="delta", max_pending=2)
+    late.hold(1, 2)
+    rewards, infos = play_on(env)
+    last = len(rewards)
+    first_and_last = progress(client, camera.films[0], [0, last], None)
+    assert rewards[:-1] == [0] * (last - 1)
+    assert_close(sum(rewards), first_and_last[1] - first_and_last[0])
+    told = infos[-1]["reward_model"]
+    assert (told["step"], told["lag"], told["skipped"]) == (last, 0, last - 3)
+    assert [late.answers[step].cancelled() for step in late.answers] == [True, True]
+
+
+def test_what_is_open_at_the_end_may_be_dropped(client: RewardClient, late: LateClient) -> None:
+    env, camera = not_blocking(late, mode="delta", max_pending=20, await_last=False)
+    late.hold(*range(2, 20))
+    env.step(PUSH_RIGHT)
+    late.let_come(1)
+    rewards, infos = play_on(env)
+    values = progress(client, camera.films[0], [0, 1], None)
+    assert_close(rewards, [values[1] - values[0]] + [0] * (len(rewards) - 1))
+    assert infos[-1]["reward_model"]["step"] == 1
+    assert sorted(late.answers) == list(range(1, len(rewards) + 1))  # the last step was not asked about
+    assert all(late.answers[step].cancelled() for step in range(2, len(rewards) + 1))
+
+
+def test_an_answer_to_an_older_episode_touches_no_newer_one(client: RewardClient, late: LateClient) -> None:
+    env, camera = not_blocking(late)
+    late.hold(1)
+    env.step(PUSH_RIGHT)
+    answer = late.answers[1]
+    env.reset(seed=1)
+    assert answer.cancelled()
+    _, reward, _, _, info = env.step(PUSH_RIGHT)
+    assert info["reward_model"]["step"] == 0
+    assert_close(reward, progress(client, camera.films[1], [0], None))
+
+
+def test_an_episode_ends_at_the_step_at_which_success_is_known_and_stays_a_success(
+    client: RewardClient, late: LateClient
+) -> None:
+    """The answer about that step, which is waited for, may say otherwise."""
+    camera = Camera(cart_pole())
+    play(RewardModelWrapper(camera, client, TASK))
+    success = [float(scores(client, camera.films[0], step, None).success[-1]) for step in range(6)]
+    early, later = next((a, b) for b in range(2, 6) for a in range(1, b) if success[a] > success[b])
+    rule = SuccessRule(threshold=(success[early] + success[later]) / 2)
+    env, camera = not_blocking(late, max_pending=6, terminate_on_success=rule)
+    late.hold(*range(1, later))
+    assert not any(env.step(PUSH_RIGHT)[2] for _ in range(later - 1))
+    late.let_come(early)
+    _, reward, terminated, truncated, info = env.step(PUSH_RIGHT)
+    told = info["reward_model"]
+    assert (terminated, truncated, told["succeeded"], told["step"]) == (True, False, True, later)
+    assert_close(told["success"], success[later])
+    assert_close(reward, progress(client, camera.films[0], [later], None))
+
+
+def test_after_an_error_delta_pays_what_was_missed(client: RewardClient, late: LateClient) -> None:
+    camera = Camera(cart_pole())
+    env = RewardModelWrapper(camera, late, TASK, RewardOptions(sampling="all", mode="delta"))
+    env.reset(seed=0)
+    late.hold(1)
+    late.connection.held[2].set_exception(ServerUnavailableError("the server is restarting"))
+    with pytest.raises(ServerUnavailableError, match=r"^the server is restarting \(request \w+-\d+\)$"):
+        env.step(PUSH_RIGHT)
+    reward = env.step(PUSH_RIGHT)[1]
+    first, _, newest = progress(client, camera.films[0], range(3), None)
+    assert_close(reward, newest - first)
 
 
 @pytest.mark.parametrize("blocking", [True, False])
