@@ -17,6 +17,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -101,19 +102,15 @@ def test_there_are_few_reports_and_the_newest_frame_wins(taker: Taker) -> None:
         assert np.abs(image.astype(int) - picture(100 * env + 9)[0, 0]).max() < 6
 
 
-def test_scores_that_are_not_predicted_are_null(taker: Taker) -> None:
-    with LiveView(taker.url) as view:
-        view.episode("stack the cups").add(picture(), score(0, success=math.nan))
-    assert [each["success"] for each in taker.steps()] == [None]
-
-
 def test_names_and_numbers_are_reported_as_a_gateway_takes_them(taker: Taker) -> None:
     with LiveView(taker.url, name="run" * 1000) as view:
-        view.episode("\ud800", np.int64(3), np.float32(0.25)).add(picture(), score(0))  # type: ignore[arg-type]
+        first_given = view.episode("\ud800", np.int64(3), np.float32(0.25))  # type: ignore[arg-type]
+        first_given.add(picture(), score(0, success=math.nan))
         view.episode("stack the cups", threshold=math.inf).add(picture(), score(0))
     first, second = episodes_of(taker)
     assert (first["task"], first["env"], first["threshold"], second["threshold"]) == ("?", 3, 0.25, None)
     assert first["name"] == ("run" * 1000)[:2000]
+    assert first["steps"][0]["success"] is None  # the checkpoint does not predict it
 
 
 def test_an_episode_that_has_ended_takes_no_more_steps(taker: Taker) -> None:
@@ -122,18 +119,14 @@ def test_an_episode_that_has_ended_takes_no_more_steps(taker: Taker) -> None:
         episode.add(picture(), score(0))
         episode.end()
         episode.add(picture(), score(1))
-        assert view._reporter._running == {}
     (told,) = episodes_of(taker)
     assert (told["ended"], [each["step"] for each in told["steps"]]) == (True, [0])
 
 
-def test_a_mistake_does_not_end_the_reports(
-    taker: Taker, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr(live, "TRY_AGAIN_AFTER_S", 0.05)
+def test_a_report_that_fails_does_not_end_the_reports(taker: Taker, caplog: pytest.LogCaptureFixture) -> None:
     with LiveView(taker.url) as view:
         episode = view.episode("stack the cups")
-        episode.add(picture(), StepScore(0.5, 0.25, "no bool", object(), 7.5))  # type: ignore[arg-type]
+        episode.add(np.zeros((4, 4, 4), np.uint8), score(0))
         poll(lambda: "a live report has failed, and is dropped" in caplog.text)
         episode.add(picture(), score(1))
         poll(lambda: bool(taker.bodies))
@@ -247,18 +240,22 @@ def test_reports_go_by_tls_to_whom_the_authority_vouches_for(tmp_path: Path, cap
         assert [each["step"] for each in taker.steps()] == [1]
 
 
-def test_frames_of_past_episodes_do_not_pile_up_without_a_gateway() -> None:
-    with LiveView(f"http://127.0.0.1:{free_port()}") as view:
-        reporter = view._reporter
-        first = view.episode("stack the cups")
-        first.add(picture(), score(0))
-        poll(lambda: reporter._is_away)
-        for _ in range(300):
+def test_frames_of_past_episodes_do_not_pile_up_without_a_gateway(
+    taker: Taker, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(live, "TRY_AGAIN_AFTER_S", 0.05)
+    taker.status = 503
+    with LiveView(taker.url) as view:
+        view.episode("the first").add(picture(), score(0))
+        poll(lambda: "expected a gateway" in caplog.text)
+        for _ in range(200):
             episode = view.episode("stack the cups")
             episode.add(picture(), score(0))
             episode.end()
-        assert set(reporter._frames) <= {first._about["id"]}
-        assert len(reporter._steps) >= 600
+        taker.status = 204
+        poll(lambda: len(taker.steps()) == 201)
+        keys = {key for body in taker.bodies for key in body["frames"]}
+    assert keys <= {told["id"] for told in episodes_of(taker) if told["task"] == "the first"}
 
 
 @pytest.mark.parametrize(
@@ -346,44 +343,42 @@ def test_a_gymnasium_environment_is_reported(served: Served, taker: Taker, block
         assert max(known) == len(seen) - 1
 
 
-@pytest.mark.triton
-def test_a_vector_environment_is_reported_by_environment(served: Served, taker: Taker) -> None:
-    envs = gymnasium.vector.SyncVectorEnv([cart_pole] * 2)
-    with RewardClient(served.url("grpc"), model=MODEL) as client, LiveView(taker.url) as view:
-        wrapped = RewardModelVectorWrapper(envs, client, TASK, RewardOptions(live=view))
-        wrapped.reset(seed=0)
-        infos = [wrapped.step(np.array([0, 1]))[-1]["reward_model"] for _ in range(3)]
-        wrapped.close()
-    told = episodes_of(taker)
-    assert [(each["env"], each["ended"]) for each in told] == [(0, True), (1, True)]
-    for env, each in enumerate(told):
-        assert [step["progress"] for step in each["steps"][1:]] == [info["progress"][env] for info in infos]
+@contextmanager
+def watched_vector(
+    served: Served, view: LiveView, mode: AutoresetMode
+) -> Iterator[tuple[RewardModelVectorWrapper, Any]]:
+    """Two environments whose episodes have three steps, and the client that scores them."""
 
-
-@pytest.mark.triton
-@pytest.mark.parametrize("mode", list(AutoresetMode))
-def test_episodes_of_a_vector_environment_end_when_their_last_step_is_reported(
-    served: Served, taker: Taker, mode: AutoresetMode
-) -> None:
     def pixels() -> gymnasium.Env[Any, Any]:
         return gymnasium.wrappers.AddRenderObservation(gymnasium.wrappers.TimeLimit(cart_pole(), 3))
 
     envs = gymnasium.vector.SyncVectorEnv([pixels] * 2, autoreset_mode=mode)
-    with RewardClient(served.url("grpc"), model=MODEL) as client, LiveView(taker.url) as view:
+    with RewardClient(served.url("grpc"), model=MODEL) as client:
         options = RewardOptions(live=view, frames_from=lambda observation: observation)
         wrapped = RewardModelVectorWrapper(envs, client, TASK, options)
         wrapped.reset(seed=0)
-        for number in range(8):
-            *_, terminations, truncations, _infos = wrapped.step(np.array([0, 1]))
-            if mode is AutoresetMode.DISABLED and (ended := terminations | truncations).any():
-                wrapped.reset(options={"reset_mask": ended})
-            running = view._reporter._running
-            assert len(running) <= 2, number
+        yield wrapped, client
         wrapped.close()
-        assert running == {}
+
+
+@pytest.mark.triton
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_episodes_of_a_vector_environment_are_reported_and_end_with_their_last_step(
+    served: Served, taker: Taker, mode: AutoresetMode
+) -> None:
+    with LiveView(taker.url) as view, watched_vector(served, view, mode) as (env, _):
+        infos = []
+        for _ in range(8):
+            *_, terminations, truncations, told_infos = env.step(np.array([0, 1]))
+            infos.append(told_infos["reward_model"])
+            if mode is AutoresetMode.DISABLED and (ended := terminations | truncations).any():
+                env.reset(options={"reset_mask": ended})
+        poll(lambda: len([each for each in episodes_of(taker) if not each["ended"]]) <= 2)
     told = episodes_of(taker)
     assert all(each["ended"] for each in told)
-    assert [step["step"] for step in told[0]["steps"]] == [0, 1, 2, 3]
+    for number, each in enumerate(told[:2]):
+        assert (each["env"], [step["step"] for step in each["steps"]]) == (number, [0, 1, 2, 3])
+        assert [step["progress"] for step in each["steps"][1:3]] == [info["progress"][number] for info in infos[:2]]
 
 
 @pytest.mark.triton
@@ -394,22 +389,13 @@ def test_an_episode_whose_last_step_fails_has_ended(
     def fails(*_words: object, **_options: object) -> None:
         raise InferenceFailedError("no answer")
 
-    def pixels() -> gymnasium.Env[Any, Any]:
-        return gymnasium.wrappers.AddRenderObservation(gymnasium.wrappers.TimeLimit(cart_pole(), 3))
-
-    envs = gymnasium.vector.SyncVectorEnv([pixels] * 2, autoreset_mode=mode)
-    with RewardClient(served.url("grpc"), model=MODEL) as client, LiveView(taker.url) as view:
-        options = RewardOptions(live=view, frames_from=lambda observation: observation)
-        wrapped = RewardModelVectorWrapper(envs, client, TASK, options)
-        wrapped.reset(seed=0)
+    with LiveView(taker.url) as view, watched_vector(served, view, mode) as (env, client):
         for _ in range(2):
-            wrapped.step(np.array([0, 1]))
-        assert len(view._reporter._running) == 2
+            env.step(np.array([0, 1]))
         monkeypatch.setattr(client, "score_windows", fails)
         with pytest.raises(InferenceFailedError):
-            wrapped.step(np.array([0, 1]))
-        assert view._reporter._running == {}
-        wrapped.close()
+            env.step(np.array([0, 1]))
+        poll(lambda: [each["ended"] for each in episodes_of(taker)] == [True, True])
 
 
 @pytest.mark.triton
