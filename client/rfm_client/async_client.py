@@ -17,7 +17,7 @@ from rfm_client.contract.names import DEFAULT_MODEL, Part, encoder_name, frames_
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.episodes.episodes import AsyncEpisode, AsyncEpisodes
-from rfm_client.episodes.scoring import EpisodeOptions, EpisodeSettings
+from rfm_client.episodes.steps import EpisodeOptions, EpisodeSettings
 from rfm_client.episodes.windows import Window, WindowScorer
 from rfm_client.scorer import Scorer
 from rfm_client.transport.access import Access, AccessOptions

@@ -18,7 +18,7 @@ from rfm_client.contract.results import PreferenceResult, ProgressResult, Result
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.data.fitting import snapshot
 from rfm_client.episodes.episodes import Episode, Episodes
-from rfm_client.episodes.scoring import EpisodeSettings
+from rfm_client.episodes.steps import EpisodeSettings
 from rfm_client.episodes.windows import Window
 from rfm_client.transport.calls import Transport
 from rfm_client.transport.loop_thread import LoopThread

@@ -18,7 +18,7 @@ from rfm_client.contract.results import FrameScores
 from rfm_client.data.inputs import load_trajectory
 from rfm_client.data.sampling import Sampling
 from rfm_client.data.video import read_video
-from rfm_client.episodes.scoring import EpisodeOptions, SuccessRule
+from rfm_client.episodes.steps import EpisodeOptions, SuccessRule
 from rfm_client.gym import RewardOptions
 from rfm_client.labelling.options import LabelOptions
 from rfm_client.labelling.ray_engine import RayOptions

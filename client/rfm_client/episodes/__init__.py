@@ -3,7 +3,7 @@
 
 from rfm_client.episodes.episodes import AsyncEpisode, AsyncEpisodes, Episode, Episodes
 from rfm_client.episodes.live import LiveView
-from rfm_client.episodes.scoring import EpisodeOptions, StepScore, StepScores, SuccessRule
+from rfm_client.episodes.steps import EpisodeOptions, StepScore, StepScores, SuccessRule
 
 __all__ = [
     "AsyncEpisode",

@@ -17,7 +17,7 @@ from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.samples import as_array
 from rfm_client.data.sampling import Sampling
-from rfm_client.episodes.scoring import EpisodeFrames, EpisodeOptions, StepQuestion, StepScore, StepScores, copied
+from rfm_client.episodes.steps import EpisodeFrames, EpisodeOptions, StepQuestion, StepScore, StepScores, copied
 from rfm_client.episodes.windows import NamedFrame
 from rfm_client.transport.deadline import Deadline
 from rfm_client.transport.one_process import OneProcess
@@ -175,8 +175,8 @@ class AsyncEpisode(OneProcess):
         self, client: AsyncRewardClient, task: str, options: EpisodeOptions, timeout_s: float | None = None
     ) -> None:
         self._episodes = AsyncEpisodes(client, [task], options, timeout_s)
-        self._waiting: tuple[Any, asyncio.Future[StepScore]] | None = None
-        self._asking: asyncio.Task[None] | None = None
+        self._open: asyncio.Task[StepScore] | None = None
+        self._waiting: asyncio.Task[StepScore] | None = None  # for the open question to be answered
 
     async def add(self, frame: Any) -> StepScore:
         """Adds a frame, uint8 [H, W, 3] or such by camera, and gives the score of the episode so far. It waits for a
@@ -189,17 +189,16 @@ class AsyncEpisode(OneProcess):
 
     def add_nowait(self, frame: Any) -> asyncio.Future[StepScore]:
         """Adds a frame, and gives the score to come. While a question is open the frame waits; if another comes
-        meanwhile, the newer one takes its place, and the older's answer is cancelled: that frame is not part of the
-        episode.
+        meanwhile, the newer one takes its place, and the older's answer is cancelled. A frame whose answer is
+        cancelled is not part of the episode.
         """
         frame = copied(frame)
-        answer: asyncio.Future[StepScore] = asyncio.get_running_loop().create_future()
-        if self._asking is None or self._asking.done():
-            self._asking = asyncio.create_task(self._ask(frame, answer))
-        else:
-            self._drop_waiting()
-            self._waiting = frame, answer
-        return answer
+        if self._open is None or (self._open.done() and self._waiting is None):
+            self._open = asyncio.create_task(self._add(frame))
+            return self._open
+        self._drop_waiting()
+        self._waiting = asyncio.create_task(self._add_after(self._open, frame))
+        return self._waiting
 
     async def reset(self, task: str | None = None) -> None:
         """Begins a new episode, when no question is open; a frame that waits is dropped. ``task``: None: as before."""
@@ -219,36 +218,22 @@ class AsyncEpisode(OneProcess):
 
     async def _settle(self) -> None:
         self._drop_waiting()
-        if self._asking is not None and not self._asking.done():
-            await asyncio.wait({self._asking})  # who stops to wait does not stop the question
+        if self._open is not None and not self._open.done():
+            await asyncio.wait({self._open})  # who stops to wait does not stop the question
+
+    def _drop_waiting(self) -> None:
+        if self._waiting is not None:
+            self._waiting.cancel()
+            self._waiting = None
 
     async def _add(self, frame: Any) -> StepScore:
         frames = {camera: [each] for camera, each in frame.items()} if isinstance(frame, Mapping) else [frame]
         return (await self._episodes.add(frames)).of(0)
 
-    def _drop_waiting(self) -> None:
-        if self._waiting is not None:
-            self._waiting[1].cancel()
-            self._waiting = None
-
-    async def _ask(self, frame: Any, answer: asyncio.Future[StepScore]) -> None:
-        """Asks about a frame, and then about the newest until none waits."""
-        waiting: tuple[Any, asyncio.Future[StepScore]] | None = (frame, answer)
-        while waiting is not None:
-            frame, answer = waiting
-            try:
-                score = await self._add(frame)
-            except Exception as error:  # noqa: BLE001  whatever it is, who waits for the answer is told
-                if not answer.done():
-                    answer.set_exception(error)
-            except BaseException:
-                answer.cancel()
-                self._drop_waiting()
-                raise
-            else:
-                if not answer.done():
-                    answer.set_result(score)
-            waiting, self._waiting = self._waiting, None
+    async def _add_after(self, before: asyncio.Task[StepScore], frame: Any) -> StepScore:
+        await asyncio.wait({before})
+        self._open, self._waiting = self._waiting, None
+        return await self._add(frame)
 
 
 class Episodes(OneProcess):

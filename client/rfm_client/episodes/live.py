@@ -22,6 +22,7 @@ import weakref
 from collections import deque
 from collections.abc import Mapping
 from http.client import HTTPConnection, HTTPException, HTTPSConnection
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import urlsplit
 
@@ -30,12 +31,10 @@ import numpy as np
 from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.resize import as_jpeg, load_pillow
-from rfm_client.transport.access import Access, AccessOptions
+from rfm_client.transport.access import Access
 
 if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
-    from rfm_client.episodes.scoring import StepScore
+    from rfm_client.episodes.steps import StepScore
 
 PATH = "/live/reports"
 REPORT_EVERY_S = 0.25
@@ -91,18 +90,29 @@ class LiveView:
 
     url: ``http://host:port`` or ``https://host:port`` of the gateway
     name: what the page calls the run
-    access: as of AccessOptions; ``api_key`` is the gateway's key
+    others: as of a client; ``api_key`` is the gateway's key
 
     A context manager that closes it. It may be pickled: each process then reports by itself. A process that was forked
     reports nothing, and logs a warning.
     Raises ValueError for what cannot be used, ImportError without Pillow (``rfm-client[resize]``).
     """
 
-    def __init__(self, url: str, *, name: str = "", **access: Unpack[AccessOptions]) -> None:
+    def __init__(
+        self,
+        url: str,
+        *,
+        name: str = "",
+        ca_file: str | Path | None = None,
+        client_certificate: str | Path | None = None,
+        client_key: str | Path | None = None,
+        headers: Mapping[str, str] | None = None,
+        api_key: str | None = None,
+    ) -> None:
         load_pillow()
         self.name = name
-        self._url, self._options = url, access
-        self._reporter = Reporter(url, Access.of(access))
+        self._url = url
+        self._access = Access(ca_file, client_certificate, client_key, headers or {}, api_key)
+        self._reporter = Reporter(url, self._access)
         weakref.finalize(self, self._reporter.stop).atexit = False  # the reporter closes itself then
 
     def episode(self, task: str, env: int = 0, threshold: float = 0.5) -> LiveEpisode:
@@ -133,7 +143,7 @@ class LiveView:
         self.close()
 
     def __reduce__(self) -> tuple[object, ...]:
-        return _rebuilt, (self._url, self.name, self._options)
+        return _rebuilt, (self._url, self.name, self._access.options)
 
 
 class Reporter:
@@ -299,7 +309,7 @@ def report_body(steps: list[Entry], frames: Mapping[str, UInt8Array]) -> bytes:
     return json.dumps({"episodes": list(episodes.values()), "frames": pictures}, allow_nan=False).encode()
 
 
-def _rebuilt(url: str, name: str, access: AccessOptions) -> LiveView:
+def _rebuilt(url: str, name: str, access: Mapping[str, Any]) -> LiveView:
     return LiveView(url, name=name, **access)
 
 

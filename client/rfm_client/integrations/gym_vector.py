@@ -13,7 +13,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWra
 from gymnasium.vector.utils import iterate
 
 from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.episodes.scoring import copied
+from rfm_client.episodes.steps import copied
 from rfm_client.integrations.gym import DEFAULTS, INFO, LOST, check_frame_source, check_kind
 from rfm_client.integrations.rewards import ClientSource, Info, PaidEpisode, Payer, RewardOptions
 

@@ -23,7 +23,7 @@ from rfm_client.data.camera_fusion import Fuse
 from rfm_client.data.orientation import Orientation
 from rfm_client.data.sampling import Rule
 from rfm_client.episodes.live import LiveView
-from rfm_client.episodes.scoring import EpisodeFrames, EpisodeOptions, StepQuestion, StepScore, SuccessRule
+from rfm_client.episodes.steps import EpisodeFrames, EpisodeOptions, StepQuestion, StepScore, SuccessRule
 
 Info: TypeAlias = dict[str, Any]
 ClientSource: TypeAlias = RewardClient | Callable[[], RewardClient]
@@ -44,8 +44,8 @@ class RewardOptions:
         takes one environment's observation and gives its frame
     cameras: each is scored, and the scores fused: keys, of the observation or of what ``frames_from`` says, that hold a
         frame of each; none: there is one camera, without a name
-    max_frames: the rule's number of frames; ``frames`` of EpisodeOptions
-    fuse, orient, sampling, resize, live: as in EpisodeOptions; rendered frames are turned, too
+    sampling, fuse, orient, resize, live: as of ``rfm_client.episodes.EpisodeOptions``; rendered frames are turned, too
+    max_frames: the rule's number of frames, EpisodeOptions' ``frames``
     blocking: a step waits for its score
     max_pending: most steps of one environment whose questions are open when not blocking
     await_last: the last step of an episode is waited for even when not blocking; otherwise what is open is dropped
@@ -118,14 +118,16 @@ class PaidEpisode:
 
     index: number of its environment; None: there is only one
     size: what the checkpoint reads: frames are made as small; None: they stay as they are
+    pending: questions, and the answers to come about each of their windows
+    known: the newest score that has come
     """
 
     def __init__(self, options: RewardOptions, task: str, index: int | None, size: FrameSize | None) -> None:
         where = "" if index is None else f"envs[{index}]"
         self.frames = EpisodeFrames(task, options.scoring, index or 0, where)
         self._options, self._size = options, size
-        self._pending: list[tuple[StepQuestion, list[Future[ProgressResult]]]] = []
-        self._known: StepScore | None = None
+        self.pending: list[tuple[StepQuestion, list[Future[ProgressResult]]]] = []
+        self.known: StepScore | None = None
         self._paid_progress = np.nan
         self.num_skipped = 0
         self.succeeded = False
@@ -137,39 +139,23 @@ class PaidEpisode:
         """
         self.frames.append(self.frames.checked(frame, self._size))
 
-    @property
-    def is_known(self) -> bool:
-        """Whether there is an answer."""
-        return self._known is not None
-
-    @property
-    def num_pending(self) -> int:
-        """Number of questions that have no answer yet."""
-        return len(self._pending)
-
-    def expect(self, question: StepQuestion, answers: list[Future[ProgressResult]]) -> None:
-        """Records that answers to the question's windows are to come."""
-        self._pending.append((question, answers))
-
     def collect(self) -> None:
         """Takes over the answers that have come. Raises the RewardError of one that failed."""
-        come = [each for each in self._pending if all(answer.done() for answer in each[1])]
-        for each in come:
-            self._pending.remove(each)
+        for each in [each for each in self.pending if all(answer.done() for answer in each[1])]:
+            self.pending.remove(each)
             question, answers = each
-            errors = [answer.exception() for answer in answers]
-            outcomes = [
-                error if isinstance(error, RewardError) else answer.result()
-                for answer, error in zip(answers, errors, strict=True)
-            ]
+            outcomes = []
+            for answer in answers:
+                error = answer.exception()
+                outcomes.append(error if isinstance(error, RewardError) else answer.result())
             self.learn(*question.scores(outcomes))
 
     def cancel(self) -> None:
         """Cancels the questions that have no answer yet."""
-        for _, answers in self._pending:
+        for _, answers in self.pending:
             for answer in answers:
                 answer.cancel()
-        self._pending.clear()
+        self.pending.clear()
 
     def end(self) -> None:
         """Cancels the questions that have no answer yet, and tells who watches that the episode is over."""
@@ -178,29 +164,29 @@ class PaidEpisode:
 
     def learn(self, score: StepScore) -> None:
         """Takes over the score of a step, unless a newer one is known."""
-        if self._known is not None and score.step <= self._known.step:
+        if self.known is not None and score.step <= self.known.step:
             return
         rule = self._options.terminate_on_success
         if rule is not None and np.isnan(score.success):
             expected = "None with a checkpoint that does not predict success"
             raise ValueError(f"terminate_on_success: expected {expected}, got {rule}")
-        if self._known is None:
+        if self.known is None:
             self._paid_progress = score.progress
         score = replace(score, succeeded=score.succeeded and score.step > 0)  # a reset is no success
-        self._known = score
+        self.known = score
         self.succeeded |= rule is not None and score.succeeded
         self.frames.report(score)
 
     def reward(self, env_reward: float) -> float:
         """The reward of the step."""
-        progress = np.nan if self._known is None else self._known.progress
+        progress = np.nan if self.known is None else self.known.progress
         change, self._paid_progress = progress - self._paid_progress, progress
         reward = self._options.scale * (progress if self._options.mode == "absolute" else change)
         return reward + env_reward if self._options.add_to_env_reward else reward
 
     def info(self) -> Info:
         """The newest known scores, and by how many steps they lag."""
-        known = self._known or StepScore(np.nan, np.nan, False, -1, np.nan)
+        known = self.known or StepScore(np.nan, np.nan, False, -1, np.nan)
         told = {"progress": known.progress, "success": known.success, "step": known.step}
         told |= {"lag": self.frames.step - known.step, "skipped": self.num_skipped}
         return told if self._options.terminate_on_success is None else told | {"succeeded": self.succeeded}
@@ -244,17 +230,19 @@ class Payer:
         for episode, ends in episodes.items():
             episode.collect()
             ends = ends or episode.succeeded
-            due = ends or not episode.is_known or episode.frames.step % self._options.every == 0
-            waits = self._options.blocking or not episode.is_known or (ends and self._options.await_last)
+            is_first = episode.known is None
+            due = ends or is_first or episode.frames.step % self._options.every == 0
+            waits = self._options.blocking or is_first or (ends and self._options.await_last)
             if ends:
                 episode.cancel()
             if due and waits:
                 awaited.append(episode)
-            elif due and not ends and episode.num_pending >= self._options.max_pending:
+            elif due and not ends and len(episode.pending) >= self._options.max_pending:
                 episode.num_skipped += 1
             elif due and not ends:
                 question = self._question([episode])
-                episode.expect(question, [self._client.submit_window(window) for window in question.windows])
+                answers = [self._client.submit_window(window) for window in question.windows]
+                episode.pending.append((question, answers))
         if awaited:
             question = self._question(awaited)
             scores = question.scores(self._client.score_windows(question.windows))
