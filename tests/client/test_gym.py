@@ -143,15 +143,10 @@ def test_several_cameras_are_scored_apart_and_fused(client: RewardClient, fuse: 
 
 REFUSED_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
     "mode": ({"mode": "relative"}, "^mode: expected 'absolute' or 'delta', got 'relative'$"),
-    "every": ({"every": 0}, "^every: expected at least 1, got 0$"),
-    "max_pending": ({"max_pending": 0}, "^max_pending: expected at least 1, got 0$"),
-    "max_frames": ({"max_frames": 0}, "^max_frames: expected at least 1, got 0$"),
     "cameras": ({"cameras": ["front"]}, r"^cameras: expected keys of the observation \[\], got \['front'\]$"),
-    "a camera": ({"cameras": "front"}, "^cameras: expected a sequence of names, got 'front'$"),
     "fuse": ({"fuse": "sum"}, "^fuse: expected one of mean, min, max, got 'sum'$"),
     "orient": ({"orient": "upside-down"}, "^orient: expected one of none, rotate180, .*, got 'upside-down'$"),
     "orient of a camera": ({"orient": {"front": "rotate180"}}, "^orient: expected one orientation, .*, got 'front'$"),
-    "scale": ({"scale": float("nan")}, "^scale: expected a number, got nan$"),
     "frames_from": ({"frames_from": "pixels"}, r"^frames_from: expected a key of the observation \[\], got 'pixels'$"),
 }
 
@@ -160,9 +155,6 @@ REFUSED_OPTIONS: dict[str, tuple[dict[str, Any], str]] = {
 def test_options_that_cannot_be_right_are_refused(client: RewardClient, options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         RewardModelWrapper(cart_pole(), client, TASK, RewardOptions(**options))
-
-
-def test_an_environment_that_renders_nothing_is_refused(client: RewardClient) -> None:
     with pytest.raises(ValueError, match=r"^render_mode: expected 'rgb_array', .* got None$"):
         RewardModelWrapper(gym.make("CartPole-v1"), client, TASK)
 

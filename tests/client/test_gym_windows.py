@@ -16,8 +16,6 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import Autoreset, TimeLimit
 
 from coded_env import Code, CodedEnv, Recorder, frame_of
-from environments import MODEL
-from reference_server import Served
 from rfm_client import InvalidSampleError, RewardError, ServerUnavailableError
 from rfm_client.gym import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions, SuccessRule
 
@@ -38,8 +36,8 @@ CASES = [
 
 
 @pytest.fixture
-def recorder(served: Served) -> Iterator[Recorder]:
-    with Recorder(served.url("grpc"), MODEL) as client:
+def recorder() -> Iterator[Recorder]:
+    with Recorder() as client:
         yield client
 
 
@@ -180,9 +178,9 @@ def down(at: int) -> Callable[[int], RewardError | None]:
 
 @pytest.mark.parametrize("failing", range(STEPS))
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.name)
-def test_a_vector_goes_on_after_a_failure_at_any_step(served: Served, mode: AutoresetMode, failing: int) -> None:
+def test_a_vector_goes_on_after_a_failure_at_any_step(mode: AutoresetMode, failing: int) -> None:
     with (
-        Recorder(served.url("grpc"), MODEL, down(failing)) as client,
+        Recorder(down(failing)) as client,
         closing(vector_of(SyncVectorEnv, mode, client, "pixels", reuse=mode is not SAME_STEP)) as env,
     ):
         envs: list[CodedEnv] = env.unwrapped.envs  # type: ignore[attr-defined]
@@ -205,9 +203,9 @@ def test_a_vector_goes_on_after_a_failure_at_any_step(served: Served, mode: Auto
 
 @pytest.mark.parametrize("failing", range(STEPS))
 @pytest.mark.parametrize("resets", ["by the caller", "by Autoreset below", "by Autoreset above"])
-def test_an_environment_goes_on_after_a_failure_at_any_step(served: Served, resets: str, failing: int) -> None:
+def test_an_environment_goes_on_after_a_failure_at_any_step(resets: str, failing: int) -> None:
     coded = CodedEnv(0, (3, 1), reuse=True)
-    with Recorder(served.url("grpc"), MODEL, down(failing)) as client:
+    with Recorder(down(failing)) as client:
         below = Autoreset(coded) if resets == "by Autoreset below" else coded
         env: gym.Env[Any, Any] = RewardModelWrapper(below, client, TASKS[0], options(None))
         if resets == "by Autoreset above":

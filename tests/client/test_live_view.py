@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import gc
 import io
@@ -29,10 +28,10 @@ from gymnasium.vector import AutoresetMode
 from PIL import Image
 
 from environments import TASK, cart_pole, play
-from gateways import free_port, poll
+from gateways import poll
 from live_reports import Taker, picture, taking
 from reference_server import Served
-from rfm_client import AsyncRewardClient, InferenceFailedError, LiveView, RewardClient
+from rfm_client import InferenceFailedError, LiveView, RewardClient
 from rfm_client.episodes import StepScore, SuccessRule, live
 from rfm_client.gym import RewardModelVectorWrapper, RewardModelWrapper, RewardOptions
 
@@ -262,12 +261,9 @@ def test_frames_of_past_episodes_do_not_pile_up_without_a_gateway(
     ("url", "options", "message"),
     [
         ("grpc://robot:8001", {}, r"url: expected http://host:port or https://host:port of a gateway, got 'grpc://"),
-        ("robot:8100", {}, "url: expected http://host:port"),
-        ("http://robot:8100/?a=b", {}, "url: expected http://host:port"),
         ("http://me:key@robot:8100", {}, "url: expected http://host:port"),
         ("http://robot:99999", {}, "Port out of range"),
         ("http://robot:8100", {"ca_file": "nowhere.pem"}, "ca_file: expected certificates"),
-        ("http://robot:8100", {"api_key": "two\nlines"}, "authorization: expected visible ASCII characters"),
     ],
 )
 def test_what_cannot_be_used_is_refused(url: str, options: Any, message: str) -> None:
@@ -283,44 +279,29 @@ def test_without_pillow_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.triton
 def test_the_scores_that_add_returns_are_reported(served: Served, taker: Taker) -> None:
-    film = [picture(seed) for seed in range(6)]
-    with (
-        RewardClient(served.url("grpc"), model=MODEL) as client,
-        LiveView(taker.url) as view,
-        client.episode("stack the cups", live=view, success=SuccessRule(threshold=0.0)) as episode,
-    ):
-        first = [episode.add(frame) for frame in film]
-        episode.reset(task="open the drawer")
-        second = [episode.add_nowait(frame).result() for frame in film[:3]]
+    film = [picture(seed) for seed in range(9)]
+    rule = SuccessRule(threshold=0.0)
+    with RewardClient(served.url("grpc"), model=MODEL) as client, LiveView(taker.url) as view:
+        with client.episode("stack the cups", live=view, success=rule) as episode:
+            alone = [episode.add(frame) for frame in film[:4]]
+            episode.reset(task="open the drawer")
+            again = [episode.add_nowait(frame).result() for frame in film[:3]]
+        with client.episodes(2, ["first", "second"], live=view, success=rule) as episodes:
+            together = [episodes.add([film[step], film[step + 4]]) for step in range(3)]
+            episodes.reset([True, False])
+            together.append(episodes.add(film[:2], [True, False]))
+    beside = [[step.of(index) for step in together[:3]] for index in range(2)]
+    expected = {("stack the cups", 0): alone, ("open the drawer", 0): again, ("first", 0): beside[0]}
+    expected |= {("second", 1): beside[1]}
     told = episodes_of(taker)
-    assert [each["task"] for each in told] == ["stack the cups", "open the drawer"]
-    assert [each["ended"] for each in told] == [True, True]
-    for each, scores in zip(told, (first, second), strict=True):
-        assert each["threshold"] == 0.0
+    assert all(each["ended"] and each["threshold"] == 0.0 for each in told)
+    for each, (about, scores) in zip(told[:4], expected.items(), strict=True):
+        assert (each["task"], each["env"]) == about
         assert each["steps"] == [
             {"step": s.step, "progress": s.progress, "success": s.success, "succeeded": s.succeeded, "ms": s.ms}
             for s in scores
         ]
-
-
-@pytest.mark.triton
-def test_episodes_side_by_side_are_reported_by_environment(served: Served, taker: Taker) -> None:
-    async def run() -> list[Any]:
-        async with AsyncRewardClient(served.url("grpc"), model=MODEL) as client:
-            episodes = client.episodes(2, ["stack the cups", "open the drawer"], live=view)
-            scores = [await episodes.add([picture(step), picture(step + 9)]) for step in range(3)]
-            await episodes.reset([True, False])
-            return [*scores, await episodes.add([picture(4), picture(5)], [True, False])]
-
-    with LiveView(taker.url) as view:
-        scores = asyncio.run(run())
-    told = episodes_of(taker)
-    assert [(each["env"], each["task"], len(each["steps"])) for each in told] == [
-        (0, "stack the cups", 3), (1, "open the drawer", 3), (0, "stack the cups", 1),
-    ]  # fmt: skip
-    for env in range(2):
-        assert [each["progress"] for each in told[env]["steps"]] == [float(s.progress[env]) for s in scores[:3]]
-    assert told[2]["steps"][0]["success"] == float(scores[3].success[0])
+    assert [(each["task"], len(each["steps"])) for each in told[4:]] == [("first", 1)]
 
 
 @pytest.mark.triton
@@ -328,19 +309,15 @@ def test_episodes_side_by_side_are_reported_by_environment(served: Served, taker
 def test_a_gymnasium_environment_is_reported(served: Served, taker: Taker, blocking: bool) -> None:
     with RewardClient(served.url("grpc"), model=MODEL) as client, LiveView(taker.url, name="cart") as view:
         env = RewardModelWrapper(cart_pole(), client, TASK, RewardOptions(live=view, blocking=blocking))
-        _, infos = play(env)
-        _, more = play(env, seed=1)
+        episodes = [play(env, seed)[1] for seed in range(2)]
         env.close()
     told = episodes_of(taker)
     assert [each["ended"] for each in told] == [True, True]
-    for each, seen in zip(told, (infos, more), strict=True):
-        known = {info["reward_model"]["step"]: info["reward_model"] for info in seen}
-        reported = {step["step"]: step for step in each["steps"]}
-        assert known.keys() <= reported.keys()
-        assert {key: (step["progress"], step["success"]) for key, step in reported.items() if key in known} == {
-            key: (info["progress"], info["success"]) for key, info in known.items()
-        }
-        assert max(known) == len(seen) - 1
+    for each, infos in zip(told, episodes, strict=True):
+        reported = {step["step"]: (step["progress"], step["success"]) for step in each["steps"]}
+        for info in (info["reward_model"] for info in infos):
+            assert reported[info["step"]] == (info["progress"], info["success"])
+        assert max(reported) == len(infos) - 1
 
 
 @contextmanager
@@ -382,34 +359,16 @@ def test_episodes_of_a_vector_environment_are_reported_and_end_with_their_last_s
 
 
 @pytest.mark.triton
-@pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_an_episode_whose_last_step_fails_has_ended(
-    served: Served, taker: Taker, mode: AutoresetMode, monkeypatch: pytest.MonkeyPatch
+    served: Served, taker: Taker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(*_words: object, **_options: object) -> None:
         raise InferenceFailedError("no answer")
 
-    with LiveView(taker.url) as view, watched_vector(served, view, mode) as (env, client):
+    with LiveView(taker.url) as view, watched_vector(served, view, AutoresetMode.NEXT_STEP) as (env, client):
         for _ in range(2):
             env.step(np.array([0, 1]))
         monkeypatch.setattr(client, "score_windows", fails)
         with pytest.raises(InferenceFailedError):
             env.step(np.array([0, 1]))
         poll(lambda: [each["ended"] for each in episodes_of(taker)] == [True, True])
-
-
-@pytest.mark.triton
-def test_an_episode_is_the_same_without_the_gateway(served: Served, caplog: pytest.LogCaptureFixture) -> None:
-    film = [picture(seed, (480, 640)) for seed in range(20)]
-    with (
-        RewardClient(served.url("grpc"), model=MODEL) as client,
-        LiveView(f"http://127.0.0.1:{free_port()}") as away,
-    ):
-        client.episode("stack the cups").add(film[0])
-        scores = {}
-        for view in (None, away):
-            with client.episode("stack the cups", live=view) as episode:
-                scores[view] = [episode.add(frame) for frame in film]
-        assert [(s.progress, s.success) for s in scores[None]] == [(s.progress, s.success) for s in scores[away]]
-        poll(lambda: "expected a gateway that takes live reports" in caplog.text)
-    assert len([record for record in caplog.records if record.levelno == logging.WARNING]) == 1

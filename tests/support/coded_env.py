@@ -12,6 +12,7 @@ import numpy as np
 from rfm_client import RewardClient, RewardError
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.episodes.windows import Window
+from shelves import Shelf
 
 SIZE_PX = 32
 
@@ -75,10 +76,13 @@ class CodedEnv(gym.Env[Any, Any]):
 
 
 class Recorder(RewardClient):
-    """Keeps the frames' codes and the task of every question. fails: which calls fail, by number, and with what"""
+    """A client of a stand-in server, which keeps the frames' codes and the task of every question.
 
-    def __init__(self, url: str, model: str, fails: Callable[[int], RewardError | None] = lambda call: None) -> None:
-        super().__init__(url, model=model, retry=False)
+    fails: which calls fail, by number, and with what
+    """
+
+    def __init__(self, fails: Callable[[int], RewardError | None] = lambda call: None) -> None:
+        super().__init__("", transports=[Shelf(has_encoder=False)], retry=False)
         self.calls: list[list[tuple[list[Code], str]]] = []
         self.pixels: list[list[UInt8Array]] = []  # of each window
         self._fails = fails

@@ -13,11 +13,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import AddRenderObservation
 
-from rfm_client import (
-    ProgressResult,
-    RewardClient,
-    Trajectory,
-)
+from rfm_client import ProgressResult, RewardClient, Trajectory
 from rfm_client.contract import wire
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.episodes.windows import Window
@@ -25,22 +21,11 @@ from rfm_client.transport.access import Access
 from rfm_client.transport.calls import Answer, GrpcTransport
 
 MODEL = "enc_c1_t1_disc10"
-
-
 MAX_FRAMES = 16  # of that checkpoint
-
-
 TASK = "balance the pole"
-
-
 PUSH_RIGHT = 1  # the pole falls within ten steps
-
-
 SIZE = 240, 160  # pixels; fewer would not show the cart
-
-
 TOLERANCE = 1e-5
-
 
 Film = list[UInt8Array]
 

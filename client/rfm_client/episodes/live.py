@@ -16,7 +16,6 @@ import math
 import operator
 import os
 import threading
-import time
 import uuid
 import weakref
 from collections import deque
@@ -133,8 +132,7 @@ class LiveView:
         """Ends the episodes, and returns when the last report has gone out, or after two seconds. What comes later is
         not reported.
         """
-        self._reporter.finish()
-        self._reporter.join(CLOSE_WITHIN_S)
+        self._reporter.close()
 
     def __enter__(self) -> LiveView:
         return self
@@ -193,8 +191,8 @@ class Reporter:
                 self._frames.pop(about["id"], None)
         self._has_more.set()
 
-    def finish(self) -> None:
-        """Has it reported that all episodes have ended, and then ends the thread. Returns at once."""
+    def close(self) -> None:
+        """Has it reported that all episodes have ended. Returns when that has happened, or after CLOSE_WITHIN_S."""
         if self._was_forked():
             return
         with self._lock:
@@ -202,11 +200,7 @@ class Reporter:
         for about in running:
             self.end(about)
         self.stop()
-
-    def join(self, timeout_s: float) -> None:
-        """Returns when the thread has ended, or after so long."""
-        if self._process_id == os.getpid():
-            self._thread.join(timeout_s)
+        self._thread.join(CLOSE_WITHIN_S)
 
     def stop(self) -> None:
         """Ends the thread as soon as what is left has been reported, or cannot be."""
@@ -288,12 +282,8 @@ _open: weakref.WeakSet[Reporter] = weakref.WeakSet()
 @atexit.register
 def _close_all() -> None:
     """Has the last steps reported before the process ends. A worker of multiprocessing ends without this."""
-    reporters = list(_open)
-    for reporter in reporters:
-        reporter.finish()
-    deadline_s = time.monotonic() + CLOSE_WITHIN_S
-    for reporter in reporters:
-        reporter.join(max(0.0, deadline_s - time.monotonic()))
+    for reporter in list(_open):
+        reporter.close()
 
 
 def report_body(steps: list[Entry], frames: Mapping[str, UInt8Array]) -> bytes:
