@@ -217,7 +217,7 @@ def test_cameras_are_scored_apart_and_fused(served: Served) -> None:
             episode = client.episode(TASK, frames=4, cameras=("front", "wrist"), fuse=fuse)  # type: ignore[arg-type]
             scores = [episode.add({"front": a, "wrist": b}) for a, b in zip(front, wrist, strict=True)]
             np.testing.assert_allclose(scores[-1].progress, expected, atol=TOLERANCE)
-        wanted = r"frames: expected frames of the cameras \['front', 'wrist'\], got \['front'\]"
+        wanted = r"frames: expected frames of the cameras \['front', 'wrist'\], got frames of \['front'\]"
         with pytest.raises(InvalidSampleError, match=wanted):
             episode.add({"front": front[0]})
 

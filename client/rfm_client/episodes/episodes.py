@@ -125,9 +125,10 @@ class AsyncEpisodes(OneProcess):
         self, frames: Any, indices: Sequence[int], size: FrameSize | None
     ) -> list[tuple[NamedFrame, ...]]:
         """The new frames of these episodes, in as many threads as there are processors."""
+        given = self._given(frames, indices)
 
         def checked(some: Sequence[int]) -> list[tuple[NamedFrame, ...]]:
-            return [self._episodes[index].checked(self._given(frames, index), size) for index in some]
+            return [self._episodes[index].checked(given[index], size) for index in some]
 
         count = max(1, math.ceil(len(indices) / (os.cpu_count() or 1)))
         parts = [indices[first : first + count] for first in range(0, len(indices), count)]
@@ -135,24 +136,22 @@ class AsyncEpisodes(OneProcess):
         await asyncio.gather(*making, return_exceptions=True)  # then the first error is raised, not the quickest
         return [frame for part in making for frame in part.result()]
 
-    def _given(self, frames: Any, index: int) -> Any:
-        """The new frame of one episode; with cameras, such by name. Raises InvalidSampleError."""
+    def _given(self, frames: Any, indices: Sequence[int]) -> dict[int, Any]:
+        """The new frame of each of these episodes; with cameras, such by name. Raises InvalidSampleError."""
         cameras = self._options.cameras
-        if not cameras and isinstance(frames, Mapping):
-            expected = "frames of one camera (cameras=... names several)"
-            raise InvalidSampleError.at("frames", expected, f"frames of {sorted(frames)}")
+        names = sorted(frames) if isinstance(frames, Mapping) else []
+        if names != sorted(cameras):
+            expected = f"the cameras {list(cameras)}" if cameras else "one camera (cameras=... names several)"
+            got = f"frames of {names}" if names else type(frames).__name__
+            raise InvalidSampleError.at("frames", f"frames of {expected}", got)
+        of_cameras = {f"frames[{camera!r}]": frames[camera] for camera in cameras} or {"frames": frames}
+        for where, each in of_cameras.items():
+            if not hasattr(each, "__len__") or len(each) != len(self):
+                got = f"{len(each)}" if hasattr(each, "__len__") else type(each).__name__
+                raise InvalidSampleError.at(where, f"a frame of each of {len(self)} episodes", got)
         if not cameras:
-            return self._one_of(frames, index, "frames")
-        if not isinstance(frames, Mapping) or set(frames) != set(cameras):
-            got = sorted(frames) if isinstance(frames, Mapping) else type(frames).__name__
-            raise InvalidSampleError.at("frames", f"frames of the cameras {list(cameras)}", str(got))
-        return {camera: self._one_of(frames[camera], index, f"frames[{camera!r}]") for camera in cameras}
-
-    def _one_of(self, frames: Any, index: int, where: str) -> Any:
-        if not hasattr(frames, "__len__") or len(frames) != len(self):
-            got = f"{len(frames)}" if hasattr(frames, "__len__") else type(frames).__name__
-            raise InvalidSampleError.at(where, f"a frame of each of {len(self)} episodes", got)
-        return frames[index]
+            return {index: frames[index] for index in indices}
+        return {index: {camera: frames[camera][index] for camera in cameras} for index in indices}
 
     def _gathered(self, scores: Mapping[int, StepScore]) -> StepScores:
         """The scores of all episodes; of those without one, none."""
