@@ -4,21 +4,19 @@
 env = gymnasium.make("CartPole-v1", render_mode="rgb_array")
 env = RewardModelWrapper(env, partial(RewardClient, "grpc://localhost:8001"), "balance the pole")
 
-Frames: each step's frame is kept until the next reset, and so is that of the reset: H * W * 3 bytes a step. All are
-needed: the rule ``sampling`` says which are sent, and which ones moves as episodes grow.
+All frames of the running episode are kept, H * W * 3 bytes a step: the rule ``sampling`` says which are shown.
 
 Scored are the frame of the reset, every ``every``-th step, and the last step of an episode. With ``blocking`` a step
-waits for its score. Without, it sends its frames and goes on with the newest answer that has come; an answer older
-than the one in use is ignored; with ``max_pending`` questions open nothing is sent, and the step counts as skipped.
-Even then the frame of the reset is waited for, so that there is a score from the start, and the last step is, unless
-``await_last=False``; older questions are needless then, and cancelled.
+waits for its score. Without, it goes on with the newest answer that has come; with ``max_pending`` questions open
+nothing is asked, and the step counts as skipped. Even then the frame of the reset is waited for, and the last step is,
+unless ``await_last=False``; older questions are cancelled.
 
 ``info["reward_model"]``: ``progress`` and ``success`` (NaN: the checkpoint does not predict it) of the newest known
-answer; the ``step`` of the episode that it is about, and its ``lag`` in steps; the steps ``skipped`` in this episode;
-after a step the ``env_reward``; with ``terminate_on_success`` whether the episode has ``succeeded``.
+answer; the ``step`` that it is about, and its ``lag`` in steps; the steps ``skipped`` in this episode; after a step the
+``env_reward``; with ``terminate_on_success`` whether the episode has ``succeeded``.
 
-A RewardError is raised out of ``reset`` or ``step`` and never becomes a reward. If the server failed, the frame is part
-of the episode; in delta mode the next step pays what that one did not. If there was no frame to keep, the next ``step``
+A RewardError comes out of ``reset`` or ``step`` and never becomes a reward. If the server failed, the frame is part of
+the episode; in delta mode the next step pays what that one did not. If there was no frame to keep, the next ``step``
 raises ResetNeeded. So does a step after an episode's end, unless the environment resets in that step.
 """
 
