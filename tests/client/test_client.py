@@ -36,7 +36,7 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.batching import MAX_REQUEST_BYTES
+from rfm_client.scoring.batching import MAX_REQUEST_BYTES
 from rfm_client.transport.deadline import Deadline
 from rfm_client.transport.in_flight import MAX_BYTES, InFlight
 from shelves import Shelf

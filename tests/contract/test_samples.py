@@ -23,8 +23,8 @@ from rfm_client import (
     Trajectory,
     float_frames_to_uint8,
 )
-from rfm_client import batching as packing
 from rfm_client.contract import wire
+from rfm_client.scoring import batching as packing
 
 FRAMES = np.zeros((3, 8, 6, 3), np.uint8)
 VIDEO = np.ones((3, 5), np.float32)
