@@ -260,7 +260,7 @@ def test_bytes_in_flight_are_bounded_and_more_than_the_bound_goes_alone() -> Non
         most = MAX_BYTES - 2**20
         async with room(most // 2, Deadline(1)), room(most // 2, Deadline(1)):
             with pytest.raises(DeadlineExceededError):
-                async with room(2**20, Deadline(0.05)):
+                async with room(2**20 + 1, Deadline(0.05)):
                     pytest.fail("there was no room")
         async with room(3 * MAX_BYTES, Deadline(1)):
             with pytest.raises(DeadlineExceededError):

@@ -41,8 +41,7 @@ def test_shared_memory_changes_no_answer_and_leaves_nothing(repository: Path, pr
                 for answer, plain in zip(client.evaluate(samples), expected, strict=True):
                     assert_same(answer, plain)
             assert len(regions(endpoints)) == 1  # one, used again and again
-            left = ours_in_dev_shm() - before
-            assert [name.endswith(".lock") for name in left] == [True]  # its name is gone while it is in use
+            assert ours_in_dev_shm() == before  # its name is gone while it is in use
         assert regions(endpoints) == set()
     assert ours_in_dev_shm() == before
 
@@ -113,23 +112,15 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-def test_what_a_killed_client_shared_is_taken_back_by_the_next(repository: Path, protocol: str) -> None:
+def test_a_killed_client_leaves_no_data(repository: Path) -> None:
     endpoints = Endpoints.free()
-    url = url_of(endpoints, protocol)
     before = ours_in_dev_shm()
     with OneModelServer(repository, endpoints):
-        killed = subprocess.run([sys.executable, "-c", KILLED_CLIENT, url], timeout=60)
+        killed = subprocess.run([sys.executable, "-c", KILLED_CLIENT, endpoints.grpc_url], timeout=60)
         assert killed.returncode == -signal.SIGKILL
-        assert all(name.endswith(".lock") for name in ours_in_dev_shm() - before)  # no data
-        orphans = regions(endpoints)
-        assert len(orphans) == 1
-        with RewardClient(url, shared_memory=True) as neighbour, RewardClient(url, shared_memory=True) as client:
-            neighbour.progress(heavy(), frame_steps=2)
-            assert not orphans & regions(endpoints)
-            client.progress(heavy(), frame_steps=2)
-            assert len(regions(endpoints)) == 2  # a living client keeps its own
-        assert regions(endpoints) == set()
-    assert ours_in_dev_shm() == before
+        assert ours_in_dev_shm() == before
+        with RewardClient(endpoints.grpc_url, shared_memory=True) as client:
+            assert client.progress(heavy(), frame_steps=2).last_progress > 0
 
 
 def test_a_server_without_the_extension_is_asked_through_the_socket(
