@@ -145,7 +145,7 @@ def failure(url: str) -> ServerUnavailableError:
             "failed to connect to all addresses; last error: UNKNOWN: ipv4:10.0.0.1:8001: Connection reset by peer",
             False,
         ),
-        ("failed to connect to all addresses; last error: UNKNOWN: ipv4:10.0.0.1:8001: Connection refused", False),
+        ("connections to all backends failing; last error: UNKNOWN: ipv4:10.0.0.1:1: Connection reset by peer", False),
         ("the queue is full: 8 requests wait already", False),
         ("Stub process 'rfm_0_0' is not healthy.", True),
     ],

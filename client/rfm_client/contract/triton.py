@@ -37,7 +37,9 @@ REGION_IN_USE = "it is currently in use"  # of a region to unmap: tests/client/t
 RESTRICTED = "is restricted, expecting header"  # of an API that wants a key
 LATE = "no answer in time"
 
-_NO_CONNECTION = re.compile("failed to connect|errors resolving|resolution failed")  # of gRPC itself: nothing was sent
+_NO_CONNECTION = re.compile(  # of gRPC itself: nothing was sent
+    "failed to connect|connections to all backends failing|errors resolving|resolution failed"
+)
 _LOST_CONNECTION = re.compile("Socket closed|Connection reset|Broken pipe|connection termination")  # or of a proxy
 _NO_TRUST = re.compile(f"CERTIFICATE|certificate|[Vv]erification [Cc]heck failed|WRONG_VERSION_NUMBER|{RESTRICTED}")
 _WRONG_SHAPE = re.compile(  # behind the batch axis, which the caller did not make
