@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache, partial
-from typing import Any, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
@@ -85,6 +85,7 @@ class TritonTransport:
     """
 
     _triton: Any  # the module
+    _as_json: ClassVar[dict[str, bool]] = {}  # by which its methods give dictionaries
     _proxy: str | None = None  # as an error tells it
 
     def __init__(self, url: str, access: Access, *, shared_memory: bool) -> None:
@@ -107,7 +108,8 @@ class TritonTransport:
 
     async def model_info(self, model: str, timeout_s: float) -> ModelInfo:
         async def request(client: Any) -> ModelInfo:
-            return ModelInfo.from_config(await self._model_config(client, model))
+            config = await client.get_model_config(model, **self._as_json)
+            return ModelInfo.from_config(config.get("config", config))  # gRPC's has it inside
 
         return await self._call(request, timeout_s, bad_request=errors.ModelNotFoundError)
 
@@ -144,7 +146,9 @@ class TritonTransport:
             async with self._shared_memory.lend(client, inputs[largest]) as region:
                 regions = {largest: region} if region is not None else {}
                 answer = await ask(await off_loop(0 if regions else num_bytes, self._inputs, inputs, regions))
-        return Answer(_outputs(answer, outputs), self._model_version(answer))
+        response = answer.get_response()
+        version = response["model_version"] if isinstance(response, dict) else response.model_version
+        return Answer(_outputs(answer, outputs), str(version))
 
     def _inputs(self, inputs: Tensors, regions: Mapping[str, Region]) -> list[Any]:
         tensors = []
@@ -194,7 +198,8 @@ class TritonTransport:
         with suppress(Exception):
             async with timeout(_SERVED_TIMEOUT_S):
                 with self._connected().used() as client:
-                    return triton.not_served(error.message, await self._served_models(client))
+                    told = await client.get_inference_statistics(**self._as_json)
+                    return triton.not_served(error.message, {each["name"] for each in told.get("model_stats", [])})
         return error
 
     async def _answer(self, request: Callable[[Any], Awaitable[Answered]]) -> Answered:
@@ -223,19 +228,8 @@ class TritonTransport:
             self._connection = Connection(client)
         return self._connection
 
-    # What differs
-
     def _open(self) -> Any:
         """A client of tritonclient's, which connects when it is first used."""
-        raise NotImplementedError
-
-    async def _model_config(self, client: Any, model: str) -> Mapping[str, Any]:
-        raise NotImplementedError
-
-    async def _served_models(self, client: Any) -> set[str]:
-        raise NotImplementedError
-
-    def _model_version(self, answer: Any) -> str:
         raise NotImplementedError
 
 
@@ -245,6 +239,7 @@ class GrpcTransport(TritonTransport):
     A host name may have several addresses, such as that of a headless Service: gRPC spreads the requests over them.
     """
 
+    _as_json: ClassVar[dict[str, bool]] = {"as_json": True}
     _first_process: int | None = None  # that used gRPC
 
     def __init__(self, url: str, access: Access, *, shared_memory: bool) -> None:
@@ -267,18 +262,6 @@ class GrpcTransport(TritonTransport):
         return self._triton.InferenceServerClient(
             self._address, channel_args=grpc_options(self._address), **self._access.grpc_options(self._scheme)
         )
-
-    async def _served_models(self, client: Any) -> set[str]:
-        answer = await client.get_inference_statistics(as_json=True)
-        return {entry["name"] for entry in answer.get("model_stats", [])}
-
-    async def _model_config(self, client: Any, model: str) -> Mapping[str, Any]:
-        answer = await client.get_model_config(model, as_json=True)
-        config: Mapping[str, Any] = answer["config"]
-        return config
-
-    def _model_version(self, answer: Any) -> str:
-        return str(answer.get_response().model_version)
 
 
 class HttpTransport(TritonTransport):
@@ -303,17 +286,6 @@ class HttpTransport(TritonTransport):
 
         client._post = post_stream
         return client
-
-    async def _served_models(self, client: Any) -> set[str]:
-        answer = await client.get_inference_statistics()
-        return {entry["name"] for entry in answer["model_stats"]}
-
-    async def _model_config(self, client: Any, model: str) -> Mapping[str, Any]:
-        config: Mapping[str, Any] = await client.get_model_config(model)
-        return config
-
-    def _model_version(self, answer: Any) -> str:
-        return str(answer.get_response()["model_version"])
 
 
 def _outputs(answer: Any, names: Collection[str]) -> Tensors:
