@@ -27,7 +27,7 @@ from rfm_client.labelling import (
     open_dataset,
 )
 from rfm_client.labelling.label import plan_labels
-from rfm_client.labelling.ray_engine import EpisodeActor, Job
+from rfm_client.labelling.ray_engine import EpisodeActor, RayJob
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::FutureWarning", "ignore::DeprecationWarning", "ignore::ResourceWarning"
@@ -64,7 +64,7 @@ def test_a_scorer_is_open_as_long_as_its_actor_lives(output: Path) -> None:
             scorer.is_open = False
 
     plan = plan_labels(open_dataset(ROOT), scorer, LabelOptions(output=output, limit=3))
-    actor = EpisodeActor(Job(str(ROOT), None, connect, plan, str(output / "parts"), workers=1))
+    actor = EpisodeActor(RayJob(str(ROOT), {}, connect, plan, str(output / "parts"), workers=1))
     assert actor({"places": [[0, 2]]}) == {"place": [0, 2], "reason": ["", ""]}
     assert actor({"places": [[1]]}) == {"place": [1], "reason": [""]}
     assert scorer.is_open
@@ -88,7 +88,7 @@ def test_an_actor_opens_the_dataset_as_it_is_told(output: Path) -> None:
     scorer, told = SeeingScorer(), {"task": "juggle", "override_task": True, "orient": Orient("rotate90")}
     dataset = open_dataset(ROOT, **told)  # type: ignore[arg-type]
     plan = plan_labels(dataset, scorer, LabelOptions(output=output, limit=1, cameras=(dataset.cameras[0],)))
-    job = Job(str(ROOT), "juggle", lambda: nullcontext(scorer), plan, str(output), 1, True, Orient("rotate90"))
+    job = RayJob(str(ROOT), told, lambda: nullcontext(scorer), plan, str(output), 1)
     assert EpisodeActor(job)({"places": [[0]]}) == {"place": [0], "reason": [""]}
     assert scorer.tasks == {"juggle"}
     (episode, *_), stored = dataset.episodes, open_dataset(ROOT)
