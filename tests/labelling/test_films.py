@@ -15,7 +15,7 @@ from encoding import encode
 from pictures import TURNS, Matrix, numbered, numbers, turn, write_video
 from rfm_client import InvalidSampleError
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.datasets.films import Packets, Span, decode
+from rfm_client.data.datasets.films import Span, decode, film_packets
 from rfm_client.data.video import frame_times_s, read_video
 from rfm_client.labelling import DatasetError, open_dataset
 
@@ -298,7 +298,7 @@ def test_a_film_that_breaks_off_is_refused(tmp_path: Path, name: str, write: Wri
         begins = sorted(packet.pos for packet in container.demux(video=0) if packet.size)
     content = file.read_bytes()
     file.write_bytes(content[: begins[24] + num_bytes])
-    with pytest.raises(InvalidSampleError, match=r"^video: expected a whole file, got .*film\.\w+\)$"):
+    with pytest.raises(InvalidSampleError, match=r"^video: expected a whole video file, got .*film\.\w+\)$"):
         read_video(file)
     with pytest.raises(DatasetError, match=r"film\.\w+: expected a whole video file, got "):
         labelled(file)
@@ -357,7 +357,7 @@ def test_damage_counts_up_to_the_next_key_frame_and_only_in_frames_that_are_used
     assert len(read_video(file, start_s=0, end_s=0.5)) == 5
     assert len(read_video(file, start_s=2, end_s=4)) == 20
     for first, count in ((0, 5), (20, 20)):
-        times_s = Packets.read(file).times_s[first : first + count]
+        times_s = film_packets(file).times_s[first : first + count]
         assert len(list(decode(Span(file, times_s, 0.05, "episode")))) == count
 
 

@@ -17,16 +17,16 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.datasets.protocol import DatasetError
+from rfm_client.data.datasets.protocol import DatasetError, require
 from rfm_client.data.film_files import (
     DAMAGED,
     UNDAMAGED,
     FilmError,
-    broken_off,
-    film_packets,
+    Packets,
     film_stream,
     import_av,
     judged,
+    read_packets,
     upright,
 )
 
@@ -82,47 +82,20 @@ class Span:
         return DatasetError.at(f"{self.where}: {self.file}", expected, got)
 
 
-@dataclass(frozen=True, eq=False)
-class Packets:
-    """What a film holds, read without decoding it.
-
-    times_s: float64 [N], rising
-    num_bytes: how many bytes each frame has
-    tick_s: what times are multiples of
-    fps: frames a second on average; 0: the file does not say it
-    """
-
-    times_s: Times
-    num_bytes: tuple[int, ...]
-    tick_s: float
-    fps: float
-
-    @classmethod
-    def read(cls, file: Path, container: str | None = None) -> Packets:
-        """The packets of all frames. Raises DatasetError for a missing or truncated file, and one of several films."""
-        av = import_av()
-        found: list[tuple[float, int]] = []
-        try:
-            with file.open("rb") as opened:
-                missing = broken_off(opened)
-            if missing is not None:
-                raise FilmError("a whole video file", missing)
-            with av.open(str(file), format=container) as film:
-                stream = film_stream(film)
-                for packet in film_packets(film, stream):
-                    if packet.is_corrupt:
-                        raise FilmError("a whole video file", f"one whose frame {len(found)} is broken")
-                    if packet.pts is not None:
-                        found.append((float(packet.pts * packet.time_base), packet.size))
-                tick_s, fps = float(stream.time_base), float(stream.average_rate or 0)
-        except FilmError as error:
-            raise DatasetError.at(file, error.expected, error.got) from error
-        except FileNotFoundError as error:
-            raise DatasetError.at(file, "a video file", "none") from error
-        except (av.FFmpegError, OSError) as error:
-            raise DatasetError.at(file, "a whole video file", error.strerror or error) from error
-        found.sort()
-        return cls(np.array([time_s for time_s, _ in found]), tuple(size for _, size in found), tick_s, fps)
+def film_packets(file: Path, container: str | None = None) -> Packets:
+    """The packets of a film's frames. Raises DatasetError for a missing or truncated file, and one of several films."""
+    av = import_av()
+    try:
+        with file.open("rb") as opened:
+            packets = read_packets(opened, container)
+    except FilmError as error:
+        raise DatasetError.at(file, error.expected, error.got) from error
+    except FileNotFoundError as error:
+        raise DatasetError.at(file, "a video file", "none") from error
+    except (av.FFmpegError, OSError) as error:
+        raise DatasetError.at(file, "a whole video file", error.strerror or error) from error
+    require(file, not packets.corrupt, "a whole video file", f"one whose frames {packets.corrupt[:3]} are broken")
+    return packets
 
 
 def decode(span: Span) -> Iterator[UInt8Array]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.datasets import lerobot_v21, lerobot_v30
-from rfm_client.data.datasets.films import Packets, Span, Times, decode, film_identity
+from rfm_client.data.datasets.films import Span, Times, decode, film_identity, film_packets
 from rfm_client.data.datasets.lerobot_rows import Entry, Info, RowReader, read_table
 from rfm_client.data.datasets.protocol import (
     Dataset,
@@ -28,7 +28,7 @@ from rfm_client.data.datasets.protocol import (
     orientations_of,
     require,
 )
-from rfm_client.data.film_files import decoder
+from rfm_client.data.film_files import Packets, decoder
 from rfm_client.data.orientation import Orient
 
 _FILMS_AT_A_TIME = 4  # whose tables of packets are kept in memory
@@ -150,7 +150,7 @@ class LeRobotDataset(Dataset):
         parts = [(entry, entry.films[camera][1] + self._rows.read(entry).times_s) for entry in entries]
         parts.sort(key=lambda part: float(part[1][0]))
         rows_s = np.concatenate([times_s for _, times_s in parts])
-        packets = Packets.read(file, _CONTAINER.get(file.suffix.lower()))
+        packets = film_packets(file, _CONTAINER.get(file.suffix.lower()))
         fps, rates = self.info.fps, ""
         if packets.fps and f"{packets.fps:.2f}" != f"{self.info.fps:.2f}":
             rates = f" (the film has {packets.fps:.2f} frames a second, meta/info.json says {fps:g})"

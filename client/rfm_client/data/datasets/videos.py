@@ -15,7 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.datasets.films import Packets, Span, decode, film_identity
+from rfm_client.data.datasets.films import Span, decode, film_identity, film_packets
 from rfm_client.data.datasets.protocol import (
     Dataset,
     DatasetEpisode,
@@ -49,7 +49,7 @@ class VideoFolder(Dataset):
         self._table = _table_in(table) if table.is_dir() else table
         self.root = self._table.parent
         self.source = self.root.resolve().name
-        self._packets = lru_cache(_FILES_AT_A_TIME)(Packets.read)
+        self._packets = lru_cache(_FILES_AT_A_TIME)(film_packets)
         self._task = task
         self.orientations = orientations_of(orient, self.cameras)
         self._tasks = _read(self._table, {"video"} if task.text else {"video", "task"})
