@@ -81,26 +81,18 @@ def test_each_frame_of_a_film_is_held_once(output: Path, mode: dict[str, Any]) -
     assert 1 <= peak < 1.7
 
 
-@pytest.mark.parametrize("scorer", [BrightnessScorer, Refusing])
-def test_all_workers_together_hold_no_more_than_fits(
-    output: Path, scorer: type[BrightnessScorer], monkeypatch: pytest.MonkeyPatch
+BOUNDS = {"of one and a half films": (int(1.5 * FILM_BYTES), BrightnessScorer), "below one film": (1, BrightnessScorer)}
+BOUNDS["and an episode that failed holds nothing"] = (int(1.5 * FILM_BYTES), Refusing)
+
+
+@pytest.mark.parametrize(("max_bytes", "scorer"), BOUNDS.values(), ids=BOUNDS)
+def test_all_workers_together_hold_no_more_than_fits_or_one_film(
+    output: Path, max_bytes: int, scorer: type[BrightnessScorer], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And an episode that failed holds nothing."""
-    monkeypatch.setattr(run, "FrameMemory", functools.partial(FrameMemory, int(1.5 * FILM_BYTES)))
+    monkeypatch.setattr(run, "FrameMemory", functools.partial(FrameMemory, max_bytes))
     options = LabelOptions(output=output, workers=WORKERS, frames=2)
     peak, report = peak_films(LongFilms(output, 2 * WORKERS), options, scorer())
     assert len(report.failures) == (2 * WORKERS if scorer is Refusing else 0)
-    assert 1 <= peak < 2
-
-
-def test_a_film_that_is_larger_than_all_that_fits_is_labelled_alone(
-    output: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(run, "FrameMemory", functools.partial(FrameMemory, 1))
-    peak, report = peak_films(
-        LongFilms(output, 3), LabelOptions(output=output, workers=3, frames=2), BrightnessScorer()
-    )
-    assert report.failures == []
     assert 1 <= peak < 2
 
 

@@ -27,7 +27,7 @@ from pyarrow import parquet
 
 import goldens
 import local_hub
-from encoding import encode
+from encoding import encode, encode_here
 from labelling import LEROBOT, BrightnessScorer
 from pictures import write_video
 from rfm_client.data.datasets.protocol import chosen_cameras
@@ -99,13 +99,7 @@ def test_one_may_walk_through_the_episodes_of_some_cameras() -> None:
 
 def rewrite(film: Path, change: Callable[[list[Any]], list[Any]], fps: Fraction = Fraction(10)) -> None:
     """Encodes a film anew, of other frames, or of another rate."""
-    frames = change(whole_film(film))
-    with av.open(str(film), "w") as container:
-        stream = container.add_stream("libx264", rate=fps, options={"crf": "1"})
-        stream.height, stream.width, stream.pix_fmt = *frames[0].shape[:2], "yuv444p"
-        for image in frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
-        container.mux(stream.encode())
+    encode_here(film, change(whole_film(film)), "libx264", {"crf": "1"}, pixels="yuv444p", rate=fps)
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
