@@ -117,7 +117,8 @@ def frame_times_s(file: str | Path, num_frames: int, *, container: str | None = 
         times_s = read_packets(opened, container).times_s
     if len(times_s) < num_frames:
         return None
-    return times_s[_spread(len(times_s), num_frames)] - times_s[0]
+    since_first_s: npt.NDArray[np.float64] = times_s - times_s[0]
+    return since_first_s[_spread(len(times_s), num_frames)]
 
 
 @contextmanager

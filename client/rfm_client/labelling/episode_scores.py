@@ -17,8 +17,8 @@ from rfm_client.contract.results import ProgressResult
 from rfm_client.contract.samples import Float32Array, ProgressSample, Trajectory, UInt8Array
 from rfm_client.data.camera_fusion import FUSES
 from rfm_client.data.datasets.protocol import Dataset, DatasetEpisode, require
-from rfm_client.data.prefixes import of_prefixes, prefix_samples
 from rfm_client.data.resize import resize_frames
+from rfm_client.data.sampling import of_prefixes, prefix_samples
 from rfm_client.labelling.plan import Recipe
 from rfm_client.labelling.scorer import Scorer
 

@@ -69,7 +69,6 @@ class Hdf5Dataset(Dataset):
         self.notes = [] if is_upright else _notes(untold, is_libero)
 
     def read_episodes(self) -> Sequence[DatasetEpisode]:
-        """All demonstrations, by their numbers. Raises DatasetError."""
         with self._opened() as opened:
             task = self._task.of(f"{self.file}: problem_info or env_args", _task_of(opened["data"].attrs))
             lengths = {name: self._length(opened, name) for name in self._demos.values()}
@@ -82,20 +81,16 @@ class Hdf5Dataset(Dataset):
         return episodes
 
     def decoder(self, camera: str) -> str | None:
-        """None: frames are stored as pixels."""
         return None
 
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
-        """A digest of the pixels, since labels may be written into the file itself. Reads all frames."""
         return digest_of(frame.tobytes() for frame in self.stored_frames(episode, camera))
 
     def check(self, episode: DatasetEpisode, camera: str) -> int:
-        """Finds the frames in the file. Raises DatasetError."""
         with self._opened() as opened:
             return int(self._film(opened, episode, camera).nbytes)
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
-        """The frames, uint8 [H, W, 3], as they are stored. Raises DatasetError."""
         with self._opened() as opened:
             film = self._film(opened, episode, camera)
             for start in range(0, episode.num_frames, _FRAMES_AT_A_TIME):
@@ -191,7 +186,6 @@ def _form(value: Any) -> str:
 
 
 def _is_picture(value: Any) -> bool:
-    """Whether an observation looks like pictures of any form."""
     if not hasattr(value, "shape"):
         return any(_is_picture(each) for each in value.values())
     if len(value.shape) == 3:
@@ -220,7 +214,6 @@ def _notes(untold: Sequence[str], is_libero: bool) -> Sequence[str]:
 
 
 def _is_libero(attributes: Mapping[str, Any]) -> bool:
-    """Whether the file says that LIBERO wrote it."""
     env_names = (attributes.get("env_name"), _document(attributes, "env_args").get("env_name"), attributes.get("tag"))
     has_problem = not {"problem_name", "language_instruction"}.isdisjoint(_document(attributes, "problem_info"))
     is_named = any("libero" in str(name).lower() for name in env_names)

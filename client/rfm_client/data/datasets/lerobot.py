@@ -40,12 +40,7 @@ _DEEP = ";16"  # how Pillow names 16 bits a channel that it cuts to 8
 
 
 class LeRobotDataset(Dataset):
-    """A LeRobot dataset in a local folder.
-
-    source, revision: of the Hub, if it came from there
-    task: what the caller says of tasks
-    orient: how pictures are turned
-    """
+    """A LeRobot dataset in a local folder. source, revision: of the Hub, if it came from there"""
 
     def __init__(
         self,
@@ -77,7 +72,6 @@ class LeRobotDataset(Dataset):
         require(root / "meta", is_whole, f"{info.total_frames} frames, as info.json says", num_frames)
 
     def read_episodes(self) -> Sequence[DatasetEpisode]:
-        """All episodes. Reads and checks the rows of all of them; raises DatasetError."""
         episodes = []
         for _, entry in sorted(self._entries.items()):
             rows = self._rows.read(entry)
@@ -86,11 +80,9 @@ class LeRobotDataset(Dataset):
         return episodes
 
     def decoder(self, camera: str) -> str | None:
-        """PyAV or Pillow, with the versions that decide what a picture looks like."""
         return decoder() if camera in self.info.films else _pillow()
 
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
-        """What tells the episode's film, or its images, from others. Raises DatasetError."""
         if camera not in self.info.films:
             return digest_of(self._images(episode, camera))
         entry = self._entries[episode.index]
@@ -99,7 +91,6 @@ class LeRobotDataset(Dataset):
         return f"{film_identity(film, verify=verify, revision=self.revision)} {from_s} {times}"
 
     def check(self, episode: DatasetEpisode, camera: str) -> int:
-        """Finds the episode's frames. Raises DatasetError if its film and rows differ, or a picture has no colours."""
         if camera in self.info.films:
             packets, frames = self._film(camera, self.film(episode, camera))
             return sum(packets.num_bytes[frames[episode.index]])
@@ -109,7 +100,6 @@ class LeRobotDataset(Dataset):
         return sum(map(len, images))
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
-        """The episode's frames, uint8 [H, W, 3]. Raises DatasetError."""
         if camera in self.info.films:
             return decode(self.span(episode, camera))
         images = self._images(episode, camera)

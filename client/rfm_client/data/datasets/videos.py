@@ -35,12 +35,7 @@ _FILES_AT_A_TIME = 4
 
 
 class VideoFolder(Dataset):
-    """Videos and their tasks.
-
-    table: the file of tasks, or the folder that holds it
-    task: what the caller says of tasks
-    orient: how pictures are turned
-    """
+    """Videos and their tasks. table: the file of tasks, or the folder that holds it"""
 
     kind = "videos"
     cameras = ("video",)
@@ -55,7 +50,6 @@ class VideoFolder(Dataset):
         self._tasks = _read(self._table, {"video"} if task.text else {"video", "task"})
 
     def read_episodes(self) -> Sequence[DatasetEpisode]:
-        """All videos, in the table's order. Counts their frames; raises DatasetError."""
         episodes: list[DatasetEpisode] = []
         first = 0
         for index, (name, own) in enumerate(self._tasks.items()):
@@ -69,20 +63,16 @@ class VideoFolder(Dataset):
         return episodes
 
     def decoder(self, camera: str) -> str | None:
-        """PyAV, with the versions that decide what a frame looks like."""
         return decoder()
 
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
-        """What tells the video from others. Raises DatasetError."""
         return film_identity(self.root / episode.name, verify=verify)
 
     def check(self, episode: DatasetEpisode, camera: str) -> int:
-        """Finds the video's frames. Raises DatasetError."""
         chosen_cameras(self, [camera])
         return sum(self._packets(self.root / episode.name).num_bytes)
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
-        """The video's frames, uint8 [H, W, 3]. Raises DatasetError."""
         file = self.root / episode.name
         times_s = self._packets(file).times_s
         gaps_s = times_s[1:] - times_s[:-1]
