@@ -23,9 +23,8 @@ from rfm_client.contract.results import SUCCESS_THRESHOLD, FrameScores, Progress
 from rfm_client.contract.samples import Float32Array, UInt8Array, as_array
 from rfm_client.data.camera_fusion import FUSES, Fuse, check_fuse, checked_cameras
 from rfm_client.data.orientation import Orient, Orientation, turned
-from rfm_client.data.prefixes import of_frames
 from rfm_client.data.resize import resize_frames
-from rfm_client.data.sampling import Prefix, Rule, Sampling
+from rfm_client.data.sampling import Prefix, Rule, Sampling, of_frames
 from rfm_client.episodes.windows import NamedFrame, Window
 
 if TYPE_CHECKING:
