@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.samples import as_array
@@ -42,8 +43,7 @@ class AsyncEpisodes(OneProcess):
     def __init__(
         self, client: AsyncRewardClient, tasks: Sequence[str], options: EpisodeOptions, timeout_s: float | None = None
     ) -> None:
-        if not tasks:
-            raise ValueError("episodes: expected at least one, got none")
+        require("episodes", len(tasks) > 0, "at least one", "none")
         self._client, self._options, self._timeout_s = client, options, timeout_s
         self._tasks = list(tasks)
         self._episodes = [self._new(index) for index in range(len(tasks))]
@@ -91,8 +91,7 @@ class AsyncEpisodes(OneProcess):
         async with self._adding:
             indices = _indices(mask, len(self))
             tasks = [task] * len(indices) if task is None or isinstance(task, str) else list(task)
-            if len(tasks) != len(indices):
-                raise ValueError(f"task: expected one for each of {len(indices)} episodes, got {len(tasks)}")
+            require("task", len(tasks) == len(indices), f"one for each of {len(indices)} episodes", len(tasks))
             for index, new in zip(indices, tasks, strict=True):
                 self._episodes[index].end()
                 self._tasks[index] = self._tasks[index] if new is None else new
@@ -140,15 +139,13 @@ class AsyncEpisodes(OneProcess):
         """The new frame of each of these episodes; with cameras, such by name. Raises InvalidSampleError."""
         cameras = self._options.cameras
         names = sorted(frames) if isinstance(frames, Mapping) else []
-        if names != sorted(cameras):
-            expected = f"the cameras {list(cameras)}" if cameras else "one camera (cameras=... names several)"
-            got = f"frames of {names}" if names else type(frames).__name__
-            raise InvalidSampleError.at("frames", f"frames of {expected}", got)
+        expected = f"the cameras {list(cameras)}" if cameras else "one camera (cameras=... names several)"
+        got = f"frames of {names}" if names else type(frames).__name__
+        require("frames", names == sorted(cameras), f"frames of {expected}", got, InvalidSampleError)
         of_cameras = {f"frames[{camera!r}]": frames[camera] for camera in cameras} or {"frames": frames}
         for where, each in of_cameras.items():
-            if not hasattr(each, "__len__") or len(each) != len(self):
-                got = f"{len(each)}" if hasattr(each, "__len__") else type(each).__name__
-                raise InvalidSampleError.at(where, f"a frame of each of {len(self)} episodes", got)
+            count = len(each) if hasattr(each, "__len__") else type(each).__name__
+            require(where, count == len(self), f"a frame of each of {len(self)} episodes", count, InvalidSampleError)
         if not cameras:
             return {index: frames[index] for index in indices}
         return {index: {camera: frames[camera][index] for camera in cameras} for index in indices}
@@ -312,6 +309,6 @@ def _indices(mask: npt.ArrayLike | None, count: int) -> list[int]:
     if mask is None:
         return list(range(count))
     array = np.asarray(as_array(mask))
-    if array.dtype != np.bool_ or array.shape != (count,):
-        raise ValueError(f"mask: expected bool [{count}], got {array.dtype} {list(array.shape)}")
+    is_mask = array.dtype == np.bool_ and array.shape == (count,)
+    require("mask", is_mask, f"bool [{count}]", f"{array.dtype} {list(array.shape)}")
     return [int(index) for index in np.flatnonzero(array)]

@@ -27,6 +27,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
+from rfm_client.contract.checks import require
 from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.resize import as_jpeg, load_pillow
@@ -151,10 +152,10 @@ class Reporter:
         self._url, self._access = url, access
         self._parts = urlsplit(url)
         is_plain = "@" not in self._parts.netloc and not self._parts.query and not self._parts.fragment
-        if self._parts.scheme not in ("http", "https") or not self._parts.hostname or not is_plain:
-            raise ValueError(f"url: expected http://host:port or https://host:port of a gateway, got {url!r}")
-        if self._parts.scheme == "http" and access.uses_tls:
-            raise ValueError(f"url: expected https://host:port with certificates, got {url!r}")
+        is_url = self._parts.scheme in ("http", "https") and bool(self._parts.hostname) and is_plain
+        require("url", is_url, "http://host:port or https://host:port of a gateway", repr(url))
+        is_secure = self._parts.scheme == "https" or not access.uses_tls
+        require("url", is_secure, "https://host:port with certificates", repr(url))
         self._port = self._parts.port  # raises ValueError for one out of range
         self._headers = {**access.shown, "content-type": "application/json"}
         self._steps: deque[Entry] = deque(maxlen=MOST_STEPS_KEPT)

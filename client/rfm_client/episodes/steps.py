@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypedDict, cast
 import numpy as np
 import numpy.typing as npt
 
+from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError, RewardError
 from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.model_info import ModelInfo
@@ -92,11 +93,10 @@ class EpisodeOptions:
         object.__setattr__(self, "cameras", checked_cameras(self.cameras))
         check_fuse(self.fuse)
         Sampling.of(self.sampling, self.frames, trained_frames=1)  # whether rule and number go together
-        unknown = [camera for camera in self._orient.cameras if camera not in self.cameras]
-        if unknown:
-            cameras = list(self.cameras)
-            expected = f"some of the cameras {cameras}" if cameras else "one orientation, as cameras names none"
-            raise ValueError(f"orient: expected {expected}, got {', '.join(map(repr, unknown))}")
+        unknown = [repr(camera) for camera in self._orient.cameras if camera not in self.cameras]
+        cameras = list(self.cameras)
+        expected = f"some of the cameras {cameras}" if cameras else "one orientation, as cameras names none"
+        require("orient", not unknown, expected, ", ".join(unknown))
 
     @property
     def orientations(self) -> list[Orientation]:
@@ -279,8 +279,8 @@ class StepQuestion:
 def checked_frame(frame: Any, where: str) -> UInt8Array:
     """A copy of a frame: an environment may draw into the same array again. Raises InvalidSampleError."""
     kept = copied(frame)
-    if kept.dtype != np.uint8 or kept.ndim != 3 or kept.shape[2] != 3 or 0 in kept.shape:
-        raise InvalidSampleError.at(where, "uint8 [H, W, 3]", f"{kept.dtype} {list(kept.shape)}")
+    is_frame = kept.dtype == np.uint8 and kept.ndim == 3 and kept.shape[2] == 3 and 0 not in kept.shape
+    require(where, is_frame, "uint8 [H, W, 3]", f"{kept.dtype} {list(kept.shape)}", InvalidSampleError)
     return cast(UInt8Array, kept)
 
 

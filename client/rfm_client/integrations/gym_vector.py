@@ -12,6 +12,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import iterate
 
+from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.episodes.steps import copied
 from rfm_client.integrations.gym import DEFAULTS, INFO, LOST, check_frame_source, check_kind
@@ -51,8 +52,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         check_frame_source(options, env.render_mode, env.single_observation_space)
         autoreset_mode = _checked_autoreset_mode(env, options)
         tasks = [task] * env.num_envs if isinstance(task, str) else list(task)
-        if len(tasks) != env.num_envs:
-            raise ValueError(f"task: expected one for each of the {env.num_envs} environments, got {len(tasks)}")
+        require("task", len(tasks) == env.num_envs, f"one for each of the {env.num_envs} environments", len(tasks))
         super().__init__(env)  # a wrapper that is refused must not close the environments when it is collected
         self._payer = Payer(client, options)
         self._options = options
@@ -170,8 +170,8 @@ class RewardModelVectorWrapper(VectorWrapper):
             shown = list(self.env.render() or ())
         else:
             shown = list(iterate(self.env.observation_space, observations))
-        if len(shown) != self.num_envs:
-            raise InvalidSampleError.at("frames", f"one of each of the {self.num_envs} environments", str(len(shown)))
+        expected = f"one of each of the {self.num_envs} environments"
+        require("frames", len(shown) == self.num_envs, expected, len(shown), InvalidSampleError)
         return shown
 
     def _frame(self, shown: Any) -> Any:

@@ -13,6 +13,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from rfm_client.client import RewardClient
+from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError, RewardError
 from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.model_info import ModelInfo
@@ -69,8 +70,7 @@ class RewardOptions:
     live: LiveView | None = None
 
     def __post_init__(self) -> None:
-        if self.mode not in ("absolute", "delta"):
-            raise ValueError(f"mode: expected 'absolute' or 'delta', got {self.mode!r}")
+        require("mode", self.mode in ("absolute", "delta"), "'absolute' or 'delta'", repr(self.mode))
         checked_finite("scale", self.scale)
         for name in ("every", "max_pending", "max_frames"):
             if getattr(self, name) is not None:
