@@ -127,6 +127,13 @@ def test_results_arrive_as_they_were() -> None:
     assert (progress.timing, preference.timing) == (TIMING, TIMING)
 
 
+def test_a_request_asks_for_the_scores_of_its_samples() -> None:
+    progress, preference, similarity = results()[0]
+    assert wire.outputs_for([progress]) == ("progress", "success")
+    assert wire.outputs_for([progress, preference]) == ("progress", "success", "preference")
+    assert wire.outputs_for([similarity]) == ("progress", "success", "similarity")
+
+
 def test_what_was_not_asked_for_is_not_there() -> None:
     samples, sent = results()
     (progress, *_) = wire.decode_results(
