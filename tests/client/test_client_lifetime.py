@@ -269,6 +269,10 @@ def test_a_wrong_url_is_refused_when_the_client_is_made(url: str) -> None:
     assert str(raised.value) == f"url: expected {forms}, got {url!r}"
 
 
+def test_a_name_may_be_written_as_grpc_does() -> None:
+    RewardClient("dns:///rfm-triton-pods:8001").close()
+
+
 def test_a_client_needs_a_url() -> None:
     with pytest.raises(ValueError, match="url: expected at least one, got none"):
         RewardClient([])

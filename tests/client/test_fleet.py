@@ -12,16 +12,12 @@ import numpy as np
 import pytest
 
 from faulty_servers import url_of
-from one_model import OneModelServer
 from patients import DEADLY, MARK, Callers, make_repository, references, trajectory
-from rfm.launch.process import Endpoints
 from rfm_client import (
-    ProcessEndedError,
-    ProgressResult,
     ProgressSample,
     RewardClient,
 )
-from rfm_serve import MODEL, PATIENCE_S, Serving, model_processes, serving
+from rfm_serve import MODEL, PATIENCE_S, Serving, serving
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
@@ -68,16 +64,3 @@ def test_a_request_that_ends_its_process_ends_two_of_a_fleet(
     # Who was in one batch with it twice is lost, too.
     assert all("ended under this request twice" in str(error) for error in callers.lost)
     assert len(callers.lost) == lost < len(callers.answered)
-
-
-def test_where_nothing_heals_a_request_ends_two_processes_and_others_are_answered(tmp_path: Path) -> None:
-    with ExitStack() as stack:
-        repositories = [
-            make_repository(tmp_path / f"server-{number}", more_code=DEADLY) for number in range(NUM_SERVERS)
-        ]
-        servers = [stack.enter_context(OneModelServer(each, Endpoints.free())) for each in repositories]
-        client = stack.enter_context(RewardClient([server.endpoints.grpc_url for server in servers]))
-        with pytest.raises(ProcessEndedError, match="ended under this request twice"):
-            client.progress(POISON)
-        assert [bool(model_processes(server.pid)) for server in servers].count(False) == 2
-        assert isinstance(client.progress(trajectory(0)), ProgressResult)

@@ -127,6 +127,13 @@ def test_results_arrive_as_they_were() -> None:
     assert (progress.timing, preference.timing) == (TIMING, TIMING)
 
 
+def test_a_request_asks_for_the_scores_of_its_samples() -> None:
+    progress, preference, similarity = results()[0]
+    assert wire.outputs_for([progress]) == ("progress", "success")
+    assert wire.outputs_for([progress, preference]) == ("progress", "success", "preference")
+    assert wire.outputs_for([similarity]) == ("progress", "success", "similarity")
+
+
 def test_what_was_not_asked_for_is_not_there() -> None:
     samples, sent = results()
     (progress, *_) = wire.decode_results(
@@ -240,12 +247,13 @@ def test_named_frames_arrive_with_those_that_are_sent(num_sent: int, shape: tupl
                 np.testing.assert_array_equal(trajectory.pixels[frame_digest(frame)], frame)
 
 
-def request(lengths: tuple[int, int], kind: int, steps: int = 0, positions: int = 4) -> wire.Tensors:
+def request(lengths: tuple[int, int], kind: int, steps: int = 0, stray: int = 0) -> wire.Tensors:
+    """Four positions. stray: so many behind the frames are no zeros"""
     return {
         "sample_type": np.array([[kind]], np.uint8),
         "num_frames": np.array([lengths], np.int32),
         "frame_steps": np.array([[steps]], np.int32),
-        "video_embeddings": np.where(np.arange(positions) < sum(lengths), 1, 0).astype(np.float32)[None, :, None],
+        "video_embeddings": np.where(np.arange(4) < sum(lengths) + stray, 1, 0).astype(np.float32)[None, :, None],
         "text_embedding": np.ones((1, 2), np.float32),
     }
 
@@ -262,6 +270,10 @@ def request(lengths: tuple[int, int], kind: int, steps: int = 0, positions: int 
         (request((1, 1), 2, -1), r"frame_steps: expected 0 unless the sample is of type progress, got -1"),
         (request((1, 1), 3), r"sample_type: expected one of 0 \(progress\), 1 \(preference\), 2 \(similarity\), got 3"),
         (request((5, 0), 0), r"num_frames: expected at most the 4 frames in video_embeddings, got 5"),
+        (
+            request((1, 0), 0, stray=1),
+            "video_embeddings: expected zeros behind the 1 frames that num_frames tells, got .*",
+        ),
         (request((2, 3), 1), r"num_frames: expected at most the 4 frames in video_embeddings, got 5"),
     ],
 )

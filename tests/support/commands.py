@@ -8,7 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -45,29 +45,15 @@ def command(repository: Path, endpoints: Endpoints) -> list[str]:
 
 
 def regions() -> set[str]:
-    """Names in shared memory, but for those of servers and clients that others run on this machine."""
+    """Names in shared memory, but for those of servers that others run on this machine."""
     names = in_shared_memory()
     owners = {name: int(match[1]) for name in names if (match := OWNER.search(name))}
     return names - {name for name, pid in owners.items() if is_alive(pid) and not is_ours(pid)}
 
 
 def in_shared_memory() -> set[str]:
-    """Names in shared memory, but for those of clients in other tests' processes, also of one that ends meanwhile."""
-    others = _client_regions_of_others()
-    names = {path.name for path in SHARED_MEMORY.iterdir()}
-    return names - others - _client_regions_of_others()
-
-
-def _client_regions_of_others() -> set[str]:
-    """Names in shared memory of clients that live in other tests' processes: each locks a file of its own."""
-    locks = (line.split() for line in Path("/proc/locks").read_text().splitlines())
-    inodes = {int(words[5].rsplit(":")[-1]) for words in locks if words[1] == "FLOCK" and not is_ours(int(words[4]))}
-    found = set()
-    for lock in SHARED_MEMORY.glob("rfm-client-*.lock"):
-        with suppress(FileNotFoundError):  # it ended meanwhile
-            if lock.stat().st_ino in inodes:
-                found |= {path.name for path in SHARED_MEMORY.glob(f"{lock.stem}*")}
-    return found
+    """Names in shared memory."""
+    return {path.name for path in SHARED_MEMORY.iterdir()}
 
 
 def tritons() -> set[int]:

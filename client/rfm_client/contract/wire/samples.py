@@ -219,7 +219,7 @@ def _unpadded(row: Row, name: str, total: int) -> npt.NDArray[Any]:
     positions = row[name]
     if total > len(positions):
         raise InvalidSampleError.at(NUM_FRAMES, f"at most the {len(positions)} frames in {name}", str(total))
-    if total < len(positions) and positions[total:].any():
+    if positions[total:].any():
         raise InvalidSampleError.at(name, f"zeros behind the {total} frames that num_frames tells", "other values")
     return positions[:total]
 
