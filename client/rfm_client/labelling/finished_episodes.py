@@ -26,8 +26,8 @@ _DIGEST_KEY = b"rfm.digest"
 _SUFFIX = ".parquet"
 
 
-class Parts:
-    """The parts in one place.
+class FinishedEpisodes:
+    """The parts of one labelling in one place.
 
     url: a folder, or a URL of fsspec, for example ``s3://bucket/folder``
     """
