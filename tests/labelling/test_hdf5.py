@@ -349,9 +349,9 @@ import os, resource, sys
 sys.path.insert(0, {str(Path(labelling.__file__).parent)!r})
 from labelling import BrightnessScorer
 from rfm_client.labelling import LabelOptions, label, open_dataset
-from rfm_client.labelling.finished_episodes import FinishedEpisodes
+from rfm_client.labelling.finished_episodes import Parts
 
-read, left = FinishedEpisodes.read, [2]  # the first is read to see its columns
+read, left = Parts.read, [2]  # the first is read to see its columns
 
 def end(self, item):
     left[0] -= 1
@@ -362,7 +362,7 @@ def fill(self, item):
     resource.setrlimit(resource.RLIMIT_FSIZE, (size + int(sys.argv[2]), resource.RLIM_INFINITY))
     return read(self, item)
 
-FinishedEpisodes.read = end if sys.argv[2] == "end" else fill
+Parts.read = end if sys.argv[2] == "end" else fill
 label(open_dataset(sys.argv[1]), BrightnessScorer(), LabelOptions(in_place=True, overwrite=True))
 """
 

@@ -24,7 +24,7 @@ from rfm_client.data.datasets.protocol import Dataset, DatasetEpisode
 from rfm_client.integrations.episode_recordings import record_episodes
 from rfm_client.integrations.recording import load_rerun
 from rfm_client.labelling.episode_scores import FrameMemory, episode_columns
-from rfm_client.labelling.finished_episodes import FinishedEpisodes
+from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.label import Outputs, Report, check_frames, label, label_with_ray, plan_labels
 from rfm_client.labelling.options import LabelOptions
 from rfm_client.labelling.plan import Item, Plan, selected
@@ -137,7 +137,7 @@ def run(source: str, flags: LabelFlags, connect: Connect, say: Say) -> ExitCode:
         dataset = open_dataset(source, **flags.opening)
         chosen = {episode.index for episode in selected(dataset, options)}
         plan = replace(report.plan, items=[item for item in report.plan.items if item.episode.index in chosen])
-        for file in record_episodes(flags.rrd, dataset, plan, FinishedEpisodes(report.parts)):
+        for file in record_episodes(flags.rrd, dataset, plan, Parts(report.parts)):
             typer.echo(f"{file}")
     return status
 

@@ -13,11 +13,11 @@ from rfm_client.contract.results import FrameScores
 from rfm_client.data.datasets.protocol import Dataset
 from rfm_client.integrations.recording import Recording
 from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS
-from rfm_client.labelling.finished_episodes import FinishedEpisodes
+from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.plan import Item, Plan
 
 
-def record_episodes(folder: Path, dataset: Dataset, plan: Plan, parts: FinishedEpisodes) -> Iterator[Path]:
+def record_episodes(folder: Path, dataset: Dataset, plan: Plan, parts: Parts) -> Iterator[Path]:
     """The file of each episode of the plan that is labelled, as it is written. The frames are decoded once more.
 
     Of several cameras each has its frames and its own scores beside the fused ones.

@@ -26,7 +26,7 @@ _DIGEST_KEY = b"rfm.digest"
 _SUFFIX = ".parquet"
 
 
-class FinishedEpisodes:
+class Parts:
     """The parts of one labelling in one place.
 
     url: a folder, or a URL of fsspec, for example ``s3://bucket/folder``

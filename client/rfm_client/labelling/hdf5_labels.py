@@ -16,7 +16,7 @@ from typing import Any
 
 from rfm_client.data.datasets.protocol import DatasetError, require
 from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS, Columns
-from rfm_client.labelling.finished_episodes import IDENTITY, FinishedEpisodes
+from rfm_client.labelling.finished_episodes import IDENTITY, Parts
 from rfm_client.labelling.label_files import canonical_json
 from rfm_client.labelling.labelled_before import LabelFile
 from rfm_client.labelling.plan import Item, Plan
@@ -51,7 +51,7 @@ def check_room(file: Path, plan: Plan) -> None:
     require(file, free >= needed, expected, f"{free}: {_REMEDY}")
 
 
-def write_hdf5(file: Path, plan: Plan, parts: FinishedEpisodes, name: str, *, in_place: bool) -> None:
+def write_hdf5(file: Path, plan: Plan, parts: Parts, name: str, *, in_place: bool) -> None:
     """Writes the labels of all parts to a new file, which takes the file's place when it is whole.
 
     in_place: the file is the dataset's own: the new one is a copy of it, in which the labels of this name give way
@@ -97,7 +97,7 @@ def _reserve(file: Path, num_bytes: int) -> None:
             num_bytes -= opened.write(bytes(min(num_bytes, _FILE_BYTES)))
 
 
-def _write(group: Any, plan: Plan, parts: FinishedEpisodes, name: str) -> None:
+def _write(group: Any, plan: Plan, parts: Parts, name: str) -> None:
     """The labels of the plan in place of all of this name."""
     for label in _labels(group, name):
         del group[label]

@@ -13,7 +13,7 @@ from rfm_client.data.datasets.hdf5 import Hdf5Dataset
 from rfm_client.data.datasets.opening import open_dataset
 from rfm_client.data.datasets.protocol import Dataset, DatasetError, require
 from rfm_client.data.orientation import Orient
-from rfm_client.labelling.finished_episodes import IDENTITY, FinishedEpisodes
+from rfm_client.labelling.finished_episodes import IDENTITY, Parts
 from rfm_client.labelling.hdf5_labels import check_room, hdf5_labels, write_hdf5
 from rfm_client.labelling.label_files import (
     PROGRESS_ENDING,
@@ -94,9 +94,9 @@ class Outputs:
         return [self.dataset.file if self.options.in_place else own]
 
     @cached_property
-    def parts(self) -> FinishedEpisodes:
+    def parts(self) -> Parts:
         """The finished episodes. Makes their folder."""
-        return FinishedEpisodes(self.options.parts or str(self.folder / f".{self.options.name}_parts"))
+        return Parts(self.options.parts or str(self.folder / f".{self.options.name}_parts"))
 
     def make_folder(self) -> None:
         """Makes the folder, if it is not there. Raises DatasetError if labels cannot be written there."""

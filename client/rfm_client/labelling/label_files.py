@@ -26,7 +26,7 @@ import numpy.typing as npt
 from rfm_client.contract.samples import Float32Array
 from rfm_client.data.datasets.protocol import DatasetError, require
 from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS, Columns
-from rfm_client.labelling.finished_episodes import IDENTITY, FinishedEpisodes
+from rfm_client.labelling.finished_episodes import IDENTITY, Parts
 from rfm_client.labelling.labelled_before import LabelFile
 from rfm_client.labelling.plan import Item, Plan
 
@@ -98,7 +98,7 @@ def _descriptor(column: str) -> dict[str, Any]:
     }
 
 
-def write_sidecars(plan: Plan, parts: FinishedEpisodes, sidecars: Sequence[Sidecar]) -> None:
+def write_sidecars(plan: Plan, parts: Parts, sidecars: Sequence[Sidecar]) -> None:
     """Streams the parts into all files, and puts each in its place when it is whole.
 
     Raises DatasetError for a missing part, or one with other columns than the first, and OSError: then no file changes.
@@ -120,7 +120,7 @@ def write_sidecars(plan: Plan, parts: FinishedEpisodes, sidecars: Sequence[Sidec
             file.unlink(missing_ok=True)
 
 
-def _stream(plan: Plan, parts: FinishedEpisodes, sidecars: Mapping[Path, Sidecar]) -> None:
+def _stream(plan: Plan, parts: Parts, sidecars: Mapping[Path, Sidecar]) -> None:
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -139,7 +139,7 @@ def _stream(plan: Plan, parts: FinishedEpisodes, sidecars: Mapping[Path, Sidecar
             writer.close()
 
 
-def _row_groups(plan: Plan, parts: FinishedEpisodes) -> Iterator[Any]:
+def _row_groups(plan: Plan, parts: Parts) -> Iterator[Any]:
     """The rows of all parts in order, about _ROWS_AT_A_TIME together."""
     import pyarrow as pa
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from rfm_client.data.datasets.protocol import Dataset, DatasetError, require
 from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS, Columns
-from rfm_client.labelling.finished_episodes import FinishedEpisodes
+from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.plan import Item, Plan, make_plan
 from rfm_client.labelling.run import Watch
 
@@ -95,7 +95,7 @@ def joined(plan: Plan, dataset: Dataset, files: Sequence[LabelFile], overwrite: 
     return replace(plan, items=[known[index] for index in sorted(known)])
 
 
-def restore(plan: Plan, parts: FinishedEpisodes, files: Sequence[LabelFile]) -> None:
+def restore(plan: Plan, parts: Parts, files: Sequence[LabelFile]) -> None:
     """Writes the parts of the plan that are gone, and whose labels the files have. Raises OSError."""
     cameras = ("", *(f".{camera}" for camera in plan.recipe.cameras))
     order = [name + camera for name in (PROGRESS, SUCCESS) for camera in cameras]

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.numbers import checked_count, checked_finite
 from rfm_client.data.datasets.opening import open_dataset
-from rfm_client.labelling.finished_episodes import FinishedEpisodes
+from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.plan import Plan
 from rfm_client.labelling.run import Failure, Run, Watch, begin, by_episode
 from rfm_client.labelling.scorer import Scorer
@@ -66,7 +66,7 @@ class EpisodeActor:
     def __init__(self, job: RayJob) -> None:
         self._held = ExitStack()  # what it holds is closed as soon as nothing refers to it
         self._job = job
-        self._parts = FinishedEpisodes(job.parts)
+        self._parts = Parts(job.parts)
         self._dataset = open_dataset(job.source, **job.opening)
         self._scorer = self._held.enter_context(job.connect())  # open as long as the actor lives
 
@@ -93,7 +93,7 @@ def finish_all_with_ray(job: RayJob, options: RayOptions, watch: Watch) -> list[
         import ray.data
     except ImportError as error:
         raise ImportError('labelling on a cluster needs Ray: pip install "./client[ray]"') from error
-    pending = {item.key for item in begin(job.plan, FinishedEpisodes(job.parts), watch)}
+    pending = {item.key for item in begin(job.plan, Parts(job.parts), watch)}
     places = [place for place, item in enumerate(job.plan.items) if item.key in pending]
     if not places:
         return []

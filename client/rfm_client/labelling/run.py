@@ -20,7 +20,7 @@ from rfm_client.contract.errors import (
 )
 from rfm_client.data.datasets.protocol import Dataset, DatasetEpisode
 from rfm_client.labelling.episode_scores import FrameMemory, episode_columns
-from rfm_client.labelling.finished_episodes import FinishedEpisodes
+from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.plan import Item, Plan
 from rfm_client.labelling.scorer import Scorer
 
@@ -64,7 +64,7 @@ class _StoppedError(RewardError):
 class Run:
     """The labelling of a plan by the threads of this process."""
 
-    def __init__(self, plan: Plan, dataset: Dataset, scorer: Scorer, parts: FinishedEpisodes, watch: Watch) -> None:
+    def __init__(self, plan: Plan, dataset: Dataset, scorer: Scorer, parts: Parts, watch: Watch) -> None:
         self._plan, self._dataset, self._scorer, self._parts, self._watch = plan, dataset, scorer, parts, watch
         self._memory = FrameMemory()
         self._stopping = threading.Event()
@@ -142,7 +142,7 @@ class Run:
             raise _StoppedError
 
 
-def begin(plan: Plan, parts: FinishedEpisodes, watch: Watch) -> list[Item]:
+def begin(plan: Plan, parts: Parts, watch: Watch) -> list[Item]:
     """The items that have no part yet; tells the watch how many frames that is."""
     finished = parts.finished(plan.items)
     watch.begin(plan.num_frames, sum(item.episode.num_frames for item in plan.items if item.key in finished))

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from rfm_client.contract.results import SUCCESS_THRESHOLD
 from rfm_client.data.datasets.protocol import require
 from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS
-from rfm_client.labelling.finished_episodes import FinishedEpisodes
+from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.label_files import read_label_table
 from rfm_client.labelling.plan import Plan
 
@@ -77,7 +77,7 @@ def summarise(file: Path) -> Summary:
     )
 
 
-def summary_of_parts(plan: Plan, parts: FinishedEpisodes) -> Summary:
+def summary_of_parts(plan: Plan, parts: Parts) -> Summary:
     """The summary of the parts of a plan."""
     return _of_episodes((item.episode.index, parts.read(item)) for item in plan.items)
 
