@@ -248,22 +248,21 @@ def test_a_picture_that_is_no_8_bit_colours_is_left_out_with_the_reason(
     assert str(refused.value) == f"{file}: data/demo_0/obs: expected {form}, got other: {reason}"
 
 
-PARTLY: dict[str, tuple[list[dict[str, Any]], str]] = {
-    "missing in the last": ([{"other": FRAMES}, {}], "missing in demo_1"),
-    "missing in the first": ([{}, {"other": FRAMES}], "missing in demo_0"),
+PARTLY: dict[str, tuple[Any, Any, str]] = {
+    "missing in the last": ({"other": FRAMES}, {}, "missing in demo_1"),
+    "missing in the first": ({}, {"other": FRAMES}, "missing in demo_0"),
     "of another form in the last": (
-        [{"other": FRAMES}, {"other": FRAMES / 255}],
+        *({"other": FRAMES}, {"other": FRAMES / 255}),
         "float64 [5, 16, 24, 3], not uint8: store colours as 0..255",
     ),
 }
 
 
-@pytest.mark.parametrize(("more", "reason"), PARTLY.values(), ids=PARTLY)
+@pytest.mark.parametrize(("first", "last", "reason"), PARTLY.values(), ids=PARTLY)
 def test_a_camera_of_some_demonstrations_is_left_out_with_the_reason(
-    tmp_path: Path, more: list[dict[str, Any]], reason: str
+    tmp_path: Path, first: Any, last: Any, reason: str
 ) -> None:
-    demos = (pictures(index, **of_demo) for index, of_demo in enumerate(more))
-    dataset = open_dataset(write(tmp_path / "demos.hdf5", LIBERO, *demos))
+    dataset = open_dataset(write(tmp_path / "demos.hdf5", LIBERO, pictures(0, **first), pictures(1, **last)))
     assert (tuple(dataset.cameras), dataset.left_out, len(dataset.episodes)) == (CAMERAS, {"other": reason}, 2)
 
 

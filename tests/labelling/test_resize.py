@@ -27,17 +27,13 @@ ENCODERS = {name: str(MODELS / "rfm_encoder" / "1" / name) for name in ("image_e
 LABELS = "rfm_progress.parquet"
 
 
-def test_an_engine_brings_frames_to_the_size_of_its_encoders() -> None:
-    told = json.loads((Path(ENCODERS["image_encoder"]) / "preprocessor_config.json").read_text())
-    scorer = EngineScorer(str(CHECKPOINT), **ENCODERS)
-    assert str(scorer.checkpoint().frame_size) == f"shortest {told['size']['shortest_edge']}"
-    assert EngineScorer(str(CHECKPOINT)).checkpoint().frame_size is None  # it reads no frames
-
-
 @pytest.mark.triton
 def test_both_commands_resize_alike(demo_server: Endpoints, output: Path) -> None:
     with RewardClient(demo_server.grpc_url) as client:
         served = ClientScorer(client).checkpoint().frame_size
+    told = json.loads((Path(ENCODERS["image_encoder"]) / "preprocessor_config.json").read_text())
+    assert str(served) == f"shortest {told['size']['shortest_edge']}"
+    assert EngineScorer(str(CHECKPOINT)).checkpoint().frame_size is None  # it reads no frames
     assert EngineScorer(str(CHECKPOINT), **ENCODERS).checkpoint().frame_size == served
     words = ["label", DATASET, "--episodes", "2", "--frames", 4, "--cameras", "front", "--no-picture"]
     folders = {name: output / name for name in ("served", "own", "whole")}

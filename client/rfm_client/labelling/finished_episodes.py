@@ -27,7 +27,7 @@ _SUFFIX = ".parquet"
 
 
 class Parts:
-    """The parts in one place.
+    """The parts of one labelling in one place.
 
     url: a folder, or a URL of fsspec, for example ``s3://bucket/folder``
     """

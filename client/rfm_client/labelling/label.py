@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 from rfm_client.data.datasets.hdf5 import Hdf5Dataset
@@ -92,6 +93,11 @@ class Outputs:
         own = self.folder / f"{self.dataset.file.stem}.{self.options.name}_rewards.hdf5"
         return [self.dataset.file if self.options.in_place else own]
 
+    @cached_property
+    def parts(self) -> Parts:
+        """The finished episodes. Makes their folder."""
+        return Parts(self.options.parts or str(self.folder / f".{self.options.name}_parts"))
+
     def make_folder(self) -> None:
         """Makes the folder, if it is not there. Raises DatasetError if labels cannot be written there."""
         try:
@@ -110,8 +116,9 @@ class Outputs:
         found += [hdf5_labels(path, self.options.name) for path in self.hdf5]
         return [each for each in found if each is not None]
 
-    def write(self, plan: Plan, parts: Parts) -> list[Path]:
+    def write(self, plan: Plan) -> list[Path]:
         """Writes all files. Raises DatasetError for a part that is missing, and OSError."""
+        parts = self.parts
         columns = [name for name in parts.read(plan.items[0]).column_names if name not in IDENTITY]
         sidecars = [progress_file(path, plan, columns) for path in self.progress]
         sidecars += [signals_file(path, plan, columns, self.options.name) for path in self.signals]
@@ -155,9 +162,9 @@ def label(dataset: Dataset, scorer: Scorer, options: LabelOptions = _DEFAULTS, w
     Raises DatasetError before the first frame is scored for a dataset that contradicts itself, or a file of labels that
     is there and not this run's; RewardError for a scorer that is gone; OSError for a full disk.
     """
-    outputs, plan, parts = _begin(dataset, scorer, options, watch)
-    failures = Run(plan, dataset, scorer, parts, watch).finish_all(options.workers)
-    return _put_together(plan, parts, outputs, failures, watch)
+    outputs, plan = _begin(dataset, scorer, options, watch)
+    failures = Run(plan, dataset, scorer, outputs.parts, watch).finish_all(options.workers)
+    return _put_together(plan, outputs, failures, watch)
 
 
 def label_with_ray(
@@ -179,13 +186,13 @@ def label_with_ray(
     opening = {"task": task, "override_task": override_task, "orient": orient}
     dataset = open_dataset(source, task=task, override_task=override_task, orient=orient)
     with connect() as scorer:
-        outputs, plan, parts = _begin(dataset, scorer, options, watch)
-    job = RayJob(source, opening, connect, plan, parts.url, options.workers)
+        outputs, plan = _begin(dataset, scorer, options, watch)
+    job = RayJob(source, opening, connect, plan, outputs.parts.url, options.workers)
     failures = finish_all_with_ray(job, ray, watch)
-    return _put_together(plan, parts, outputs, failures, watch)
+    return _put_together(plan, outputs, failures, watch)
 
 
-def _begin(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch) -> tuple[Outputs, Plan, Parts]:
+def _begin(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch) -> tuple[Outputs, Plan]:
     """The plan, when all of its frames that have no labels yet are known to be there."""
     outputs = Outputs(options.output or dataset.root, options, dataset)
     before: list[LabelFile] = []
@@ -196,23 +203,22 @@ def _begin(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch
     if options.in_place:
         for file in outputs.hdf5:
             check_room(file, plan)
-    parts = Parts(options.parts or str(outputs.folder / f".{options.name}_parts"))
-    restore(plan, parts, before)
-    finished = parts.finished(plan.items)
+    restore(plan, outputs.parts, before)
+    finished = outputs.parts.finished(plan.items)
     pending = [item for item in plan.items if item.key not in finished]
     check_frames(dataset, plan.recipe, pending, watch)
-    return outputs, plan, parts
+    return outputs, plan
 
 
-def _put_together(plan: Plan, parts: Parts, outputs: Outputs, failures: Sequence[Failure], watch: Watch) -> Report:
+def _put_together(plan: Plan, outputs: Outputs, failures: Sequence[Failure], watch: Watch) -> Report:
     """Writes the files, unless an episode failed or only a shard was labelled."""
-    report = Report([], failures, parts.url, None, plan)
+    report = Report([], failures, outputs.parts.url, None, plan)
     if failures or outputs.options.shard is not None:
         return report
-    files = outputs.write(plan, parts)
+    files = outputs.write(plan)
     assert outputs.dataset is not None  # of a run
     num_episodes = len(outputs.dataset.episodes)
     if len(plan.items) < num_episodes:
         others = "; LeRobot's reader gives frames of the others the weight 1.0" if outputs.progress else ""
         watch.note(f"{len(plan.items)} of the dataset's {num_episodes} episodes have labels{others}")
-    return replace(report, files=files, summary=summary_of_parts(plan, parts))
+    return replace(report, files=files, summary=summary_of_parts(plan, outputs.parts))

@@ -16,7 +16,7 @@ from __future__ import annotations
 import json
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -171,8 +171,7 @@ def parquet_labels(path: Path, option: str = "--name") -> LabelFile | None:
     except (OSError, ArrowException):
         metadata = {}
     provenance = metadata.get(PROVENANCE_KEY, metadata.get(SIGNALS_PROVENANCE_KEY))
-    found = LabelFile.of(path, provenance, metadata.get(_EPISODES_KEY), lambda items: _read(path, items))
-    return replace(found, option=option)
+    return LabelFile.of(path, provenance, metadata.get(_EPISODES_KEY), lambda items: _read(path, items), option)
 
 
 def _read(path: Path, items: Sequence[Item]) -> Iterator[tuple[Item, Columns]]:

@@ -19,8 +19,7 @@ from rfm_client.labelling.run import Watch
 
 Reader: TypeAlias = Callable[[Sequence[Item]], Iterator[tuple[Item, Columns]]]
 
-OF_ANOTHER_PROGRAM = "labels of another program"
-_OTHERS = "those of others, or of copies (label with --verify to tell copies by their content)"
+_OTHERS = "those of others, or of films that have changed or were copied (--verify knows copies by their content)"
 
 
 @dataclass(frozen=True)
@@ -38,16 +37,16 @@ class LabelFile:
     provenance: Mapping[str, Any]
     digests: Mapping[int, str]
     read: Reader
-    option: str = "--name"
+    option: str
 
     @classmethod
-    def of(cls, path: Path, provenance: Any, digests: Any, read: Reader, flaw: str = OF_ANOTHER_PROGRAM) -> LabelFile:
-        """The file with these documents as it holds them, JSON. flaw: of a file that says no provenance of ours"""
+    def of(cls, path: Path, provenance: Any, digests: Any, read: Reader, option: str = "--name") -> LabelFile:
+        """The file with these documents as it holds them, JSON."""
         told, by_episode = _parsed(provenance), _parsed(digests)
         if not str(told.get("writer")).startswith("rfm-client") or not isinstance(told.get("dataset"), dict):
-            return cls(path, flaw, {}, {}, read)
-        flaw_of_ours = None if by_episode else "no digests of its episodes"
-        return cls(path, flaw_of_ours, told, {int(index): digest for index, digest in by_episode.items()}, read)
+            return cls(path, "labels of another program", {}, {}, read, option)
+        flaw = None if by_episode else "no digests of its episodes"
+        return cls(path, flaw, told, {int(index): digest for index, digest in by_episode.items()}, read, option)
 
     def check(self, plan: Plan, dataset: Dataset, known: Mapping[int, Item]) -> Mapping[int, Item]:
         """The items of its episodes. Raises DatasetError if its labels would be lost, or are not those of the frames.

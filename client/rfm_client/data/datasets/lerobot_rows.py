@@ -148,9 +148,9 @@ class RowReader:
     def read(self, entry: Entry) -> EpisodeRows:
         """The episode's rows. Raises DatasetError where they and its metadata contradict each other."""
         columns = self._columns(entry.data_file)
-        is_own = columns["episode_index"] == entry.index
-        rows = {name: column[is_own] for name, column in columns.items()}
-        where, num_rows = f"{entry.where}: {entry.data_file}", int(is_own.sum())
+        own = np.flatnonzero(columns["episode_index"] == entry.index)
+        rows = {name: column[own] for name, column in columns.items()}
+        where, num_rows = f"{entry.where}: {entry.data_file}", len(own)
         is_whole = num_rows == entry.length and num_rows > 0
         require(where, is_whole, f"{max(entry.length, 1)} rows, as its metadata say", num_rows)
         first = int(rows["index"][0]) if entry.first_index is None else entry.first_index
