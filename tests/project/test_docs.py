@@ -329,5 +329,7 @@ def test_make_help_has_a_line_for_every_target() -> None:
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda file: str(file.relative_to(ROOT)))
 def test_every_make_command_is_a_target(document: Path) -> None:
+    if document.name == "CHANGELOG.md":
+        return  # it tells of targets that were
     for target in re.findall(r"^    make ([\w-]+)|`make ([\w-]+)`", document.read_text(), re.MULTILINE):
         assert re.search(rf"^{target[0] or target[1]}:", (ROOT / "Makefile").read_text(), re.MULTILINE), target

@@ -30,7 +30,9 @@ pytestmark = pytest.mark.triton
 
 @pytest.mark.reference
 @pytest.mark.parametrize("case", goldens.SERVED_CASES, ids=str)
-def test_a_reference_answer_of_each_checkpoint_comes_back_over_the_wire(served: Served, protocol: str, case: goldens.Case) -> None:
+def test_a_reference_answer_of_each_checkpoint_comes_back_over_the_wire(
+    served: Served, protocol: str, case: goldens.Case
+) -> None:
     with served.client(protocol, case.config.name) as client:
         results = client.evaluate(case.samples(), logits=case.config.is_discrete)
     for result, expected in zip(results, case.expected(), strict=True):
