@@ -62,7 +62,7 @@ bench: $(INSTALLED)
 # Before it the engine without a server: beside the original's forward, and as the work grows.
 bench-full: $(INSTALLED)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[bench]"
-	$(BIN)/python benchmarks/forward.py
+	$(BIN)/python benchmarks/engine.py forward
 	$(BIN)/python benchmarks/bench.py --full
 
 # Measure with Triton's own perf_analyzer, checkpoints of both sizes.

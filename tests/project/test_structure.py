@@ -64,17 +64,13 @@ EXCEPTIONS = {
     "examples/demo.py": {"rfm", "rfm_commands"},  # starts the server
     "examples/evaluate_demo_checkpoint.py": {"rfm"},
     "examples/train_policy.py": {"rfm"},
-    "benchmarks/bench.py": {"rfm", "rfm_commands", "rfm_export"},  # the engine without a server, and what is served
-    "benchmarks/accelerator.py": {"rfm", "rfm_export"},
-    "benchmarks/episodes.py": {"rfm", "rfm_export"},
-    "benchmarks/peers/simulated.py": {"rfm"},
-    "benchmarks/contestants.py": {"rfm"},
-    "benchmarks/forward.py": {"rfm"},
-    "benchmarks/loading.py": {"rfm", "rfm_export"},
-    "benchmarks/preparation.py": {"rfm"},
+    "benchmarks/bench.py": {"rfm", "rfm_export"},  # the engine without a server, and what is served
+    "benchmarks/client.py": {"rfm", "rfm_export"},
+    "benchmarks/contestants.py": {"rfm", "rfm_commands", "rfm_export"},
+    "benchmarks/engine.py": {"rfm", "rfm_export"},
     "benchmarks/perf_analyzer.py": {"rfm"},
-    "benchmarks/peers/litserve_server.py": {"rfm"},  # the peers score with our engine, or weights
-    "benchmarks/peers/message.py": {"rfm"},
+    "benchmarks/peers/engines.py": {"rfm"},  # the peers score with our engine, or weights
+    "benchmarks/peers/litserve_server.py": {"rfm"},
     "benchmarks/peers/upstream_forward.py": {"rfm"},
 }
 FEWEST_WORDS = 4  # of a docstring
