@@ -59,9 +59,13 @@ SERVED_AS = {"--model first": "--model rfm", "--model second": "--model rfm"}  #
 
 
 def found(pattern: re.Pattern[str], files: Iterable[Path] = RUN) -> list[Any]:
-    """Each match in each document, named by file and number."""
+    """Each match in each document, named by file and number. What the guides show runs at night."""
     matches = [
-        pytest.param(match, id=f"{file.relative_to(ROOT)} {number}")
+        pytest.param(
+            match,
+            id=f"{file.relative_to(ROOT)} {number}",
+            marks=[pytest.mark.nightly] if files is RUN and file in GUIDES else [],
+        )
         for file in files
         for number, match in enumerate(pattern.findall(file.read_text()))
     ]
