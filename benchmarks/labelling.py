@@ -31,7 +31,7 @@ from rfm_client.contract.samples import UInt8Array
 from rfm_client.labelling import (
     CheckpointFacts,
     Dataset,
-    Episode,
+    DatasetEpisode,
     LabelOptions,
     RayOptions,
     Scorer,
@@ -91,11 +91,11 @@ class InMemory:
         return getattr(self._dataset, name)
 
     @cached_property
-    def episodes(self) -> Sequence[Episode]:
+    def episodes(self) -> Sequence[DatasetEpisode]:
         """All episodes of the dataset."""
         return self._dataset.episodes
 
-    def frames(self, episode: Episode, camera: str) -> Iterator[UInt8Array]:
+    def frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         """The frames, decoded before."""
         return iter(self._frames[episode.index, camera])
 
@@ -190,7 +190,7 @@ class Arrivals(Watch):
     def __init__(self) -> None:
         self._arrivals: list[tuple[float, int]] = []
 
-    def scored(self, episode: Episode) -> None:
+    def scored(self, episode: DatasetEpisode) -> None:
         """Notes the time."""
         self._arrivals.append((time.monotonic(), episode.num_frames))
 
