@@ -3,11 +3,11 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed
 WORKERS := --numprocesses 2 --dist loadgroup
-TOOL := PYTHONPATH=tests/support:tools/faults $(BIN)/python
+TOOL := PYTHONPATH=tests/support:tools $(BIN)/python
 
 # `make help` shows the first line of the comment above each target.
-.PHONY: help demo test test-all test-newest check parity rollout bench bench-full perf chaos chaos-full soak format model_repository clean \
-  ops-check ops-tools audit lock mutate
+.PHONY: help demo test test-all nightly test-newest check parity bench bench-full perf chaos soak format model_repository \
+  clean ops-check ops-tools audit lock mutate
 
 # What can be made: this list.
 help:
@@ -20,12 +20,19 @@ demo: $(INSTALLED)
 
 # Lint, types, generated files, and the tests that take minutes.
 test: check
-	$(BIN)/pytest $(WORKERS) -m "not gpu and not slow"
+	$(BIN)/pytest $(WORKERS) -m "not gpu and not slow and not nightly"
 
 # All that CI runs: also the tests that kill, wait or restart, or need programs of Debian.
 test-all: check ops-tools
-	$(BIN)/pytest $(WORKERS) -m "not gpu and not alone"
-	$(BIN)/pytest -m alone
+	$(BIN)/pytest $(WORKERS) -m "not gpu and not alone and not nightly"
+	$(BIN)/pytest -m "alone and not nightly"
+
+# What takes too long for CI: chaos, a cold install, every snippet of the documents, more reference cases.
+# RFM_GOLDENS names a folder with more reference cases.
+nightly: check ops-tools
+	$(BIN)/pytest $(WORKERS) -m nightly
+	$(if $(RFM_GOLDENS),$(BIN)/pytest -m reference)
+	$(TOOL) tools/chaos.py
 
 # Test scoring with the newest transformers. Needs the network.
 # The other tests use the pinned one.
@@ -46,10 +53,6 @@ check: $(INSTALLED)
 parity: $(INSTALLED)
 	$(TOOL) tools/parity.py
 
-# Is a request lost while two versions take turns? 32 callers ask, half over gRPC and half over HTTP.
-rollout: $(INSTALLED)
-	$(TOOL) tools/faults/rollout.py
-
 # Measure this server beside the bare engine, the FastAPI server's design, LitServe and mosec.
 bench: $(INSTALLED)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[bench]"
@@ -59,7 +62,7 @@ bench: $(INSTALLED)
 # Before it the engine without a server: beside the original's forward, and as the work grows.
 bench-full: $(INSTALLED)
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[bench]"
-	$(BIN)/python benchmarks/forward.py
+	$(BIN)/python benchmarks/engine.py forward
 	$(BIN)/python benchmarks/bench.py --full
 
 # Measure with Triton's own perf_analyzer, checkpoints of both sizes.
@@ -68,26 +71,20 @@ perf: $(INSTALLED)
 	$(BIN)/python benchmarks/perf_analyzer.py --size default
 
 # Cause faults while callers ask, ten minutes.
-# Processes killed, stopped and hung, full memory and disks, malformed requests, killed exports.
+# Processes killed, stopped and hung, a crash loop, rollouts, killed exports, malformed requests.
 chaos: $(INSTALLED)
-	$(TOOL) tools/faults/chaos.py
-	$(TOOL) tools/faults/fuzz.py
-	$(TOOL) tools/faults/kill_export.py --kills 10
-
-# The same with 100 killed exports, a quarter of an hour.
-chaos-full: $(INSTALLED)
-	$(TOOL) tools/faults/chaos.py
-	$(TOOL) tools/faults/fuzz.py
-	$(TOOL) tools/faults/kill_export.py --kills 100
+	$(TOOL) tools/chaos.py
 
 # Do memory and latency stay the same? Half an hour at half of the load that can be served.
 soak: $(INSTALLED)
-	$(TOOL) tools/faults/chaos.py --soak
+	$(TOOL) tools/chaos.py soak
 
-# Do the tests see small faults? Three quarters of an hour.
-# 220 changes of one operator, constant, index or branch; the tests of the changed file run on each.
+# Do the tests see small faults? An hour or two.
+# 200 changes of the wire, the collators, the networks and the batch model, made by cosmic-ray.
 mutate: $(INSTALLED)
-	$(TOOL) tools/mutation/mutate.py
+	$(PYTHON) -m venv $(VENV)/mutate
+	$(VENV)/mutate/bin/pip install --quiet --disable-pip-version-check "cosmic-ray>=8.7,<9"
+	$(VENV)/mutate/bin/python tools/mutate.py
 
 # Test what docker/ holds: alerts, dashboard, image, compose file, Kubernetes.
 # No container engine and no cluster are needed. Rules run on made-up series, then on a live Prometheus and Triton.

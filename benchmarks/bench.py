@@ -1,187 +1,259 @@
 # SPDX-License-Identifier: MIT
-"""This server, the bare engine and what one would take instead: same weights, same samples, one run.
+"""This server beside what one would take instead: same weights, same samples, one run.
 
-    python benchmarks/bench.py            # eight minutes
-    python benchmarks/bench.py --full     # all loads, half an hour
+    bench.py servers          the bare engine, the FastAPI server's design, LitServe and mosec; --full: all loads
+    bench.py accelerator      does an accelerator ever wait? each server before one whose forward passes only sleep
+    bench.py commits --server before=OTHER_VENV/bin/python --server after=.venv/bin/python
+                              this server at other commits, each served by the environment in which it is installed
 
 Rounds are interleaved: in each, every contestant is measured once, so that a machine that drifts hits all alike; ratios
-within a round are what is compared. Writes JSON, Markdown and pictures.
+within a round are what is compared. Callers run on the same cores.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
 import subprocess
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from datetime import datetime, timezone
-from importlib.metadata import PackageNotFoundError, version
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import report
 import torch
-from contestants import PEER_SCRIPTS, BareEngine, Callers, Checkpoint, contestants
+from contestants import DEMO, PEERS, VLM_BASE, VLM_CHECKPOINT, BareEngine, Contestant, checkpoint, peer, running
 from load import SHARED_MEMORY, Load
-from rich.console import Console
 
 import rfm_export
 from rfm.config import ExportConfig
-from rfm.rewind.checkpoint import RewindCheckpoint
-from rfm.rewind.network import RewindConfig, RewindTransformer
-from rfm_commands.config import Config
+from rfm.launch.process import Endpoints
+from rfm.launch.temporary import temporary_server
+from rfm_gateway.command import gateway_command
+from rfm_gateway.config import GatewayConfig
 
-ROOT = Path(__file__).parents[1]
-RESULTS = ROOT / "benchmarks" / "results"
-DEMO = ROOT / "model_repository"
-BARE = "bare engine"
-BARE_BATCH_SIZES = (1, 8, 32)
-PEERS = tuple(PEER_SCRIPTS)
+sys.path.insert(0, str(Path(__file__).parent / "peers"))
+from engines import SIMULATION, Ledger
+
 UNIFORM, MIXED, AS_LONG_AS_MIXED = (16, 16), (1, 16), (8, 9)
-PACKAGES = ("torch", "numpy", "tritonclient", "nvidia-pytriton", "fastapi", "uvicorn", "litserve", "mosec")
+OURS = ("gRPC", "HTTP", SHARED_MEMORY, "gateway")
+ONE, MANY = Load(1, 0, UNIFORM), Load(32, 0, UNIFORM)
+SCENARIOS = {  # name: load, ways of this server, whether the peers are measured
+    "1 caller": (ONE, ("gRPC",), True),
+    "32 callers": (MANY, ("gRPC", "gateway"), True),
+    "32 callers, 8 or 9 frames": (replace(MANY, frames=AS_LONG_AS_MIXED), ("gRPC",), False),
+    "32 callers, 1 to 16 frames, all types": (replace(MANY, frames=MIXED, mixed=True), ("gRPC",), False),
+}
+FULL = {
+    "8 callers": (replace(MANY, callers=8), OURS, True),
+    "128 callers": (replace(MANY, callers=128), OURS, True),
+    "2 callers, 32 samples each": (Load(2, 0, UNIFORM, together=32), ("gRPC", "gateway"), True),
+    "8 callers, 8 raw frames of 256 x 256": (Load(8, 0, (8, 8), frame_px=256), OURS[:3], False),
+    "Poisson, half of the bare engine's rate": (Load(0, 0, UNIFORM, rate_per_s=0.5), ("gRPC",), True),
+}
+COMMIT = """
+import sys
+from pathlib import Path
+from rfm.config import ExportConfig
+from rfm.launch.temporary import temporary_server
+import rfm_export
 
-DEFAULT_SIZE = RewindConfig(  # upstream's defaults
-    video_feature_dim=768,
-    text_feature_dim=384,
-    hidden_dim=512,
-    num_layers=4,
-    num_attention_heads=8,
-    max_len=16,
-    causal_mask=True,
-    use_per_frame_progress_token=True,
-    progress_bins=10,
-    has_similarity=True,
-)
+checkpoint, base, threads, folder = sys.argv[1:]
+config = ExportConfig(num_gpus=0, torch_threads=int(threads), base_model=base or None)
+rfm_export.export(checkpoint, Path(folder) / "repository", config)
+with temporary_server(Path(folder) / "repository", Path(folder) / "log") as endpoints:
+    print(endpoints.grpc_url, flush=True)
+    sys.stdin.readline()
+"""
+BATCH_S, ROW_S, VLM_ROW_S = 4e-3, 0.5e-3, 30e-3  # of the simulated accelerator's forward passes
+SIMULATED = """
+
+import sys
+
+sys.path.insert(0, {peers!r})
+_load = TritonPythonModel.load
 
 
-@dataclass(frozen=True)
-class Scenario:
-    """A load, and who takes it; ways: those of this server; peers: all, or none (they cannot, or it tells no more)"""
+def load(self, *arguments):
+    from pathlib import Path
 
-    name: str
-    load: Load
-    ways: tuple[str, ...] = ("gRPC",)
-    with_peers: bool = False
+    from engines import simulate
+
+    _load(self, *arguments)
+    simulate(self.engine, Path({file!r}), {batch_s}, {row_s})
 
 
-QUICK = (
-    Scenario("1 caller", Load(1, 0, UNIFORM), ("gRPC",), with_peers=True),
-    Scenario("32 callers", Load(32, 0, UNIFORM), ("gRPC", "gateway"), with_peers=True),
-    Scenario("32 callers, 8 or 9 frames", Load(32, 0, AS_LONG_AS_MIXED)),
-    Scenario("32 callers, 1 to 16 frames, all types", Load(32, 0, MIXED, mixed=True)),
-)
-FULL = (
-    *QUICK,
-    Scenario("8 callers", Load(8, 0, UNIFORM), ("gRPC", "HTTP", SHARED_MEMORY, "gateway"), with_peers=True),
-    Scenario("128 callers", Load(128, 0, UNIFORM), ("gRPC", "HTTP", SHARED_MEMORY, "gateway"), with_peers=True),
-    Scenario("2 callers, 32 samples each", Load(2, 0, UNIFORM, together=32), ("gRPC", "gateway"), with_peers=True),
-    Scenario("8 callers, 8 raw frames of 256 x 256", Load(8, 0, (8, 8), frame_px=256), ("gRPC", "HTTP", SHARED_MEMORY)),
-    Scenario("Poisson, half of the bare engine's rate", Load(0, 0, UNIFORM, rate_per_s=0.5), with_peers=True),
-)
+TritonPythonModel.load = load
+"""
+
+
+def servers(arguments: argparse.Namespace, folder: Path) -> None:
+    """This server's ways, the bare engine and the peers, for both sizes of a checkpoint."""
+    rows: list[dict[str, Any]] = []
+    scenarios = {**SCENARIOS, **(FULL if arguments.full else {})}
+    for size in arguments.sizes:
+        measured = checkpoint(size, folder)
+        bare = BareEngine(measured)
+        with ExitStack() as stack:
+            ends = stack.enter_context(temporary_server(measured.repository, folder / f"triton_{size}.log"))
+            port = Endpoints.free().http_port
+            command = gateway_command(GatewayConfig(port, triton=ends.grpc_url, metrics_url=ends.metrics_url))
+            stack.enter_context(running(command, port, folder / f"gateway_{size}.log"))
+            urls = dict.fromkeys(OURS, ends.grpc_url) | {"HTTP": ends.http_url, "gateway": f"http://127.0.0.1:{port}"}
+            options = {"checkpoint": measured.folder, "threads": measured.threads}
+            addresses = {way: _given(url) for way, url in urls.items()}
+            addresses |= {name: peer(name, options, folder / f"{name}_{size}.log") for name in PEERS}
+            made = {way: Contestant(way, server, measured.widths) for way, server in addresses.items()}
+            for contestant in made.values():
+                stack.enter_context(contestant)
+            for name, (load, ways, with_peers) in scenarios.items():
+                if load.frame_px and size != "small":
+                    continue
+                chosen = {way: one for way, one in made.items() if way in ways or (with_peers and way in PEERS)}
+                for number in range(arguments.rounds):
+                    of_round = {
+                        f"bare engine, batch {batch}": bare.measure(
+                            replace(load, rate_per_s=0, seconds=arguments.seconds), batch
+                        )
+                        for batch in ((1,) if load.callers == 1 else (1, 8, 32))
+                    }
+                    best = max(of_batch["samples_per_s"] for of_batch in of_round.values())
+                    now = replace(load, seconds=arguments.seconds, rate_per_s=load.rate_per_s * best)
+                    ahead = {way: one.measure(now) for way, one in chosen.items()}
+                    rows += _rows({"checkpoint": size, "load": name}, number, ahead | of_round)
+    told = "This server beside the bare engine and its alternatives\nRatio: of samples/s, to this server over gRPC."
+    report.write("results", told, rows, ("checkpoint", "load", "way"), "samples_per_s", arguments.output)
+
+
+def commits(arguments: argparse.Namespace, folder: Path) -> None:
+    """This server at several commits, and mosec."""
+    rows: list[dict[str, Any]] = []
+    for size in arguments.sizes:
+        measured = checkpoint(size, folder)
+        base = str(VLM_BASE) if size == "vlm" else ""
+        with ExitStack() as stack:
+            made = {}
+            for name, python in (word.split("=", 1) for word in arguments.server):
+                place = folder / f"{size}_{name}"
+                place.mkdir()
+                words = [python, "-c", COMMIT, str(measured.folder), base, str(measured.threads), str(place)]
+                made[name] = Contestant("gRPC", _commit(words), measured.widths)
+            if size != "vlm":
+                options = {"checkpoint": measured.folder, "threads": measured.threads}
+                made["mosec"] = Contestant("mosec", peer("mosec", options, folder / "mosec.log"), measured.widths)
+            for contestant in made.values():
+                stack.enter_context(contestant)
+            load = Load(1, arguments.seconds, (8, 8) if base else UNIFORM, frame_px=256 if base else 0)
+            for number in range(arguments.rounds):
+                for callers in arguments.callers:
+                    of_round = {way: one.measure(replace(load, callers=callers)) for way, one in made.items()}
+                    rows += _rows({"checkpoint": size, "callers": callers}, number, of_round)
+    told = "Before and after\nRatio: of samples/s, to the first server's."
+    report.write("before_after", told, rows, ("checkpoint", "callers", "way"), "samples_per_s", arguments.output)
+
+
+def accelerator(arguments: argparse.Namespace, folder: Path) -> None:
+    """Embeddings to all servers, frames to a vision-language checkpoint; preparing frames is as real as ever."""
+    source = DEMO / "rfm" / "1" / "checkpoint"
+    config = ExportConfig(num_gpus=0, torch_threads=1)
+    of_vlm = replace(config, base_model=str(VLM_BASE))
+    ours = {
+        "this server, two instances": (source, replace(config, instances=2), BATCH_S, ROW_S),
+        "this server, one instance": (source, config, BATCH_S, ROW_S),
+        "this server, frames": (VLM_CHECKPOINT, of_vlm, 0.0, VLM_ROW_S),
+    }
+    rows: list[dict[str, Any]] = []
+    with ExitStack() as stack:
+        made, ledgers = {}, {}
+        for name, (of, settings, batch_s, row_s) in ours.items():
+            place = folder / name
+            rfm_export.export(of, place / "repository", settings)
+            (model,) = (place / "repository").glob("*/1/model.py")
+            told = {"peers": sys.path[0], "file": str(place / "ledger"), "batch_s": batch_s, "row_s": row_s}
+            model.write_text(model.read_text() + SIMULATED.format(**told))
+            ledgers[name] = Ledger(place / "ledger")
+            made[name] = Contestant("gRPC", _ours(place), (64, 32))
+        for name in ("LitServe", "mosec"):
+            copied = folder / name / "checkpoint"
+            copied.mkdir(parents=True)
+            for file in source.iterdir():
+                (copied / file.name).symlink_to(file)
+            (copied / SIMULATION).write_text(json.dumps([str(folder / name / "ledger"), BATCH_S, ROW_S]))
+            ledgers[name] = Ledger(folder / name / "ledger")
+            server = peer(name, {"checkpoint": copied, "threads": 1}, folder / f"{name}.log")
+            made[name] = Contestant(name, server, (64, 32))
+        for contestant in made.values():
+            stack.enter_context(contestant)
+        loads = [("embeddings", Load(callers, arguments.seconds, UNIFORM)) for callers in arguments.callers]
+        for callers, px in ((16, 256), (4, 256), (16, 480)):
+            loads.append((f"frames of {px} x {px}", Load(callers, 2 * arguments.seconds, (8, 8), frame_px=px)))
+        for number in range(arguments.rounds):
+            for name, load in loads:
+                of_round = {}
+                for way, contestant in made.items():
+                    if ("frames" in way) == bool(load.frame_px):
+                        busy_s, _ = ledgers[way].read()
+                        measured = contestant.measure(load)
+                        busy = (ledgers[way].read()[0] - busy_s) / measured["took_s"]
+                        of_round[way] = {"busy": busy, **measured}
+                rows += _rows({"load": name, "callers": load.callers}, number, of_round)
+    told = (
+        f"A simulated accelerator: {1e3 * BATCH_S:g} ms a batch and {1e3 * ROW_S:g} ms a sample, asleep\n"
+        f"busy: share of the time. Frames: 8 a sample, a tiny checkpoint on Qwen3-VL, {1e3 * VLM_ROW_S:g} ms a sample."
+    )
+    report.write("accelerator", told, rows, ("load", "callers", "way"), folder=arguments.output)
+
+
+def _rows(of: dict[str, Any], number: int, measured: dict[str, dict[str, float]]) -> list[dict[str, Any]]:
+    """A row a way, shown as it comes."""
+    rows = [{**of, "way": way, "round": number, **figures} for way, figures in measured.items()]
+    rates = ", ".join(f"{row['way']} {row['samples_per_s']:.0f}" for row in rows)
+    print(f"{', '.join(map(str, of.values()))}, round {number + 1}: {rates} samples/s", flush=True)
+    return rows
+
+
+@contextmanager
+def _given(url: str) -> Iterator[str]:
+    yield url
+
+
+@contextmanager
+def _ours(place: Path) -> Iterator[str]:
+    with temporary_server(place / "repository", place / "triton.log") as endpoints:
+        yield endpoints.grpc_url
+
+
+@contextmanager
+def _commit(words: list[str]) -> Iterator[str]:
+    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        while not (line := process.stdout.readline()).startswith("grpc"):
+            assert line, "expected a server, got its end"
+        yield line.strip()
+    finally:
+        process.communicate("\n")
 
 
 def main() -> None:
     """Measures, writes and shows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--full", action="store_true", help="all loads")
+    parser.add_argument("what", choices=["servers", "accelerator", "commits"], nargs="?", default="servers")
+    parser.add_argument("--full", action="store_true", help="servers: all loads, half an hour instead of eight minutes")
+    parser.add_argument("--server", action="append", default=[], metavar="NAME=PYTHON", help="commits: one of them")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=2.0, help="of each measurement")
-    parser.add_argument("--sizes", nargs="+", default=["default", "small"], choices=["default", "small"])
-    parser.add_argument("--threads", type=int, default=0, help="of torch, in every server; 0: torch's choice")
-    parser.add_argument("--output", type=Path, default=RESULTS, help="folder for the results")
+    parser.add_argument("--callers", type=int, nargs="+", default=[1, 8, 32])
+    parser.add_argument("--sizes", nargs="+", default=["default", "small"], choices=["default", "small", "vlm"])
+    parser.add_argument("--output", type=Path, default=report.RESULTS, help="folder for the results")
     arguments = parser.parse_args()
-
-    threads = arguments.threads or torch.get_num_threads()
-    torch.set_num_threads(threads)
-    scenarios = FULL if arguments.full else QUICK
-    console = Console()
-    rows: list[dict[str, object]] = []
+    torch.set_num_threads(torch.get_num_threads())
+    measure = {"servers": servers, "accelerator": accelerator, "commits": commits}[arguments.what]
     with TemporaryDirectory(prefix="rfm-bench-") as folder:
-        for size in arguments.sizes:
-            measured = checkpoint(size, Path(folder), threads)
-            bare = BareEngine(measured)
-            with contestants(measured, bare.widths, PEERS, Path(folder) / "logs") as callers:
-                for scenario in scenarios:
-                    if scenario.load.frame_px and measured.encoders is None:
-                        continue
-                    load = replace(scenario.load, seconds=arguments.seconds)
-                    rows += _rounds(size, replace(scenario, load=load), bare, callers, arguments.rounds, console)
-    of_run = {"threads": threads, "rounds": arguments.rounds, "seconds": arguments.seconds}
-    results = {"machine": machine(), **of_run, "measurements": rows}
-    arguments.output.mkdir(parents=True, exist_ok=True)
-    (arguments.output / "results.json").write_text(json.dumps(results, indent=1) + "\n")
-    report.write(results, arguments.output)
-    console.print(f"{arguments.output}: results.json, results.md and pictures")
-
-
-def _rounds(
-    size: str,
-    scenario: Scenario,
-    bare: BareEngine,
-    callers: Mapping[str, Callers],
-    rounds: int,
-    console: Console,
-) -> list[dict[str, object]]:
-    """A row a measurement."""
-    ours = ("gRPC", "HTTP", SHARED_MEMORY, "gateway")
-    ways = [way for way in callers if way in scenario.ways or (scenario.with_peers and way not in ours)]
-    batch_sizes = (1,) if scenario.load.callers == 1 else BARE_BATCH_SIZES
-    load = scenario.load
-    rows = []
-    for number in range(rounds):
-        measured = {f"{BARE}, batch {batch}": bare.measure(replace(load, rate_per_s=0), batch) for batch in batch_sizes}
-        if scenario.load.rate_per_s:  # a share of what the engine could do just now
-            best = max(each.samples_per_s for each in measured.values())
-            load = replace(scenario.load, rate_per_s=scenario.load.rate_per_s * best)
-        measured |= {way: callers[way].measure(load) for way in ways}
-        rows += [
-            {"size": size, "scenario": scenario.name, "round": number, "way": way, **asdict(each)}
-            for way, each in measured.items()
-        ]
-        told = ", ".join(f"{way} {each.samples_per_s:.0f}" for way, each in measured.items())
-        console.print(f"{size}, {scenario.name}, round {number + 1}: {told} samples/s", highlight=False)
-    return rows
-
-
-def checkpoint(size: str, folder: Path, threads: int) -> Checkpoint:
-    """The demo's, served as it is there, or one of the default size with random weights."""
-    repository = folder / f"repository_{size}"
-    if size == "small":
-        versions = DEMO / "rfm" / "1", DEMO / "rfm_encoder" / "1"
-        source, encoders = versions[0] / "checkpoint", (versions[1] / "image_encoder", versions[1] / "text_encoder")
-        images, texts = map(str, encoders)
-        settings = replace(Config.from_yaml(DEMO / "serve.yaml").export, image_encoder=images, text_encoder=texts)
-    else:
-        torch.manual_seed(0)
-        source, encoders = folder / size, None
-        RewindCheckpoint(DEFAULT_SIZE, RewindTransformer(DEFAULT_SIZE).state_dict()).save(source)
-        settings = ExportConfig(num_gpus=0, torch_threads=threads)
-    rfm_export.export(source, repository, settings)
-    return Checkpoint(size, source, repository, settings.instances or 1, settings.torch_threads, encoders)
-
-
-def machine() -> dict[str, object]:
-    """What the results are of."""
-    cpu = next((line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")), "")
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False).stdout
-    return {
-        "cpu": cpu.partition(": ")[2],
-        "cores": len(os.sched_getaffinity(0)),
-        "python": platform.python_version(),
-        "packages": {name: _version(name) for name in PACKAGES},
-        "commit": commit.strip(),
-        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-    }
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
+        measure(arguments, Path(folder))
 
 
 if __name__ == "__main__":

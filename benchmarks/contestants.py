@@ -4,165 +4,160 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import time
 import urllib.request
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from load import SHARED_MEMORY, Load, Measured, samples
+import numpy as np
+import psutil
+import torch
+from load import Load, Measured, samples
 
+import rfm_export
+from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.launch.process import Endpoints
-from rfm.launch.temporary import temporary_server
-from rfm.rewind.encoders import Encoders
-from rfm_gateway.command import gateway_command
-from rfm_gateway.config import GatewayConfig
+from rfm.rewind.checkpoint import RewindCheckpoint
+from rfm.rewind.network import RewindConfig, RewindTransformer
+from rfm_commands.config import Config
 
-PEER_SCRIPTS = {"FastAPI": "fastapi_server.py", "LitServe": "litserve_server.py", "mosec": "mosec_server.py"}
-START_S = 120
-WARM_UPS = 3  # as callers of a server ask three times before the clock starts
 HERE = Path(__file__).parent
+DEMO = HERE.parent / "model_repository"
+VLM = HERE.parent / "tests" / "golden" / "vlm"
+VLM_CHECKPOINT, VLM_BASE = VLM / "q3_tok_disc10" / "checkpoint", VLM / "bases" / "q3"
+PEERS = {"FastAPI": "fastapi_server.py", "LitServe": "litserve_server.py", "mosec": "mosec_server.py"}
+START_S = 120
+US_PER_S = 1e6
+DEFAULT_SIZE = RewindConfig(  # upstream's defaults
+    video_feature_dim=768,
+    text_feature_dim=384,
+    hidden_dim=512,
+    num_layers=4,
+    num_attention_heads=8,
+    max_len=16,
+    causal_mask=True,
+    use_per_frame_progress_token=True,
+    progress_bins=10,
+    has_similarity=True,
+)
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """name: of its size; folder: the checkpoint; repository: it, exported; encoders: folders of its two, if any
+    """A checkpoint and its export. threads: of torch, in every server; widths: of its embeddings, 0: it takes frames"""
 
-    instances: model processes of every server but FastAPI's; threads: of torch, of each
-    """
-
-    name: str
     folder: Path
     repository: Path
-    instances: int
     threads: int
-    encoders: tuple[Path, Path] | None = None
+    widths: tuple[int, int]
 
 
-class Callers:
-    """A process of callers of one server."""
+def checkpoint(size: str, folder: Path, threads: int = 0) -> Checkpoint:
+    """``small``: the demo's, as it is served there; ``default``: random weights; ``vlm``: a tiny one on Qwen3-VL."""
+    repository, threads = folder / f"repository_{size}", threads or torch.get_num_threads()
+    settings = ExportConfig(num_gpus=0, torch_threads=threads)
+    if size == "small":
+        source, encoders = DEMO / "rfm" / "1" / "checkpoint", DEMO / "rfm_encoder" / "1"
+        folders = {f"{kind}_encoder": str(encoders / f"{kind}_encoder") for kind in ("image", "text")}
+        settings, widths = replace(Config.from_yaml(DEMO / "serve.yaml").export, **folders), (64, 32)
+    elif size == "vlm":
+        source, widths, settings = VLM_CHECKPOINT, (0, 0), replace(settings, base_model=str(VLM_BASE))
+    else:
+        torch.manual_seed(0)
+        source, widths = folder / size, (DEFAULT_SIZE.video_feature_dim, DEFAULT_SIZE.text_feature_dim)
+        RewindCheckpoint(DEFAULT_SIZE, RewindTransformer(DEFAULT_SIZE).state_dict()).save(source)
+    rfm_export.export(source, repository, settings)
+    return Checkpoint(source, repository, settings.torch_threads or threads, widths)
 
-    def __init__(self, way: str, url: str, widths: tuple[int, int]) -> None:
-        words = [sys.executable, str(HERE / "load.py"), way, url, *map(str, widths)]
-        self._process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
-    @property
-    def pid(self) -> int:
-        """Id of the process."""
-        return self._process.pid
+class Contestant:
+    """A server that runs, and its callers in a process of their own. A context manager.
 
-    def measure(self, load: Load) -> Measured:
-        """Raises RuntimeError if the process ends."""
-        assert self._process.stdin is not None and self._process.stdout is not None
-        self._process.stdin.write(json.dumps(asdict(load)) + "\n")
-        self._process.stdin.flush()
-        line = self._process.stdout.readline()
+    server: gives its address; way: how it is asked
+    """
+
+    def __init__(self, way: str, server: AbstractContextManager[str], widths: tuple[int, int]) -> None:
+        self._way, self._server, self._widths = way, server, widths
+
+    def __enter__(self) -> Contestant:
+        before = set(psutil.Process().children(recursive=True))
+        url = self._server.__enter__()
+        self._processes = set(psutil.Process().children(recursive=True)) - before
+        words = [sys.executable, str(HERE / "load.py"), self._way, url, *map(str, self._widths)]
+        self._callers = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._callers.communicate()
+        self._server.__exit__(None, None, None)
+
+    def measure(self, load: Load) -> dict[str, float]:
+        """Rates, latencies, and microseconds of CPU a sample. Raises RuntimeError if the callers' process ends."""
+        assert self._callers.stdin is not None and self._callers.stdout is not None
+        before_s = _cpu_s(self._processes), _cpu_s([psutil.Process(self._callers.pid)])
+        self._callers.stdin.write(json.dumps(asdict(load)) + "\n")
+        self._callers.stdin.flush()
+        line = self._callers.stdout.readline()
         if not line:
-            raise RuntimeError(f"callers: expected an answer, got exit status {self._process.wait()}")
-        return Measured(**json.loads(line))
+            raise RuntimeError(f"callers: expected an answer, got exit status {self._callers.wait()}")
+        after_s = _cpu_s(self._processes), _cpu_s([psutil.Process(self._callers.pid)])
+        measured = Measured(**json.loads(line))
+        count = max(measured.samples_per_s * measured.took_s, 1)
+        server_us, client_us = ((after - b) / count * US_PER_S for after, b in zip(after_s, before_s, strict=True))
+        return {**asdict(measured), "server_us": server_us, "client_us": client_us}
 
-    def close(self) -> None:
-        """Ends the process."""
-        self._process.communicate()
+
+def _cpu_s(processes: Sequence[psutil.Process] | set[psutil.Process]) -> float:
+    return sum(sum(process.cpu_times()[:2]) for process in processes if process.is_running())
 
 
 class BareEngine:
-    """``Engine.evaluate`` in this process: what no server around it can beat."""
+    """``Engine.evaluate`` in this process, one batch after the other: what no server around it can beat."""
 
-    def __init__(self, checkpoint: Checkpoint) -> None:
-        encoders = Encoders.from_pretrained(*checkpoint.encoders) if checkpoint.encoders else None
-        self.engine = Engine.from_checkpoint(checkpoint.folder, encoders=encoders)
-        config = self.engine.predictor.network.config
-        self.widths = config.video_feature_dim, config.text_feature_dim
+    def __init__(self, measured: Checkpoint) -> None:
+        self._engine, self._widths = Engine.from_checkpoint(measured.folder), measured.widths
 
-    def measure(self, load: Load, batch_size: int, pause_s: float = 0.0) -> Measured:
-        """One batch after the other, of the load's samples.
-
-        pause_s: between two batches, as a server has them while a lone caller's requests and answers are on their way
-        """
-        asked = samples(load, *self.widths)
-        for _ in range(WARM_UPS):
-            self.engine.evaluate([asked[i % len(asked)] for i in range(batch_size)])
-        latencies_s = []
-        start, started_s = 0, time.perf_counter()
-        while time.perf_counter() - started_s < load.seconds:
-            batch = [asked[(start + i) % len(asked)] for i in range(batch_size)]
-            start += batch_size
+    def measure(self, load: Load, batch_size: int) -> dict[str, float]:
+        """Of the load's samples; two batches warm up."""
+        asked, latencies_s, started_s = samples(load, *self._widths), [], 0.0
+        for number in range(1_000_000):
+            if number == 2:
+                latencies_s, started_s = [], time.perf_counter()
+            if started_s and time.perf_counter() - started_s > load.seconds:
+                break
             before_s = time.perf_counter()
-            self.engine.evaluate(batch)
+            self._engine.evaluate([asked[(number * batch_size + i) % len(asked)] for i in range(batch_size)])
             latencies_s.append(time.perf_counter() - before_s)
-            time.sleep(pause_s)
         took_s = time.perf_counter() - started_s
-        rate = len(latencies_s) * batch_size / took_s
-        in_order = sorted(latencies_s)
-        p50_s, p99_s = in_order[len(in_order) // 2], in_order[int(len(in_order) * 0.99)]
-        return Measured(rate, 0, p50_s * 1e3, p99_s * 1e3, took_s)
+        p50_ms, p99_ms = np.percentile(latencies_s, [50, 99]) * 1e3
+        measured = Measured(len(latencies_s) * batch_size / took_s, 0, float(p50_ms), float(p99_ms), took_s)
+        return {**asdict(measured), "server_us": 0.0, "client_us": 0.0}
 
 
 @contextmanager
-def contestants(
-    checkpoint: Checkpoint, widths: tuple[int, int], peers: Sequence[str], log_folder: Path
-) -> Iterator[Mapping[str, Callers]]:
-    """Callers by name, of this server over each of its ways and of the peers, all of the same checkpoint."""
-    log_folder.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as stack:
-        endpoints = stack.enter_context(
-            temporary_server(checkpoint.repository, log_folder / f"triton_{checkpoint.name}.log")
-        )
-        gateway_port = Endpoints.free().http_port
-        config = GatewayConfig(gateway_port, triton=endpoints.grpc_url, metrics_url=endpoints.metrics_url)
-        gateway = gateway_command(config)
-        stack.enter_context(_running(gateway, gateway_port, log_folder / f"gateway_{checkpoint.name}.log"))
-        urls = {
-            "gRPC": endpoints.grpc_url,
-            "HTTP": endpoints.http_url,
-            SHARED_MEMORY: endpoints.grpc_url,
-            "gateway": f"http://127.0.0.1:{gateway_port}",
-        }
-        for peer in peers:
-            options = {"checkpoint": checkpoint.folder, **_processes(peer, checkpoint)}
-            log = log_folder / f"{peer}_{checkpoint.name}.log"
-            port = stack.enter_context(running_peer(PEER_SCRIPTS[peer], options, log))
-            ways = ["FastAPI, JSON", "FastAPI, npy"] if peer == "FastAPI" else [peer]
-            urls |= dict.fromkeys(ways, f"http://127.0.0.1:{port}")
-        callers = {}
-        for way, url in urls.items():
-            callers[way] = Callers(way, url, widths)
-            stack.callback(callers[way].close)
-        yield callers
-
-
-def _processes(peer: str, checkpoint: Checkpoint) -> Mapping[str, int]:
-    """As many as this server has; the FastAPI design has one replica a device, which takes all threads."""
-    if peer == "FastAPI":
-        return {"threads": checkpoint.threads * checkpoint.instances}
-    return {"threads": checkpoint.threads, "workers": checkpoint.instances}
-
-
-@contextmanager
-def running_peer(script: str, options: Mapping[str, object], log: Path) -> Iterator[int]:
-    """A peer with these options, from when it answers, and its port."""
+def peer(name: str, options: Mapping[str, object], log: Path) -> Iterator[str]:
+    """Address of a peer with these options, from when it answers."""
     port = Endpoints.free().http_port
-    words = [f"--{name}={value}" for name, value in {**options, "port": port}.items()]
-    with _running([sys.executable, str(HERE / "peers" / script), *words], port, log):
-        yield port
+    words = [f"--{option}={value}" for option, value in {**options, "port": port}.items()]
+    with running([sys.executable, str(HERE / "peers" / PEERS[name]), *words], port, log):
+        yield f"http://127.0.0.1:{port}"
 
 
 @contextmanager
-def _running(command: Sequence[str], port: int, log: Path) -> Iterator[None]:
+def running(command: Sequence[str], port: int, log: Path) -> Iterator[None]:
     """A server, from when it answers."""
     with log.open("wb") as lines:
-        process = subprocess.Popen(command, stdout=lines, stderr=lines, env={**os.environ})
+        process = subprocess.Popen(command, stdout=lines, stderr=lines)
         try:
             deadline_s = time.monotonic() + START_S
             while not _answers(port):
                 if process.poll() is not None or time.monotonic() > deadline_s:
-                    raise RuntimeError(f"{' '.join(command)}: expected to listen, got: see {log}")
+                    raise RuntimeError(f"{' '.join(command)}: expected to listen, got:\n{log.read_text()[-2000:]}")
                 time.sleep(0.2)
             yield
         finally:

@@ -40,11 +40,10 @@ IN_FLIGHT = 4096  # more than any load has under way, so that no client holds sa
 KEEP_ALIVE_S = 3.0  # the peers close a connection that is idle for 5 seconds, perhaps just when it is used again
 MS_PER_S = 1e3
 PEERS = {
-    "FastAPI, JSON": clients.fastapi_json,
-    "FastAPI, npy": clients.fastapi_npy,
-    "gateway": clients.gateway_npy,
-    "LitServe": clients.litserve,
-    "mosec": clients.mosec,
+    "FastAPI": clients.fastapi_npy,
+    "gateway": clients.fastapi_npy,
+    "LitServe": lambda session, url: clients.by_msgpack(session, f"{url}/predict"),
+    "mosec": lambda session, url: clients.by_msgpack(session, f"{url}/inference"),
 }
 SHARED_MEMORY = "shared memory"
 

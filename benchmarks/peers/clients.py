@@ -25,20 +25,8 @@ Ask: TypeAlias = Callable[[Sequence[Sample]], Awaitable[list[float]]]
 _MSGPACK = {"Content-Type": "application/msgpack"}
 
 
-def fastapi_json(session: aiohttp.ClientSession, base_url: str) -> Ask:
-    """Asks the FastAPI evaluation server, or the gateway, with numbers as JSON."""
-
-    async def ask(samples: Sequence[Sample]) -> list[float]:
-        described = [{"sample_type": _kind(sample), **_as_lists(sample)} for sample in samples]
-        async with session.post(f"{base_url}/evaluate_batch", json={"samples": described}) as answer:
-            answer.raise_for_status()
-            return _scores(samples, await answer.json())
-
-    return ask
-
-
 def fastapi_npy(session: aiohttp.ClientSession, base_url: str) -> Ask:
-    """Asks the FastAPI evaluation server with .npy files in a form."""
+    """Asks the FastAPI evaluation server, or our gateway, with .npy files in a form."""
 
     async def ask(samples: Sequence[Sample]) -> list[float]:
         async with session.post(f"{base_url}/evaluate_batch_npy", data=_form(samples)) as answer:
@@ -48,21 +36,8 @@ def fastapi_npy(session: aiohttp.ClientSession, base_url: str) -> Ask:
     return ask
 
 
-gateway_npy = fastapi_npy  # our gateway speaks the same
-
-
-def litserve(session: aiohttp.ClientSession, base_url: str) -> Ask:
-    """Asks the LitServe server."""
-    return _by_msgpack(session, f"{base_url}/predict")
-
-
-def mosec(session: aiohttp.ClientSession, base_url: str) -> Ask:
-    """Asks the mosec server."""
-    return _by_msgpack(session, f"{base_url}/inference")
-
-
-def _by_msgpack(session: aiohttp.ClientSession, url: str) -> Ask:
-    """Asks with a message a sample, as ``message`` describes it."""
+def by_msgpack(session: aiohttp.ClientSession, url: str) -> Ask:
+    """Asks the LitServe or mosec server with a message a sample, as ``engines`` describes it."""
 
     async def ask_one(sample: Sample) -> float:
         videos = [_video(trajectory) for trajectory in sample.trajectories]
@@ -117,13 +92,6 @@ def _arrays(sample: Sample) -> Iterator[tuple[str, str, np.ndarray]]:
     for name, trajectory in _named(sample).items():
         yield name, "video_embeddings", _video(trajectory)
         yield name, "text_embedding", _text(trajectory)
-
-
-def _as_lists(sample: Sample) -> dict[str, dict[str, Any]]:
-    lists: dict[str, dict[str, Any]] = {}
-    for name, kind, array in _arrays(sample):
-        lists.setdefault(name, {})[kind] = array.tolist()
-    return lists
 
 
 def _form(samples: Sequence[Sample]) -> aiohttp.FormData:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Our engine behind LitServe, with its dynamic batching: an HTTP process and an inference process.
 
-Requests and answers are raw bytes (``message``), so that neither JSON nor a form is parsed. One that the engine cannot
+Requests and answers are raw bytes (``engines``), so that neither JSON nor a form is parsed. One that the engine cannot
 score is answered with 400; one that cannot be read fails its batch, as LitServe has it.
 """
 
@@ -15,9 +15,8 @@ import litserve
 import msgpack
 import torch
 from fastapi import Body, Response
-from message import answer_of, sample_of
-from simulated import engine_of
 
+from engines import answer_of, engine_of, sample_of
 from rfm.engine import Outcome
 from rfm_client import Sample
 

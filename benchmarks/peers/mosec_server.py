@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Our engine behind mosec, with its dynamic batching: a Rust HTTP process and an inference process.
 
-Requests and answers are msgpack (``message``). A sample that the engine cannot score is answered with ``error``; a
+Requests and answers are msgpack (``engines``). A sample that the engine cannot score is answered with ``error``; a
 request that cannot be read fails its batch, as mosec has it.
 """
 
@@ -16,9 +16,9 @@ from typing import Any
 
 import mosec
 import torch
-from message import answer_of, sample_of
 from mosec.mixin import MsgpackMixin
-from simulated import engine_of
+
+from engines import answer_of, engine_of, sample_of
 
 MAX_BATCH_SIZE = 64
 MAX_WAIT_MS = 1  # the least that it takes

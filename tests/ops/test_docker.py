@@ -265,6 +265,7 @@ def test_a_package_without_its_hash_is_not_installed(tmp_path: Path, options: st
     assert list(environment.glob("lib/python*/site-packages/*")) == []
 
 
+@pytest.mark.nightly
 def test_the_image_holds_what_serving_needs_in_locked_versions_and_nothing_else(image: Image) -> None:
     listed = image.run(
         "python",
@@ -279,6 +280,7 @@ def test_the_image_holds_what_serving_needs_in_locked_versions_and_nothing_else(
         assert name in OURS or versions[name].contains(version), (name, version)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "words",
     [
@@ -294,6 +296,7 @@ def test_the_image_has_the_packages_and_commands(image: Image, words: list[str])
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "config", [None, next(config for config in goldens.VLM if not config.is_bfloat16)], ids=["rewind", "vlm"]
 )
@@ -400,6 +403,7 @@ def test_the_gateway_s_key_is_mounted_where_there_is_one(options: dict[str, str]
     assert yaml.safe_load(done.stdout)["secrets"]["gateway_api_key"]["file"].endswith(source)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", [name for name, service in SERVICES.items() if is_ours(service)])
 def test_the_image_knows_the_options_that_the_compose_file_gives_it(image: Image, name: str) -> None:
     words = [*SERVICES[name].get("entrypoint", entrypoint()), *SERVICES[name]["command"]]

@@ -59,6 +59,7 @@ def test_the_demo_shows_what_it_promises(tmp_path: Path) -> None:
     assert np.abs(kept.astype(int) - scored).mean() < 8  # a video halves the resolution of colours
 
 
+@pytest.mark.nightly
 def test_a_policy_is_paid_by_the_served_checkpoint(tmp_path: Path) -> None:
     """Two short rounds; ten whole ones, which take minutes, teach it the task."""
     few = ("--rounds", 2, "--population", 6, "--scenes", 1, "--tests", 3, "--log", tmp_path / "triton.log")
@@ -69,6 +70,7 @@ def test_a_policy_is_paid_by_the_served_checkpoint(tmp_path: Path) -> None:
     assert all(0 < reward < 1 for reward in paid)
 
 
+@pytest.mark.nightly
 def test_the_served_checkpoint_keeps_its_bounds_on_clips_it_never_saw(tmp_path: Path) -> None:
     """A part of what the model card tells, which is of 240 tasks."""
     output = tmp_path / "evaluation.json"
@@ -107,6 +109,7 @@ def test_a_repository_that_is_none_is_told(tmp_path: Path, video: Path) -> None:
     assert result.stderr.startswith("rfm: ")
 
 
+@pytest.mark.nightly
 def test_training_is_reproducible_and_its_result_is_served_as_any_checkpoint(tmp_path: Path) -> None:
     steps = ("--encoder-steps", 2, "--frozen-steps", 1, "--joint-steps", 1, "--groups", 1)
     for name in ("first", "second"):
@@ -124,12 +127,6 @@ def test_training_is_reproducible_and_its_result_is_served_as_any_checkpoint(tmp
 def test_the_committed_repository_is_small() -> None:
     files = [file for file in REPOSITORY.rglob("*") if file.is_file() and "__pycache__" not in file.parts]
     assert sum(file.stat().st_size for file in files) <= 3e6
-
-
-def test_the_clip_survives_its_video_file(video: Path) -> None:
-    frames = read_video(video, clip.FPS)
-    assert frames.shape == clip.render().shape
-    assert np.abs(frames.astype(int) - clip.render()).mean() < 8  # lossy, but the same picture
 
 
 @pytest.mark.parametrize(

@@ -13,11 +13,15 @@ import tritonclient.grpc
 from rfm.launch.installation import find_installation
 from rfm.launch.process import Endpoints, TritonServer
 
+CRASHES: list[Path] = []  # repositories whose Triton has ended with SIGABRT, by itself
+
 
 class BriefServer(TritonServer):
     """A server that is killed when its test is over: Triton takes a second for each model process to end in order."""
 
     def __exit__(self, *raised: Any) -> None:
+        if self._process is not None and self.exit_status == -signal.SIGABRT:
+            CRASHES.append(self.repository)
         if self._process is not None and self.exit_status is None:
             self.kill()
         super().__exit__(*raised)

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""A simulated accelerator: an engine whose forward passes are a sleep, so that what a server does beside them shows.
+"""What the LitServe and mosec servers have in common: their messages, and the engine behind them.
 
-The sleep takes no CPU and no lock, as a GPU's forward pass does. How long all of them took, and how many samples they
-were of, stands in a file that others read.
+A message is a msgpack map a sample, arrays as their float32 bytes. Request: ``type`` (progress, preference or
+similarity), ``shapes`` ([[T, D]] of each trajectory), ``video`` (their embeddings, one after the other) and ``text``
+(the first trajectory's [Dt]). Answer: ``progress`` and ``success`` (a float32 [T] a trajectory), and of pairs
+``query``; or ``error``. The engine's accelerator may be simulated: forward passes are a sleep, which takes no CPU and
+no lock.
 """
 
 from __future__ import annotations
@@ -12,18 +15,63 @@ import json
 import mmap
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rfm.engine import Engine
+from rfm.engine import Engine, Outcome
 from rfm.predictor import RowScores
-from rfm_client import FrameScores
+from rfm_client import (
+    FrameScores,
+    PreferenceResult,
+    PreferenceSample,
+    ProgressResult,
+    ProgressSample,
+    RewardError,
+    Sample,
+    SimilaritySample,
+    Trajectory,
+)
 
 SIMULATION = "simulated.json"
 _LEDGER = struct.Struct("<dQ")  # seconds in forward passes, rows in them
+
+
+_PAIRS = {"preference": PreferenceSample, "similarity": SimilaritySample}
+
+
+def sample_of(message: Mapping[str, Any]) -> Sample:
+    """The sample of a request. Raises KeyError, ValueError, InvalidSampleError."""
+    text = np.frombuffer(message["text"], np.float32)
+    video = np.frombuffer(message["video"], np.float32)
+    shapes = message["shapes"]
+    ends = np.cumsum([0, *(num_frames * width for num_frames, width in shapes)])
+    parts = [video[start:end].reshape(shape) for (start, end), shape in zip(pairwise(ends), shapes, strict=True)]
+    trajectories = [Trajectory(video_embeddings=part, text_embedding=text) for part in parts]
+    if message["type"] == "progress":
+        return ProgressSample(*trajectories)
+    return _PAIRS[message["type"]](*trajectories)
+
+
+def answer_of(outcome: Outcome) -> dict[str, Any]:
+    """The answer to a request."""
+    if isinstance(outcome, RewardError):
+        return {"error": str(outcome)}
+    if isinstance(outcome, ProgressResult):
+        return _frames(outcome)
+    if isinstance(outcome, PreferenceResult):
+        return {**_frames(outcome.first, outcome.second), "query": outcome.preference}
+    return {**_frames(outcome.reference, outcome.other), "query": outcome.similarity}
+
+
+def _frames(*scores: FrameScores) -> dict[str, Any]:
+    return {
+        "progress": [each.progress.tobytes() for each in scores],
+        "success": [each.success.tobytes() for each in scores],
+    }
 
 
 class Ledger:

@@ -1,17 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""``make rollout``: two versions of a checkpoint take turns on one server while callers ask; what became of each request.
+"""Two versions of a checkpoint on one server, and callers who compare each answer with that of the version it names.
 
-Half of the callers use gRPC, half HTTP. They send embeddings and raw frames, in turn, one request at a time and a few a
-second each, and retry nothing.
+They send embeddings and raw frames, in turn, one request at a time and a few a second each, and retry nothing.
 """
 
 from __future__ import annotations
 
 import asyncio
-import functools
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections import Counter
@@ -29,13 +26,11 @@ import rfm_export
 from engines import serve_config
 from rfm import families
 from rfm.engine import Engine, Outcome
-from rfm.launch.process import Endpoints
 from rfm_client import (
     AsyncRewardClient,
     DeadlineExceededError,
     PreferenceSample,
     ProgressSample,
-    RewardClient,
     RewardError,
     Sample,
     Trajectory,
@@ -50,9 +45,7 @@ FRAME_PX = 48
 RFM = Path(sys.executable).parent / "rfm"
 TOLERANCE = 1e-5
 CLEARLY = 1e-2  # versions differ by at least so much
-SECONDS = 60.0
 CALLERS = 32
-DEADLINE_S = 10.0  # of a call
 PAUSE_S = 0.2  # a control loop's step; without it they would take the processor from what is being loaded
 
 
@@ -188,76 +181,3 @@ def models(command: str, repository: Path, url: str, key_file: Path, *words: str
         options += ["--repository", str(repository)]
     line = [str(RFM), "models", command, *words, *options]
     return subprocess.run(line, capture_output=True, text=True, timeout=180, check=False)
-
-
-@contextmanager
-def rfm_serve(repository: Path, key_file: Path, log: Path) -> Iterator[Endpoints]:
-    """What users run, until it is left."""
-    endpoints = Endpoints.free()
-    ports = {"http": endpoints.http_port, "grpc": endpoints.grpc_port, "metrics": endpoints.metrics_port}
-    options = [f"--{name}-port={port}" for name, port in ports.items()]
-    line = [str(RFM), "serve", "--repository", str(repository), "--admin-key-file", str(key_file), *options]
-    with log.open("wb") as lines:
-        process = subprocess.Popen(line, stdout=lines, stderr=lines)
-    try:
-        with RewardClient(endpoints.grpc_url, model=NAME) as client:
-            client.wait_ready(120)
-        yield endpoints
-    finally:
-        process.terminate()
-        process.wait(60)
-
-
-def take_turns(repository: Path, url: str, key_file: Path, seconds: float) -> int:
-    """Rollout of version 2 and rollback in turn, for so long; how many there were."""
-    end_s, turn = time.monotonic() + seconds, 0
-    while time.monotonic() < end_s:
-        begun_s = time.monotonic()
-        words = ("rollback", NAME) if turn % 2 else ("rollout", NAME, "2")
-        done = models(words[0], repository, url, key_file, *words[1:])
-        if done.returncode != 0:
-            raise RuntimeError(done.stderr)
-        print(f"{' '.join(words)}: {time.monotonic() - begun_s:.1f} s", flush=True)
-        turn += 1
-    return turn
-
-
-def main() -> int:
-    """Prints the figures; 1 if a request was lost or answered by neither version."""
-    torch.set_num_threads(1)
-    with tempfile.TemporaryDirectory(prefix="rfm-rollout-") as name:
-        folder = Path(name)
-        repository, key_file, samples = folder / "repository", folder / "key", questions()
-        key_file.touch(0o600)
-        key_file.write_text("the-key-of-this-run")
-        other = other_checkpoint(folder / "other")
-        expected = {"1": answers(WITH_ENCODERS.checkpoint, samples), "2": answers(other, samples)}
-        apart = min(difference(*pair) for pair in zip(expected["1"], expected["2"], strict=True))
-        assert apart > CLEARLY, apart
-        export(WITH_ENCODERS.checkpoint, repository)
-        with rfm_serve(repository, key_file, folder / "log") as endpoints:
-            export(other, repository)
-            begun_s = time.monotonic()
-            ask = functools.partial(
-                callers, samples=samples, expected=expected, count=CALLERS // 2, timeout_s=DEADLINE_S
-            )
-            with (
-                ask(endpoints.grpc_url) as over_grpc,
-                ask(endpoints.http_url) as over_http,
-            ):
-                turns = take_turns(repository, endpoints.grpc_url, key_file, SECONDS)
-            took_s = time.monotonic() - begun_s
-        told = [line for line in (folder / "log").read_text().splitlines() if line.startswith("rfm: ")]
-    print(
-        f"{took_s:.0f} s, {CALLERS} callers, {turns} times another version; the versions differ by {apart:.2g} or more"
-    )
-    for protocol, tally in {"gRPC": over_grpc, "HTTP": over_http}.items():
-        print(f"{protocol}: {tally}")
-        for line in (*tally.failed[:5], *tally.unlike[:5]):
-            print(line)
-    print(*told, sep="\n")
-    return int(any(tally.failed or tally.unlike for tally in (over_grpc, over_http)))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

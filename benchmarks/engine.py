@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: MIT
+"""The engine without a server.
+
+    engine.py forward      its forward beside the original's; options; dense mode; more frames; wider networks
+    engine.py preparation  CPU time to prepare frames for a vision-language checkpoint, beside transformers' processor
+    engine.py loading      memory of the host to load a vision-language checkpoint of 0.6B parameters (takes 9 GB)
+    engine.py checkpoint FOLDER --base-model DIR_OR_ID
+                           writes a Qwen3-VL reward checkpoint of 4B parameters with random weights
+
+Weights are random. What is compared is measured in turn, round after round.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import report
+import torch
+from contestants import DEFAULT_SIZE, VLM_BASE, VLM_CHECKPOINT
+from peers.upstream_forward import UpstreamRewind, progress_of
+
+from rfm import families
+from rfm.config import ExportConfig
+from rfm.engine import Engine
+from rfm.layers.heads import progress_from_logits
+from rfm.rewind.network import RewindBatch, RewindConfig, RewindTransformer
+from rfm.rewind.predictor import RewindPredictor
+from rfm_client import ProgressSample, Trajectory
+
+FRAMES = 16
+THREE_LAYERS, ALL_LAYERS = 3, 36  # of the language model: 0.6B and 4B parameters
+SPECIAL_TOKENS = ("<|split_token|>", "<|reward_token|>", "<|pref_token|>", "<|sim_token|>", "<|prog_token|>")
+TEXT: dict[str, Any] = {  # Qwen3-VL-4B-Instruct
+    "hidden_size": 2560, "intermediate_size": 9728, "num_attention_heads": 32, "num_key_value_heads": 8,
+    "head_dim": 128, "max_position_embeddings": 262144, "rope_theta": 5000000,
+    "rope_scaling": {"rope_type": "default", "mrope_interleaved": True, "mrope_section": [24, 20, 20]},
+}  # fmt: skip
+VISION = {
+    "hidden_size": 1024, "intermediate_size": 4096, "depth": 24, "num_heads": 16, "patch_size": 16,
+    "out_hidden_size": 2560, "deepstack_visual_indexes": [5, 11, 17], "num_position_embeddings": 2304,
+}  # fmt: skip
+RUN = {  # Robometer-4B's defaults
+    "model": {
+        "model_type": "default", "torch_dtype": "bfloat16", "use_multi_image": True,
+        "use_per_frame_progress_token": True,
+    },
+    "training": {"predict_pref_progress": True},
+}  # fmt: skip
+TOKEN_IDS = {
+    "image_token_id": "<|image_pad|>",
+    "video_token_id": "<|video_pad|>",
+    "vision_start_token_id": "<|vision_start|>",
+    "vision_end_token_id": "<|vision_end|>",
+}
+
+Row = dict[str, Any]
+
+
+@torch.inference_mode()
+def forward(arguments: argparse.Namespace) -> None:
+    """Of the default ReWiND, but for what a row varies. difference: of progress, the largest from the first way's."""
+    ours, original = RewindTransformer(DEFAULT_SIZE).eval(), UpstreamRewind(DEFAULT_SIZE).eval()
+    original.load_state_dict(ours.state_dict())
+    halved = RewindTransformer(DEFAULT_SIZE).eval()
+    halved.load_state_dict(ours.state_dict())
+    halved.bfloat16()
+    compiled = None
+    if shutil.which("c++"):
+        from torch._inductor import config as inductor
+
+        inductor.freezing = True  # it packs weights only then
+        torch.backends.mha.set_fastpath_enabled(False)  # a compiler sees one opaque operation in it
+        compiled = torch.compile(original, dynamic=False)
+    rows: list[Row] = []
+    for batch_size in (1, 2, 4, 8, 16, 32, 64):
+        text, video = torch.randn(batch_size, 384), torch.randn(batch_size, FRAMES, 768)
+        lengths = np.array([(FRAMES, 0)] * batch_size)
+        make = partial(RewindBatch.of, DEFAULT_SIZE, text, video.flatten(0, 1), lengths)
+        ways: dict[str, Callable[[], torch.Tensor]] = {
+            "the original": lambda t=text, v=video: progress_of(original(t, v).progress).flatten(),
+            "ours": lambda m=make: progress_from_logits(ours(m()).progress),
+            "ours, bfloat16": lambda m=make: progress_from_logits(halved(m().to("cpu", torch.bfloat16)).progress),
+        }
+        if compiled is not None and batch_size in (1, 8, 32):
+            ways["the original, compiled"] = lambda t=text, v=video: progress_of(compiled(t, v).progress).flatten()
+        rows += _timed({"what": "forward", "size": batch_size}, ways, arguments.rounds)
+    trajectory = _trajectory(DEFAULT_SIZE, FRAMES)
+    engine = Engine(RewindPredictor(RewindTransformer(DEFAULT_SIZE), torch.device("cpu")))
+    assert trajectory.video_embeddings is not None
+    videos = [trajectory.video_embeddings[np.linspace(0, t, 4).astype(int)] for t in range(FRAMES)]
+    prefixes = [ProgressSample(replace(trajectory, video_embeddings=video)) for video in videos]
+    ways = {
+        "prefixes one by one": lambda: _last([engine.evaluate([prefix])[0] for prefix in prefixes]),
+        "dense mode": lambda: torch.from_numpy(
+            engine.evaluate([ProgressSample(trajectory, frame_steps=4)])[0].progress  # type: ignore[union-attr]
+        ),
+    }
+    rows += _timed({"what": "dense", "size": FRAMES}, ways, arguments.rounds)
+    for num_frames in (4, 8, 16, 32, 64, 128):
+        rows += _engine("frames", num_frames, replace(DEFAULT_SIZE, max_len=128), num_frames, arguments.rounds)
+    for width in (64, 128, 256, 512, 1024):
+        rows += _engine("width", width, replace(DEFAULT_SIZE, hidden_dim=width), FRAMES, arguments.rounds)
+    told = f"The engine without a server\n{forward.__doc__} Ratio: of ms. Batches of 8 in the last two."
+    report.write("forward", told, rows, ("what", "size", "way"), "ms", arguments.output)
+
+
+def _last(results: list[Any]) -> torch.Tensor:
+    return torch.tensor([result.last_progress for result in results])
+
+
+def _timed(of: Row, ways: Mapping[str, Callable[[], torch.Tensor]], rounds: int) -> list[Row]:
+    """Milliseconds of each way in each round, after two that warm up, and how far its scores are from the first's."""
+    scores = {way: call().float() for way, call in ways.items()}
+    first = next(iter(scores.values()))
+    rows = []
+    for number in range(rounds + 1):
+        for way, call in ways.items():
+            before_s = time.perf_counter()
+            call()
+            ms = (time.perf_counter() - before_s) * 1e3
+            if number:
+                difference = float((scores[way] - first).abs().max())
+                rows.append({**of, "way": way, "round": number, "ms": ms, "difference": difference})
+    return rows
+
+
+def _engine(what: str, size: int, config: RewindConfig, num_frames: int, rounds: int) -> list[Row]:
+    engine = Engine(RewindPredictor(RewindTransformer(config), torch.device("cpu")))
+    samples = [ProgressSample(_trajectory(config, num_frames, seed)) for seed in range(8)]
+    return _timed({"what": what, "size": size}, {"ours": lambda: _last(list(engine.evaluate(samples)))}, rounds)
+
+
+def _trajectory(config: RewindConfig, num_frames: int, seed: int = 0) -> Trajectory:
+    random = np.random.default_rng(seed)
+    return Trajectory(
+        video_embeddings=random.standard_normal((num_frames, config.video_feature_dim), np.float32),
+        text_embedding=random.standard_normal(config.text_feature_dim, np.float32),
+    )
+
+
+def preparation(arguments: argparse.Namespace) -> None:
+    """CPU milliseconds of all threads for 8 new frames: checked, named by digests, brought to size, laid out.
+
+    A task that was asked before, as in an RL loop, and a new one. The processor also normalises and cuts into patches.
+    """
+    from transformers import AutoImageProcessor
+
+    checkpoint = families.load(VLM_CHECKPOINT, base_model=str(VLM_BASE))
+    predictor = Engine.of(checkpoint, feature_cache_mb=ExportConfig().feature_cache_mb).predictor
+    processor = AutoImageProcessor.from_pretrained(VLM_BASE, use_fast=False)
+    numbers = itertools.count()
+
+    def ours(frames: np.ndarray, task: str) -> object:
+        return predictor.collate(predictor.rows(ProgressSample(Trajectory(frames=frames, task=task))))
+
+    ways: dict[str, Callable[[np.ndarray], object]] = {
+        "transformers' processor": lambda frames: processor(images=list(frames), return_tensors="pt"),
+        "this server": lambda frames: ours(frames, "stack the cups"),
+        "this server, a new task": lambda frames: ours(frames, f"stack {next(numbers)} cups"),
+    }
+    random, rows = np.random.default_rng(0), []
+    for height, width in ((256, 256), (480, 640), (720, 1280)):
+        for number in range(arguments.rounds + 1):
+            frames = random.integers(0, 256, (8, height, width, 3), np.uint8)
+            for way, prepare in ways.items():
+                began_s = time.process_time()
+                prepare(frames)
+                if number:
+                    ms = (time.process_time() - began_s) * 1e3
+                    rows.append({"frames": f"{height}x{width}", "way": way, "round": number, "cpu_ms": ms})
+    told = f"Preparing a sample for a vision-language checkpoint\n{preparation.__doc__}"
+    report.write("preparation", told, rows, ("frames", "way"), "cpu_ms", arguments.output)
+
+
+def loading(arguments: argparse.Namespace) -> None:
+    """Peak (VmHWM) of a process that loads it, less that of one that loads a tiny one. share: of the weights' size."""
+    if arguments.one:
+        print(_peak_bytes(arguments.one, arguments.folder))
+        return
+    with TemporaryDirectory() as name:
+        folder, rows = Path(name) / "checkpoint", []
+        write_checkpoint(folder, str(VLM_BASE), THREE_LAYERS)
+        size = (folder / "model.safetensors").stat().st_size
+        for what in ("bfloat16", "float32", "export"):
+            words = [[sys.executable, __file__, "loading", str(of), "--one", what] for of in (folder, VLM_CHECKPOINT)]
+            peaks = [int(subprocess.check_output(line, text=True).splitlines()[-1]) for line in words]
+            peak = peaks[0] - peaks[1]
+            rows.append({"way": what, "round": 0, "peak_mib": peak / 2**20, "share": peak / size})
+    report.write("loading", f"Memory to load\n{loading.__doc__}", rows, ("way",), folder=arguments.output)
+
+
+def _peak_bytes(what: str, checkpoint: Path) -> int:
+    """The most memory that this process has had at a time, after what it is to do."""
+    if what == "export":
+        import rfm_export
+
+        with TemporaryDirectory(dir=checkpoint.parent) as repository:
+            settings = ExportConfig(base_model=str(VLM_BASE), num_gpus=0)
+            rfm_export.export(checkpoint, Path(repository) / "repository", settings)
+    else:
+        loaded = families.load(checkpoint, base_model=str(VLM_BASE))
+        for weights in Engine.of(loaded, dtype=getattr(torch, what)).predictor.network.parameters():
+            weights.sum()  # reads it from the file, as copying it to a GPU does
+    (peak_kib,) = re.findall(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    return int(peak_kib) * 1024
+
+
+def write_checkpoint(folder: Path, base_model: str, layers: int = ALL_LAYERS) -> None:
+    """Writes model.safetensors, config.json and config.yaml. base_model: folder or id whose tokenizer is used"""
+    from safetensors.torch import save_file
+    from transformers import AutoTokenizer, Qwen3VLConfig, Qwen3VLModel
+
+    folder.mkdir(parents=True)
+    tokenizer = AutoTokenizer.from_pretrained(base_model)
+    tokenizer.add_tokens(list(SPECIAL_TOKENS), special_tokens=True)
+    ids = {name: tokenizer.convert_tokens_to_ids(token) for name, token in TOKEN_IDS.items()}
+    text = {**TEXT, "num_hidden_layers": layers, "vocab_size": len(tokenizer)}
+    config = Qwen3VLConfig(text_config=text, vision_config=VISION, **ids)
+    torch.manual_seed(0)
+    backbone = Qwen3VLModel._from_config(config, dtype=torch.bfloat16)
+    width = TEXT["hidden_size"]
+    weights = {f"model.{name}": tensor for name, tensor in backbone.state_dict().items()}
+    weights["frame_pool_attn.weight"] = torch.randn(1, width)
+    for head, outputs in (("progress", 10), ("success", 1), ("preference", 1)):
+        modules = {0: (width, width // 2), 4: (width // 2, outputs)}
+        layers_of = {i: torch.nn.Linear(*sizes) for i, sizes in modules.items()} | {1: torch.nn.LayerNorm(width // 2)}
+        for index, layer in layers_of.items():
+            weights |= {f"{head}_head.{index}.{key}": tensor for key, tensor in layer.state_dict().items()}
+    tensors = {name: tensor.to(torch.bfloat16).contiguous() for name, tensor in weights.items()}
+    save_file(tensors, folder / "model.safetensors", metadata={"format": "pt"})
+    (folder / "config.json").write_text(json.dumps(config.to_dict(), indent=2))
+    run = {**RUN, "model": {**RUN["model"], "base_model_id": base_model}}
+    (folder / "config.yaml").write_text(json.dumps(run))  # JSON is YAML
+
+
+def main() -> None:
+    """Measures, writes and shows."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["forward", "preparation", "loading", "checkpoint"])
+    parser.add_argument("folder", type=Path, nargs="?", help="checkpoint: where it is written")
+    parser.add_argument("--base-model", help="checkpoint: folder or id whose tokenizer is used")
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--output", type=Path, default=report.RESULTS, help="folder for the results")
+    parser.add_argument("--one", help=argparse.SUPPRESS)  # of loading: prints the peak
+    arguments = parser.parse_args()
+    if arguments.what == "checkpoint":
+        if arguments.folder is None or arguments.base_model is None:
+            parser.error("checkpoint: expected FOLDER and --base-model")
+        write_checkpoint(arguments.folder, arguments.base_model)
+        return
+    {"forward": forward, "preparation": preparation, "loading": loading}[arguments.what](arguments)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,324 @@
+# SPDX-License-Identifier: MIT
+"""Faults that a running ``rfm serve`` must survive while callers ask, and what ``make chaos`` tells of each."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+import numpy as np
+import psutil
+
+import rfm_export
+import rollout
+from callers import Callers, Exam, direct, through_gateway
+from paths import ROOT
+from rfm.config import ExportConfig
+from rfm.launch.process import Endpoints
+from rfm_client import RewardClient
+from rfm_serve import MODEL, Serving, children, serving, wait_for
+
+CHECKPOINT = ROOT / "model_repository" / "rfm" / "1" / "checkpoint"
+TRITON, OTHER = "triton", f"{MODEL}_b"
+HEALED_S = 10.0  # from a fault to readiness, beside what a start takes, and the time until the fault can be noticed
+CALLERS = 16
+HANG_S = 10
+SILENT_S = 10.0  # as rfm serve has it by default
+LOOP_S = 120.0  # six starts of Triton and more, with back-off
+SLOW_CONNECTIONS = 100
+MODEL_FAULTS = """
+
+_answer = TritonPythonModel.answer
+
+
+def answer(self, questions, execution):
+    import os, time
+
+    for fault in ("hang", "break"):  # once, by the instance that takes the file
+        try:
+            os.unlink(f"{folder}/{fault}.{name}")
+        except FileNotFoundError:
+            continue
+        self.fault = fault
+    if getattr(self, "fault", None) == "hang":
+        time.sleep(3600)
+    if getattr(self, "fault", None) == "break":
+        raise RuntimeError("CUDA error: an illegal memory access was encountered")
+    if os.path.exists(f"{folder}/die.{name}"):
+        os._exit(1)
+    return _answer(self, questions, execution)
+
+
+TritonPythonModel.answer = answer
+"""
+
+
+@dataclass
+class Row:
+    """What became of the calls under one fault; healed_s: from the fault to readiness; broken: bounds that were."""
+
+    name: str
+    calls: Callers | None = None
+    healed_s: float | None = None
+    told: str = ""
+    may_lose: int = 0
+    may_break_off: bool = False
+    broken: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if self.calls is not None:
+            lost, untold = self.calls.lost, self.calls.refused + self.calls.broken_off
+            self.expect(len(lost) <= self.may_lose, f"{len(lost)} calls were lost, such as {lost[:1]}")
+            self.expect(not self.calls.wrong, f"{self.calls.wrong} answers were wrong")
+            self.expect(self.may_break_off or not untold, f"{untold} calls were refused or broken off")
+
+    def expect(self, is_so: bool, otherwise: str) -> None:
+        """Notes a bound that was broken."""
+        if not is_so:
+            self.broken.append(otherwise)
+
+    @property
+    def cells(self) -> list[str]:
+        counts = ["-"] * 6
+        if (calls := self.calls) is not None:
+            each = calls.asked, calls.answered, calls.refused, calls.broken_off, len(calls.lost), calls.wrong
+            counts = list(map(str, each))
+        return [self.name, *counts, "-" if self.healed_s is None else f"{self.healed_s:.1f}", self.told]
+
+
+@dataclass(frozen=True)
+class Site:
+    """``rfm serve`` with a gateway and two models; start_s: what it took to be ready."""
+
+    served: Serving
+    gateway_url: str
+    folder: Path
+    start_s: float
+    mixed: Exam
+    progress: Exam
+
+    @contextmanager
+    def callers(self, count: int = CALLERS, *, url: str = "", pause_s: float = 0.0) -> Iterator[Callers]:
+        """With the client as it is by default, about samples of all types."""
+        with (
+            RewardClient(url or self.served.endpoints.grpc_url) as client,
+            Callers(direct(client), self.mixed, count, pause_s) as callers,
+        ):
+            yield callers
+
+    @contextmanager
+    def gateway_callers(self, count: int = CALLERS // 2, *, pause_s: float = 0.0) -> Iterator[Callers]:
+        """About progress, as JSON."""
+        with (
+            httpx.Client(base_url=self.gateway_url, timeout=60) as session,
+            Callers(through_gateway(session), self.progress, count, pause_s) as callers,
+        ):
+            yield callers
+
+    def trigger(self, fault: str, model: str = MODEL) -> Path:
+        """A file with which ``model`` begins to ``hang``, ``break`` or ``die``."""
+        file = self.folder / f"{fault}.{model}"
+        file.touch()
+        return file
+
+    def restarts(self, what: str) -> float:
+        return self.served.metric("rfm_serve_restarts_total", what=what)
+
+    def models(self, command: str, *words: str) -> None:
+        """``rfm models COMMAND``. Raises RuntimeError if it fails."""
+        key, url = self.folder / "key", self.served.endpoints.grpc_url
+        done = rollout.models(command, self.folder / "model_repository", url, key, *words)
+        if done.returncode:
+            raise RuntimeError(f"rfm models {command}: {done.stderr}")
+
+    @property
+    def gateway(self) -> psutil.Process:
+        (pid,) = [pid for pid in children(self.served.process.pid, ".") if pid != self.served.triton]
+        return psutil.Process(pid)
+
+    def wait_healthy(self) -> float:
+        """Seconds until the gateway says that it is healthy."""
+
+        def is_healthy() -> bool:
+            with suppress(httpx.TransportError):
+                return httpx.get(f"{self.gateway_url}/health").status_code == 200
+            return False
+
+        return wait_for(is_healthy)
+
+
+@contextmanager
+def site(folder: Path, export: Callable[[Path], object] | None = None) -> Iterator[Site]:
+    """A server of a fault's own: six restarts in a row would be a crash loop."""
+    folder.mkdir()
+    repository, key_file, config = folder / "model_repository", folder / "key", folder / "serve.yaml"
+    (export or (lambda repository: export_faulty(repository, folder)))(repository)
+    key_file.touch(0o600)
+    key_file.write_text("the-key-of-this-run")
+    config.write_text(f"hang_s: {HANG_S}\n")
+    port = Endpoints.free().http_port
+    with serving(repository, f"--gateway-port={port}", f"--admin-key-file={key_file}", f"--config={config}") as served:
+        start_s = served.wait_ready()
+        exams = [Exam.of(CHECKPOINT, mixed=mixed) for mixed in (True, False)]
+        made = Site(served, f"http://127.0.0.1:{port}", folder, start_s, *exams)
+        made.wait_healthy()
+        yield made
+
+
+def export_faulty(repository: Path, folder: Path) -> None:
+    """The demo's checkpoint twice, whose models have faults when they are told to."""
+    for name in (MODEL, OTHER):
+        settings = ExportConfig(name=name, num_gpus=0, torch_threads=1, instances=2 - (name == OTHER))
+        rfm_export.export(CHECKPOINT, repository, settings)
+        with (repository / name / "1" / "model.py").open("a") as code:
+            code.write(MODEL_FAULTS.replace("{folder}", str(folder)).replace("{name}", name))
+
+
+def healed(
+    name: str, fault: Callable[[Site], object], what: str, noticed_s: float = 0.0, may_lose: int = 0
+) -> Callable[[Site], list[Row]]:
+    """A fault because of which Triton is restarted once.
+
+    what: is to blame; noticed_s: until it can be noticed; may_lose: so many calls, which are told that they failed
+    """
+
+    def cause(site: Site) -> list[Row]:
+        before = site.restarts(what)
+        with site.callers() as callers:
+            fault(site)
+            healed_s = wait_for(lambda: site.restarts(what) > before) + site.served.wait_ready()
+            callers.wait_for_all()
+        row = Row(name, callers, healed_s, may_lose=may_lose)
+        most_s = noticed_s + HEALED_S + site.start_s
+        row.expect(healed_s <= most_s, f"healed after {healed_s:.1f} s; allowed: {most_s:.0f} s")
+        row.expect(site.restarts(what) == before + 1, f"{site.restarts(what) - before:.0f} restarts")
+        return [row]
+
+    cause.__name__ = name
+    return cause
+
+
+def crash_loop(site: Site) -> list[Row]:
+    """One model of two ends Triton again and again: it is left out, and a person takes it in again."""
+    with site.callers() as callers:
+        trigger = site.trigger("die", OTHER)
+        took_s = wait_for(lambda: site.served.reasons().get(OTHER, "").startswith("it is left out"), LOOP_S)
+        took_s += wait_for(lambda: site.served.reasons().get(MODEL) == "")
+        callers.wait_for_all()
+        trigger.unlink()
+        site.models("load", OTHER)
+        site.served.wait_ready()
+        callers.wait_for_all()
+    told = f"callers of the other; left out after {site.restarts(OTHER):.0f} restarts"
+    return [Row("crash loop of one model of two", callers, took_s, told)]
+
+
+def kill_gateway(site: Site) -> list[Row]:
+    """Its callers are told by a connection that breaks; others do not notice."""
+    process = site.gateway
+    with site.callers(CALLERS // 2) as beside, site.gateway_callers() as callers:
+        process.kill()
+        healed_s = wait_for(lambda: not process.is_running()) + site.wait_healthy()
+        callers.wait_for_all()
+        beside.wait_for_all()
+    row = Row("kill -9 of the gateway", callers, healed_s, may_break_off=True)
+    row.expect(healed_s <= HEALED_S, f"healed after {healed_s:.1f} s; allowed: {HEALED_S:g} s")
+    return [row, Row("  callers beside it, over gRPC", beside)]
+
+
+def stop_gateway(site: Site, seconds: float = 5.0) -> list[Row]:
+    """Its callers wait until it goes on, which `rfm serve` leaves to others."""
+    process = site.gateway
+    with site.gateway_callers() as callers:
+        process.suspend()
+        try:
+            time.sleep(seconds)
+        finally:
+            process.resume()
+        healed_s = seconds + site.wait_healthy()
+        callers.wait_for_all()
+    return [Row("SIGSTOP of the gateway", callers, healed_s, f"SIGCONT after {seconds:g} s")]
+
+
+def slow_connections(site: Site, seconds: float = 10.0) -> list[Row]:
+    """Callers of the same door are served beside many connections that send a byte a second."""
+    ends, rows = site.served.endpoints, []
+    gateway_port = int(site.gateway_url.rpartition(":")[2])
+    doors = {
+        "Triton's HTTP": (ends.http_port, f"/v2/models/{MODEL}/infer", site.callers(CALLERS // 2, url=ends.http_url)),
+        "the gateway": (gateway_port, "/evaluate_batch", site.gateway_callers()),
+    }
+    for name, (port, path, asking) in doors.items():
+        with dripping(ends.host, port, path), asking as callers:
+            time.sleep(seconds)
+        told = f"{SLOW_CONNECTIONS} connections; p99 {1e3 * np.percentile(callers.latencies_s, 99):.0f} ms"
+        rows.append(Row(f"slow connections to {name}", callers, told=told))
+    return rows
+
+
+@contextmanager
+def dripping(host: str, port: int, path: str) -> Iterator[None]:
+    """Within it, connections send a byte a second each: half of them of the head, half of the body.
+
+    A connection that the server resets is opened anew: of so many at once, Triton drops some now and then.
+    """
+    head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 99\r\n\r\n"
+    connections: dict[int, socket.socket] = {}
+    stop = threading.Event()
+
+    def drip() -> None:
+        while not stop.wait(1):
+            for number in range(SLOW_CONNECTIONS):
+                with suppress(OSError):
+                    if number not in connections:
+                        connections[number] = socket.create_connection((host, port), 1)
+                        connections[number].sendall(head.encode() if number % 2 else b"POST /")
+                    try:
+                        connections[number].sendall(b"x")
+                    except OSError:
+                        connections.pop(number).close()
+
+    thread = threading.Thread(target=drip)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+        for connection in connections.values():
+            connection.close()
+
+
+def signalled(what: Callable[[Serving], int], number: signal.Signals) -> Callable[[Site], None]:
+    return lambda site: os.kill(what(site.served), number)
+
+
+def a_model_process(served: Serving) -> int:
+    return served.model_processes()[0]
+
+
+def triton_of(served: Serving) -> int:
+    return served.triton
+
+
+FAULTS: tuple[Callable[[Site], list[Row]], ...] = (
+    healed("kill -9 of a model process", signalled(a_model_process, signal.SIGKILL), MODEL),
+    healed("SIGSTOP of a model process", signalled(a_model_process, signal.SIGSTOP), MODEL),
+    healed("kill -9 of Triton", signalled(triton_of, signal.SIGKILL), TRITON),
+    healed("SIGSTOP of Triton", signalled(triton_of, signal.SIGSTOP), TRITON, noticed_s=SILENT_S),
+    healed(f"a batch hangs (hang_s: {HANG_S})", lambda site: site.trigger("hang"), MODEL, noticed_s=1.1 * HANG_S),
+    # The callers of its first two batches are told that they failed.
+    healed("a broken context (simulated)", lambda site: site.trigger("break"), MODEL, may_lose=2 * CALLERS),
+    kill_gateway,
+    stop_gateway,
+    slow_connections,
+    crash_loop,
+)

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: MIT
+"""``make mutate``: do the tests see small faults of the code that scores come from? By cosmic-ray.
+
+A random share of all mutants of each part is tried, in a clone of the last commit. It ends with status 1 if fewer than
+95 % are caught. Why some of the others cannot be caught: mutants_that_survive.yaml.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from cosmic_ray.work_db import WorkDB, use_db
+from cosmic_ray.work_item import WorkerOutcome, WorkItem, WorkResult
+
+ROOT = Path(__file__).parents[1]
+BIN = Path(sys.executable).parent
+CAUGHT = 0.95
+# What is changed, and the tests of which one must fail.
+PARTS = {
+    "client/rfm_client/contract/wire*": "tests/contract tests/families/test_properties.py",
+    "rfm/layers/*.py": "tests/families/test_linear.py tests/families/test_precision.py tests/families/test_rewind.py",
+    "rfm/rewind/*.py": "tests/families/test_rewind.py tests/families/test_encoders.py tests/families/test_checkpoint.py",
+    "rfm/vlm/*.py": "tests/families -k vlm",
+    "rfm/triton_model/batch_model.py": "tests/triton/test_batch_model.py tests/triton/test_pipeline.py",
+}
+CONFIG = """
+[cosmic-ray]
+module-path = {modules}
+timeout = 900.0
+excluded-modules = []
+test-command = "{pytest} -x -q -p no:cacheprovider -m 'not triton and not slow and not gpu and not nightly' {tests}"
+
+[cosmic-ray.distributor]
+name = "local"
+
+[cosmic-ray.filters.operators-filter]
+exclude-operators = ["core/ReplaceBinaryOperator_BitOr_.*", "core/RemoveDecorator", "core/ExceptionReplacer"]
+"""  # "|" stands in annotations
+
+
+def start(pattern: str, folder: Path) -> Path:
+    """A clone with a cosmic-ray session of all mutants of a part. Raises RuntimeError if there is no such file."""
+    subprocess.run(["git", "clone", "--quiet", "--shared", ROOT, folder], check=True)
+    modules = [str(file.relative_to(folder)) for file in sorted(folder.glob(pattern)) if file.name != "__init__.py"]
+    if not modules:
+        raise RuntimeError(f"{pattern}: expected files, got none")
+    pytest = ROOT / ".venv" / "bin" / "pytest"
+    (folder / "mutate.toml").write_text(CONFIG.format(modules=modules, pytest=pytest, tests=PARTS[pattern]))
+    run(folder, "cosmic-ray", "init", "mutate.toml", "mutants.sqlite")
+    run(folder, "cr-filter-operators", "mutants.sqlite", "mutate.toml")
+    return folder
+
+
+def run(folder: Path, program: str, *words: str) -> str:
+    """What a program of cosmic-ray prints. Tests import the clone."""
+    imported = [folder / name for name in (".", "client", "gateway", "export", "commands")]
+    own = {"PYTHONPATH": os.pathsep.join(map(str, imported)), "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1"}
+    words = (str(BIN / program), *words)
+    return subprocess.run(
+        words, cwd=folder, env={**os.environ, **own}, check=True, stdout=subprocess.PIPE, text=True
+    ).stdout
+
+
+def sample(folder: Path, database: WorkDB, share: float, seed: int) -> None:
+    """Leaves out all but a share of the mutants, and those of assertions and of what is raised."""
+    pending: list[WorkItem] = list(database.pending_work_items)
+    sources = {
+        path: (folder / path).read_text().splitlines() for path in {one.mutations[0].module_path for one in pending}
+    }
+    chosen = {
+        one.job_id
+        for one in pending
+        if not sources[(mutation := one.mutations[0]).module_path][mutation.start_pos[0] - 1]
+        .lstrip()
+        .startswith(("assert ", "raise "))
+    }
+    chosen = set(random.Random(seed).sample(sorted(chosen), max(1, round(share * len(chosen)))))
+    skipped = WorkResult(output="not chosen", worker_outcome=WorkerOutcome.SKIPPED)
+    database.set_multiple_results([one.job_id for one in pending if one.job_id not in chosen], skipped)
+
+
+def main() -> int:
+    """Prints what survives; 1 if that is too much."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=200, help="mutants to try")
+    parser.add_argument("--seed", type=int, default=0, help="which ones")
+    parser.add_argument("--part", choices=PARTS, help="of this part alone")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="rfm-mutate-") as name, ThreadPoolExecutor(2) as pool:
+        patterns = [arguments.part] if arguments.part else list(PARTS)
+        folders = [start(pattern, Path(name) / str(number)) for number, pattern in enumerate(patterns)]
+        databases = [folder / "mutants.sqlite" for folder in folders]
+        counts = []
+        for database in databases:
+            with use_db(str(database)) as work:
+                counts.append(len(list(work.pending_work_items)))
+        for folder, database in zip(folders, databases, strict=True):
+            with use_db(str(database)) as work:
+                sample(folder, work, arguments.count / sum(counts), arguments.seed)
+        list(pool.map(lambda folder: run(folder, "cosmic-ray", "exec", "mutate.toml", "mutants.sqlite"), folders))
+        tried = survived = 0
+        for pattern, folder, database in zip(patterns, folders, databases, strict=True):
+            print(
+                f"# {pattern}", run(folder, "cr-report", "--surviving-only", "--show-diff", "mutants.sqlite"), sep="\n"
+            )
+            with use_db(str(database)) as work:
+                results = [result for _, result in work.results if result.worker_outcome != WorkerOutcome.SKIPPED]
+            tried += len(results)
+            survived += sum(not result.is_killed for result in results)
+    print(f"{tried} mutants, {tried - survived} caught")
+    return int(tried - survived < CAUGHT * tried)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
