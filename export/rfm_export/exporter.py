@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -24,26 +24,21 @@ from rfm.parameters import FAMILY_PARAMETER
 from rfm.version_folder import CHECKPOINT_FOLDER
 from rfm_client.contract import wire
 from rfm_client.contract.names import encoder_name, frames_name
-from rfm_export.about import Origin, about, record_digests
-from rfm_export.device import device_for, device_named, needing_room
+from rfm_export.about import about, origin_in, origin_of, record_digests
 from rfm_export.errors import ExportError
 from rfm_export.layout import GeneratedModel, Version, generated_models, scorer_name
 from rfm_export.publish import alone, next_version, publish, read_config, staging
-from rfm_export.verify import probes, verify
+from rfm_export.verify import device_for, device_named, needing_room, probes, verify
 
 
 @dataclass(frozen=True)
 class _Source:
-    """What one export is made of.
-
-    encoders: of the checkpoint; None: it has none
-    decisions: what decided the scores
-    """
+    """What one export is made of; decisions: what decided the scores"""
 
     family: Family
     checkpoint: Checkpoint
     encoders: FrameEncoders | None
-    origin: Origin
+    origin: Mapping[str, str]
     decisions: Sequence[Decision] = ()
 
 
@@ -114,14 +109,8 @@ def _load(
         of_run = [] if run_config is None else [f"{run_config}: read as the settings of the training run"]
         for note in (*of_run, *families.notes(folder, checkpoint)):
             say(note)
-    decisions = [*checkpoint.decisions(), *_told(settings)]
-    return _Source(kind, checkpoint, encoders, Origin.of(source, folder), decisions)
-
-
-def _told(settings: ExportConfig) -> Iterator[Decision]:
-    """What the caller decides of any checkpoint."""
-    if settings.dtype is not None:
-        yield Decision("served_dtype", settings.dtype, "--dtype")
+    told = [] if settings.dtype is None else [Decision("served_dtype", settings.dtype, "--dtype")]
+    return _Source(kind, checkpoint, encoders, origin_of(source, folder), [*checkpoint.decisions(), *told])
 
 
 def _check_gpus(num_gpus: int | None) -> None:
@@ -202,7 +191,7 @@ def check(repository: Path, settings: ExportConfig) -> list[str]:
     checkpoint = family.load(folder, Options())
     encoders = repository / encoder_name(settings.name) / str(number)
     described = family.encoders.describe(encoders) if family.encoders is not None and encoders.exists() else None
-    version = _version(_Source(family, checkpoint, None, Origin.from_config(config)), settings, number)
+    version = _version(_Source(family, checkpoint, None, origin_in(config)), settings, number)
     models = generated_models(checkpoint.description, described, version)
     differences = []
     for path, content in _generated(models, repository).items():

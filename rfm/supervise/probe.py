@@ -87,7 +87,7 @@ class Probe:
             self._num_failures += 1
 
     def _request(self) -> bytes:
-        config = self._http.get_json(f"/v2/models/{self._model}/config")
+        config = self._http.json(f"/v2/models/{self._model}/config")
         outputs = [{"name": output["name"]} for output in config["output"] if output["name"] in _OUTPUTS]
         inputs = [
             {

@@ -20,7 +20,7 @@ import httpx
 import pytest
 
 from commands import EXIT_S
-from rfm.launch.process import Endpoints
+from rfm.launch.endpoints import Endpoints
 from rfm.launch.triton_options import MAX_HTTP_BYTES
 from rfm_client import AccessDeniedError, ServerUnavailableError
 from rfm_client.status import read_status
@@ -134,14 +134,11 @@ BAD = {
 def test_what_cannot_be_used_is_refused(
     papers: Papers, options: Callable[[Papers], dict[str, Any]], message: str
 ) -> None:
+    """No description has a key."""
+    assert KEY not in repr(Access(api_key=KEY, headers={"x-api-key": KEY}))
     with pytest.raises(ValueError, match=message) as refused:
         client(**{"url": "grpcs://127.0.0.1:1", **options(papers)})
     assert KEY not in str(refused.value)
-
-
-def test_a_key_is_in_no_description() -> None:
-    access = Access(api_key=KEY, headers={"x-api-key": KEY})
-    assert KEY not in repr(access)
 
 
 def rfm_client(*words: object, **environment: str) -> subprocess.CompletedProcess[str]:
