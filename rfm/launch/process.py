@@ -34,7 +34,7 @@ from rfm.proc import cpu_s_of_group
 from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
 
 POLL_S = 0.1
-STALLED_S = 60.0  # without use of the CPU: a start that Triton has spoilt
+STALLED_S, WORK_S = 60.0, 0.05  # a start that uses less of the CPU in so long has been spoilt by Triton
 LOAD_S = 1800.0
 ANSWER_TIMEOUT_S = 10.0  # of one that starts
 NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # a `load` would load all versions anew: their folders have changed
@@ -45,7 +45,6 @@ _REMEDIES = {  # by what Triton, PyTorch or the system say of a model that is no
     ),
     "No space left on device": NEEDS_ROOM,
 }
-_WORK_S = 0.05  # of the CPU: what waits uses less in STALLED_S
 _REGIONS = "--backend-config=python,shm-region-prefix-name="
 
 Config = Mapping[str, Any]  # of a model, as Triton's JSON has it
@@ -179,7 +178,7 @@ class TritonServer:
             raise ServerStartError(no_models(self.repository))
         as_in_file = there
         if served is not None:
-            as_in_file = [name for name in served if names_the_same_versions(self.repository, name, served[name])]
+            as_in_file = [name for name in served if _names_the_same_versions(self.repository, name, served[name])]
             if len(as_in_file) < len(served):  # an ensemble loads its parts with it, as their files say
                 as_in_file = []
         self._start(sorted(as_in_file))
@@ -230,7 +229,7 @@ class TritonServer:
                 index = self._http.json(INDEX_PATH, ANSWER_TIMEOUT_S, "POST")
             except NO_ANSWER:  # Triton gives none while it loads
                 now_s, used_s = time.monotonic(), cpu_s_of_group(self.pid)
-                if used_s - cpu_s > _WORK_S:
+                if used_s - cpu_s > WORK_S:
                     cpu_s, worked_s = used_s, now_s
                 if now_s - worked_s > STALLED_S or now_s - started_s > LOAD_S:
                     self.kill()
@@ -277,19 +276,17 @@ class TritonServer:
         ]
 
     def _environment(self) -> dict[str, str]:
-        """Environment of tritonserver: that of this process, without its secrets."""
         own = {name: value for name, value in os.environ.items() if name not in SECRETS}
         set_here = {**self._installation.environment, **NO_BYTECODE, HANG_VARIABLE: str(self._hang_s)}
         return {**short_spin(own), **own, **set_here}
 
 
 def _remedy(reasons: str) -> str:
-    """What to do where models are not loaded for ``reasons``, behind a semicolon; empty: that is not known."""
     return next((f"; {remedy}" for said, remedy in _REMEDIES.items() if re.search(said, reasons)), "")
 
 
-def names_the_same_versions(repository: Path, model: str, config: Config) -> bool:
-    """Whether the model's file names the versions of ``config``, or none."""
+def _names_the_same_versions(repository: Path, model: str, config: Config) -> bool:
+    """True if the model's file names the versions of ``config``, or none."""
     try:
         file = text_format.Parse((repository / model / CONFIG_FILE).read_text(), ModelConfig())
     except (OSError, UnicodeDecodeError, text_format.ParseError):

@@ -90,7 +90,7 @@ class BatchModel(Generic[Question, Answer]):
 
     @property
     def works_ahead(self) -> bool:
-        """Whether ``work_ahead`` is worth a thread; asked when the weights are loaded."""
+        """True if ``work_ahead`` is worth a thread; asked when the weights are loaded."""
         return False
 
     def decode(self, tensors: Tensors) -> list[Question]:
@@ -135,7 +135,6 @@ class BatchModel(Generic[Question, Answer]):
     def _responses(
         self, batch: list[Request[Question]], score: Callable[[list[Request[Question]]], Scored[Question]]
     ) -> list[Any]:
-        """Scores the requests by ``score``, and gives Triton's responses."""
         self._is_executing = True
         try:
             for request in batch:
@@ -209,13 +208,11 @@ class BatchModel(Generic[Question, Answer]):
         return [(batch, execution)]
 
     def _send(self, scored: Scored[Question]) -> None:
-        """Answers requests of the pipeline."""
         for request in [request for part, _ in scored for request in part]:
             request.send(self._response(request))
         self._count(scored)
 
     def _response(self, request: Request[Question]) -> Any:
-        """Triton's response of the answers or the error; of an error, too, if the answers cannot be written."""
         if request.error is None:
             try:
                 return request.response(self.encode(request.answers, request.tensors, request.outputs))
@@ -224,7 +221,6 @@ class BatchModel(Generic[Question, Answer]):
         return request.error_response()
 
     def _count(self, scored: Scored[Question]) -> None:
-        """Logs what has failed, and counts all."""
         for part, execution in scored:
             for request in part:
                 if request.error is not None:

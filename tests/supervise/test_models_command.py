@@ -112,6 +112,22 @@ def test_callers_are_answered_while_another_model_loads(running: Running, tmp_pa
 
 
 @pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        pytest.param(("rollout", "nobody", "1"), ", got nobody", id="name"),
+        pytest.param(
+            ("rollout", NAME, "77"), "rfm version 77: expected an exported version, got [Errno 2]", id="version"
+        ),
+        pytest.param(("load", "nobody"), ", got nobody", id="load"),
+    ],
+)
+def test_what_is_not_there_is_told_and_nothing_changes(running: Running, words: tuple[str, ...], message: str) -> None:
+    before = running.models("list")
+    assert message in running.refused(*words)
+    assert running.models("list") == before
+
+
+@pytest.mark.parametrize(
     ("url", "words", "message"),
     [
         ("http://127.0.0.1:8000", (), "url: expected grpc://host:port (its gRPC port, 8001) or with TLS grpcs://"),

@@ -34,6 +34,7 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract import wire
+from rfm_client.status import read_status
 from rfm_serve import wait_for
 from tensors import infer
 from trajectories import random_trajectory
@@ -222,6 +223,28 @@ def test_raw_frames_are_counted_where_they_are_encoded_and_where_they_are_scored
         asked.preference(film(2), film(5))
     assert counted(served, f"{FILMED}_encoder", before) == {"encode scored": 3, "frames": 3 + 4 + 7}
     assert counted(served, FILMED, before) == {"progress scored": 1, "preference scored": 1, "frames": 4 + 7}
+
+
+def test_the_client_s_status_and_prometheus_agree(served: Served) -> None:
+    """Without the admin key: the repository's index is not asked for."""
+
+    def status(protocol: str) -> tuple[int, int]:
+        read = read_status(served.url(protocol), metrics_url=served.endpoints.metrics_url)
+        (model,) = (model for model in read.models if model.name == MODEL)
+        assert (model.state, model.version, read.ready) == ("READY", "1", True)
+        return model.requests_succeeded, model.samples
+
+    before = {protocol: status(protocol) for protocol in ("grpc", "http")}
+    with client(served, MODEL) as asked:
+        for index in range(7):
+            asked.evaluate([ProgressSample(random_trajectory(index, 2 + index))] * 3)
+    families = text_string_to_metric_families(httpx.get(served.endpoints.metrics_url).text)
+    samples = [sample for family in families for sample in family.samples if sample.labels.get("model") == MODEL]
+    told = {sample.name: sample.value for sample in samples}
+    for protocol in before:
+        after = status(protocol)
+        assert [after[0] - before[protocol][0], after[1] - before[protocol][1]] == [7, 21]
+        assert after == (told["nv_inference_request_success_total"], told["nv_inference_count_total"])
 
 
 def test_the_served_checkpoint_is_told(served: Served) -> None:
