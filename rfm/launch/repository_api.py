@@ -54,12 +54,12 @@ class ModelVersion:
 
     @property
     def is_ready(self) -> bool:
-        """Whether it answers requests, as far as the server knows."""
+        """True if it answers requests, as far as the server knows."""
         return self.state == READY
 
     @property
     def is_unloaded(self) -> bool:
-        """Whether the version is not loaded because somebody unloaded it. A version that failed has another reason."""
+        """True if it is not loaded because somebody unloaded it. A version that failed has another reason."""
         return self.state == _NOT_LOADED or (self.state, self.reason) == (_UNAVAILABLE, _UNLOADED)
 
 

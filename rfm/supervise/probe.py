@@ -102,6 +102,6 @@ class Probe:
 
 
 def can_be_probed(config: Mapping[str, Any]) -> bool:
-    """Whether a model, of which this is the configuration, is one of ours that has processes of its own."""
+    """True if a model with this configuration is one of ours and has processes of its own."""
     names = {tensor["name"] for tensor in config["input"]}
     return config.get("backend") == "python" and wire.NUM_FRAMES in names

@@ -59,7 +59,7 @@ class Status:
 
     @property
     def ready(self) -> tuple[bool, dict[str, Any]]:
-        """Whether all models are ready, and the body of ``/ready``."""
+        """True if all models are ready; and the body of ``/ready``."""
         reasons = self._reasons
         is_ready = bool(reasons) and all(reason == NO_REASON for reason in reasons.values())
         models = {model: {"ready": reason == NO_REASON, "reason": reason} for model, reason in reasons.items()}

@@ -219,7 +219,7 @@ class Supervisor:
                 what, why = error.model or what, str(error)  # Triton 2.51 itself ends with a process that loads
 
     def _leaves_out(self, what: str, why: str) -> bool:
-        """Whether others are served without the model ``what``, and what is made of it, from now on."""
+        """True if others are served from now on, without the model ``what`` and what is made of it."""
         served = self._served or {}
         left_out = [what, *(name for name, config in served.items() if what in parts_of(config))]
         others = {name: config for name, config in served.items() if name not in left_out}

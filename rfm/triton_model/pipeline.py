@@ -57,7 +57,7 @@ class Pipeline:
 
     @property
     def is_idle(self) -> bool:
-        """Whether no request waits and none is scored."""
+        """True if no request waits and none is scored."""
         with self._changed:
             return not (self._is_scoring or self._waiting)
 
@@ -87,7 +87,7 @@ class Pipeline:
         self._preparing.shutdown()
 
     def _has_room(self) -> bool:
-        """Whether what waits is less than a batch."""
+        """True if what waits is less than a batch."""
         num_samples = sum(request.num_samples for request, _ in self._waiting)
         num_tokens = sum(request.num_tokens for request, _ in self._waiting)
         return not self._waiting or (num_samples < self._max_samples and num_tokens < self._max_tokens)
