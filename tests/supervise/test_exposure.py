@@ -143,6 +143,7 @@ def test_children_are_found_dead_or_alive(monkeypatch: pytest.MonkeyPatch, has_l
     assert not {child.pid for child in children} & set(proc.children_of(os.getpid()))
 
 
+@pytest.mark.slow
 def test_a_silent_connection_to_the_status_port_is_cut() -> None:
     port = Endpoints.free().http_port
     with closing(StatusServer("127.0.0.1", port, Status())), socket.create_connection(("127.0.0.1", port)) as silent:
