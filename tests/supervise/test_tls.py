@@ -26,9 +26,9 @@ from repositories import kill_model
 from rfm.launch.endpoints import Endpoints
 from rfm.launch.triton_options import MAX_HTTP_BYTES
 from rfm_client import AccessDeniedError, ServerUnavailableError
-from rfm_client.status import read_status
 from rfm_client.transport.access import Access
 from rfm_client.transport.loop_thread import LoopThread
+from rfm_client.transport.status import read_status
 from rfm_commands.cli import app
 from secured import (
     AT_ONCE_S,

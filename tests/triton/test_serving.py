@@ -34,14 +34,10 @@ from trajectories import random_trajectory
 pytestmark = pytest.mark.triton
 
 VLM = "q3_tok_disc10"
-SERVED = (MODEL, FRAMES_MODEL, VLM, "q25_video_avg_disc10")
-CASES = [  # each of the others runs on the engine
-    next(case for case in goldens.config(name).cases() if case.file.stem.startswith("mixed")) for name in SERVED
-]
 
 
 @pytest.mark.reference
-@pytest.mark.parametrize("case", CASES, ids=str)
+@pytest.mark.parametrize("case", goldens.SERVED_CASES, ids=str)  # each of the others runs on the engine
 def test_a_reference_answer_of_each_kind_of_checkpoint_comes_back(
     served: Served, protocol: str, case: goldens.Case
 ) -> None:
@@ -254,6 +250,12 @@ def test_a_rewound_trajectory_is_scored(served: Served, protocol: str) -> None:
     copied = Trajectory(video_embeddings=forwards.positions[::-1].copy(), text_embedding=forwards.text_embedding)
     with served.client(protocol) as client:
         assert_same(client.progress(backwards), client.progress(copied))
+
+
+def test_a_checkpoint_without_similarity_says_so(served: Served, protocol: str) -> None:
+    message = "sample_type: expected progress or preference .*no similarity head.*, got similarity"
+    with served.client(protocol, VLM) as client, pytest.raises(InvalidSampleError, match=message):
+        client.similarity(film(0, 2, 64, 64), film(1, 2, 64, 64))
 
 
 def test_what_was_not_asked_is_nan_on_the_wire(served: Served, protocol: str) -> None:
