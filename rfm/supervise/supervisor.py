@@ -17,7 +17,7 @@ from rfm.launch.ending import end, ending_with_parent, stop_signals_to
 from rfm.launch.installation import ServerStartError
 from rfm.launch.process import POLL_S, Config, TritonServer
 from rfm.supervise.status import Status, StatusServer
-from rfm.supervise.watch import TRITON, Watch, parts_of
+from rfm.supervise.watch import TRITON, TritonWatch, parts_of
 
 GATEWAY = "gateway"
 STEADY_S = 60.0  # whatever has run for so long is no part of a crash loop
@@ -96,7 +96,7 @@ class Supervisor:
 
     gateway: command line of a gateway that runs beside the server; None: there is none
     status_port: of the status (``status``), on the server's host; None: there is none
-    canary_s, hang_s, triton_silent_s: as Watch has them
+    canary_s, hang_s, triton_silent_s: as TritonWatch has them
     say: takes what happened, a line each
     """
 
@@ -117,12 +117,12 @@ class Supervisor:
         self._say = say
         self._status = Status()
         self._new_watch = partial(
-            Watch, server, self._status, canary_s=canary_s, hang_s=hang_s, silent_s=triton_silent_s
+            TritonWatch, server, self._status, canary_s=canary_s, hang_s=hang_s, silent_s=triton_silent_s
         )
         self._is_to_stop = threading.Event()
         self._new_back_off = partial(BackOff, "tritonserver", STEADY_S + hang_s)
         self._back_off = self._new_back_off()
-        self._watch: Watch | None = None  # None: Triton is started, or has ended
+        self._watch: TritonWatch | None = None  # None: Triton is started, or has ended
         self._served: dict[str, Config] | None = None  # last; None: nothing yet
         self._left_out: dict[str, str] = {}  # models that kept ending Triton, and how
 

@@ -87,7 +87,7 @@ class ModelProcesses:
         return states
 
 
-class Watch:
+class TritonWatch:
     """Looks every LOOK_S in a thread of its own, until it is closed.
 
     canary_s: how often each model is probed

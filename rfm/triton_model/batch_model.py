@@ -18,7 +18,7 @@ from rfm.execution import Execution
 from rfm.parameters import BUDGET_PARAMETER, DEFAULT_HANG_S, HANG_VARIABLE, OLD_QUEUE_PARAMETERS
 from rfm.probe import blank_question
 from rfm.triton_model.guard import Guard
-from rfm.triton_model.metrics import Metrics
+from rfm.triton_model.metrics import InstanceMetrics
 from rfm.triton_model.pipeline import Pipeline
 from rfm.triton_model.placement import Placement
 from rfm.triton_model.request import SAMPLE_TYPES, CancelledError, Request
@@ -64,7 +64,7 @@ class BatchModel(Generic[Question, Answer]):
         labels = {**model, "device": str(placement.device), "instance": args["model_instance_name"]}
         sample_types = _sample_types([spec["name"] for spec in config["input"]])
         self._log = RequestLog(model)
-        self._metrics = Metrics(labels, _checkpoint(settings), sample_types, lambda: self._guard.num_steps)
+        self._metrics = InstanceMetrics(labels, _checkpoint(settings), sample_types, lambda: self._guard.num_steps)
         self._blank_tensors = blank_question(config)
         self._num_warmups = sum(max(warmup.get("count", 0), 1) for warmup in config.get("model_warmup", []))
         if any(settings.get(name) for name in OLD_QUEUE_PARAMETERS):

@@ -44,7 +44,7 @@ _HISTOGRAMS = {
 }
 
 
-class Metrics:
+class InstanceMetrics:
     """The metrics of one instance; to be closed. Whatever goes wrong with them is logged once, and fails no request.
 
     labels: the labels that name the instance
