@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import time
 import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -31,7 +32,6 @@ from rfm_client.contract.samples import Footage
 from rfm_client.contract.wire import Tensors
 
 GIVEN_UP_S = 0.1  # clients may have given up behind a batch that took longer; Triton 2.51 hands their requests over
-MAX_INT32 = 2**31 - 1
 
 Question = TypeVar("Question")
 Answer = TypeVar("Answer")
@@ -66,11 +66,11 @@ class BatchModel(Generic[Question, Answer]):
         self._log = RequestLog(model)
         self._metrics = InstanceMetrics(labels, _checkpoint(settings), sample_types, lambda: self._guard.num_steps)
         self._blank_tensors = blank_question(config)
-        self._num_warmups = sum(max(warmup.get("count", 0), 1) for warmup in config.get("model_warmup", []))
+        self._num_warmups = sum(warmup.get("count") or 1 for warmup in config.get("model_warmup", []))
         if any(settings.get(name) for name in OLD_QUEUE_PARAMETERS):
             self._log.note(f"{', '.join(OLD_QUEUE_PARAMETERS)} of an older export have no effect: export again")
         if self.works_ahead:
-            max_tokens = int(settings.get(BUDGET_PARAMETER) or MAX_INT32)
+            max_tokens = int(settings.get(BUDGET_PARAMETER) or sys.maxsize)
             self._pipeline = Pipeline(
                 self._work_ahead, self._score, self._send, placement, config["max_batch_size"], max_tokens
             )

@@ -106,7 +106,7 @@ class Model(BatchModel[Sample, Result]):
         MODELS.append(self)
         self.batches: list[int] = []
         parameters = {name: {"string_value": value} for name, value in {"torch_threads": "1", **settings}.items()}
-        config = CONFIG | {"parameters": parameters, "model_warmup": [{"count": 1}] * warmups}
+        config = CONFIG | {"parameters": parameters, "model_warmup": [{"count": 0}] * warmups}
         self.initialize(
             {
                 "model_config": json.dumps(config),

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,9 @@ import torch
 from batch_models import BREAKS, CONFIG, FAILS, LOGGED, METRICS, REFUSED, WIDTHS, Model, Request, backend, request  # noqa: F401  a fixture
 from rfm.execution import Execution
 from rfm.probe import blank_question
+from rfm.triton_model import batch_model
 from rfm.triton_model.batch_model import GIVEN_UP_S
-from rfm.triton_model.guard import FAILED_BATCHES
+from rfm.triton_model.guard import FAILED_BATCHES, Guard
 from rfm.triton_model.placement import Placement, use_threads
 from rfm_client import (
     FrameScores,
@@ -237,18 +238,32 @@ def test_an_instance_that_raises_at_the_blank_sample_after_failed_batches_ends(
     assert bool(ended) is is_broken
 
 
-def test_requests_are_scored_in_the_thread_that_calls_execute(tmp_path: Path) -> None:
+def test_requests_are_scored_in_the_thread_that_calls_execute_and_the_guard_knows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Warm-ups, too: else OpenMP has two teams of threads."""
     threads = []
 
     class Watched(Model):
         def answer(self, questions: Sequence[Sample], execution: Execution) -> list[Result | RewardError]:
             threads.append(threading.current_thread())
+            assert is_working()
             return super().answer(questions, execution)
 
+    guards: list[Callable[[], bool]] = []
+
+    class WatchedGuard(Guard):
+        def __init__(self, hang_s: float, is_working: Callable[[], bool]) -> None:
+            guards.append(is_working)
+            super().__init__(hang_s, is_working)
+
+    monkeypatch.setattr(batch_model, "Guard", WatchedGuard)
     model = Watched(tmp_path, warmups=1)
-    model.execute([request(1)])
-    model.execute([request(5), request(6)])
+    (is_working,) = guards
+    for requests in ([request(1)], [request(5), request(6)]):
+        assert not is_working()
+        model.execute(requests)
+    assert not is_working()
     assert threads == [threading.current_thread()] * 2
 
 
