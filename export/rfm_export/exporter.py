@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from google.protobuf.text_format import ParseError
@@ -30,6 +30,12 @@ from rfm_export.layout import GeneratedModel, Version, generated_models, scorer_
 from rfm_export.publish import alone, next_version, publish, read_config, staging
 from rfm_export.verify import device_for, device_named, needing_room, probes, verify
 
+Say: TypeAlias = Callable[[str], object]  # takes a line for the user
+
+
+def _nobody(line: str) -> None:
+    pass
+
 
 @dataclass(frozen=True)
 class _Source:
@@ -50,7 +56,7 @@ def export(
     other_machine: bool = False,
     family: str | None = None,
     device: str | None = None,
-    say: Callable[[str], object] | None = None,
+    say: Say = _nobody,
 ) -> int:
     """Writes the checkpoint at ``source`` into ``repository`` and gives its version number.
 
@@ -85,7 +91,7 @@ def explain(
     settings: ExportConfig,
     *,
     family: str | None = None,
-    say: Callable[[str], object] | None = None,
+    say: Say = _nobody,
 ) -> Sequence[Decision]:
     """What decided each thing that the scores of the checkpoint at ``source`` would depend on; writes nothing.
 
@@ -94,9 +100,7 @@ def explain(
     return _load(source, settings, family, say).decisions
 
 
-def _load(
-    source: str | Path, settings: ExportConfig, family: str | None, say: Callable[[str], object] | None
-) -> _Source:
+def _load(source: str | Path, settings: ExportConfig, family: str | None, say: Say) -> _Source:
     """What is at ``source``, checked. Says which file holds the training run's settings, and what may be wrong."""
     folder = families.find(source)
     kind = families.choose(folder, family)
@@ -104,11 +108,10 @@ def _load(
     checkpoint = families.load_from(folder, kind, options)
     check_links(folder)
     encoders = checkpoint.encoders()
-    if say is not None:
-        run_config = find_run_config(folder)
-        of_run = [] if run_config is None else [f"{run_config}: read as the settings of the training run"]
-        for note in (*of_run, *families.notes(folder, checkpoint)):
-            say(note)
+    if (run_config := find_run_config(folder)) is not None:
+        say(f"{run_config}: read as the settings of the training run")
+    for note in families.notes(folder, checkpoint):
+        say(note)
     told = [] if settings.dtype is None else [Decision("served_dtype", settings.dtype, "--dtype")]
     return _Source(kind, checkpoint, encoders, origin_of(source, folder), [*checkpoint.decisions(), *told])
 
@@ -145,15 +148,13 @@ def _stage(source: _Source, models: Sequence[GeneratedModel], version: Version, 
         (staged / path).write_bytes(content)
 
 
-def _verify(
-    source: _Source, version: Version, staged: Path, named: torch.device | None, say: Callable[[str], object] | None
-) -> None:
+def _verify(source: _Source, version: Version, staged: Path, named: torch.device | None, say: Say) -> None:
     """Raises ExportDiffersError unless what was staged gives the checkpoint's numbers."""
     description, settings = source.checkpoint.description, version.settings
     dtype = settings.torch_dtype if description.is_large else None
     device = named or device_for(source.checkpoint, dtype, may_use_gpu=settings.num_gpus != 0)
     engine = partial(Engine.of, device=device, dtype=dtype)
-    if description.is_large and say is not None:
+    if description.is_large:
         say(f"the export's scores are compared with the checkpoint's on {device} (--device names another one)")
 
     def exported() -> Engine:
