@@ -57,7 +57,7 @@ class Request(Generic[Question]):
     request_id: str
     outputs: Collection[str]
     is_cancelled: Callable[[], bool]
-    is_counted: bool = True
+    is_counted: bool
     sender: Any = None
     tensors: wire.Tensors = field(default_factory=dict)
     num_samples: int = 1
