@@ -19,8 +19,9 @@ from rfm.checkpoint.content import CheckpointError
 from rfm.checkpoint.decision import table
 from rfm.config import ExportConfig, ServeConfig
 from rfm.launch.admin_key import AdminKeyError, take_key
+from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import ServerStartError, find_installation
-from rfm.launch.process import Endpoints, TritonServer, short_spin
+from rfm.launch.process import TritonServer, short_spin
 from rfm.launch.temporary import stopped_by_signals, temporary_server
 from rfm.supervise.supervisor import Supervisor
 from rfm_client import RewardError
@@ -177,7 +178,6 @@ def serve(
             admin_key=take_key(admin_key_file, os.environ),
             accepts_known_vulnerabilities=accept_known_vulnerabilities,
             more_arguments=more_arguments or (),
-            ends_with_parent=True,
             hang_s=config.serve.hang_s,
         )
         status = _supervisor(server, config).run()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from rfm.launch.process import Endpoints
+from rfm.launch.endpoints import Endpoints
 from rfm_client import RewardClient, Trajectory
 from rfm_client.cli.show import Panel, plot, scores_table, status_tables
 from rfm_client.contract.samples import UInt8Array

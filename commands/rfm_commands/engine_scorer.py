@@ -22,7 +22,7 @@ from rfm.family import Checkpoint, FrameEncoders, config_fields
 from rfm_client import ProgressResult, ProgressSample, RewardError, Trajectory
 from rfm_client.contract.samples import Footage, UInt8Array
 from rfm_client.labelling import CheckpointFacts
-from rfm_export.device import device_named
+from rfm_export.verify import device_named
 
 
 class EngineScorer:

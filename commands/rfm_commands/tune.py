@@ -18,15 +18,17 @@ from tempfile import TemporaryDirectory
 import yaml
 from tritonclient.grpc import model_config_pb2 as pb
 
+from rfm.config import ExportConfig
 from rfm.launch.repository_folder import CONFIG_FILE, models_in, no_models
 from rfm.launch.temporary import temporary_server
-from rfm.parameters import THREADS_PARAMETER
+from rfm.parameters import FEATURE_CACHE_PARAMETER, THREADS_PARAMETER
 from rfm_client import AsyncRewardClient, ProgressSample, RewardClient, Sample
 from rfm_client.cli.toy import SampleKind, Toy
+from rfm_client.contract import wire
 from rfm_commands.config import File
+from rfm_commands.unused_settings import exported_settings
 from rfm_export.errors import ExportError
-from rfm_export.layout import lay_out
-from rfm_export.pbtxt import render
+from rfm_export.pbtxt import Interface, python_config, render
 from rfm_export.publish import read_config
 
 AS_FAST = 0.95  # of the highest rate: closer than that, rates do not separate settings
@@ -199,3 +201,32 @@ def _apply(setting: Setting, repository: Path) -> None:
 
 def _configs(repository: Path) -> dict[str, pb.ModelConfig]:
     return {name: read_config(repository, name) for name in models_in(repository)}
+
+
+def lay_out(config: pb.ModelConfig, **changed: int) -> None:
+    """Makes of an exported model's configuration what an export with other settings would write.
+
+    changed: ``instances``, ``torch_threads``, ``max_batch_size`` of ExportConfig
+
+    A scorer that was exported without a feature cache gets none: its configuration does not tell whether it could have
+    one.
+    """
+    told, cache = exported_settings(config), FEATURE_CACHE_PARAMETER in config.parameters
+    cache_mb = int(config.parameters[FEATURE_CACHE_PARAMETER].string_value) if cache else 0
+    settings = ExportConfig(**{**told, "feature_cache_mb": cache_mb, **changed})
+    config.max_batch_size = settings.max_batch_size
+    if not config.instance_group:  # an ensemble
+        return
+    if any(output.name == wire.VIDEO_EMBEDDINGS for output in config.output):
+        settings = replace(settings, instances=1) if cache_mb else settings
+    elif cache and not (settings.feature_cache_mb > 0 and settings.instances == 1):
+        del config.parameters[FEATURE_CACHE_PARAMETER]
+        kept = [tensor for tensor in config.input if tensor.name != wire.FRAME_DIGESTS]
+        del config.input[:]
+        config.input.extend(kept)
+    num_gpus = len(config.instance_group[0].gpus)
+    new = python_config(Interface(config.name, (), ()), settings, num_gpus, version=0, warmups=[])
+    config.instance_group[0].CopyFrom(new.instance_group[0])
+    config.dynamic_batching.CopyFrom(new.dynamic_batching)
+    for name, parameter in new.parameters.items():
+        config.parameters[name].CopyFrom(parameter)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +11,15 @@ from google.protobuf.text_format import ParseError
 
 from rfm.checkpoint.decision import source_name
 from rfm.launch.repository_folder import CONFIG_FILE
+from rfm.parameters import BUDGET_PARAMETER, DTYPE_PARAMETER, SAMPLE_TOKENS_PARAMETER, THREADS_PARAMETER
+from rfm_client.contract.model_info import SOURCE_PARAMETER
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.settings import settings_of
 from rfm_commands.config import LIFETIMES, Config
-from rfm_commands.tune import Setting
-from rfm_export.pbtxt import exported_settings
 from rfm_export.publish import read_config
 from rfm_gateway.config import GatewayConfig
 
-TRIED = [each.name for each in fields(Setting)]
+TRIED = ["instances", "torch_threads", "max_batch_size"]
 
 
 def notes_at_export(config: Config) -> Iterator[str]:
@@ -83,3 +82,22 @@ def _contradicted(key: str, there: Any, wanted: Any) -> str:
 def _notes_of_batch_size(config: Config) -> Iterator[str]:
     if config.export.batch_size is not None:
         yield "batch_size has no effect, as in the FastAPI server; max_batch_size bounds a batch"
+
+
+def exported_settings(config: Any) -> dict[str, Any]:
+    """What a configuration of ``python_config`` tells of the ExportConfig that it was made from, by key.
+
+    ``num_gpus`` is that of the machine for which it was made, ``checkpoint`` its ``source_name``. An older export tells
+    less.
+    """
+    texts = {name: parameter.string_value for name, parameter in config.parameters.items()}
+    numbers = (THREADS_PARAMETER, BUDGET_PARAMETER, SAMPLE_TOKENS_PARAMETER)
+    told: dict[str, Any] = {key: int(texts[key]) for key in numbers if key in texts}
+    policy = config.dynamic_batching.default_queue_policy
+    told["max_queue_size"] = policy.max_queue_size or None
+    told["queue_timeout_ms"] = policy.default_timeout_microseconds // 1000 or None
+    if SOURCE_PARAMETER in texts:
+        told["checkpoint"] = texts[SOURCE_PARAMETER]
+    for group in config.instance_group:
+        told |= {"num_gpus": len(group.gpus), "instances": group.count}
+    return told | {"max_batch_size": config.max_batch_size, "dtype": texts.get(DTYPE_PARAMETER) or None}

@@ -8,7 +8,6 @@ import math
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,48 +29,32 @@ from rfm_client.contract.model_info import (
     SOURCE_PARAMETER,
 )
 
+_OF_ORIGIN = (SOURCE_PARAMETER, REVISION_PARAMETER, RUN_CONFIG_PARAMETER)
 _SECRET = re.compile(r"(^|_)(token|secret|password|key)$", re.IGNORECASE)  # such as hub_token, wandb_api_key
 
 
-@dataclass(frozen=True)
-class Origin:
-    """Where a checkpoint came from.
+def origin_of(source: str | Path, folder: Path) -> dict[str, str]:
+    """Where a checkpoint came from, as parameters by name.
 
-    source: the end of its folder's path, or its Hub id
-    revision: the Hub's commit; empty for a folder
-    run_config: config.yaml of its training run as JSON, without secrets; empty if there is none
+    source: as the user named it; folder: where its files lie, of the Hub's in a snapshot named by its commit
+
+    Of a folder the end of its path is told; config.yaml of the training run as JSON, without secrets.
     """
-
-    source: str
-    revision: str
-    run_config: str = ""
-
-    @classmethod
-    def of(cls, source: str | Path, folder: Path) -> Origin:
-        """The origin of a checkpoint.
-
-        source: as the user named it; folder: where its files lie, of the Hub's in a snapshot named by its commit
-        """
-        file = find_run_config(folder)
-        run_config = "" if file is None else json.dumps(_public(read_run_config(file)))
-        return cls(source_name(source), "" if is_folder(source) else commit_of(folder), run_config)
-
-    @classmethod
-    def from_config(cls, config: pb.ModelConfig) -> Origin:
-        """The origin that an exported configuration names."""
-        names = (SOURCE_PARAMETER, REVISION_PARAMETER, RUN_CONFIG_PARAMETER)
-        return cls(*(config.parameters[name].string_value if name in config.parameters else "" for name in names))
-
-    @property
-    def parameters(self) -> dict[str, str]:
-        """Where the checkpoint is from, as parameters of config.pbtxt by name."""
-        of_run = {RUN_CONFIG_PARAMETER: self.run_config} if self.run_config else {}
-        return {SOURCE_PARAMETER: self.source, REVISION_PARAMETER: self.revision, **of_run}
+    revision = "" if is_folder(source) else commit_of(folder)
+    file = find_run_config(folder)
+    of_run = {} if file is None else {RUN_CONFIG_PARAMETER: json.dumps(_public(read_run_config(file)))}
+    return {SOURCE_PARAMETER: source_name(source), REVISION_PARAMETER: revision, **of_run}
 
 
-def about(checkpoint: Checkpoint, origin: Origin) -> dict[str, str]:
+def origin_in(config: pb.ModelConfig) -> dict[str, str]:
+    """Where the checkpoint of an exported configuration came from, as ``origin_of``."""
+    told = {name: config.parameters[name].string_value for name in _OF_ORIGIN if name in config.parameters}
+    return {SOURCE_PARAMETER: "", REVISION_PARAMETER: "", **told}
+
+
+def about(checkpoint: Checkpoint, origin: Mapping[str, str]) -> dict[str, str]:
     """Parameters by name, without the digests of weights and settings: those are not written yet."""
-    return {**origin.parameters, NETWORK_PARAMETER: json.dumps(_network(checkpoint))}
+    return {**origin, NETWORK_PARAMETER: json.dumps(_network(checkpoint))}
 
 
 def about_encoders(encoders: EncodersDescription, of_scorer: Mapping[str, str]) -> dict[str, str]:

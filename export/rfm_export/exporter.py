@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from google.protobuf.text_format import ParseError
@@ -24,26 +24,27 @@ from rfm.parameters import FAMILY_PARAMETER
 from rfm.version_folder import CHECKPOINT_FOLDER
 from rfm_client.contract import wire
 from rfm_client.contract.names import encoder_name, frames_name
-from rfm_export.about import Origin, about, record_digests
-from rfm_export.device import device_for, device_named, needing_room
+from rfm_export.about import about, origin_in, origin_of, record_digests
 from rfm_export.errors import ExportError
 from rfm_export.layout import GeneratedModel, Version, generated_models, scorer_name
 from rfm_export.publish import alone, next_version, publish, read_config, staging
-from rfm_export.verify import probes, verify
+from rfm_export.verify import device_for, device_named, needing_room, probes, verify
+
+Say: TypeAlias = Callable[[str], object]  # takes a line for the user
+
+
+def _nobody(line: str) -> None:
+    pass
 
 
 @dataclass(frozen=True)
 class _Source:
-    """What one export is made of.
-
-    encoders: of the checkpoint; None: it has none
-    decisions: what decided the scores
-    """
+    """What one export is made of; decisions: what decided the scores"""
 
     family: Family
     checkpoint: Checkpoint
     encoders: FrameEncoders | None
-    origin: Origin
+    origin: Mapping[str, str]
     decisions: Sequence[Decision] = ()
 
 
@@ -55,7 +56,7 @@ def export(
     other_machine: bool = False,
     family: str | None = None,
     device: str | None = None,
-    say: Callable[[str], object] | None = None,
+    say: Say = _nobody,
 ) -> int:
     """Writes the checkpoint at ``source`` into ``repository`` and gives its version number.
 
@@ -90,7 +91,7 @@ def explain(
     settings: ExportConfig,
     *,
     family: str | None = None,
-    say: Callable[[str], object] | None = None,
+    say: Say = _nobody,
 ) -> Sequence[Decision]:
     """What decided each thing that the scores of the checkpoint at ``source`` would depend on; writes nothing.
 
@@ -99,9 +100,7 @@ def explain(
     return _load(source, settings, family, say).decisions
 
 
-def _load(
-    source: str | Path, settings: ExportConfig, family: str | None, say: Callable[[str], object] | None
-) -> _Source:
+def _load(source: str | Path, settings: ExportConfig, family: str | None, say: Say) -> _Source:
     """What is at ``source``, checked. Says which file holds the training run's settings, and what may be wrong."""
     folder = families.find(source)
     kind = families.choose(folder, family)
@@ -109,19 +108,12 @@ def _load(
     checkpoint = families.load_from(folder, kind, options)
     check_links(folder)
     encoders = checkpoint.encoders()
-    if say is not None:
-        run_config = find_run_config(folder)
-        of_run = [] if run_config is None else [f"{run_config}: read as the settings of the training run"]
-        for note in (*of_run, *families.notes(folder, checkpoint)):
-            say(note)
-    decisions = [*checkpoint.decisions(), *_told(settings)]
-    return _Source(kind, checkpoint, encoders, Origin.of(source, folder), decisions)
-
-
-def _told(settings: ExportConfig) -> Iterator[Decision]:
-    """What the caller decides of any checkpoint."""
-    if settings.dtype is not None:
-        yield Decision("served_dtype", settings.dtype, "--dtype")
+    if (run_config := find_run_config(folder)) is not None:
+        say(f"{run_config}: read as the settings of the training run")
+    for note in families.notes(folder, checkpoint):
+        say(note)
+    told = [] if settings.dtype is None else [Decision("served_dtype", settings.dtype, "--dtype")]
+    return _Source(kind, checkpoint, encoders, origin_of(source, folder), [*checkpoint.decisions(), *told])
 
 
 def _check_gpus(num_gpus: int | None) -> None:
@@ -156,15 +148,13 @@ def _stage(source: _Source, models: Sequence[GeneratedModel], version: Version, 
         (staged / path).write_bytes(content)
 
 
-def _verify(
-    source: _Source, version: Version, staged: Path, named: torch.device | None, say: Callable[[str], object] | None
-) -> None:
+def _verify(source: _Source, version: Version, staged: Path, named: torch.device | None, say: Say) -> None:
     """Raises ExportDiffersError unless what was staged gives the checkpoint's numbers."""
     description, settings = source.checkpoint.description, version.settings
     dtype = settings.torch_dtype if description.is_large else None
     device = named or device_for(source.checkpoint, dtype, may_use_gpu=settings.num_gpus != 0)
     engine = partial(Engine.of, device=device, dtype=dtype)
-    if description.is_large and say is not None:
+    if description.is_large:
         say(f"the export's scores are compared with the checkpoint's on {device} (--device names another one)")
 
     def exported() -> Engine:
@@ -202,7 +192,7 @@ def check(repository: Path, settings: ExportConfig) -> list[str]:
     checkpoint = family.load(folder, Options())
     encoders = repository / encoder_name(settings.name) / str(number)
     described = family.encoders.describe(encoders) if family.encoders is not None and encoders.exists() else None
-    version = _version(_Source(family, checkpoint, None, Origin.from_config(config)), settings, number)
+    version = _version(_Source(family, checkpoint, None, origin_in(config)), settings, number)
     models = generated_models(checkpoint.description, described, version)
     differences = []
     for path, content in _generated(models, repository).items():

@@ -28,7 +28,7 @@ from rfm_client.contract.model_info import (
 )
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_export.about import about_encoders
-from rfm_export.pbtxt import Interface, Warmup, ensemble_config, exported_settings, python_config, render
+from rfm_export.pbtxt import Interface, Warmup, ensemble_config, python_config, render
 
 MODEL_FILE = "model.py"
 WARMUP_FOLDER = "warmup"
@@ -57,7 +57,7 @@ class GeneratedModel:
 
     @property
     def is_ensemble(self) -> bool:
-        """Whether it is made of other models."""
+        """True if it is made of other models."""
         return self.model_file is None
 
     def files(self) -> dict[str, bytes]:
@@ -93,76 +93,27 @@ def generated_models(
     description: Description, encoders: EncodersDescription | None, version: Version
 ) -> list[GeneratedModel]:
     """The models of a checkpoint and its encoders, if it has some; an ensemble stands behind what it is made of."""
-    version = replace(version, settings=_with_instances(description, version))
-    name, widths = version.settings.name, description.widths
+    name, widths, cache_mb = version.settings.name, description.widths, version.settings.feature_cache_mb
+    # Two small networks keep a GPU busy: one scores while the other reads.
+    several = widths is not None and version.num_gpus > 0
+    settings = replace(version.settings, instances=version.settings.instances or (2 if several else 1))
+    # Of several instances with a cache each would have to see all frames.
+    keeps = description.keeps_features and cache_mb > 0 and settings.instances == 1
     outputs = wire.score_outputs(description.progress_bins if description.progress_bins > 1 else None)
-    cache_mb = version.settings.feature_cache_mb
-    keeps = description.keeps_features and _scorer_has_cache(version.settings)
     inputs = wire.frame_inputs(by_digest=keeps) if widths is None else wire.embedding_inputs(*widths)
     about = {**_limits(description, description.frame_size), **version.about}
     scorer = Interface(scorer_name(description, name), inputs, outputs, about)
-    models = [_python_model(scorer, "rfm", version, _warmups(description))]
-    if keeps:
-        models[0].config.parameters[FEATURE_CACHE_PARAMETER].string_value = str(cache_mb)
+    version = replace(version, settings=settings)
+    models = [_python_model(scorer, "rfm", version, _warmups(description), keeps=keeps)]
     if encoders is None or widths is None:
         return models
-    about = about_encoders(encoders, version.about)
-    inputs = wire.encoder_inputs(by_digest=cache_mb > 0)
+    inputs, about = wire.encoder_inputs(by_digest=cache_mb > 0), about_encoders(encoders, version.about)
     encoder = Interface(encoder_name(name), inputs, wire.encoder_outputs(*widths), about)
+    of_encoder = replace(version, settings=replace(settings, instances=1)) if cache_mb else version
+    models.append(_python_model(encoder, "rfm_encoder", of_encoder, [_encoder_warmup()], keeps=True))
     about = {**_limits(description, encoders.frame_size), **version.about}
     frames = Interface(frames_name(name), wire.frame_inputs(by_digest=cache_mb > 0), outputs, about)
-    of_encoder = replace(version, settings=_of_encoder(version.settings))
-    models.append(_python_model(encoder, "rfm_encoder", of_encoder, [_encoder_warmup()]))
-    models[-1].config.parameters[FEATURE_CACHE_PARAMETER].string_value = str(cache_mb)
-    models.append(
-        GeneratedModel(ensemble_config(frames, version.settings, version.number, encoder, scorer), version.number)
-    )
-    return models
-
-
-def _with_instances(description: Description, version: Version) -> ExportConfig:
-    """The settings with a number of instances. Two small networks keep a GPU busy: one scores while the other reads."""
-    several = description.widths is not None and version.num_gpus > 0
-    return replace(version.settings, instances=version.settings.instances or (2 if several else 1))
-
-
-def lay_out(config: pb.ModelConfig, **changed: int) -> None:
-    """Makes of an exported model's configuration what an export with other settings would write.
-
-    changed: ``instances``, ``torch_threads``, ``max_batch_size`` of ExportConfig
-
-    A scorer that was exported without a feature cache gets none: its configuration does not tell whether it could have
-    one.
-    """
-    told, cache = exported_settings(config), FEATURE_CACHE_PARAMETER in config.parameters
-    cache_mb = int(config.parameters[FEATURE_CACHE_PARAMETER].string_value) if cache else 0
-    settings = ExportConfig(**{**told, "feature_cache_mb": cache_mb, **changed})
-    config.max_batch_size = settings.max_batch_size
-    if not config.instance_group:  # an ensemble
-        return
-    if any(output.name == wire.VIDEO_EMBEDDINGS for output in config.output):
-        settings = _of_encoder(settings)
-    elif cache and not _scorer_has_cache(settings):
-        del config.parameters[FEATURE_CACHE_PARAMETER]
-        kept = [tensor for tensor in config.input if tensor.name != wire.FRAME_DIGESTS]
-        del config.input[:]
-        config.input.extend(kept)
-    num_gpus = len(config.instance_group[0].gpus)
-    new = python_config(Interface(config.name, (), ()), settings, num_gpus, version=0, warmups=[])
-    config.instance_group[0].CopyFrom(new.instance_group[0])
-    config.dynamic_batching.CopyFrom(new.dynamic_batching)
-    for name, parameter in new.parameters.items():
-        config.parameters[name].CopyFrom(parameter)
-
-
-def _scorer_has_cache(settings: ExportConfig) -> bool:
-    """Whether a scorer that can keep features does: several instances would each have to see all frames."""
-    return settings.feature_cache_mb > 0 and settings.instances == 1
-
-
-def _of_encoder(settings: ExportConfig) -> ExportConfig:
-    """As the encoder is served: with a cache by one instance on each device, or each would have to see all frames."""
-    return replace(settings, instances=1) if settings.feature_cache_mb else settings
+    return [*models, GeneratedModel(ensemble_config(frames, settings, version.number, encoder, scorer), version.number)]
 
 
 def _limits(description: Description, frame_size: FrameSize | None) -> dict[str, str]:
@@ -177,11 +128,16 @@ def _limits(description: Description, frame_size: FrameSize | None) -> dict[str,
     }
 
 
-def _python_model(interface: Interface, template: str, version: Version, warmups: list[Warmup]) -> GeneratedModel:
+def _python_model(
+    interface: Interface, template: str, version: Version, warmups: list[Warmup], *, keeps: bool
+) -> GeneratedModel:
+    """keeps: it keeps what it makes of frames"""
     model_file = resources.files("rfm_export") / "templates" / template / MODEL_FILE
     files = {name: content for warmup in warmups for name, content in warmup.files().items()}
     config = python_config(interface, version.settings, version.num_gpus, version.number, warmups)
     config.parameters[FAMILY_PARAMETER].string_value = version.family
+    if keeps:
+        config.parameters[FEATURE_CACHE_PARAMETER].string_value = str(version.settings.feature_cache_mb)
     return GeneratedModel(config, version.number, model_file.read_bytes(), files)
 
 

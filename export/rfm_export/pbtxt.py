@@ -15,7 +15,6 @@ from tritonclient.grpc import model_config_pb2 as pb
 from rfm.config import ExportConfig
 from rfm.parameters import BUDGET_PARAMETER, DTYPE_PARAMETER, SAMPLE_TOKENS_PARAMETER, THREADS_PARAMETER
 from rfm_client.contract import wire
-from rfm_client.contract.model_info import SOURCE_PARAMETER
 from rfm_client.contract.wire import TensorSpec
 
 _US_PER_MS = 1000
@@ -64,25 +63,6 @@ def python_config(
     for warmup in warmups:
         _add_warmup(config, interface, warmup)
     return config
-
-
-def exported_settings(config: pb.ModelConfig) -> dict[str, Any]:
-    """What a configuration of ``python_config`` tells of the ExportConfig that it was made from, by key.
-
-    ``num_gpus`` is that of the machine for which it was made, ``checkpoint`` its ``source_name``. An older export tells
-    less.
-    """
-    texts = {name: parameter.string_value for name, parameter in config.parameters.items()}
-    numbers = (THREADS_PARAMETER, BUDGET_PARAMETER, SAMPLE_TOKENS_PARAMETER)
-    told: dict[str, Any] = {key: int(texts[key]) for key in numbers if key in texts}
-    policy = config.dynamic_batching.default_queue_policy
-    told["max_queue_size"] = policy.max_queue_size or None
-    told["queue_timeout_ms"] = policy.default_timeout_microseconds // _US_PER_MS or None
-    if SOURCE_PARAMETER in texts:
-        told["checkpoint"] = texts[SOURCE_PARAMETER]
-    for group in config.instance_group:
-        told |= {"num_gpus": len(group.gpus), "instances": group.count}
-    return told | {"max_batch_size": config.max_batch_size, "dtype": texts.get(DTYPE_PARAMETER) or None}
 
 
 def ensemble_config(

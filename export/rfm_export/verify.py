@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""Does an exported model give the numbers of the checkpoint that it was made from?"""
+"""Does an exported model give the numbers of the checkpoint that it was made from, and where is that compared?"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from rfm.engine import Engine, Outcome
-from rfm.family import Description
+from rfm.family import NETWORK, Checkpoint, Description
 from rfm_client.contract import (
     FrameScores,
     PreferenceResult,
@@ -22,13 +24,55 @@ from rfm_client.contract import (
     Trajectory,
 )
 from rfm_client.contract.made_up import Widths, random_trajectory
-from rfm_export.errors import ExportDiffersError
+from rfm_export.errors import ExportDiffersError, ExportError
 
 TOLERANCE = 1e-6  # same weights, same machine, same code: the numbers are the same but for rounding
 PROBE_FRAMES = (1, 3, 8)
 PROBE_SIZE_PX = (48, 80)
 PROBE_FRAME_STEPS = 2
-PROBE_SEED = 0
+WORKING_ROOM = 1.5  # of the weights' bytes: they, and what a pass over a few small samples needs
+
+
+def device_for(checkpoint: Checkpoint, dtype: torch.dtype | None, *, may_use_gpu: bool) -> torch.device:
+    """Where to compare, if nobody says: the CPU, and for a large network the GPU with most room, if that is enough.
+
+    dtype: of the network there; None: the weights' own
+    """
+    if not (checkpoint.description.is_large and may_use_gpu and torch.cuda.is_available()):
+        return torch.device("cpu")
+    free_bytes = [_free_bytes(index) for index in range(torch.cuda.device_count())]
+    weights = checkpoint.parts[NETWORK].values()
+    needed = WORKING_ROOM * sum(each.numel() * (dtype or each.dtype).itemsize for each in weights)
+    roomiest = max(range(len(free_bytes)), key=free_bytes.__getitem__)
+    return torch.device("cuda", roomiest) if free_bytes[roomiest] >= needed else torch.device("cpu")
+
+
+def _free_bytes(index: int) -> int:
+    try:
+        return torch.cuda.mem_get_info(index)[0]
+    except RuntimeError:  # it is too full to be asked, or belongs to another process alone
+        return 0
+
+
+def device_named(name: str) -> torch.device:
+    """The device of this name. Raises ExportError for one that this machine has not."""
+    there, why = ["cpu"], f": PyTorch {torch.__version__} finds no GPU; --device cpu"
+    if torch.cuda.is_available():
+        there, why = ["cpu", "cuda", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))], ""
+    if name not in there:
+        raise ExportError(f"device: expected one of {', '.join(there)}, got {name}{why}")
+    return torch.device(name)
+
+
+@contextmanager
+def needing_room(device: torch.device) -> Iterator[None]:
+    """Raises ExportError for a network that does not fit on the device."""
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        reason = str(error).partition("\n")[0].partition(". ")[0]
+        expected = f"room on {device} to compare the export with the checkpoint"
+        raise ExportError(f"device: expected {expected}, got: {reason}; --device names another one") from error
 
 
 def probes(description: Description, *, with_encoders: bool) -> list[Sample]:
@@ -36,7 +80,7 @@ def probes(description: Description, *, with_encoders: bool) -> list[Sample]:
 
     with_encoders: there are encoders, so that a checkpoint that scores embeddings is compared on raw frames, too
     """
-    random = np.random.default_rng(PROBE_SEED)
+    random = np.random.default_rng(0)
 
     def make(num_frames: int, widths: Widths) -> Trajectory:
         task = f"pick up {num_frames} red cups"
@@ -68,16 +112,17 @@ def verify(original: Callable[[], Engine], exported: Callable[[], Engine], sampl
 
 
 def _numbers(index: int, whose: str, outcome: Outcome) -> npt.NDArray[np.float64]:
+    """All scores of a probe in a row."""
     if isinstance(outcome, RewardError):
         raise ExportDiffersError(f"probe {index}: expected scores of {whose}, got: {outcome}") from outcome
     if isinstance(outcome, ProgressResult):
-        return _frame_numbers(outcome)
+        return _of_frames(outcome)
     if isinstance(outcome, PreferenceResult):
-        return np.concatenate([[outcome.preference], _frame_numbers(outcome.first), _frame_numbers(outcome.second)])
-    return np.concatenate([[outcome.similarity], _frame_numbers(outcome.reference), _frame_numbers(outcome.other)])
+        return np.concatenate([[outcome.preference], _of_frames(outcome.first), _of_frames(outcome.second)])
+    return np.concatenate([[outcome.similarity], _of_frames(outcome.reference), _of_frames(outcome.other)])
 
 
-def _frame_numbers(scores: FrameScores) -> npt.NDArray[np.float64]:
+def _of_frames(scores: FrameScores) -> npt.NDArray[np.float64]:
     logits = [] if scores.progress_logits is None else [scores.progress_logits.ravel()]
     numbers: npt.NDArray[np.float64] = np.concatenate([scores.progress, scores.success, *logits]).astype(np.float64)
     return numbers

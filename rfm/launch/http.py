@@ -19,39 +19,27 @@ NO_ANSWER = (OSError, http.client.HTTPException, UnreadableAnswerError)  # or no
 
 
 class Http:
-    """The server at ``host:port``. Its methods raise one of NO_ANSWER."""
+    """The server at ``host:port``. Its methods raise one of NO_ANSWER.
 
-    def __init__(self, host: str, port: int) -> None:
-        self._address = host, port
+    headers: of each request
+    """
 
-    def request(
-        self,
-        method: str,
-        path: str,
-        timeout_s: float,
-        body: bytes | None = None,
-        *,
-        headers: Mapping[str, str] | None = None,
-    ) -> tuple[int, str]:
+    def __init__(self, host: str, port: int, headers: Mapping[str, str] | None = None) -> None:
+        self._address, self._headers = (host, port), headers or {}
+
+    def request(self, method: str, path: str, timeout_s: float, body: bytes | None = None) -> tuple[int, str]:
         """Status and content of the answer."""
         connection = http.client.HTTPConnection(*self._address, timeout=timeout_s)
         try:
-            connection.request(method, path, body, headers or {})
+            connection.request(method, path, body, self._headers)
             answer = connection.getresponse()
             return answer.status, answer.read().decode(errors="replace")
         finally:
             connection.close()
 
-    def get_json(
-        self,
-        path: str,
-        timeout_s: float = PROBE_TIMEOUT_S,
-        *,
-        method: str = "GET",
-        headers: Mapping[str, str] | None = None,
-    ) -> Any:
+    def json(self, path: str, timeout_s: float = PROBE_TIMEOUT_S, method: str = "GET") -> Any:
         """The content of an answer that is JSON."""
-        status, text = self.request(method, path, timeout_s, headers=headers)
+        status, text = self.request(method, path, timeout_s)
         if status != http.client.OK:
             raise UnreadableAnswerError(f"{path}: {status} {text}")
         try:

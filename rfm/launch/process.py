@@ -11,7 +11,6 @@ import subprocess
 import time
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
 from types import TracebackType
@@ -21,25 +20,21 @@ from urllib.parse import quote
 from google.protobuf import text_format
 from tritonclient.grpc.model_config_pb2 import ModelConfig
 
-from rfm.config import DEFAULT_HOST, ServeConfig
 from rfm.launch.admin_key import VARIABLE, http_headers, new_key, restrictions
 from rfm.launch.cleanup import NEEDS_ROOM, Claim
 from rfm.launch.ending import EXIT_TIMEOUT_S, end, ending_with_parent
+from rfm.launch.endpoints import Endpoints, check_version
 from rfm.launch.http import NO_ANSWER, Http
-from rfm.launch.installation import Installation, ServerStartError
-from rfm.launch.listen_address import check_before_start, check_version
-from rfm.launch.ports import free_ports
+from rfm.launch.installation import WHEEL_VERSION, Installation, ServerStartError
 from rfm.launch.repository_api import INDEX_PATH, versions_of
 from rfm.launch.repository_folder import CONFIG_FILE, models_in, no_models
-from rfm.launch.tls import GrpcTls
 from rfm.launch.triton_options import check_arguments, size_limits
-from rfm.parameters import HANG_VARIABLE
+from rfm.parameters import DEFAULT_HANG_S, HANG_VARIABLE
 from rfm.proc import cpu_s_of_group
-from rfm_client.contract.listening import check_free, in_url
 from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
 
 POLL_S = 0.1
-STALLED_S = 60.0  # without use of the CPU: a start that Triton has spoilt
+STALLED_S, WORK_S = 60.0, 0.05  # a start that uses less of the CPU in so long has been spoilt by Triton
 LOAD_S = 1800.0
 ANSWER_TIMEOUT_S = 10.0  # of one that starts
 NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # a `load` would load all versions anew: their folders have changed
@@ -50,11 +45,9 @@ _REMEDIES = {  # by what Triton, PyTorch or the system say of a model that is no
     ),
     "No space left on device": NEEDS_ROOM,
 }
-_WORK_S = 0.05  # of the CPU: what waits uses less in STALLED_S
 _REGIONS = "--backend-config=python,shm-region-prefix-name="
 
-
-Config = Mapping[str, Any]
+Config = Mapping[str, Any]  # of a model, as Triton's JSON has it
 
 
 def short_spin(environment: Mapping[str, str]) -> dict[str, str]:
@@ -64,61 +57,6 @@ def short_spin(environment: Mapping[str, str]) -> dict[str, str]:
     own 3 ms a pass takes several times as long on a busy machine; without any, half as long again on a quiet one.
     """
     return {} if {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & environment.keys() else {"GOMP_SPINCOUNT": "10000"}
-
-
-@dataclass(frozen=True)
-class Endpoints:
-    """Addresses of one server. grpc_tls: gRPC is encrypted; HTTP cannot be, and then listens on 127.0.0.1 alone"""
-
-    host: str = DEFAULT_HOST
-    http_port: int = 8000
-    grpc_port: int = 8001
-    metrics_port: int = 8002
-    grpc_tls: GrpcTls | None = None
-
-    @classmethod
-    def of(cls, config: ServeConfig) -> Endpoints:
-        """The endpoints that a configuration names."""
-        return cls(config.host, config.http_port, config.grpc_port, config.metrics_port, GrpcTls.of(config))
-
-    @classmethod
-    def free(cls) -> Endpoints:
-        """Loopback endpoints on ports that are free now."""
-        http_port, grpc_port, metrics_port = free_ports(3)
-        return cls(DEFAULT_HOST, http_port, grpc_port, metrics_port)
-
-    @property
-    def http_url(self) -> str:
-        """URL at which RewardClient reaches the server over HTTP."""
-        return f"http://{in_url(self.http_host)}:{self.http_port}"
-
-    @property
-    def http_host(self) -> str:
-        """Listen address of the server's HTTP port."""
-        return self.host if self.grpc_tls is None else DEFAULT_HOST
-
-    @property
-    def grpc_url(self) -> str:
-        """URL at which RewardClient reaches the server over gRPC."""
-        return f"{'grpc' if self.grpc_tls is None else 'grpcs'}://{in_url(self.host)}:{self.grpc_port}"
-
-    @property
-    def metrics_url(self) -> str:
-        """URL of the metrics that Prometheus scrapes."""
-        return f"http://{in_url(self.host)}:{self.metrics_port}/metrics"
-
-    def check_free(self) -> None:
-        """Raises ServerStartError for a port that is taken or an address that is not this machine's."""
-        listening = (
-            ("HTTP", self.http_host, self.http_port),
-            ("gRPC", self.host, self.grpc_port),
-            ("metrics", self.host, self.metrics_port),
-        )
-        for name, host, port in listening:
-            try:
-                check_free(host, port, name, port_option=f"--{name.lower()}-port")
-            except ValueError as error:
-                raise ServerStartError(str(error)) from None
 
 
 class SpoiltStartError(ServerStartError):
@@ -131,11 +69,12 @@ class SpoiltStartError(ServerStartError):
 class TritonServer:
     """A tritonserver on ``repository`` with every model of it loaded. A context manager that stops it.
 
+    It is killed when the thread that starts it ends, however that ends.
+
     http_threads: threads that read HTTP requests; None: Triton's choice
-    hang_s: after how many seconds without progress of a batch a model process ends itself; None: DEFAULT_HANG_S
+    hang_s: after how many seconds without progress of a batch a model process ends itself
     log: where Triton's log goes; None: this process's standard output and error
     admin_key: what requests to the restricted APIs must show (``admin_key``); None: a new one, known to this alone
-    ends_with_parent: it is killed when the thread that starts it ends, be it by kill -9
     accepts_known_vulnerabilities: it may be reached from elsewhere although its Triton has some
     more_arguments: of tritonserver, such as ``--trace-config=...``; not those that this class sets
     """
@@ -147,23 +86,22 @@ class TritonServer:
         installation: Installation,
         *,
         http_threads: int | None = None,
-        hang_s: int | None = None,
+        hang_s: int = DEFAULT_HANG_S,
         log: IO[bytes] | None = None,
         admin_key: str | None = None,
         accepts_known_vulnerabilities: bool = False,
         more_arguments: Sequence[str] = (),
-        ends_with_parent: bool = False,
     ) -> None:
         self.endpoints = endpoints
         self.repository = repository
+        self.admin_key = admin_key or new_key()
         self._installation = installation
         self._http_threads = http_threads
         self._hang_s = hang_s
         self._log = log
-        self._admin_key = admin_key or new_key()
         self._accepts_known_vulnerabilities = accepts_known_vulnerabilities
         self._more_arguments = tuple(more_arguments)
-        self._ends_with_parent = ends_with_parent
+        self._http = Http(endpoints.http_host, endpoints.http_port, http_headers(self.admin_key))
         self._claim: Claim | None = None
         self._signal: int | None = None  # that was sent last
         self._process: subprocess.Popen[bytes] | None = None
@@ -185,11 +123,6 @@ class TritonServer:
         assert self._process is not None  # started
         return self._process.poll()
 
-    @property
-    def admin_key(self) -> str:
-        """The key that requests to the restricted APIs must show."""
-        return self._admin_key
-
     def signal(self, number: int) -> None:
         """Sends a signal to the process, and to one that is being started."""
         self._signal = number
@@ -198,46 +131,7 @@ class TritonServer:
 
     def kill(self) -> None:
         """Ends the process and its children at once."""
-        with suppress(ProcessLookupError):
-            os.killpg(self.pid, signal.SIGKILL)
-
-    def start(self, models: Collection[str] | None = None) -> None:
-        """Starts the process. Raises ServerStartError for what is known to be wrong before.
-
-        models: that it loads; None: all
-        """
-        there = self.models
-        if not there:
-            raise ServerStartError(no_models(self.repository))
-        own = self._arguments(sorted(there if models is None else models))
-        check_arguments(self._more_arguments, [*own, _REGIONS])
-        check_before_start(self.endpoints.host, self._installation, accepted=self._accepts_known_vulnerabilities)
-        if self.endpoints.grpc_tls is not None:
-            self.endpoints.grpc_tls.check()
-        self.endpoints.check_free()
-        self._claim = Claim()
-        arguments = [*own, f"{_REGIONS}{self._claim.region_prefix}"]
-        arguments += self._installation.lay_out_backends(self._claim.backends)
-        arguments += self.endpoints.grpc_tls.arguments() if self.endpoints.grpc_tls else []
-        arguments += [*size_limits(self._installation, self._more_arguments), *self._more_arguments]
-        try:
-            self._process = subprocess.Popen(
-                [self._installation.executable, *arguments],
-                env=self._environment(),
-                stdin=subprocess.DEVNULL,
-                stdout=self._log,
-                stderr=self._log,
-                preexec_fn=ending_with_parent() if self._ends_with_parent else None,
-                pass_fds=self._claim.lock_files,
-                start_new_session=True,  # a Ctrl-C in the terminal reaches it once, through us
-            )
-        except OSError as error:
-            self._release()
-            program = self._installation.executable
-            raise ServerStartError(f"tritonserver: expected a program at {program}, got: {error.strerror}") from error
-
-        if self._signal is not None:
-            self._process.send_signal(self._signal)
+        self._kill_group()
 
     def start_ready(self, served: Mapping[str, Config] | None = None) -> None:
         """Starts the process, and returns when every model is ready. Repeats a start once that Triton has spoilt.
@@ -252,44 +146,17 @@ class TritonServer:
             self.stop()
             self._start_ready(served)
 
-    def wait_ready(self, models: Collection[str] | None = None) -> None:
-        """Returns when ``models`` are ready (None: all). Raises ServerStartError with the reason of one that is not."""
-        assert self._process is not None  # started
-        triton = Http(self.endpoints.http_host, self.endpoints.http_port)
-        headers = http_headers(self._admin_key)
-        started_s = worked_s = time.monotonic()
-        cpu_s = 0.0
-        while self._process.poll() is None:
-            try:
-                version = triton.get_json("/v2", ANSWER_TIMEOUT_S).get("version", "")
-                index = triton.get_json(INDEX_PATH, ANSWER_TIMEOUT_S, method="POST", headers=headers)
-            except NO_ANSWER:  # Triton gives none while it loads
-                now_s, used_s = time.monotonic(), cpu_s_of_group(self.pid)
-                if used_s - cpu_s > _WORK_S:
-                    cpu_s, worked_s = used_s, now_s
-                if now_s - worked_s > STALLED_S or now_s - started_s > LOAD_S:
-                    self.kill()
-                    raise SpoiltStartError("tritonserver: expected to be ready, got processes that wait") from None
-                time.sleep(POLL_S)
-                continue
-            wanted = self.models if models is None else models
-            failed = [entry for entry in versions_of(index) if not entry.is_ready and entry.name in wanted]
-            if failed:
-                reasons = "; ".join(f"{entry.name}: {entry.reason or 'not loaded'}" for entry in failed)
-                why = f"models: expected all to be ready, got {reasons}{_remedy(reasons)}"
-                raise ServerStartError(why, failed[0].name)
-            check_version(self.endpoints.host, version, accepted=self._accepts_known_vulnerabilities)
-            return
-        kind = SpoiltStartError if self._process.returncode == -signal.SIGABRT else ServerStartError
-        raise kind(f"tritonserver: expected to run, got exit status {self._process.returncode}")
-
     def stop(self) -> int:
         """Ends the server gracefully, by force after KILL_AFTER_S, and gives its exit status (0 if it never ran)."""
-        if self._process is None:
-            self._release()  # of a start that a signal has interrupted
-            return 0
-        end(self._process)
-        return self._wait()
+        status = 0
+        if self._process is not None:
+            end(self._process)
+            status = self._process.wait()
+            self._kill_group()  # model processes that Triton ran out of time to end
+        if self._claim is not None:
+            self._claim.release()
+            self._claim = None
+        return status
 
     def __enter__(self) -> TritonServer:
         try:
@@ -304,8 +171,97 @@ class TritonServer:
     ) -> None:
         self.stop()
 
+    def _start_ready(self, served: Mapping[str, Config] | None) -> None:
+        """As ``start_ready``. Triton loads by itself what its files name, and is asked to load the rest."""
+        there = self.models
+        if not there:
+            raise ServerStartError(no_models(self.repository))
+        as_in_file = there
+        if served is not None:
+            as_in_file = [name for name in served if _names_the_same_versions(self.repository, name, served[name])]
+            if len(as_in_file) < len(served):  # an ensemble loads its parts with it, as their files say
+                as_in_file = []
+        self._start(sorted(as_in_file))
+        self._wait_ready(as_in_file)
+        others = {name: served[name] for name in served.keys() - set(as_in_file)} if served else {}
+        for name in sorted(others, key=lambda name: "ensemble_scheduling" in others[name]):
+            self._load(name, others[name])
+
+    def _start(self, models: Sequence[str]) -> None:
+        """Starts the process, which loads ``models``. Raises ServerStartError for what is known to be wrong before."""
+        own = self._arguments(models)
+        check_arguments(self._more_arguments, [*own, _REGIONS])
+        if self._installation.wheel is not None:
+            check_version(self.endpoints.host, WHEEL_VERSION, accepted=self._accepts_known_vulnerabilities)
+        self.endpoints.check()
+        self._claim = Claim()
+        arguments = [*own, f"{_REGIONS}{self._claim.region_prefix}"]
+        arguments += self._installation.lay_out_backends(self._claim.backends)
+        arguments += self.endpoints.grpc_tls.arguments() if self.endpoints.grpc_tls else []
+        arguments += [*size_limits(self._installation, self._more_arguments), *self._more_arguments]
+        program = self._installation.executable
+        try:
+            self._process = subprocess.Popen(
+                [program, *arguments],
+                env=self._environment(),
+                stdin=subprocess.DEVNULL,
+                stdout=self._log,
+                stderr=self._log,
+                preexec_fn=ending_with_parent(),
+                pass_fds=[self._claim.lock_file],
+                start_new_session=True,  # a Ctrl-C in the terminal reaches it once, through us
+            )
+        except OSError as error:
+            self._claim.release()
+            self._claim = None
+            raise ServerStartError(f"tritonserver: expected a program at {program}, got: {error.strerror}") from error
+        if self._signal is not None:
+            self._process.send_signal(self._signal)
+
+    def _wait_ready(self, models: Collection[str]) -> None:
+        """Returns when ``models`` are ready. Raises ServerStartError with the reason of one that is not."""
+        assert self._process is not None  # started
+        started_s = worked_s = time.monotonic()
+        cpu_s = 0.0
+        while self._process.poll() is None:
+            try:
+                version = self._http.json("/v2", ANSWER_TIMEOUT_S).get("version", "")
+                index = self._http.json(INDEX_PATH, ANSWER_TIMEOUT_S, "POST")
+            except NO_ANSWER:  # Triton gives none while it loads
+                now_s, used_s = time.monotonic(), cpu_s_of_group(self.pid)
+                if used_s - cpu_s > WORK_S:
+                    cpu_s, worked_s = used_s, now_s
+                if now_s - worked_s > STALLED_S or now_s - started_s > LOAD_S:
+                    self.kill()
+                    raise SpoiltStartError("tritonserver: expected to be ready, got processes that wait") from None
+                time.sleep(POLL_S)
+                continue
+            failed = [entry for entry in versions_of(index) if not entry.is_ready and entry.name in models]
+            if failed:
+                reasons = "; ".join(f"{entry.name}: {entry.reason or 'not loaded'}" for entry in failed)
+                why = f"models: expected all to be ready, got {reasons}{_remedy(reasons)}"
+                raise ServerStartError(why, failed[0].name)
+            check_version(self.endpoints.host, version, accepted=self._accepts_known_vulnerabilities)
+            return
+        kind = SpoiltStartError if self._process.returncode == -signal.SIGABRT else ServerStartError
+        raise kind(f"tritonserver: expected to run, got exit status {self._process.returncode}")
+
+    def _load(self, name: str, config: Config) -> None:
+        """Has Triton load a model with this configuration, over HTTP: its gRPC port may ask for a certificate."""
+        body = json.dumps({"parameters": {"config": json.dumps(config)}}).encode()
+        path = f"/v2/repository/models/{quote(name, safe='')}/load"
+        try:
+            status, text = self._http.request("POST", path, LOAD_S, body)
+        except NO_ANSWER as error:
+            raise ServerStartError(f"models: expected {name} to load, got: {error}", name) from error
+        if status != HTTPStatus.OK:
+            raise ServerStartError(f"models: expected {name} to load, got: {text}", name)
+
+    def _kill_group(self) -> None:
+        with suppress(ProcessLookupError):
+            os.killpg(self.pid, signal.SIGKILL)
+
     def _arguments(self, models: Sequence[str]) -> list[str]:
-        endpoints = self.endpoints
         return [
             f"--model-repository={self.repository}",
             "--model-control-mode=explicit",
@@ -314,71 +270,23 @@ class TritonServer:
             "--strict-readiness=false",  # else one version that cannot be loaded keeps all models from being ready
             "--exit-on-error=false",  # so that the reason of each model that fails can be read
             f"--exit-timeout-secs={EXIT_TIMEOUT_S}",
-            f"--http-address={_of_http_server(endpoints.http_host)}",
-            f"--http-port={endpoints.http_port}",
-            f"--grpc-address={in_url(endpoints.host)}",
-            f"--grpc-port={endpoints.grpc_port}",
-            f"--metrics-address={_of_http_server(endpoints.host)}",
-            f"--metrics-port={endpoints.metrics_port}",
+            *self.endpoints.arguments(),
             *([f"--http-thread-count={self._http_threads}"] if self._http_threads else []),
-            *restrictions(self._admin_key),
+            *restrictions(self.admin_key),
         ]
 
     def _environment(self) -> dict[str, str]:
-        """Environment of tritonserver: that of this process, without its secrets."""
         own = {name: value for name, value in os.environ.items() if name not in SECRETS}
-        hang = {} if self._hang_s is None else {HANG_VARIABLE: str(self._hang_s)}
-        return {**short_spin(own), **own, **self._installation.environment, **NO_BYTECODE, **hang}
-
-    def _start_ready(self, served: Mapping[str, Config] | None) -> None:
-        """As ``start_ready``. Triton loads by itself what its files name, and is asked to load the rest."""
-        if served is None:
-            self.start()
-            self.wait_ready()
-            return
-        as_in_file = [name for name in served if names_the_same_versions(self.repository, name, served[name])]
-        if len(as_in_file) < len(served):  # an ensemble loads its parts with it, as their files say
-            as_in_file = []
-        self.start(as_in_file)
-        self.wait_ready(as_in_file)
-        others = sorted(served.keys() - set(as_in_file), key=lambda name: "ensemble_scheduling" in served[name])
-        for name in others:
-            self._load(name, served[name])
-
-    def _load(self, name: str, config: Config) -> None:
-        """Has Triton load a model with this configuration, over HTTP: its gRPC port may ask for a certificate."""
-        triton = Http(self.endpoints.http_host, self.endpoints.http_port)
-        body = json.dumps({"parameters": {"config": json.dumps(config)}}).encode()
-        path = f"/v2/repository/models/{quote(name, safe='')}/load"
-        try:
-            status, text = triton.request("POST", path, LOAD_S, body, headers=http_headers(self._admin_key))
-        except NO_ANSWER as error:
-            raise ServerStartError(f"models: expected {name} to load, got: {error}", name) from error
-        if status != HTTPStatus.OK:
-            raise ServerStartError(f"models: expected {name} to load, got: {text}", name)
-
-    def _wait(self) -> int:
-        """Waits for the server to end and clears away what it leaves; gives its exit status."""
-        assert self._process is not None  # started
-        status = self._process.wait()
-        with suppress(ProcessLookupError):  # model processes that Triton ran out of time to end
-            os.killpg(self._process.pid, signal.SIGKILL)
-        self._release()
-        return status
-
-    def _release(self) -> None:
-        if self._claim is not None:
-            self._claim.release()
-            self._claim = None
+        set_here = {**self._installation.environment, **NO_BYTECODE, HANG_VARIABLE: str(self._hang_s)}
+        return {**short_spin(own), **own, **set_here}
 
 
 def _remedy(reasons: str) -> str:
-    """What to do where models are not loaded for ``reasons``, behind a semicolon; empty: that is not known."""
     return next((f"; {remedy}" for said, remedy in _REMEDIES.items() if re.search(said, reasons)), "")
 
 
-def names_the_same_versions(repository: Path, model: str, config: Config) -> bool:
-    """Whether the model's file names the versions of ``config``, or none."""
+def _names_the_same_versions(repository: Path, model: str, config: Config) -> bool:
+    """True if the model's file names the versions of ``config``, or none."""
     try:
         file = text_format.Parse((repository / model / CONFIG_FILE).read_text(), ModelConfig())
     except (OSError, UnicodeDecodeError, text_format.ParseError):
@@ -386,8 +294,3 @@ def names_the_same_versions(repository: Path, model: str, config: Config) -> boo
     if not file.version_policy.HasField("specific"):  # of a model that is not ours
         return True
     return bool(list(file.version_policy.specific.versions) == config["version_policy"]["specific"]["versions"])
-
-
-def _of_http_server(host: str) -> str:
-    """An address as Triton's HTTP servers read it: without the prefix they take IPv6 for a name."""
-    return f"ipv6:{host}" if ":" in host else host

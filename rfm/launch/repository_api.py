@@ -7,7 +7,6 @@ and with it all connections of that thread, until the model is loaded.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
@@ -27,17 +26,11 @@ from rfm_client.contract.wire import Tensors
 INDEX_PATH = "/v2/repository/index"  # over HTTP
 READY, LOADING, UNLOADING = "READY", "LOADING", "UNLOADING"
 POLL_S = 0.1
-CONNECT_S = 10.0
 ANSWER_S = 1800.0  # of one request: a load answers when the model is warmed up
 FINISH_S = 600.0  # requests in flight on a version that is taken out
 
-_GRPC = ("grpc", "grpcs")
-_UNBOUNDED = -1
-_MS_PER_S = 1000
 _CHANNEL = [
-    ("grpc.max_send_message_length", _UNBOUNDED),
-    ("grpc.max_receive_message_length", _UNBOUNDED),
-    ("grpc.min_reconnect_backoff_ms", int(CONNECT_S * _MS_PER_S)),  # how long it may take to connect, too
+    ("grpc.min_reconnect_backoff_ms", 10_000),  # how long it may take to connect, too
     ("grpc.enable_http_proxy", 0),
 ]
 _OF_SERVER = (*triton.UNAVAILABLE, *triton.OUT_OF_TIME, *triton.CANCELLED)
@@ -61,12 +54,12 @@ class ModelVersion:
 
     @property
     def is_ready(self) -> bool:
-        """Whether it answers requests, as far as the server knows."""
+        """True if it answers requests, as far as the server knows."""
         return self.state == READY
 
     @property
     def is_unloaded(self) -> bool:
-        """Whether the version is not loaded because somebody unloaded it. A version that failed has another reason."""
+        """True if it is not loaded because somebody unloaded it. A version that failed has another reason."""
         return self.state == _NOT_LOADED or (self.state, self.reason) == (_UNAVAILABLE, _UNLOADED)
 
 
@@ -78,8 +71,11 @@ class RepositoryApi:
     """
 
     def __init__(self, url: str, admin_key: str | None, options: Mapping[str, Any] | None = None) -> None:
-        scheme, address = _split(url)
-        if scheme not in _GRPC:
+        try:
+            scheme, address = split_url(url)
+        except ValueError as error:
+            raise RepositoryApiError(str(error)) from None
+        if scheme not in ("grpc", "grpcs"):
             raise RepositoryApiError(
                 f"url: expected grpc://host:port (its gRPC port, 8001) or with TLS grpcs://host:port, got {url}"
             )
@@ -99,19 +95,9 @@ class RepositoryApi:
         ready = (entry for entry in self.index() if entry.name == model and entry.is_ready)
         return [entry.version for entry in ready if entry.version is not None]
 
-    def config(self, model: str, version: int) -> dict[str, Any]:
-        """The configuration with which the version was loaded."""
-        answer = self._request(self._client.get_model_config, model, str(version))
-        config: dict[str, Any] = MessageToDict(answer.config, preserving_proto_field_name=True)
-        return config
-
-    def load(self, model: str, config: Mapping[str, Any] | None = None) -> None:
-        """Has the server serve what the model's configuration says; what was served before stays if that fails.
-
-        config: instead of the one in the model's file
-        """
-        instead = None if config is None else json.dumps(config)
-        self._request(self._client.load_model, model, config=instead)
+    def load(self, model: str) -> None:
+        """Has the server serve what the model's configuration says; what was served before stays if that fails."""
+        self._request(self._client.load_model, model)
 
     def unload(self, model: str) -> None:
         """Has the server forget the model, after the requests that it is working on."""
@@ -181,12 +167,4 @@ def versions_of(index: Iterable[Mapping[str, str]]) -> list[ModelVersion]:
 
 def one_line(reason: str) -> str:
     """The first line of an error, which says what happened; the lines behind it say where."""
-    lines = reason.strip().splitlines()
-    return lines[0].strip() if lines else ""
-
-
-def _split(url: str) -> tuple[str, str]:
-    try:
-        return split_url(url)
-    except ValueError as error:
-        raise RepositoryApiError(str(error)) from None
+    return reason.strip().partition("\n")[0].strip()

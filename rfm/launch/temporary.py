@@ -10,8 +10,9 @@ from types import FrameType
 from typing import NoReturn
 
 from rfm.launch.ending import stop_signals_to
+from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.process import TritonServer
 
 
 @contextmanager
@@ -27,14 +28,11 @@ def stopped_by_signals() -> Iterator[None]:
 
 @contextmanager
 def temporary_server(repository: Path, log: Path, tritonserver: Path | None = None) -> Iterator[Endpoints]:
-    """A server on free ports of this machine, with Triton's log in a file. Raises ServerStartError.
-
-    It is killed when the thread that starts it ends, however that ends.
-    """
+    """A server on free ports of this machine, with Triton's log in a file. Raises ServerStartError."""
     log.parent.mkdir(parents=True, exist_ok=True)
     installation = find_installation(tritonserver)
     with (
         log.open("wb") as lines,
-        TritonServer(repository, Endpoints.free(), installation, log=lines, ends_with_parent=True) as server,
+        TritonServer(repository, Endpoints.free(), installation, log=lines) as server,
     ):
         yield server.endpoints

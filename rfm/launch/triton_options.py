@@ -53,7 +53,7 @@ def size_limits(installation: Installation, given: Sequence[str]) -> list[str]:
 
 
 def _knows(program: Path, option: str) -> bool:
-    """Whether the option's name stands in the program: asking by --help would start it."""
+    """True if the option's name stands in the program: asking by --help would start it."""
     try:
         with program.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             return content.find(option.encode()) >= 0

@@ -87,7 +87,7 @@ class Probe:
             self._num_failures += 1
 
     def _request(self) -> bytes:
-        config = self._http.get_json(f"/v2/models/{self._model}/config")
+        config = self._http.json(f"/v2/models/{self._model}/config")
         outputs = [{"name": output["name"]} for output in config["output"] if output["name"] in _OUTPUTS]
         inputs = [
             {
@@ -102,6 +102,6 @@ class Probe:
 
 
 def can_be_probed(config: Mapping[str, Any]) -> bool:
-    """Whether a model, of which this is the configuration, is one of ours that has processes of its own."""
+    """True if a model with this configuration is one of ours and has processes of its own."""
     names = {tensor["name"] for tensor in config["input"]}
     return config.get("backend") == "python" and wire.NUM_FRAMES in names

@@ -8,6 +8,7 @@ import socket
 import sys
 import threading
 from collections.abc import Mapping
+from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -29,24 +30,15 @@ class Status:
     def __init__(self) -> None:
         self._reasons: Mapping[str, str] = {}
         self._registry = CollectorRegistry()
-        labelled: dict[str, Any] = {"labelnames": ["model"], "registry": self._registry}
-        self._ready = Gauge("rfm_serve_ready", "1: the model is ready.", **labelled)
-        self._reason = Gauge(
-            "rfm_serve_not_ready", "1: the model is not ready, and why.", ["model", "reason"], registry=self._registry
-        )
+        gauge = partial(Gauge, registry=self._registry)
+        self._ready = gauge("rfm_serve_ready", "1: the model is ready.", ["model"])
+        self._reason = gauge("rfm_serve_not_ready", "1: the model is not ready, and why.", ["model", "reason"])
+        told = "From a health probe to its answer."
         self.probe_seconds = Histogram(
-            "rfm_serve_canary_seconds",
-            "From a health probe to its answer.",
-            ["model"],
-            buckets=_BUCKETS_S,
-            registry=self._registry,
+            "rfm_serve_canary_seconds", told, ["model"], registry=self._registry, buckets=_BUCKETS_S
         )
-        self.restarts = Counter(
-            "rfm_serve_restarts",
-            "Why Triton was started again: a model by name, or triton itself; gateway: the gateway was.",
-            ["what"],
-            registry=self._registry,
-        )
+        told = "Why Triton was started again: a model by name, or triton itself; gateway: the gateway was."
+        self.restarts = Counter("rfm_serve_restarts", told, ["what"], registry=self._registry)
 
     def record(self, reasons: Mapping[str, str]) -> None:
         """Records by model why it is not ready; NO_REASON for one that is. There are no other models."""
@@ -67,7 +59,7 @@ class Status:
 
     @property
     def ready(self) -> tuple[bool, dict[str, Any]]:
-        """Whether all models are ready, and the body of ``/ready``."""
+        """True if all models are ready; and the body of ``/ready``."""
         reasons = self._reasons
         is_ready = bool(reasons) and all(reason == NO_REASON for reason in reasons.values())
         models = {model: {"ready": reason == NO_REASON, "reason": reason} for model, reason in reasons.items()}
@@ -78,31 +70,25 @@ class Status:
         return generate_latest(self._registry)
 
 
-class StatusServer:
+class StatusServer(ThreadingHTTPServer):
     """Serves a Status over HTTP: ``/live``, ``/ready`` and ``/metrics``. Raises ServerStartError for a taken port."""
+
+    daemon_threads = True
 
     def __init__(self, host: str, port: int, status: Status) -> None:
         try:
             check_free(host, port, "status", port_option="--status-port")
         except ValueError as error:
             raise ServerStartError(str(error)) from None
-        self._server = _Server((host, port), _handler(status))
-        self._thread = threading.Thread(target=self._server.serve_forever, name="rfm-status", daemon=True)
-        self._thread.start()
+        self.status = status
+        self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        super().__init__((host, port), _Handler)
+        threading.Thread(target=self.serve_forever, name="rfm-status", daemon=True).start()
 
     def close(self) -> None:
         """Ends the HTTP server and its thread."""
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()
-
-
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-
-    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
-        self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
-        super().__init__(address, handler)
+        self.shutdown()
+        self.server_close()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Logs nothing: a caller that leaves without an answer is no fault."""
@@ -110,30 +96,25 @@ class _Server(ThreadingHTTPServer):
             super().handle_error(request, client_address)
 
 
-def _handler(status: Status) -> type[BaseHTTPRequestHandler]:
-    class Handler(BaseHTTPRequestHandler):
-        timeout = REQUEST_S
+class _Handler(BaseHTTPRequestHandler):
+    server: StatusServer
+    timeout = REQUEST_S
 
-        def do_GET(self) -> None:
-            if self.path == "/live":
-                self._answer(HTTPStatus.OK, b"{}", "application/json")
-            elif self.path == "/ready":
-                is_ready, body = status.ready
-                code = HTTPStatus.OK if is_ready else HTTPStatus.SERVICE_UNAVAILABLE
-                self._answer(code, json.dumps(body).encode(), "application/json")
-            elif self.path == "/metrics":
-                self._answer(HTTPStatus.OK, status.metrics(), CONTENT_TYPE_LATEST)
-            else:
-                self._answer(HTTPStatus.NOT_FOUND, b"{}", "application/json")
+    def do_GET(self) -> None:
+        code, body, content_type = HTTPStatus.OK, b"{}", "application/json"
+        if self.path == "/ready":
+            is_ready, told = self.server.status.ready
+            code = HTTPStatus.OK if is_ready else HTTPStatus.SERVICE_UNAVAILABLE
+            body = json.dumps(told).encode()
+        elif self.path == "/metrics":
+            body, content_type = self.server.status.metrics(), CONTENT_TYPE_LATEST
+        elif self.path != "/live":
+            code = HTTPStatus.NOT_FOUND
+        self.send_response(code)
+        self.send_header("Content-Type", content_type)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
 
-        def _answer(self, code: HTTPStatus, body: bytes, content_type: str) -> None:
-            self.send_response(code)
-            self.send_header("Content-Type", content_type)
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
-
-        def log_message(self, *_: Any) -> None:
-            """Logs nothing: probes come every few seconds."""
-
-    return Handler
+    def log_message(self, *_: Any) -> None:
+        """Logs nothing: probes come every few seconds."""

@@ -4,7 +4,7 @@
 | fault | seen by |
 |---|---|
 | Triton answers nothing | no answer of ``/metrics`` |
-| a model process is dead or stopped | ``processes`` |
+| a model process is dead or stopped | ``ModelProcesses`` |
 | a model hangs outside of a batch, or its requests fail before they reach model.py | its ``probe`` |
 
 A process that hangs in a batch, or whose device is broken, ends itself (``rfm.triton_model.guard``).
@@ -19,15 +19,15 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from typing import Any
+from pathlib import Path
 from urllib.parse import quote
 
 from rfm.launch.admin_key import http_headers
 from rfm.launch.http import NO_ANSWER, Http
-from rfm.launch.process import TritonServer
+from rfm.launch.process import Config, TritonServer
 from rfm.launch.repository_api import INDEX_PATH, LOADING, READY, UNLOADING, ModelVersion, versions_of
+from rfm.proc import STOPPED, ZOMBIE, arguments_of, children_of, stat_of
 from rfm.supervise.probe import Probe, can_be_probed
-from rfm.supervise.processes import UNKNOWN, ModelProcesses
 from rfm.supervise.status import NO_REASON, Status
 
 LOOK_S = 0.5
@@ -40,14 +40,54 @@ _PROGRESS = re.compile(  # counts that grow while a model gets on
     re.MULTILINE,
 )
 
+_PROGRAM = "triton_python_backend_stub"
+_PROGRAM_IN_KERNEL = _PROGRAM[:15]
+_STATES = {ZOMBIE: "a process of it is dead", STOPPED: "a process of it is stopped"}  # of a fault
+
 TRITON = "triton"
+UNKNOWN = ""  # the model of a process that died before the first look
 
 logger = logging.getLogger(__name__)
 
-Config = Mapping[str, Any]
+
+class ModelProcesses:
+    """The processes that Triton, ``triton_pid``, has started, one for each instance of a model, as /proc shows them.
+
+    Triton does not notice that one is dead until it has a request for it, and keeps it as a zombie until then.
+    """
+
+    def __init__(self, triton_pid: int) -> None:
+        self._triton_pid = triton_pid
+        self._models: dict[int, str] = {}  # by process; of a zombie nothing can be read
+        self._suspects: set[int] = set()
+
+    def fault(self, settled: Collection[str]) -> tuple[str, str] | None:
+        """A model of ``settled`` with a process that is dead or stopped now and was so at the last look, and which."""
+        states = self._states()
+        suspects = {pid for pid, state in states.items() if state in _STATES and self._models[pid] in settled}
+        confirmed = suspects & self._suspects
+        self._suspects = suspects
+        return next(((self._models[pid], _STATES[states[pid]]) for pid in sorted(confirmed)), None)
+
+    def _states(self) -> dict[int, str]:
+        """The states of the model processes; notes which model each runs."""
+        states = {}
+        for pid in children_of(self._triton_pid):
+            stat = stat_of(pid)
+            if stat is None:
+                continue
+            words = arguments_of(pid)  # .../triton_python_backend_stub .../MODEL/VERSION/model.py ...
+            if len(words) > 1 and words[0].endswith(_PROGRAM):
+                self._models[pid] = Path(words[1]).parent.parent.name
+            elif stat.name == _PROGRAM_IN_KERNEL:
+                self._models.setdefault(pid, UNKNOWN)
+            if pid in self._models:
+                states[pid] = stat.state
+        self._models = {pid: model for pid, model in self._models.items() if pid in states}
+        return states
 
 
-class Watch:
+class TritonWatch:
     """Looks every LOOK_S in a thread of its own, until it is closed.
 
     canary_s: how often each model is probed
@@ -67,9 +107,8 @@ class Watch:
         served: Mapping[str, Config],
     ) -> None:
         endpoints = server.endpoints
-        self._http = Http(endpoints.http_host, endpoints.http_port)
+        self._http = Http(endpoints.http_host, endpoints.http_port, http_headers(server.admin_key))
         self._metrics = Http(endpoints.host, endpoints.metrics_port)
-        self._headers = http_headers(server.admin_key)
         self._new_probe = partial(Probe, self._http, interval_s=canary_s, hang_s=hang_s)
         self._silent_s = silent_s
         self._status = status
@@ -136,8 +175,7 @@ class Watch:
 
     def _keep_up(self) -> None:
         """Reads what Triton serves now. Raises one of NO_ANSWER."""
-        index = self._http.get_json(INDEX_PATH, _INDEX_TIMEOUT_S, method="POST", headers=self._headers)
-        versions = versions_of(index)
+        versions = versions_of(self._http.json(INDEX_PATH, _INDEX_TIMEOUT_S, "POST"))
         for model in {entry.name for entry in versions}:
             self._keep_up_with(model, [entry for entry in versions if entry.name == model])
         self.reasons = {name: self._reason(name, versions) for name in self.served}
@@ -148,7 +186,7 @@ class Watch:
         is_settled = len(ready) > 0 and not is_going
         if is_settled and ready != self._ready.get(model):
             path = f"/v2/models/{quote(model, safe='')}/versions/{max(ready)}/config"
-            self.served[model] = serving_just(self._http.get_json(path), ready)
+            self.served[model] = serving_just(self._http.json(path), ready)
             self._status.restarts.labels(model)  # 0, so that already the first is an increase
             before = self._probes.get(model)
             self._forget(model)

@@ -5,10 +5,11 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import time
+import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any, Generic, TypeAlias, TypeVar
 
@@ -17,10 +18,10 @@ import torch
 from rfm.execution import Execution
 from rfm.parameters import BUDGET_PARAMETER, DEFAULT_HANG_S, HANG_VARIABLE, OLD_QUEUE_PARAMETERS
 from rfm.probe import blank_question
-from rfm.triton_model.guard import Guard, end
-from rfm.triton_model.metrics import Counted, Metrics
-from rfm.triton_model.pipeline import Pipeline, Stages
-from rfm.triton_model.placement import Placement, use_threads
+from rfm.triton_model.guard import Guard
+from rfm.triton_model.metrics import InstanceMetrics
+from rfm.triton_model.pipeline import Pipeline
+from rfm.triton_model.placement import Placement
 from rfm.triton_model.request import SAMPLE_TYPES, CancelledError, Request
 from rfm.triton_model.request_log import RequestLog
 from rfm.triton_model.weights import check_digest
@@ -31,7 +32,6 @@ from rfm_client.contract.samples import Footage
 from rfm_client.contract.wire import Tensors
 
 GIVEN_UP_S = 0.1  # clients may have given up behind a batch that took longer; Triton 2.51 hands their requests over
-MAX_INT32 = 2**31 - 1
 
 Question = TypeVar("Question")
 Answer = TypeVar("Answer")
@@ -54,35 +54,28 @@ class BatchModel(Generic[Question, Answer]):
         settings = {name: value["string_value"] for name, value in config["parameters"].items()}
         placement = Placement.of(args, config, settings)
         version = Path(args["model_repository"], args["model_version"])
-        self._pipeline: Pipeline[Request[Question], Scored[Question]] | None = None
+        self._pipeline: Pipeline | None = None
         self._is_executing = False
         self._batch_s = 0.0  # what the last batch took
-        self._guard = Guard(float(os.environ.get(HANG_VARIABLE) or DEFAULT_HANG_S), lambda: self._is_working)
+        self._guard = Guard(float(os.environ.get(HANG_VARIABLE) or DEFAULT_HANG_S), self._is_working)
         check_digest(version, settings.get(DIGEST_PARAMETER, ""))
         placement.run(lambda: self.load(version, placement.device, settings))
         model = {"model": args["model_name"], "version": args["model_version"]}
         labels = {**model, "device": str(placement.device), "instance": args["model_instance_name"]}
-        names = [spec["name"] for spec in config["input"]]
+        sample_types = _sample_types([spec["name"] for spec in config["input"]])
         self._log = RequestLog(model)
-        self._metrics = Metrics(labels, _checkpoint(settings), _sample_types(names), lambda: self._guard.num_steps)
+        self._metrics = InstanceMetrics(labels, _checkpoint(settings), sample_types, lambda: self._guard.num_steps)
         self._blank_tensors = blank_question(config)
-        self._num_warmups = sum(max(warmup.get("count", 0), 1) for warmup in config.get("model_warmup", []))
+        self._num_warmups = sum(warmup.get("count") or 1 for warmup in config.get("model_warmup", []))
         if any(settings.get(name) for name in OLD_QUEUE_PARAMETERS):
             self._log.note(f"{', '.join(OLD_QUEUE_PARAMETERS)} of an older export have no effect: export again")
-        if not self.works_ahead:
+        if self.works_ahead:
+            max_tokens = int(settings.get(BUDGET_PARAMETER) or sys.maxsize)
+            self._pipeline = Pipeline(
+                self._work_ahead, self._score, self._send, placement, config["max_batch_size"], max_tokens
+            )
+        else:
             placement.apply()
-            return
-        stages = Stages(
-            self._work_ahead,
-            self._score,
-            self._send,
-            fail=lambda: end("its pipeline has failed"),
-            begin_preparing=partial(use_threads, 1),  # on a GPU there is a thread for each core of the instance
-            begin_scoring=placement.apply,
-            num_preparing=placement.num_preparing,
-        )
-        batch_tokens = int(settings.get(BUDGET_PARAMETER) or MAX_INT32)
-        self._pipeline = Pipeline(stages, config["max_batch_size"], batch_tokens)
 
     def finalize(self) -> None:
         """Called once by Triton when the model is unloaded."""
@@ -97,7 +90,7 @@ class BatchModel(Generic[Question, Answer]):
 
     @property
     def works_ahead(self) -> bool:
-        """Whether ``work_ahead`` is worth a thread; asked when the weights are loaded."""
+        """True if ``work_ahead`` is worth a thread; asked when the weights are loaded."""
         return False
 
     def decode(self, tensors: Tensors) -> list[Question]:
@@ -136,14 +129,12 @@ class BatchModel(Generic[Question, Answer]):
         pipeline.put(batch)
         return None
 
-    @property
     def _is_working(self) -> bool:
         return self._is_executing or (self._pipeline is not None and not self._pipeline.is_idle)
 
     def _responses(
         self, batch: list[Request[Question]], score: Callable[[list[Request[Question]]], Scored[Question]]
     ) -> list[Any]:
-        """Scores the requests by ``score``, and gives Triton's responses."""
         self._is_executing = True
         try:
             for request in batch:
@@ -164,23 +155,18 @@ class BatchModel(Generic[Question, Answer]):
             return
         try:
             request.questions = self.decode(request.tensors)
-            self._prepare(request)
+            prepared = []
+            for index, question in enumerate(request.questions):
+                try:
+                    prepared.append(self.prepare(question))
+                except RewardError as error:
+                    raise _located(error, index, len(request.questions)) from error.__cause__
+            request.prepared, num_tokens = zip(*prepared, strict=True)
+            request.num_tokens = sum(num_tokens)
         except RewardError as error:
             request.error = error
         except Exception as error:  # noqa: BLE001  whatever went wrong with it costs no other its answer
             request.fail(error)
-
-    def _prepare(self, request: Request[Question]) -> None:
-        """Prepares the questions of a request, or notes the first error, located in it."""
-        prepared = []
-        for index, question in enumerate(request.questions):
-            try:
-                prepared.append(self.prepare(question))
-            except RewardError as error:
-                request.error = _located(error, index, len(request.questions))
-                return
-        request.prepared, num_tokens = zip(*prepared, strict=True)
-        request.num_tokens = sum(num_tokens)
 
     def _work_ahead(self, request: Request[Question]) -> None:
         """Beside the scoring of others: what takes long of a request. What fails here fails again in its turn."""
@@ -215,20 +201,18 @@ class BatchModel(Generic[Question, Answer]):
                 request.error = _first_error(request.answers)
         except Exception as error:  # noqa: BLE001  the request boundary: whatever happened, every request is answered
             if len(batch) > 1:
-                self._log.report_batch(batch, error)
+                _tell(self._log.report_batch, batch, error)
                 return [scored for request in batch for scored in self._scored([request])]
             batch[0].fail(error)
             execution = Execution()
         return [(batch, execution)]
 
     def _send(self, scored: Scored[Question]) -> None:
-        """Answers requests of the pipeline."""
         for request in [request for part, _ in scored for request in part]:
             request.send(self._response(request))
         self._count(scored)
 
     def _response(self, request: Request[Question]) -> Any:
-        """Triton's response of the answers or the error; of an error, too, if the answers cannot be written."""
         if request.error is None:
             try:
                 return request.response(self.encode(request.answers, request.tensors, request.outputs))
@@ -237,12 +221,11 @@ class BatchModel(Generic[Question, Answer]):
         return request.error_response()
 
     def _count(self, scored: Scored[Question]) -> None:
-        """Logs what has failed, and counts all."""
         for part, execution in scored:
             for request in part:
                 if request.error is not None:
-                    self._log.report(request)
-            self._metrics.add(Counted.of(part, execution))
+                    _tell(self._log.report, request)
+            _tell(self._metrics.add, part, execution)
 
     def _score_blank(self) -> None:
         """Raises what an instance whose device is broken raises. A sample that is refused, or for which there is no
@@ -253,6 +236,14 @@ class BatchModel(Generic[Question, Answer]):
         except InvalidSampleError:  # a checkpoint may refuse blank frames
             return
         self.answer(questions, Execution(on_forward=self._guard.step))
+
+
+def _tell(tell: Callable[..., None], *what: Any) -> None:
+    """Logs or counts; a fault in that costs nobody an answer."""
+    try:
+        tell(*what)
+    except Exception:  # noqa: BLE001  whatever it is
+        traceback.print_exc()
 
 
 def _first_error(answers: Sequence[Any]) -> RewardError | None:

@@ -26,7 +26,7 @@ class Guard:
     """Ends the process. Starts a thread.
 
     hang_s: seconds in which a batch may make no progress; a forward pass is progress
-    is_working: whether there is a batch
+    is_working: tells whether there is a batch
     """
 
     def __init__(self, hang_s: float, is_working: Callable[[], bool]) -> None:

@@ -46,20 +46,18 @@ class Request(Generic[Question]):
 
     request_id: the id that the client chose; empty if it chose none
     outputs: names of the outputs that the client wants
-    is_counted: whether metrics count it: a caller sent it, no warm-up and no health probe
     is_cancelled: asks Triton whether the client has cancelled, which takes 0.1 ms
+    is_counted: whether metrics count it: a caller sent it, no warm-up and no health probe
     sender: Triton's, which takes the response; None: ``execute`` returns the response
     num_tokens: of all its samples, known when they are prepared
-    questions: none unless it could be decoded
-    prepared: one a question, once they are there
-    answers: one a question, once they are there
+    questions, prepared, answers: as many each, or none yet
     error: why it has no answer; None: it has one, or may get one
     """
 
     request_id: str
     outputs: Collection[str]
     is_cancelled: Callable[[], bool]
-    is_counted: bool = True
+    is_counted: bool
     sender: Any = None
     tensors: wire.Tensors = field(default_factory=dict)
     num_samples: int = 1
@@ -106,12 +104,9 @@ class Request(Generic[Question]):
         """Triton's response of the error, of which the log knows more than the client."""
         import triton_python_backend_utils as pb_utils
 
-        codes = {
-            InvalidSampleError: pb_utils.TritonError.INVALID_ARG,
-            CancelledError: pb_utils.TritonError.CANCELLED,
-        }
-        code = next((codes[kind] for kind in codes if isinstance(self.error, kind)), pb_utils.TritonError.INTERNAL)
-        return pb_utils.InferenceResponse(error=pb_utils.TritonError(str(self.error), code))
+        kinds = pb_utils.TritonError
+        codes = {REFUSED: kinds.INVALID_ARG, CANCELLED: kinds.CANCELLED, FAILED: kinds.INTERNAL}
+        return pb_utils.InferenceResponse(error=kinds(str(self.error), codes[self.outcome]))
 
     def send(self, response: Any) -> None:
         """Send the response, which is the only one to this request."""

@@ -24,17 +24,14 @@ class RequestLog:
     def report(self, request: Request[Any]) -> None:
         """Writes down what became of a request that has an error."""
         assert request.error is not None
-        fields = {
-            "request_id": request.request_id,
-            "sample_type": ",".join(sorted(request.sample_types)),
-            "error": str(request.error),
-        }
-        self._write(request.outcome, fields, request.error.__cause__)
+        sample_types = ",".join(sorted(request.sample_types))
+        fields = {"request_id": request.request_id, "sample_type": sample_types, "error": str(request.error)}
+        self._write(f"request_{request.outcome}", fields, request.error.__cause__, is_error=request.outcome == FAILED)
 
     def report_batch(self, batch: Sequence[Request[Any]], error: Exception) -> None:
         """Writes down that requests failed together. Each is served alone then."""
         fields = {"request_ids": [request.request_id for request in batch], "error": repr(error)}
-        self._write(FAILED, fields, error, event="batch_failed")
+        self._write("batch_failed", fields, error, is_error=True)
 
     def note(self, text: str) -> None:
         """Writes down what the one who serves the model may want to know."""
@@ -42,16 +39,11 @@ class RequestLog:
 
         pb_utils.Logger.log_info(json.dumps({"event": "note", **self._labels, "note": text}))
 
-    def _write(
-        self, outcome: str, fields: Mapping[str, Any], cause: BaseException | None, event: str | None = None
-    ) -> None:
+    def _write(self, event: str, fields: Mapping[str, Any], cause: BaseException | None, *, is_error: bool) -> None:
         import triton_python_backend_utils as pb_utils
 
-        entry = {"event": event or f"request_{outcome}", **self._labels, **fields}
+        entry = {"event": event, **self._labels, **fields}
         if cause is not None:
             entry["traceback"] = "".join(traceback.format_exception(cause))
-        line = json.dumps(entry)
-        if outcome == FAILED:
-            pb_utils.Logger.log_error(line)
-        else:
-            pb_utils.Logger.log_verbose(line)
+        write = pb_utils.Logger.log_error if is_error else pb_utils.Logger.log_verbose
+        write(json.dumps(entry))

@@ -21,7 +21,8 @@ from rfm.supervise.supervisor import Supervisor
 from rfm_client.contract.settings import ConfigError, settings_of
 from rfm_commands import cli
 from rfm_commands.config import FLAT_KEYS, LIFETIMES, SECTIONS, Config
-from rfm_export.pbtxt import Interface, exported_settings, python_config
+from rfm_commands.unused_settings import exported_settings
+from rfm_export.pbtxt import Interface, python_config
 from rfm_gateway.config import GatewayConfig
 
 REPOSITORY = ROOT / "model_repository"

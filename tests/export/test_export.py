@@ -26,14 +26,11 @@ from repositories import forget_input
 from rfm.checkpoint.content import CheckpointError, read_run_config
 from rfm.config import ExportConfig
 from rfm.rewind.checkpoint import RewindCheckpoint
-from rfm.rewind.network import RewindTransformer
 from rfm_client.contract import wire
 from rfm_commands.cli import app
 from rfm_commands.config import Config
 from rfm_export import ExportDiffersError, ExportError
-from rfm_export.about import Origin
-
-pytestmark = pytest.mark.triton
+from rfm_export.about import origin_of
 
 EMBEDDINGS = goldens.config("c1_t1_disc10")
 FRAMES = goldens.config("enc_c1_t1_disc10")
@@ -83,34 +80,25 @@ def test_the_scorers_configuration_is_the_wire_contract(exported: Path) -> None:
     assert [tensor.name for tensor in config.input if tensor.allow_ragged_batch] == ["video_embeddings"]
     batching = config.dynamic_batching
     assert not batching.max_queue_delay_microseconds  # a delay would cost every lone request
+    assert not batching.HasField("default_queue_policy")
     assert not config.HasField("sequence_batching")
     assert [warmup.name for warmup in config.model_warmup] == ["progress", "preference", "similarity"]
 
 
-def test_a_queue_is_bounded_by_triton_s_own_policy(tmp_path: Path) -> None:
-    config = goldens.config("c1_t1_disc10")
-    rfm_export.export(
-        config.checkpoint, tmp_path, replace(serve_config(config), max_queue_size=7, queue_timeout_ms=250)
-    )
+def test_a_queue_is_bounded_by_triton_s_own_policy_if_it_is(tmp_path: Path) -> None:
+    """By default it is not: with a bound, Triton 2.51 at times notices a free instance half a second late."""
+    export(EMBEDDINGS, tmp_path, max_queue_size=7, queue_timeout_ms=250)
     policy = read(tmp_path, "rfm").dynamic_batching.default_queue_policy
     assert (policy.max_queue_size, policy.default_timeout_microseconds) == (7, 250_000)
     assert policy.allow_timeout_override
 
 
-def test_a_queue_has_no_bound_by_default(tmp_path: Path) -> None:
-    """With one, Triton 2.51 at times notices a free instance half a second late."""
-    export(goldens.config("c1_t1_disc10"), tmp_path)
-    assert not read(tmp_path, "rfm").dynamic_batching.HasField("default_queue_policy")
-
-
-def test_a_continuous_checkpoint_has_no_progress_logits(tmp_path: Path) -> None:
-    export(goldens.config("legacy_keys_l2"), tmp_path)
-    assert "progress_logits" not in dims(read(tmp_path, "rfm").output)
-
-
-def test_a_checkpoint_without_similarity_is_not_warmed_up_with_it(tmp_path: Path) -> None:
-    export(goldens.config("robometer_c1_t1_disc10"), tmp_path)
-    assert [warmup.name for warmup in read(tmp_path, "rfm").model_warmup] == ["progress", "preference"]
+def test_a_checkpoint_is_asked_for_what_it_has(tmp_path: Path) -> None:
+    export(goldens.config("legacy_keys_l2"), tmp_path / "continuous")
+    assert "progress_logits" not in dims(read(tmp_path / "continuous", "rfm").output)
+    export(goldens.config("robometer_c1_t1_disc10"), tmp_path / "no similarity")
+    warmups = read(tmp_path / "no similarity", "rfm").model_warmup
+    assert [warmup.name for warmup in warmups] == ["progress", "preference"]
 
 
 def test_frames_go_through_the_encoder_into_the_scorer(exported: Path) -> None:
@@ -155,76 +143,12 @@ def test_an_export_holds_what_serving_needs_and_nothing_of_the_training_run(expo
     assert not [file for file in files if file.endswith((".yaml", ".bin"))]
 
 
-@pytest.mark.parametrize("folder", ["rfm", "rfm_encoder"])
-def test_model_py_stays_thin(folder: str) -> None:
-    lines = (REPOSITORY / folder / "1" / "model.py").read_text().splitlines()
-    assert len(lines) <= 120
-
-
 def test_the_next_export_is_the_next_version(tmp_path: Path) -> None:
     assert [export(FRAMES, tmp_path) for _ in range(3)] == [1, 2, 3]
     for name in ("rfm", "rfm_encoder", "rfm_frames"):
         assert list(read(tmp_path, name).version_policy.specific.versions) == [3]
         assert {path.name for path in (tmp_path / name).iterdir() if path.name.isdecimal()} == {"1", "2", "3"}
     assert {step.model_version for step in read(tmp_path, "rfm_frames").ensemble_scheduling.step} == {3}
-
-
-def check_loadable(repository: Path) -> None:
-    """Whatever Triton would load now is whole and fits together."""
-    served = {}
-    for folder in sorted(path for path in repository.iterdir() if path.is_dir()):
-        config = read(repository, folder.name)
-        served[folder.name] = list(config.version_policy.specific.versions)
-        assert served[folder.name]
-        for version in served[folder.name]:
-            assert any((folder / str(version)).iterdir())
-        for warmup in config.model_warmup:
-            for tensor in warmup.inputs.values():
-                assert tensor.zero_data or (folder / "warmup" / tensor.input_data_file).is_file()
-    for name in served:
-        for step in read(repository, name).ensemble_scheduling.step:
-            assert step.model_version in served[step.model_name]
-
-
-class Killed(BaseException):
-    """In place of kill -9 between two operations on the file system."""
-
-
-@pytest.mark.parametrize("before", [0, 1], ids=["first export", "second export"])
-def test_an_export_that_dies_at_any_moment_leaves_a_repository_that_loads(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: int
-) -> None:
-    died = True
-    survived = 0
-    exported = tmp_path / "exported"
-    exported.mkdir()
-    for _ in range(before):
-        export(FRAMES, exported)
-    while died:
-        repository = shutil.copytree(exported, tmp_path / str(survived) / "model_repository")
-        remaining = survived
-
-        def counted(original: Any, repository: Path = repository) -> Any:
-            def move(self: Path, target: Path) -> Path:
-                nonlocal remaining
-                if repository in Path(target).parents:
-                    if remaining == 0:
-                        raise Killed
-                    remaining -= 1
-                return Path(original(self, target))
-
-            return move
-
-        with monkeypatch.context() as patch:
-            patch.setattr(Path, "rename", counted(Path.rename))
-            patch.setattr(Path, "replace", counted(Path.replace))
-            try:
-                export(FRAMES, repository)
-                died = False
-            except Killed:
-                survived += 1
-        check_loadable(repository)
-    assert survived >= (3, 8)[before]  # three folders; and three versions, warm-up files, five configurations
 
 
 def test_an_export_that_differs_from_its_checkpoint_is_not_published(
@@ -286,13 +210,10 @@ def test_an_ensemble_does_not_lose_its_encoder(tmp_path: Path) -> None:
         export(EMBEDDINGS, tmp_path)
 
 
-def test_encoders_of_another_width_are_refused(tmp_path: Path) -> None:
+def test_encoders_that_do_not_fit_or_cannot_be_had_are_named(tmp_path: Path) -> None:
     encoders = {"image_encoder": str(FRAMES.image_encoder), "text_encoder": str(FRAMES.text_encoder)}
     with pytest.raises(CheckpointError, match=r"expected widths \(768, 384\), got \(48, 32\)"):
         export(EMBEDDINGS, tmp_path, **encoders)
-
-
-def test_encoders_that_cannot_be_had_are_named(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"encoders /no/such/folder and .*--image-encoder and --text-encoder"):
         export(FRAMES, tmp_path, image_encoder="/no/such/folder")
 
@@ -305,12 +226,10 @@ def test_the_committed_repository_is_what_an_export_generates() -> None:
 
 
 def test_check_names_what_differs(tmp_path: Path) -> None:
-    repository = tmp_path / "model_repository"
-    shutil.copytree(REPOSITORY, repository)
+    repository = shutil.copytree(REPOSITORY, tmp_path / "model_repository")
     (repository / "rfm" / "1" / "model.py").write_text("# changed\n")
     (repository / "rfm_frames" / "config.pbtxt").unlink()
-    differences = rfm_export.check(repository, Config.from_yaml(REPOSITORY / "serve.yaml").export)
-    assert differences == [
+    assert rfm_export.check(repository, Config.from_yaml(REPOSITORY / "serve.yaml").export) == [
         f"{repository}/rfm/1/model.py: differs from what `rfm export` generates",
         f"{repository}/rfm_frames/config.pbtxt: is missing",
     ]
@@ -320,20 +239,6 @@ def test_the_commands_errors_are_one_line(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["export", "--checkpoint", "nowhere", "--repository", str(tmp_path)])
     assert result.exit_code == 1
     assert re.fullmatch(r"rfm: checkpoint: expected .*, got 'nowhere'\n", result.stderr)
-
-
-def test_a_config_file_tells_the_command_what_to_do(tmp_path: Path) -> None:
-    (tmp_path / "serve.yaml").write_text(
-        f"model_path: {EMBEDDINGS.checkpoint}\nnum_gpus: 0\nmax_batch_size: 8\ntoken_budget: 512\nname: reward\n"
-    )
-    repository = tmp_path / "model_repository"
-    result = CliRunner().invoke(
-        app, ["export", "--config", str(tmp_path / "serve.yaml"), "--repository", str(repository)]
-    )
-    assert result.exit_code == 0, result.output
-    config = read(repository, "reward")
-    assert config.max_batch_size == 8
-    assert config.parameters["token_budget"].string_value == "512"
 
 
 # As upstream publishes it, comments aside.
@@ -410,13 +315,10 @@ def test_an_export_says_which_config_yaml_and_which_encoders_it_took(tmp_path: P
     )
     rfm_export.export(EMBEDDINGS.checkpoint, tmp_path / "above", serve_config(EMBEDDINGS), say=said.append)
     assert of_run(EMBEDDINGS.checkpoint.parent) in said
-
-
-def test_an_export_of_an_export_says_nothing_of_a_run(exported: Path, tmp_path: Path) -> None:
-    said: list[str] = []
-    checkpoint = exported / "rfm" / "1" / "checkpoint"
-    rfm_export.export(checkpoint, tmp_path / "repository", serve_config(EMBEDDINGS), say=said.append)
-    assert said == []
+    again: list[str] = []
+    checkpoint = tmp_path / "above" / "rfm" / "1" / "checkpoint"
+    rfm_export.export(checkpoint, tmp_path / "again", serve_config(EMBEDDINGS), say=again.append)
+    assert again == []  # an export of an export knows of no run
 
 
 NOTE = "batch_size has no effect, as in the FastAPI server; max_batch_size bounds a batch"
@@ -452,13 +354,6 @@ def test_more_gpus_than_there_are_are_refused_at_export(tmp_path: Path) -> None:
     assert list(group.gpus) == list(range(there + 1))
 
 
-def test_the_exported_network_has_every_weight(exported: Path) -> None:
-    from rfm import families
-
-    loaded = families.load(exported / "rfm" / "1" / "checkpoint")
-    assert loaded.network.keys() == RewindTransformer(loaded.config).state_dict().keys()
-
-
 def parameter(repository: Path, model: str, name: str) -> str:
     return str(read(repository, model).parameters[name].string_value)
 
@@ -476,24 +371,19 @@ def test_models_tell_their_weights_by_the_files_digest(exported: Path) -> None:
     assert {name: parameter(exported, name, "weights_digest") for name in expected} == expected
 
 
-def test_check_notices_other_weights(exported: Path, tmp_path: Path) -> None:
-    repository = shutil.copytree(exported, tmp_path / "repository")
-    weights = repository / "film_encoder" / "1" / "text_encoder" / "model.safetensors"
-    content = bytearray(weights.read_bytes())
-    content[-1] ^= 1
-    weights.write_bytes(content)
-    assert rfm_export.check(repository, serve_config(FRAMES, "film")) == [
-        f"{repository}/film_encoder/config.pbtxt: differs from what `rfm export` generates",
-        f"{repository}/film_frames/config.pbtxt: differs from what `rfm export` generates",
-    ]
-
-
-@pytest.mark.parametrize("file", ["image_encoder/preprocessor_config.json", "text_encoder/tokenizer_config.json"])
-def test_the_digest_of_settings_is_of_the_files_beside_the_weights(exported: Path, tmp_path: Path, file: str) -> None:
+@pytest.mark.parametrize(
+    "file",
+    [
+        "text_encoder/model.safetensors",
+        "image_encoder/preprocessor_config.json",
+        "text_encoder/tokenizer_config.json",
+    ],
+)
+def test_check_notices_other_weights_and_settings(exported: Path, tmp_path: Path, file: str) -> None:
     repository = shutil.copytree(exported, tmp_path / "repository")
     assert len(parameter(repository, "film_encoder", "settings_digest")) == 16
     changed = repository / "film_encoder" / "1" / file
-    changed.write_text(changed.read_text() + "\n")
+    changed.write_bytes(changed.read_bytes() + b"\n")
     assert rfm_export.check(repository, serve_config(FRAMES, "film")) == [
         f"{repository}/film_encoder/config.pbtxt: differs from what `rfm export` generates",
         f"{repository}/film_frames/config.pbtxt: differs from what `rfm export` generates",
@@ -512,9 +402,9 @@ def test_the_digest_of_settings_is_of_the_dtype_too(tmp_path: Path) -> None:
 
 def test_a_checkpoint_of_the_hub_tells_its_commit(tmp_path: Path) -> None:
     snapshot = tmp_path / "models--org--name" / "snapshots" / "0123abcd"
-    assert Origin.of("org/name@best", snapshot) == Origin("org/name@best", "0123abcd")
+    assert origin_of("org/name@best", snapshot) == {"source": "org/name@best", "revision": "0123abcd"}
     snapshot.mkdir(parents=True)
-    assert Origin.of(snapshot, snapshot) == Origin("snapshots/0123abcd", "")
+    assert origin_of(snapshot, snapshot) == {"source": "snapshots/0123abcd", "revision": ""}
 
 
 def test_the_configuration_of_the_training_run_is_kept_without_its_secrets(tmp_path: Path) -> None:

@@ -1,179 +1,303 @@
 # SPDX-License-Identifier: MIT
-"""What an export or a rollout needs of the file system, and what Triton sees of a repository meanwhile."""
+"""What an export needs of the file system, what Triton sees of a repository meanwhile, and what it loads."""
 
 from __future__ import annotations
 
+import fcntl
+import json
 import os
+import re
 import shutil
+import subprocess
+import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import goldens
 import rfm_export
+from commands import REPOSITORY
 from engines import serve_config
 from one_model import BriefServer
+from reference_server import Served
+from rfm import families
+from rfm.checkpoint.content import CheckpointError
+from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints, TritonServer
-from rfm.launch.repository_api import RepositoryApi
+from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
 from rfm_client import RewardClient
-from rfm_commands.rollout import Rollout, previous_version
-from rfm_export.publish import staging
-from rfm_serve import model_processes
+from rfm_export import ExportError
+from rfm_export.publish import alone, read_config, staging
+from rfm_serve import model_processes, wait_for
+from spoilt import WEIGHTS, copied, files_in, weights
 from trajectories import random_trajectory
 
-pytestmark = pytest.mark.triton
-
-PLAIN = goldens.config("c1_t1_disc10")
-KEY = "a-key-that-only-tests-know"
+PLAIN, SMALL = goldens.config("c1_t1_disc10"), goldens.config("legacy_keys_l2")
+FRAMES = goldens.config("enc_c1_t1_disc10")
 NOBODY = 65534
-HANG_S = PATIENCE_S = 60.0
-POLL_S = 0.05
+PATIENCE_S = 60
 
 
-def export(repository: Path, name: str = "rfm", checkpoint: Path = PLAIN.checkpoint) -> int:
-    return rfm_export.export(checkpoint, repository, serve_config(PLAIN, name))
+def export(repository: Path, name: str = "rfm", config: goldens.Config = SMALL, checkpoint: Path | None = None) -> int:
+    return rfm_export.export(checkpoint or config.checkpoint, repository, serve_config(config, name))
 
 
 @contextmanager
-def served(repository: Path, log: Path, kind: type[TritonServer] = BriefServer) -> Iterator[TritonServer]:
-    with (
-        log.open("wb") as lines,
-        kind(repository, Endpoints.free(), find_installation(), log=lines, admin_key=KEY) as server,
-    ):
-        yield server
-
-
-@dataclass(frozen=True)
-class Mounted:
-    """A repository, all that its user may write."""
-
-    repository: Path
-    checkpoint: Path
-
-    @contextmanager
-    def as_user(self) -> Iterator[None]:
-        """Root may write everywhere, and is nobody meanwhile."""
-        user = os.geteuid()
+def as_any_user(folder: Path) -> Iterator[None]:
+    """A context in which this process, in ``folder``, has the rights of a user who may not do everything."""
+    user = os.geteuid()
+    try:
         if user == 0:
+            folder.chmod(0o755)
             os.seteuid(NOBODY)
-        try:
-            assert not os.access(self.repository.parent, os.W_OK, effective_ids=True)
-            yield
-        finally:
-            os.seteuid(user)
+        yield
+    finally:
+        os.seteuid(user)
 
 
-@pytest.fixture
-def mounted() -> Iterator[Mounted]:
+def test_a_file_that_may_not_be_read_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = copied(SMALL, Path("checkpoint"))
+    (folder / "config.json").chmod(0)
+    with as_any_user(tmp_path), pytest.raises(CheckpointError, match=r"Permission ?[dD]enied|PermissionError"):
+        families.load(folder)
+
+
+def test_only_the_repository_must_be_writable(tmp_path: Path) -> None:
     folder = Path(tempfile.mkdtemp(prefix="rfm-mounted-"))  # pytest's own is closed to nobody
-    repository, checkpoint = folder / "repository", folder / "checkpoint"
-    shutil.copytree(PLAIN.checkpoint, checkpoint)
+    repository, checkpoint = folder / "repository", shutil.copytree(SMALL.checkpoint, folder / "checkpoint")
     repository.mkdir()
     if os.geteuid() == 0:
         os.chown(repository, NOBODY, NOBODY)
-    folder.chmod(0o555)
+    export(tmp_path / "other")  # imports what nobody need be allowed to read
     try:
-        yield Mounted(repository, checkpoint)
+        with as_any_user(folder):
+            assert not os.access(folder, os.W_OK, effective_ids=True)
+            assert [export(repository, checkpoint=checkpoint) for _ in range(2)] == [1, 2]
     finally:
         folder.chmod(0o755)
-        shutil.rmtree(folder)
-
-
-@pytest.mark.slow
-def test_only_the_repository_must_be_writable(mounted: Mounted, tmp_path: Path) -> None:
-    repository, checkpoint = mounted.repository, mounted.checkpoint
-    export(tmp_path / "other")  # imports what nobody need be allowed to read
-    with mounted.as_user():
-        assert export(repository, checkpoint=checkpoint) == 1
-    with (
-        served(repository, tmp_path / "log") as server,
-        RepositoryApi(server.endpoints.grpc_url, KEY) as api,
-        mounted.as_user(),
-    ):
-        assert export(repository, checkpoint=checkpoint) == 2
-        rollout = Rollout(repository, "rfm", api, lambda line: None)
-        rollout.to(2)
-        assert api.ready_versions("rfm") == [2]
-        rollout.to(previous_version(repository, "rfm", api))
-        assert api.ready_versions("rfm") == [1]
     assert sorted(path.name for path in repository.iterdir()) == ["rfm"]
     assert sorted(path.name for path in (repository / "rfm").iterdir()) == ["1", "2", "config.pbtxt", "warmup"]
+    shutil.rmtree(folder)
 
 
-class LoadsAll(BriefServer):
-    """As an operator may run Triton without ``rfm serve``: each folder of the repository is a model."""
+# One `rfm export` after the other, each under a limit of file sizes, in a process of their own.
+IN_LITTLE_ROOM = """
+import io, json, resource, sys
+from contextlib import redirect_stderr
+from rfm_commands.cli import main
+checkpoint, repository, *rooms = sys.argv[1:]
+for room in map(int, rooms):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
+    sys.argv = ["rfm", "export", "--checkpoint", checkpoint, "--repository", repository]
+    status, errors = 0, io.StringIO()
+    try:
+        with redirect_stderr(errors):
+            main()
+    except SystemExit as ended:
+        status = ended.code
+    print(json.dumps([status, errors.getvalue()]))
+"""
 
-    mode = "none"
+
+def test_a_full_disk_is_told_and_changes_nothing(tmp_path: Path) -> None:
+    """Be it full at once, behind a small file, or in the middle of the weights."""
+    repository = tmp_path / "model_repository"
+    export(repository)
+    before = files_in(tmp_path)
+    rooms = (0, 100, (SMALL.checkpoint / WEIGHTS).stat().st_size // 2)
+    ended = subprocess.run(
+        [sys.executable, "-c", IN_LITTLE_ROOM, *map(str, (SMALL.checkpoint, repository, *rooms))],
+        check=True,
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=PATIENCE_S,
+    )
+    assert files_in(tmp_path) == before
+    assert not list(tmp_path.rglob(".*"))
+    told = [json.loads(line) for line in ended.stdout.splitlines()]
+    assert [status for status, _ in told] == [1] * len(rooms)
+    expected = (
+        r"rfm: .*/model_repository: expected room for the exported files, got: .*[Ff]ile too large.*; the versions that "
+        r"are served stay as they are; make room there, or name another --repository"
+    )
+    for _, errors in told:
+        assert re.fullmatch(expected, errors.splitlines()[-1]), errors
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda folder: folder.mkdir(0o555),
+            "that this user may change, got: Permission denied; --repository names an",
+        ),
+        (
+            lambda folder: folder.write_text(""),
+            "that this user may change, got: File exists; --repository names another",
+        ),
+        (lambda folder: shutil.copytree(REPOSITORY / "rfm", folder), "got a model of one: --repository ."),
+    ],
+    ids=["read-only", "a file", "a model"],
+)
+def test_an_export_into_what_takes_none_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Callable[[Path], object], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = Path("models")
+    make(folder)
+    with as_any_user(tmp_path), pytest.raises(ExportError, match=re.escape(message)), alone(folder):
+        raise AssertionError("it may be changed")
+
+
+@pytest.mark.parametrize("place", [".", "rfm", "another"])
+def test_two_exports_at_a_time_are_one_too_many_and_the_next_removes_what_a_killed_one_left(
+    tmp_path: Path, place: str
+) -> None:
+    repository = tmp_path / "model_repository"
+    for name in ("another", "rfm"):
+        export(repository, name)
+    left = repository / place / ".export-killed"
+    (left / "rfm").mkdir(parents=True)
+    descriptor = os.open(repository, os.O_RDONLY)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
+    try:
+        with pytest.raises(ExportError, match="model_repository: expected no other export or rollout at work, got one"):
+            export(repository)
+        assert left.exists()  # it may be the other's
+    finally:
+        os.close(descriptor)
+    assert export(repository) == 2
+    assert not left.exists()
+
+
+def check_loadable(repository: Path) -> None:
+    """Whatever Triton would load now is whole and fits together."""
+    configs = {path.parent.name: read_config(repository, path.parent.name) for path in repository.glob("[!.]*/*.pbtxt")}
+    assert configs.keys() == {path.name for path in repository.glob("[!.]*")}
+    served = {name: list(config.version_policy.specific.versions) for name, config in configs.items()}
+    for name, config in configs.items():
+        assert served[name]
+        assert all(any((repository / name / str(version)).iterdir()) for version in served[name])
+        for warmup in config.model_warmup:
+            for tensor in warmup.inputs.values():
+                assert tensor.zero_data or (repository / name / "warmup" / tensor.input_data_file).is_file()
+        for step in config.ensemble_scheduling.step:
+            assert step.model_version in served[step.model_name]
+
+
+class Killed(BaseException):
+    """In place of kill -9 between two operations on the file system."""
+
+
+@pytest.mark.parametrize("before", [0, 1], ids=["first export", "second export"])
+def test_an_export_that_dies_at_any_moment_leaves_a_repository_that_loads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: int
+) -> None:
+    died, survived = True, 0
+    exported = tmp_path / "exported"
+    exported.mkdir()
+    for _ in range(before):
+        export(exported, config=FRAMES)
+    while died:
+        repository = shutil.copytree(exported, tmp_path / str(survived) / "model_repository")
+        remaining = survived
+
+        def counted(original: Any, repository: Path = repository) -> Any:
+            def move(self: Path, target: Path) -> Path:
+                nonlocal remaining
+                if repository in Path(target).parents:
+                    if remaining == 0:
+                        raise Killed
+                    remaining -= 1
+                return Path(original(self, target))
+
+            return move
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "rename", counted(Path.rename))
+            patch.setattr(Path, "replace", counted(Path.replace))
+            try:
+                export(repository, config=FRAMES)
+                died = False
+            except Killed:
+                survived += 1
+        check_loadable(repository)
+    assert survived >= (3, 8)[before]  # three folders; and three versions, warm-up files, five configurations
+
+
+class Polls(BriefServer):
+    """As an operator may run Triton without ``rfm serve``: each folder of the repository is a model, also later."""
 
     def _arguments(self, models: Sequence[str]) -> list[str]:
         told = [argument for argument in super()._arguments(models) if not argument.startswith("--load-model")]
-        return [argument.replace("explicit", self.mode) for argument in told]
+        return [*(argument.replace("explicit", "poll") for argument in told), "--repository-poll-secs=1"]
 
 
-class Polls(LoadsAll):
-    mode = "poll"
-
-    def _arguments(self, models: Sequence[str]) -> list[str]:
-        return [*super()._arguments(models), "--repository-poll-secs=1"]  # it ends only when it has slept for so long
-
-
-@pytest.mark.parametrize("kind", [LoadsAll, Polls, BriefServer])
-def test_triton_does_not_see_what_is_staged(kind: type[TritonServer], tmp_path: Path) -> None:
+@pytest.mark.triton
+@pytest.mark.slow
+def test_triton_does_not_see_what_is_staged(tmp_path: Path) -> None:
     """Nor what an export left that was killed."""
     repository = tmp_path / "repository"
-    export(repository)
+    export(repository, config=PLAIN)
     with staging(repository, ["rfm"]) as scratch:
         shutil.copytree(repository / "rfm", scratch / "rfm", ignore=shutil.ignore_patterns(scratch.name))
         shutil.copy(repository / "rfm" / "config.pbtxt", scratch)
+        key = "a-key-that-only-tests-know"
         with (
-            served(repository, tmp_path / "log", kind) as server,
-            RepositoryApi(server.endpoints.grpc_url, KEY) as api,
+            (tmp_path / "log").open("wb") as log,
+            Polls(repository, Endpoints.free(), find_installation(), log=log, admin_key=key) as server,
+            RepositoryApi(server.endpoints.grpc_url, key) as api,
             RewardClient(server.endpoints.grpc_url) as client,
         ):
             assert [(entry.name, entry.version, entry.state) for entry in api.index()] == [("rfm", 1, "READY")]
             client.progress(random_trajectory(0, 3))
 
 
-def living(triton: int) -> list[int]:
-    """Processes of ``rfm``, as soon as those of one load alone are alive."""
-    deadline_s = time.monotonic() + PATIENCE_S
-    while len(found := model_processes(triton)) > 1:
-        assert time.monotonic() < deadline_s, found
-        time.sleep(POLL_S)
-    return found
-
-
-def test_an_export_changes_no_model_of_another_name(tmp_path: Path) -> None:
+@pytest.mark.triton
+def test_an_export_changes_no_model_of_another_name(served: Served) -> None:
     """One that is loaded again has the processes that it had, since its files are what they were."""
-    repository = tmp_path / "repository"
-    export(repository)
-    with served(repository, tmp_path / "log") as server, RepositoryApi(server.endpoints.grpc_url, KEY) as api:
-        api.load("rfm")  # the first load after the start is a new one anyway
-        before = living(server.pid)
-        export(repository, "another")
-        api.load("rfm")
-        assert living(server.pid) == before != []
+
+    def living() -> list[int]:
+        """As soon as those of one load alone are alive."""
+        wait_for(lambda: len(model_processes(served.server.pid, "kept")) == 1)
+        return model_processes(served.server.pid, "kept")
+
+    export(served.repository, "kept")
+    with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
+        for _ in range(2):  # the first load after the start is a new one anyway
+            api.load("kept")
+        before = living()
+        export(served.repository, "added")
+        api.load("kept")
+        assert living() == before
+        api.unload("kept")
 
 
-@pytest.mark.parametrize(
-    "place",
-    [
-        pytest.param(lambda repository: repository, id="of the first export"),
-        pytest.param(lambda repository: repository / "rfm", id="of a later one"),
-        pytest.param(lambda repository: repository / "another", id="of another name"),
-    ],
-)
-def test_the_next_export_removes_what_a_killed_one_left(place: Callable[[Path], Path], tmp_path: Path) -> None:
-    repository = tmp_path / "repository"
-    for name in ("another", "rfm"):
-        export(repository, name)
-    left = place(repository) / ".export-killed"
-    (left / "rfm").mkdir(parents=True)
-    export(repository)
-    assert not left.exists()
+@pytest.mark.triton
+def test_weights_that_have_changed_since_their_export_are_not_served(served: Served) -> None:
+    """Those of each version are compared with its own configuration: one for all tells the newest one's."""
+    export(served.repository, "changed")
+    folder = served.repository / "changed" / "1" / "checkpoint"
+    with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
+        other = copied(SMALL, served.repository.parent / "other")
+        weights(lambda tensors: tensors["video_proj.bias"].add_(1))(other)
+        export(served.repository, "changed", checkpoint=other)
+        config = served.repository / "changed" / "config.pbtxt"
+        config.write_text(config.read_text().replace("versions: 2", "versions: 1 versions: 2"))
+        api.load("changed")
+        assert api.ready_versions("changed") == [1, 2]
+        api.unload("changed")
+        api.wait_gone("changed")
+        content = bytearray((folder / WEIGHTS).read_bytes())
+        content[-2] ^= 1  # of one number, a little
+        (folder / WEIGHTS).write_bytes(content)
+        with pytest.raises(RepositoryApiError):
+            api.load("changed")
+        api.unload("changed")
+    log = (served.repository.parent / "tritonserver.log").read_text()
+    assert re.search(r"changed/1: expected the weights that were exported \(\w{16}\), got others", log)

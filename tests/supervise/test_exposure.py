@@ -1,73 +1,66 @@
 # SPDX-License-Identifier: MIT
-"""What others may reach of a server."""
+"""Where a server listens, and what others may reach of it."""
 
 from __future__ import annotations
 
 import os
+import socket
+import subprocess
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
+from rfm import proc
 from rfm.config import ConfigError, ServeConfig
-from rfm.launch.cleanup import REGION_PREFIX
+from rfm.launch import endpoints
+from rfm.launch.endpoints import PORTS, Endpoints, GrpcTls, check_version, free_ports
 from rfm.launch.installation import Installation, ServerStartError, find_installation
-from rfm.launch.listen_address import check_version
-from rfm.launch.process import Endpoints, TritonServer
-from rfm.launch.triton_options import MAX_HTTP_BYTES, size_limits
-from secured import (
-    Papers,
-    nothing_left_behind,
-    refused_to_serve,
-    regions_of,
-)
-
-pytestmark = [pytest.mark.triton, pytest.mark.slow]
-
-
-def test_the_backend_s_memory_has_a_name_that_newer_tritons_guard(secure: Endpoints) -> None:
-    """They refuse clients who would map what is called so. The name tells its server, too."""
-    assert REGION_PREFIX.startswith("triton_python_backend_shm_region_")
-    assert regions_of(os.getpid())
+from rfm.launch.process import TritonServer
+from rfm.supervise.status import NO_REASON, Status, StatusServer
+from rfm_serve import wait_for
+from secured import Papers, nothing_left_behind, refused_to_serve
 
 
 def test_the_wheel_s_triton_is_not_opened_to_others() -> None:
-    told = refused_to_serve("--host", "0.0.0.0")
+    *_, told = refused_to_serve("--host", "0.0.0.0").splitlines()
     assert told.startswith("rfm: host: expected a loopback address for Triton 2.51.0, which has known remote vulner")
     assert "--accept-known-vulnerabilities" in told
 
 
+@pytest.mark.triton
+@pytest.mark.slow
 def test_an_older_triton_that_listens_elsewhere_is_stopped(repository: Path, tmp_path: Path) -> None:
     """One whose version is known only when it answers: no wheel, as far as ``rfm serve`` can see."""
     wheel = find_installation()
-    assert wheel.wheel is not None
     program = tmp_path / "tritonserver"
     backends = " ".join(wheel.lay_out_backends(tmp_path / "backends"))
     program.write_text(f'#!/bin/sh\nexec {wheel.executable} {backends} "$@"\n')
     program.chmod(0o755)
-    endpoints = Endpoints.free()
-
-    class SeenFromElsewhere(TritonServer):
-        """Its address counts as open, but it listens on loopback."""
-
-        def _arguments(self, models: Any) -> list[str]:
-            return [argument.replace("192.0.2.1", "127.0.0.1") for argument in super()._arguments(models)]
+    free = Endpoints.free()
 
     class Open(Endpoints):
+        """Its address counts as open, but it listens on loopback."""
+
         @property
         def http_host(self) -> str:
             return "127.0.0.1"
 
-        def check_free(self) -> None:
-            endpoints.check_free()
+        def arguments(self) -> list[str]:
+            return free.arguments()
 
-    opened = Open("192.0.2.1", endpoints.http_port, endpoints.grpc_port, endpoints.metrics_port)
+        def check(self) -> None:
+            free.check()
+
+    opened = Open("192.0.2.1", free.http_port, free.grpc_port, free.metrics_port)
     installation = Installation(program, wheel.environment)
     with (
         nothing_left_behind(),
         (tmp_path / "log").open("wb") as log,
         pytest.raises(ServerStartError, match=r"host: expected a loopback address for Triton 2\.51\.0"),
-        SeenFromElsewhere(repository, opened, installation, log=log),
+        TritonServer(repository, opened, installation, log=log),
     ):
         raise AssertionError("it serves")
 
@@ -75,7 +68,6 @@ def test_an_older_triton_that_listens_elsewhere_is_stopped(repository: Path, tmp
 @pytest.mark.parametrize(
     ("host", "version", "accepted", "is_served"),
     [
-        ("127.0.0.1", "2.51.0", False, True),
         ("127.0.0.2", "2.51.0", False, True),
         ("localhost", "2.51.0", False, True),
         ("10.0.0.1", "2.51.0", True, True),
@@ -98,21 +90,85 @@ def test_which_triton_others_may_reach(host: str, version: str, accepted: bool, 
 
 
 def test_files_of_tls_are_read_before_anything_starts(papers: Papers) -> None:
-    told = refused_to_serve("--grpc-certificate", papers.certificate, "--grpc-key", papers.client_key)
-    assert told.startswith("rfm: grpc_certificate, grpc_key: expected a certificate and its key")
-    told = refused_to_serve(
-        "--grpc-certificate", papers.certificate, "--grpc-key", papers.key, "--grpc-client-ca", "/nowhere"
-    )
-    assert told.startswith("rfm: grpc_client_ca: expected certificates (PEM) at /nowhere, got: No such file")
+    with pytest.raises(ServerStartError, match=r"^grpc_certificate, grpc_key: expected a certificate and its key"):
+        GrpcTls(papers.certificate, papers.client_key).check()
+    with pytest.raises(
+        ServerStartError, match=r"^grpc_client_ca: expected certificates \(PEM\) at /nowhere, got: No su"
+    ):
+        GrpcTls(papers.certificate, papers.key, Path("/nowhere")).check()
     assert "expected both or none" in refused_to_serve("--grpc-key", papers.key)
-    assert "expected an option that rfm serve leaves open" in refused_to_serve("--", "--grpc-use-ssl=true")
     with pytest.raises(ConfigError, match="grpc_client_ca: expected with grpc_certificate and grpc_key"):
         ServeConfig(grpc_client_ca=papers.ca)
 
 
-def test_a_triton_that_can_limit_requests_is_told_to(tmp_path: Path) -> None:
-    knows = tmp_path / "tritonserver"
-    knows.write_bytes(b"\x00OPTION\x00http-max-input-size\x00")
-    assert size_limits(Installation(knows), []) == [f"--http-max-input-size={MAX_HTTP_BYTES}"]
-    assert size_limits(Installation(knows), ["--http-max-input-size=1"]) == []
-    assert size_limits(find_installation(), []) == []  # 2.51 has no such option, and would not start with it
+def test_http_beside_tls_listens_on_loopback_alone(papers: Papers) -> None:
+    tls = GrpcTls(papers.certificate, papers.key)
+    beside = Endpoints("10.0.0.1", 8000, 8001, 8002, tls)
+    assert {"--http-address=127.0.0.1", "--grpc-address=10.0.0.1"} <= set(beside.arguments())
+    assert "--grpc-use-ssl=true" in tls.arguments()
+    assert (beside.http_url, beside.grpc_url) == ("http://127.0.0.1:8000", "grpcs://10.0.0.1:8001")
+
+
+def test_ports_are_free_and_given_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = [port for _ in range(20) for port in free_ports(3)]
+    assert len(set(given)) == 60
+    assert set(given) <= set(PORTS)
+    with ExitStack() as stack:
+        for port in given:
+            stack.enter_context(socket.create_server(("127.0.0.1", port)))
+        (free,) = free_ports(1)
+        monkeypatch.setattr(
+            endpoints, "PORTS", range(min(free, given[0]), max(free, given[0]) + 1, abs(free - given[0]))
+        )
+        monkeypatch.setattr(endpoints, "_given", endpoints.deque())
+        assert free_ports(1) == [free]  # the other is taken
+        with pytest.raises(OSError, match="ports: expected 1 free ones in"):
+            free_ports(1)
+
+
+@pytest.mark.parametrize("has_lists", [True, False])
+def test_children_are_found_dead_or_alive(monkeypatch: pytest.MonkeyPatch, has_lists: bool) -> None:
+    if not has_lists:  # a kernel without CONFIG_PROC_CHILDREN
+        monkeypatch.setattr(Path, "exists", lambda *_: False)
+    children = [subprocess.Popen(["sleep", "3600"]) for _ in range(2)]
+    try:
+        children[0].kill()
+        wait_for(lambda: (stat := proc.stat_of(children[0].pid)) is not None and stat.state == proc.ZOMBIE)
+        assert {child.pid for child in children} <= set(proc.children_of(os.getpid()))
+        assert os.getppid() not in proc.children_of(os.getpid())
+    finally:
+        for child in children:
+            child.kill()
+            child.wait()
+    assert not {child.pid for child in children} & set(proc.children_of(os.getpid()))
+
+
+@pytest.mark.slow
+def test_a_silent_connection_to_the_status_port_is_cut() -> None:
+    port = Endpoints.free().http_port
+    with closing(StatusServer("127.0.0.1", port, Status())), socket.create_connection(("127.0.0.1", port)) as silent:
+        silent.send(b"G")
+        assert silent.recv(1) == b""
+        assert httpx.get(f"http://127.0.0.1:{port}/live").status_code == 200
+
+
+def told(about: Status) -> dict[str, Any]:
+    """What the metrics tell of models, by their name and labels."""
+    lines = [line for line in about.metrics().decode().splitlines() if line.startswith("rfm_serve_")]
+    return {name: float(value) for name, value in (line.rsplit(" ", 1) for line in lines) if "ready" in name}
+
+
+def test_the_status_tells_nothing_of_what_there_was() -> None:
+    about = Status()
+    about.record({"a": NO_REASON, "b": NO_REASON, "a_frames": NO_REASON})
+    about.record({"a": NO_REASON, "a_frames": NO_REASON})
+    assert told(about) == {'rfm_serve_ready{model="a"}': 1, 'rfm_serve_ready{model="a_frames"}': 1}
+    about.record_down("restarted")
+    about.record({"a": "it is loaded", "a_frames": NO_REASON})
+    assert told(about) == {
+        'rfm_serve_ready{model="a"}': 0,
+        'rfm_serve_ready{model="a_frames"}': 1,
+        'rfm_serve_not_ready{model="a",reason="it is loaded"}': 1,
+    }
+    about.record_down("restarted")
+    assert about.ready[1]["models"]["a_frames"] == {"ready": False, "reason": "restarted"}

@@ -43,9 +43,6 @@ DEADLINE_S = 20.0
 POLL_S = 0.02
 
 
-LARGE_BYTES = 5 * 2**20
-
-
 WAITS_AT_IMPORT = """
 import time, pathlib
 pathlib.Path({begun!r}).touch()
@@ -114,16 +111,20 @@ def test_callers_are_answered_while_another_model_loads(running: Running, tmp_pa
     running.models("unload", "held")
 
 
-def test_a_large_configuration_is_loaded_and_told(running: Running) -> None:
-    """Larger than gRPC's own limit of a message, 4 MiB."""
-    export_plain(running.repository, "large")
-    with RepositoryApi(running.endpoints.grpc_url, KEY) as server:
-        server.load("large")
-        config = server.config("large", 1)
-        config["parameters"]["padding"] = {"string_value": "x" * LARGE_BYTES}
-        server.load("large", config)
-        assert len(server.config("large", 1)["parameters"]["padding"]["string_value"]) == LARGE_BYTES
-        server.unload("large")
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        pytest.param(("rollout", "nobody", "1"), ", got nobody", id="name"),
+        pytest.param(
+            ("rollout", NAME, "77"), "rfm version 77: expected an exported version, got [Errno 2]", id="version"
+        ),
+        pytest.param(("load", "nobody"), ", got nobody", id="load"),
+    ],
+)
+def test_what_is_not_there_is_told_and_nothing_changes(running: Running, words: tuple[str, ...], message: str) -> None:
+    before = running.models("list")
+    assert message in running.refused(*words)
+    assert running.models("list") == before
 
 
 @pytest.mark.parametrize(

@@ -26,8 +26,8 @@ from gateways import answers, poll
 from paths import ROOT
 from rfm.config import ExportConfig
 from rfm.launch import installation
+from rfm.launch.endpoints import free_ports
 from rfm.launch.installation import ServerStartError, find_installation
-from rfm.launch.ports import free_ports
 from rfm.launch.process import Endpoints, TritonServer
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_serve import children, serving, wait_for
@@ -209,7 +209,7 @@ def test_a_folder_without_models_is_refused_with_the_one_that_was_meant(
     shutil.copytree(REPOSITORY / "rfm/1/checkpoint", tmp_path / "checkpoint")
     folder = tmp_path / below
     with pytest.raises(ServerStartError) as refused:
-        TritonServer(folder, Endpoints.free(), find_installation()).start()
+        TritonServer(folder, Endpoints.free(), find_installation()).start_ready()
     got = f"repository: expected a folder of models, got {folder}, {remedy}"
     assert str(refused.value) == got.format(folder=folder, root=tmp_path)
 
@@ -258,7 +258,7 @@ def test_a_program_that_cannot_run_is_named(tmp_path: Path) -> None:
     program.chmod(0o755)
     server = TritonServer(REPOSITORY, Endpoints.free(), find_installation(program))
     with pytest.raises(ServerStartError, match=r"tritonserver: expected a program at .*tritonserver, got: Exec format"):
-        server.start()
+        server.start_ready()
 
 
 def test_a_known_vulnerable_triton_on_an_open_address_is_warned_of() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import sys
-from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +18,6 @@ import torch
 
 from rfm.execution import Execution
 from rfm.triton_model.batch_model import BatchModel
-from rfm.triton_model.metrics import Counted
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,
@@ -106,11 +104,9 @@ class Model(BatchModel[Sample, Result]):
 
     def __init__(self, folder: Path, warmups: int = 0, settings: Mapping[str, str] = MappingProxyType({})) -> None:
         MODELS.append(self)
-        self.counted: list[Counted] = []
         self.batches: list[int] = []
-        self.logged: list[str] = []
         parameters = {name: {"string_value": value} for name, value in {"torch_threads": "1", **settings}.items()}
-        config = CONFIG | {"parameters": parameters, "model_warmup": [{"count": 1}] * warmups}
+        config = CONFIG | {"parameters": parameters, "model_warmup": [{"count": 0}] * warmups}
         self.initialize(
             {
                 "model_config": json.dumps(config),
@@ -121,11 +117,6 @@ class Model(BatchModel[Sample, Result]):
                 "model_instance_kind": "CPU",
                 "model_instance_device_id": "0",
             }
-        )
-        self._metrics = SimpleNamespace(add=self.counted.append, close=lambda: None)  # type: ignore[assignment]
-        self._log = SimpleNamespace(  # type: ignore[assignment]
-            report=lambda request: self.logged.append(str(request.error)),
-            report_batch=lambda batch, error: self.logged.append(f"{len(batch)}: {error}"),
         )
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
@@ -163,9 +154,51 @@ class Model(BatchModel[Sample, Result]):
     def encode(self, answers: Sequence[Result], tensors: wire.Tensors, outputs: Collection[str]) -> wire.Tensors:
         return wire.encode_results(answers, wire.num_positions(tensors), outputs)
 
+    def told(self, name: str) -> dict[tuple[str, ...], float]:
+        """What Triton was told of a metric, by the labels that do not name the instance."""
+        self.finalize()
+        own = {"model", "version", "device", "instance"}
+        return {
+            tuple(value for label, value in metric.labels.items() if label not in own): metric.value
+            for metric in METRICS
+            if metric.name == f"rfm_{name}" and metric.value
+        }
+
     @property
-    def samples(self) -> Counter[tuple[str, str]]:
-        return sum((counted.samples for counted in self.counted), Counter())
+    def samples(self) -> dict[tuple[str, ...], float]:
+        return self.told("samples_total")
+
+
+@dataclass
+class Metric:
+    """Triton's: a counter, a gauge, or the sum of a histogram."""
+
+    name: str
+    labels: dict[str, str]
+    value: float = 0.0
+
+    def increment(self, by: float) -> None:
+        self.value += by
+
+    observe = increment
+
+    def set(self, value: float) -> None:
+        self.value = value
+
+
+class MetricFamily:
+    COUNTER, GAUGE, HISTOGRAM = range(3)
+
+    def __init__(self, name: str, description: str, kind: int) -> None:
+        self.name = name
+
+    def Metric(self, labels: dict[str, str], buckets: Sequence[float] = ()) -> Metric:  # noqa: N802  Triton's word
+        METRICS.append(Metric(self.name, dict(labels)))
+        return METRICS[-1]
+
+
+METRICS: list[Metric] = []
+LOGGED: list[dict[str, Any]] = []
 
 
 @pytest.fixture(autouse=True)
@@ -173,20 +206,27 @@ def backend(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     def error_of(message: str, code: str) -> tuple[str, str]:
         return code, message
 
-    codes = {"INVALID_ARG": "invalid", "INTERNAL": "internal", "CANCELLED": "cancelled", "UNAVAILABLE": "unavailable"}
+    codes = {"INVALID_ARG": "invalid", "INTERNAL": "internal", "CANCELLED": "cancelled"}
     for name, code in codes.items():
         setattr(error_of, name, code)
+
+    def log(line: str) -> None:
+        LOGGED.append(json.loads(line))
+
     module = SimpleNamespace(
         InferenceResponse=Response,
         TritonError=error_of,
         Tensor=lambda name, array: (name, array.tolist()),
         TRITONSERVER_RESPONSE_COMPLETE_FINAL=FINAL,
-        Logger=SimpleNamespace(log_error=print, log_info=print, log_verbose=print),
+        Logger=SimpleNamespace(log_error=log, log_info=log, log_verbose=log),
+        MetricFamily=MetricFamily,
     )
     monkeypatch.setitem(sys.modules, "triton_python_backend_utils", module)  # type: ignore[arg-type]
     yield
     while MODELS:
         MODELS.pop().finalize()
+    METRICS.clear()
+    LOGGED.clear()
 
 
 def request(*num_frames: int, **more: Any) -> Request:

@@ -16,7 +16,7 @@ from pathlib import Path
 import requests
 from prometheus_client.parser import text_string_to_metric_families
 
-from rfm.launch.ports import free_ports
+from rfm.launch.endpoints import free_ports
 from rfm.launch.process import Endpoints
 from rfm_client import (
     RewardClient,

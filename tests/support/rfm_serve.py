@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -126,4 +125,3 @@ def serving(repository: Path, *more: str) -> Iterator[Serving]:
             process.terminate()
         process.wait(PATIENCE_S)
     assert not list(SHARED_MEMORY.glob(f"*_rfm_{process.pid}_*"))
-    assert not list(Path(tempfile.gettempdir()).glob(f"rfm-backends-{process.pid}-*"))

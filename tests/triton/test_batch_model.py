@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 import torch
 
-from batch_models import BREAKS, CONFIG, FAILS, REFUSED, WIDTHS, Model, Request, backend, request  # noqa: F401  a fixture
+from batch_models import BREAKS, CONFIG, FAILS, LOGGED, METRICS, REFUSED, WIDTHS, Model, Request, backend, request  # noqa: F401  a fixture
 from rfm.execution import Execution
 from rfm.probe import blank_question
 from rfm.triton_model import batch_model
 from rfm.triton_model.batch_model import GIVEN_UP_S
+from rfm.triton_model.guard import FAILED_BATCHES, Guard
 from rfm.triton_model.placement import Placement, use_threads
 from rfm_client import (
     FrameScores,
@@ -35,6 +36,8 @@ from rfm_client.contract.names import PROBE_PREFIX
 from rfm_serve import PATIENCE_S
 from trajectories import random_trajectory
 
+REASON = "scoring failed; the server's log has the reason"
+
 
 def test_requests_are_answered_together_and_each_gets_its_own(tmp_path: Path) -> None:
     model = Model(tmp_path)
@@ -46,50 +49,84 @@ def test_requests_are_answered_together_and_each_gets_its_own(tmp_path: Path) ->
     assert (name, five, one) == ("progress", [5] * 5, 1)
     assert np.isnan(padding).all()
     assert tensors[2] == [("progress", [[6] * 6])]
-    (counted,) = model.counted
-    assert counted.samples == {("progress", "scored"): 4}
-    assert (counted.num_frames, counted.num_executed) == (1 + 5 + 1 + 6, 4)
-    assert model.logged == []
+    assert model.samples == {("progress", "scored"): 4}
+    assert model.told("frames_total") == {(): 1 + 5 + 1 + 6}
+    assert LOGGED == []
 
 
 def test_refused_and_failed_requests_fail_alone(tmp_path: Path) -> None:
+    """As one does whose tensors cannot be had, or read."""
     model = Model(tmp_path)
     unreadable = Request(request(1).tensors | {"num_frames": np.zeros((1, 2), np.int32)})
-    responses = model.respond([request(REFUSED), request(1), request(FAILS), unreadable, request(1, REFUSED)])
+    responses = model.respond(
+        [request(REFUSED), request(1), request(FAILS), unreadable, request(1, REFUSED), Request({})]
+    )
     assert [response.error for response in responses] == [
         ("invalid", "num_frames: expected others, got these"),
         None,
         ("internal", "failed"),
         ("invalid", "num_frames: expected [at least 1, 0] for progress, got [0, 0]"),
         ("invalid", "samples[1].num_frames: expected others, got these"),
+        ("internal", REASON),
     ]
-    assert model.batches == [5]  # one request of five cannot be read, another has two samples
+    assert model.batches == [5]  # two requests cannot be read, another has two samples
     assert model.samples == {
-        ("progress", "refused"): 3, ("progress", "scored"): 1, ("progress", "failed"): 1, ("unknown", "refused"): 1,
+        ("progress", "refused"): 3, ("progress", "scored"): 1, ("progress", "failed"): 1,
+        ("unknown", "refused"): 1, ("unknown", "failed"): 1,
     }  # fmt: skip
-    assert sum(counted.num_frames for counted in model.counted) == 1  # frames of what was scored
-    assert sum(counted.num_executed for counted in model.counted) == 5
-    assert len(model.logged) == 4
+    assert model.told("frames_total") == {(): 1}  # of what was scored
+    assert [entry["event"] for entry in LOGGED].count("request_refused") == 3
+    assert [entry["event"] for entry in LOGGED].count("request_failed") == 2
 
 
-def test_a_request_whose_tensors_cannot_be_had_is_one_that_failed(tmp_path: Path) -> None:
-    model = Model(tmp_path)
-    lost, other = model.respond([Request({}), request(1)])
-    assert lost.error == ("internal", "scoring failed; the server's log has the reason")
-    assert other.error is None
+def test_a_question_that_cannot_be_prepared_is_refused_with_its_place(tmp_path: Path) -> None:
+    class Picky(Model):
+        def prepare(self, question: Sample) -> tuple[Any, int]:
+            if question.trajectories[0].num_frames == 7:
+                raise InvalidSampleError.at("num_frames", "another", "7")
+            return super().prepare(question)
+
+    model = Picky(tmp_path)
+    outcomes = [response.error for response in model.respond([request(7), request(1, 7), request(5)])]
+    expected = ("num_frames: expected another, got 7", "samples[1].num_frames: expected another, got 7")
+    assert outcomes == [("invalid", expected[0]), ("invalid", expected[1]), None]
     assert model.batches == [1]
-    assert model.samples == {("unknown", "failed"): 1, ("progress", "scored"): 1}
 
 
 def test_a_request_that_breaks_a_batch_is_found(tmp_path: Path) -> None:
     model = Model(tmp_path)
-    responses = model.respond([request(1), request(BREAKS), request(5)])
-    assert [response.error for response in responses] == [
-        None, ("internal", "scoring failed; the server's log has the reason"), None,
-    ]  # fmt: skip
+    responses = model.respond([request(1, id="a"), request(BREAKS, id="b"), request(5, id="c")])
+    assert [response.error for response in responses] == [None, ("internal", REASON), None]
     assert model.batches == [3, 1, 1, 1]
-    assert model.logged == ["3: made up", "scoring failed; the server's log has the reason"]
+    together, alone = LOGGED
+    assert (together["event"], together["request_ids"]) == ("batch_failed", ["a", "b", "c"])
+    assert (alone["event"], alone["request_id"], alone["error"]) == ("request_failed", "b", REASON)
+    assert "RuntimeError: made up" in alone["traceback"]
     assert model.samples == {("progress", "scored"): 2, ("progress", "failed"): 1}
+
+
+def test_answers_that_cannot_be_written_fail_alone(tmp_path: Path) -> None:
+    class Large(Model):
+        def encode(self, answers: Sequence[Result], tensors: wire.Tensors, outputs: Collection[str]) -> wire.Tensors:
+            if len(answers) == 2:
+                raise MemoryError
+            return super().encode(answers, tensors, outputs)
+
+    model = Large(tmp_path)
+    good, bad = model.respond([request(1), request(5, 6)])
+    assert (good.error, bad.error) == (None, ("internal", REASON))
+    assert model.samples == {("progress", "scored"): 1, ("progress", "failed"): 2}
+
+
+def test_a_log_that_cannot_be_written_costs_no_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(line: str) -> None:
+        raise OSError("no space")
+
+    model = Model(tmp_path)
+    monkeypatch.setattr("triton_python_backend_utils.Logger.log_error", full)
+    responses = model.respond([request(1), request(BREAKS)])
+    assert [response.error for response in responses] == [None, ("internal", REASON)]
+    assert model.samples == {("progress", "scored"): 1, ("progress", "failed"): 1}
 
 
 def test_behind_a_batch_that_took_long_a_cancelled_request_is_not_scored(tmp_path: Path) -> None:
@@ -105,84 +142,136 @@ def test_behind_a_batch_that_took_long_a_cancelled_request_is_not_scored(tmp_pat
     cancelled, scored = model.respond([request(5, is_given_up=True), request(6)])
     assert cancelled.error == ("cancelled", "cancelled by the client")
     assert scored.error is None
+    (scored,) = model.respond([request(5, is_given_up=True)])  # nobody asks Triton behind a short batch
+    assert scored.error is None
     assert model.samples[("progress", "cancelled")] == 1
 
 
 def test_warm_ups_and_probes_are_not_counted(tmp_path: Path) -> None:
     model = Model(tmp_path, warmups=2)
     blank = Request(blank_question(CONFIG), id=f"{PROBE_PREFIX}-rfm")
-    model.respond([request(1), request(5), blank])
-    assert model.samples == {}
-    model.respond([request(1), request(1, id="caller")])
-    assert model.samples == {("progress", "scored"): 2}
-
-
-def test_a_caller_is_no_warm_up(tmp_path: Path) -> None:
-    model = Model(tmp_path, warmups=1)
-    model.respond([request(1, id="caller")])
+    model.respond([request(1), request(5), blank, request(1, id="caller")])
     assert model.samples == {("progress", "scored"): 1}
-
-
-def test_metrics_know_what_a_model_can_be_asked_about() -> None:
-    assert batch_model._sample_types(["frames", "sample_type"]) == ["progress", "preference", "similarity"]
-    assert batch_model._sample_types(["frames", "task"]) == ["encode"]
-
-
-def test_metrics_know_the_checkpoint() -> None:
-    settings = {"source": "org/name", "network": '{"class": "Rewind"}'}
-    told = batch_model._checkpoint(settings)
-    assert told["network"] == "Rewind"
-    assert "" in told.values()
-    assert batch_model._checkpoint({})["network"] == ""
+    model.respond([request(1), request(1, id="caller")])
+    assert model.samples == {("progress", "scored"): 3}
 
 
 def test_pairs_are_counted_with_all_their_frames(tmp_path: Path) -> None:
-    model = Model(tmp_path)
-    first, second = random_trajectory(0, 5, *WIDTHS), random_trajectory(1, 7, *WIDTHS)
-    score = FrameScores(progress=np.ones(1, np.float32), success=np.ones(1, np.float32))
-    model.encode = lambda answers, tensors, outputs: {"progress": score.progress}  # type: ignore[method-assign]
-    model.respond([Request(wire.encode_samples([PreferenceSample(first, second)]))])
-    (counted,) = model.counted
-    assert counted.samples == {("preference", "scored"): 1}
-    assert counted.num_frames == 12
+    class Pairs(Model):
+        def encode(self, answers: Sequence[Result], tensors: wire.Tensors, outputs: Collection[str]) -> wire.Tensors:
+            return {"progress": FrameScores(progress=np.ones(1, np.float32), success=np.ones(1, np.float32)).progress}
+
+    model = Pairs(tmp_path)
+    pair = PreferenceSample(random_trajectory(0, 5, *WIDTHS), random_trajectory(1, 7, *WIDTHS))
+    model.respond([Request(wire.encode_samples([pair]))])
+    assert model.samples == {("preference", "scored"): 1}
+    assert model.told("frames_total") == {(): 12}
+
+
+def test_what_an_execution_took_is_told(tmp_path: Path) -> None:
+    class Working(Model):
+        def answer(self, questions: Sequence[Sample], execution: Execution) -> list[Result | RewardError]:
+            execution.collate_s, execution.forward_s = 0.25, 0.5
+            execution.add_tokens(6, 8)
+            execution.num_encoded, execution.num_found, execution.cache_bytes = 3, 2, 1000
+            execution.out_of_memory_count = 1
+            execution.on_forward()
+            return super().answer(questions, execution)
+
+    model = Working(tmp_path)
+    model.respond([request(1), request(5, 6)])
+    model.respond([Request(blank_question(CONFIG), id=PROBE_PREFIX)])
+    model.finalize()
+    told = {metric.name: metric.value for metric in METRICS if metric.value and metric.name != "rfm_samples_total"}
+    assert told == {
+        "rfm_frames_total": 12, "rfm_out_of_memory_retries_total": 2, "rfm_frames_encoded_total": 6,
+        "rfm_feature_cache_hits_total": 4, "rfm_feature_cache_misses_total": 6, "rfm_feature_cache_bytes": 1000,
+        "rfm_forward_passes_total": 4, "rfm_batch_samples": 3, "rfm_batch_padding_ratio": 0.25,
+        "rfm_collate_seconds": 0.25, "rfm_forward_seconds": 0.5,
+    }  # fmt: skip
+
+
+def test_metrics_know_the_checkpoint_and_what_can_be_asked(tmp_path: Path) -> None:
+    Model(tmp_path, settings={"source": "org/name", "network": '{"class": "Rewind"}'})
+    (told,) = (metric for metric in METRICS if metric.name == "rfm_checkpoint_info")
+    assert told.value == 1
+    assert told.labels == {
+        "model": "rfm", "version": "1", "source": "org/name", "revision": "", "weights_digest": "", "network": "Rewind",
+    }  # fmt: skip
+    kinds = {metric.labels["sample_type"] for metric in METRICS if metric.name == "rfm_samples_total"}
+    assert kinds == {"progress", "preference", "similarity", "unknown"}
 
 
 @pytest.mark.parametrize(
-    "error", [None, InvalidSampleError("made up"), InferenceFailedError("no memory"), RuntimeError]
+    ("outcome", "is_broken"),
+    [
+        (None, False),
+        (InvalidSampleError("made up"), False),
+        (InferenceFailedError("no memory"), False),
+        (RuntimeError, True),
+    ],
 )
-def test_only_an_exception_at_the_blank_sample_says_that_an_instance_is_broken(
-    tmp_path: Path, error: Exception | type[Exception] | None
+def test_an_instance_that_raises_at_the_blank_sample_after_failed_batches_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, outcome: Any, is_broken: bool
 ) -> None:
     """A checkpoint may refuse blank frames, and memory may be short for a moment; a lost device raises."""
+    ended: list[str] = []
+    monkeypatch.setattr("rfm.triton_model.guard.end", ended.append)
 
     class Blank(Model):
+        has_warmed_up = False
+
         def answer(self, questions: Sequence[Sample], execution: Execution) -> list[Result | RewardError]:
-            if error is RuntimeError:
+            if not self.has_warmed_up:
+                self.has_warmed_up = True
+                return super().answer(questions, execution)
+            if outcome is RuntimeError or len(questions[0].trajectories[0].positions) == BREAKS:
                 raise RuntimeError("CUDA error")
             score = np.zeros(questions[0].trajectories[0].num_frames, np.float32)
-            return [error if isinstance(error, RewardError) else ProgressResult(progress=score, success=score)]
+            return [outcome or ProgressResult(progress=score, success=score)]
 
-    model = Blank(tmp_path)
-    if error is RuntimeError:
-        with pytest.raises(RuntimeError, match="CUDA error"):
-            model._score_blank()
-    else:
-        model._score_blank()
+    model = Blank(tmp_path, warmups=1)
+    model.respond([request(1)])
+    for _ in range(FAILED_BATCHES):
+        assert ended == []
+        model.respond([request(BREAKS)])
+    assert bool(ended) is is_broken
 
 
-def test_answers_that_cannot_be_written_fail_alone(tmp_path: Path) -> None:
-    model = Model(tmp_path)
-    encode = model.encode
+def test_requests_are_scored_in_the_thread_that_calls_execute_and_the_guard_knows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Warm-ups, too: else OpenMP has two teams of threads."""
+    threads = []
 
-    def encode_most(answers: Sequence[Result], tensors: wire.Tensors, outputs: Collection[str]) -> wire.Tensors:
-        if len(answers) == 2:
-            raise MemoryError
-        return encode(answers, tensors, outputs)
+    class Watched(Model):
+        def answer(self, questions: Sequence[Sample], execution: Execution) -> list[Result | RewardError]:
+            threads.append(threading.current_thread())
+            assert is_working()
+            return super().answer(questions, execution)
 
-    model.encode = encode_most  # type: ignore[method-assign]  # one request of two samples cannot be written
-    good, bad = model.respond([request(1), request(5, 6)])
-    assert (good.error, bad.error) == (None, ("internal", "scoring failed; the server's log has the reason"))
-    assert model.samples == {("progress", "scored"): 1, ("progress", "failed"): 2}
+    guards: list[Callable[[], bool]] = []
+
+    class WatchedGuard(Guard):
+        def __init__(self, hang_s: float, is_working: Callable[[], bool]) -> None:
+            guards.append(is_working)
+            super().__init__(hang_s, is_working)
+
+    monkeypatch.setattr(batch_model, "Guard", WatchedGuard)
+    model = Watched(tmp_path, warmups=1)
+    (is_working,) = guards
+    for requests in ([request(1)], [request(5), request(6)]):
+        assert not is_working()
+        model.execute(requests)
+    assert not is_working()
+    assert threads == [threading.current_thread()] * 2
+
+
+@pytest.mark.parametrize("parameter", ["max_queue_size", "queue_timeout_ms"])
+def test_an_older_export_s_bound_of_the_queue_is_ignored_with_a_note(tmp_path: Path, parameter: str) -> None:
+    model = Model(tmp_path, settings={parameter: "1"})
+    assert "of an older export have no effect: export again" in LOGGED[0]["note"]
+    assert [response.error for response in model.respond([request(1), request(5)])] == [None, None]
 
 
 @pytest.mark.parametrize(("kind", "gpus"), [("CPU", []), ("GPU", [0, 1, 2, 3])])
@@ -193,6 +282,7 @@ def test_the_cores_of_a_machine_are_shared_among_the_instances(
     args = {"model_instance_kind": kind, "model_instance_device_id": "3"}
     config = {"instance_group": [{"count": 2, "gpus": gpus}]}
     placement = Placement.of(args, config, {"torch_threads": "0"})
+    assert placement.device == (torch.device("cuda", 3) if gpus else torch.device("cpu"))
     assert placement.num_threads == (2 if gpus else 8)
     assert placement.num_preparing == (2 if gpus else 1)
     assert Placement.of(args, config, {"torch_threads": "5"}).num_threads == 5
@@ -215,12 +305,6 @@ def test_what_is_loaded_is_computed_in_a_thread_that_ends() -> None:
     assert not thread.is_alive()
     assert num_threads == 3
     assert torch.get_num_threads() == 1  # the calling thread starts no team of its own
-
-    def broken() -> None:
-        raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        placement.run(broken)
     with pytest.raises(RuntimeError, match="positive"):  # PyTorch's own words, not those of a pool of threads
         Placement(torch.device("cpu"), num_threads=0).run(lambda: None)
 
@@ -241,28 +325,3 @@ def test_a_thread_computes_with_its_own_number_of_threads_whatever_others_set() 
         pool.submit(use_threads, 2).result()
         may_look.set()
         assert seen.result() == 3
-
-
-def test_requests_are_scored_in_the_thread_that_calls_execute(tmp_path: Path) -> None:
-    """Warm-ups, too: else OpenMP has two teams of threads."""
-    model = Model(tmp_path, warmups=1)
-    threads = []
-    answer = model.answer
-
-    def watched(questions: Sequence[Sample], execution: Execution) -> Any:
-        threads.append(threading.current_thread())
-        return answer(questions, execution)
-
-    model.answer = watched  # type: ignore[method-assign]
-    model.execute([request(1)])
-    model.execute([request(5), request(6)])
-    assert threads == [threading.current_thread()] * 2
-
-
-@pytest.mark.parametrize("parameter", ["max_queue_size", "queue_timeout_ms"])
-def test_an_older_export_s_bound_of_the_queue_is_ignored_with_a_note(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], parameter: str
-) -> None:
-    model = Model(tmp_path, settings={parameter: "1"})
-    assert "of an older export have no effect: export again" in capsys.readouterr().out
-    assert [response.error for response in model.respond([request(1), request(5)])] == [None, None]

@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,6 @@ import pytest
 
 from batch_models import BREAKS, CONFIG, MODELS, REFUSED, Model, Request, backend, request  # noqa: F401  a fixture
 from rfm.execution import Execution
-from rfm.triton_model.pipeline import Pipeline, Stages
 from rfm_client import Result, RewardError, Sample
 from rfm_serve import PATIENCE_S, wait_for
 
@@ -64,11 +64,6 @@ class Ahead(Model):
     def open(self, *requests: Request) -> None:
         self.may_answer.set()
         wait_for(lambda: all(len(request.responses) == 1 for request in requests))
-
-    @property
-    def pipeline(self) -> Pipeline[Any, Any]:
-        assert self._pipeline is not None
-        return self._pipeline
 
 
 def test_a_lone_request_on_an_idle_model_is_answered_by_execute(tmp_path: Path) -> None:
@@ -179,24 +174,26 @@ def _all_may_answer() -> Iterator[None]:
         model.may_answer.set()  # type: ignore[attr-defined]
 
 
-@dataclass(eq=False)
-class Job:
-    num_samples: int = 1
-    num_tokens: int = 1
+BROKEN = """
+import sys
+from types import SimpleNamespace
+import torch
+from rfm.triton_model.pipeline import Pipeline
+from rfm.triton_model.placement import Placement
+def broken(_):
+    raise SystemError("made up")
+stages = {"score": lambda batch: batch, "reply": broken, sys.argv[1]: broken}
+pipeline = Pipeline(print, stages["score"], stages["reply"], Placement(torch.device("cpu"), 1), 8, 8)
+pipeline.put([SimpleNamespace(num_samples=1, num_tokens=1)] * 2)
+pipeline.close()
+"""
 
 
 @pytest.mark.parametrize("stage", ["score", "reply"])
-def test_a_stage_that_breaks_is_told(stage: str) -> None:
-    """The model process ends then: nothing would be answered any more."""
-    told = threading.Event()
-
-    def broken(*_: object) -> None:
-        raise SystemError
-
-    def scored(batch: list[Job]) -> list[Job]:
-        return batch
-
-    score = broken if stage == "score" else scored
-    pipeline = Pipeline(Stages(lambda job: None, score, broken, fail=told.set), MAX_BATCH, MAX_BATCH)  # type: ignore[arg-type]
-    pipeline.put([Job(), Job()])
-    assert told.wait(PATIENCE_S)
+def test_a_pipeline_that_breaks_ends_the_process(stage: str) -> None:
+    """Nothing would be answered any more."""
+    command = [sys.executable, "-c", BROKEN, stage]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    assert ended.returncode == 1
+    assert "SystemError: made up" in ended.stderr
+    assert "rfm: the model process ends: its pipeline has failed" in ended.stderr

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: MIT
+"""Where a Triton listens, with which certificates, and which Triton may where others can reach it."""
+
+from __future__ import annotations
+
+import random
+import re
+import socket
+from collections import deque
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+from rfm.config import DEFAULT_HOST, ServeConfig
+from rfm.launch.installation import ServerStartError
+from rfm_client.contract.addresses import check_authorities, check_certificate, is_loopback
+from rfm_client.contract.listening import check_free, in_url
+
+PORTS = range(20_000, 32_000)  # Linux gives the higher ones to connections that go out, while a server still loads
+# NVIDIA's container 26.07. Earlier ones can be crashed, or taken over, by whoever reaches them: docs/security.md
+SECURITY_FLOOR = (2, 71)
+
+_given: deque[int] = deque(maxlen=256)  # ports of late: their servers may not listen yet
+
+
+@dataclass(frozen=True)
+class GrpcTls:
+    """Files (PEM) that Triton serves gRPC with. client_ca: who may vouch for clients, which then need a certificate"""
+
+    certificate: Path
+    key: Path
+    client_ca: Path | None = None
+
+    def check(self) -> None:
+        """Raises ServerStartError for files that Triton could not serve with."""
+        try:
+            check_certificate(self.certificate, self.key, "grpc_certificate, grpc_key")
+            if self.client_ca is not None:
+                check_authorities(self.client_ca, "grpc_client_ca")
+        except ValueError as error:
+            raise ServerStartError(str(error)) from None
+
+    def arguments(self) -> list[str]:
+        """Arguments of tritonserver that encrypt its gRPC port."""
+        files = [f"--grpc-server-cert={self.certificate}", f"--grpc-server-key={self.key}"]
+        if self.client_ca is None:
+            return ["--grpc-use-ssl=true", *files]
+        return ["--grpc-use-ssl-mutual=true", *files, f"--grpc-root-cert={self.client_ca}"]
+
+
+@dataclass(frozen=True)
+class Endpoints:
+    """Addresses of one server. grpc_tls: gRPC is encrypted; HTTP cannot be, and then listens on 127.0.0.1 alone"""
+
+    host: str = DEFAULT_HOST
+    http_port: int = 8000
+    grpc_port: int = 8001
+    metrics_port: int = 8002
+    grpc_tls: GrpcTls | None = None
+
+    @classmethod
+    def of(cls, config: ServeConfig) -> Endpoints:
+        """The endpoints that a configuration names."""
+        tls = None
+        if config.grpc_certificate is not None and config.grpc_key is not None:
+            tls = GrpcTls(config.grpc_certificate, config.grpc_key, config.grpc_client_ca)
+        return cls(config.host, config.http_port, config.grpc_port, config.metrics_port, tls)
+
+    @classmethod
+    def free(cls) -> Endpoints:
+        """Loopback endpoints on ports that are free now."""
+        http_port, grpc_port, metrics_port = free_ports(3)
+        return cls(DEFAULT_HOST, http_port, grpc_port, metrics_port)
+
+    @property
+    def http_host(self) -> str:
+        """Listen address of the server's HTTP port."""
+        return self.host if self.grpc_tls is None else DEFAULT_HOST
+
+    @property
+    def http_url(self) -> str:
+        """URL at which RewardClient reaches the server over HTTP."""
+        return f"http://{in_url(self.http_host)}:{self.http_port}"
+
+    @property
+    def grpc_url(self) -> str:
+        """URL at which RewardClient reaches the server over gRPC."""
+        return f"{'grpc' if self.grpc_tls is None else 'grpcs'}://{in_url(self.host)}:{self.grpc_port}"
+
+    @property
+    def metrics_url(self) -> str:
+        """URL of the metrics that Prometheus scrapes."""
+        return f"http://{in_url(self.host)}:{self.metrics_port}/metrics"
+
+    def arguments(self) -> list[str]:
+        """Arguments of tritonserver that make it listen there."""
+        return [
+            f"--http-address={_of_http_server(self.http_host)}",
+            f"--http-port={self.http_port}",
+            f"--grpc-address={in_url(self.host)}",
+            f"--grpc-port={self.grpc_port}",
+            f"--metrics-address={_of_http_server(self.host)}",
+            f"--metrics-port={self.metrics_port}",
+        ]
+
+    def check(self) -> None:
+        """Raises ServerStartError for a taken port, another machine's address, and files that are no certificate."""
+        if self.grpc_tls is not None:
+            self.grpc_tls.check()
+        listening = (
+            ("HTTP", self.http_host, self.http_port),
+            ("gRPC", self.host, self.grpc_port),
+            ("metrics", self.host, self.metrics_port),
+        )
+        for name, host, port in listening:
+            try:
+                check_free(host, port, name, port_option=f"--{name.lower()}-port")
+            except ValueError as error:
+                raise ServerStartError(str(error)) from None
+
+
+def check_version(host: str, version: str, *, accepted: bool) -> None:
+    """Raises ServerStartError if others can reach a Triton with known vulnerabilities, unless that is ``accepted``."""
+    match = re.match(r"(\d+)\.(\d+)", version)
+    is_safe = match is not None and (int(match[1]), int(match[2])) >= SECURITY_FLOOR
+    if is_safe or accepted or is_loopback(host):
+        return
+    floor = ".".join(map(str, SECURITY_FLOOR))
+    raise ServerStartError(
+        f"host: expected a loopback address for Triton {version or 'of no version'}, which has known remote "
+        f"vulnerabilities (Triton {floor}, in NVIDIA's container 26.07, has not), got {host}; "
+        "--accept-known-vulnerabilities serves there all the same"
+    )
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports of the loopback address that are free now. Raises OSError if there are too few."""
+    tried = random.SystemRandom().sample(PORTS, len(PORTS))
+    ports = list(islice((port for port in tried if port not in _given and _is_free(port)), count))
+    if len(ports) < count:
+        raise OSError(f"ports: expected {count} free ones in {PORTS.start}..{PORTS.stop - 1}, got {len(ports)}")
+    _given.extend(ports)
+    return ports
+
+
+def _is_free(port: int) -> bool:
+    try:
+        socket.create_server((DEFAULT_HOST, port)).close()
+    except OSError:
+        return False
+    return True
+
+
+def _of_http_server(host: str) -> str:
+    """An address as Triton's HTTP servers read it: without the prefix they take IPv6 for a name."""
+    return f"ipv6:{host}" if ":" in host else host
