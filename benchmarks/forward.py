@@ -29,7 +29,7 @@ from rich.console import Console
 from torch._inductor import config as inductor
 
 from rfm.engine import Engine
-from rfm.layers.heads import progress_from_logits
+from rfm.engine.layers import progress_from_logits
 from rfm.rewind.network import RewindBatch, RewindConfig, RewindTransformer
 from rfm.rewind.predictor import RewindPredictor
 from rfm_client import ProgressResult, ProgressSample, Trajectory

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from rfm.engine import Engine
-from rfm.predictor import RowScores
+from rfm.engine.predictor import RowScores
 from rfm_client import FrameScores
 
 SIMULATION = "simulated.json"

@@ -10,7 +10,7 @@ from typing import Any
 
 from google.protobuf.text_format import ParseError
 
-from rfm.checkpoint.decision import source_name
+from rfm.checkpoint.provenance import source_name
 from rfm.launch.repository_folder import CONFIG_FILE
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.settings import settings_of

@@ -29,12 +29,12 @@ from rfm.launch.http import NO_ANSWER, Http
 from rfm.launch.installation import Installation, ServerStartError
 from rfm.launch.listen_address import check_before_start, check_version
 from rfm.launch.ports import free_ports
+from rfm.launch.proc import cpu_s_of_group
 from rfm.launch.repository_api import INDEX_PATH, versions_of
 from rfm.launch.repository_folder import CONFIG_FILE, models_in, no_models
 from rfm.launch.tls import GrpcTls
 from rfm.launch.triton_options import check_arguments, size_limits
 from rfm.parameters import HANG_VARIABLE
-from rfm.proc import cpu_s_of_group
 from rfm_client.contract.listening import check_free, in_url
 from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
 

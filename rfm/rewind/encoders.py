@@ -19,20 +19,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rfm.checkpoint.content import read_json
-from rfm.checkpoint.preprocessor import PREPROCESSOR_CONFIG
-from rfm.execution import Execution
+from rfm.checkpoint.content import PREPROCESSOR_CONFIG, read_json
+from rfm.engine.execution import Execution
+from rfm.engine.feature_cache import FeatureCache, get_or_make
+from rfm.engine.layers import as_tensor, speed_up
 from rfm.family import EncodersDescription
-from rfm.feature_cache import FeatureCache, get_or_make
-from rfm.layers.linear import speed_up
-from rfm.layers.tensors import as_tensor
-from rfm.rewind.preprocessing import ImagePreprocessor
-from rfm.rewind.pretrained import IMAGE_MODELS, TEXT_MODELS, load_model, load_preprocessor, load_tokenizer
-from rfm.version_folder import IMAGE_ENCODER_FOLDER, TEXT_ENCODER_FOLDER
+from rfm.rewind.pretrained import (
+    IMAGE_MODELS,
+    TEXT_MODELS,
+    ImagePreprocessor,
+    load_model,
+    load_preprocessor,
+    load_tokenizer,
+)
 from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError, Trajectory, wire
 from rfm_client.contract.named_frames import NamedFootage, NamedTrajectory
 from rfm_client.contract.samples import Float32Array, Footage, UInt8Array
 
+IMAGE_ENCODER_FOLDER = "image_encoder"  # in an exported version of a model that encodes
+TEXT_ENCODER_FOLDER = "text_encoder"
 IMAGES_PER_FORWARD = 64
 FRAMES_TOGETHER = 16  # that are brought to size in one call, for which they are copied
 MAX_ENCODER_ASPECT_RATIO = 50

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
-from rfm.proc import STOPPED, ZOMBIE, arguments_of, children_of, stat_of
+from rfm.launch.proc import STOPPED, ZOMBIE, arguments_of, children_of, stat_of
 
 _PROGRAM = "triton_python_backend_stub"
 _NAME = _PROGRAM[:15]  # as the kernel keeps it

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from rfm.execution import Execution
+from rfm.engine.execution import Execution
 from rfm.triton_model.request import OUTCOMES, SCORED, UNKNOWN_TYPE, Request
 
 FLUSH_INTERVAL_S = 0.25

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from rfm.layers.precision import keep_float32
+from rfm.engine.layers import keep_float32
 from rfm.parameters import THREADS_PARAMETER
 
 

@@ -19,49 +19,56 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from rfm.checkpoint.content import (
+    ADAPTER_CONFIG,
+    NETWORK_CONFIG,
+    WEIGHTS,
     CheckpointError,
     expecting,
     is_there,
     read_json,
     shown,
 )
-from rfm.checkpoint.decision import Decision
-from rfm.checkpoint.files import (
-    ADAPTER_CONFIG,
-    NETWORK_CONFIG,
-    WEIGHTS,
-    check_shapes,
-    has_head,
-    read_weights,
-)
-from rfm.checkpoint.nf4 import dequantize
-from rfm.checkpoint.training import check_progress
+from rfm.checkpoint.provenance import Decision
+from rfm.checkpoint.run_config import check_progress
+from rfm.checkpoint.weights import check_shapes, has_head, read_weights
+from rfm.engine.feature_cache import FeatureCache
 from rfm.family import NETWORK, Description, Options, config_fields
-from rfm.feature_cache import FeatureCache
-from rfm.version_folder import PROCESSOR_FOLDER
-from rfm.vlm.adapter import adapted, base_of_adapter, has_adapter
 from rfm.vlm.backbone import (
     BACKBONES,
+    LORA_INSIDE,
     NF4,
+    QUANTIZED,
     QWEN_2_5,
+    QWEN_NAMES,
     SMOL,
+    SMOL_NAMES,
     UNQUANTIZED,
+    UNUSED,
+    Renames,
     backbone_config,
     check_not_quantized,
     is_at_least,
     quantization,
+    renamed,
 )
 from rfm.vlm.collator import VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP
-from rfm.vlm.lora import LORA_NAME, Scaling, changed_by, merged, split
-from rfm.vlm.names import LORA_INSIDE, QUANTIZED, QWEN_NAMES, SMOL_NAMES, UNUSED, Renames, renamed
+from rfm.vlm.lora import LORA_NAME, Scaling, adapted, base_of_adapter, changed_by, has_adapter, merged, split
 from rfm.vlm.network import VlmConfig, VlmRewardModel, build_backbone
+from rfm.vlm.nf4 import dequantize
 from rfm.vlm.predictor import VlmPredictor
-from rfm.vlm.processor import frame_size, load_collator, save_processor
+from rfm.vlm.processor import (
+    PROCESSOR_FOLDER,
+    check_published,
+    differences,
+    frame_size,
+    is_published,
+    load_collator,
+    of_processor,
+    save_processor,
+)
 from rfm.vlm.prompts import OF_AN_OLD_RUN
-from rfm.vlm.provenance import of_export, of_processor, of_rounding, of_run
-from rfm.vlm.published import check_published, differences, is_published
-from rfm.vlm.run_config import RunConfig
+from rfm.vlm.run_config import RunConfig, of_export, of_rounding, of_run
 
 LORA = "lora"  # in VlmCheckpoint.parts: the factors that change the network's weights
 SETTINGS = "rfm"  # key of our own fields in an exported config.json

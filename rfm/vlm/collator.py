@@ -17,17 +17,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rfm.feature_cache import FeatureCache
-from rfm.predictor import check_type
-from rfm.vlm.batch import FramesOfOneSize, QwenPixels, SmolPixels, VlmBatch
-from rfm.vlm.chat import Chat, Visual
+from rfm.engine.feature_cache import FeatureCache
+from rfm.engine.predictor import check_type
+from rfm.vlm.batch import FramesOfOneSize, QwenPixels, Shots, SmolPixels, VlmBatch
 from rfm.vlm.film import Film, Indices, Shot, SizedFrames, named_frames
 from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, Grid, QwenImages, SmolImages
 from rfm.vlm.network import VlmConfig
-from rfm.vlm.positions import Box, positions
-from rfm.vlm.prompts import PREFERENCE_TOKEN, PROGRESS_TOKEN, SIMILARITY_TOKEN, TrajectoryPart, question
-from rfm.vlm.shots import Shots
-from rfm.vlm.vision import plan
+from rfm.vlm.prompts import PREFERENCE_TOKEN, PROGRESS_TOKEN, SIMILARITY_TOKEN, Chat, TrajectoryPart, Visual, question
+from rfm.vlm.qwen import Box, plan, positions
 from rfm_client.contract import InvalidSampleError, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.contract.named_frames import NamedProgressSample, NamedTrajectory
 from rfm_client.contract.samples import UInt8Array

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
-from rfm.dense_mode import prefix_indices
+from rfm.engine.predictor import prefix_indices
 from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm_client.contract import InvalidSampleError, wire
 from rfm_client.contract.named_frames import NamedTrajectory, frame_digest

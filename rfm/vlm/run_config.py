@@ -7,14 +7,19 @@ docs/checkpoints.md lists every setting, and what decides it where the file lack
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from rfm.checkpoint.content import CheckpointError, read_run_config, shown
-from rfm.checkpoint.decision import OF_UPSTREAM, Decision, file_name
-from rfm.checkpoint.files import RUN_CONFIG, find_run_config, frame_count, trained_frames
-from rfm.vlm.backbone import SMOL
+from rfm.checkpoint.content import ADAPTER_CONFIG, NETWORK_CONFIG, RUN_CONFIG, CheckpointError, read_run_config, shown
+from rfm.checkpoint.provenance import OF_UPSTREAM, OF_WEIGHTS, TRAINED_WITH_PADDING, Decision, file_name, source_name
+from rfm.checkpoint.run_config import find_run_config, frame_count, trained_frames
+from rfm.vlm.backbone import QWEN_2_5, SMOL
+from rfm.vlm.network import VlmConfig
+
+if TYPE_CHECKING:
+    from rfm.vlm.lora import Scaling
 
 HEADS, VQA = "default", "vqa"  # values of model.model_type: reward heads, and answers in generated text
 DTYPES = ("float32", "bfloat16", "float16")
@@ -32,6 +37,8 @@ SETTINGS = {
     "size_px": ("data.resized_height", "data.resized_width"),
     "trained_frames": ("data.max_frames",),
 }
+_BASE_MODEL = "--base-model"
+_VARIANT = re.compile(r"-unsloth$")  # of one model, which Unsloth puts in the place of a base model
 _DROPPED = ("pairwise_progress", "use_progress_token")  # other ways to prompt that upstream once had
 
 Value = TypeVar("Value", bool, str, float)
@@ -160,3 +167,90 @@ class RunConfig:
             mend = "set both to how the run showed frames"
             raise CheckpointError(f"{self.file}: expected {' and '.join(places)} to agree, got {got}; {mend}")
         return any(values.values())
+
+
+def of_run(
+    config: VlmConfig, run: RunConfig, base_model: str | None, scaling: Scaling | None, *, is_adapter: bool
+) -> tuple[Decision, ...]:
+    """The decisions about a checkpoint as training wrote it.
+
+    base_model: the one that the caller names
+    scaling: of LoRA factors; None: there are none
+    is_adapter: the base model's weights are not in the checkpoint
+    """
+    base = _base_model(config.base_model_id, run, base_model)
+    backbone = f"{NETWORK_CONFIG} of base_model" if is_adapter else NETWORK_CONFIG
+    lora = [] if scaling is None else [_lora(scaling, run)]
+    return (
+        Decision("backbone", config.family, backbone),
+        base,
+        *lora,
+        *_of_weights(config),
+        *(run.decision(name, getattr(config, name)) for name in _deciding(config)),
+        TRAINED_WITH_PADDING,
+        *_positions(config),
+    )
+
+
+def of_export(config: VlmConfig, base_model: str | None) -> tuple[Decision, ...]:
+    """The decisions about a checkpoint that ``rfm export`` wrote: its config.json has every setting."""
+    stated = Decision("base_model", source_name(config.base_model_id), NETWORK_CONFIG)
+    given = None if base_model is None else Decision("base_model", source_name(base_model), _BASE_MODEL)
+    return (
+        Decision("backbone", config.family, NETWORK_CONFIG),
+        given or stated,
+        *_of_weights(config),
+        *(Decision(name, getattr(config, name), NETWORK_CONFIG) for name in _deciding(config)),
+        TRAINED_WITH_PADDING,
+    )
+
+
+def of_rounding(num_nf4: int) -> list[Decision]:
+    """The decision about weights in NF4, which may have been rounded after training. ``num_nf4``: how many they are."""
+    rounded = f"{num_nf4} in NF4 of bitsandbytes"
+    source = f"{OF_WEIGHTS}, rounded in training too"
+    return [Decision("rounded_weights", rounded, source, is_assumed=True)] if num_nf4 else []
+
+
+def _of_weights(config: VlmConfig) -> list[Decision]:
+    names = ("progress_bins", "has_similarity", "has_preference", "has_success")
+    return [Decision(name, getattr(config, name), OF_WEIGHTS) for name in names]
+
+
+def _deciding(config: VlmConfig) -> list[str]:
+    """The SETTINGS that change something about this checkpoint."""
+    idle = {"average_temporal_patches", "size_px"} if config.multi_image else set()
+    idle |= set() if config.pools_images else {"frame_pooling"}
+    idle |= set() if config.pools_by_attention else {"pooling_temperature"}
+    return [name for name in SETTINGS if name not in idle]
+
+
+def _base_model(named: str, run: RunConfig, given: str | None) -> Decision:
+    """Where the tokenizer and image preprocessing are from, and of an adapter what it changes."""
+    if given is None:
+        return Decision("base_model", source_name(named), f"{run.name}: model.base_model_id")
+    if not named or model_name(named) in given.lower():
+        return Decision("base_model", source_name(given), _BASE_MODEL)
+    source = f"{_BASE_MODEL}, for {named} of {run.name}"
+    return Decision("base_model", source_name(given), source, is_assumed=True)
+
+
+def _lora(scaling: Scaling, run: RunConfig) -> Decision:
+    file = ADAPTER_CONFIG if scaling.file.name == ADAPTER_CONFIG else f"{run.name}: peft"
+    return Decision("lora", {"r": scaling.rank, "lora_alpha": scaling.alpha}, f"{file}: r, lora_alpha")
+
+
+def _positions(config: VlmConfig) -> list[Decision]:
+    """What decides positions behind a video, which transformers changed, of a Qwen2.5-VL."""
+    if config.family != QWEN_2_5 or config.multi_image:
+        return []
+    version = config.backbone.get("transformers_version")
+    stated = f"{NETWORK_CONFIG}: transformers_version {version}"
+    source = stated if str(version).startswith("4.") else "default: no file names transformers 4"
+    is_assumed = version is None  # of a later version, VlmCheckpoint.notes tells
+    return [Decision("positions_behind_videos", "as transformers 4", source, is_assumed=is_assumed)]
+
+
+def model_name(base: str) -> str:
+    """What is left of a base model's id or path where the same model may have several."""
+    return _VARIANT.sub("", base.rstrip("/").rpartition("/")[2].lower())

@@ -27,8 +27,8 @@ import rfm_export
 from paths import ROOT
 from rfm import families
 from rfm.checkpoint.content import CheckpointError
-from rfm.checkpoint.files import find_run_config
 from rfm.checkpoint.hub import best_tag, commit_of
+from rfm.checkpoint.run_config import find_run_config
 from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.rewind.network import RewindConfig
@@ -680,10 +680,11 @@ LOADS = """
 import json, sys
 from dataclasses import asdict
 from rfm import families
+from rfm.checkpoint.content import CheckpointError
 for source in sys.argv[1:]:
     try:
         print(json.dumps(asdict(families.load(source).config)))
-    except families.CheckpointError as error:
+    except CheckpointError as error:
         print(error)
 """
 UNTAGGED, TAGGED, WITHOUT = "org/name", f"org/other@{TAG}", "org/without"  # repositories of their own

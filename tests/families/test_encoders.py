@@ -20,9 +20,8 @@ from torch import Tensor
 import goldens
 from engines import load_engine
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
-from rfm.checkpoint.preprocessor import PREPROCESSOR_CONFIG
-from rfm.execution import Execution
+from rfm.checkpoint.content import PREPROCESSOR_CONFIG, CheckpointError
+from rfm.engine.execution import Execution
 from rfm.rewind.encoders import Encoders, ImagePreprocessor
 from rfm_client import (
     BatchTiming,

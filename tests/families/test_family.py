@@ -164,5 +164,5 @@ def test_what_is_no_family_s_is_refused(checkpoint: Path, loaded: Callable[[Path
 
 def test_encoders_of_an_export_that_names_no_family_are_rewind_s() -> None:
     assert families.encoders_of(None) is families.encoders_of("rfm.rewind") is Encoders
-    with pytest.raises(families.CheckpointError, match=r"expected one with encoders, got rfm\.vlm"):
+    with pytest.raises(CheckpointError, match=r"expected one with encoders, got rfm\.vlm"):
         families.encoders_of("rfm.vlm")

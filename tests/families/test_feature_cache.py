@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from engines import load_engine
-from rfm.execution import Execution
+from rfm.engine.execution import Execution
+from rfm.engine.feature_cache import FeatureCache, get_or_make
 from rfm.family import FrameEncoders
-from rfm.feature_cache import FeatureCache, get_or_make
 from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError, Trajectory
 from rfm_client.contract.named_frames import NamedFootage, NamedTrajectory, frame_digest
 from rfm_client.contract.samples import Footage, UInt8Array

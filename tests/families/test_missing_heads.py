@@ -23,9 +23,9 @@ import rfm_export
 from engines import serve_config
 from rfm import families
 from rfm.checkpoint.content import CheckpointError
-from rfm.checkpoint.decision import Decision
+from rfm.checkpoint.provenance import Decision
 from rfm.engine import Engine
-from rfm.family import Checkpoint
+from rfm.family import Checkpoint, Options
 from rfm_client import (
     InvalidSampleError,
     PreferenceResult,
@@ -96,9 +96,7 @@ def test_a_score_that_is_not_finite_is_still_an_error(tmp_path: Path, name: str)
         save_file(weights, folder / "model.safetensors")
         family = families.choose(folder)
         base = str(goldens.config(name).base_model) if name == VLM else None
-        (outcome,) = Engine.of(family.load(folder, families.Options(base_model=base))).evaluate(
-            [ProgressSample(pair(name)[0])]
-        )
+        (outcome,) = Engine.of(family.load(folder, Options(base_model=base))).evaluate([ProgressSample(pair(name)[0])])
         assert str(outcome) == "the network gave a score that is not finite"
 
 

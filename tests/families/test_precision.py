@@ -11,11 +11,11 @@ from pathlib import Path
 import torch
 
 import goldens
-from rfm.layers.precision import MKL_FUNCTIONS, keep_float32
+from rfm.engine.layers import MKL_FUNCTIONS, keep_float32
 
 ENGINE_IS_MADE = """
 import sys
-from rfm.layers import precision
+from rfm.engine import layers as precision
 from rfm.engine import Engine
 assert precision._call_each_once.cache_info().currsize == 0
 Engine.from_checkpoint(sys.argv[1])

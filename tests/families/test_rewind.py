@@ -14,13 +14,11 @@ from torch import Tensor, nn
 
 import goldens
 from rfm.config import DEFAULT_TOKEN_BUDGET
-from rfm.dense_mode import prefix_indices
 from rfm.engine import Engine, Outcome
-from rfm.layers.heads import PredictionHead, progress_from_logits
-from rfm.rewind.collator import MAX_EMBEDDING, RewindCollator
-from rfm.rewind.network import RewindBatch, RewindConfig, RewindTransformer
-from rfm.rewind.packing import Packing, rounded_up
-from rfm.rewind.predictor import RewindPredictor
+from rfm.engine.layers import PredictionHead, progress_from_logits
+from rfm.engine.predictor import prefix_indices
+from rfm.rewind.network import Packing, RewindBatch, RewindConfig, RewindTransformer, rounded_up
+from rfm.rewind.predictor import MAX_EMBEDDING, RewindCollator, RewindPredictor
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,

@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from rfm.engine import Engine
-from rfm.execution import Execution
-from rfm.feature_cache import BYTES_PER_MB, FeatureCache
+from rfm.engine.execution import Execution
+from rfm.engine.feature_cache import BYTES_PER_MB, FeatureCache
 from rfm.vlm.predictor import VlmPredictor
 from rfm_client import InferenceFailedError, PreferenceSample, ProgressResult, ProgressSample, RewardError, Trajectory
 from rfm_client.contract.named_frames import NamedProgressSample, NamedTrajectory, frame_digest

@@ -17,14 +17,14 @@ import goldens
 from engines import load_engine
 from reference_server import Served
 from rfm.engine import Engine
-from rfm.execution import Execution
-from rfm.predictor import RowScores
+from rfm.engine.execution import Execution
+from rfm.engine.predictor import RowScores
 from rfm.vlm.batch import VlmBatch
 from rfm.vlm.collator import QWEN3, VISION_START, VlmRow
 from rfm.vlm.images import Grid
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.prompts import SPLIT_TOKEN
-from rfm.vlm.vision import UNIT, plan
+from rfm.vlm.qwen import UNIT, plan
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,

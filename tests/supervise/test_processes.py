@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rfm import proc
+from rfm.launch import proc
 from rfm_serve import wait_for
 
 

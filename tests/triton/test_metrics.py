@@ -21,7 +21,7 @@ import goldens
 import rfm_export
 from engines import load_engine, serve_config
 from one_model import BriefServer
-from rfm.execution import Execution
+from rfm.engine.execution import Execution
 from rfm.launch.installation import find_installation
 from rfm.launch.process import Endpoints
 from rfm.launch.repository_api import RepositoryApi
