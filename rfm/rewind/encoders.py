@@ -171,7 +171,10 @@ class Encoders:
             execution.num_encoded += sum(map(len, whole))
             return self.encode_frames(whole, execution), self.encode_tasks(tasks, execution)
         with execution.collating():
-            named = [_named(trajectory) for trajectory in trajectories]
+            named = [
+                each if isinstance(each, NamedTrajectory) else NamedTrajectory.of(each.positions, each.task)
+                for each in trajectories
+            ]
             pixels = dict(pair for each in named for pair in each.pixels.items())
         wanted = (digest for each in named for digest in each.digests)
         images, num_made = get_or_make(
@@ -194,7 +197,8 @@ class Encoders:
         """float32 [Dv] of each frame [H, W, 3], or why there is none."""
         by_size = sorted(range(len(frames)), key=lambda index: frames[index].shape)
         sizes = groupby(by_size, key=lambda index: frames[index].shape)
-        parts = [part for _, of_size in sizes for part in _cut(list(of_size), FRAMES_TOGETHER)]
+        same = [list(of_size) for _, of_size in sizes]
+        parts = [each[at : at + FRAMES_TOGETHER] for each in same for at in range(0, len(each), FRAMES_TOGETHER)]
         images = self._images([np.stack([frames[index] for index in part]) for part in parts], execution)
         made = [image for image in images if isinstance(image, Tensor)]
         read = iter(torch.stack(made).float().cpu().numpy() if made else ())
@@ -275,16 +279,6 @@ def task_digest(task: str) -> bytes:
     return b"task" + hashlib.sha256(task.encode()).digest()
 
 
-def _cut(indices: Sequence[int], most: int) -> list[Sequence[int]]:
-    return [indices[start : start + most] for start in range(0, len(indices), most)]
-
-
-def _named(trajectory: Trajectory | NamedTrajectory) -> NamedTrajectory:
-    if isinstance(trajectory, NamedTrajectory):
-        return trajectory
-    return NamedTrajectory.of(trajectory.positions, trajectory.task)
-
-
 def _of_named(
     trajectory: NamedTrajectory, images: Mapping[bytes, Float32Array | RewardError]
 ) -> Float32Array | RewardError:
@@ -328,10 +322,6 @@ def _check_shapes(trajectory: Trajectory | NamedTrajectory) -> None:
     else:
         sizes = {trajectory.positions.shape[1:3]}
     for height, width in sizes:
-        _check_shape(height, width)
-
-
-def _check_shape(height: int, width: int) -> None:
-    if min(height, width) < 1 or max(height, width) > MAX_ENCODER_ASPECT_RATIO * min(height, width):
-        expected = f"frames at most {MAX_ENCODER_ASPECT_RATIO} times as long as wide"
-        raise InvalidSampleError.at("frames", expected, f"{height} x {width}")
+        if min(height, width) < 1 or max(height, width) > MAX_ENCODER_ASPECT_RATIO * min(height, width):
+            expected = f"frames at most {MAX_ENCODER_ASPECT_RATIO} times as long as wide"
+            raise InvalidSampleError.at("frames", expected, f"{height} x {width}")

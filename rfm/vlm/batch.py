@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -96,24 +95,6 @@ class Shots:
             self._kept[key] = sized.kept[key]
         else:
             self._of_size.setdefault(sized.pixels.shape[1:3], SizedShots()).add(sized, key, shot)
-
-
-class Pixels(Protocol):
-    """The frames that a batch shows, each once, and what the backbone reads of them."""
-
-    @property
-    def films(self) -> list[Tensor]:
-        """uint8 [T, H', W', 3] each, on the host or already on the device."""
-
-    @property
-    def num_shown(self) -> int:
-        """Frames that the backbone reads."""
-
-    def changed(self, change: Callable[[Tensor], Tensor]) -> Pixels:
-        """The same with ``change`` made to the tensors that say where pixels go."""
-
-    def inputs(self, device: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
-        """The backbone's arguments about pixels, made on ``device`` of frames there, and given in ``dtype``."""
 
 
 @dataclass(frozen=True)
@@ -247,7 +228,7 @@ class VlmBatch:
     query_tokens: Tensor
     num_tokens: int
     num_span_tokens: int
-    pixels: Pixels | None = None
+    pixels: QwenPixels | SmolPixels | None = None
     plan: VisionPlan | None = None
     layout: Layout | None = None
 

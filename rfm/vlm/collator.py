@@ -66,11 +66,6 @@ class VlmRow:
         return tuple(film.frames for film in self.films)
 
     @property
-    def num_frames(self) -> list[int]:
-        """Frames of each trajectory that the conversation shows."""
-        return [film.num_shown for film in self.films]
-
-    @property
     def shown(self) -> Iterator[tuple[Film, Indices]]:
         """Each trajectory, and which of its frames the conversation shows."""
         return ((film, np.arange(film.num_shown) if self.picked is None else self.picked) for film in self.films)
@@ -86,26 +81,14 @@ class VlmCollator:
 
     tokenizer: the base model's, with the checkpoint's special tokens appended and a chat template
     images: preprocessing of the backbone's kind
-    keeps_conversations: whether the text and tokens of the latest conversations, without their frames, are kept
     """
 
-    def __init__(
-        self,
-        config: VlmConfig,
-        tokenizer: Any,
-        images: QwenImages | SmolImages,
-        *,
-        keeps_conversations: bool = False,
-    ) -> None:
+    def __init__(self, config: VlmConfig, tokenizer: Any, images: QwenImages | SmolImages) -> None:
         self.config = config
         self.tokenizer = tokenizer
         self.images = images
         self._special_tokens = tuple(tokenizer.get_added_vocab())
-        self._chat = Chat(tokenizer, keeps=keeps_conversations)
-
-    def keeping_conversations(self) -> VlmCollator:
-        """The same, but one that keeps conversations."""
-        return type(self)(self.config, self.tokenizer, self.images, keeps_conversations=True)
+        self._chat = Chat(tokenizer)
 
     @property
     def frames_per_shot(self) -> int:

@@ -38,7 +38,7 @@ class VlmPredictor:
     ) -> None:
         self.network = network.to(device).eval()
         speed_up(self.network)
-        self.collator = collator if cache is None else collator.keeping_conversations()
+        self.collator = collator
         self.device = device
         self.cache = cache
         self._copies = Copies(device)
@@ -90,8 +90,8 @@ class VlmPredictor:
         of_rows, read, num_queries = [], 0, 0
         for row in rows:
             frames = []
-            for spans, num_frames in zip(row.spans, row.num_frames, strict=True):
-                frames.append(self._per_frame(part_of(scores, slice(read, read + len(spans))), num_frames))
+            for spans, film in zip(row.spans, row.films, strict=True):
+                frames.append(self._per_frame(part_of(scores, slice(read, read + len(spans))), film.num_shown))
                 read += len(spans)
             query = None
             if row.query is not None:

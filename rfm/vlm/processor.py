@@ -192,7 +192,7 @@ def facts(collator: VlmCollator) -> dict[str, Any]:
     del images["rescale_factor"]  # the only one that loads
     for name in ("image_mean", "image_std"):
         images[name] = list(images[name])
-    return {"prompt": Chat(collator.tokenizer, keeps=False).text((_EXAMPLE, visual)), **images}
+    return {"prompt": Chat(collator.tokenizer).text((_EXAMPLE, visual)), **images}
 
 
 def check_published(collator: VlmCollator, processor: str) -> None:

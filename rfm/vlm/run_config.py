@@ -37,6 +37,7 @@ SETTINGS = {
     "size_px": ("data.resized_height", "data.resized_width"),
     "trained_frames": ("data.max_frames",),
 }
+_OF_WEIGHTS = ("progress_bins", "has_similarity", "has_preference", "has_success")
 _BASE_MODEL = "--base-model"
 _VARIANT = re.compile(r"-unsloth$")  # of one model, which Unsloth puts in the place of a base model
 _DROPPED = ("pairwise_progress", "use_progress_token")  # other ways to prompt that upstream once had
@@ -169,86 +170,58 @@ class RunConfig:
         return any(values.values())
 
 
-def of_run(
-    config: VlmConfig, run: RunConfig, base_model: str | None, scaling: Scaling | None, *, is_adapter: bool
+def decisions_of(
+    config: VlmConfig,
+    run: RunConfig | None,
+    base_model: str | None,
+    scaling: Scaling | None = None,
+    *,
+    is_adapter: bool = False,
+    num_nf4: int = 0,
 ) -> tuple[Decision, ...]:
-    """The decisions about a checkpoint as training wrote it.
+    """What decided each setting of a checkpoint.
 
+    run: None: ``rfm export`` wrote it, and its config.json has every setting
     base_model: the one that the caller names
     scaling: of LoRA factors; None: there are none
     is_adapter: the base model's weights are not in the checkpoint
+    num_nf4: weights in NF4, which may have been rounded after training
     """
-    base = _base_model(config.base_model_id, run, base_model)
-    backbone = f"{NETWORK_CONFIG} of base_model" if is_adapter else NETWORK_CONFIG
-    lora = [] if scaling is None else [_lora(scaling, run)]
-    return (
-        Decision("backbone", config.family, backbone),
-        base,
-        *lora,
-        *_of_weights(config),
-        *(run.decision(name, getattr(config, name)) for name in _deciding(config)),
-        TRAINED_WITH_PADDING,
-        *_positions(config),
-    )
-
-
-def of_export(config: VlmConfig, base_model: str | None) -> tuple[Decision, ...]:
-    """The decisions about a checkpoint that ``rfm export`` wrote: its config.json has every setting."""
-    stated = Decision("base_model", source_name(config.base_model_id), NETWORK_CONFIG)
-    given = None if base_model is None else Decision("base_model", source_name(base_model), _BASE_MODEL)
-    return (
-        Decision("backbone", config.family, NETWORK_CONFIG),
-        given or stated,
-        *_of_weights(config),
-        *(Decision(name, getattr(config, name), NETWORK_CONFIG) for name in _deciding(config)),
-        TRAINED_WITH_PADDING,
-    )
-
-
-def of_rounding(num_nf4: int) -> list[Decision]:
-    """The decision about weights in NF4, which may have been rounded after training. ``num_nf4``: how many they are."""
-    rounded = f"{num_nf4} in NF4 of bitsandbytes"
-    source = f"{OF_WEIGHTS}, rounded in training too"
-    return [Decision("rounded_weights", rounded, source, is_assumed=True)] if num_nf4 else []
-
-
-def _of_weights(config: VlmConfig) -> list[Decision]:
-    names = ("progress_bins", "has_similarity", "has_preference", "has_success")
-    return [Decision(name, getattr(config, name), OF_WEIGHTS) for name in names]
-
-
-def _deciding(config: VlmConfig) -> list[str]:
-    """The SETTINGS that change something about this checkpoint."""
-    idle = {"average_temporal_patches", "size_px"} if config.multi_image else set()
+    idle = {"average_temporal_patches", "size_px"} if config.multi_image else set()  # change nothing about it
     idle |= set() if config.pools_images else {"frame_pooling"}
     idle |= set() if config.pools_by_attention else {"pooling_temperature"}
-    return [name for name in SETTINGS if name not in idle]
+    deciding = {name: getattr(config, name) for name in SETTINGS if name not in idle}
+    decided = [
+        Decision("backbone", config.family, f"{NETWORK_CONFIG} of base_model" if is_adapter else NETWORK_CONFIG),
+        _base_model(config.base_model_id, run, base_model),
+    ]
+    if run is not None and scaling is not None:
+        file = ADAPTER_CONFIG if scaling.file.name == ADAPTER_CONFIG else f"{run.name}: peft"
+        decided.append(Decision("lora", {"r": scaling.rank, "lora_alpha": scaling.alpha}, f"{file}: r, lora_alpha"))
+    decided += [Decision(name, getattr(config, name), OF_WEIGHTS) for name in _OF_WEIGHTS]
+    for name, value in deciding.items():
+        decided.append(Decision(name, value, NETWORK_CONFIG) if run is None else run.decision(name, value))
+    decided.append(TRAINED_WITH_PADDING)
+    if run is not None and config.family == QWEN_2_5 and not config.multi_image:
+        version = config.backbone.get("transformers_version")  # of 5 or later, VlmCheckpoint.notes tells
+        stated = f"{NETWORK_CONFIG}: transformers_version {version}"
+        source = stated if str(version).startswith("4.") else "default: no file names transformers 4"
+        decided.append(Decision("positions_behind_videos", "as transformers 4", source, is_assumed=version is None))
+    if num_nf4:
+        rounded, source = f"{num_nf4} in NF4 of bitsandbytes", f"{OF_WEIGHTS}, rounded in training too"
+        decided.append(Decision("rounded_weights", rounded, source, is_assumed=True))
+    return tuple(decided)
 
 
-def _base_model(named: str, run: RunConfig, given: str | None) -> Decision:
+def _base_model(named: str, run: RunConfig | None, given: str | None) -> Decision:
     """Where the tokenizer and image preprocessing are from, and of an adapter what it changes."""
     if given is None:
-        return Decision("base_model", source_name(named), f"{run.name}: model.base_model_id")
-    if not named or model_name(named) in given.lower():
+        file = NETWORK_CONFIG if run is None else f"{run.name}: model.base_model_id"
+        return Decision("base_model", source_name(named), file)
+    if run is None or not named or model_name(named) in given.lower():
         return Decision("base_model", source_name(given), _BASE_MODEL)
     source = f"{_BASE_MODEL}, for {named} of {run.name}"
     return Decision("base_model", source_name(given), source, is_assumed=True)
-
-
-def _lora(scaling: Scaling, run: RunConfig) -> Decision:
-    file = ADAPTER_CONFIG if scaling.file.name == ADAPTER_CONFIG else f"{run.name}: peft"
-    return Decision("lora", {"r": scaling.rank, "lora_alpha": scaling.alpha}, f"{file}: r, lora_alpha")
-
-
-def _positions(config: VlmConfig) -> list[Decision]:
-    """What decides positions behind a video, which transformers changed, of a Qwen2.5-VL."""
-    if config.family != QWEN_2_5 or config.multi_image:
-        return []
-    version = config.backbone.get("transformers_version")
-    stated = f"{NETWORK_CONFIG}: transformers_version {version}"
-    source = stated if str(version).startswith("4.") else "default: no file names transformers 4"
-    is_assumed = version is None  # of a later version, VlmCheckpoint.notes tells
-    return [Decision("positions_behind_videos", "as transformers 4", source, is_assumed=is_assumed)]
 
 
 def model_name(base: str) -> str:

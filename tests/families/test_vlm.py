@@ -371,9 +371,9 @@ def test_a_question_is_read_as_if_no_other_had_been_asked_before(make: Callable[
         PreferenceSample(other, one),
         ProgressSample(film(0, 4, 56, 56, "image")),
     ]
-    many = make().collator.keeping_conversations()
+    many = make().collator
     for question in questions * 2:
-        fresh = many.keeping_conversations()  # has kept nothing
+        fresh = type(many)(many.config, many.tokenizer, many.images)  # has kept nothing
         (alone, *_), (among, *_) = fresh.rows(question), many.rows(question)
         np.testing.assert_array_equal(among.input_ids, alone.input_ids)
         np.testing.assert_array_equal(among.position_ids, alone.position_ids)  # type: ignore[arg-type]
@@ -385,7 +385,7 @@ def test_a_short_question_that_is_asked_again_is_not_tokenised_again(
     monkeypatch: pytest.MonkeyPatch, task: str, expected: int
 ) -> None:
     """Long ones are not kept: they would take memory without end."""
-    collator = load(PLAIN).collator.keeping_conversations()
+    collator = load(PLAIN).collator
     made: Counter[str] = Counter()
 
     class Spy:
