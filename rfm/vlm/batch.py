@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from rfm.engine.device import pinned
-from rfm.vlm.film import Film, Indices, Shot, SizedFrames, shots_of
+from rfm.vlm.film import Indices, Shot, SizedFrames, VlmFilm, shots_of
 from rfm.vlm.images import QwenImages, SmolImages
 from rfm.vlm.qwen import VisionPlan
 
@@ -68,7 +68,7 @@ class Shots:
         """The shots of each size that are to be read, in the order in which they first came."""
         return list(self._of_size.values())
 
-    def add(self, film: Film, shown: Indices) -> list[Hashable]:
+    def add(self, film: VlmFilm, shown: Indices) -> list[Hashable]:
         """The keys of the shots of a conversation that shows these frames of a film."""
         sized, keys = film.ready, []
         self._sized.append(sized)

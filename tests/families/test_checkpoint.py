@@ -32,7 +32,7 @@ from rfm.engine import Engine
 from rfm.rewind.network import RewindConfig
 from rfm.vlm.network import VlmConfig
 from rfm_commands.engine_scorer import EngineScorer
-from spoilt import run_the_command
+from spoilt import copied, in_json, run_the_command, weights
 
 CONTINUOUS = "legacy_keys_l2"  # lacks causal_mask and use_per_frame_progress_token
 MISMATCHED = "h40_L3_H5_c1_t1_disc5_cfgmismatch"  # its configs say l2 and 32 bins, its weights 5 bins
@@ -44,11 +44,7 @@ TAG = "best-p-rank-0.8500-step-123"
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A copy of a reference checkpoint that a test may spoil."""
-    copy = tmp_path / "checkpoint"
-    shutil.copytree(goldens.config(CONTINUOUS).checkpoint, copy)
-    for file in copy.iterdir():
-        file.chmod(0o644)
-    return copy
+    return copied(goldens.config(CONTINUOUS), tmp_path / "checkpoint")
 
 
 def test_weights_decide_where_configurations_disagree() -> None:
@@ -82,7 +78,7 @@ def test_config_yaml_of_another_run_above_the_checkpoint_is_refused(
 ) -> None:
     golden, above = goldens.config(name), goldens.config(other)
     run = next(file for file in above.checkpoint.parent.rglob("config.yaml"))
-    folder = shutil.copytree(golden.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
+    folder = copied(golden, tmp_path / "checkpoint")
     own = folder / "config.yaml"
     own = own if own.exists() else golden.checkpoint.parent / "config.yaml"
     right = own.read_text()
@@ -115,7 +111,7 @@ def test_what_decides_each_setting_is_documented(config: type[VlmConfig | Rewind
 @pytest.mark.parametrize("name", ["causal_mask", "num_attention_heads"])
 def test_a_null_is_a_key_that_is_not_there(folder: Path, name: str) -> None:
     expected = families.load(folder).config
-    change_json("config.json", lambda content: content.update({name: None}))(folder)
+    in_json("config.json", lambda content: content.update({name: None}))(folder)
     assert families.load(folder).config == expected
 
 
@@ -136,24 +132,6 @@ def test_shards_are_put_together(folder: Path) -> None:
     sharded = families.load(folder)
     assert sharded.config == whole.config
     assert all(torch.equal(sharded.network[name], whole.network[name]) for name in whole.network)
-
-
-def change_weights(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
-    def spoil(folder: Path) -> None:
-        weights = load_file(folder / "model.safetensors")
-        change(weights)
-        save_file(weights, folder / "model.safetensors")
-
-    return spoil
-
-
-def change_json(file: str, change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
-    def spoil(folder: Path) -> None:
-        content = json.loads((folder / file).read_text())
-        change(content)
-        (folder / file).write_text(json.dumps(content))
-
-    return spoil
 
 
 def as_pickle(folder: Path) -> None:
@@ -199,35 +177,35 @@ def whole_and_shards(folder: Path) -> None:
 
 SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
     "missing and unexpected keys": (
-        change_weights(lambda w: w.update(surplus=w.pop("success_head.4.bias"))),
+        weights(lambda w: w.update(surplus=w.pop("success_head.4.bias"))),
         r"missing keys: \['success_head.4.bias'\]; unexpected keys: \['surplus'\]",
     ),
     "no head of progress": (
-        change_weights(lambda w: [w.pop(name) for name in list(w) if name.startswith("progress_head")]),
+        weights(lambda w: [w.pop(name) for name in list(w) if name.startswith("progress_head")]),
         r"expected a ReWiND checkpoint, which has 'progress_head.4.weight'",
     ),
     "another model type": (
-        change_json("config.json", lambda c: c.update(model_type="llama")),
+        in_json("config.json", lambda c: c.update(model_type="llama")),
         r"model_type: expected rewind_transformer, got llama",
     ),
     "configurations that contradict each other": (
-        change_json("config.json", lambda c: c.update(num_attention_heads=8)),
+        in_json("config.json", lambda c: c.update(num_attention_heads=8)),
         r"num_attention_heads: expected config.json and config.yaml to agree, got",
     ),
     "heads that do not divide the width": (
         lambda folder: (
-            change_json("config.json", lambda c: c.update(num_attention_heads=5))(folder),
+            in_json("config.json", lambda c: c.update(num_attention_heads=5))(folder),
             (folder / "config.yaml").unlink(),
         )[0],
         r"num_attention_heads: expected a divisor of the hidden width 32, got 5",
     ),
     "a number of heads that is no number": (
-        change_json("config.json", lambda c: c.update(num_attention_heads="4")),
+        in_json("config.json", lambda c: c.update(num_attention_heads="4")),
         r"num_attention_heads in config.json: expected int, got '4'",
     ),
     "no word of a causal mask, from a file that upstream did not write": (
         lambda folder: (
-            change_json("config.json", lambda c: c.pop("hidden_dim"))(folder),
+            in_json("config.json", lambda c: c.pop("hidden_dim"))(folder),
             (folder / "config.yaml").unlink(),
         )[0],
         r"causal_mask: expected it in config.json or model.rewind of config.yaml, got it in neither",
@@ -268,7 +246,7 @@ SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
         r"\['more'\]; move that file away",
     ),
     "a weight with and without a wrapper's prefix": (
-        change_weights(lambda w: w.update({"module.success_head.4.bias": w["success_head.4.bias"] + 1})),
+        weights(lambda w: w.update({"module.success_head.4.bias": w["success_head.4.bias"] + 1})),
         r"expected each weight once, got 'success_head\.4\.bias' and",
     ),
     "pickles whole and in shards": (
@@ -281,11 +259,11 @@ SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
         r"config.yaml: data: expected a mapping, got \[1\]",
     ),
     "a half frame": (
-        change_json("config.json", lambda c: c.update(trained_frames=7.5)),
+        in_json("config.json", lambda c: c.update(trained_frames=7.5)),
         r"config.json: trained_frames: expected a whole number of at least 1, got 7.5",
     ),
     "padding that is a number": (
-        change_json("config.json", lambda c: c.update(trained_padding=1)),
+        in_json("config.json", lambda c: c.update(trained_padding=1)),
         r"config.json: trained_padding: expected true or false, got 1",
     ),
 }
@@ -302,7 +280,7 @@ def test_a_spoiled_checkpoint_is_refused(folder: Path, spoil: Callable[[Path], N
 @pytest.mark.parametrize("name", [CONTINUOUS, WITH_IMAGES])
 def test_progress_since_the_frame_before_is_refused(tmp_path: Path, name: str, kind: str) -> None:
     golden = goldens.config(name)
-    folder = shutil.copytree(golden.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
+    folder = copied(golden, tmp_path / "checkpoint")
     text = (folder / "config.yaml").read_text()
     (folder / "config.yaml").write_text(text.replace("absolute_wrt_total_frames", kind))
     expected = f"{folder}/config.yaml: data.progress_pred_type: expected absolute progress, got '{kind}': such a head"
@@ -361,7 +339,7 @@ def test_the_conversion_of_a_pickled_adapter_works(tmp_path: Path) -> None:
         return families.load(folder, base_model=str(golden.base_model))
 
     before = load(golden.checkpoint)
-    folder = shutil.copytree(golden.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
+    folder = copied(golden, tmp_path / "checkpoint")
     torch.save(load_file(folder / "adapter_model.safetensors"), folder / "adapter_model.bin")
     (folder / "adapter_model.safetensors").unlink()
     with pytest.raises(CheckpointError, match=r"expected adapter_model\.safetensors, got adapter_model\.bin: pickles"):
@@ -405,7 +383,7 @@ PREFIXES: dict[str, Callable[[str], str]] = {
 @pytest.mark.parametrize("name", [CONTINUOUS, WITH_IMAGES])
 def test_prefixes_of_wrappers_change_nothing(tmp_path: Path, name: str, change: Callable[[str], str]) -> None:
     golden = goldens.config(name)
-    folder = shutil.copytree(golden.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
+    folder = copied(golden, tmp_path / "checkpoint")
     renamed(change)(folder)
     before, after = (families.load(each, base_model=str(golden.base_model)) for each in (golden.checkpoint, folder))
     assert after.config == before.config
@@ -464,8 +442,8 @@ def test_weights_that_are_no_numbers_are_refused_at_every_door(
     tmp_path: Path, door: Callable[..., object], name: str, weight: str, value: float
 ) -> None:
     golden = goldens.config(name)
-    folder = shutil.copytree(golden.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
-    change_weights(lambda weights: weights[weight].view(-1)[-1:].fill_(value))(folder)
+    folder = copied(golden, tmp_path / "checkpoint")
+    weights(lambda weights: weights[weight].view(-1)[-1:].fill_(value))(folder)
     sources = {option: getattr(golden, option) for option in ("base_model", "image_encoder", "text_encoder")}
     options = {option: str(source) for option, source in sources.items() if source is not None}
     short = weight.removeprefix("image_encoder.")
@@ -476,14 +454,12 @@ def test_weights_that_are_no_numbers_are_refused_at_every_door(
 @pytest.mark.parametrize("which", ["image_encoder", "text_encoder"])
 def test_an_encoder_s_weights_that_are_no_numbers_are_refused(tmp_path: Path, which: str) -> None:
     golden = goldens.config(ENCODED)
-    folder = shutil.copytree(golden.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
-    change_weights(lambda weights: [weights.pop(name) for name in list(weights) if "_encoder." in name])(folder)
+    folder = copied(golden, tmp_path / "checkpoint")
+    weights(lambda weights: [weights.pop(name) for name in list(weights) if "_encoder." in name])(folder)
     sources = {"image_encoder": golden.image_encoder, "text_encoder": golden.text_encoder}
     spoilt = shutil.copytree(sources[which] or "", tmp_path / which, copy_function=shutil.copyfile)
-    weights = load_file(spoilt / "model.safetensors")
-    name = next(iter(weights))
-    weights[name].view(-1)[0] = math.inf
-    save_file(weights, spoilt / "model.safetensors", {"format": "pt"})
+    name = next(iter(load_file(spoilt / "model.safetensors")))
+    weights(lambda tensors: tensors[name].view(-1)[:1].fill_(math.inf))(spoilt)
     options = {option: str(source) for option, source in (sources | {which: spoilt}).items()}
     with pytest.raises(CheckpointError, match=rf"{re.escape(name)}: expected finite weights, got inf at \["):
         families.load(folder, **options).encoders()
@@ -501,8 +477,8 @@ ZEROED = {
 @pytest.mark.parametrize("name", [CONTINUOUS, WITH_IMAGES])
 def test_a_head_of_zeros_is_told(tmp_path: Path, name: str, zeroed: list[str], told: list[str]) -> None:
     golden = goldens.config(name)
-    folder = shutil.copytree(golden.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
-    change_weights(lambda w: [t.zero_() for key, t in w.items() if key.startswith(tuple(zeroed))])(folder)
+    folder = copied(golden, tmp_path / "checkpoint")
+    weights(lambda w: [t.zero_() for key, t in w.items() if key.startswith(tuple(zeroed))])(folder)
     checkpoint = families.load(folder, base_model=str(golden.base_model))
     lines = [
         line for line in families.notes(folder, checkpoint, ("progress", "success")) if "model.safetensors" in line

@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
 
 import goldens
 from paths import GOLDEN
 from rfm.checkpoint.content import CheckpointError
+from spoilt import weights
 from vlm import load
 
 ADAPTER = "q25_peft_adapter_disc10"
@@ -38,11 +38,7 @@ def factors_twice(tensors: dict[str, Any]) -> None:
 
 
 def changed(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    """Changes the tensors of the adapter."""
-    file = folder / "adapter_model.safetensors"
-    tensors = load_file(file)
-    change(tensors)
-    save_file(tensors, file)
+    weights(change, "adapter_model.safetensors")(folder)
 
 
 PLAIN = [name for name in WRITTEN if name.startswith("LoRA")]

@@ -29,7 +29,7 @@ from rfm.plain_yaml import MAX_YAML_BYTES
 from rfm_client.contract.settings import ConfigError
 from rfm_commands.cli import app
 from rfm_commands.config import Config
-from spoilt import WEIGHTS, Spoil, copied, files_in
+from spoilt import WEIGHTS, Spoil, copied, files_in, settings, text_settings
 
 REWIND = goldens.config("legacy_keys_l2")
 VLM = goldens.config("q25_mean_l2")
@@ -54,25 +54,6 @@ def _soon() -> Iterator[None]:
 
 def text(name: str, content: str) -> Spoil:
     return lambda folder: (folder / name).write_text(content)
-
-
-def settings(file: str, **changes: Any) -> Spoil:
-    def spoil(folder: Path) -> None:
-        content = json.loads((folder / file).read_text())
-        (folder / file).write_text(json.dumps(content | changes))
-
-    return spoil
-
-
-def text_settings(**changes: Any) -> Spoil:
-    """Of the language model in a vision-language one."""
-
-    def spoil(folder: Path) -> None:
-        content = json.loads((folder / "config.json").read_text())
-        content["text_config"].update(changes)
-        (folder / "config.json").write_text(json.dumps(content))
-
-    return spoil
 
 
 def header(change: Callable[[dict[str, Any]], object]) -> Spoil:

@@ -23,7 +23,7 @@ from rfm.engine import Engine
 from rfm.engine.execution import Execution
 from rfm.vlm.backbone import QWEN_2_5
 from rfm.vlm.collator import QwenCollator
-from rfm.vlm.film import Film
+from rfm.vlm.film import VlmFilm
 from rfm.vlm.images import Normalisation, QwenImages, fitted_size
 from rfm_client import PreferenceSample, ProgressSample, Sample
 from vlm import BFLOAT16, PLAIN, assert_close, film, predictor_of, upstream_inputs
@@ -256,7 +256,7 @@ def test_a_tokenizer_adds_nothing_to_what_the_chat_template_says(name: str) -> N
 @pytest.mark.parametrize("needed", [[], [1], [0, 2], [0, 1, 2]])
 def test_a_film_gives_the_frames_that_are_needed(make: Any, needed: list[int]) -> None:
     frames = np.random.default_rng(0).integers(0, 256, (3, 6, 4, 3), np.uint8)
-    given = Film.of(make(frames), 0).stack(needed)
+    given = VlmFilm.of(make(frames), 0).stack(needed)
     assert given.dtype == np.uint8
     np.testing.assert_array_equal(given, frames[np.array(needed, int)])
 
