@@ -36,7 +36,7 @@ from peers.upstream_forward import UpstreamRewind, progress_of
 from rfm import families
 from rfm.config import ExportConfig
 from rfm.engine import Engine
-from rfm.layers.heads import progress_from_logits
+from rfm.engine.layers import progress_from_logits
 from rfm.rewind.network import RewindBatch, RewindConfig, RewindTransformer
 from rfm.rewind.predictor import RewindPredictor
 from rfm_client import ProgressSample, Trajectory

@@ -7,30 +7,15 @@ from collections.abc import Collection
 from importlib import import_module
 from pathlib import Path
 
-from rfm.checkpoint import training
-from rfm.checkpoint.content import CheckpointError, read_run_config
-from rfm.checkpoint.decision import assumed
-from rfm.checkpoint.files import WEIGHTS, check_finite
-from rfm.checkpoint.hub import best_tag, find
+from rfm.checkpoint.content import WEIGHTS, CheckpointError
+from rfm.checkpoint.hub import find as find
+from rfm.checkpoint.provenance import assumed
+from rfm.checkpoint.run_config import HEADS, SIMILARITY, constant_heads, training_notes
+from rfm.checkpoint.weights import check_finite
 from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options
 
 # Packages in the order in which they are tried. ReWiND's comes last: its first checkpoints do not say what they are.
 FAMILIES = ("rfm.vlm", "rfm.rewind")
-
-__all__ = [
-    "FAMILIES",
-    "Checkpoint",
-    "CheckpointError",
-    "best_tag",
-    "choose",
-    "encoders_of",
-    "find",
-    "load",
-    "load_from",
-    "named",
-    "notes",
-    "read_run_config",
-]
 
 
 def named(package: str) -> Family:
@@ -90,7 +75,7 @@ def load_from(folder: Path, family: Family, options: Options) -> Checkpoint:
     return checkpoint
 
 
-def notes(folder: Path, checkpoint: Checkpoint, answered: Collection[str] = training.HEADS) -> list[str]:
+def notes(folder: Path, checkpoint: Checkpoint, answered: Collection[str] = HEADS) -> list[str]:
     """A line for the user on each thing that decides the scores of the checkpoint in ``folder``, and may be wrong.
 
     answered: heads of which its answers are made; of those that it lacks only that is said
@@ -98,8 +83,8 @@ def notes(folder: Path, checkpoint: Checkpoint, answered: Collection[str] = trai
     """
     lacks = checkpoint.description.lacks
     heads = [head for head in answered if head not in lacks]
-    missing = [head for head in answered if head in lacks - {training.SIMILARITY}]  # most have no head of similarity
+    missing = [head for head in answered if head in lacks - {SIMILARITY}]  # most have no head of similarity
     without = [f"{WEIGHTS}: there is no head of {' and '.join(missing)}: served without"] if missing else []
-    of_weights = training.constant_heads(checkpoint.parts[NETWORK], heads)
-    of_run = training.notes(folder, heads)
+    of_weights = constant_heads(checkpoint.parts[NETWORK], heads)
+    of_run = training_notes(folder, heads)
     return [*without, *of_run, *of_weights, *checkpoint.notes, *assumed(checkpoint.decisions())]

@@ -10,8 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from rfm.checkpoint.decision import Decision
-from rfm.feature_cache import FeatureCache
+from rfm.checkpoint.provenance import Decision
 from rfm_client.contract import FrameSize, RewardError
 from rfm_client.contract.named_frames import NamedFootage
 from rfm_client.contract.samples import Float32Array, Footage
@@ -20,8 +19,9 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from rfm.execution import Execution
-    from rfm.predictor import Predictor
+    from rfm.engine.execution import Execution
+    from rfm.engine.feature_cache import FeatureCache
+    from rfm.engine.predictor import Predictor
 
 NETWORK = "network"  # in Checkpoint.parts: the weights of the network that scores
 _USUAL_HEADS = ("has_preference", "has_success")  # fields of configurations
@@ -45,12 +45,11 @@ class Options:
 class Description:
     """What a checkpoint takes, and what it answers.
 
-    network_class: name of the network's class
     widths: Dv and Dt of the embeddings that it scores; None: it scores raw frames
     progress_bins: K; 1: continuous progress
     max_frames: the longest trajectory that its network can take; None: any length
-    trained_frames: the most frames of a trajectory in training; None: the checkpoint does not say
-    trained_padding: whether training padded shorter trajectories; None: the checkpoint does not say
+    trained_frames, trained_padding: the most frames of a trajectory in training, and whether shorter ones were padded;
+        None: the checkpoint does not say
     frame_size: to what it brings each raw frame; None: that depends on the frame
     frames_per_value: frames that share their scores
     keeps_features: it can keep what it makes of frames, and takes samples with named frames then
@@ -90,11 +89,7 @@ def config_fields(config: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class EncodersDescription:
-    """What the export records of encoders.
-
-    network_class: name of their class
-    frame_size: to what they bring each raw frame; None: that depends on the frame
-    """
+    """What the export records of encoders; ``frame_size``: to what they bring each raw frame; None: it depends."""
 
     network_class: str
     frame_size: FrameSize | None = None

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""What a model process is told: parameters in config.pbtxt that rfm_export writes, and variables of rfm serve."""
+"""What a model process is told: its version's folder, parameters in config.pbtxt, variables of rfm serve."""
+
+CHECKPOINT_FOLDER = "checkpoint"  # in a version of a model that scores
 
 THREADS_PARAMETER = "torch_threads"
 BUDGET_PARAMETER = "token_budget"

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from rfm.engine import Engine, Outcome
-from rfm.predictor import RowScores
+from rfm.engine.predictor import RowScores
 from rfm_client import (
     FrameScores,
     PreferenceResult,
@@ -112,7 +112,7 @@ def simulate(engine: Engine, file: Path, batch_s: float, row_s: float) -> Engine
 
 def _half(row: Any, num_bins: int) -> RowScores:
     """Scores of a row of either family."""
-    counts = row.num_frames if hasattr(row, "num_frames") else [len(video) for video in row.videos]
+    counts = [film.num_shown for film in row.films] if hasattr(row, "films") else [len(video) for video in row.videos]
     frames = []
     for count in counts:
         half = np.full(count, 0.5, np.float32)

@@ -16,7 +16,7 @@ import typer
 from rich.console import Console
 
 from rfm.checkpoint.content import CheckpointError
-from rfm.checkpoint.decision import table
+from rfm.checkpoint.provenance import table
 from rfm.config import ExportConfig, ServeConfig
 from rfm.launch.admin_key import AdminKeyError, take_key
 from rfm.launch.endpoints import Endpoints

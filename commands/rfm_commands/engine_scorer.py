@@ -13,11 +13,11 @@ from typing import Any, cast
 from safetensors import SafetensorError
 
 from rfm import families
-from rfm.checkpoint import training
 from rfm.checkpoint.content import CheckpointError
-from rfm.checkpoint.digest import settings_digest, weights_digest
+from rfm.checkpoint.provenance import settings_digest, weights_digest
+from rfm.checkpoint.run_config import PROGRESS, SUCCESS
 from rfm.engine import Engine
-from rfm.execution import Execution
+from rfm.engine.execution import Execution
 from rfm.family import Checkpoint, FrameEncoders, config_fields
 from rfm_client import ProgressResult, ProgressSample, RewardError, Trajectory
 from rfm_client.contract.samples import Footage, UInt8Array
@@ -44,7 +44,7 @@ class EngineScorer:
         told = {"device": on.type, **{name: _named(value) for name, value in options.items()}}
         folders = _folders(source, options)
         self._facts = _facts(source, self._checkpoint, self._encoders, folders, told)
-        self.notes = families.notes(folders[0], self._checkpoint, (training.PROGRESS, training.SUCCESS))
+        self.notes = families.notes(folders[0], self._checkpoint, (PROGRESS, SUCCESS))
         self._device = on
         self._lock = threading.Lock()
 

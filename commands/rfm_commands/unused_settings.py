@@ -9,7 +9,7 @@ from typing import Any
 
 from google.protobuf.text_format import ParseError
 
-from rfm.checkpoint.decision import source_name
+from rfm.checkpoint.provenance import source_name
 from rfm.launch.repository_folder import CONFIG_FILE
 from rfm.parameters import BUDGET_PARAMETER, DTYPE_PARAMETER, SAMPLE_TOKENS_PARAMETER, THREADS_PARAMETER
 from rfm_client.contract.model_info import SOURCE_PARAMETER

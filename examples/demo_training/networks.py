@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from demo_training.groups import HINT_DIM
-from rfm.checkpoint.files import WEIGHTS
+from rfm.checkpoint.content import WEIGHTS
 from rfm.rewind.checkpoint import IMAGE_ENCODER_PREFIX, TEXT_ENCODER_PREFIX, RewindCheckpoint
 from rfm.rewind.encoders import Encoders, ImagePreprocessor
 from rfm.rewind.network import RewindConfig, RewindTransformer

@@ -14,10 +14,9 @@ from typing import Any
 from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.checkpoint.content import read_run_config
-from rfm.checkpoint.decision import is_folder, source_name
-from rfm.checkpoint.digest import settings_digest, weights_digest
-from rfm.checkpoint.files import find_run_config
 from rfm.checkpoint.hub import commit_of
+from rfm.checkpoint.provenance import is_folder, settings_digest, source_name, weights_digest
+from rfm.checkpoint.run_config import find_run_config
 from rfm.family import NETWORK, Checkpoint, EncodersDescription, config_fields
 from rfm.parameters import DTYPE_PARAMETER
 from rfm_client.contract.model_info import (

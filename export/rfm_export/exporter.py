@@ -15,13 +15,13 @@ from google.protobuf.text_format import ParseError
 from safetensors import SafetensorError
 
 from rfm import families
-from rfm.checkpoint.decision import Decision, write
-from rfm.checkpoint.files import check_links, find_run_config
+from rfm.checkpoint.hub import check_links
+from rfm.checkpoint.provenance import Decision, write
+from rfm.checkpoint.run_config import find_run_config
 from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.family import Checkpoint, Description, Family, FrameEncoders, Options
-from rfm.parameters import FAMILY_PARAMETER
-from rfm.version_folder import CHECKPOINT_FOLDER
+from rfm.parameters import CHECKPOINT_FOLDER, FAMILY_PARAMETER
 from rfm_client.contract import wire
 from rfm_client.contract.names import encoder_name, frames_name
 from rfm_export.about import about, origin_in, origin_of, record_digests

@@ -20,6 +20,17 @@ from rfm.plain_yaml import read_yaml
 if TYPE_CHECKING:
     from torch import Tensor
 
+WEIGHTS = "model.safetensors"
+WEIGHTS_INDEX = "model.safetensors.index.json"
+NETWORK_CONFIG = "config.json"
+ADAPTER_CONFIG = "adapter_config.json"
+ADAPTER_WEIGHTS = "adapter_model.safetensors"
+RUN_CONFIG = "config.yaml"
+RUN_CONFIGS = (RUN_CONFIG, "config.yml", ".hydra/config.yaml")  # the first is read
+PREPROCESSOR_CONFIG = "preprocessor_config.json"  # beside a model's weights: how its images are made
+PIL_BICUBIC = 3  # the value of `resample` in it
+MAX_UINT8 = 255
+
 MAX_JSON_BYTES = 2**24
 MAX_HEADER_BYTES = 2**24  # of a safetensors file: a hundred for each tensor
 

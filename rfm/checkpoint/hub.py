@@ -9,9 +9,8 @@ import shlex
 from collections.abc import Iterable
 from pathlib import Path
 
-from rfm.checkpoint.content import CheckpointError, cut, is_there, shown
-from rfm.checkpoint.files import RUN_CONFIG, WEIGHTS
-from rfm.checkpoint.pickles import pickled_weights
+from rfm.checkpoint.content import RUN_CONFIG, WEIGHTS, CheckpointError, cut, is_there, shown
+from rfm.checkpoint.weights import PICKLE_STEM, pickled_weights
 
 _SOURCE = "a folder that exists or a Hugging Face id org/name[/subfolder][@tag]"
 _ID = re.compile(r"(?P<repo>\w[\w.-]*/\w[\w.-]*)(?:/(?P<subfolder>[\w=.+-]+(?:/[\w=.+-]+)*))?(?:@(?P<tag>.+))?")
@@ -34,6 +33,19 @@ def find(source: str | Path) -> Path:
     if match is None or ".." in Path(source).parts:
         raise CheckpointError(f"checkpoint: expected {_SOURCE}, got {shown(str(source))}{_near(path)}")
     return _fetch(match["repo"], match["subfolder"] or "", match["tag"], path)
+
+
+def check_links(folder: Path) -> None:
+    """Raises CheckpointError for a link in ``folder``, or one level below, to somewhere else.
+
+    Those of the Hub's cache lead from ``snapshots/<commit>`` to ``blobs`` beside it.
+    """
+    home = folder.resolve()
+    snapshots = next((path for path in home.parents if path.name == "snapshots"), None)
+    allowed = home if snapshots is None or not (snapshots.parent / "blobs").is_dir() else snapshots.parent
+    for file in (*folder.glob("*"), *folder.glob("*/*")):
+        if file.is_symlink() and not file.resolve().is_relative_to(allowed):
+            raise CheckpointError(f"{file}: expected a file of the checkpoint, got a link to {file.resolve()}")
 
 
 def commit_of(folder: Path) -> str:
@@ -94,7 +106,7 @@ def _refuse_pickles(repo_id: str, subfolder: str, tag: str | None) -> None:
     from huggingface_hub import HfApi
 
     files = [Path(file.rfilename) for file in HfApi().model_info(repo_id, revision=tag).siblings or ()]
-    names = pickled_weights((file.name for file in files if file.parent == Path(subfolder)), "pytorch_model")
+    names = pickled_weights((file.name for file in files if file.parent == Path(subfolder)), PICKLE_STEM)
     if names:
         revision = "" if tag is None else f" --revision {shlex.quote(tag)}"
         fetch = f"hf download {repo_id}{revision} --local-dir FOLDER"

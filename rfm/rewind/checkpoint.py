@@ -17,8 +17,19 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from rfm.checkpoint.content import CheckpointError, cut, is_there, misfits, read_json, read_run_config, shown
-from rfm.checkpoint.decision import (
+from rfm.checkpoint.content import (
+    NETWORK_CONFIG,
+    RUN_CONFIG,
+    WEIGHTS,
+    CheckpointError,
+    cut,
+    is_there,
+    misfits,
+    read_json,
+    read_run_config,
+    shown,
+)
+from rfm.checkpoint.provenance import (
     OF_UPSTREAM,
     OF_WEIGHTS,
     TRAINED_WITH_PADDING,
@@ -26,49 +37,39 @@ from rfm.checkpoint.decision import (
     file_name,
     source_name,
 )
-from rfm.checkpoint.files import (
-    MAX_COUNT,
-    NETWORK_CONFIG,
-    RUN_CONFIG,
-    WEIGHTS,
-    check_shapes,
-    find_run_config,
-    frame_count,
-    has_head,
-    read_weights,
-    take_prefix,
-    trained_frames,
-)
-from rfm.checkpoint.training import check_progress
+from rfm.checkpoint.run_config import MAX_COUNT, check_progress, find_run_config, frame_count, trained_frames
+from rfm.checkpoint.weights import check_shapes, has_head, read_weights, take_prefix
+from rfm.engine.feature_cache import FeatureCache
 from rfm.family import NETWORK, Description, Options, config_fields
-from rfm.feature_cache import FeatureCache
-from rfm.rewind import first_code, usual
 from rfm.rewind.encoders import Encoders
 from rfm.rewind.network import RewindConfig, RewindTransformer
 from rfm.rewind.predictor import RewindPredictor
+from rfm.rewind.pretrained import IMAGE_ENCODER, TEXT_ENCODER, differences, image_facts, text_facts
 
 MODEL_TYPE = "rewind_transformer"
 IMAGE_ENCODER_PREFIX = "image_encoder."
 TEXT_ENCODER_PREFIX = "text_encoder."
 
 # Upstream's configurations of before causal_mask, when no network had one, state all of these.
-_FIRST_FIELDS = {"video_feature_dim", "text_feature_dim", "hidden_dim", "num_layers", "num_attention_heads", "max_len"}
+_FIRST_FIELDS = ("video_feature_dim", "text_feature_dim", "hidden_dim", "num_layers", "num_attention_heads", "max_len")
 # What no ReWiND network is beyond, nor below 1: whatever is larger is a lie that would only cost memory and time.
-_LIMITS = {
-    "video_feature_dim": MAX_COUNT,
-    "text_feature_dim": MAX_COUNT,
-    "hidden_dim": MAX_COUNT,
-    "num_layers": 1024,
-    "num_attention_heads": MAX_COUNT,
-    "max_len": MAX_COUNT,
-    "progress_bins": MAX_COUNT,
-}
+_LIMITS = dict.fromkeys((*_FIRST_FIELDS, "progress_bins"), MAX_COUNT) | {"num_layers": 1024}
 _LAYERS = "transformer.layers."
 _OF_WEIGHTS = (
     "video_feature_dim", "text_feature_dim", "hidden_dim", "num_layers", "use_per_frame_progress_token",
     "progress_bins", "has_similarity", "has_preference", "has_success",
 )  # fmt: skip
 _STATED_TYPES: dict[str, type] = {"num_attention_heads": int, "max_len": int, "causal_mask": bool}
+
+# The first ReWiND code, the paper's (https://github.com/Jiahui-3205/ReWiND_Release): progress alone, names of its own,
+# no configuration. Its network always has so many heads and a causal mask. Its training script shows 16 frames unless
+# told otherwise.
+_FIRST_CODES_FRAME = "first_pos_embed"  # [1, D]; added to the first frame
+_FIRST_CODES_UNREAD = "class_token"  # a parameter that its network never reads
+_FIRST_CODES_SETTINGS = {
+    name: Decision(name, value, "default of the first ReWiND code", is_assumed=True)
+    for name, value in {"num_attention_heads": 8, "causal_mask": True, "max_len": 16}.items()
+}
 
 
 @dataclass(frozen=True)
@@ -115,47 +116,43 @@ class RewindCheckpoint:
         """A line on each encoder that is as wide as upstream's and another one."""
         if not self._has_encoders:
             return []
-        sources = (usual.IMAGE_ENCODER, self._image_source), (usual.TEXT_ENCODER, self._text_source)
-        found = [usual.differences(facts) for facts in self._facts()]
+        compared = zip((IMAGE_ENCODER, TEXT_ENCODER), self._sources, map(differences, self._facts()), strict=True)
         return [
-            f"{source}: differs from upstream's {known} in {'; '.join(names)}: scores are right only if the run's "
+            f"{source}: differs from upstream's {known} in {'; '.join(found)}: scores are right only if the run's "
             "embeddings were made with it"
-            for (known, source), names in zip(sources, found, strict=True)
-            if names
+            for known, source, found in compared
+            if found
         ]
 
     def decisions(self) -> list[Decision]:
         """What decided each setting, and the encoders, which no file of a training run names."""
-        if not self._has_encoders:
-            return [*self.settings]
-        taken = (
-            ("image_encoder", self._image_source, self.image_source, self.image_encoder),
-            ("text_encoder", self._text_source, self.text_source, self.text_encoder),
-        )
         decided = [*self.settings]
-        for (name, source, named, weights), facts in zip(taken, self._facts(), strict=True):
-            option = f"--{name.replace('_', '-')}" if named else OF_UPSTREAM
-            whose = "weights of the checkpoint" if weights else "only its width agrees"
-            decided.append(Decision(name, source_name(source), f"{option}; {whose}", is_assumed=True))
-            decided.append(Decision(f"{name}_settings", facts, f"files of {source_name(source)}"))
+        if not self._has_encoders:
+            return decided
+        named, weights = (self.image_source, self.text_source), (self.image_encoder, self.text_encoder)
+        encoders = zip(("image", "text"), self._sources, named, weights, self._facts(), strict=True)
+        for kind, source, option, own, facts in encoders:
+            given = f"--{kind}-encoder" if option else OF_UPSTREAM
+            whose = "weights of the checkpoint" if own else "only its width agrees"
+            source = source_name(source)
+            decided.append(Decision(f"{kind}_encoder", source, f"{given}; {whose}", is_assumed=True))
+            decided.append(Decision(f"{kind}_encoder_settings", facts, f"files of {source}"))
         return decided
-
-    def _facts(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """What the files of the image encoder and of the text encoder say. Raises CheckpointError."""
-        with self._having_encoders():
-            return usual.image_facts(self._image_source), usual.text_facts(self._text_source)
 
     @property
     def _has_encoders(self) -> bool:
         return any((self.image_encoder, self.text_encoder, self.image_source, self.text_source))
 
     @property
-    def _image_source(self) -> str:
-        return self.image_source or usual.IMAGE_ENCODER
+    def _sources(self) -> tuple[str, str]:
+        """Folders or ids of the image encoder and of the text encoder."""
+        return self.image_source or IMAGE_ENCODER, self.text_source or TEXT_ENCODER
 
-    @property
-    def _text_source(self) -> str:
-        return self.text_source or usual.TEXT_ENCODER
+    def _facts(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """What the files of the image encoder and of the text encoder say. Raises CheckpointError."""
+        image_source, text_source = self._sources
+        with self._having_encoders():
+            return image_facts(image_source), text_facts(text_source)
 
     def encoders(self) -> Encoders | None:
         """The encoders of a checkpoint that has them, or for which the user names them; else None.
@@ -166,36 +163,30 @@ class RewindCheckpoint:
             return None
         with self._having_encoders():
             encoders = Encoders.from_pretrained(
-                self._image_source,
-                self._text_source,
-                image_weights=self.image_encoder or None,
-                text_weights=self.text_encoder or None,
+                *self._sources, image_weights=self.image_encoder or None, text_weights=self.text_encoder or None
             )
         widths, expected = (encoders.video_feature_dim, encoders.text_feature_dim), self.description.widths
         if widths != expected:
-            where = f"encoders {self._image_source} and {self._text_source}"
-            raise CheckpointError(f"{where}: expected widths {expected}, got {widths}")
+            raise CheckpointError(f"encoders {' and '.join(self._sources)}: expected widths {expected}, got {widths}")
         return encoders
 
     @contextmanager
     def _having_encoders(self) -> Iterator[None]:
         """Turns what is raised of encoders that cannot be had into a CheckpointError."""
-        sources = (self._image_source, self._text_source)
         try:
             yield
         except misfits(ImportError, OSError) as error:
-            absent = [source for source in sources if not Path(source).is_dir()]
+            absent = [source for source in self._sources if not Path(source).is_dir()]
             here = f"; there is no folder {' nor '.join(absent)} either" if absent else ""
             hint = f"name local folders with --image-encoder and --text-encoder{here}"
-            raise CheckpointError(f"encoders {' and '.join(sources)}: {cut(str(error))} ({hint})") from error
+            raise CheckpointError(f"encoders {' and '.join(self._sources)}: {cut(str(error))} ({hint})") from error
 
     def predictor(
         self, device: torch.device, dtype: torch.dtype | None = None, cache: FeatureCache[Any] | None = None
     ) -> RewindPredictor:
-        """The network on ``device``. Raises CheckpointError.
+        """The network on ``device``, in ``dtype`` (None: float32); it reads embeddings, and needs no cache.
 
-        dtype: of the network; None: float32
-        cache: of no use: it reads embeddings
+        Raises CheckpointError.
         """
         return RewindPredictor(self.build(), device, dtype or torch.float32)
 
@@ -223,37 +214,44 @@ class RewindCheckpoint:
 
 def reads(folder: Path) -> bool:
     """Whether the folder does not say that it holds something else; the first ReWiND checkpoints say nothing."""
-    config = folder / NETWORK_CONFIG
-    return not is_there(config) or read_json(config).get("model_type", MODEL_TYPE) == MODEL_TYPE
+    return _saved(folder).get("model_type", MODEL_TYPE) == MODEL_TYPE
 
 
 def load(folder: Path, options: Options) -> RewindCheckpoint:
     """The checkpoint in a local folder. Raises CheckpointError."""
     network = read_weights(folder)
-    if (renamed := first_code.renamed(network)) is not None:
-        return _of_first_code(folder, renamed, options)
+    if _FIRST_CODES_FRAME in network:
+        return _of_first_code(folder, network, options)
     image_encoder = take_prefix(network, IMAGE_ENCODER_PREFIX)
     text_encoder = take_prefix(network, TEXT_ENCODER_PREFIX)
-    sources = options.image_encoder, options.text_encoder
-    stated = {**_stated(folder), "trained_frames": _trained_frames(folder)}
-    config = _rewind_config(folder, network, stated)
-    for name in _unread(config):
-        network.pop(name, None)
-    checkpoint = RewindCheckpoint(config, network, image_encoder, text_encoder, *sources, _settings(config, stated))
+    stated = _stated(folder)
+    config = _config(folder, network, stated)
+    if not config.has_preference:  # weights that upstream's network has for the sake of heads that this one lacks
+        network.pop("preference_token", None)
+    if not config.has_pairs:
+        network.pop("first_embedding_B", None)
+    sources, settings = (options.image_encoder, options.text_encoder), _settings(config, stated)
+    checkpoint = RewindCheckpoint(config, network, image_encoder, text_encoder, *sources, settings)
     checkpoint.check()
     return checkpoint
 
 
 def _of_first_code(folder: Path, weights: dict[str, Tensor], options: Options) -> RewindCheckpoint:
+    """The checkpoint, with its weights under upstream's names."""
+    first = weights.pop(_FIRST_CODES_FRAME)
+    if first.dim() != 2:
+        raise CheckpointError(f"{_FIRST_CODES_FRAME}: expected 2 axes, got {list(first.shape)}")
+    weights.pop(_FIRST_CODES_UNREAD, None)
+    weights["first_embedding_A"] = first[None]
     if options.image_encoder or options.text_encoder:
         raise CheckpointError(
             f"{folder}: encoders: expected none for a checkpoint of the first ReWiND code, which crops frames and does "
             "not resize them; encode frames as it does, and send video_embeddings and text_embedding"
         )
     read = {name: decision for name, decision in _stated(folder).items() if not decision.is_assumed}
-    stated = {**first_code.SETTINGS, **read}
+    stated = _FIRST_CODES_SETTINGS | read
     stated["trained_frames"] = Decision("trained_frames", stated["max_len"].value, "max_len")
-    config = _rewind_config(folder, weights, stated)
+    config = _config(folder, weights, stated)
     checkpoint = RewindCheckpoint(config, weights, settings=_settings(config, stated))
     checkpoint.check()
     return checkpoint
@@ -262,40 +260,39 @@ def _of_first_code(folder: Path, weights: dict[str, Tensor], options: Options) -
 def _settings(config: RewindConfig, stated: Mapping[str, Decision]) -> tuple[Decision, ...]:
     """What decided each setting of the network, and the clients' defaults."""
     of_weights = (*_OF_WEIGHTS, *(["max_len"] if config.use_per_frame_progress_token else []))
-    padding = Decision("trained_padding", config.trained_padding, NETWORK_CONFIG)
     return (
         *(Decision(name, getattr(config, name), OF_WEIGHTS) for name in of_weights),
         *(decision for name, decision in stated.items() if name not in of_weights),
-        TRAINED_WITH_PADDING if config.trained_padding is None else padding,
     )
 
 
-def _unread(config: RewindConfig) -> list[str]:
-    """Weights that upstream's network has, and that are read for the sake of heads alone that this one lacks."""
-    return [
-        *([] if config.has_preference else ["preference_token"]),
-        *([] if config.has_pairs else ["first_embedding_B"]),
-    ]
+def _config(folder: Path, weights: Mapping[str, Tensor], stated: Mapping[str, Decision]) -> RewindConfig:
+    def required(name: str) -> Any:
+        """A value that weights do not tell."""
+        if name not in stated:
+            places = f"{NETWORK_CONFIG} or model.rewind of {RUN_CONFIG}"
+            got = "got it in neither; weights do not tell it"
+            raise CheckpointError(f"{folder}: {name}: expected it in {places}, {got}")
+        return stated[name].value
 
-
-def _rewind_config(folder: Path, weights: Mapping[str, Tensor], stated: Mapping[str, Decision]) -> RewindConfig:
     has_progress_tokens = "prog_token_A" in weights
+    padding = stated["trained_padding"]
     try:
-        max_len = _shape(weights, "prog_token_A", 3)[1] if has_progress_tokens else _required(stated, "max_len", folder)
+        max_len = _shape(weights, "prog_token_A", 3)[1] if has_progress_tokens else required("max_len")
         hidden_dim, video_feature_dim = _shape(weights, "video_proj.weight", 2)
         config = RewindConfig(
             video_feature_dim=video_feature_dim,
             text_feature_dim=_shape(weights, "text_proj.weight", 2)[1],
             hidden_dim=hidden_dim,
             num_layers=len({name.split(".")[2] for name in weights if name.startswith(_LAYERS)}),
-            num_attention_heads=_required(stated, "num_attention_heads", folder),
+            num_attention_heads=required("num_attention_heads"),
             max_len=max_len,
-            causal_mask=_required(stated, "causal_mask", folder),
+            causal_mask=required("causal_mask"),
             use_per_frame_progress_token=has_progress_tokens,
             progress_bins=_shape(weights, "progress_head.4.weight", 2)[0],
             has_similarity="similarity_head.0.weight" in weights,
             trained_frames=stated["trained_frames"].value,
-            trained_padding=_trained_padding(folder),
+            trained_padding=None if padding is TRAINED_WITH_PADDING else padding.value,
             has_preference=has_head(weights, "preference"),
             has_success=has_head(weights, "success"),
         )
@@ -310,14 +307,6 @@ def _rewind_config(folder: Path, weights: Mapping[str, Tensor], stated: Mapping[
     return config
 
 
-def _required(stated: Mapping[str, Decision], name: str, folder: Path) -> Any:
-    """Raises CheckpointError for a value that neither weights nor configurations hold."""
-    if name not in stated:
-        places = f"{NETWORK_CONFIG} or model.rewind of {RUN_CONFIG}"
-        raise CheckpointError(f"{folder}: {name}: expected it in {places}, got it in neither; weights do not tell it")
-    return stated[name].value
-
-
 def _shape(weights: Mapping[str, Tensor], name: str, rank: int) -> torch.Size:
     """Raises KeyError if there is no such weight, CheckpointError if it has another number of axes."""
     shape = weights[name].shape
@@ -326,51 +315,29 @@ def _shape(weights: Mapping[str, Tensor], name: str, rank: int) -> torch.Size:
     return shape
 
 
-def _trained_frames(folder: Path) -> Decision:
-    """The most frames of a trajectory in training, as ``save`` wrote it to config.json, else as config.yaml has it."""
-    if is_there(folder / NETWORK_CONFIG):
-        saved = read_json(folder / NETWORK_CONFIG).get("trained_frames")
-        if saved is not None:
-            frames = frame_count(saved, f"{folder / NETWORK_CONFIG}: trained_frames")
-            return Decision("trained_frames", frames, NETWORK_CONFIG)
-    file = find_run_config(folder)
-    if file is None:
-        return Decision("trained_frames", None, "no file says it")
-    source = f"{file_name(file, folder)}: data.max_frames"
-    return Decision("trained_frames", trained_frames(read_run_config(file), file), source)
-
-
-def _trained_padding(folder: Path) -> bool | None:
-    """Whether training padded shorter trajectories, as ``save`` wrote it; upstream's configurations do not say."""
-    file = folder / NETWORK_CONFIG
-    padding = read_json(file).get("trained_padding") if is_there(file) else None
-    if padding is not None and not isinstance(padding, bool):
-        raise CheckpointError(f"{file}: trained_padding: expected true or false, got {shown(padding)}")
-    return padding
+def _saved(folder: Path) -> dict[str, Any]:
+    """What config.json says; nothing if there is none."""
+    return read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
 
 
 def _stated(folder: Path) -> dict[str, Decision]:
     """What config.json and config.yaml say of the network. Both may lack a field; neither may contradict the other."""
-    sources: dict[str, dict[str, Any]] = {}
+    saved, run, run_file = _saved(folder), {}, find_run_config(folder)
+    network: Any = {}
     places = {NETWORK_CONFIG: NETWORK_CONFIG}
-    if is_there(folder / NETWORK_CONFIG):
-        sources[NETWORK_CONFIG] = read_json(folder / NETWORK_CONFIG)
-    run_config = find_run_config(folder)
-    if run_config is not None:
-        run = read_run_config(run_config)
-        check_progress(run, run_config)
+    if run_file is not None:
+        run = read_run_config(run_file)
+        check_progress(run, run_file)
         model = run.get("model") or {}
         network = model.get("rewind") or {} if isinstance(model, dict) else model
         if not isinstance(network, dict):
-            raise CheckpointError(f"{run_config}: model.rewind: expected a mapping, got {shown(network)}")
-        sources[RUN_CONFIG] = network
-        places[RUN_CONFIG] = f"{file_name(run_config, folder)}: model.rewind"
-    model_type = sources.get(NETWORK_CONFIG, {}).get("model_type", MODEL_TYPE)
-    if model_type != MODEL_TYPE:
-        raise CheckpointError(
-            f"{folder / NETWORK_CONFIG}: model_type: expected {MODEL_TYPE}, got {cut(str(model_type))}"
-        )
+            raise CheckpointError(f"{run_file}: model.rewind: expected a mapping, got {shown(network)}")
+        places[RUN_CONFIG] = f"{file_name(run_file, folder)}: model.rewind"
+    if saved.get("model_type", MODEL_TYPE) != MODEL_TYPE:
+        got = cut(str(saved["model_type"]))
+        raise CheckpointError(f"{folder / NETWORK_CONFIG}: model_type: expected {MODEL_TYPE}, got {got}")
     stated: dict[str, Decision] = {}
+    sources = {NETWORK_CONFIG: saved, RUN_CONFIG: network}
     for name, kind in _STATED_TYPES.items():
         values = {source: content[name] for source, content in sources.items() if content.get(name) is not None}
         for source, value in values.items():
@@ -380,7 +347,25 @@ def _stated(folder: Path) -> dict[str, Decision]:
             raise CheckpointError(f"{folder}: {name}: expected {' and '.join(values)} to agree, got {values}")
         if values:
             stated[name] = Decision(name, next(iter(values.values())), " and ".join(places[each] for each in values))
-    if any(content.keys() >= _FIRST_FIELDS for content in sources.values()):
+    if any(content.keys() >= {*_FIRST_FIELDS} for content in sources.values()):
         older = Decision("causal_mask", False, f"{OF_UPSTREAM} of before causal_mask", is_assumed=True)
         stated.setdefault("causal_mask", older)
+    # What ``save`` wrote of the training, else what the run says of it.
+    frames, source = (
+        frame_count(saved.get("trained_frames"), f"{folder / NETWORK_CONFIG}: trained_frames"),
+        NETWORK_CONFIG,
+    )
+    if frames is None and run_file is not None:
+        frames, source = trained_frames(run, run_file), f"{file_name(run_file, folder)}: data.max_frames"
+    elif frames is None:
+        source = "no file says it"
+    stated["trained_frames"] = Decision("trained_frames", frames, source)
+    padding = saved.get("trained_padding")
+    if padding is not None and not isinstance(padding, bool):
+        where = f"{folder / NETWORK_CONFIG}: trained_padding"
+        raise CheckpointError(f"{where}: expected true or false, got {shown(padding)}")
+    is_said = padding is not None
+    stated["trained_padding"] = (
+        Decision("trained_padding", padding, NETWORK_CONFIG) if is_said else TRAINED_WITH_PADDING
+    )
     return stated

@@ -19,20 +19,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rfm.checkpoint.content import read_json
-from rfm.checkpoint.preprocessor import PREPROCESSOR_CONFIG
-from rfm.execution import Execution
+from rfm.checkpoint.content import PREPROCESSOR_CONFIG, read_json
+from rfm.engine.execution import Execution
+from rfm.engine.feature_cache import FeatureCache, get_or_make
+from rfm.engine.layers import as_tensor, speed_up
 from rfm.family import EncodersDescription
-from rfm.feature_cache import FeatureCache, get_or_make
-from rfm.layers.linear import speed_up
-from rfm.layers.tensors import as_tensor
-from rfm.rewind.preprocessing import ImagePreprocessor
-from rfm.rewind.pretrained import IMAGE_MODELS, TEXT_MODELS, load_model, load_preprocessor, load_tokenizer
-from rfm.version_folder import IMAGE_ENCODER_FOLDER, TEXT_ENCODER_FOLDER
+from rfm.rewind.pretrained import (
+    IMAGE_MODELS,
+    TEXT_MODELS,
+    ImagePreprocessor,
+    load_model,
+    load_preprocessor,
+    load_tokenizer,
+)
 from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError, Trajectory, wire
 from rfm_client.contract.named_frames import NamedFootage, NamedTrajectory
 from rfm_client.contract.samples import Float32Array, Footage, UInt8Array
 
+IMAGE_ENCODER_FOLDER = "image_encoder"  # in an exported version of a model that encodes
+TEXT_ENCODER_FOLDER = "text_encoder"
 IMAGES_PER_FORWARD = 64
 FRAMES_TOGETHER = 16  # that are brought to size in one call, for which they are copied
 MAX_ENCODER_ASPECT_RATIO = 50
@@ -166,7 +171,10 @@ class Encoders:
             execution.num_encoded += sum(map(len, whole))
             return self.encode_frames(whole, execution), self.encode_tasks(tasks, execution)
         with execution.collating():
-            named = [_named(trajectory) for trajectory in trajectories]
+            named = [
+                each if isinstance(each, NamedTrajectory) else NamedTrajectory.of(each.positions, each.task)
+                for each in trajectories
+            ]
             pixels = dict(pair for each in named for pair in each.pixels.items())
         wanted = (digest for each in named for digest in each.digests)
         images, num_made = get_or_make(
@@ -189,7 +197,8 @@ class Encoders:
         """float32 [Dv] of each frame [H, W, 3], or why there is none."""
         by_size = sorted(range(len(frames)), key=lambda index: frames[index].shape)
         sizes = groupby(by_size, key=lambda index: frames[index].shape)
-        parts = [part for _, of_size in sizes for part in _cut(list(of_size), FRAMES_TOGETHER)]
+        same = [list(of_size) for _, of_size in sizes]
+        parts = [each[at : at + FRAMES_TOGETHER] for each in same for at in range(0, len(each), FRAMES_TOGETHER)]
         images = self._images([np.stack([frames[index] for index in part]) for part in parts], execution)
         made = [image for image in images if isinstance(image, Tensor)]
         read = iter(torch.stack(made).float().cpu().numpy() if made else ())
@@ -270,16 +279,6 @@ def task_digest(task: str) -> bytes:
     return b"task" + hashlib.sha256(task.encode()).digest()
 
 
-def _cut(indices: Sequence[int], most: int) -> list[Sequence[int]]:
-    return [indices[start : start + most] for start in range(0, len(indices), most)]
-
-
-def _named(trajectory: Trajectory | NamedTrajectory) -> NamedTrajectory:
-    if isinstance(trajectory, NamedTrajectory):
-        return trajectory
-    return NamedTrajectory.of(trajectory.positions, trajectory.task)
-
-
 def _of_named(
     trajectory: NamedTrajectory, images: Mapping[bytes, Float32Array | RewardError]
 ) -> Float32Array | RewardError:
@@ -323,10 +322,6 @@ def _check_shapes(trajectory: Trajectory | NamedTrajectory) -> None:
     else:
         sizes = {trajectory.positions.shape[1:3]}
     for height, width in sizes:
-        _check_shape(height, width)
-
-
-def _check_shape(height: int, width: int) -> None:
-    if min(height, width) < 1 or max(height, width) > MAX_ENCODER_ASPECT_RATIO * min(height, width):
-        expected = f"frames at most {MAX_ENCODER_ASPECT_RATIO} times as long as wide"
-        raise InvalidSampleError.at("frames", expected, f"{height} x {width}")
+        if min(height, width) < 1 or max(height, width) > MAX_ENCODER_ASPECT_RATIO * min(height, width):
+            expected = f"frames at most {MAX_ENCODER_ASPECT_RATIO} times as long as wide"
+            raise InvalidSampleError.at("frames", expected, f"{height} x {width}")

@@ -1,18 +1,138 @@
 # SPDX-License-Identifier: MIT
-"""The ReWiND transformer as a predictor: samples of embeddings in, scores of rows out."""
+"""Samples of embeddings -> rows -> packed batches -> scores.
+
+A row is one token sequence of one forward: a sample is one row, and in dense mode one row per frame.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
+import numpy as np
+import numpy.typing as npt
 import torch
 
-from rfm.execution import Execution
-from rfm.predictor import RowScores, are_finite, checked, frame_scores, part_of
-from rfm.rewind.collator import RewindCollator, Row
-from rfm.rewind.network import RewindBatch, RewindTransformer
-from rfm_client.contract import InvalidSampleError, RewardError, Sample
+from rfm.engine.execution import Execution
+from rfm.engine.layers import as_tensor
+from rfm.engine.predictor import RowScores, are_finite, check_type, checked, frame_scores, part_of, prefix_indices
+from rfm.rewind.network import RewindBatch, RewindConfig, RewindTransformer, rounded_up
+from rfm_client.contract import InvalidSampleError, ProgressSample, RewardError, Sample, SimilaritySample, Trajectory
 from rfm_client.contract.named_frames import NamedProgressSample
+from rfm_client.contract.samples import Float32Array
+
+MAX_EMBEDDING = 1e6  # thousands of times what an encoder gives
+
+
+@dataclass(frozen=True, eq=False)
+class RewindRow:
+    """One token sequence: text [Dt], first [T, Dv], and in a question about two trajectories second [T, Dv].
+
+    picked: in dense mode int64 [K], the frames of ``first`` that the row is about; None: all
+    """
+
+    text: Float32Array
+    first: Float32Array
+    second: Float32Array | None = None
+    is_similarity: bool = False
+    picked: npt.NDArray[np.int64] | None = None
+
+    @property
+    def num_first(self) -> int:
+        """Frames of the first trajectory in the row."""
+        return len(self.first if self.picked is None else self.picked)
+
+    @property
+    def num_second(self) -> int:
+        """Frames of the second trajectory in the row, 0 without one."""
+        return 0 if self.second is None else len(self.second)
+
+    @property
+    def videos(self) -> tuple[Float32Array, ...]:
+        """The first trajectory, and the second if there is one."""
+        return (self.first,) if self.second is None else (self.first, self.second)
+
+    def shown(self, video: Float32Array) -> npt.NDArray[np.int64]:
+        """int64 [T], the frames of one of ``videos`` that are in the row."""
+        return np.arange(len(video)) if self.picked is None else self.picked
+
+
+@dataclass(frozen=True)
+class RewindCollator:
+    """What a checkpoint can take of a sample, and how a batch of it looks."""
+
+    config: RewindConfig
+
+    def rows(self, sample: Sample) -> list[RewindRow]:
+        """The rows of a sample of embeddings. Raises InvalidSampleError if the checkpoint cannot score it."""
+        check_type(sample, self.config)
+        frame_steps = sample.frame_steps if isinstance(sample, ProgressSample) else 0
+        if sample.trajectories[0].frames is not None:
+            raise InvalidSampleError.at("frames", "video_embeddings (no encoders are loaded)", "frames")
+        text = self._text(sample.trajectories[0])
+        videos = [self._video(trajectory, frame_steps) for trajectory in sample.trajectories]
+        if frame_steps:
+            return [RewindRow(text, videos[0], picked=picked) for picked in prefix_indices(len(videos[0]), frame_steps)]
+        if len(videos) == 1:
+            return [RewindRow(text, videos[0])]
+        return [RewindRow(text, videos[0], videos[1], isinstance(sample, SimilaritySample))]
+
+    def collate(self, rows: Sequence[RewindRow]) -> RewindBatch:
+        """One batch of rows of any kinds. Frames that several rows show are in it once."""
+        videos: dict[int, Float32Array] = {}
+        starts: dict[int, int] = {}
+        num_frames = 0
+        for row in rows:
+            for video in row.videos:
+                if id(video) not in videos:
+                    videos[id(video)], starts[id(video)] = video, num_frames
+                    num_frames += len(video)
+        frames = np.zeros((rounded_up(num_frames), self.config.video_feature_dim), np.float32)
+        np.concatenate(list(videos.values()), out=frames[:num_frames])
+        lengths = np.array([(row.num_first, row.num_second) for row in rows], np.int64)
+        shown = None
+        if lengths.sum() != num_frames or any(row.picked is not None for row in rows):
+            of_rows = [starts[id(video)] + row.shown(video) for row in rows for video in row.videos]
+            shown = as_tensor(np.concatenate(of_rows))
+        questions = [row.is_similarity for row in rows if row.second is not None]
+        return RewindBatch.of(
+            self.config,
+            as_tensor(np.stack([row.text for row in rows])),
+            as_tensor(frames),
+            lengths,
+            shown=shown,
+            is_similarity=torch.tensor(questions) if any(questions) else None,
+        )
+
+    def _text(self, trajectory: Trajectory) -> Float32Array:
+        width = self.config.text_feature_dim
+        text = trajectory.text_embedding
+        if text is None or text.shape != (width,):
+            got = "None" if text is None else str(list(text.shape))
+            raise InvalidSampleError.at("text_embedding", f"float32 [{width}]", got)
+        _check_range("text_embedding", text)
+        return text
+
+    def _video(self, trajectory: Trajectory, frame_steps: int) -> Float32Array:
+        """The trajectory's embeddings [T, Dv]."""
+        width, limit = self.config.video_feature_dim, self.config.max_frames
+        video = trajectory.video_embeddings
+        if video is None or video.shape[1] != width:
+            got = "frames" if video is None else str(list(video.shape))
+            raise InvalidSampleError.at("video_embeddings", f"float32 [T, {width}]", got)
+        if limit is not None and (frame_steps or len(video)) > limit:
+            where, count = ("frame_steps", frame_steps) if frame_steps else ("num_frames", len(video))
+            expected = f"at most {limit} (max_len of this checkpoint, which has per-frame progress tokens)"
+            raise InvalidSampleError.at(where, expected, str(count))
+        _check_range("video_embeddings", video)
+        return video
+
+
+def _check_range(where: str, embeddings: Float32Array) -> None:
+    """Raises InvalidSampleError for values with which the network's own would overflow."""
+    largest = max(float(embeddings.max()), -float(embeddings.min()))
+    if largest > MAX_EMBEDDING:
+        raise InvalidSampleError.at(where, f"values from {-MAX_EMBEDDING:g} to {MAX_EMBEDDING:g}", f"{largest:g}")
 
 
 class RewindPredictor:
@@ -29,20 +149,20 @@ class RewindPredictor:
         self.dtype = dtype
         self.collator = RewindCollator(network.config)
 
-    def rows(self, sample: Sample | NamedProgressSample) -> list[Row]:
+    def rows(self, sample: Sample | NamedProgressSample) -> list[RewindRow]:
         """The rows of a sample of embeddings. Raises InvalidSampleError."""
         if isinstance(sample, NamedProgressSample):
             raise InvalidSampleError.at("frames", "video_embeddings (this checkpoint reads embeddings)", "named frames")
         return self.collator.rows(sample)
 
-    def num_tokens(self, row: Row) -> int:
+    def num_tokens(self, row: RewindRow) -> int:
         """Number of tokens that the row takes in the transformer."""
         return self.network.config.num_tokens(row.num_first, row.num_second)
 
-    def work_ahead(self, rows: Sequence[Row]) -> None:
+    def work_ahead(self, rows: Sequence[RewindRow]) -> None:
         """Nothing: collation is cheap."""
 
-    def collate(self, rows: Sequence[Row]) -> RewindBatch:
+    def collate(self, rows: Sequence[RewindRow]) -> RewindBatch:
         """One batch of rows, which may be of different kinds."""
         return self.collator.collate(rows)
 
@@ -51,7 +171,7 @@ class RewindPredictor:
         execution.add_tokens(batch.packing.num_tokens, len(batch.packing.at))
 
     @torch.inference_mode()
-    def score(self, rows: Sequence[Row], batch: RewindBatch) -> list[RowScores | RewardError]:
+    def score(self, rows: Sequence[RewindRow], batch: RewindBatch) -> list[RowScores | RewardError]:
         """The scores of each row of the batch, or why it has none, from one forward pass."""
         output = self.network(batch.to(self.device, self.dtype))
         frames = frame_scores(output.progress, output.success)

@@ -24,9 +24,9 @@ from urllib.parse import quote
 
 from rfm.launch.admin_key import http_headers
 from rfm.launch.http import NO_ANSWER, Http
+from rfm.launch.proc import STOPPED, ZOMBIE, arguments_of, children_of, stat_of
 from rfm.launch.process import Config, TritonServer
 from rfm.launch.repository_api import INDEX_PATH, LOADING, READY, UNLOADING, ModelVersion, versions_of
-from rfm.proc import STOPPED, ZOMBIE, arguments_of, children_of, stat_of
 from rfm.supervise.probe import Probe, can_be_probed
 from rfm.supervise.status import NO_REASON, Status
 

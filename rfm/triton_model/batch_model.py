@@ -15,7 +15,7 @@ from typing import Any, Generic, TypeAlias, TypeVar
 
 import torch
 
-from rfm.execution import Execution
+from rfm.engine.execution import Execution
 from rfm.parameters import BUDGET_PARAMETER, DEFAULT_HANG_S, HANG_VARIABLE, OLD_QUEUE_PARAMETERS
 from rfm.probe import blank_question
 from rfm.triton_model.guard import Guard

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
-from rfm.execution import Execution
+from rfm.engine.execution import Execution
 from rfm.triton_model.request import OUTCOMES, SCORED, UNKNOWN_TYPE, Request
 
 FLUSH_INTERVAL_S = 0.25

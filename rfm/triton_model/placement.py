@@ -10,7 +10,8 @@ from typing import Any
 
 import torch
 
-from rfm.layers.precision import keep_float32
+from rfm.engine.device import use
+from rfm.engine.layers import keep_float32
 from rfm.parameters import THREADS_PARAMETER
 
 
@@ -38,8 +39,7 @@ class Placement:
         """To be called in each thread that computes: both settings are a thread's own."""
         use_threads(self.num_threads)
         keep_float32()
-        if self.device.type == "cuda":
-            torch.cuda.set_device(self.device)  # some kernels launch on the current device, whatever their tensors'
+        use(self.device)
 
     def run(self, work: Callable[[], None]) -> None:
         """Does the work in a thread of its own. When that ends, its OpenMP threads end, too."""

@@ -9,7 +9,7 @@ from google.protobuf import text_format
 from tritonclient.grpc import model_config_pb2 as pb
 
 from rfm.checkpoint.content import CheckpointError, is_there
-from rfm.checkpoint.digest import weights_digest
+from rfm.checkpoint.provenance import weights_digest
 from rfm_client.contract.model_info import DIGEST_PARAMETER
 
 

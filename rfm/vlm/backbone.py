@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""config.json of a backbone, in the form that both transformers 4.57 and 5 read alike.
+"""config.json of a backbone, and the names of its weights, in the form that transformers 4.57 and 5 read alike.
 
 Transformers 5 keeps all of a rotary embedding in ``rope_parameters``, which 4.57 ignores; before 4.52 a Qwen2.5-VL had
 no ``text_config``. No weight shows how positions were rotated, so nothing about that is left to a default.
@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import importlib.metadata
 import math
-from collections.abc import Mapping
-from typing import Any
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
+
+from torch import Tensor
 
 from rfm.checkpoint.content import CheckpointError, shown
 
@@ -143,3 +146,40 @@ def _vision(config: dict[str, Any], where: str) -> dict[str, Any]:
         expected = "axial with a rope_theta of 10000"
         raise CheckpointError(f"{where}.rope_parameters: expected {expected}, got {shown(rope)}; {_COPY}")
     return {name: value for name, value in config.items() if name != "rope_parameters"}
+
+
+# Renames of one form, tried in order on each name; the first that matches is applied.
+Renames: TypeAlias = Sequence[tuple[str, str]]
+SMOL_NAMES: Renames = ((r"^model\.model\.", "model."),)
+LORA_INSIDE: Renames = ((r"^(model(\.\w+)?)\.base_model\.model\.", r"\1."),)
+ADAPTER_NAMES: Renames = ((r"^base_model\.model\.", "model."),)
+# Of a Qwen backbone as transformers had its weights before 4.52, and as it writes them since in some cases.
+QWEN_NAMES: Renames = (
+    (r"^visual\.", "model.visual."),
+    (r"^model\.(embed_tokens|layers|norm)\.", r"model.language_model.\1."),
+)
+
+# What makes text, which no reward head reads; the rotary frequencies, which transformers once saved, and computes.
+UNUSED = re.compile(r"(model\.)?lm_head\.weight|.*\.(rotary_emb|rotary_pos_emb)\.(original_)?inv_freq")
+# What bitsandbytes, GPTQ, AWQ and FP8 write beside or in place of a weight.
+QUANTIZED = re.compile(
+    r"\.(absmax|quant_map|nested_absmax|SCB|qweight|qzeros|weight_packed|weight_scale|weight_scale_inv)$|\.quant_state\."
+)
+
+
+def renamed(weights: Mapping[str, Tensor], renames: Renames) -> dict[str, Tensor]:
+    """The weights under other names. Raises CheckpointError if two would have one."""
+
+    def rename(name: str) -> str:
+        for pattern, replacement in renames:
+            changed, count = re.subn(pattern, replacement, name)
+            if count:
+                return changed
+        return name
+
+    names = {rename(name): name for name in weights}
+    if len(names) < len(weights):
+        twice = next(name for name in weights if names[rename(name)] != name)
+        got = f"{shown(twice)} and {shown(names[rename(twice)])}"
+        raise CheckpointError(f"{rename(twice)}: expected one weight, got {got}; remove the one that is not meant")
+    return {name: weights[old] for name, old in names.items()}

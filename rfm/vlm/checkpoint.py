@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,53 +19,60 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from rfm.checkpoint.content import (
+    ADAPTER_CONFIG,
+    NETWORK_CONFIG,
+    WEIGHTS,
     CheckpointError,
     expecting,
     is_there,
     read_json,
     shown,
 )
-from rfm.checkpoint.decision import Decision
-from rfm.checkpoint.files import (
-    ADAPTER_CONFIG,
-    NETWORK_CONFIG,
-    WEIGHTS,
-    check_shapes,
-    has_head,
-    read_weights,
-)
-from rfm.checkpoint.nf4 import dequantize
-from rfm.checkpoint.training import check_progress
+from rfm.checkpoint.provenance import Decision
+from rfm.checkpoint.run_config import check_progress
+from rfm.checkpoint.weights import check_shapes, has_head, read_weights
+from rfm.engine.feature_cache import FeatureCache
 from rfm.family import NETWORK, Description, Options, config_fields
-from rfm.feature_cache import FeatureCache
-from rfm.version_folder import PROCESSOR_FOLDER
-from rfm.vlm.adapter import adapted, base_of_adapter, has_adapter
 from rfm.vlm.backbone import (
     BACKBONES,
+    LORA_INSIDE,
     NF4,
+    QUANTIZED,
     QWEN_2_5,
+    QWEN_NAMES,
     SMOL,
+    SMOL_NAMES,
     UNQUANTIZED,
+    UNUSED,
     backbone_config,
     check_not_quantized,
     is_at_least,
     quantization,
+    renamed,
 )
 from rfm.vlm.collator import VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP
-from rfm.vlm.lora import LORA_NAME, Scaling, changed_by, merged, split
-from rfm.vlm.names import LORA_INSIDE, QUANTIZED, QWEN_NAMES, SMOL_NAMES, UNUSED, Renames, renamed
+from rfm.vlm.lora import LORA_NAME, Scaling, adapted, base_of_adapter, changed_by, has_adapter, merged, split
 from rfm.vlm.network import VlmConfig, VlmRewardModel, build_backbone
+from rfm.vlm.nf4 import dequantize
 from rfm.vlm.predictor import VlmPredictor
-from rfm.vlm.processor import frame_size, load_collator, save_processor
+from rfm.vlm.processor import (
+    PROCESSOR_FOLDER,
+    check_published,
+    differences,
+    frame_size,
+    is_published,
+    load_collator,
+    of_processor,
+    save_processor,
+)
 from rfm.vlm.prompts import OF_AN_OLD_RUN
-from rfm.vlm.provenance import of_export, of_processor, of_rounding, of_run
-from rfm.vlm.published import check_published, differences, is_published
-from rfm.vlm.run_config import RunConfig
+from rfm.vlm.run_config import RunConfig, decisions_of
 
 LORA = "lora"  # in VlmCheckpoint.parts: the factors that change the network's weights
 SETTINGS = "rfm"  # key of our own fields in an exported config.json
 
+_NAMES_OF = {SMOL: SMOL_NAMES}
 _LAYER_COUNTS = ("num_hidden_layers", "num_layers", "depth")
 MAX_LAYERS = 1024
 
@@ -111,9 +118,22 @@ class VlmCheckpoint:
         return {NETWORK: self.weights, LORA: self.factors}
 
     @property
-    def notes(self) -> Sequence[str]:
+    def notes(self) -> list[str]:
         """That prompts, images or positions may be others than in training."""
-        return [*self._of_processor(), *self._of_positions()]
+        lines = []
+        if not self._is_own and (found := differences(self.collator)):
+            known = f"the published processors of {self.config.family}"
+            lines.append(f"base model {self._source}: differs from {known} in {'; '.join(found)}")
+        version = str(self.config.backbone.get("transformers_version"))
+        major = version.partition(".")[0]
+        reads_videos = self.config.family == QWEN_2_5 and not self.config.multi_image
+        if reads_videos and major.isdigit() and int(major) >= 5:
+            lines.append(
+                f"{NETWORK_CONFIG}: transformers_version is {version}: text behind a video stands where transformers 4 "
+                "puts it; if the run was trained with transformers 5, which puts it elsewhere, scores differ from the "
+                "run's"
+            )
+        return lines
 
     def decisions(self) -> list[Decision]:
         """What decided each setting. Raises CheckpointError if the processor cannot be had."""
@@ -128,24 +148,6 @@ class VlmCheckpoint:
     def _is_own(self) -> bool:
         """Whether the processor is the checkpoint's own, as an export has it."""
         return self._source == self.processor
-
-    def _of_processor(self) -> Sequence[str]:
-        """That it is not as published: the run may have been trained with it, or not."""
-        found = [] if self._is_own else differences(self.collator)
-        known = f"the published processors of {self.config.family}"
-        return [f"base model {self._source}: differs from {known} in {'; '.join(found)}"] if found else []
-
-    def _of_positions(self) -> Sequence[str]:
-        """That they may be others than in training, of a Qwen2.5-VL that reads videos."""
-        version = str(self.config.backbone.get("transformers_version"))
-        major = version.partition(".")[0]
-        if self.config.family != QWEN_2_5 or self.config.multi_image or not major.isdigit() or int(major) < 5:
-            return ()
-        return (
-            f"{NETWORK_CONFIG}: transformers_version is {version}: "
-            "text behind a video stands where transformers 4 puts "
-            "it; if the run was trained with transformers 5, which puts it elsewhere, scores differ from the run's",
-        )
 
     @cached_property
     def collator(self) -> VlmCollator:
@@ -187,7 +189,10 @@ class VlmCheckpoint:
     def build(self, dtype: torch.dtype | None = None) -> VlmRewardModel:
         """The network with these weights, on the CPU, ready to score, in ``dtype`` (None: its own)."""
         wanted = dtype or self.config.torch_dtype
-        _check_transformers(self.config)
+        if self.config.family == SMOL and is_at_least(5):  # it computes other image features than in training
+            expected = "transformers < 5 for a SmolVLM checkpoint, whose scores would differ"
+            version = importlib.metadata.version("transformers")
+            raise CheckpointError(f"transformers: expected {expected}, got {version}")
         network = self._network(wanted)
         # Parameters only: rotary frequencies stay float32, as in the original.
         network.load_state_dict(merged(self.weights, self.factors, wanted), strict=True, assign=True)
@@ -224,8 +229,8 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
         check_not_quantized(backbone, file, UNQUANTIZED)
         if SETTINGS in backbone:  # written by VlmCheckpoint.save, with every setting
             config = _saved_config(backbone)
-            weights, factors = _used(renamed(read_weights(folder), _renames(config.family)))
-            settings = of_export(config, options.base_model)
+            weights, factors = _used(renamed(read_weights(folder), _NAMES_OF.get(config.family, QWEN_NAMES)))
+            settings = decisions_of(config, None, options.base_model)
         else:
             run = RunConfig.of(folder)
             run.check_model_type()
@@ -238,8 +243,7 @@ def load(folder: Path, options: Options) -> VlmCheckpoint:
                 tensors, scaling = _whole(tensors, folder, backbone, run)
             weights, factors = _used(tensors, scaling)
             config = _trained_config(folder, backbone, run, weights)
-            settings = of_run(config, run, options.base_model, scaling, is_adapter=is_adapter)
-            settings = (*settings, *of_rounding(num_nf4))
+            settings = decisions_of(config, run, options.base_model, scaling, is_adapter=is_adapter, num_nf4=num_nf4)
     own = folder / PROCESSOR_FOLDER
     processor = own if own.is_dir() else None
     checkpoint = VlmCheckpoint(config, weights, factors, processor, options.base_model, settings)
@@ -281,20 +285,6 @@ def _trained_config(
     return config
 
 
-def _check_transformers(config: VlmConfig) -> None:
-    """Raises CheckpointError for SmolVLM on transformers 5, which computes other image features than in training."""
-    if config.family != SMOL:
-        return
-    if is_at_least(5):
-        expected = "transformers < 5 for a SmolVLM checkpoint, whose scores would differ"
-        version = importlib.metadata.version("transformers")
-        raise CheckpointError(f"transformers: expected {expected}, got {version}")
-
-
-def _renames(family: Any) -> Renames:
-    return SMOL_NAMES if family == SMOL else QWEN_NAMES
-
-
 def _in_full_precision(folder: Path, is_nf4: bool) -> tuple[dict[str, Tensor], int]:
     """The tensors in the folder, and the number of those that were in NF4; is_nf4: config.json says that some are."""
     tensors = read_weights(folder)
@@ -317,7 +307,7 @@ def _whole(
         tensors, scaling = renamed(tensors, LORA_INSIDE), Scaling.of(run.file, run.sections["peft"])
         if is_there(folder / ADAPTER_CONFIG):
             scaling.check_equal(Scaling.of(folder / ADAPTER_CONFIG, read_json(folder / ADAPTER_CONFIG)))
-    return renamed(tensors, _renames(backbone["model_type"])), scaling
+    return renamed(tensors, _NAMES_OF.get(backbone["model_type"], QWEN_NAMES)), scaling
 
 
 def _used(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:

@@ -17,17 +17,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rfm.feature_cache import FeatureCache
-from rfm.predictor import check_type
-from rfm.vlm.batch import FramesOfOneSize, QwenPixels, SmolPixels, VlmBatch
-from rfm.vlm.chat import Chat, Visual
-from rfm.vlm.film import Film, Indices, Shot, SizedFrames, named_frames
+from rfm.engine.feature_cache import FeatureCache
+from rfm.engine.predictor import check_type
+from rfm.vlm.batch import FramesOfOneSize, QwenPixels, Shots, SmolPixels, VlmBatch
+from rfm.vlm.film import Indices, Shot, SizedFrames, VlmFilm, named_frames
 from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, Grid, QwenImages, SmolImages
 from rfm.vlm.network import VlmConfig
-from rfm.vlm.positions import Box, positions
-from rfm.vlm.prompts import PREFERENCE_TOKEN, PROGRESS_TOKEN, SIMILARITY_TOKEN, TrajectoryPart, question
-from rfm.vlm.shots import Shots
-from rfm.vlm.vision import plan
+from rfm.vlm.prompts import PREFERENCE_TOKEN, PROGRESS_TOKEN, SIMILARITY_TOKEN, Chat, TrajectoryPart, Visual, question
+from rfm.vlm.qwen import Box, plan, positions
 from rfm_client.contract import InvalidSampleError, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.contract.named_frames import NamedProgressSample, NamedTrajectory
 from rfm_client.contract.samples import UInt8Array
@@ -56,7 +53,7 @@ class VlmRow:
     """
 
     input_ids: Indices
-    films: tuple[Film, ...]
+    films: tuple[VlmFilm, ...]
     spans: tuple[Spans, ...]
     query: int | None
     is_similarity: bool
@@ -69,12 +66,7 @@ class VlmRow:
         return tuple(film.frames for film in self.films)
 
     @property
-    def num_frames(self) -> list[int]:
-        """Frames of each trajectory that the conversation shows."""
-        return [film.num_shown for film in self.films]
-
-    @property
-    def shown(self) -> Iterator[tuple[Film, Indices]]:
+    def shown(self) -> Iterator[tuple[VlmFilm, Indices]]:
         """Each trajectory, and which of its frames the conversation shows."""
         return ((film, np.arange(film.num_shown) if self.picked is None else self.picked) for film in self.films)
 
@@ -89,26 +81,14 @@ class VlmCollator:
 
     tokenizer: the base model's, with the checkpoint's special tokens appended and a chat template
     images: preprocessing of the backbone's kind
-    keeps_conversations: whether the text and tokens of the latest conversations, without their frames, are kept
     """
 
-    def __init__(
-        self,
-        config: VlmConfig,
-        tokenizer: Any,
-        images: QwenImages | SmolImages,
-        *,
-        keeps_conversations: bool = False,
-    ) -> None:
+    def __init__(self, config: VlmConfig, tokenizer: Any, images: QwenImages | SmolImages) -> None:
         self.config = config
         self.tokenizer = tokenizer
         self.images = images
         self._special_tokens = tuple(tokenizer.get_added_vocab())
-        self._chat = Chat(tokenizer, keeps=keeps_conversations)
-
-    def keeping_conversations(self) -> VlmCollator:
-        """The same, but one that keeps conversations."""
-        return type(self)(self.config, self.tokenizer, self.images, keeps_conversations=True)
+        self._chat = Chat(tokenizer)
 
     @property
     def frames_per_shot(self) -> int:
@@ -130,7 +110,7 @@ class VlmCollator:
             return [replace(row, picked=picked) for picked in films[0].conversations]
         return [row]
 
-    def to_size(self, film: Film, cache: FeatureCache[Any] | None = None) -> SizedFrames:
+    def to_size(self, film: VlmFilm, cache: FeatureCache[Any] | None = None) -> SizedFrames:
         """A film's frames as large as the backbone reads them.
 
         cache: of shots whose frames need not be brought to size; None: there is none
@@ -139,7 +119,7 @@ class VlmCollator:
         keys = {shot: (id(film), shot) for shot in film.shots(are_images=self.config.multi_image)}
         return SizedFrames(self._to_size(film, frames.tolist()), frames, keys)
 
-    def _to_size(self, film: Film, needed: Sequence[int]) -> Tensor:
+    def _to_size(self, film: VlmFilm, needed: Sequence[int]) -> Tensor:
         """uint8 [N, H', W', 3] of some of a film's frames."""
         raise NotImplementedError
 
@@ -171,7 +151,7 @@ class VlmCollator:
         )
         return self._with_pixels(batch, rows)
 
-    def _row(self, sample: Sample | NamedProgressSample, films: tuple[Film, ...]) -> VlmRow:
+    def _row(self, sample: Sample | NamedProgressSample, films: tuple[VlmFilm, ...]) -> VlmRow:
         parts: list[str | Visual] = []
         for part in question(sample, progress_in_preference=self.config.progress_in_preference):
             parts += self._frame_parts(films[part.index].num_shown) if isinstance(part, TrajectoryPart) else [part]
@@ -196,17 +176,17 @@ class VlmCollator:
             each.append(PROGRESS_TOKEN)
         return each * num_frames
 
-    def _placed(self, text: str, films: tuple[Film, ...]) -> tuple[str, str, list[int]]:
+    def _placed(self, text: str, films: tuple[VlmFilm, ...]) -> tuple[str, str, list[int]]:
         """The text with one pad token for each image or video or group of it, which token, and of how many it stands
         for.
         """
         raise NotImplementedError
 
-    def _spans(self, ids: Indices, films: tuple[Film, ...]) -> tuple[Spans, ...]:
+    def _spans(self, ids: Indices, films: tuple[VlmFilm, ...]) -> tuple[Spans, ...]:
         """Where each frame's state is read."""
         raise NotImplementedError
 
-    def _position_ids(self, ids: Indices, films: tuple[Film, ...]) -> Indices | None:
+    def _position_ids(self, ids: Indices, films: tuple[VlmFilm, ...]) -> Indices | None:
         """int64 [3, L], if the backbone wants them."""
         return None
 
@@ -214,7 +194,7 @@ class VlmCollator:
         """The batch with what its backbone wants besides tokens."""
         raise NotImplementedError
 
-    def _image_spans(self, ids: Indices, films: tuple[Film, ...], ends: Spans) -> tuple[Spans, ...]:
+    def _image_spans(self, ids: Indices, films: tuple[VlmFilm, ...], ends: Spans) -> tuple[Spans, ...]:
         """Spans of frames that are images of their own; ``ends``: the tokens around each one's."""
         if self.config.per_frame_progress_token:
             spans = [(int(token), int(token) + 1) for token in self._positions(ids, PROGRESS_TOKEN)]
@@ -242,7 +222,7 @@ class QwenCollator(VlmCollator):
 
     images: QwenImages
 
-    def to_size(self, film: Film, cache: FeatureCache[Any] | None = None) -> SizedFrames:
+    def to_size(self, film: VlmFilm, cache: FeatureCache[Any] | None = None) -> SizedFrames:
         """The frames of the shots that are not kept."""
         if cache is None:
             return super().to_size(film)
@@ -255,13 +235,13 @@ class QwenCollator(VlmCollator):
         places[needed] = np.arange(len(needed))
         return SizedFrames(self._to_size(film, needed), places[alike], keys, kept)
 
-    def shot_keys(self, film: Film) -> dict[Shot, Hashable]:
+    def shot_keys(self, film: VlmFilm) -> dict[Shot, Hashable]:
         """What is shown of each of a film's shots, in which size: all that the vision tower's answer depends on."""
         grid, digests = self.grid(film), film.digests
         shots = film.shots(are_images=self.config.multi_image)
         return {shot: (grid.rows, grid.columns, *(digests[frame] for frame in shot)) for shot in shots}
 
-    def _to_size(self, film: Film, needed: Sequence[int]) -> Tensor:
+    def _to_size(self, film: VlmFilm, needed: Sequence[int]) -> Tensor:
         """uint8 [N, H', W', 3] of images, or of a video's frames."""
         frames = film.stack(needed)
         if self.config.multi_image:
@@ -272,13 +252,13 @@ class QwenCollator(VlmCollator):
     def _pad(self) -> str:
         return IMAGE_PAD if self.config.multi_image else VIDEO_PAD
 
-    def grid(self, film: Film) -> Grid:
+    def grid(self, film: VlmFilm) -> Grid:
         """The grid of all that is shown of a film: images, or temporal groups."""
         if self.config.multi_image:
             return replace(self.images.image_grid(*film.size), groups=film.num_shown)
         return self.images.video_grid(*film.size, film.num_shown)
 
-    def _placed(self, text: str, films: tuple[Film, ...]) -> tuple[str, str, list[int]]:
+    def _placed(self, text: str, films: tuple[VlmFilm, ...]) -> tuple[str, str, list[int]]:
         grids = [self.grid(film) for film in films]
         of_shots = [grid.tokens_per_group for grid in grids for _ in range(grid.groups)]
         if self.config.multi_image:
@@ -288,7 +268,7 @@ class QwenCollator(VlmCollator):
         timed = [_timed_groups(grid) for grid in grids]
         return _replaced(text, VISION_START + VIDEO_PAD + VISION_END, timed), VIDEO_PAD, of_shots
 
-    def _spans(self, ids: Indices, films: tuple[Film, ...]) -> tuple[Spans, ...]:
+    def _spans(self, ids: Indices, films: tuple[VlmFilm, ...]) -> tuple[Spans, ...]:
         starts = self._positions(ids, VISION_START)
         if self.config.multi_image:
             ends = list(zip(starts.tolist(), self._positions(ids, VISION_END).tolist(), strict=True))
@@ -304,7 +284,7 @@ class QwenCollator(VlmCollator):
             return list(pairwise(bounds))
         return [(bound, bound + 1) for bound in bounds[1:]]
 
-    def _position_ids(self, ids: Indices, films: tuple[Film, ...]) -> Indices:
+    def _position_ids(self, ids: Indices, films: tuple[VlmFilm, ...]) -> Indices:
         """Of images, and of Qwen3-VL's groups, each is a box of its own; else a video is one."""
         is_whole = not self.config.multi_image and self.config.family != QWEN3
         step = SECONDS_PER_GROUP * self.config.backbone["vision_config"].get("tokens_per_second", TOKENS_PER_SECOND)
@@ -344,21 +324,21 @@ class SmolCollator(VlmCollator):
 
     images: SmolImages
 
-    def _to_size(self, film: Film, needed: Sequence[int]) -> Tensor:
+    def _to_size(self, film: VlmFilm, needed: Sequence[int]) -> Tensor:
         """uint8 [N, side, side, 3]."""
         return self.images.images_to_size(film.stack(needed))
 
-    def _placed(self, text: str, films: tuple[Film, ...]) -> tuple[str, str, list[int]]:
+    def _placed(self, text: str, films: tuple[VlmFilm, ...]) -> tuple[str, str, list[int]]:
         text = text.replace(SMOL_IMAGE, FAKE + GLOBAL_IMAGE + SMOL_IMAGE + FAKE)
         return text, SMOL_IMAGE, [self.images.tokens] * sum(film.num_shown for film in films)
 
-    def _spans(self, ids: Indices, films: tuple[Film, ...]) -> tuple[Spans, ...]:
+    def _spans(self, ids: Indices, films: tuple[VlmFilm, ...]) -> tuple[Spans, ...]:
         around = self._positions(ids, FAKE).tolist()
         return self._image_spans(ids, films, list(zip(around[::2], around[1::2], strict=True)))
 
     def _with_pixels(self, batch: VlmBatch, rows: Sequence[VlmRow]) -> VlmBatch:
         """Each conversation's squares side by side; a film that several show is there once."""
-        firsts: dict[Film, int] = {}
+        firsts: dict[VlmFilm, int] = {}
         for film in (film for row in rows for film, _ in row.shown):
             if film not in firsts:
                 firsts[film] = sum(len(each.frames) for each in firsts)
@@ -375,12 +355,12 @@ class SmolCollator(VlmCollator):
         return replace(batch, pixels=pixels)
 
 
-def _film(trajectory: Trajectory | NamedTrajectory, frame_steps: int) -> Film:
+def _film(trajectory: Trajectory | NamedTrajectory, frame_steps: int) -> VlmFilm:
     if isinstance(trajectory, NamedTrajectory):
-        return Film.of(named_frames(trajectory), frame_steps, trajectory.digests)
+        return VlmFilm.of(named_frames(trajectory), frame_steps, trajectory.digests)
     if trajectory.frames is None:
         raise InvalidSampleError.at("video_embeddings", "frames (this checkpoint reads raw frames)", "embeddings")
-    return Film.of(trajectory.frames, frame_steps)
+    return VlmFilm.of(trajectory.frames, frame_steps)
 
 
 def _replaced(text: str, placeholder: str, replacements: Sequence[str]) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
-from rfm.dense_mode import prefix_indices
+from rfm.engine.predictor import prefix_indices
 from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm_client.contract import InvalidSampleError, wire
 from rfm_client.contract.named_frames import NamedTrajectory, frame_digest
@@ -42,7 +42,7 @@ class SizedFrames:
 
 
 @dataclass(eq=False)
-class Film:
+class VlmFilm:
     """A trajectory's frames, which all rows about it share.
 
     frames: uint8 [H, W, 3] each, of one size
@@ -61,7 +61,7 @@ class Film:
     @classmethod
     def of(
         cls, frames: Sequence[UInt8Array] | UInt8Array, frame_steps: int, named: Sequence[bytes] | None = None
-    ) -> Film:
+    ) -> VlmFilm:
         """The film of a sample's frames. ``frame_steps``: of dense mode; 0: one conversation shows all frames."""
         count = len(frames)
         conversations = list(prefix_indices(count, frame_steps)) if frame_steps else [np.arange(count)]

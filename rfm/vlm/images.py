@@ -20,7 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from rfm.checkpoint.preprocessor import MAX_UINT8, PIL_BICUBIC
+from rfm.checkpoint.content import MAX_UINT8, PIL_BICUBIC
 from rfm_client.contract.samples import UInt8Array
 
 MERGE = 2

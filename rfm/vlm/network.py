@@ -15,11 +15,10 @@ from typing import Any, Literal, TypeAlias
 import torch
 from torch import Tensor, nn
 
-from rfm.layers.heads import PredictionHead
+from rfm.engine.layers import PredictionHead
 from rfm.vlm.backbone import BACKBONES, SMOL
 from rfm.vlm.batch import VlmBatch
-from rfm.vlm.qwen import check_attention, last_hidden_state
-from rfm.vlm.vision import features
+from rfm.vlm.qwen import check_attention, features, last_hidden_state
 
 Pooling: TypeAlias = Literal["mean", "boundary", "attention"]
 

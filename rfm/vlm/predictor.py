@@ -11,16 +11,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from rfm.execution import Execution, memory_errors
-from rfm.feature_cache import FeatureCache
-from rfm.layers.heads import progress_from_logits
-from rfm.layers.linear import speed_up
-from rfm.predictor import RowScores, checked, no_success, part_of
+from rfm.engine.device import Copies, memory_errors
+from rfm.engine.execution import Execution
+from rfm.engine.feature_cache import FeatureCache
+from rfm.engine.layers import progress_from_logits, speed_up
+from rfm.engine.predictor import RowScores, checked, no_success, part_of
 from rfm.vlm.batch import Layout, VlmBatch
 from rfm.vlm.collator import VlmCollator, VlmRow
 from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm.vlm.network import VlmOutput
-from rfm.vlm.upload import Upload
 from rfm_client.contract import FrameScores, InvalidSampleError, RewardError, Sample
 from rfm_client.contract.named_frames import NamedProgressSample
 
@@ -39,10 +38,10 @@ class VlmPredictor:
     ) -> None:
         self.network = network.to(device).eval()
         speed_up(self.network)
-        self.collator = collator if cache is None else collator.keeping_conversations()
+        self.collator = collator
         self.device = device
         self.cache = cache
-        self._upload = Upload(device)
+        self._copies = Copies(device)
         self._dtype = next(network.parameters()).dtype
         self._max_tokens = int(network.model.config.get_text_config().max_position_embeddings)
 
@@ -65,13 +64,13 @@ class VlmPredictor:
         for film in (film for row in rows for film in row.films):
             if film.sized is None:
                 sized = self.collator.to_size(film, self.cache)
-                film.sized = replace(sized, pixels=self._upload(sized.pixels))
+                film.sized = replace(sized, pixels=self._copies.send(sized.pixels))
 
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
         """Conversations of any kind."""
         self.work_ahead(rows)
         batch = self.collator.collate(rows)
-        return batch.pinned() if self.device.type == "cuda" else batch
+        return batch.pinned() if self._copies.pins else batch
 
     def count(self, batch: VlmBatch, execution: Execution) -> None:
         """Counts tokens, padding to the longest conversation, and the frames of the different shots that go through the
@@ -85,14 +84,14 @@ class VlmPredictor:
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch) -> list[RowScores | RewardError]:
         """The scores of each row of the batch, or why it has none, from one forward pass."""
-        self._upload.wait_for([] if batch.pixels is None else batch.pixels.films)
+        self._copies.wait_for([] if batch.pixels is None else batch.pixels.films)
         output = self._output(batch)
         scores, preference, similarity, may_keep = _read(output)
         of_rows, read, num_queries = [], 0, 0
         for row in rows:
             frames = []
-            for spans, num_frames in zip(row.spans, row.num_frames, strict=True):
-                frames.append(self._per_frame(part_of(scores, slice(read, read + len(spans))), num_frames))
+            for spans, film in zip(row.spans, row.films, strict=True):
+                frames.append(self._per_frame(part_of(scores, slice(read, read + len(spans))), film.num_shown))
                 read += len(spans)
             query = None
             if row.query is not None:

@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
-from rfm.checkpoint.content import CheckpointError, read_json
-from rfm.checkpoint.preprocessor import PREPROCESSOR_CONFIG
+from rfm.checkpoint.content import PREPROCESSOR_CONFIG, CheckpointError, read_json
+from rfm.checkpoint.provenance import Decision, source_name
 from rfm.vlm.backbone import QWEN_2_5, SMOL, is_at_least
 from rfm.vlm.collator import (
     IMAGE_PAD,
@@ -22,9 +23,10 @@ from rfm.vlm.collator import (
 )
 from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, Normalisation, QwenImages, SmolImages, fitted_size
 from rfm.vlm.network import VlmConfig
-from rfm.vlm.prompts import OLD_SPECIAL_TOKENS, SPECIAL_TOKENS
+from rfm.vlm.prompts import OLD_SPECIAL_TOKENS, SPECIAL_TOKENS, Chat, Visual
 from rfm_client.contract import FrameSize
 
+PROCESSOR_FOLDER = "processor"  # in an exported checkpoint: its tokenizer and image preprocessing
 PROCESSOR_CONFIG = "processor_config.json"
 TOKENIZER_CONFIG = "tokenizer_config.json"
 # Fields of it that transformers 4.57 and 5 read alike; all else stands in tokenizer.json.
@@ -150,3 +152,75 @@ def _collator(config: VlmConfig, tokenizer: Any, preprocessor: dict[str, Any], w
     vision = config.backbone["vision_config"]
     tokens = (vision["image_size"] // vision["patch_size"] // config.backbone["scale_factor"]) ** 2
     return SmolCollator(config, tokenizer, SmolImages(SMOL_SIZE_PX, preprocessor["resample"], tokens, normalisation))
+
+
+_EXAMPLE = "TASK"
+_QWEN_PROMPT = "<|im_start|>user\nTASK{visual} 1: <|vision_start|><|{pad}_pad|><|vision_end|><|im_end|>\n"
+_NAMES = {
+    QWEN_2_5: r"Qwen/Qwen2\.5-VL-\w+-Instruct",
+    QWEN3: r"Qwen/Qwen3-VL-\w+-Instruct",
+    SMOL: r"HuggingFaceTB/SmolVLM2-[\w.-]+-Instruct",
+}
+_FACTS: dict[str, dict[str, Any]] = {
+    QWEN_2_5: {
+        "prompt": f"<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n{_QWEN_PROMPT}",
+        "patch_size": 14,
+        "image_mean": [0.48145466, 0.4578275, 0.40821073],
+        "image_std": [0.26862954, 0.26130258, 0.27577711],
+    },
+    QWEN3: {"prompt": _QWEN_PROMPT, "patch_size": 16, "image_mean": [0.5] * 3, "image_std": [0.5] * 3},
+    SMOL: {
+        "prompt": "<|im_start|>User: TASK<image><end_of_utterance>\n",
+        "resample": 1,
+        "image_mean": [0.5] * 3,
+        "image_std": [0.5] * 3,
+    },
+}
+
+
+def is_published(base_model_id: str, family: str) -> bool:
+    """Whether the base model is one of those whose processors are known."""
+    return re.fullmatch(_NAMES[family], base_model_id) is not None
+
+
+def facts(collator: VlmCollator) -> dict[str, Any]:
+    """What a processor does, as JSON can hold it: the text of a conversation that shows one frame or video, and how
+    images become numbers.
+    """
+    visual = Visual.IMAGE if collator.config.multi_image else Visual.VIDEO
+    images = {**collator.images.to_config()}
+    del images["rescale_factor"]  # the only one that loads
+    for name in ("image_mean", "image_std"):
+        images[name] = list(images[name])
+    return {"prompt": Chat(collator.tokenizer).text((_EXAMPLE, visual)), **images}
+
+
+def check_published(collator: VlmCollator, processor: str) -> None:
+    """Raises CheckpointError for a processor that stands for a published one, and is another."""
+    found = differences(collator)
+    if found:
+        named = collator.config.base_model_id
+        raise CheckpointError(
+            f"base model {processor}: expected a processor like that of {named}, which the run names: "
+            f"{'; '.join(found)}; name a folder with the files of {named} with --base-model, or correct "
+            "model.base_model_id of the run's config.yaml"
+        )
+
+
+def differences(collator: VlmCollator) -> list[str]:
+    """Where a processor differs from the published ones of its backbone's kind."""
+    words = (
+        {"visual": "Picture", "pad": "image"} if collator.config.multi_image else {"visual": "Video", "pad": "video"}
+    )
+    known = {**_FACTS[collator.config.family]}
+    known["prompt"] = known["prompt"].format(**words)
+    got = facts(collator)
+    return [f"{name}: expected {value!r}, got {got[name]!r}" for name, value in known.items() if got[name] != value]
+
+
+def of_processor(collator: VlmCollator, source: object) -> list[Decision]:
+    """The decisions about prompts and images. ``source``: folder or id of the processor."""
+    name = f"processor of {source_name(str(source))}" if source != PROCESSOR_FOLDER else f"{PROCESSOR_FOLDER}/"
+    tokens = [collator.tokenizer.convert_tokens_to_ids(token) for token in SPECIAL_TOKENS]
+    read = [Decision(fact, value, name) for fact, value in facts(collator).items()]
+    return [*read, Decision("special_tokens", tokens, "weights: last rows of the embedding")]

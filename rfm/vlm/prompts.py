@@ -1,15 +1,21 @@
 # SPDX-License-Identifier: MIT
-"""The prompts of vision-language checkpoints, to the letter: the wording is part of the checkpoint.
+"""The conversations of vision-language checkpoints, to the letter: the wording is part of the checkpoint.
 
-A question is a list of parts in the order in which the model reads them: text, and whole trajectories.
+A question is a list of parts in the order in which the model reads them: text, and whole trajectories. The chat
+template makes text of it, and the tokenizer tokens.
 Source: the collators of ``reward_fm`` and ``robometer``.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from enum import Enum
+from functools import lru_cache
+from typing import Any, TypeAlias
 
+import numpy as np
+
+from rfm.vlm.film import Indices
 from rfm_client.contract import PreferenceSample, ProgressSample, Sample
 from rfm_client.contract.named_frames import NamedProgressSample
 
@@ -84,3 +90,47 @@ def question(sample: Sample | NamedProgressSample, *, progress_in_preference: bo
         TrajectoryPart(1),
         SIMILARITY_TOKEN,
     ]
+
+
+KEPT_TEXTS = 256  # conversations: an RL loop asks about the same task again and again
+MAX_KEPT_BYTES = 16_384  # of one's text; a task sentence and 128 frames have fewer. A byte is a token at most.
+FRAME_BYTES = 64  # of a chat template's text about a frame, about
+
+
+class Visual(Enum):
+    """What a chat template shows besides text, by the name that it has there."""
+
+    IMAGE = "image"
+    VIDEO = "video"
+
+
+class Chat:
+    """A base model's chat template and tokenizer. The latest short conversations are kept: they come again."""
+
+    def __init__(self, tokenizer: Any) -> None:
+        self._tokenizer = tokenizer
+        self._text = lru_cache(KEPT_TEXTS)(self._render)
+        self._tokens = lru_cache(KEPT_TEXTS)(self._tokenise)
+
+    def text(self, parts: tuple[str | Visual, ...]) -> str:
+        """The chat template's text of one user message."""
+        is_short = sum(_num_bytes(part) if isinstance(part, str) else FRAME_BYTES for part in parts) <= MAX_KEPT_BYTES
+        return (self._text if is_short else self._render)(parts)
+
+    def tokens(self, text: str) -> Indices:
+        """int64 [L]: the text's tokens; not to be changed."""
+        return (self._tokens if _num_bytes(text) <= MAX_KEPT_BYTES else self._tokenise)(text)
+
+    def _render(self, parts: tuple[str | Visual, ...]) -> str:
+        content = [{"type": "text", "text": part} if isinstance(part, str) else {"type": part.value} for part in parts]
+        conversation = [{"role": "user", "content": content}]
+        return str(self._tokenizer.apply_chat_template(conversation, tokenize=False, add_vision_id=True))
+
+    def _tokenise(self, text: str) -> Indices:
+        ids = np.asarray(self._tokenizer(text, add_special_tokens=False, verbose=False)["input_ids"], np.int64)
+        ids.setflags(write=False)
+        return ids
+
+
+def _num_bytes(text: str) -> int:
+    return len(text.encode(errors="surrogatepass"))

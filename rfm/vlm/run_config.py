@@ -7,14 +7,19 @@ docs/checkpoints.md lists every setting, and what decides it where the file lack
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from rfm.checkpoint.content import CheckpointError, read_run_config, shown
-from rfm.checkpoint.decision import OF_UPSTREAM, Decision, file_name
-from rfm.checkpoint.files import RUN_CONFIG, find_run_config, frame_count, trained_frames
-from rfm.vlm.backbone import SMOL
+from rfm.checkpoint.content import ADAPTER_CONFIG, NETWORK_CONFIG, RUN_CONFIG, CheckpointError, read_run_config, shown
+from rfm.checkpoint.provenance import OF_UPSTREAM, OF_WEIGHTS, TRAINED_WITH_PADDING, Decision, file_name, source_name
+from rfm.checkpoint.run_config import find_run_config, frame_count, trained_frames
+from rfm.vlm.backbone import QWEN_2_5, SMOL
+from rfm.vlm.network import VlmConfig
+
+if TYPE_CHECKING:
+    from rfm.vlm.lora import Scaling
 
 HEADS, VQA = "default", "vqa"  # values of model.model_type: reward heads, and answers in generated text
 DTYPES = ("float32", "bfloat16", "float16")
@@ -32,6 +37,9 @@ SETTINGS = {
     "size_px": ("data.resized_height", "data.resized_width"),
     "trained_frames": ("data.max_frames",),
 }
+_OF_WEIGHTS = ("progress_bins", "has_similarity", "has_preference", "has_success")
+_BASE_MODEL = "--base-model"
+_VARIANT = re.compile(r"-unsloth$")  # of one model, which Unsloth puts in the place of a base model
 _DROPPED = ("pairwise_progress", "use_progress_token")  # other ways to prompt that upstream once had
 
 Value = TypeVar("Value", bool, str, float)
@@ -160,3 +168,62 @@ class RunConfig:
             mend = "set both to how the run showed frames"
             raise CheckpointError(f"{self.file}: expected {' and '.join(places)} to agree, got {got}; {mend}")
         return any(values.values())
+
+
+def decisions_of(
+    config: VlmConfig,
+    run: RunConfig | None,
+    base_model: str | None,
+    scaling: Scaling | None = None,
+    *,
+    is_adapter: bool = False,
+    num_nf4: int = 0,
+) -> tuple[Decision, ...]:
+    """What decided each setting of a checkpoint.
+
+    run: None: ``rfm export`` wrote it, and its config.json has every setting
+    base_model: the one that the caller names
+    scaling: of LoRA factors; None: there are none
+    is_adapter: the base model's weights are not in the checkpoint
+    num_nf4: weights in NF4, which may have been rounded after training
+    """
+    idle = {"average_temporal_patches", "size_px"} if config.multi_image else set()  # change nothing about it
+    idle |= set() if config.pools_images else {"frame_pooling"}
+    idle |= set() if config.pools_by_attention else {"pooling_temperature"}
+    deciding = {name: getattr(config, name) for name in SETTINGS if name not in idle}
+    decided = [
+        Decision("backbone", config.family, f"{NETWORK_CONFIG} of base_model" if is_adapter else NETWORK_CONFIG),
+        _base_model(config.base_model_id, run, base_model),
+    ]
+    if run is not None and scaling is not None:
+        file = ADAPTER_CONFIG if scaling.file.name == ADAPTER_CONFIG else f"{run.name}: peft"
+        decided.append(Decision("lora", {"r": scaling.rank, "lora_alpha": scaling.alpha}, f"{file}: r, lora_alpha"))
+    decided += [Decision(name, getattr(config, name), OF_WEIGHTS) for name in _OF_WEIGHTS]
+    for name, value in deciding.items():
+        decided.append(Decision(name, value, NETWORK_CONFIG) if run is None else run.decision(name, value))
+    decided.append(TRAINED_WITH_PADDING)
+    if run is not None and config.family == QWEN_2_5 and not config.multi_image:
+        version = config.backbone.get("transformers_version")  # of 5 or later, VlmCheckpoint.notes tells
+        stated = f"{NETWORK_CONFIG}: transformers_version {version}"
+        source = stated if str(version).startswith("4.") else "default: no file names transformers 4"
+        decided.append(Decision("positions_behind_videos", "as transformers 4", source, is_assumed=version is None))
+    if num_nf4:
+        rounded, source = f"{num_nf4} in NF4 of bitsandbytes", f"{OF_WEIGHTS}, rounded in training too"
+        decided.append(Decision("rounded_weights", rounded, source, is_assumed=True))
+    return tuple(decided)
+
+
+def _base_model(named: str, run: RunConfig | None, given: str | None) -> Decision:
+    """Where the tokenizer and image preprocessing are from, and of an adapter what it changes."""
+    if given is None:
+        file = NETWORK_CONFIG if run is None else f"{run.name}: model.base_model_id"
+        return Decision("base_model", source_name(named), file)
+    if run is None or not named or model_name(named) in given.lower():
+        return Decision("base_model", source_name(given), _BASE_MODEL)
+    source = f"{_BASE_MODEL}, for {named} of {run.name}"
+    return Decision("base_model", source_name(given), source, is_assumed=True)
+
+
+def model_name(base: str) -> str:
+    """What is left of a base model's id or path where the same model may have several."""
+    return _VARIANT.sub("", base.rstrip("/").rpartition("/")[2].lower())

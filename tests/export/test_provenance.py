@@ -22,7 +22,7 @@ import rfm_export
 from engines import serve_config
 from rfm import families
 from rfm.checkpoint.content import CheckpointError
-from rfm.checkpoint.decision import PROVENANCE, Decision
+from rfm.checkpoint.provenance import PROVENANCE, Decision
 from rfm.config import ExportConfig
 from rfm_commands.cli import app
 

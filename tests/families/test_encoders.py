@@ -14,15 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 import goldens
 from engines import load_engine
 from rfm import families
-from rfm.checkpoint.content import CheckpointError
-from rfm.checkpoint.preprocessor import PREPROCESSOR_CONFIG
-from rfm.execution import Execution
+from rfm.checkpoint.content import PREPROCESSOR_CONFIG, CheckpointError
+from rfm.engine.execution import Execution
 from rfm.rewind.encoders import Encoders, ImagePreprocessor
 from rfm_client import (
     BatchTiming,
@@ -163,14 +161,6 @@ def test_a_pair_of_one_frame_size_is_encoded_as_one_film(encoders: Encoders) -> 
         np.testing.assert_array_equal(trajectory.text_embedding, encoders.encode_tasks([first.task])[0])
 
 
-def test_a_sliver_beside_a_film_is_refused(encoders: Encoders) -> None:
-    good = Footage((sized(1, 2, 48, 48), sized(2, 2, 30, 60)))
-    first, failed, last = encoders.encode([good, Footage((sized(1, 2, 48, 48), sized(2, 2, 2, 200))), good])
-    assert str(failed) == "frames: expected frames at most 50 times as long as wide, got 2 x 200"
-    assert isinstance(first, Footage)
-    assert isinstance(last, Footage)
-
-
 def refuse(model: torch.nn.Module, is_too_large: Callable[[Tensor], bool], monkeypatch: pytest.MonkeyPatch) -> None:
     """The CPU has no memory of a device that could run out: the model refuses what it is given in its place."""
     forward = model.forward
@@ -214,14 +204,6 @@ def test_a_film_that_does_not_fit_in_memory_fails_alone(encoders: Encoders, monk
     np.testing.assert_allclose(positions(first), positions(last), rtol=0, atol=EMBEDDING_TOLERANCE)
 
 
-def test_a_task_that_does_not_fit_in_memory_fails_alone(encoders: Encoders, monkeypatch: pytest.MonkeyPatch) -> None:
-    refuse(encoders.text_model, lambda tokens: tokens.shape[1] > 10, monkeypatch)
-    first, failed, last = encoders.encode([film(0, 2), film(1, 2, "lift the cup " * 5), film(2, 2)])
-    assert isinstance(failed, InferenceFailedError)
-    assert isinstance(first, Footage)
-    assert isinstance(last, Footage)
-
-
 def test_what_the_encoders_take_is_forward_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """By a clock that says that each of their forward passes takes an hour."""
     engine = load_engine(NAME)
@@ -260,16 +242,6 @@ def test_saving_and_loading_changes_nothing(encoders: Encoders, tmp_path: Path) 
     np.testing.assert_array_equal(copy.encode_tasks(["lift the cup"]), encoders.encode_tasks(["lift the cup"]))
 
 
-def test_what_an_export_saves_is_loaded_from_its_folder(encoders: Encoders, tmp_path: Path) -> None:
-    encoders.save(tmp_path)
-    film = Footage([Trajectory(frames=np.full((2, 40, 48, 3), 7, np.uint8), task="lift")])
-    (before,), (after,) = (made.encode([film], Execution()) for made in (encoders, Encoders.load(tmp_path)))
-    assert isinstance(before, Footage)
-    assert isinstance(after, Footage)
-    np.testing.assert_array_equal(positions(before), positions(after))
-    assert Encoders.describe(tmp_path) == encoders.description
-
-
 def test_a_checkpoints_own_encoder_weights_win(encoders: Encoders) -> None:
     config = goldens.config(NAME)
     assert config.image_encoder is not None
@@ -289,21 +261,6 @@ def test_encoder_weights_that_do_not_fit_are_named() -> None:
     weights = {"embeddings.cls_token": torch.zeros(1, 1, 48)}
     with pytest.raises(ValueError, match=r"the encoder's weights do not fit: \{'missing_keys': .*'layernorm.weight'"):
         Encoders.from_pretrained(config.image_encoder, config.text_encoder, image_weights=weights)
-
-
-def test_a_base_encoder_with_missing_weights_is_refused(tmp_path: Path) -> None:
-    config = goldens.config(NAME)
-    assert config.image_encoder is not None
-    assert config.text_encoder is not None
-    shutil.copytree(config.image_encoder, tmp_path / "image")
-    weights = load_file(tmp_path / "image" / "model.safetensors")
-    del weights["layernorm.weight"]
-    (tmp_path / "image" / "model.safetensors").unlink()
-    save_file(weights, tmp_path / "image" / "model.safetensors", metadata={"format": "pt"})
-    with pytest.raises(
-        ValueError, match=r"the encoder's weights do not fit: \{'missing_keys': \['layernorm.weight'\]\}"
-    ):
-        Encoders.from_pretrained(tmp_path / "image", config.text_encoder)
 
 
 @pytest.mark.gpu
@@ -326,11 +283,7 @@ UNSUPPORTED = {
         {"size": 64, "image_processor_type": "ViTImageProcessor"},
         "expected size {shortest_edge} and crop_size {height, width}, got 64 and",
     ),
-    "no size": ({"size": None}, "expected size {shortest_edge}"),
-    "a size that is a truth": ({"size": True}, "expected size {shortest_edge}"),
     "a size of half a pixel": ({"size": {"shortest_edge": 0.5}}, "expected size {shortest_edge}"),
-    "no mean": ({"image_mean": None}, "image_mean: expected three numbers, got None"),
-    "one deviation": ({"image_std": [0.5]}, r"image_std: expected three numbers, got \[0.5\]"),
 }
 
 
@@ -389,10 +342,7 @@ MISFITS: dict[str, tuple[Callable[[Path], None], str]] = {
     "no files of a tokenizer": (without_tokenizer, r"text_encoder: expected files of a tokenizer \(tokenizer\.json, or vocab"),
     "a tokenizer of more words": (too_many_words, r"text_encoder: expected a tokenizer of at most 180 tokens, got 3"),
     "ViT": (of_type("image_encoder", model_type="vit"), IMAGE_MODEL + "vit"),
-    "CLIP": (of_type("image_encoder", model_type="clip"), IMAGE_MODEL + "clip"),
-    "CLIP's text": (of_type("text_encoder", model_type="clip_text_model"), TEXT_MODEL + "clip_text_model"),
     "T5": (of_type("text_encoder", model_type="t5"), TEXT_MODEL + "t5"),
-    "encoders changed for each other": (of_type("image_encoder", model_type="bert"), IMAGE_MODEL + "bert"),
     "weights whole and in shards": (whole_and_in_shards, r"image_encoder: expected model\.safetensors or shards, got"),
 }  # fmt: skip
 
@@ -405,12 +355,6 @@ def test_encoders_that_do_not_fit_are_refused(
     change(tmp_path)
     with pytest.raises((ValueError, CheckpointError), match=message):
         Encoders.load(tmp_path)
-
-
-def test_encoders_that_are_no_folders_are_told() -> None:
-    checkpoint = families.load(goldens.config(NAME).checkpoint, image_encoder="org/nowhere", text_encoder="no/where")
-    with pytest.raises(CheckpointError, match=r"there is no folder org/nowhere nor no/where either\)"):
-        checkpoint.encoders()
 
 
 def test_an_encoder_s_settings_of_another_type_are_told(encoders: Encoders, tmp_path: Path) -> None:
@@ -439,12 +383,11 @@ except CheckpointError as error:
 """
 
 
-@pytest.mark.parametrize("room", [0, 4096])
-def test_a_full_folder_of_temporary_files_is_told(room: int) -> None:
+def test_a_full_folder_of_temporary_files_is_told() -> None:
     """Loading needs none."""
     config = goldens.config(NAME)
     folders = (config.checkpoint, config.image_encoder, config.text_encoder)
-    command = [sys.executable, "-B", "-c", NO_ROOM, str(room), *map(str, folders)]
+    command = [sys.executable, "-B", "-c", NO_ROOM, "4096", *map(str, folders)]
     done = subprocess.run(command, check=False, stderr=subprocess.PIPE, text=True)
     assert "TMPDIR: expected a folder of temporary files with room for a copy of the encoders, got: " in done.stderr
     assert done.stderr.endswith("; name another one with it\n")

@@ -14,8 +14,8 @@ import numpy as np
 
 from paths import ROOT
 from rfm.engine import Engine
-from rfm.execution import Execution
-from rfm.predictor import RowScores
+from rfm.engine.execution import Execution
+from rfm.engine.predictor import RowScores
 from rfm_client import FrameScores, ProgressResult, ProgressSample, RewardError, Sample
 from trajectories import random_trajectory
 
@@ -69,7 +69,7 @@ import numpy as np, torch
 from small_network import SMALL
 from trajectories import random_trajectory
 from rfm.engine import Engine
-from rfm.execution import Execution
+from rfm.engine.execution import Execution
 from rfm.rewind.predictor import RewindPredictor
 from rfm.rewind.network import RewindTransformer
 from rfm_client import InferenceFailedError, ProgressResult, ProgressSample

@@ -27,7 +27,6 @@ from rfm.engine import Engine
 from rfm.launch.installation import Installation, find_installation
 from rfm.launch.process import Endpoints
 from rfm.parameters import FAMILY_PARAMETER
-from rfm.rewind.encoders import Encoders
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, RewardClient, SimilaritySample, Trajectory
 from rfm_export.layout import CONFIG_FILE
 from rfm_export.pbtxt import parse, render
@@ -114,15 +113,6 @@ def test_a_family_from_elsewhere_is_served_on_raw_frames(running: Running) -> No
 
 
 @pytest.mark.triton
-def test_a_family_from_elsewhere_is_served_on_embeddings(running: Running) -> None:
-    colours = np.array([[0.5, 0.25, 1.0]], np.float32)
-    sample = ProgressSample(Trajectory(video_embeddings=colours, text_embedding=np.zeros(1, np.float32)))
-    with RewardClient(running.url, model="toy") as client:
-        (result,) = client.evaluate([sample])
-    np.testing.assert_allclose(result.progress, 1 / (1 + np.exp(2 - 4 * 0.5 + 1.0)), atol=1e-6)
-
-
-@pytest.mark.triton
 def test_what_a_family_from_elsewhere_generates_is_checked(running: Running) -> None:
     assert rfm_export.check(running.repository, TOY) == []
     config = parse((running.repository / "toy" / CONFIG_FILE).read_text())
@@ -160,9 +150,3 @@ NOT_NAMED = "model_type: expected rewind_transformer, got redness"
 def test_what_is_no_family_s_is_refused(checkpoint: Path, loaded: Callable[[Path], object], message: str) -> None:
     with pytest.raises(CheckpointError, match=message):
         loaded(checkpoint)
-
-
-def test_encoders_of_an_export_that_names_no_family_are_rewind_s() -> None:
-    assert families.encoders_of(None) is families.encoders_of("rfm.rewind") is Encoders
-    with pytest.raises(families.CheckpointError, match=r"expected one with encoders, got rfm\.vlm"):
-        families.encoders_of("rfm.vlm")

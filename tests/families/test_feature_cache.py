@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from engines import load_engine
-from rfm.execution import Execution
+from rfm.engine.execution import Execution
+from rfm.engine.feature_cache import FeatureCache, get_or_make
 from rfm.family import FrameEncoders
-from rfm.feature_cache import FeatureCache, get_or_make
 from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError, Trajectory
 from rfm_client.contract.named_frames import NamedFootage, NamedTrajectory, frame_digest
 from rfm_client.contract.samples import Footage, UInt8Array
@@ -47,14 +47,6 @@ def embeddings(outcome: Footage | RewardError) -> tuple[np.ndarray, np.ndarray]:
     assert trajectory.video_embeddings is not None
     assert trajectory.text_embedding is not None
     return trajectory.video_embeddings, trajectory.text_embedding
-
-
-def test_a_digest_tells_apart_what_a_frame_shows_and_how_it_lies() -> None:
-    wide, tall = np.zeros((2, 4, 3), np.uint8), np.zeros((4, 2, 3), np.uint8)
-    other = wide.copy()
-    other[1, 3, 2] = 1
-    assert len({frame_digest(wide), frame_digest(tall), frame_digest(other)}) == 3
-    assert frame_digest(other) == frame_digest(np.asfortranarray(other))
 
 
 @pytest.mark.parametrize("limit_bytes", [2**20, 0], ids=["kept", "evicted at once"])
@@ -142,13 +134,6 @@ def test_what_was_used_last_stays() -> None:
     cache.found([b"\x00"])
     cache.keep({b"\x03": features[b"\x03"]})
     assert list(cache.found(features)) == [b"\x00", b"\x02", b"\x03"]
-
-
-def test_what_is_kept_keeps_nothing_else() -> None:
-    cache = FeatureCache(2**20)
-    batch = np.zeros((64, 8), np.float32)
-    get_or_make(cache, [b"one"], {b"one": 3}, lambda rows: [batch[row] for row in rows])
-    assert cache.found([b"one"])[b"one"].base is None
 
 
 def test_a_black_frame_with_pixels_is_always_encoded(encoders: FrameEncoders) -> None:

@@ -5,19 +5,17 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
 
 import goldens
-from paths import GOLDEN, ROOT
+from paths import GOLDEN
 from rfm.checkpoint.content import CheckpointError
+from spoilt import weights
 from vlm import load
 
 ADAPTER = "q25_peft_adapter_disc10"
@@ -40,11 +38,7 @@ def factors_twice(tensors: dict[str, Any]) -> None:
 
 
 def changed(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    """Changes the tensors of the adapter."""
-    file = folder / "adapter_model.safetensors"
-    tensors = load_file(file)
-    change(tensors)
-    save_file(tensors, file)
+    weights(change, "adapter_model.safetensors")(folder)
 
 
 PLAIN = [name for name in WRITTEN if name.startswith("LoRA")]
@@ -78,10 +72,6 @@ REFUSED = {
     "rows of an embedding": r"expected plain LoRA, got trainable_token_indices",
     "parameters": r"expected plain LoRA, got target_parameters",
 }
-
-
-def test_each_configuration_of_peft_is_taken_or_refused() -> None:
-    assert WRITTEN.keys() == {*PLAIN, CONVERTED, *REFUSED}
 
 
 @pytest.mark.parametrize(("name", "message"), REFUSED.items(), ids=REFUSED)
@@ -134,117 +124,3 @@ def test_lora_of_other_layers_is_refused(folder: Path, change: Callable[[dict[st
     changed(folder, change)
     with pytest.raises(CheckpointError, match=rf"{message}.*{MERGE}"):
         load(ADAPTER, folder)
-
-
-SPOILED = "test_a_spoiled_checkpoint_is_refused"
-SAME = "test_a_checkpoint_in_another_form_scores_the_same"
-WHOLE_AND_SHARDS = (
-    f"{SPOILED}[weights whole and in shards]",
-    f"{SPOILED}[a tensor in two shards]",
-    f"{SPOILED}[a shard that the index does not name]",
-)
-ANOTHER_NETWORK = "test_config_yaml_of_another_run_above_the_checkpoint_is_refused"
-PLACES = (
-    "test_config_yaml_may_be_called_otherwise",
-    "test_config_yaml_is_found_above_the_checkpoint",
-    "test_config_yaml_is_found_on_main_of_the_hub_s_repository[org/name]",
-)
-SUBFOLDER = "test_config_yaml_is_found_on_main_of_the_hub_s_repository[offline org/runs/one/ckpt=5@v1]"
-LIKELY = (
-    "test_a_misspelt_folder_is_told_beside_the_hub_s_answer",
-    "test_a_run_folder_is_refused_with_its_checkpoints",
-    "test_a_model_repository_is_refused_with_its_checkpoints",
-)
-OF_TRANSFORMERS_5 = tuple(f"{SAME}[{name} of transformers 5]" for name in ("Qwen2.5-VL", "Qwen3-VL", "SmolVLM"))
-ROTARY = tuple(
-    f"{SPOILED}[{what}]"
-    for what in (
-        "rotary positions without a base",
-        "rotary positions without sections",
-        "two bases of rotary positions",
-        "no num_attention_heads of the text_config",
-    )
-)
-BY_NAME = (
-    *(f"{SPOILED}[weights of {method}]" for method in ("gptq", "awq", "fp8")),
-    "test_other_types_of_bitsandbytes_are_refused_by_name",
-)
-RANKS = tuple(f"{SPOILED}[{what} of another rank]" for what in ("an adapter", "a run", "a module"))
-OTHER_ENCODERS = (
-    "test_encoders_that_do_not_fit_are_refused",
-    "test_a_preprocessor_that_works_otherwise_is_refused",
-    "test_encoder_weights_that_do_not_fit_are_named",
-)
-# The beginning of each row of the table, and its tests.
-ROWS: dict[str, tuple[str, ...]] = {
-    "weights in shards": ("test_shards_are_put_together",),
-    "weights whole and in shards": WHOLE_AND_SHARDS,
-    "prefixes of DataParallel": ("test_prefixes_of_wrappers_change_nothing",),
-    "another prefix": ("test_the_command_that_strips_a_prefix_works",),
-    "pickles": (
-        "test_the_conversion_that_the_refusal_of_a_pickle_names_works",
-        "test_the_conversion_of_a_pickled_adapter_works",
-    ),
-    "a Hugging Face repository": ("test_what_a_hub_s_repository_lacks_is_told[pickles alone]",),
-    "weights that are inf": ("test_weights_that_are_no_numbers_are_refused_at_every_door",),
-    "a head that is 0": ("test_a_head_of_zeros_is_told",),
-    "no head of": ("test_what_is_there_is_scored_as_with_all_heads_and_the_rest_refused_alone",),
-    "a run of before": (f"{SPOILED}[a run of before 2026-01-21]", "test_eight_special_tokens_tell_an_old_run"),
-    "`config.yml`": PLACES,
-    "no `config.yaml`": ("test_without_config_yaml_nothing_is_guessed",),
-    "`config.yaml` of another": (ANOTHER_NETWORK,),
-    "a checkpoint in a subfolder": (SUBFOLDER,),
-    "a misspelt folder": LIKELY,
-    "`config.json` of transformers 5": OF_TRANSFORMERS_5,
-    "`config.json` of a Qwen2.5-VL": (f"{SAME}[Qwen2.5-VL without text_config]",),
-    "names of weights": (f"{SAME}[layers right under the model]",),
-    "rotary frequencies": (f"{SAME}[with rotary frequencies]",),
-    "`config.json` without": ROTARY,
-    "tokenizer and processor": ("test_a_processor_of_transformers_5_reads_the_same",),
-    "a Qwen2.5-VL that reads videos": ("test_a_video_run_of_transformers_5_is_told_about_its_positions",),
-    "SmolVLM with": ("test_smolvlm_is_refused_where_its_scores_would_differ",),
-    "weights in NF4": ("test_an_export_scores_as_the_values_of_its_weights",),
-    "weights of GPTQ": BY_NAME,
-    "an adapter as PEFT": ("test_plain_lora_of_peft_is_taken", f"{SAME}[an adapter around the language model]"),
-    "PiSSA or OLoRA": (f"test_plain_lora_of_peft_is_taken[{CONVERTED}]",),
-    "LoRA factors": (f"{SAME}[LoRA around the whole model]",),
-    "the whole model beside": (f"{SAME}[a whole model beside its adapter]",),
-    "PiSSA, OLoRA": ("test_other_adapters_of_peft_are_refused[PiSSA]", f"{SPOILED}[LoRA that begins by corda]"),
-    "rsLoRA": ("test_other_adapters_of_peft_are_refused", f"{SPOILED}[LoRA with a field of the future]"),
-    "LoRA of an embedding": ("test_lora_of_other_layers_is_refused",),
-    "an adapter without": (f"{SPOILED}[an adapter without its embedding]",),
-    "`r` that": RANKS,
-    "an adapter that names": ("test_an_adapter_on_another_base_model_is_asked_about",),
-    "an adapter of a run": ("test_an_adapter_of_a_run_that_began_with_a_checkpoint_needs_its_base_named",),
-    "an adapter on a base": (
-        "test_an_adapter_on_weights_of_few_bits_is_refused",
-        "test_a_base_model_of_few_bits_is_refused",
-    ),
-    "`--base-model` with": (
-        "test_a_processor_that_is_not_the_published_one_of_the_run_is_refused",
-        "test_special_tokens_in_another_order_are_refused",
-    ),
-    "a checkpoint of the first": ("test_a_checkpoint_of_the_first_rewind_code_has_its_scores",),
-    "ReWiND's": ("test_a_null_is_a_key_that_is_not_there",),
-    "an image encoder": ("test_sizes_may_be_numbers_as_transformers_once_wrote_them",),
-    "other encoders": (
-        "test_encoders_that_are_not_upstream_s_are_told",
-        "test_a_text_encoder_as_wide_as_upstream_s_is_compared",
-    ),
-    "encoders of other": OTHER_ENCODERS,
-}
-
-
-def test_each_row_of_the_table_has_a_test() -> None:
-    section = (
-        (ROOT / "docs" / "checkpoints.md").read_text().partition("## Forms of checkpoints")[2].partition("\n## ")[0]
-    )
-    forms = [line.split(" | ")[0].removeprefix("| ") for line in section.splitlines() if line.startswith("| ")][1:]
-    assert len(forms) == len(ROWS)
-    assert [form for form, row in zip(forms, ROWS, strict=True) if not form.startswith(row)] == []
-    folders = [str(ROOT / "tests" / name) for name in ("families", "export")]
-    command = [sys.executable, "-m", "pytest", "--collect-only", "-o", "addopts=-q --import-mode=importlib", *folders]
-    collected = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
-    known = {line.partition("::")[2] for line in collected.splitlines()}
-    known |= {name.partition("[")[0] for name in known}
-    assert [test for tests in ROWS.values() for test in tests if test not in known] == []

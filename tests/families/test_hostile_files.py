@@ -29,7 +29,7 @@ from rfm.plain_yaml import MAX_YAML_BYTES
 from rfm_client.contract.settings import ConfigError
 from rfm_commands.cli import app
 from rfm_commands.config import Config
-from spoilt import WEIGHTS, Spoil, copied, files_in, weights
+from spoilt import WEIGHTS, Spoil, copied, files_in, settings, text_settings
 
 REWIND = goldens.config("legacy_keys_l2")
 VLM = goldens.config("q25_mean_l2")
@@ -54,25 +54,6 @@ def _soon() -> Iterator[None]:
 
 def text(name: str, content: str) -> Spoil:
     return lambda folder: (folder / name).write_text(content)
-
-
-def settings(file: str, **changes: Any) -> Spoil:
-    def spoil(folder: Path) -> None:
-        content = json.loads((folder / file).read_text())
-        (folder / file).write_text(json.dumps(content | changes))
-
-    return spoil
-
-
-def text_settings(**changes: Any) -> Spoil:
-    """Of the language model in a vision-language one."""
-
-    def spoil(folder: Path) -> None:
-        content = json.loads((folder / "config.json").read_text())
-        content["text_config"].update(changes)
-        (folder / "config.json").write_text(json.dumps(content))
-
-    return spoil
 
 
 def header(change: Callable[[dict[str, Any]], object]) -> Spoil:
@@ -105,13 +86,6 @@ def shards(**weight_map: Any) -> Spoil:
         (folder / INDEX).write_text(json.dumps({"weight_map": weight_map}))
 
     return spoil
-
-
-def one_value(name: str, value: float) -> Spoil:
-    def change(tensors: dict[str, torch.Tensor]) -> None:
-        tensors[name].view(-1)[-1] = value
-
-    return weights(change)
 
 
 def other_endian(folder: Path) -> None:
@@ -153,29 +127,14 @@ HOSTILE: dict[str, tuple[Spoil, str]] = {
         header(lambda _: b"{" + b" " * MAX_HEADER_BYTES + b"}"),
         SAFETENSORS + "one whose header would be",
     ),
-    "a header of the other endianness": (
-        lambda f: (f / WEIGHTS).write_bytes(struct.pack(">Q", 2) + b"{}"),
-        SAFETENSORS + "one whose header would be 144115188075855872 bytes long",
-    ),
     "a deep header": (header(lambda _: b"[" * 2**20), SAFETENSORS),
-    "a header that is a list": (header(lambda _: b"[1, 2]"), SAFETENSORS),
-    "a header in no encoding": (header(lambda _: b'{"\xff\xfe": 1}'), SAFETENSORS),
     "a tensor twice": (
         header(lambda h: json.dumps(h).replace("{", f'{{"{FIRST}": {json.dumps(h[FIRST])}, ', 1).encode()),
         SAFETENSORS + f"the key '{FIRST}' twice",
     ),
     "offsets beyond the end": (header(lambda h: h[FIRST].update(data_offsets=[0, 2**60])), SAFETENSORS),
-    "offsets that overlap": (
-        header(lambda h: h[FIRST].update(data_offsets=h["first_embedding_B"]["data_offsets"])),
-        SAFETENSORS,
-    ),
-    "offsets backwards": (header(lambda h: h[FIRST].update(data_offsets=h[FIRST]["data_offsets"][::-1])), SAFETENSORS),
-    "offsets that are negative": (header(lambda h: h[FIRST].update(data_offsets=[-128, 0])), SAFETENSORS),
     "a shape that lies": (header(lambda h: h[FIRST].update(shape=[1, 1, 10**6])), SAFETENSORS),
-    "a shape whose size overflows": (header(lambda h: h[FIRST].update(shape=[2**33, 2**33, 2**33])), SAFETENSORS),
-    "a type that lies": (header(lambda h: h[FIRST].update(dtype="F16")), SAFETENSORS),
     "a type that is none": (header(lambda h: h[FIRST].update(dtype="PY")), SAFETENSORS + f"'{FIRST}' of type 'PY'"),
-    "a type of eight bits": (header(lambda h: h[FIRST].update(dtype="F8_E4M3")), SAFETENSORS + f"'{FIRST}' of type"),
     "whole numbers as weights": (header(lambda h: h[FIRST].update(dtype="I32")), rf"{FIRST}: expected numbers like"),
     "huge shapes of no numbers": (no_numbers_but_shapes, r"expected|axes"),
     "a petabyte that is not there": (sparse, SAFETENSORS),
@@ -184,10 +143,6 @@ HOSTILE: dict[str, tuple[Spoil, str]] = {
         text(WEIGHTS, "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n"),
         SAFETENSORS + "Git LFS's note of where it is; `git lfs pull` fetches it",
     ),
-    "a web page": (text(WEIGHTS, "<!doctype html><html>404</html>"), SAFETENSORS),
-    "a zip": (lambda f: torch.save({}, f / WEIGHTS), SAFETENSORS),
-    "NaN": (one_value("video_proj.bias", float("nan")), r"video_proj\.bias: expected finite weights, got nan at \[31\]"),
-    "infinity": (one_value("success_head.4.bias", float("inf")), r"success_head\.4\.bias: expected finite weights, got inf"),
     "numbers of the other endianness": (other_endian, r"expected finite weights, got|expected the checkpoint's scores"),
     # settings
     "a deep config.json": (text("config.json", "[" * 10**6), r"config\.json: expected JSON, got"),
@@ -195,7 +150,6 @@ HOSTILE: dict[str, tuple[Spoil, str]] = {
     "a number of many digits": (text("config.json", "9" * 10**5), r"config\.json: expected JSON, got"),
     "a key twice": (text("config.json", '{"max_len": 3, "max_len": 4}'), r"config\.json: expected JSON, got the key 'max_len' twice"),
     "max_len that nothing can hold": (settings("config.json", max_len=10**15), r"max_len: expected 1 to \d+, got 10{15}"),
-    "max_len below 1": (settings("config.json", max_len=-1), r"max_len: expected 1 to \d+, got -1"),
     "frames without end": (settings("config.json", trained_frames=10**30), r"trained_frames: expected at most \d+"),
     "a model type that is a list": (settings("config.json", model_type=[]), r"model_type: expected rewind_transformer"),
     "a billion laughs": (text("config.yaml", LAUGHS), r"config\.yaml: expected YAML, got aliases that stand for more"),
@@ -203,26 +157,17 @@ HOSTILE: dict[str, tuple[Spoil, str]] = {
     "a value inside itself": (text("config.yaml", "model: &m {rewind: *m}"), r"got a value that is inside itself"),
     "a deep config.yaml": (text("config.yaml", "[" * 10**5), r"config\.yaml: expected YAML, got"),
     "a huge config.yaml": (text("config.yaml", "#" * (MAX_YAML_BYTES + 1)), r"config\.yaml: expected YAML, got more than"),
-    "a day that is none": (text("config.yaml", "day: 2001-99-99"), r"config\.yaml: expected YAML, got"),
-    "a truth that is none": (text("config.yaml", "a: !!bool maybe"), r"config\.yaml: expected YAML, got"),
-    "a whole number of nothing": (text("config.yaml", 'a: !!int ""'), r"config\.yaml: expected YAML, got"),
     "a number of a thousand digits": (text("config.yaml", f"a: 0x{'f' * 1000}"), r"got a number of 1002 digits"),
-    "two documents": (text("config.yaml", "a: 1\n---\nb: 2\n"), r"config\.yaml: expected YAML, got"),
     "a key twice in YAML": (text("config.yaml", "data: {}\ndata: {}"), r"config\.yaml: expected YAML, got the key 'data' twice"),
     # names
     "a shard elsewhere": (shards(a="../secret.safetensors"), r"expected names of files beside it, got '\.\./secret"),
-    "a shard at the root": (shards(a="/etc/passwd"), r"expected names of files beside it, got '/etc/passwd'"),
-    "a shard that is the folder": (shards(a=".."), r"expected names of files beside it, got '\.\.'"),
     "a shard with a NUL": (shards(a="a\0.safetensors"), r"expected a file|not there"),
-    "a shard that is no name": (shards(a=[1], b={}), r"expected names of files beside it, got"),
     # what is no file
     "a folder as weights": (instead(WEIGHTS, Path.mkdir), rf"{WEIGHTS}: expected a file, got a folder"),
     "a pipe as weights": (instead(WEIGHTS, os.mkfifo), rf"{WEIGHTS}: expected a file, got a pipe"),
-    "a pipe as config.json": (instead("config.json", os.mkfifo), r"config\.json: expected a file, got a pipe"),
     "a pipe as config.yaml": (instead("config.yaml", os.mkfifo), r"config\.yaml: expected a file, got a pipe"),
     "a device": (instead(WEIGHTS, lambda f: f.symlink_to("/dev/zero")), rf"{WEIGHTS}: expected a file, got a device"),
     "a link to nowhere": (instead("config.json", lambda f: f.symlink_to("gone")), r"got a link that leads nowhere"),
-    "a link to itself": (instead("config.json", lambda f: f.symlink_to("config.json")), r"config\.json: expected a file, got"),
     "a link out of the checkpoint": (
         instead(WEIGHTS, lambda f: f.symlink_to(REWIND.checkpoint / WEIGHTS)),
         rf"{WEIGHTS}: expected a file of the checkpoint, got a link to /",
@@ -272,8 +217,6 @@ HOSTILE_VLM: dict[str, tuple[Spoil, str]] = {
     ),
     "a configuration that is a list": (settings("config.json", text_config=[1]), r"text_config: expected settings of the backbone, got \[1\]"),
     "another type of value": (text_settings(num_attention_heads="x"), r"expected a backbone that"),
-    "a run that is a list": (text("config.yaml", "model: [1]"), r"config\.yaml: model: expected a mapping, got \[1\]"),
-    "a temperature that is none": (text("config.yaml", "model: {frame_pooling_attn_temperature: hot}"), r"expected"),
     "a pipe as adapter": (lambda f: os.mkfifo(f / "adapter_config.json"), r"adapter_config\.json: expected a file, got a pipe"),
     "code of its own": (settings("config.json", auto_map={"AutoConfig": "evil.Config"}, model_type="evil"), r"expected"),
 }  # fmt: skip
@@ -328,16 +271,10 @@ def test_the_links_of_the_hubs_cache_are_followed(tmp_path: Path) -> None:
 
 
 BAD_SETTINGS = {
-    "a billion laughs": (LAUGHS, r"serve\.yaml: expected a YAML file, got aliases that stand for more"),
     "a path as name": ("name: ../../etc", r"serve\.yaml: name: expected letters, digits, _ and -, got"),
     "an endless name": (f"name: {'a' * 300}", r"serve\.yaml: name: expected at most 100 characters, got 300"),
     "a batch beyond int32": ("max_batch_size: 9999999999", r"serve\.yaml: max_batch_size: expected at most 2147483647"),
     "GPUs without end": ("num_gpus: 1000000000", r"serve\.yaml: num_gpus: expected at most 4096"),
-    "a key twice": (
-        "batch_size: 1\nbatch_size: 2",
-        r"serve\.yaml: expected a YAML file, got the key 'batch_size' twice",
-    ),
-    "a port of many digits": (f"server_port: 0x{'f' * 5000}", r"serve\.yaml: expected a YAML file, got a number of"),
 }
 
 

@@ -10,8 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from rfm.layers import linear as module
-from rfm.layers.linear import WORTH_ONEDNN, Linear, linear, speed_up
+from rfm.engine import layers as module
+from rfm.engine.layers import WORTH_ONEDNN, Linear, linear, speed_up
 
 LARGE, SMALL = (512, 256), (32, 16)  # [N, K] on either side of WORTH_ONEDNN
 

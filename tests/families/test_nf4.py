@@ -18,9 +18,9 @@ import goldens
 import rfm_export
 from engines import load_engine, serve_config
 from paths import GOLDEN
-from rfm.checkpoint import nf4
 from rfm.checkpoint.content import CheckpointError
 from rfm.engine import Engine
+from rfm.vlm import nf4
 from rfm_client import ProgressSample
 from vlm import PLAIN, assert_close, film, load
 

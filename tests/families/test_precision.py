@@ -4,23 +4,14 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
+import pytest
 import torch
 
 import goldens
-from rfm.layers.precision import MKL_FUNCTIONS, keep_float32
-
-ENGINE_IS_MADE = """
-import sys
-from rfm.layers import precision
 from rfm.engine import Engine
-assert precision._call_each_once.cache_info().currsize == 0
-Engine.from_checkpoint(sys.argv[1])
-assert precision._call_each_once.cache_info().currsize == 1
-"""
+from rfm.engine.layers import MKL_FUNCTIONS
 
 
 def test_the_first_calls_of_all_functions_of_mkl_are_made_by_one_thread() -> None:
@@ -31,12 +22,9 @@ def test_the_first_calls_of_all_functions_of_mkl_are_made_by_one_thread() -> Non
     assert "cos" in named
 
 
-def test_an_engine_makes_them_before_anything_is_scored() -> None:
-    checkpoint = str(goldens.REWIND[0].checkpoint)
-    subprocess.run([sys.executable, "-c", ENGINE_IS_MADE, checkpoint], check=True)
-
-
-def test_a_gpu_multiplies_float32_as_float32() -> None:
-    keep_float32()
+def test_an_engine_multiplies_float32_as_float32(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)
+    monkeypatch.setattr(torch.backends.cuda.matmul, "allow_tf32", True)
+    Engine.from_checkpoint(goldens.REWIND[0].checkpoint)
     assert not torch.backends.cudnn.allow_tf32
     assert not torch.backends.cuda.matmul.allow_tf32

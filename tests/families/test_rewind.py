@@ -14,13 +14,11 @@ from torch import Tensor, nn
 
 import goldens
 from rfm.config import DEFAULT_TOKEN_BUDGET
-from rfm.dense_mode import prefix_indices
 from rfm.engine import Engine, Outcome
-from rfm.layers.heads import PredictionHead, progress_from_logits
-from rfm.rewind.collator import MAX_EMBEDDING, RewindCollator
-from rfm.rewind.network import RewindBatch, RewindConfig, RewindTransformer
-from rfm.rewind.packing import Packing, rounded_up
-from rfm.rewind.predictor import RewindPredictor
+from rfm.engine.layers import PredictionHead, progress_from_logits
+from rfm.engine.predictor import prefix_indices
+from rfm.rewind.network import Packing, RewindBatch, RewindConfig, RewindTransformer, rounded_up
+from rfm.rewind.predictor import MAX_EMBEDDING, RewindCollator, RewindPredictor
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,
@@ -145,18 +143,6 @@ def test_every_variant_scores_as_torchs_own_transformer(config: RewindConfig) ->
         np.testing.assert_allclose(numbers(outcome), expected.numpy(), rtol=0, atol=TOLERANCE)
 
 
-@pytest.mark.parametrize("config", VARIANTS.values(), ids=VARIANTS)
-@pytest.mark.parametrize("token_budget", [64, 16_384])
-def test_a_result_does_not_depend_on_its_neighbours(config: RewindConfig, token_budget: int) -> None:
-    samples = samples_for(config) * 3
-    order = np.random.default_rng(0).permutation(len(samples))
-    network = build(config)
-    alone = [numbers(engine_of(network).evaluate([sample])[0]) for sample in samples]
-    together = engine_of(network, token_budget=token_budget).evaluate([samples[index] for index in order])
-    for index, outcome in zip(order, together, strict=True):
-        np.testing.assert_allclose(numbers(outcome), alone[index], rtol=0, atol=TOLERANCE)
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_no_mix_of_lengths_and_types_changes_a_result(seed: int) -> None:
     random = np.random.default_rng(seed)
@@ -168,13 +154,6 @@ def test_no_mix_of_lengths_and_types_changes_a_result(seed: int) -> None:
         chosen = random.integers(0, len(samples), size)
         for index, outcome in zip(chosen, engine.evaluate([samples[i] for i in chosen]), strict=True):
             np.testing.assert_allclose(numbers(outcome), alone[index], rtol=0, atol=TOLERANCE)
-
-
-def test_frames_beyond_max_len_are_taken_without_progress_tokens() -> None:
-    config = replace(SMALL, use_per_frame_progress_token=False)
-    (outcome,) = engine_of(build(config)).evaluate([ProgressSample(trajectory(0, 3 * config.max_len))])
-    assert isinstance(outcome, ProgressResult)
-    assert len(outcome.progress) == 3 * config.max_len
 
 
 def test_the_token_budget_bounds_every_forward() -> None:
@@ -258,10 +237,6 @@ def test_a_score_that_is_no_number_is_an_error() -> None:
     failed, good = engine_of(network).evaluate([ProgressSample(huge), ProgressSample(trajectory(0, 2))])
     assert isinstance(failed, InferenceFailedError)
     assert isinstance(good, ProgressResult)
-
-
-def test_no_samples_no_results() -> None:
-    assert engine_of(build(SMALL)).evaluate([]) == []
 
 
 def test_prefixes_are_sampled_as_the_original_samples_them() -> None:

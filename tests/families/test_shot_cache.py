@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from rfm.engine import Engine
-from rfm.execution import Execution
-from rfm.feature_cache import BYTES_PER_MB, FeatureCache
+from rfm.engine.execution import Execution
+from rfm.engine.feature_cache import BYTES_PER_MB, FeatureCache
 from rfm.vlm.predictor import VlmPredictor
-from rfm_client import InferenceFailedError, PreferenceSample, ProgressResult, ProgressSample, RewardError, Trajectory
+from rfm_client import PreferenceSample, ProgressSample, RewardError, Trajectory
 from rfm_client.contract.named_frames import NamedProgressSample, NamedTrajectory, frame_digest
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.sampling import RULES, Rule, Sampling
@@ -153,18 +153,6 @@ def test_the_size_that_frames_are_brought_to_is_part_of_what_is_kept(monkeypatch
     assert grid(rows[0].films[0]).tokens_per_group != grid(rows[1].films[0]).tokens_per_group
 
 
-def test_what_is_not_finite_is_not_kept() -> None:
-    cache, frames = FeatureCache[Any](BYTES_PER_MB), frames_of(7, 2)
-    cached = engine(MODELS[0], cache)
-    assert isinstance(cached.predictor, VlmPredictor)
-    merger = cached.predictor.network.model.visual.merger
-    handle = merger.register_forward_hook(lambda _module, _inputs, output: output * torch.nan)
-    assert isinstance(ask(cached, named(frames, frames)), InferenceFailedError)
-    assert len(cache) == 0
-    handle.remove()
-    assert isinstance(ask(cached, named(frames, frames)), ProgressResult)
-
-
 @pytest.mark.parametrize("name", MODELS)
 def test_what_is_not_finite_is_not_kept_even_if_no_score_shows_it(name: str) -> None:
     """The last tokens of a video may stand behind all that is read."""
@@ -203,16 +191,6 @@ def test_black_frames_with_pixels_are_always_encoded(name: str) -> None:
     assert execution.num_encoded == 2 * frames_per_shot(cached)
     assert_close(ask(cached, named(black, ()), execution), expected, TOLERANCE)
     assert execution.num_encoded == 2 * frames_per_shot(cached)
-
-
-def test_a_film_that_the_cache_cannot_hold_leaves_it_as_it_is() -> None:
-    cache, frames = FeatureCache[Any](BYTES_PER_MB // 4), frames_of(14, 1)
-    cached = engine(MODELS[0], cache)
-    ask(cached, named(frames, frames))
-    before = len(cache)
-    assert isinstance(ask(cached, named(large := frames_of(15, 20), large)), ProgressResult)
-    assert len(cache) == before
-    assert cache.found([frame_digest(frames[0])])
 
 
 def test_a_pass_without_memory_empties_the_cache_and_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -266,12 +244,3 @@ def test_what_is_kept_holds_on_to_no_request() -> None:
     kept = cache.found([frame_digest(frame) for frame in frames])
     assert len(kept) == 3
     assert all(frame.base is None for frame in kept.values())
-
-
-def test_many_frames_stay_within_the_limit() -> None:
-    cache, frames = FeatureCache[Any](BYTES_PER_MB // 4), frames_of(11, 2000, (28, 28))
-    cached = engine(MODELS[0], cache)
-    for start in range(0, 2000, 100):
-        cached.evaluate([whole(frames[at : at + 4]) for at in range(start, start + 100, 4)])
-        assert cache.num_bytes <= BYTES_PER_MB // 4
-    assert len(cache) > 20

@@ -14,7 +14,7 @@ import pytest
 import goldens
 import rfm_export
 from rfm.config import ExportConfig
-from rfm.rewind import usual
+from rfm.rewind import pretrained as usual
 
 CHECKPOINT = goldens.config("c1_t1_disc10").checkpoint  # of upstream's widths, without encoders
 

@@ -17,14 +17,14 @@ import goldens
 from engines import load_engine
 from reference_server import Served
 from rfm.engine import Engine
-from rfm.execution import Execution
-from rfm.predictor import RowScores
+from rfm.engine.execution import Execution
+from rfm.engine.predictor import RowScores
 from rfm.vlm.batch import VlmBatch
 from rfm.vlm.collator import QWEN3, VISION_START, VlmRow
 from rfm.vlm.images import Grid
 from rfm.vlm.predictor import VlmPredictor
 from rfm.vlm.prompts import SPLIT_TOKEN
-from rfm.vlm.vision import UNIT, plan
+from rfm.vlm.qwen import UNIT, plan
 from rfm_client import (
     InferenceFailedError,
     InvalidSampleError,
@@ -285,14 +285,6 @@ def test_a_pair_of_two_frame_sizes_is_read_as_its_trajectories_are_beside_one_of
         np.testing.assert_allclose(scores.success, told.success, rtol=0, atol=1e-6)
 
 
-def test_a_vision_language_model_takes_frames_alone(served: Served, protocol: str) -> None:
-    embeddings = Trajectory(video_embeddings=np.ones((2, 8), np.float32), text_embedding=np.ones(8, np.float32))
-    (outcome,) = load_engine(PLAIN).evaluate([ProgressSample(embeddings)])
-    assert str(outcome) == "video_embeddings: expected frames (this checkpoint reads raw frames), got embeddings"
-    with served.client(protocol, PLAIN) as client:
-        assert client.is_ready()
-
-
 BAD: dict[str, tuple[Callable[[], Sample], str]] = {
     "a special token in the task": (
         lambda: ProgressSample(film(0, 1, 56, 56, "lift <|prog_token|> it")),
@@ -326,26 +318,6 @@ def test_what_cannot_be_scored_fails_alone(make: Callable[[], Sample], message: 
     assert_close(first, last, MIXED_TOLERANCE)
 
 
-@pytest.mark.parametrize(
-    "sample",
-    [
-        ProgressSample(film(0, 1, 1, 1)),
-        ProgressSample(film(0, 2, 64, 64, "naïve: 積み木を\nput {task} 'there' " * 20)),
-        ProgressSample(film(0, 1, 64, 64, "lift the cup " * 770)),  # 10,000 characters
-    ],
-    ids=["one pixel", "odd characters", "10,000 characters"],
-)
-def test_what_is_unusual_is_scored(sample: ProgressSample) -> None:
-    (outcome,) = load_engine(PLAIN).evaluate([sample])
-    assert isinstance(outcome, ProgressResult)
-
-
-@pytest.mark.parametrize("name", [PLAIN, "smol_mean_disc10"])
-def test_the_written_preprocessing_brings_pixels_to_0_and_1(name: str) -> None:
-    written = predictor_of(name).collator.images.to_config()
-    assert written["rescale_factor"] == 1 / 255
-
-
 def test_the_task_is_not_a_template() -> None:
     tokens = predictor_of(PLAIN).collator
     (row,) = tokens.rows(ProgressSample(film(0, 1, 56, 56, "put {task} there")))
@@ -372,40 +344,13 @@ def test_a_question_is_read_as_if_no_other_had_been_asked_before(make: Callable[
         PreferenceSample(other, one),
         ProgressSample(film(0, 4, 56, 56, "image")),
     ]
-    many = make().collator.keeping_conversations()
+    many = make().collator
     for question in questions * 2:
-        fresh = many.keeping_conversations()  # has kept nothing
+        fresh = type(many)(many.config, many.tokenizer, many.images)  # has kept nothing
         (alone, *_), (among, *_) = fresh.rows(question), many.rows(question)
         np.testing.assert_array_equal(among.input_ids, alone.input_ids)
         np.testing.assert_array_equal(among.position_ids, alone.position_ids)  # type: ignore[arg-type]
         assert (among.spans, among.query) == (alone.spans, alone.query)
-
-
-@pytest.mark.parametrize(("task", "expected"), [("stack", 1), ("stack " * 3000, 3)], ids=["short", "long"])
-def test_a_short_question_that_is_asked_again_is_not_tokenised_again(
-    monkeypatch: pytest.MonkeyPatch, task: str, expected: int
-) -> None:
-    """Long ones are not kept: they would take memory without end."""
-    collator = load(PLAIN).collator.keeping_conversations()
-    made: Counter[str] = Counter()
-
-    class Spy:
-        def __call__(self, text: str, **options: Any) -> Any:
-            made["tokens"] += 1
-            return tokenizer(text, **options)
-
-        def apply_chat_template(self, *arguments: Any, **options: Any) -> Any:
-            made["text"] += 1
-            return tokenizer.apply_chat_template(*arguments, **options)
-
-        def __getattr__(self, name: str) -> Any:
-            return getattr(tokenizer, name)
-
-    tokenizer = collator.tokenizer
-    monkeypatch.setattr(collator._chat, "_tokenizer", Spy())
-    for seed, height in ((0, 56), (1, 84), (2, 56)):
-        collator.rows(ProgressSample(film(seed, 2, height, 56, task)))
-    assert made == {"text": expected, "tokens": expected}
 
 
 def test_both_frames_of_a_group_carry_its_value() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import inspect
 import warnings
-from contextlib import nullcontext
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any
@@ -21,10 +20,10 @@ from transformers.models.qwen2_5_vl.configuration_qwen2_5_vl import Qwen2_5_VLVi
 import goldens
 from engines import TRANSFORMERS, load_engine
 from rfm.engine import Engine
-from rfm.execution import Execution
+from rfm.engine.execution import Execution
 from rfm.vlm.backbone import QWEN_2_5
 from rfm.vlm.collator import QwenCollator
-from rfm.vlm.film import Film
+from rfm.vlm.film import VlmFilm
 from rfm.vlm.images import Normalisation, QwenImages, fitted_size
 from rfm_client import PreferenceSample, ProgressSample, Sample
 from vlm import BFLOAT16, PLAIN, assert_close, film, predictor_of, upstream_inputs
@@ -89,44 +88,6 @@ def test_patches_hold_every_pixel_once() -> None:
 
 
 QWEN = [config.name for config in goldens.VLM if not config.name.startswith("smol")]
-
-
-class Copies(TorchDispatchMode):
-    """Counts copies between devices, and those for which the host waits."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.num_copies = self.num_awaited = 0
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        kwargs = kwargs or {}
-        made = func(*args, **kwargs)
-        devices = {each.device.type for each in args if isinstance(each, torch.Tensor)}
-        if devices == {"cpu"} and isinstance(made, torch.Tensor) and made.device.type == "meta":
-            self.num_copies += 1
-            self.num_awaited += not kwargs.get("non_blocking")
-        return made
-
-
-@pytest.mark.parametrize("name", QWEN)
-def test_a_forward_pass_asks_the_device_for_no_value(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On the device "meta" tensors have no values: whoever asks for one, as for a GPU's, for which it waits, fails."""
-    monkeypatch.setattr(torch, "autocast", lambda **_: nullcontext())  # there is none there
-    monkeypatch.setattr(torch, "is_autocast_enabled", lambda *_: False)
-    predictor = predictor_of(name)
-    samples = [
-        ProgressSample(film(0, 3, 64, 64)),
-        PreferenceSample(film(1, 2, 64, 96), film(2, 3, 64, 64)),
-        ProgressSample(film(3, 4, 140, 56), frame_steps=3),
-    ]
-    batch = predictor.collate([row for sample in samples for row in predictor.rows(sample)])
-    network, device = deepcopy(predictor.network).to("meta"), torch.device("meta")
-    batch.to(device, torch.float32)  # what is the same for all batches is there from now on
-    with torch.inference_mode(), Copies() as copies:
-        output = network(batch.to(device, torch.float32))
-    assert output.progress.shape[0] == len(batch.spans)
-    assert copies.num_copies > 10
-    assert copies.num_awaited == 0
 
 
 @pytest.mark.parametrize("name", QWEN)
@@ -295,7 +256,7 @@ def test_a_tokenizer_adds_nothing_to_what_the_chat_template_says(name: str) -> N
 @pytest.mark.parametrize("needed", [[], [1], [0, 2], [0, 1, 2]])
 def test_a_film_gives_the_frames_that_are_needed(make: Any, needed: list[int]) -> None:
     frames = np.random.default_rng(0).integers(0, 256, (3, 6, 4, 3), np.uint8)
-    given = Film.of(make(frames), 0).stack(needed)
+    given = VlmFilm.of(make(frames), 0).stack(needed)
     assert given.dtype == np.uint8
     np.testing.assert_array_equal(given, frames[np.array(needed, int)])
 

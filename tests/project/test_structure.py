@@ -16,13 +16,8 @@ from paths import ROOT
 
 SHARED = {  # what a family may import beside itself
     "rfm.checkpoint",
-    "rfm.execution",
-    "rfm.feature_cache",
+    "rfm.engine",
     "rfm.family",
-    "rfm.layers",
-    "rfm.predictor",
-    "rfm.dense_mode",
-    "rfm.version_folder",
     "rfm_client.contract",
 }
 FAMILIES = {"rewind", "vlm"}
@@ -42,13 +37,12 @@ MAY_IMPORT = {
     "rfm_client.labelling": {"rfm_client", "!rfm_client.cli"},
     "rfm_client": set(),
     "rfm_gateway": {"rfm_client"},
-    "rfm.layers": set(),
     "rfm.checkpoint": {"rfm.plain_yaml"},
     "rfm.rewind": SHARED,
     "rfm.vlm": SHARED,
-    "rfm.triton_model": {*SHARED, "rfm.parameters", "rfm.probe", "rfm.proc"},
-    "rfm.launch": {"rfm.config", "rfm.parameters", "rfm.proc", "rfm_client.contract"},
-    "rfm.supervise": {"rfm.launch", "rfm.probe", "rfm.proc", "rfm_client.contract"},
+    "rfm.triton_model": {*SHARED, "rfm.parameters", "rfm.probe"},
+    "rfm.launch": {"rfm.config", "rfm.parameters", "rfm_client.contract"},
+    "rfm.supervise": {"rfm.launch", "rfm.probe", "rfm_client.contract"},
     "rfm.engine": {"rfm", "!rfm.launch", "!rfm.supervise", "!rfm.triton_model", "rfm_client.contract"},
     "rfm": {"rfm_client.contract"},
     "rfm_export": {"rfm", "rfm_client.contract"},

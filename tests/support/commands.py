@@ -14,8 +14,8 @@ from typing import Any
 
 from paths import ROOT
 from rfm.launch.cleanup import REGION_PREFIX, SHARED_MEMORY
+from rfm.launch.proc import ZOMBIE, stat_of
 from rfm.launch.process import Endpoints
-from rfm.proc import ZOMBIE, stat_of
 from rfm_client import RewardClient
 
 REPOSITORY = ROOT / "model_repository"

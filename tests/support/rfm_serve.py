@@ -16,8 +16,8 @@ import httpx
 from prometheus_client.parser import text_string_to_metric_families
 
 from rfm.launch.cleanup import SHARED_MEMORY
+from rfm.launch.proc import ZOMBIE, arguments_of, stat_of
 from rfm.launch.process import Endpoints
-from rfm.proc import ZOMBIE, arguments_of, stat_of
 from rfm_client import RewardClient
 
 RFM = Path(sys.executable).parent / "rfm"

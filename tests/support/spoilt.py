@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -10,9 +11,9 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
-import torch
 from safetensors.torch import load_file, save_file
 
 import goldens
@@ -24,23 +25,40 @@ Spoil = Callable[[Path], object]
 
 
 def copied(config: goldens.Config, folder: Path) -> Path:
-    shutil.copytree(config.checkpoint, folder)
-    for file in folder.rglob("*"):
-        file.chmod(0o644 if file.is_file() else 0o755)
-    return folder
+    return shutil.copytree(config.checkpoint, folder, copy_function=shutil.copyfile)
 
 
 def files_in(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def weights(change: Callable[[dict[str, torch.Tensor]], object]) -> Spoil:
+def weights(change: Callable[[dict[str, Any]], object], file: str = WEIGHTS) -> Spoil:
+    """Changes the tensors of a file."""
+
     def spoil(folder: Path) -> None:
-        tensors = load_file(folder / WEIGHTS)
+        tensors = load_file(folder / file)
         change(tensors)
-        save_file(tensors, folder / WEIGHTS)
+        save_file(tensors, folder / file)
 
     return spoil
+
+
+def in_json(file: str, change: Callable[[dict[str, Any]], object]) -> Spoil:
+    def spoil(folder: Path) -> None:
+        content = json.loads((folder / file).read_text())
+        change(content)
+        (folder / file).write_text(json.dumps(content))
+
+    return spoil
+
+
+def settings(file: str, **changes: Any) -> Spoil:
+    return in_json(file, lambda content: content.update(changes))
+
+
+def text_settings(**changes: Any) -> Spoil:
+    """Of the language model in a vision-language one."""
+    return in_json("config.json", lambda content: content["text_config"].update(changes))
 
 
 def run_the_command(load: Callable[[Path], object], folder: Path) -> None:

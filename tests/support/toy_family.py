@@ -17,13 +17,12 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from rfm.checkpoint.decision import Decision
-from rfm.checkpoint.files import NETWORK_CONFIG, WEIGHTS
-from rfm.dense_mode import prefix_indices
-from rfm.execution import Execution
+from rfm.checkpoint.content import NETWORK_CONFIG, WEIGHTS
+from rfm.checkpoint.provenance import Decision
+from rfm.engine.execution import Execution
+from rfm.engine.feature_cache import FeatureCache
+from rfm.engine.predictor import RowScores, frame_scores, prefix_indices
 from rfm.family import NETWORK, Description, EncodersDescription, Family, Options
-from rfm.feature_cache import FeatureCache
-from rfm.predictor import RowScores, frame_scores
 from rfm_client.contract import InvalidSampleError, ProgressSample, RewardError, Sample, SimilaritySample, Trajectory
 from rfm_client.contract.named_frames import NamedFootage, NamedTrajectory
 from rfm_client.contract.samples import Footage

@@ -15,7 +15,7 @@ from rfm import families
 from rfm.vlm.checkpoint import VlmCheckpoint
 from rfm.vlm.collator import QwenCollator, VlmRow
 from rfm.vlm.predictor import VlmPredictor
-from rfm.vlm.vision import UNIT
+from rfm.vlm.qwen import UNIT
 from rfm_client import (
     Trajectory,
 )

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from batch_models import BREAKS, CONFIG, FAILS, LOGGED, METRICS, REFUSED, WIDTHS, Model, Request, backend, request  # noqa: F401  a fixture
-from rfm.execution import Execution
+from rfm.engine.execution import Execution
 from rfm.probe import blank_question
 from rfm.triton_model import batch_model
 from rfm.triton_model.batch_model import GIVEN_UP_S

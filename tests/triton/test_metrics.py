@@ -20,7 +20,7 @@ import rfm_export
 from engines import load_engine, serve_config
 from mixtures import TOLD_S, mixed_samples
 from reference_server import Served
-from rfm.execution import Execution
+from rfm.engine.execution import Execution
 from rfm.launch.repository_api import RepositoryApi
 from rfm.triton_model.metrics import BUCKETS_S, PADDING_BUCKETS, SAMPLES_BUCKETS
 from rfm.triton_model.request import OUTCOMES, UNKNOWN_TYPE

@@ -9,16 +9,16 @@ from pathlib import Path
 import torch
 
 from rfm.engine import Engine, Outcome, Prepared
-from rfm.execution import Execution
+from rfm.engine.execution import Execution
 from rfm.parameters import (
     BUDGET_PARAMETER,
+    CHECKPOINT_FOLDER,
     DTYPE_PARAMETER,
     FAMILY_PARAMETER,
     FEATURE_CACHE_PARAMETER,
     SAMPLE_TOKENS_PARAMETER,
 )
 from rfm.triton_model.batch_model import BatchModel
-from rfm.version_folder import CHECKPOINT_FOLDER
 from rfm_client.contract import Result, RewardError, Sample, wire
 from rfm_client.contract.named_frames import NamedProgressSample
 

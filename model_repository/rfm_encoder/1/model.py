@@ -10,8 +10,8 @@ import torch
 
 from rfm import families
 from rfm.config import DEFAULT_SAMPLE_TOKENS
-from rfm.execution import Execution
-from rfm.feature_cache import BYTES_PER_MB, FeatureCache
+from rfm.engine.execution import Execution
+from rfm.engine.feature_cache import BYTES_PER_MB, FeatureCache
 from rfm.parameters import FAMILY_PARAMETER, FEATURE_CACHE_PARAMETER, SAMPLE_TOKENS_PARAMETER
 from rfm.triton_model.batch_model import BatchModel
 from rfm_client.contract import InvalidSampleError, RewardError, wire

@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""What one batch took: times, tokens, failures of memory.
-
-The code that answers adds to it. The caller may read it afterwards."""
+"""What one batch took: times, tokens, failures of memory. The code that answers adds to it."""
 
 from __future__ import annotations
 
 import logging
-import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -15,32 +12,12 @@ from typing import Any, TypeVar
 
 import torch
 
+from rfm.engine.device import free_unused, memory_errors
 from rfm_client.contract import InferenceFailedError
 
 Output = TypeVar("Output")
 
 _log = logging.getLogger(__name__)
-
-_CPU_OUT_OF_MEMORY = re.compile(  # PyTorch's allocator and oneDNN, which gives no reason, raise plain RuntimeErrors
-    r"DefaultCPUAllocator: can't allocate memory|could not (create|execute) a (primitive|memory object)"
-)
-
-
-def _nothing() -> None:
-    pass
-
-
-@contextmanager
-def memory_errors() -> Iterator[None]:
-    """A context in which every lack of memory is a torch.OutOfMemoryError: a GPU's, PyTorch's on the CPU, Python's."""
-    try:
-        yield
-    except MemoryError as error:
-        raise torch.OutOfMemoryError(str(error)) from error
-    except RuntimeError as error:
-        if not _CPU_OUT_OF_MEMORY.search(str(error)):
-            raise
-        raise torch.OutOfMemoryError(str(error)) from error
 
 
 @dataclass
@@ -64,7 +41,7 @@ class Execution:
     num_found: int = 0
     cache_bytes: int | None = None
     out_of_memory_count: int = 0
-    on_forward: Callable[[], None] = field(default=_nothing, compare=False, repr=False)
+    on_forward: Callable[[], None] = field(default=lambda: None, compare=False, repr=False)
 
     def run(self, forward: Callable[[Any], Sequence[Output]], rows: Any) -> list[Output | InferenceFailedError]:
         """What a forward pass gives for each of ``rows``: a sequence, or a tensor of them.
@@ -79,7 +56,7 @@ class Execution:
             _log.warning("out of memory with %d rows: %s", len(rows), error)
         finally:
             self.on_forward()
-        torch.cuda.empty_cache()  # nothing where there is no GPU
+        free_unused()
         if len(rows) == 1:
             return [InferenceFailedError("the sample does not fit in the device's memory")]
         half = len(rows) // 2

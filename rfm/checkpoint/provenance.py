@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""What decided each thing that a checkpoint's scores depend on: its weights, a file, a default, or the caller."""
+"""What a checkpoint's scores depend on: what decided each setting, and the digests that identify it."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -79,3 +80,39 @@ def write(decisions: Sequence[Decision], folder: Path) -> None:
     """Writes PROVENANCE into an exported checkpoint's folder."""
     content = json.dumps([asdict(each) for each in decisions], indent=2)
     (folder / PROVENANCE).write_text(content + "\n")
+
+
+DIGEST_DIGITS = 16  # of 64: enough to identify a checkpoint, and to find damage
+
+# Of files beside the weights that decide scores: configuration, tokenizer, image processor.
+SETTINGS_SUFFIXES = (".json", ".jinja", ".model", ".txt", ".yaml")
+
+_CHUNK_BYTES = 2**22
+
+
+def weights_digest(folders: Iterable[Path]) -> str:
+    """The first digits of the SHA-256 of all safetensors files in the folders, one behind the other. Raises OSError."""
+    digest = hashlib.sha256()
+    for file in (file for folder in folders for file in sorted(folder.rglob("*.safetensors"))):
+        with file.open("rb") as content:
+            while chunk := content.read(_CHUNK_BYTES):
+                digest.update(chunk)
+    return digest.hexdigest()[:DIGEST_DIGITS]
+
+
+def settings_digest(folders: Iterable[Path], told: Mapping[str, Any]) -> str:
+    """The first digits of the SHA-256 of what decides scores beside the weights. Raises OSError.
+
+    folders: whose files of SETTINGS_SUFFIXES count, with their paths; but for PROVENANCE, which decides nothing
+    told: what no file says, as JSON can hold it
+    """
+    digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
+    for folder in folders:
+        for file in sorted(file for file in folder.rglob("*") if _counts(file)):
+            content = file.read_bytes()
+            digest.update(f"{file.relative_to(folder).as_posix()} {len(content)}\n".encode() + content)
+    return digest.hexdigest()[:DIGEST_DIGITS]
+
+
+def _counts(file: Path) -> bool:
+    return file.suffix in SETTINGS_SUFFIXES and file.name != PROVENANCE and file.is_file()

@@ -16,12 +16,12 @@ import torch
 
 from rfm import families
 from rfm.config import DEFAULT_SAMPLE_TOKENS, DEFAULT_TOKEN_BUDGET
-from rfm.embedding import embedded
-from rfm.execution import Execution, memory_errors
+from rfm.engine.device import memory_errors
+from rfm.engine.execution import Execution
+from rfm.engine.feature_cache import BYTES_PER_MB, FeatureCache
+from rfm.engine.layers import keep_float32
+from rfm.engine.predictor import Predictor, RowScores
 from rfm.family import Checkpoint, FrameEncoders
-from rfm.feature_cache import BYTES_PER_MB, FeatureCache
-from rfm.layers.precision import keep_float32
-from rfm.predictor import Predictor, RowScores
 from rfm_client.contract import (
     BatchTiming,
     FrameScores,
@@ -36,6 +36,7 @@ from rfm_client.contract import (
     SimilarityResult,
 )
 from rfm_client.contract.named_frames import NamedProgressSample
+from rfm_client.contract.samples import Footage, with_trajectories
 
 Outcome: TypeAlias = Result | RewardError
 
@@ -91,8 +92,7 @@ class Engine:
     ) -> Engine:
         """The engine of a checkpoint folder or Hugging Face id. Raises CheckpointError.
 
-        family, base_model: as in ``rfm.families.load``
-        others: as in ``of``
+        family, base_model: as in ``rfm.families.load``; the others as in ``of``
         """
         return cls.of(
             families.load(source, family=family, base_model=base_model),
@@ -167,7 +167,17 @@ class Engine:
         return self._results(prepared, execution, replace(execution))
 
     def _embedded(self, samples: Sequence[Sample], execution: Execution) -> Sequence[Sample | RewardError]:
-        return samples if self.encoders is None else embedded(samples, self.encoders, execution)
+        """The samples with embeddings in place of raw frames, which are encoded together; or why a sample has none."""
+        outcomes: list[Sample | RewardError] = list(samples)
+        raw = {i: Footage(s.trajectories) for i, s in enumerate(samples) if s.trajectories[0].frames is not None}
+        if self.encoders is None or not raw:
+            return outcomes
+        for index, outcome in zip(raw, self.encoders.encode(list(raw.values()), execution, None), strict=True):
+            if isinstance(outcome, Footage):
+                outcomes[index] = with_trajectories(samples[index], outcome.trajectories)
+            else:
+                outcomes[index] = outcome
+        return outcomes
 
     def _prepared(
         self, sample: Sample | NamedProgressSample, embedded_sample: Sample | NamedProgressSample | RewardError

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
-from rfm.execution import Execution
-from rfm.layers.heads import progress_from_logits
+from rfm.engine.execution import Execution
+from rfm.engine.layers import progress_from_logits
 from rfm_client.contract import (
     FrameScores,
     InferenceFailedError,
@@ -123,3 +123,11 @@ def part_of(scores: FrameScores, index: slice | npt.NDArray[np.intp]) -> FrameSc
         success=scores.success[index],
         progress_logits=None if logits is None else logits[index],
     )
+
+
+def prefix_indices(num_frames: int, frame_steps: int) -> npt.NDArray[np.int64]:
+    """int64 [T, K], the frames that stand for each prefix 0..t.
+
+    K positions evenly from 0 to t, truncated to whole frames, as the original server samples them.
+    """
+    return np.stack([np.linspace(0, t, frame_steps).astype(np.int64) for t in range(num_frames)])

@@ -17,16 +17,13 @@ BYTES_PER_MB = 2**20
 _ENTRY_BYTES = 256  # of a key, an array's header and a place in the order
 
 
-class Array(Protocol):
-    """A NumPy array, or a tensor on any device."""
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of its values."""
-
-
 Source = TypeVar("Source")
-Kept = TypeVar("Kept", bound=Array)
+Kept = TypeVar("Kept", bound="_Array")
+
+
+class _Array(Protocol):  # of NumPy, or a tensor on any device
+    @property
+    def nbytes(self) -> int: ...
 
 
 class FeatureCache(Generic[Kept]):
@@ -69,10 +66,10 @@ class FeatureCache(Generic[Kept]):
             for key, array in arrays.items():
                 if key not in self._arrays:
                     self._arrays[key] = array
-                    self.num_bytes += _size(array)
+                    self.num_bytes += array.nbytes + _ENTRY_BYTES
             while self.num_bytes > self.limit_bytes:
                 _, array = self._arrays.popitem(last=False)
-                self.num_bytes -= _size(array)
+                self.num_bytes -= array.nbytes + _ENTRY_BYTES
 
 
 def get_or_make(
@@ -95,13 +92,6 @@ def get_or_make(
     missing = [key for key in wanted if key not in found and key in sources]
     made = dict(zip(missing, make([sources[key] for key in missing]) if missing else [], strict=True))
     good = {key: each for key, each in made.items() if not isinstance(each, RewardError)}
-    cache.keep({key: _own(each) for key, each in good.items() if np.isfinite(each).all()})
+    finite = {key: each for key, each in good.items() if np.isfinite(each).all()}
+    cache.keep({key: each if each.base is None else each.copy() for key, each in finite.items()})
     return {**found, **made}, len(missing)
-
-
-def _own(array: Float32Array) -> Float32Array:
-    return array if array.base is None else array.copy()
-
-
-def _size(array: Array) -> int:
-    return array.nbytes + _ENTRY_BYTES

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: MIT
+"""config.yaml of the training run: where it is, and what it says of how the heads were trained. No score shows that."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rfm.checkpoint.content import (
+    ADAPTER_CONFIG,
+    NETWORK_CONFIG,
+    RUN_CONFIG,
+    RUN_CONFIGS,
+    WEIGHTS,
+    CheckpointError,
+    is_there,
+    read_json,
+    read_run_config,
+    shown,
+)
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+PROGRESS, PREFERENCE, SUCCESS, SIMILARITY = HEADS = ("progress", "preference", "success", "similarity")
+MAX_COUNT = 2**20  # of frames: longer than any trajectory
+_COMMIT_DIGITS = 40
+
+
+def find_run_config(folder: Path) -> Path | None:
+    """The training run's configuration in the checkpoint's folder, its parent, or there on main in the Hub's cache.
+
+    Raises CheckpointError for one from outside the folder that is of another kind of network.
+    """
+    home = folder.resolve()
+    for place in (folder, home.parent, *_places_on_main(home)):
+        file = next((place / name for name in RUN_CONFIGS if is_there(place / name)), None)
+        if file is not None:
+            if place != folder:
+                _check_base(file, folder)
+            return file
+    return None
+
+
+def _check_base(file: Path, folder: Path) -> None:
+    """Raises CheckpointError if the run's base model and the checkpoint's network are of different kinds."""
+
+    def plain(name: str) -> str:
+        return re.sub(r"[^a-z0-9]", "", name.lower())
+
+    base = section_of(read_run_config(file), "model").get("base_model_id")
+    if is_there(folder / NETWORK_CONFIG):
+        kind = read_json(folder / NETWORK_CONFIG).get("model_type")
+    else:  # an adapter names its base model; the first ReWiND checkpoints say nothing
+        kind = None if is_there(folder / ADAPTER_CONFIG) else "rewind_transformer"
+    if isinstance(kind, str) and isinstance(base, str) and base and plain(kind) not in plain(base):
+        raise CheckpointError(
+            f"{file}: expected the run of {folder}, whose network is {shown(kind)}, got model.base_model_id "
+            f"{shown(base)}; copy the run's {RUN_CONFIG} into {folder}, also if it is this one"
+        )
+
+
+def _places_on_main(home: Path) -> list[Path]:
+    """``home``, and the folder above a subfolder, in the Hub's cache of main: the snapshot that refs/main names."""
+    snapshot = next((path for path in (home, *home.parents) if path.parent.name == "snapshots"), home)
+    main = snapshot.parent.parent / "refs" / "main"
+    if snapshot.parent.name != "snapshots" or not is_there(main):
+        return []
+    with main.open("rb") as file:
+        commit = file.read(_COMMIT_DIGITS + 1)
+    if not re.fullmatch(rb"[0-9a-f]+", commit):
+        return []
+    place = snapshot.parent / commit.decode() / home.relative_to(snapshot)
+    return [place] if home == snapshot else [place, place.parent]
+
+
+def section_of(run: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """The section of that name; an empty one if it is none, which is for the family to refuse."""
+    section = run.get(name)
+    return section if isinstance(section, dict) else {}
+
+
+def trained_frames(run: Mapping[str, Any], file: Path) -> int | None:
+    """The most frames of a trajectory in training, as config.yaml has it; None if it has none."""
+    data = run.get("data") or {}
+    if not isinstance(data, dict):
+        raise CheckpointError(f"{file}: data: expected a mapping, got {shown(data)}")
+    return frame_count(data.get("max_frames"), f"{file}: data.max_frames")
+
+
+def frame_count(frames: Any, where: str) -> int | None:
+    """The value if it is a count of frames, or None. Raises CheckpointError."""
+    if frames is not None and (type(frames) is not int or frames < 1):
+        raise CheckpointError(f"{where}: expected a whole number of at least 1, got {shown(frames)}")
+    if frames is not None and frames > MAX_COUNT:
+        raise CheckpointError(f"{where}: expected at most {MAX_COUNT}, got {shown(frames)}")
+    return frames
+
+
+def check_progress(run: Mapping[str, Any], file: Path) -> None:
+    """Raises CheckpointError for a head that was trained on increments of progress, not on progress.
+
+    run: config.yaml, read from ``file``
+    """
+    kind = section_of(run, "data").get("progress_pred_type")
+    if isinstance(kind, str) and kind.startswith("relative"):  # as upstream's names of increments begin
+        raise CheckpointError(
+            f"{file}: data.progress_pred_type: expected absolute progress, got {shown(kind)}: such a head predicts how "
+            "far the task has come since the frame before, which would be served as how far it has come"
+        )
+
+
+def training_notes(folder: Path, answered: Collection[str]) -> list[str]:
+    """A line for the user on each thing that the training run of the checkpoint in ``folder`` left untrained.
+
+    answered: heads of which its answers are made. The run it started from may have trained them
+    Raises CheckpointError for a config.yaml that cannot be read.
+    """
+    file = find_run_config(folder)
+    run = {} if file is None else read_run_config(file)
+    model = section_of(run, "model")
+    lines = [
+        f"{RUN_CONFIG}: model.train_{head}_head is false: the run did not train the head of {head}, so {head} means "
+        "something only if the run started from a checkpoint that did"
+        for head in HEADS
+        if head in answered and model.get(f"train_{head}_head") is False
+    ]
+    if PROGRESS in answered and section_of(run, "loss").get("predict_last_frame_progress") is True:
+        lines.append(
+            f"{RUN_CONFIG}: loss.predict_last_frame_progress is true: the run trained progress of the last frame "
+            "alone, so progress of the frames before it means something only if the run started from a checkpoint "
+            "that trained it"
+        )
+    if model.get("quantization") is True:
+        lines.append(
+            f"{RUN_CONFIG}: model.quantization is true: the run scored with its base model rounded to a few bits; the "
+            "scores here are those of the weights as they stand, so they differ from the run's unless these are "
+            "rounded alike"
+        )
+    return lines
+
+
+def constant_heads(weights: Mapping[str, Tensor], answered: Collection[str]) -> list[str]:
+    """A line for the user on each head of ``answered`` whose last layer multiplies by 0, as before any training."""
+    heads = {head: weights.get(f"{head}_head.4.weight") for head in answered}
+    return [
+        f"{WEIGHTS}: {head}_head.4.weight is 0 throughout: {head} is the same whatever is scored, as if untrained"
+        for head, weight in heads.items()
+        if weight is not None and not weight.any()
+    ]

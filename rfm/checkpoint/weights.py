@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: MIT
+"""The weights of a checkpoint: from safetensors files, never from pickles, and without prefixes of training code."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rfm.checkpoint.content import (
+    ADAPTER_WEIGHTS,
+    WEIGHTS,
+    WEIGHTS_INDEX,
+    CheckpointError,
+    cut,
+    is_there,
+    listed,
+    read_json,
+    read_tensors,
+    shown,
+    tensor_names,
+)
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+PICKLE_STEM = "pytorch_model"  # of transformers' pickles of weights
+_SHARDS = "model-*.safetensors"
+_ENCODERS = ("image_encoder", "text_encoder")  # below an exported checkpoint's
+_LEVELS = ("*", "*/*", "*/*/*")  # below a folder: a training run's checkpoints, those of a model repository
+_MAX_SUGGESTED = 5
+
+_PICKLES = ("*.bin", "*.pt", "*.pth", "*.ckpt", "*.pkl")
+# What training leaves beside weights, to go on from.
+_STATES = ("optimizer*", "*optim_states*", "scheduler*", "rng_state*", "random_states*", "scaler*", "training_args*")
+_CONVERT = (
+    "import argparse, functools, sys, torch, safetensors.torch as s; "
+    "torch.serialization.add_safe_globals([argparse.Namespace]); "
+    "load = lambda file: functools.reduce("
+    "lambda d, key: d[key] if isinstance(d.get(key), dict) else d, "
+    "('state_dict', 'model_state_dict', 'model', 'module'), "
+    "torch.load(file, map_location='cpu', weights_only=True)); "
+    "s.save_file({name: t.clone(memory_format=torch.contiguous_format) "
+    "for file in sys.argv[2:] for name, t in load(file).items() if torch.is_tensor(t)}, "
+    "sys.argv[1], {'format': 'pt'})"
+)
+
+# Prefixes that training code puts before names of weights; those inside stand before names of layers, too.
+_INSIDE = r"_orig_mod|_fsdp_wrapped_module|_checkpoint_wrapped_module|_forward_module"
+_WRAPPERS = re.compile(rf"^(?:(?:module|base_model\.model|{_INSIDE})\.)+|(?<=\.)(?:(?:{_INSIDE})\.)+")
+_HEAD = "progress_head.4.weight"  # of every network of ours
+_STRIP = (
+    "import sys, safetensors.torch as s; prefix, target, *files = sys.argv[1:]; "
+    "t = [(name.removeprefix(prefix), v) for file in files for name, v in s.load_file(file).items()]; "
+    "assert len(dict(t)) == len(t), 'two tensors would have one name'; s.save_file(dict(t), target, {'format': 'pt'})"
+)
+
+
+def read_weights(folder: Path) -> dict[str, Tensor]:
+    """All tensors of model.safetensors or of the shards that its index names, without the prefixes of wrappers.
+
+    Raises CheckpointError.
+    """
+    check_one_form(folder)
+    if is_there(folder / WEIGHTS):
+        files, weights = [folder / WEIGHTS], read_tensors(folder / WEIGHTS)
+    elif is_there(folder / WEIGHTS_INDEX):
+        files, weights = _read_shards(folder / WEIGHTS_INDEX)
+    else:
+        refuse_pickles(folder, WEIGHTS, PICKLE_STEM)
+        got = cut(", ".join(sorted(path.name for path in folder.iterdir()))) or "nothing"
+        raise CheckpointError(f"{folder}: expected {WEIGHTS} or {WEIGHTS_INDEX}, got {got}: {_below(folder)}")
+    return _unwrapped(weights, files, folder / WEIGHTS)
+
+
+def check_one_form(folder: Path) -> None:
+    """Raises CheckpointError for weights that are there whole and in shards: which are the newer, no file says."""
+    shards = [path.name for path in (folder / WEIGHTS_INDEX, *sorted(folder.glob(_SHARDS))) if is_there(path)]
+    if shards and is_there(folder / WEIGHTS):
+        raise CheckpointError(
+            f"{folder}: expected {WEIGHTS} or shards, got {WEIGHTS} and {listed(shards)}, of which one is older; "
+            "move away what is not meant: transformers, which reads the former, leaves it when it writes shards"
+        )
+
+
+def _read_shards(index: Path) -> tuple[list[Path], dict[str, Tensor]]:
+    """The shards that the index names, and their tensors."""
+    weight_map = read_json(index).get("weight_map")
+    if not isinstance(weight_map, dict):
+        raise CheckpointError(f"{index}: expected a weight_map, got none")
+    weights: dict[str, Tensor] = {}
+    shard_of: dict[str, str] = {}
+    for shard in dict.fromkeys(map(str, weight_map.values())):
+        if Path(shard).name != shard or not shard.endswith(".safetensors"):
+            raise CheckpointError(f"{index}: expected names of files beside it, got {shown(shard)}")
+        if not is_there(index.parent / shard):
+            raise CheckpointError(f"{index}: names the shard {shard}, which is not there")
+        for name, tensor in read_tensors(index.parent / shard).items():
+            if name in shard_of:
+                got = f"{shown(name)} in {shard_of[name]} and in {shard}"
+                raise CheckpointError(f"{index}: expected each tensor in one shard, got {got}; save the weights again")
+            weights[name], shard_of[name] = tensor, shard
+    _check_names(weight_map.keys(), weights.keys())
+    for file in sorted(index.parent.glob(_SHARDS)):
+        unknown = set(tensor_names(file)) - shard_of.keys()
+        if unknown:
+            got = f"{file.name}, which it does not name, with {listed(sorted(unknown))}"
+            raise CheckpointError(f"{index}: expected the names of all shards, got {got}; move that file away")
+    return [index.parent / shard for shard in dict.fromkeys(shard_of.values())], weights
+
+
+def _unwrapped(weights: Mapping[str, Tensor], files: Sequence[Path], target: Path) -> dict[str, Tensor]:
+    """The weights without the prefixes of DataParallel, torch.compile, PEFT, FSDP, nor another one that all have.
+
+    files: those that hold the weights; target: that which would hold them without another prefix
+    Raises CheckpointError if only some have it, or two would have one name. Which names are right is not known here.
+    """
+    bare: dict[str, Tensor] = {}
+    for name, tensor in weights.items():
+        if (short := _WRAPPERS.sub("", name)) in bare:
+            raise CheckpointError(f"{target.parent}: expected each weight once, got {shown(short)} and {shown(name)}")
+        bare[short] = tensor
+    head = next((name for name in bare if name == _HEAD or name.endswith(f".{_HEAD}")), _HEAD)
+    prefix = head.removesuffix(_HEAD)
+    other = next((name for name in bare if not name.startswith(prefix)), None)
+    if other is not None:
+        stripped = target.parent / "stripped.safetensors"
+        line = f"{_command(_STRIP, [prefix, stripped, *files])} && mv {shlex.join([str(stripped), str(target)])}"
+        then = "" if list(files) == [target] else ", then move the shards and their index away"
+        raise CheckpointError(
+            f"{target.parent}: expected {_HEAD}, got {shown(head)}, with the prefix {prefix} that {shown(other)} lacks"
+            f"; strip it with: {line}{then}"
+        )
+    return {name.removeprefix(prefix): tensor for name, tensor in bare.items()}
+
+
+def _below(folder: Path) -> str:
+    """Where there are weights below a folder that has none, or what a folder with weights looks like."""
+    names = (WEIGHTS, WEIGHTS_INDEX, ADAPTER_WEIGHTS)
+    found = [file.parent for level in _LEVELS for name in names for file in sorted(folder.glob(f"{level}/{name}"))]
+    checkpoints = [str(path) for path in dict.fromkeys(found) if path.name not in _ENCODERS]
+    if not checkpoints:
+        return "a checkpoint's folder has it, beside config.json"
+    return f"name the checkpoint in it: {cut(', '.join(checkpoints[:_MAX_SUGGESTED]))}"
+
+
+def take_prefix(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Moves the tensors under ``prefix`` out of ``weights``, without the prefix."""
+    names = [name for name in weights if name.startswith(prefix)]
+    return {name.removeprefix(prefix): weights.pop(name) for name in names}
+
+
+def has_head(weights: Iterable[str], head: str) -> bool:
+    """Whether there are weights of the head of ``head``; one of which some are missing is refused later."""
+    return any(name.startswith(f"{head}_head.") for name in weights)
+
+
+def check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> None:
+    """Raises CheckpointError unless both have the same names, shapes and kinds of numbers."""
+    _check_names(expected.keys(), got.keys())
+    for name, tensor in got.items():
+        if tensor.shape != expected[name].shape:
+            raise CheckpointError(f"{name}: expected {list(expected[name].shape)}, got {list(tensor.shape)}")
+        if tensor.is_floating_point() != expected[name].is_floating_point():
+            raise CheckpointError(f"{name}: expected numbers like {expected[name].dtype}, got {tensor.dtype}")
+
+
+def check_finite(weights: Mapping[str, Tensor]) -> None:
+    """Raises CheckpointError for a weight that is no number. A score that it makes may still be one: success of 1."""
+    for name, tensor in weights.items():
+        if not (tensor.is_floating_point() and tensor.numel()):
+            continue
+        if not all(extreme.isfinite() for extreme in tensor.aminmax()):  # fifty times as fast as isfinite of each
+            at = (~tensor.isfinite()).nonzero()[0].tolist()
+            raise CheckpointError(f"{name}: expected finite weights, got {tensor[tuple(at)].item()} at {at}")
+
+
+def _check_names(expected: Iterable[str], got: Iterable[str]) -> None:
+    missing, unexpected = sorted(set(expected) - set(got)), sorted(set(got) - set(expected))
+    if missing or unexpected:
+        named = [listed(names) if names else "none" for names in (missing, unexpected)]
+        raise CheckpointError(f"{WEIGHTS}: missing keys: {named[0]}; unexpected keys: {named[1]}")
+
+
+def pickled_weights(names: Iterable[str], stem: str) -> list[str]:
+    """Those of a folder's files that are pickles and may hold its weights.
+
+    stem: how transformers begins their names; if there are such, the others are left out
+    """
+
+    def is_any(name: str, patterns: Sequence[str]) -> bool:
+        return any(fnmatch(name, pattern) for pattern in patterns)
+
+    pickles = sorted(name for name in names if is_any(name, _PICKLES) and not is_any(name, _STATES))
+    usual = [name for name in pickles if name == f"{stem}.bin" or fnmatch(name, f"{stem}-*-of-*.bin")]
+    return usual or pickles
+
+
+def refuse_pickles(folder: Path, wanted: str, stem: str) -> None:
+    """Raises CheckpointError if ``folder`` has pickled weights, where the file ``wanted`` is not there.
+
+    They are never opened here, since that may run code; the message has the command that converts them.
+    """
+    names = pickled_weights((file.name for file in folder.iterdir()), stem)
+    if not names:
+        return
+    if len(names) > 1 and f"{stem}.bin" in names:
+        both = f"{stem}.bin and {names[0]}"
+        raise CheckpointError(f"{folder}: expected one form of the weights, got {both}; move away what is not meant")
+    files = names if names[0].endswith(".bin") and "-of-" in names[0] else names[:1]  # all shards, or the first other
+    raise CheckpointError(
+        f"{folder}: expected {wanted}, got {cut(', '.join(names))}: pickles may run code when they are loaded, so they "
+        "are refused. If you trust who made it, convert it. weights_only=True lets PyTorch make tensors and little "
+        "else; do not convert a file that needs more: "
+        + _command(_CONVERT, [folder / wanted, *(folder / name for name in files)])
+    )
+
+
+def _command(code: str, arguments: Iterable[str | Path]) -> str:
+    """A line for a shell that runs ``code``, which has no double quotes."""
+    return f'python -c "{code}" {shlex.join(map(str, arguments))}'
