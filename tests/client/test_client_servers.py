@@ -24,11 +24,9 @@ from rfm_client.contract import wire
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.transport.calls import Answer
 from rfm_gateway.body import Batch
-from rfm_gateway.folder import AllowedFolder
-from rfm_gateway.memory import Memory
 from rfm_gateway.schema import SAMPLES
-from rfm_gateway.scoring import Scorer
-from rfm_gateway.state import State
+from rfm_gateway.scoring import Evaluator
+from rfm_gateway.state import TritonState
 from trajectories import random_trajectory
 
 NUM_FRAMES = 4
@@ -129,14 +127,13 @@ def test_the_gateway_tells_of_the_version_that_answers_now() -> None:
     async def ask() -> None:
         stand = Stand()
         async with AsyncRewardClient("", transports=[stand], retry=False) as client:
-            state = State(client, "grpc://127.0.0.1:1", "http://127.0.0.1:1/metrics", "rfm")
-            scorer = Scorer(client, AllowedFolder(None, 0), WITHIN_S)
+            state = TritonState(client, "grpc://127.0.0.1:1", "http://127.0.0.1:1/metrics", "rfm")
+            evaluator = Evaluator(client, WITHIN_S)
             sample = {"sample_type": "progress", "trajectory": {"task": "lift", "frames": FILMED.frames}}
             batch = Batch(SAMPLES.validate_python([sample], context={}), False)
             for version, frames_per_value in ((1, 1), (2, 2)):
                 stand.version, stand.frames_per_value = version, frames_per_value
-                with Memory(2**20).share() as share:
-                    answer = await scorer.evaluate(batch, share, "request")
+                answer = await evaluator.evaluate(batch, "request")
                 assert answer.outputs_progress is not None
                 assert len(answer.outputs_progress.progress_pred[0]) == NUM_FRAMES // frames_per_value
             stand.version = 3

@@ -80,24 +80,6 @@ def test_a_body_that_does_not_come_is_a_408(strict: Gateway, path: str, half: An
     assert response.getheader("Connection") == "close"
 
 
-CHUNK = b"40000\r\n" + b" " * 2**18 + b"\r\n"
-
-
-LARGE: dict[str, tuple[dict[str, str], list[bytes]]] = {
-    "announced": ({"Content-Length": str(2**20 + 1)}, []),
-    "in chunks": ({"Transfer-Encoding": "chunked"}, [CHUNK] * 5),
-}
-
-
-@pytest.mark.parametrize("path", HALVES)
-@pytest.mark.parametrize(("headers", "parts"), LARGE.values(), ids=LARGE)
-def test_too_large_a_body_is_a_413(strict: Gateway, headers: dict[str, str], parts: list[bytes], path: str) -> None:
-    beginning = [b"%x\r\n%b\r\n" % (len(NAMED), NAMED)] if parts and path.endswith("npy") else []
-    response, detail = ended(begun(strict, headers | {"Content-Type": MULTIPART}, *beginning, *parts, path=path))
-    assert (response.status, detail) == (413, "body: expected at most 1048576 bytes, got more")
-    assert answered(ask_json(strict, [progress(FIRST)]))
-
-
 def test_more_requests_than_allowed_are_a_503_and_health_is_not_one(strict: Gateway) -> None:
     for path, half in HALVES.items():  # each is answered 408 in the end
         connection = begun(strict, *half, path=path)
@@ -256,7 +238,9 @@ def test_health_is_told_while_a_model_works(gated: Gated, monkeypatch: pytest.Mo
 
         async def ask() -> None:
             async with AsyncRewardClient(gated.endpoints.grpc_url) as client:
-                await gateway_state.State(client, gated.endpoints.grpc_url, gated.endpoints.metrics_url, TINY).health()
+                await gateway_state.TritonState(
+                    client, gated.endpoints.grpc_url, gated.endpoints.metrics_url, TINY
+                ).health()
 
         with pytest.raises(ServerUnavailableError, match=r"rfm: no answer within 1\.5 s, and nothing finished for 0 s"):
             asyncio.run(ask())
@@ -288,8 +272,3 @@ def test_a_model_that_is_not_served_is_a_503(triton: Triton, tmp_path: Path) -> 
     with running(triton.endpoints, tmp_path, "nowhere") as gateway:
         for response in (ask_json(gateway, [progress(FIRST)]), requests.get(f"{gateway.url}/health")):
             assert "nowhere" in failure(response, 503)
-
-
-def test_unknown_paths_and_methods_are_told_as_json(tiny: Gateway) -> None:
-    assert failure(requests.get(f"{tiny.url}/evaluate"), 404) == "Not Found"
-    assert failure(requests.get(f"{tiny.url}/evaluate_batch"), 405) == "Method Not Allowed"
