@@ -29,7 +29,7 @@ from rfm_gateway.observe import (
     REQUEST_ID_HEADER,
     RETRY_AFTER,
     CallerLeftError,
-    Metrics,
+    GatewayMetrics,
     Observed,
     while_connected,
 )
@@ -64,7 +64,7 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
     Raises OSError for a folder that is not there, ValueError for a malformed URL or files that cannot be used.
     """
     folder = None if config.allow_folder is None else config.allow_folder.resolve(strict=True)
-    model, access, metrics = config.model or DEFAULT_MODEL, config.access, Metrics()
+    model, access, metrics = config.model or DEFAULT_MODEL, config.access, GatewayMetrics()
     new_client = partial(
         AsyncRewardClient,
         config.triton_url,
@@ -118,7 +118,7 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
     return app
 
 
-def _add_evaluations(router: APIRouter, limits: BodyLimits, evaluator: Evaluator, metrics: Metrics) -> None:
+def _add_evaluations(router: APIRouter, limits: BodyLimits, evaluator: Evaluator, metrics: GatewayMetrics) -> None:
     """The endpoints that score samples."""
 
     async def answer(request: Request, reading: Awaitable[Batch]) -> Response:
@@ -151,7 +151,7 @@ def _add_evaluations(router: APIRouter, limits: BodyLimits, evaluator: Evaluator
         return await answer(request, read_multipart(limits, request))
 
 
-def _add_reports(router: APIRouter, state: TritonState, metrics: Metrics) -> None:
+def _add_reports(router: APIRouter, state: TritonState, metrics: GatewayMetrics) -> None:
     """The endpoints that tell what is served, and how."""
 
     @router.get("/gpu_status", responses=_failures(502, 503, 504))

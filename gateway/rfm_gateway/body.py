@@ -30,6 +30,7 @@ MAX_SAMPLES = 10_000  # of one request
 MAX_JSON_BYTES = 32 * 2**20  # arrays have a better way
 MAX_ERRORS = 1000  # that one answer lists
 
+_format: Any = np.lib.format  # numpy declares no types for it
 _ANY_SAMPLE_FIELD = re.compile(r"sample_[0-9]+")
 _SAMPLE_FIELD = re.compile(r"sample_(0|[1-9][0-9]{0,5})")
 _STEPS_FIELD = "use_frame_steps"
@@ -45,7 +46,9 @@ _EXPECTED = {  # pydantic's kind of error, and what a field of it is
     "union_tag_invalid": "progress, preference or similarity",
     "union_tag_not_found": "progress, preference or similarity",
 }
-_BEFORE_EXPECTED = re.compile(".*?should (be|have|match) ")  # in pydantic's messages
+_AROUND_EXPECTED = re.compile(
+    "^.*?should (be|have|match) | after validation.*|, unable to .*"
+)  # in pydantic's messages
 
 Parts: TypeAlias = tuple[dict[str, str], dict[str, UploadFile]]  # fields and files of a form, by name
 
@@ -88,7 +91,7 @@ class BodyLimits:
     timeout_s: float
 
     async def read(self, request: Request, max_bytes: int = MAX_JSON_BYTES) -> bytes:
-        """The whole body."""
+        """The whole body, of which JSON is made."""
         with anyio.fail_after(self.timeout_s):
             return b"".join([chunk async for chunk in _chunks(request, min(self.max_bytes, max_bytes))])
 
@@ -210,7 +213,7 @@ def _read_npy(upload: UploadFile) -> np.ndarray[Any, Any]:
     """The array of numbers in a .npy file. No pickle, and nothing behind the array. Raises ValueError."""
     upload.file.seek(0)
     try:
-        array: np.ndarray[Any, Any] = np.lib.format.read_array(upload.file, allow_pickle=False)  # type: ignore[no-untyped-call]
+        array: np.ndarray[Any, Any] = _format.read_array(upload.file, allow_pickle=False)
     except BROKEN_NPY as error:
         raise ValueError(f"expected a .npy file, got: {error}") from None
     if array.dtype.kind not in "biuf":
@@ -292,7 +295,7 @@ def _field_error(error: Any) -> dict[str, Any]:
         message = f"expected JSON, got: {message.removeprefix('Invalid JSON: ')}"
     else:
         given = given.get("sample_type") if "union_tag" in kind else given
-        expected = _EXPECTED.get(kind) or _BEFORE_EXPECTED.sub("", message, count=1).partition(" after validation")[0]
+        expected = _EXPECTED.get(kind) or _AROUND_EXPECTED.sub("", message)
         got = {"missing": "none", "too_long": "more"}.get(kind) or reprlib.repr(given)
         message = f"expected {expected}, got {got}"
     return {"type": kind, "loc": ["body", *(each for each in error["loc"] if each != "[key]")], "msg": message}

@@ -43,7 +43,7 @@ _ID_BYTES = 8  # of chance, where a request comes without an id
 _BUCKETS_S = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0)
 
 
-class Metrics:
+class GatewayMetrics:
     """The Prometheus metrics of one gateway."""
 
     def __init__(self) -> None:
@@ -83,7 +83,7 @@ class Metrics:
 class Observed:
     """ASGI middleware: names, times and counts every request, and lets in as many evaluations as ``config`` says."""
 
-    def __init__(self, app: ASGIApp, metrics: Metrics, config: GatewayConfig) -> None:
+    def __init__(self, app: ASGIApp, metrics: GatewayMetrics, config: GatewayConfig) -> None:
         self._app = app
         self._metrics = metrics
         self._config = config

@@ -21,7 +21,14 @@ from live_reports import Json, episode, identity, jpeg, picture, report, step
 from rfm.launch.process import Endpoints
 from rfm_client import LiveView
 from rfm_client.episodes import StepScore
-from rfm_gateway.viewer.live import FORGOTTEN_AFTER_S, MOST_BODY_BYTES, MOST_EPISODES, MOST_POINTS, LiveEpisodes, Report
+from rfm_gateway.viewer.live import (
+    FORGOTTEN_AFTER_S,
+    MOST_BODY_BYTES,
+    MOST_EPISODES,
+    MOST_POINTS,
+    LiveEpisodes,
+    LiveReport,
+)
 
 KEY = "open sesame"
 
@@ -52,7 +59,7 @@ def frame_of(gateway: TestClient, key: str) -> Any:
 
 
 def taken(episodes: LiveEpisodes, body: Json) -> None:
-    episodes.take(Report.read(json.dumps(body).encode()))
+    episodes.take(LiveReport.read(json.dumps(body).encode()))
 
 
 def test_an_answer_has_everything_and_the_next_one_what_is_new(gateway: TestClient) -> None:

@@ -12,7 +12,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
 import requests
@@ -300,12 +299,3 @@ def test_a_gateway_that_is_told_to_stop_answers_what_it_has_begun(triton: Triton
         assert json.loads(connection.getresponse().read()) == answer
         connection.close()
         assert gateway.process.wait(WITHIN_S) in (0, -signal.SIGTERM)
-
-
-def test_one_connection_serves_many_requests_of_httpx(tiny: Gateway) -> None:
-    with httpx.Client(base_url=tiny.url) as client:
-        for seed in range(5):
-            sample = progress(embedded(seed, 1 + seed))
-            response = client.post("/evaluate_batch", content=dumped([sample]))
-            assert response.json() == expected(tiny, [sample])
-            assert client.post("/evaluate_batch", content="[").status_code == 422

@@ -91,14 +91,14 @@ class _ReportedEpisode(_Strict):
     steps: Annotated[list[_Step], FailFast(), Field(max_length=_MOST_STEPS)]
 
 
-class Report(_Strict):
+class LiveReport(_Strict):
     """What one report says: steps in their order, and JPEG files by the episodes' ids."""
 
     episodes: Annotated[list[_ReportedEpisode], FailFast(), Field(max_length=_MOST_STEPS)]
     frames: Annotated[dict[_Id, Annotated[bytes, BeforeValidator(_jpeg)]], Field(max_length=_MOST_FRAMES)]
 
     @classmethod
-    def read(cls, body: bytes) -> Report:
+    def read(cls, body: bytes) -> LiveReport:
         """The report in JSON. Raises RequestValidationError for a field that is not allowed."""
         try:
             return cls.model_validate_json(body)
@@ -153,7 +153,7 @@ class LiveEpisodes:
         self._changed = 0
         self._life = secrets.token_hex(8)  # a cursor of an earlier gateway is none of this one
 
-    def take(self, report: Report) -> None:
+    def take(self, report: LiveReport) -> None:
         """Takes a report over. Of an episode that is not known, an end or a frame alone is left out."""
         self._changed += 1
         for told in report.episodes:
@@ -216,7 +216,7 @@ def live_routes(limits: BodyLimits) -> APIRouter:
         if kind != "application/json":  # which no page of elsewhere may send unasked
             raise HTTPException(415, f"content-type: expected application/json, got {reprlib.repr(kind)}")
         body = await limits.read(request, MOST_BODY_BYTES)
-        episodes.take(await off_loop(len(body), Report.read, body))
+        episodes.take(await off_loop(len(body), LiveReport.read, body))
 
     @router.get("/viewer/live")
     async def news(after: str = "") -> Response:

@@ -8,26 +8,26 @@ like to the decoder: a play list or a session description names other files or a
 from __future__ import annotations
 
 import asyncio
-import math
-import reprlib
 import shutil
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import cast
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, Field, StringConstraints, ValidationError
 from starlette.datastructures import UploadFile
 
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.samples import MAX_FRAME_STEPS, Trajectory
-from rfm_client.data.orientation import ORIENTATIONS, Orientation, turned
-from rfm_client.data.sampling import RULES, Rule, Sampling
+from rfm_client.data.orientation import Orientation, turned
+from rfm_client.data.sampling import Rule, Sampling
 from rfm_client.data.video import frame_times_s, read_video
-from rfm_gateway.body import Decoded, invalid
+from rfm_gateway.body import Decoded, field_errors, invalid
 
 DEFAULT_FPS = 3.0  # as rfm-client score has it
 KINDS = "MP4, MOV, WebM, Matroska, Ogg or AVI"
@@ -45,9 +45,8 @@ class ShownVideo:
     times_s: npt.NDArray[np.float64] | None
 
 
-@dataclass(frozen=True)
-class VideoQuestion:
-    """How videos are scored.
+class VideoQuestion(BaseModel):
+    """How videos are scored: the fields of a form, of which those that are empty count as not there.
 
     fps: frames a second that are taken of a video
     rule, frames: of each point's prefix; None: as the checkpoint was trained
@@ -55,28 +54,22 @@ class VideoQuestion:
     orient: how frames are turned before
     """
 
-    task: str
+    task: Annotated[str, StringConstraints(strip_whitespace=True)]
     model: str
-    fps: float
-    rule: Rule | None
-    frames: int | None
-    resize: bool
-    orient: Orientation
+    fps: Annotated[float, Field(gt=0, allow_inf_nan=False)] = DEFAULT_FPS
+    rule: Rule | None = Field(None, alias="sampling")
+    frames: Annotated[int, Field(ge=1, le=MAX_FRAME_STEPS)] | None = None
+    resize: bool = False
+    orient: Orientation = "none"
 
     @classmethod
     def of(cls, fields: Mapping[str, str], default_model: str) -> VideoQuestion:
         """The question of a form. Raises RequestValidationError for a field that is not allowed."""
-        if not fields.get("task", "").strip():
-            raise invalid(("task",), "expected what is to be done, as a sentence, got none")
-        return cls(
-            task=fields["task"].strip(),
-            model=fields.get("model") or default_model,
-            fps=_fps(fields.get("fps") or str(DEFAULT_FPS)),
-            rule=cast("Rule | None", _one_of(RULES, fields, "sampling")),
-            frames=_frames(fields.get("frames", "").strip()),
-            resize=_one_of(("true", "false"), fields, "resize") == "true",
-            orient=cast("Orientation", _one_of(ORIENTATIONS, fields, "orient") or "none"),
-        )
+        given = {name: text for name, text in fields.items() if text.strip()}
+        try:
+            return cls.model_validate({"model": default_model, **given})
+        except ValidationError as error:
+            raise RequestValidationError(field_errors(error)) from None
 
     def sampling(self, info: ModelInfo) -> Sampling:
         """The rule with its frames. Raises RequestValidationError for a number that the rule does not take."""
@@ -124,29 +117,3 @@ def _container(beginning: bytes) -> str | None:
     if beginning.startswith(_OGG):
         return "ogg"
     return "avi" if beginning[:4] == _RIFF and beginning[8:12] == _AVI else None
-
-
-def _one_of(options: Collection[str], fields: Mapping[str, str], name: str) -> str | None:
-    """The option that a field names; None: it is empty or not there."""
-    value = fields.get(name) or None
-    if value is not None and value not in options:
-        raise invalid((name,), f"expected one of {', '.join(options)}, got {reprlib.repr(value)}")
-    return value
-
-
-def _fps(text: str) -> float:
-    try:
-        fps = float(text)
-    except ValueError:
-        fps = math.nan
-    if not 0 < fps < math.inf:
-        raise invalid(("fps",), f"expected a number above 0, got {reprlib.repr(text)}")
-    return fps
-
-
-def _frames(text: str) -> int | None:
-    if not text:
-        return None
-    if not (text.isascii() and text.isdecimal() and len(text) < 6 and 0 < int(text) <= MAX_FRAME_STEPS):
-        raise invalid(("frames",), f"expected a whole number from 1 to {MAX_FRAME_STEPS}, got {reprlib.repr(text)}")
-    return int(text)

@@ -37,7 +37,7 @@ from rfm_client.status import read_status
 from rfm_client.transport.off_loop import off_loop
 from rfm_gateway.body import BodyLimits, Decoded, invalid
 from rfm_gateway.config import GatewayConfig
-from rfm_gateway.observe import Metrics, while_connected
+from rfm_gateway.observe import GatewayMetrics, while_connected
 from rfm_gateway.viewer import numbers_or_null
 from rfm_gateway.viewer.questions import DEFAULT_FPS, ShownVideo, VideoQuestion
 
@@ -66,7 +66,7 @@ def viewer_routes(
     new_client: Callable[..., AsyncRewardClient],
     limits: BodyLimits,
     max_decoded_bytes: int,
-    metrics: Metrics,
+    metrics: GatewayMetrics,
 ) -> APIRouter:
     """The endpoints of the page. They are its own, and not those of the evaluation server.
 
