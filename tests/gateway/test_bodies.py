@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from collections.abc import Iterator
 from typing import Any
 
@@ -59,6 +60,16 @@ def test_a_body_that_holds_no_samples_is_refused(
     gateway: TestClient, body: bytes, path: list[Any], message: str
 ) -> None:
     check_refused(gateway.post("/evaluate_batch", content=body), (path, message))
+
+
+def test_words_for_numbers_are_refused_before_numpy_makes_each_as_wide_as_the_longest(gateway: TestClient) -> None:
+    body = dumped([progress({"video_embeddings": ["a" * 20_000, *["b"] * 10_000]})])
+    tracemalloc.start()
+    try:
+        check_refused(gateway.post("/evaluate_batch", content=body), (VIDEO_AT, "expected numbers, got something else"))
+        assert tracemalloc.get_traced_memory()[1] < 100 * 2**20
+    finally:
+        tracemalloc.stop()
 
 
 VIDEO_AT = ["samples", 0, "trajectory", "video_embeddings"]
@@ -156,6 +167,13 @@ def test_json_is_smaller_than_other_bodies() -> None:
     with inside() as client:
         response = client.post("/evaluate_batch", content=b" " * (32 * 2**20 + 1))
         assert failure(response, 413) == "body: expected at most 33554432 bytes, got more"
+
+
+@pytest.mark.parametrize("path", ["/health", "/gpu_status", "/model_info", "/viewer/served", "/evaluate_batch"])
+def test_a_triton_that_is_down_is_a_503(gateway: TestClient, path: str) -> None:
+    response = gateway.get(path) if path != "/evaluate_batch" else gateway.post(path, content=SEED_PAYLOAD)
+    assert "connect" in failure(response, 503)
+    assert response.headers["Retry-After"] == "1"
 
 
 def test_unknown_paths_and_methods_are_told_as_json(gateway: TestClient) -> None:

@@ -76,17 +76,11 @@ def test_images_and_arrays_in_the_allowed_folder_are_read(shelf: tuple[Gateway, 
 
 
 OUTSIDE = ["../outside.png", "episode/../../outside.png", "/etc/passwd", "link_to_outside.png"]
-
-
 NOWHERE = ["folder_outside/outside.png", "missing.png", "episode", "", "circle", "a\0b", "a" * 5000]
-
-
 BAD_IMAGES = [
     *((name, "a file in the allowed folder") for name in (*OUTSIDE, *NOWHERE)),
     *((name, "an image file") for name in ("text.png", "episode.npy")),
 ]
-
-
 BAD_FILES = [
     *((f"{name}outside.npz", "a file in the allowed folder") for name in ("../", "link_to_", "folder_outside/")),
     *((name, "a file of embeddings [T, D]") for name in ("pickled.npy", "text.npz", "nan.npz")),

@@ -29,8 +29,6 @@ from gateway_requests import (
 from gateways import Gateway
 
 pytestmark = pytest.mark.triton
-
-
 ROW = [1.0] * FILM_DIMS[0]
 
 
@@ -39,11 +37,7 @@ def but(**fields: Any) -> Json:
 
 
 VIDEO_AT, TEXT_AT = ["trajectory", "video_embeddings"], ["trajectory", "text_embedding"]
-
-
 NO_FILES = r"expected an array \(this gateway reads no files\), got the name of a file"
-
-
 BAD_ARRAYS: dict[str, dict[str, tuple[Any, str]]] = {
     "video_embeddings": {
         "another width": (np.ones((3, 7)), r"expected \[T, 48\], got \[3, 7\]"),
@@ -83,8 +77,6 @@ BAD_ARRAYS: dict[str, dict[str, tuple[Any, str]]] = {
         "null": (None, "expected frames, got neither frames nor video_embeddings"),
     },
 }
-
-
 BAD_SAMPLES: dict[str, tuple[Any, list[Any], str]] = {
     f"{field}, {name}": (
         of_frames(value) if field == "frames" else but(**{field: value}),

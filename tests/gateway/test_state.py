@@ -28,7 +28,6 @@ from gateway_requests import (
     SECOND,
     TINY,
     TOLERANCE,
-    TRUTH_S,
     VIDEO,
     Triton,
     answered,
@@ -101,9 +100,7 @@ def test_health_has_asked_every_model(film: Gateway) -> None:
 def test_a_server_that_hangs_is_unhealthy_with_the_reason(triton: Triton, strict: Gateway) -> None:
     assert requests.get(f"{strict.url}/health").ok
     with paused(triton):  # what was found before is told for a second more
-        hung_s = time.monotonic()
         poll(lambda: requests.get(f"{strict.url}/health").status_code == 503)
-        assert time.monotonic() - hung_s < TRUTH_S
         assert "no answer within" in failure(requests.get(f"{strict.url}/health"), 503)
     poll(lambda: requests.get(f"{strict.url}/health").ok)
 
