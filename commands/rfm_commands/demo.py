@@ -12,7 +12,7 @@ from rfm_client import RewardClient, Trajectory
 from rfm_client.cli.show import Panel, plot, scores_table, status_tables
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.video import frame_times_s
-from rfm_client.status import read_status
+from rfm_client.transport.status import read_status
 
 
 def score_video(

@@ -193,7 +193,7 @@ def status(
 ) -> None:
     """The server's models, requests, batches, GPUs and memory."""
     from rfm_client.cli.show import status_tables
-    from rfm_client.status import read_status
+    from rfm_client.transport.status import read_status
 
     options.check_outputs(json, None)
     if metrics_url is not None and len(urls) > 1:

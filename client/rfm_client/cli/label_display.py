@@ -20,13 +20,12 @@ from rfm_client.cli.options import ExitCode
 from rfm_client.cli.show import print_tables, table
 from rfm_client.contract.errors import RewardError
 from rfm_client.data.datasets.opening import open_dataset
-from rfm_client.data.datasets.protocol import Dataset, Episode
+from rfm_client.data.datasets.protocol import Dataset, DatasetEpisode
 from rfm_client.integrations.episode_recordings import record_episodes
 from rfm_client.integrations.recording import load_rerun
-from rfm_client.labelling.episode_scores import episode_columns
+from rfm_client.labelling.episode_scores import FrameMemory, episode_columns
 from rfm_client.labelling.finished_episodes import Parts
-from rfm_client.labelling.frame_memory import FrameMemory
-from rfm_client.labelling.label import Outputs, Report, label, label_with_ray, plan_labels
+from rfm_client.labelling.label import Outputs, Report, check_frames, label, label_with_ray, plan_labels
 from rfm_client.labelling.options import LabelOptions
 from rfm_client.labelling.plan import Item, Plan, selected
 from rfm_client.labelling.ray_engine import Connect
@@ -77,7 +76,7 @@ class ProgressBar(Watch):
         """The bar counts the episodes that are checked."""
         self._next("checking episodes", num_episodes, 0)
 
-    def checked(self, episode: Episode) -> None:
+    def checked(self, episode: DatasetEpisode) -> None:
         """The bar advances by one episode."""
         self._advance(1)
 
@@ -88,13 +87,13 @@ class ProgressBar(Watch):
         self._began_s, self._num_scored, self.num_begun = time.monotonic(), 0, num_frames
         self._next("labelling frames", num_frames, num_finished)
 
-    def scored(self, episode: Episode) -> None:
+    def scored(self, episode: DatasetEpisode) -> None:
         """The episode's frames more."""
         self._num_scored += episode.num_frames
         took_s = time.monotonic() - self._began_s
         self._advance(episode.num_frames, rate=f"{self._num_scored / max(took_s, 1e-9):.1f} frames/s")
 
-    def failed(self, episode: Episode, error: RewardError) -> None:
+    def failed(self, episode: DatasetEpisode, error: RewardError) -> None:
         """Writes a line with the reason."""
         text = str(error)
         self._say(text if text.startswith(episode.name) else f"{episode.name}: {text}")
@@ -149,8 +148,9 @@ def _dry_run(source: str, flags: LabelFlags, connect: Connect, say: Say) -> Exit
     dataset = open_dataset(source, **flags.opening)
     with connect() as scorer, ProgressBar(say) as watch:
         plan = plan_labels(dataset, scorer, options, watch)
+        num_bytes = check_frames(dataset, plan.recipe, plan.items, watch)
         took_s = _measured_s(plan, dataset, scorer, options.workers)
-    _print(_plan_rows(plan, dataset, took_s))
+    _print(_plan_rows(plan, dataset, num_bytes, took_s))
     return ExitCode.OK
 
 
@@ -205,14 +205,14 @@ def _measured_s(plan: Plan, dataset: Dataset, scorer: Scorer, workers: int) -> f
     return took_s * plan.num_frames / sum(item.episode.num_frames for item in first)
 
 
-def _plan_rows(plan: Plan, dataset: Dataset, took_s: float) -> list[tuple[str, str]]:
+def _plan_rows(plan: Plan, dataset: Dataset, num_bytes: int, took_s: float) -> list[tuple[str, str]]:
     tasks = sorted({item.episode.task for item in plan.items})
     cameras = plan.recipe.cameras
     return [
         ("dataset", f"{dataset.kind}: {dataset.source}" + (f"@{dataset.revision}" if dataset.revision else "")),
         ("episodes", str(len(plan.items))),
         ("frames", f"{plan.num_frames}, of {len(cameras)} cameras: {plan.num_frames * len(cameras)} to be decoded"),
-        ("to be decoded", f"{sum(item.num_bytes for item in plan.items) / _MIB:.1f} MiB"),
+        ("to be decoded", f"{num_bytes / _MIB:.1f} MiB"),
         (f"tasks: {len(tasks)}", "; ".join(tasks[:5]) + (" ..." if len(tasks) > 5 else "")),
         ("it will take about", f"{took_s:.0f} s"),
     ]

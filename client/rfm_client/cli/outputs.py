@@ -35,7 +35,7 @@ from rfm_client.cli.scoring import (
 from rfm_client.cli.show import FILE_WIDTH, shortened
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
-from rfm_client.status import ServerStatus
+from rfm_client.transport.status import ServerStatus
 
 GAP = "  "  # between columns
 MIN_NAME_WIDTH = 10

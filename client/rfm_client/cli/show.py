@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
 from rfm_client.contract.samples import Float32Array, UInt8Array
-from rfm_client.status import DEVICE_METRICS, Device, ModelStatus, ServerStatus
+from rfm_client.transport.status import DEVICE_METRICS, Device, ModelStatus, ServerStatus
 
 if TYPE_CHECKING:
     from matplotlib.figure import SubFigure

@@ -45,6 +45,7 @@ class LabelOptions:
     parts: folder or URL of the finished episodes; None: ``.<name>_parts`` in the output
     workers: episodes under way at a time
     overwrite: a file of another provenance is replaced
+    verify: films are told from others by their SHA-256, not by their size and time of change
     in_place: with the format ``hdf5``: rewards are written into the dataset's own file
     """
 
@@ -65,6 +66,7 @@ class LabelOptions:
     workers: int = DEFAULT_WORKERS
     overwrite: bool = False
     in_place: bool = False
+    verify: bool = False
 
     def __post_init__(self) -> None:
         for where, name in (("name", self.name), ("alias", self.alias)):

@@ -25,12 +25,18 @@ from rfm_client.contract.results import SUCCESS_THRESHOLD
 from rfm_client.contract.settings import ConfigError
 from rfm_client.data.datasets.films import Span
 from rfm_client.data.datasets.lerobot import LeRobotDataset
-from rfm_client.data.datasets.lerobot_info import INFO_FILE
-from rfm_client.data.datasets.protocol import DatasetError, Episode
+from rfm_client.data.datasets.lerobot_rows import INFO_FILE
+from rfm_client.data.datasets.protocol import DatasetEpisode, DatasetError
 from rfm_client.data.film_files import FilmError, film_stream
 from rfm_client.data.orientation import ORIENTATIONS
-from rfm_client.labelling.label_files import Curve, EpisodeLabels, find_label_files, read_episode_labels
-from rfm_client.labelling.sidecars import PROVENANCE_KEY, SIGNALS_PROVENANCE_KEY
+from rfm_client.labelling.label_files import (
+    PROVENANCE_KEY,
+    SIGNALS_PROVENANCE_KEY,
+    Curve,
+    EpisodeLabels,
+    find_label_files,
+    read_episode_labels,
+)
 from rfm_client.labelling.summary import Summary, summarise
 from rfm_gateway.viewer import numbers_or_null
 
@@ -121,7 +127,7 @@ class ShownDataset:
         """A message for people elsewhere, whom the place of the dataset on this machine does not concern."""
         return message.replace(str(self.root), self.dataset.source)
 
-    def _episode(self, number: int) -> Episode:
+    def _episode(self, number: int) -> DatasetEpisode:
         episodes = self.dataset.episodes
         if not 0 <= number < len(episodes):
             raise HTTPException(404, f"episode: expected one from 0 to {len(episodes) - 1}, got {number}")

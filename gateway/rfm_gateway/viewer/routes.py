@@ -31,10 +31,9 @@ from rfm_client.contract.results import PreferenceResult, ProgressResult
 from rfm_client.contract.samples import ProgressSample, Trajectory
 from rfm_client.data.fitting import fitted
 from rfm_client.data.orientation import ORIENTATIONS
-from rfm_client.data.prefixes import prefix_samples
-from rfm_client.data.sampling import RULES, Rule, Sampling, trained_rule
-from rfm_client.status import read_status
+from rfm_client.data.sampling import RULES, Rule, Sampling, prefix_samples, trained_rule
 from rfm_client.transport.off_loop import off_loop
+from rfm_client.transport.status import read_status
 from rfm_gateway.body import BodyLimits, Decoded, invalid
 from rfm_gateway.config import GatewayConfig
 from rfm_gateway.observe import GatewayMetrics, while_connected
