@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The files of the page and of the endpoints' documentation, and where a browser finds them. No Triton is needed."""
+"""The files of the page and of the endpoints' documentation. No Triton is needed."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ import pytest
 
 from gateways import TestClient, inside
 from paths import ROOT
-from rfm_gateway.command import gateway_command, page_link
-from rfm_gateway.config import GatewayConfig
 
 GATEWAY = ROOT / "gateway" / "rfm_gateway"
 STATIC = GATEWAY / "viewer" / "static"
@@ -104,23 +102,3 @@ def test_the_page_is_in_the_distribution(tmp_path: Path) -> None:
     kinds = ("docs/*", "viewer/static/*", "vendored/*/*")
     expected = {f"rfm_gateway/{file.relative_to(GATEWAY)}" for kind in kinds for file in GATEWAY.glob(kind)}
     assert expected <= set(zipfile.ZipFile(wheel).namelist())
-
-
-@pytest.mark.parametrize(
-    ("config", "link"),
-    [
-        (GatewayConfig(8100), "http://127.0.0.1:8100/"),
-        (GatewayConfig(host="0.0.0.0"), "http://127.0.0.1:8000/"),
-        (GatewayConfig(8100, host="::1"), "http://[::1]:8100/"),
-        (GatewayConfig(8443, host="robot", certificate=Path("a.pem"), key=Path("a.key")), "https://robot:8443/"),
-    ],
-    ids=["loopback", "every address", "IPv6", "HTTPS"],
-)
-def test_the_link_is_one_that_a_browser_can_open(config: GatewayConfig, link: str) -> None:
-    assert page_link(config) == link
-
-
-@pytest.mark.parametrize("viewer", [True, False])
-def test_a_gateway_beside_triton_is_told_whether_there_is_a_page(viewer: bool) -> None:
-    words = gateway_command(GatewayConfig(8100, viewer=viewer))
-    assert [word for word in words if "viewer" in word] == ["--viewer" if viewer else "--no-viewer"]

@@ -18,7 +18,6 @@ import pytest
 import requests
 import schemathesis
 from hypothesis import HealthCheck, given, settings
-from typer.testing import CliRunner
 
 import goldens
 from gateway_requests import (
@@ -51,7 +50,6 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.transport.status import read_status
-from rfm_commands.cli import app
 
 pytestmark = pytest.mark.triton
 
@@ -223,56 +221,6 @@ def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed(trito
     assert len(started) >= 4  # Triton, its model process, the first gateway and the second
     assert not [child for child in started if Path(f"/proc/{child}").exists()]
     assert not list(SHARED_MEMORY.glob(f"*_rfm_{process.pid}_*"))
-
-
-BAD_OPTIONS: dict[str, tuple[list[str], str]] = {
-    "no URL": (
-        ["--triton", "localhost:8001"],
-        "url: expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
-    ),
-    "no folder": (["--allow-folder", "nowhere"], "No such file or directory"),
-    "no key file": (["--api-key-file", "nowhere"], "--api-key-file: expected a text file, got"),
-    "an empty key": (
-        ["--api-key-file", os.devnull],
-        "--api-key-file: expected a key, here or in RFM_GATEWAY_API_KEY, got no character",
-    ),
-    "no port": (["--port", "0"], "Input should be greater than or equal to 1"),
-    "an address of another machine": (["--host", "192.0.2.1"], "Cannot assign requested address; --host names another"),
-    "a time-out that never ends": (["--timeout", "inf"], "Input should be less than or equal to 86400"),
-}
-
-
-@pytest.mark.parametrize(("options", "message"), BAD_OPTIONS.values(), ids=BAD_OPTIONS)
-def test_wrong_options_are_refused(options: list[str], message: str, tmp_path: Path) -> None:
-    given = ["gateway", *([] if "--triton" in options else ["--triton", "grpc://localhost:1"]), *options]
-    result = CliRunner().invoke(app, given, env={"COLUMNS": "200"})
-    assert result.exit_code == 2
-    assert message in result.output
-
-
-WITHOUT_GATEWAY = "import sys; sys.modules['rfm_gateway'] = None; sys.argv = {words}; from {module} import main; main()"
-
-
-@pytest.mark.parametrize(
-    ("module", "words", "message"),
-    [
-        (
-            "rfm_client.cli",
-            ["rfm-client", "gateway", "--triton", "grpc://localhost:1"],
-            "pip install ./client ./gateway",
-        ),
-        ("rfm_commands.cli", ["rfm", "serve", "--gateway-port", "8100"], "pip install ./client ./gateway ."),
-    ],
-    ids=["rfm-client", "rfm"],
-)
-def test_a_gateway_that_is_not_installed_is_told_with_the_command_that_installs_it(
-    module: str, words: list[str], message: str
-) -> None:
-    program = WITHOUT_GATEWAY.format(words=words, module=module)
-    done = subprocess.run([sys.executable, "-c", program], stderr=subprocess.PIPE, text=True, check=False)
-    assert done.returncode == 1
-    assert done.stderr.endswith(f"{message}\n")
-    assert len(done.stderr.splitlines()) == 1
 
 
 def test_the_client_encodes_a_trajectory_once_for_many_questions(film: Gateway, tiny: Gateway) -> None:
