@@ -5,39 +5,41 @@ from __future__ import annotations
 
 import logging
 import secrets
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from contextlib import aclosing, asynccontextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from functools import partial
 from typing import Annotated, Any
 
-import anyio
 from fastapi import APIRouter, Depends, FastAPI, HTTPException, Request, Response
-from fastapi.exceptions import RequestValidationError
 from fastapi.middleware.cors import CORSMiddleware
 from fastapi.openapi.utils import get_openapi
 from fastapi.responses import JSONResponse
 from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
 from pydantic.json_schema import models_json_schema
-from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.requests import ClientDisconnect
 
 from rfm_client.async_client import AsyncRewardClient
 from rfm_client.contract import errors
 from rfm_client.contract.names import DEFAULT_MODEL
-from rfm_gateway import schema
-from rfm_gateway.body import Admitted, Batch, BodyLimits, read_json, read_multipart
-from rfm_gateway.cancellation import CallerLeftError, while_connected
+from rfm_gateway import pages, schema
+from rfm_gateway.body import Batch, BodyLimits, read_json, read_multipart
 from rfm_gateway.config import MIB, GatewayConfig
-from rfm_gateway.folder import AllowedFolder
-from rfm_gateway.memory import RETRY_AFTER
-from rfm_gateway.observe import CALLER_LEFT, REQUEST_ID_HEADER, Metrics, Observed
-from rfm_gateway.scoring import Scorer
-from rfm_gateway.state import State
-from rfm_gateway.viewer.dataset_routes import Shelf, dataset_routes
-from rfm_gateway.viewer.files import docs_files, viewer_files
-from rfm_gateway.viewer.live_routes import live_routes
-from rfm_gateway.viewer.models import Models
-from rfm_gateway.viewer.routes import Behind, viewer_routes
+from rfm_gateway.observe import (
+    CALLER_LEFT,
+    REQUEST_ID_HEADER,
+    RETRY_AFTER,
+    CallerLeftError,
+    GatewayMetrics,
+    Observed,
+    while_connected,
+)
+from rfm_gateway.scoring import Evaluator
+from rfm_gateway.state import TritonState
+from rfm_gateway.viewer.dataset_routes import dataset_routes
+from rfm_gateway.viewer.live import live_routes
+from rfm_gateway.viewer.routes import viewer_routes
+
+DECODED_PER_BODY = 2  # files of a request may become so many times as large as a body may be
 
 _KEY_HEADER = APIKeyHeader(name="X-API-Key", auto_error=False)  # FastAPI looks annotations up in the module
 _KEY_BEARER = HTTPBearer(auto_error=False)
@@ -61,8 +63,8 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
     api_key: what requests must show, but for those of health and documentation; None: nothing
     Raises OSError for a folder that is not there, ValueError for a malformed URL or files that cannot be used.
     """
-    folder = AllowedFolder(config.allow_folder, config.max_body_mib * MIB)
-    model, access, metrics = config.model or DEFAULT_MODEL, config.access, Metrics()
+    folder = None if config.allow_folder is None else config.allow_folder.resolve(strict=True)
+    model, access, metrics = config.model or DEFAULT_MODEL, config.access, GatewayMetrics()
     new_client = partial(
         AsyncRewardClient,
         config.triton_url,
@@ -71,79 +73,60 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
         max_in_flight=config.max_in_flight,
         **access.options,
     )
-    client, models = new_client(model=model), Models(lambda name: new_client(model=name))
+    client = new_client(model=model)
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        async with client, aclosing(models):
+        async with client:
             yield
 
     title, summary = "RFM evaluation gateway", "Rewards for robot trajectories."
-    app = FastAPI(title=title, summary=summary, lifespan=lifespan, docs_url=None, redoc_url=None)
+    app = FastAPI(
+        title=title, summary=summary, lifespan=lifespan, docs_url=None, redoc_url=None, exception_handlers=_handlers()
+    )
     app.add_middleware(Observed, metrics=metrics, config=config)
-    _allow_origins(app, config.cors_origin)
-    state = State(client, config.triton_url, config.metrics_url, model, access)
-    limits = BodyLimits(config.max_body_mib * MIB, config.max_memory_mib * MIB)
-    evaluations = _Evaluations(config, limits, Scorer(client, folder, config.timeout), metrics)
-    guarded = _guarded(api_key, evaluations, state, metrics)
-    routers = [_health(state), docs_files()]
-    if config.viewer:
-        routers.append(viewer_files())
-        guarded.include_router(viewer_routes(Behind(config, model, models, limits, metrics)))
-        guarded.include_router(dataset_routes(Shelf(config.shown_datasets(), limits, config.timeout)))
-        guarded.include_router(live_routes(limits, config.timeout))
-    for router in (*routers, guarded):
-        app.include_router(router)
-    _answer_errors(app)
-    app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]  # FastAPI's way to extend it
-    return app
-
-
-def _allow_origins(app: FastAPI, origins: Sequence[str]) -> None:
-    """Lets browsers ask from ``origins``."""
-    if origins:
+    if config.cors_origin:
         app.add_middleware(
             CORSMiddleware,
-            allow_origins=origins,
+            allow_origins=config.cors_origin,
             allow_methods=["GET", "POST"],
             allow_headers=["*"],
             expose_headers=[REQUEST_ID_HEADER],
         )
-
-
-class _Evaluations:
-    """Reads requests within the limits, has them scored, and counts their samples."""
-
-    def __init__(self, config: GatewayConfig, limits: BodyLimits, scorer: Scorer, metrics: Metrics) -> None:
-        self._limits = limits
-        self._timeout_s = config.timeout
-        self._scorer = scorer
-        self._metrics = metrics
-
-    async def answer(self, request: Request, read: Callable[[Admitted], Awaitable[Batch]]) -> Response:
-        """The answer to a request whose body ``read`` reads."""
-        with self._limits.admitted(request) as admitted:
-            await admitted.wait_for_room(request.state.begin_by)
-            with anyio.fail_after(self._timeout_s):
-                batch = await read(admitted)
-            scoring = self._scorer.evaluate(batch, admitted.share, request.state.request_id)
-            answer = await while_connected(request, scoring)
-        for sample in batch.samples:
-            self._metrics.samples.labels(sample.sample_type).inc()
-        return Response(answer.model_dump_json(), media_type="application/json")
-
-
-def _guarded(api_key: str | None, evaluations: _Evaluations, state: State, metrics: Metrics) -> APIRouter:
-    """Everything that the key guards."""
+    limits = BodyLimits(config.max_body_mib * MIB, config.timeout)
+    max_decoded_bytes = DECODED_PER_BODY * limits.max_bytes
+    state = TritonState(client, config.triton_url, config.metrics_url, model, access)
     guards = [] if api_key is None else [Depends(_key_check(api_key))]
-    router = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
-    _add_evaluations(router, evaluations)
-    _add_reports(router, state, metrics)
-    return router
+    guarded = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
+    _add_evaluations(guarded, limits, Evaluator(client, config.timeout, folder, max_decoded_bytes), metrics)
+    _add_reports(guarded, state, metrics)
+    if config.viewer:
+        guarded.include_router(viewer_routes(config, new_client, limits, max_decoded_bytes, metrics))
+        guarded.include_router(dataset_routes(config.shown_datasets(), config.timeout, max_decoded_bytes))
+        guarded.include_router(live_routes(limits))
+    app.include_router(guarded)
+
+    @app.get("/health", responses=_failures(502, 503, 504))
+    async def health() -> schema.Health:
+        """Healthy if every model has just scored something."""
+        return await state.health()
+
+    pages.add_docs(app)
+    if config.viewer:
+        pages.add_viewer(app)
+    app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]  # FastAPI's way to extend it
+    return app
 
 
-def _add_evaluations(router: APIRouter, evaluations: _Evaluations) -> None:
+def _add_evaluations(router: APIRouter, limits: BodyLimits, evaluator: Evaluator, metrics: GatewayMetrics) -> None:
     """The endpoints that score samples."""
+
+    async def answer(request: Request, reading: Awaitable[Batch]) -> Response:
+        batch = await reading
+        found = await while_connected(request, evaluator.evaluate(batch, request.state.request_id))
+        for sample in batch.samples:
+            metrics.samples.labels(sample.sample_type).inc()
+        return Response(found.model_dump_json(), media_type="application/json")
 
     @router.post(
         "/evaluate_batch",
@@ -153,7 +136,7 @@ def _add_evaluations(router: APIRouter, evaluations: _Evaluations) -> None:
     )
     async def evaluate_batch(request: Request) -> Response:
         """Score samples that come as JSON."""
-        return await evaluations.answer(request, read_json)
+        return await answer(request, read_json(limits, request))
 
     @router.post(
         "/evaluate_batch_npy",
@@ -165,10 +148,10 @@ def _add_evaluations(router: APIRouter, evaluations: _Evaluations) -> None:
         """Score samples whose arrays come as .npy files: fields `sample_0`, `sample_1`, ... hold each sample as JSON,
         in which `{"__numpy_file__": name}` stands for the array in the part of that name.
         """
-        return await evaluations.answer(request, read_multipart)
+        return await answer(request, read_multipart(limits, request))
 
 
-def _add_reports(router: APIRouter, state: State, metrics: Metrics) -> None:
+def _add_reports(router: APIRouter, state: TritonState, metrics: GatewayMetrics) -> None:
     """The endpoints that tell what is served, and how."""
 
     @router.get("/gpu_status", responses=_failures(502, 503, 504))
@@ -185,17 +168,6 @@ def _add_reports(router: APIRouter, state: State, metrics: Metrics) -> None:
     async def metrics_text() -> Response:
         """The gateway's own metrics, for Prometheus."""
         return Response(metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
-
-
-def _health(state: State) -> APIRouter:
-    router = APIRouter()
-
-    @router.get("/health", responses=_failures(502, 503, 504))
-    async def health() -> schema.Health:
-        """Healthy if every model has just scored something."""
-        return await state.health()
-
-    return router
 
 
 _MULTIPART = {
@@ -237,38 +209,30 @@ def _key_check(key: str) -> Callable[..., None]:
     return check
 
 
-def _answer_errors(app: FastAPI) -> None:
+def _handlers() -> dict[Any, Any]:
     """Every error is answered as JSON, and none of bad input is a 500."""
 
-    @app.exception_handler(RequestValidationError)
-    async def invalid(_request: Request, error: RequestValidationError) -> JSONResponse:
-        return JSONResponse({"detail": [dict(each) for each in error.errors()]}, 422)
+    def fixed(code: int, detail: str, **headers: str) -> Callable[..., Awaitable[JSONResponse]]:
+        async def handler(_request: Request, _error: Exception) -> JSONResponse:
+            return JSONResponse({"detail": detail}, code, headers)
 
-    @app.exception_handler(TimeoutError)
-    async def slow(_request: Request, _error: TimeoutError) -> JSONResponse:
-        return JSONResponse({"detail": "body: expected all of it in time, got a part"}, 408, {"Connection": "close"})
+        return handler
 
-    @app.exception_handler(ClientDisconnect)
-    async def gone(_request: Request, _error: ClientDisconnect) -> JSONResponse:
-        return JSONResponse({"detail": "body: expected all of it, got a part"}, 400)  # which nobody reads
-
-    @app.exception_handler(CallerLeftError)
-    async def left(_request: Request, error: CallerLeftError) -> JSONResponse:
-        return JSONResponse({"detail": str(error)}, CALLER_LEFT)  # which nobody reads
-
-    @app.exception_handler(errors.RewardError)
     async def failed(_request: Request, error: errors.RewardError) -> JSONResponse:
         code = next((code for kind, code in _STATUS_OF.items() if isinstance(error, kind)), 500)
         return JSONResponse({"detail": str(error)}, code, RETRY_AFTER if code == 503 else None)
 
-    @app.exception_handler(StarletteHTTPException)
-    async def refused(_request: Request, error: StarletteHTTPException) -> JSONResponse:
-        return JSONResponse({"detail": error.detail}, error.status_code, error.headers)
-
-    @app.exception_handler(Exception)
     async def unexpected(request: Request, error: Exception) -> JSONResponse:
         logger.error("request %s: unexpected", request.state.request_id, exc_info=error)
         return JSONResponse({"detail": "the gateway failed; its log has the reason"}, 500)
+
+    return {
+        TimeoutError: fixed(408, "body: expected all of it in time, got a part", Connection="close"),
+        ClientDisconnect: fixed(400, "body: expected all of it, got a part"),  # which nobody reads
+        CallerLeftError: fixed(CALLER_LEFT, "the caller has hung up"),  # which nobody reads
+        errors.RewardError: failed,
+        Exception: unexpected,
+    }
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:

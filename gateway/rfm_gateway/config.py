@@ -54,7 +54,6 @@ class GatewayConfig(Settings):
         most=_LONGEST_S,
     )
     max_body_mib: int = setting(512, "Largest request.", least=1)
-    max_memory_mib: int = setting(1024, "What all requests under way may hold; others wait.", least=1)
     max_in_flight: int = setting(256, "Evaluations at a time; others wait.", least=1)
     max_waiting: int = setting(1024, "Evaluations that wait for their turn; more are refused with 503.", least=0)
     viewer: bool = setting(True, "Serve the page in the browser, at /.")
@@ -62,8 +61,6 @@ class GatewayConfig(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.max_memory_mib < self.max_body_mib:
-            raise ConfigError("max_memory_mib", f"expected at least max_body_mib ({self.max_body_mib}), got less")
         if (self.certificate is None) != (self.key is None):
             raise ConfigError("certificate, key", "expected both or none, got one")
 

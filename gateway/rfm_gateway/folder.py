@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 from zipfile import BadZipFile, ZipFile
@@ -15,52 +16,28 @@ import numpy as np
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import Trajectory, UInt8Array
 from rfm_client.data.inputs import ARRAY_SUFFIXES, load_trajectory
-from rfm_gateway.memory import Share
+from rfm_gateway.body import Decoded
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
 
-class AllowedFolder:
-    """The folder whose files requests may name. Without a folder, they may name none.
-
-    max_bytes: of the files that one request names, all together, when they are decoded
-    """
-
-    def __init__(self, folder: Path | None, max_bytes: int) -> None:
-        self.max_bytes = max_bytes
-        self._folder = None if folder is None else folder.resolve(strict=True)
-
-    def file(self, name: str, where: str) -> Path:
-        """The file of this name. Raises InvalidSampleError."""
-        if self._folder is None:
-            raise InvalidSampleError.at(where, "an array (this gateway reads no files)", "the name of a file")
-        try:
-            file = (self._folder / name).resolve()
-            is_in_folder = file.is_relative_to(self._folder) and file.is_file()  # links are followed before
-        except (OSError, ValueError, RuntimeError):  # no name of a file, or links in a circle
-            is_in_folder = False
-        if not is_in_folder:
-            raise InvalidSampleError.at(where, "a file in the allowed folder", name)
-        return file
-
-
+@dataclass(frozen=True)
 class NamedFiles:
-    """The files of ``folder`` that one request names. They count as held by it, and are counted before they are read.
+    """The files that one request names. They are counted before they are read.
 
-    Its methods raise InvalidSampleError, and HTTPException as Share.
+    folder: where they are, without links on the way to it; None: requests may name none
+    Its methods raise InvalidSampleError, and HTTPException as Decoded.
     """
 
-    def __init__(self, folder: AllowedFolder, share: Share) -> None:
-        self._folder = folder
-        self._share = share
-        self._left_bytes = folder.max_bytes
+    folder: Path | None
+    decoded: Decoded
 
     def frames(self, names: Sequence[str]) -> UInt8Array:
         """uint8 [T, H, W, 3], the images of these names."""
         with self._image(names[0], "frames.0") as first:
             shape = (len(names), first.height, first.width, 3)
-        self._take(math.prod(shape), "frames")
+        self.decoded.take(math.prod(shape))
         frames = np.empty(shape, np.uint8)
         for index, name in enumerate(names):
             with self._image(name, f"frames.{index}") as image:
@@ -71,19 +48,14 @@ class NamedFiles:
 
     def embeddings(self, name: str) -> Trajectory:
         """The embeddings in a .npy or .npz file."""
-        file = self._folder.file(name, "embeddings_path")
+        file = self._file(name, "embeddings_path")
         if file.suffix.lower() not in ARRAY_SUFFIXES:
             raise InvalidSampleError.at("embeddings_path", " or ".join(ARRAY_SUFFIXES), name)
-        unreadable = InvalidSampleError.at("embeddings_path", "a file of embeddings [T, D]", name)
         try:
-            num_bytes = _unpacked_bytes(file)
-        except (OSError, ValueError, BadZipFile):
-            raise unreadable from None
-        self._take(num_bytes, "embeddings_path")
-        try:
+            self.decoded.take(_unpacked_bytes(file))
             trajectory = load_trajectory(file)
-        except InvalidSampleError:  # which shows the whole path
-            raise unreadable from None
+        except (OSError, ValueError, BadZipFile):  # InvalidSampleError among them, which shows the whole path
+            raise InvalidSampleError.at("embeddings_path", "a file of embeddings [T, D]", name) from None
         if trajectory.video_embeddings is None:
             raise InvalidSampleError.at("embeddings_path", "a file of embeddings", "frames")
         return trajectory
@@ -92,7 +64,7 @@ class NamedFiles:
     def _image(self, name: str, where: str) -> Iterator[Image]:
         from PIL import Image
 
-        file = self._folder.file(name, where)
+        file = self._file(name, where)
         try:
             with Image.open(file) as image:
                 yield image
@@ -101,12 +73,17 @@ class NamedFiles:
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
             raise InvalidSampleError.at(where, "an image file", name) from None
 
-    def _take(self, num_bytes: int, where: str) -> None:
-        if num_bytes > self._left_bytes:
-            expected = f"files of at most {self._folder.max_bytes} bytes in one request, when they are decoded"
-            raise InvalidSampleError.at(where, expected, "more")
-        self._share.take(num_bytes)
-        self._left_bytes -= num_bytes
+    def _file(self, name: str, where: str) -> Path:
+        if self.folder is None:
+            raise InvalidSampleError.at(where, "an array (this gateway reads no files)", "the name of a file")
+        try:
+            file = (self.folder / name).resolve()
+            is_in_folder = file.is_relative_to(self.folder) and file.is_file()  # links are followed before
+        except (OSError, ValueError, RuntimeError):  # no name of a file, or links in a circle
+            is_in_folder = False
+        if not is_in_folder:
+            raise InvalidSampleError.at(where, "a file in the allowed folder", name)
+        return file
 
 
 def _unpacked_bytes(file: Path) -> int:

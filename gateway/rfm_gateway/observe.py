@@ -1,26 +1,28 @@
 # SPDX-License-Identifier: MIT
-"""What the gateway counts, in Prometheus' terms, and how many requests it lets in at a time."""
+"""Requests under way: how many are let in at a time, what is counted of them in Prometheus' terms, and who hangs up."""
 
 from __future__ import annotations
 
 import asyncio
 import secrets
 import time
+from collections.abc import Coroutine
+from typing import Any, TypeVar
 
+import anyio
+from fastapi import Request
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from rfm_client.contract.errors import DeadlineExceededError
 from rfm_client.contract.names import PROBE_PREFIX
 from rfm_client.contract.wire import REQUEST_ID
-from rfm_client.transport.deadline import Deadline, timeout
-from rfm_gateway.body import MULTIPART_ENDPOINTS
 from rfm_gateway.config import GatewayConfig
-from rfm_gateway.memory import RETRY_AFTER
 
-EVALUATIONS = ("/evaluate_batch", *MULTIPART_ENDPOINTS)
+Returned = TypeVar("Returned")
+
+EVALUATIONS = ("/evaluate_batch", "/evaluate_batch_npy", "/viewer/score", "/viewer/compare")
 ENDPOINTS = (*EVALUATIONS, "/gpu_status", "/health", "/model_info", "/metrics")
 CALLER_LEFT = 499  # as other servers log it; nobody reads the answer
 REJECTIONS = {
@@ -35,12 +37,13 @@ REJECTIONS = {
 }
 
 REQUEST_ID_HEADER = "X-Request-ID"
+RETRY_AFTER = {"Retry-After": "1"}
 _ID_BYTES = 8  # of chance, where a request comes without an id
 
 _BUCKETS_S = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0)
 
 
-class Metrics:
+class GatewayMetrics:
     """The Prometheus metrics of one gateway."""
 
     def __init__(self) -> None:
@@ -80,7 +83,7 @@ class Metrics:
 class Observed:
     """ASGI middleware: names, times and counts every request, and lets in as many evaluations as ``config`` says."""
 
-    def __init__(self, app: ASGIApp, metrics: Metrics, config: GatewayConfig) -> None:
+    def __init__(self, app: ASGIApp, metrics: GatewayMetrics, config: GatewayConfig) -> None:
         self._app = app
         self._metrics = metrics
         self._config = config
@@ -94,8 +97,7 @@ class Observed:
             return
         started_s = time.perf_counter()
         request_id = _request_id(scope)
-        state = scope.setdefault("state", {})
-        state["request_id"], state["begin_by"] = request_id, Deadline(self._config.timeout)
+        scope.setdefault("state", {})["request_id"] = request_id
         code = 500  # if nothing is answered
 
         async def send_counted(message: Message) -> None:
@@ -108,36 +110,29 @@ class Observed:
         try:
             if scope["path"] not in EVALUATIONS:
                 await self._app(scope, receive, send_counted)
-            elif not await self._has_entered(state["begin_by"]):
+            elif await self._has_entered():
+                try:
+                    with self._metrics.in_flight.track_inprogress():
+                        await self._app(scope, receive, send_counted)
+                finally:
+                    self._room.release()
+            else:
                 refused = {"detail": f"expected at most {self._config.max_in_flight} evaluations at a time, got more"}
                 await JSONResponse(refused, 503, RETRY_AFTER)(scope, receive, send_counted)
-            else:
-                await self._evaluated(scope, receive, send_counted)
         finally:
             self._metrics.count(scope["path"], code, time.perf_counter() - started_s)
 
-    async def _has_entered(self, deadline: Deadline) -> bool:
+    async def _has_entered(self) -> bool:
         """Whether there is room in time, first come, first served."""
         if self._room.locked() and self._waiting >= self._config.max_waiting:
             return False
         self._waiting += 1
-        self._metrics.waiting.set(self._waiting)
         try:
-            async with timeout(deadline.remaining_s()):
+            with self._metrics.waiting.track_inprogress(), anyio.move_on_after(self._config.timeout):
                 return await self._room.acquire()
-        except (asyncio.TimeoutError, DeadlineExceededError):  # in Python 3.10 not the built-in TimeoutError
             return False
         finally:
             self._waiting -= 1
-            self._metrics.waiting.set(self._waiting)
-
-    async def _evaluated(self, scope: Scope, receive: Receive, send: Send) -> None:
-        self._metrics.in_flight.inc()
-        try:
-            await self._app(scope, receive, send)
-        finally:
-            self._metrics.in_flight.dec()
-            self._room.release()
 
 
 def _request_id(scope: Scope) -> str:
@@ -149,3 +144,30 @@ def _request_id(scope: Scope) -> str:
     if REQUEST_ID.fullmatch(given) and not given.startswith(PROBE_PREFIX):
         return given
     return secrets.token_hex(_ID_BYTES)
+
+
+class CallerLeftError(Exception):
+    """The caller has hung up before the answer was there."""
+
+
+async def while_connected(request: Request, work: Coroutine[Any, Any, Returned]) -> Returned:
+    """What ``work`` gives. If the caller hangs up, it is cancelled with its requests to Triton: CallerLeftError.
+
+    The body of the request must have been read.
+    """
+    working = asyncio.create_task(work)
+    leaving = asyncio.create_task(_disconnected(request))
+    try:
+        await asyncio.wait((working, leaving), return_when=asyncio.FIRST_COMPLETED)
+        if not working.done():
+            raise CallerLeftError("the caller has hung up")
+        return working.result()
+    finally:
+        for task in (working, leaving):
+            task.cancel()
+        await asyncio.gather(working, leaving, return_exceptions=True)
+
+
+async def _disconnected(request: Request) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass

@@ -122,49 +122,37 @@ class Trajectory(BaseModel):
     metadata: Any = None
 
 
-class ProgressSample(BaseModel):
-    """How far has the trajectory come at each frame?"""
-
+class _Sample(BaseModel):
     model_config = ConfigDict(extra="ignore")
-
-    sample_type: Literal["progress"]
-    trajectory: Trajectory
 
     @property
     def named_trajectories(self) -> dict[str, Trajectory]:
         """The trajectories by field name, in the order in which they are scored."""
-        return {"trajectory": self.trajectory}
+        return {name: value for name, value in self if isinstance(value, Trajectory)}
 
 
-class PreferenceSample(BaseModel):
+class ProgressSample(_Sample):
+    """How far has the trajectory come at each frame?"""
+
+    sample_type: Literal["progress"]
+    trajectory: Trajectory
+
+
+class PreferenceSample(_Sample):
     """Which trajectory does the chosen one's task better?"""
-
-    model_config = ConfigDict(extra="ignore")
 
     sample_type: Literal["preference"]
     chosen_trajectory: Trajectory
     rejected_trajectory: Trajectory
 
-    @property
-    def named_trajectories(self) -> dict[str, Trajectory]:
-        """The trajectories by field name, in the order in which they are scored."""
-        return {"chosen_trajectory": self.chosen_trajectory, "rejected_trajectory": self.rejected_trajectory}
 
-
-class SimilaritySample(BaseModel):
+class SimilaritySample(_Sample):
     """How similar is ``sim_trajectory`` to ``ref_trajectory``? ``diff_trajectory`` is ignored, as it was."""
-
-    model_config = ConfigDict(extra="ignore")
 
     sample_type: Literal["similarity"]
     ref_trajectory: Trajectory = Field(validation_alias=AliasChoices("ref_trajectory", "reference_trajectory"))
     sim_trajectory: Trajectory = Field(validation_alias=AliasChoices("sim_trajectory", "traj_sim_trajectory"))
     data_gen_strategy: Any = None
-
-    @property
-    def named_trajectories(self) -> dict[str, Trajectory]:
-        """The trajectories by field name, in the order in which they are scored."""
-        return {"ref_trajectory": self.ref_trajectory, "sim_trajectory": self.sim_trajectory}
 
 
 Sample: TypeAlias = ProgressSample | PreferenceSample | SimilaritySample

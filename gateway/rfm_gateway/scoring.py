@@ -4,118 +4,128 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
+from fastapi.exceptions import RequestValidationError
 
 from rfm_client.async_client import AsyncRewardClient
-from rfm_client.contract.errors import DeadlineExceededError, InvalidSampleError, ModelNotFoundError, RewardError
+from rfm_client.contract.errors import (
+    DeadlineExceededError,
+    InvalidSampleError,
+    ModelNotFoundError,
+    RewardError,
+    ServerUnavailableError,
+)
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
-from rfm_client.contract.samples import Float32Array, Sample, Trajectory
+from rfm_client.contract.samples import (
+    Float32Array,
+    PreferenceSample,
+    ProgressSample,
+    Sample,
+    SimilaritySample,
+    Trajectory,
+    UInt8Array,
+    as_array,
+    float_frames_to_uint8,
+)
 from rfm_client.transport.deadline import Deadline
-from rfm_client.transport.off_loop import off_loop
+from rfm_client.transport.off_loop import MIN_BYTES, off_loop
 from rfm_gateway import schema
-from rfm_gateway.body import Batch
-from rfm_gateway.conversion import Conversion, Served, Texts, converted_bytes, has_embeddings, num_bytes, refused
-from rfm_gateway.folder import AllowedFolder, NamedFiles
-from rfm_gateway.memory import Share
-from rfm_gateway.versions import check_one, of_one_version
+from rfm_gateway.body import Batch, Decoded, invalid
+from rfm_gateway.folder import NamedFiles
 
 FRAME_STEPS = 4  # frames to which the evaluation server samples each prefix
 PREFERRED = 0.5
 CHOSEN_IS_FIRST = 1.0  # the evaluation server's label: the first trajectory, which is the chosen one, is better
+RGB_CHANNELS, RGBA_CHANNELS = 3, 4
 
 _TEXT_FRAME_PX = 32  # of the blank frame that goes with a task, where only the task's embedding is wanted
+_SIDES = {  # what the client calls them
+    "first": "chosen_trajectory",
+    "second": "rejected_trajectory",
+    "reference": "ref_trajectory",
+    "other": "sim_trajectory",
+}
+Texts: TypeAlias = Mapping[str, Float32Array | InvalidSampleError]  # by task; why one cannot be encoded
 
 
-class Scorer:
-    """Scores batches with the server behind ``client``."""
+class Evaluator:
+    """Scores batches with the server behind ``client``.
 
-    def __init__(self, client: AsyncRewardClient, folder: AllowedFolder, timeout_s: float) -> None:
+    folder: whose files samples may name, without links on the way to it; None: none
+    max_decoded_bytes: of the files that one request names, when they are decoded
+    """
+
+    def __init__(
+        self, client: AsyncRewardClient, timeout_s: float, folder: Path | None = None, max_decoded_bytes: int = 0
+    ) -> None:
         self._client = client
-        self._folder = folder
         self._timeout_s = timeout_s
-        self._frames_per_value: dict[str, int] = {}  # of each version that was served alone
+        self._folder = folder
+        self._max_decoded_bytes = max_decoded_bytes
 
-    async def evaluate(self, batch: Batch, share: Share, request_id: str) -> schema.EvaluateBatchAnswer:
+    async def evaluate(self, batch: Batch, request_id: str) -> schema.EvaluateBatchAnswer:
         """The answer to a batch, whole: one that lacked a sample would shift the others', or be read as a reward of 0.
 
-        Raises RequestValidationError for samples that cannot be scored, all of them listed, HTTPException as ``share``
-        does, and ServerError.
+        Raises RequestValidationError for samples that cannot be scored, all of them listed, HTTPException for named
+        files that become too large, and ServerError.
         """
         deadline = Deadline(self._timeout_s)
         try:
-            return await self._evaluate(batch, share, deadline, request_id)
+            return await self._evaluate(batch, deadline, request_id)
         except DeadlineExceededError as error:  # its message names the time of one of several calls
             raise deadline.exceeded("Triton") from error
 
-    async def _evaluate(
-        self, batch: Batch, share: Share, deadline: Deadline, request_id: str
-    ) -> schema.EvaluateBatchAnswer:
+    async def _evaluate(self, batch: Batch, deadline: Deadline, request_id: str) -> schema.EvaluateBatchAnswer:
         served = await self._served(batch.samples, deadline)
         texts = await self._texts(batch.samples, served, deadline, request_id)
-        steps = FRAME_STEPS if batch.use_frame_steps else 0
-        share.take(sum(map(converted_bytes, batch.samples)))
-        conversion = Conversion(served, texts, NamedFiles(self._folder, share), steps)
-        samples = await off_loop(sum(map(num_bytes, batch.samples)), conversion.samples, batch.samples)
-        scored = await self._results(samples, deadline, request_id, may_repeat=not texts)
-        group = 1
-        if served.frames is not None and not steps:
-            group = await self._group(served.frames, str(scored[0].model_version), deadline)
-        return _answer(batch.samples, scored, group)
-
-    async def _results(
-        self, samples: Sequence[Sample], deadline: Deadline, request_id: str, *, may_repeat: bool
-    ) -> list[Result]:
-        """The results of all samples, of one version.
-
-        may_repeat: they can be sent as they are to another version: none has embeddings that the server made
-        """
-        outcomes = await of_one_version(
-            lambda: self._client.evaluate(
-                samples, return_errors=True, timeout_s=deadline.remaining_s(), request_id=request_id
-            ),
-            may_repeat=may_repeat,
+        files = NamedFiles(self._folder, Decoded(self._max_decoded_bytes))
+        conversion = _Conversion(served, texts, files, FRAME_STEPS if batch.use_frame_steps else 0)
+        num_bytes = batch.num_bytes if self._folder is None else MIN_BYTES  # files may be large
+        samples = await off_loop(num_bytes, conversion.samples, batch.samples)
+        outcomes = await self._client.evaluate(
+            samples, return_errors=True, timeout_s=deadline.remaining_s(), request_id=request_id
         )
         failed = {index: outcome for index, outcome in enumerate(outcomes) if isinstance(outcome, RewardError)}
-        unfit = {i: error for i, error in failed.items() if isinstance(error, InvalidSampleError)}
+        unfit = {index: error for index, error in failed.items() if isinstance(error, InvalidSampleError)}
         if unfit:
-            raise refused(unfit)
+            raise _refused(unfit)
         for error in failed.values():
             raise error
-        return [outcome for outcome in outcomes if not isinstance(outcome, RewardError)]  # all of them
+        results = [outcome for outcome in outcomes if not isinstance(outcome, RewardError)]  # all of them
+        group = 1 if served.frames is None or batch.use_frame_steps else await self._frames_per_value(results, deadline)
+        return _answer(batch.samples, results, group)
 
-    async def _group(self, info: ModelInfo, version: str, deadline: Deadline) -> int:
-        """How many frames share a value of the version that answered.
+    async def _frames_per_value(self, results: Sequence[Result], deadline: Deadline) -> int:
+        """How many frames share a value. Asks again if another version has answered than the client knows."""
+        info = await self._client.model_info(frames=True, timeout_s=deadline.remaining_s())
+        unknown = {str(result.model_version) for result in results} - set(info.versions)
+        if info.versions and unknown:
+            got = ", ".join(sorted(unknown))
+            expected = f"model_version: expected one of {', '.join(info.versions)}"
+            raise ServerUnavailableError(f"{expected}, got {got}: the checkpoint is being replaced, try again")
+        return info.frames_per_value
 
-        ``info`` may be of another one. While a checkpoint is replaced, one configuration names both versions; what an
-        earlier one said of a version alone holds.
-        """
-        known = self._frames_per_value
-        if info.versions not in ((), (version,)) and version not in known:
-            info = await self._client.model_info(frames=True, refresh=True, timeout_s=deadline.remaining_s())
-        if len(info.versions) == 1:
-            known[info.versions[0]] = info.frames_per_value
-        if version not in known and info.versions and version not in info.versions:
-            check_one({version, *info.versions})
-        return known.get(version, info.frames_per_value)
-
-    async def _served(self, samples: Sequence[schema.Sample], deadline: Deadline) -> Served:
+    async def _served(self, samples: Sequence[schema.Sample], deadline: Deadline) -> _Served:
         """The models that may score the samples.
 
         It reads the model for frames only if a sample may need it: the client does not remember that a model is not
         served, and would send a request every time.
         """
         trajectories = [t for sample in samples for t in sample.named_trajectories.values()]
-        needs_embeddings = any(has_embeddings(trajectory) for trajectory in trajectories)
+        needs_embeddings = any(map(_has_embeddings, trajectories))
         embeddings = await self._model_info(deadline, frames=False) if needs_embeddings else None
         has_frames = any(trajectory.frames is not None for trajectory in trajectories)
-        needs_frames = has_frames and not (embeddings is not None and all(map(has_embeddings, trajectories)))
+        needs_frames = has_frames and not (embeddings is not None and all(map(_has_embeddings, trajectories)))
         frames = await self._model_info(deadline, frames=True) if needs_frames else None
         if embeddings is None and frames is None:  # is the other one served, or none at all?
             await self._client.model_info(frames=not needs_frames, timeout_s=deadline.remaining_s())
-        return Served(embeddings, frames)
+        return _Served(embeddings, frames)
 
     async def _model_info(self, deadline: Deadline, *, frames: bool) -> ModelInfo | None:
         try:
@@ -124,13 +134,13 @@ class Scorer:
             return None
 
     async def _texts(
-        self, samples: Sequence[schema.Sample], served: Served, deadline: Deadline, request_id: str
+        self, samples: Sequence[schema.Sample], served: _Served, deadline: Deadline, request_id: str
     ) -> Texts:
         """Embeddings of the tasks that come without one, by task; empty if there is no encoder."""
         tasks = {
             first.task
             for first, *_ in (tuple(sample.named_trajectories.values()) for sample in samples)
-            if has_embeddings(first) and first.text_embedding is None and first.task and first.task.strip()
+            if _has_embeddings(first) and first.text_embedding is None and first.task and first.task.strip()
         }
         if not tasks or served.embeddings is None:
             return {}
@@ -150,6 +160,137 @@ class Scorer:
             return error
         assert encoded.text_embedding is not None
         return encoded.text_embedding
+
+
+@dataclass(frozen=True)
+class _Served:
+    """What is served of the checkpoint: for embeddings, and for raw frames; None: it is not."""
+
+    embeddings: ModelInfo | None
+    frames: ModelInfo | None
+
+
+@dataclass(frozen=True)
+class _Conversion:
+    """Converts the samples of one request.
+
+    texts: embeddings of tasks; files: those that the samples name; frame_steps: of progress samples
+    """
+
+    served: _Served
+    texts: Texts
+    files: NamedFiles
+    frame_steps: int
+
+    def samples(self, samples: Sequence[schema.Sample]) -> list[Sample]:
+        """The samples as the client takes them.
+
+        Raises RequestValidationError that lists all that cannot be scored, and HTTPException as NamedFiles does.
+        """
+        converted: list[Sample] = []
+        errors: dict[int, InvalidSampleError] = {}
+        for index, sample in enumerate(samples):
+            try:
+                converted.append(self._sample(sample))
+            except InvalidSampleError as error:
+                errors[index] = error
+        if errors:
+            raise _refused(errors)
+        return converted
+
+    def _sample(self, sample: schema.Sample) -> Sample:
+        given = sample.named_trajectories
+        by_embeddings = self.served.embeddings is not None and all(map(_has_embeddings, given.values()))
+        trajectories: list[Trajectory] = []
+        for name, trajectory in given.items():
+            try:
+                if by_embeddings:
+                    trajectories.append(self._of_embeddings(trajectory, needs_text=not trajectories))
+                else:
+                    trajectories.append(self._of_frames(trajectory))
+            except InvalidSampleError as error:
+                raise error.inside(name) from None
+        if isinstance(sample, schema.ProgressSample):
+            return ProgressSample(trajectories[0], frame_steps=self.frame_steps)
+        if isinstance(sample, schema.PreferenceSample):
+            return PreferenceSample(*trajectories)
+        return SimilaritySample(*trajectories)
+
+    def _of_embeddings(self, given: schema.Trajectory, *, needs_text: bool) -> Trajectory:
+        video, text = given.video_embeddings, given.text_embedding
+        if video is None:
+            in_file = self.files.embeddings(given.embeddings_path or "")
+            video, text = in_file.video_embeddings, in_file.text_embedding if text is None else text
+        if text is None and given.task is not None:
+            text = self.texts.get(given.task)
+            if isinstance(text, InvalidSampleError):
+                raise text
+        trajectory = Trajectory(video_embeddings=video, text_embedding=text, task=given.task or "")
+        info = self.served.embeddings
+        assert info is not None and trajectory.video_embeddings is not None
+        _check_width("video_embeddings", trajectory.video_embeddings, info.video_dim)
+        if trajectory.text_embedding is not None:
+            _check_width("text_embedding", trajectory.text_embedding, info.text_dim)
+        elif needs_text:
+            got = "neither" if not (given.task and given.task.strip()) else "a task, and no encoder is served"
+            raise InvalidSampleError.at("text_embedding", "an embedding, or a task to encode", got)
+        return trajectory
+
+    def _of_frames(self, given: schema.Trajectory) -> Trajectory:
+        if given.frames is None:
+            what = "video_embeddings" if _has_embeddings(given) else "neither frames nor video_embeddings"
+            if _has_embeddings(given) and self.served.embeddings is not None:
+                raise InvalidSampleError.at("video_embeddings", "them in both trajectories or neither", "one of two")
+            raise InvalidSampleError.at("frames", "frames", what)
+        if self.served.frames is None:
+            raise InvalidSampleError.at(
+                "video_embeddings", "embeddings, since no model for raw frames is served", "frames"
+            )
+        if isinstance(given.frames, list):
+            return Trajectory(frames=self.files.frames(given.frames), task=given.task or "")
+        return Trajectory(frames=_uint8(given.frames), task=given.task or "")
+
+
+def _has_embeddings(trajectory: schema.Trajectory) -> bool:
+    """Whether the trajectory has embeddings: its own, or those of a file where it has no frames."""
+    in_file = trajectory.embeddings_path is not None and trajectory.frames is None
+    return trajectory.video_embeddings is not None or in_file
+
+
+def _uint8(frames: Any) -> UInt8Array:
+    """uint8 [T, H, W, C], as the evaluation server made images.
+
+    Whole numbers stay as they are, floats are clipped and truncated. One frame is a film of one. Of RGBA the colours
+    count.
+    """
+    array = as_array(frames)
+    if array.ndim == 3:
+        array = array[np.newaxis]
+    if array.ndim == 4 and array.shape[-1] == RGBA_CHANNELS:
+        array = array[..., :RGB_CHANNELS]
+    if array.dtype.kind == "f":
+        return float_frames_to_uint8(array)
+    if array.dtype != np.uint8 and array.dtype.kind in "iu" and array.size:
+        if array.min() < 0 or array.max() > 255:
+            raise InvalidSampleError.at("frames", "values in 0..255", f"{array.min()}..{array.max()}")
+        return array.astype(np.uint8)
+    return array  # Trajectory checks the rest
+
+
+def _check_width(where: str, array: Float32Array, width: int | None) -> None:
+    if width is not None and array.shape[-1] != width:
+        axes = "[T, " if array.ndim > 1 else "["
+        raise InvalidSampleError.at(where, f"{axes}{width}]", str(list(array.shape)))
+
+
+def _refused(errors: Mapping[int, InvalidSampleError]) -> RequestValidationError:
+    """One error that lists all samples that cannot be scored, each at its field as the caller named it."""
+    details: list[Any] = []
+    for index, error in errors.items():
+        where, _, message = error.message.partition(": ")
+        path: list[str | int] = [int(word) if word.isdecimal() else _SIDES.get(word, word) for word in where.split(".")]
+        details += invalid(("samples", index, *path), message).errors()
+    return RequestValidationError(details)
 
 
 def _answer(samples: Sequence[schema.Sample], results: Sequence[Result], group: int) -> schema.EvaluateBatchAnswer:

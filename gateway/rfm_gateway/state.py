@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+
+import anyio
 
 from rfm_client.async_client import AsyncRewardClient
 from rfm_client.contract.errors import (
@@ -20,7 +21,7 @@ from rfm_client.contract.made_up import blank_trajectory
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.names import PROBE_PREFIX, encoder_name, frames_name
 from rfm_client.transport.access import Access
-from rfm_client.transport.deadline import Deadline, timeout
+from rfm_client.transport.deadline import Deadline
 from rfm_client.transport.status import Device, ServerStatus, read_status
 from rfm_gateway import schema
 
@@ -32,65 +33,63 @@ STATUS_TIMEOUT_S = 5.0
 MS_PER_S = 1e3
 
 
-class State:
-    """The state of ``model`` on the server at ``url``, whose metrics are at ``metrics_url``."""
+class TritonState:
+    """The state of ``model`` on the server at ``url``, whose metrics are at ``metrics_url``.
+
+    clock_s: gives the time in seconds
+    """
 
     def __init__(
-        self, client: AsyncRewardClient, url: str, metrics_url: str | None, model: str, access: Access | None = None
+        self,
+        client: AsyncRewardClient,
+        url: str,
+        metrics_url: str | None,
+        model: str,
+        access: Access | None = None,
+        clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._client = client
         self._url = url
         self._metrics_url = metrics_url
         self._model = model
         self._access = access
+        self._clock_s = clock_s
         self._refreshing = asyncio.Lock()
-        self._refreshed_s = -HEALTH_KEPT_S
-        self._problem: str | None = None
-        self._devices: schema.GpuStatus | None = None
-        self._stalled: dict[str, _Stalled] = {}
+        self._refreshed_s = float("-inf")
+        self._health: schema.Health | str = ""  # a text: what is wrong
+        self._late: dict[str, tuple[int, float]] = {}  # models: requests finished, since when it is that number
 
     async def gpu_status(self) -> schema.GpuStatus:
         """The answer of ``/gpu_status``, from Triton's metrics. Raises ServerError."""
-        status = await asyncio.to_thread(
-            read_status,
-            self._url,
-            metrics_url=self._metrics_url,
-            timeout_s=STATUS_TIMEOUT_S,
-            access=self._access,
-        )
-        return _gpu_status(status, self._model)
+        return _gpu_status(await self._status(STATUS_TIMEOUT_S), self._model)
 
     async def health(self) -> schema.Health:
         """The answer of ``/health``, within HEALTH_TIMEOUT_S. Raises ServerUnavailableError when a model does not
         answer.
         """
         async with self._refreshing:
-            if time.monotonic() - self._refreshed_s >= HEALTH_KEPT_S:
-                deadline = Deadline(HEALTH_TIMEOUT_S)
-                self._problem = await self._probe_all(deadline)
-                self._devices = await self._read_devices(deadline) if self._problem is None else None
-                self._refreshed_s = time.monotonic()
-            problem, devices = self._problem, self._devices
-        if problem is not None:
-            raise ServerUnavailableError(problem)
-        if devices is None:
-            return schema.Health(status="healthy", available_gpus=None, total_gpus=None)
-        return schema.Health(status="healthy", available_gpus=devices.available_gpus, total_gpus=devices.total_gpus)
+            if self._clock_s() - self._refreshed_s >= HEALTH_KEPT_S:
+                self._health = await self._probe_all(Deadline(HEALTH_TIMEOUT_S))
+                self._refreshed_s = self._clock_s()
+            found = self._health
+        if isinstance(found, str):
+            raise ServerUnavailableError(found)
+        return found
 
     async def model_info(self) -> schema.ModelInformation:
         """The answer of ``/model_info``, from the model's configuration. Raises ServerError."""
         deadline = Deadline(STATUS_TIMEOUT_S)
         info = (await self._infos(deadline))[0]
+        devices = await self._devices(deadline)
         parts = info.network.get("parameters", {})
         total = sum(parts.values())
-        kind = info.network.get("class")
         return schema.ModelInformation(
             model_path=info.source,
             model_version=max(info.versions, key=int, default=None),
-            num_gpus=None if (devices := await self._read_devices(deadline)) is None else devices.total_gpus,
+            num_gpus=None if devices is None else devices.total_gpus,
             experiment_config=dict(info.run_config) or {"model": info.network.get("config", {})},
             model_architecture={
-                "model_class": kind,
+                "model_class": info.network.get("class"),
                 "total_parameters": total,
                 "trainable_parameters": 0,  # served weights are frozen
                 "frozen_parameters": total,
@@ -99,13 +98,19 @@ class State:
             },
         )
 
-    async def _read_devices(self, deadline: Deadline) -> schema.GpuStatus | None:
+    async def _status(self, timeout_s: float) -> ServerStatus:
+        return await asyncio.to_thread(
+            read_status, self._url, metrics_url=self._metrics_url, timeout_s=timeout_s, access=self._access
+        )
+
+    async def _devices(self, deadline: Deadline) -> schema.GpuStatus | None:
         """State of the devices; None where the metrics cannot be read: scoring does not need them."""
         try:
-            async with timeout(deadline.remaining_s()):
+            with anyio.move_on_after(deadline.remaining_s()):
                 return await self.gpu_status()
-        except (ServerError, asyncio.TimeoutError):  # in Python 3.10 not the built-in one
-            return None
+        except ServerError:
+            pass
+        return None
 
     async def _infos(self, deadline: Deadline) -> list[ModelInfo]:
         """What is known of the models for embeddings and for raw frames, as far as they are served now."""
@@ -122,19 +127,24 @@ class State:
             raise missing
         return infos
 
-    async def _probe_all(self, deadline: Deadline) -> str | None:
-        """Probes every model with a blank sample. Gives the reason of the first that neither answers nor works."""
+    async def _probe_all(self, deadline: Deadline) -> schema.Health | str:
+        """Probes every model with a blank sample. A text is the reason of the first that neither answers nor works."""
         try:
             infos = await self._infos(deadline)
-            late = [name for name in await asyncio.gather(*map(self._late, infos)) if name is not None]
-            if not late:
-                self._stalled.clear()
-                return None
-            return await self._stall(late, deadline)
+            late = [name for name in await asyncio.gather(*map(self._late_name, infos)) if name is not None]
+            stall = await self._stall(late, deadline)
         except RewardError as error:
             return str(error)
+        if stall is not None:
+            return stall
+        devices = await self._devices(deadline)
+        return schema.Health(
+            status="healthy",
+            available_gpus=None if devices is None else devices.available_gpus,
+            total_gpus=None if devices is None else devices.total_gpus,
+        )
 
-    async def _late(self, info: ModelInfo) -> str | None:
+    async def _late_name(self, info: ModelInfo) -> str | None:
         """The model's name if it has no score in time. Raises RewardError."""
         blank = blank_trajectory(info.widths)
         try:
@@ -145,33 +155,17 @@ class State:
 
     async def _stall(self, late: Sequence[str], deadline: Deadline) -> str | None:
         """Why late models do not work; None: they are busy, or may be. Raises RewardError."""
-        left_s = deadline.remaining_s()
-        status = await asyncio.to_thread(
-            read_status, self._url, metrics_url=self._metrics_url, timeout_s=left_s, access=self._access
-        )
-        now_s = time.monotonic()
-        stalled = {}
+        status = await self._status(deadline.remaining_s()) if late else None
+        now_s, known, self._late = self._clock_s(), self._late, {}
         for name in late:
+            assert status is not None
             finished = sum(e.requests_succeeded + e.requests_failed for e in status.models if e.name == name)
-            known = self._stalled.get(name)
-            is_known = known is not None and known.num_finished == finished
-            stalled[name] = known if known is not None and is_known else _Stalled(finished, now_s)
-        self._stalled = stalled
-        for name, stall in stalled.items():
-            if now_s - stall.since_s >= STALL_S:
+            num_known, since_s = known.get(name, (finished, now_s))
+            self._late[name] = (finished, since_s if num_known == finished else now_s)
+        for name, (_, since_s) in self._late.items():
+            if now_s - since_s >= STALL_S:
                 return f"{name}: no answer within {PROBE_TIMEOUT_S:g} s, and nothing finished for {STALL_S:g} s"
         return None
-
-
-@dataclass(frozen=True)
-class _Stalled:
-    """A model that is late.
-
-    num_finished: requests that it has answered; since_s: when that number was first seen
-    """
-
-    num_finished: int
-    since_s: float
 
 
 def _gpu_status(status: ServerStatus, model: str) -> schema.GpuStatus:

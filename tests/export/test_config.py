@@ -176,10 +176,6 @@ BAD = {
         "gateway: {key: a}",
         r"serve\.yaml: gateway\.certificate, key: expected both or none, got one",
     ),
-    "less memory than a body": (
-        "gateway: {max_memory_mib: 100}",
-        r"serve\.yaml: gateway\.max_memory_mib: expected at least max_body_mib \(512\), got less",
-    ),
     "a name that is a path": ("name: ../rfm", r"serve\.yaml: name: expected letters, digits, _ and -, got '\.\./rfm'"),
     "a list": ("- 1", r"serve\.yaml: expected keys and values, got list"),
     "no YAML": ("a: [", r"serve\.yaml: expected a YAML file, got"),
@@ -310,7 +306,6 @@ def test_every_setting_of_a_gateway_is_an_option_of_serve(told: Any, tmp_path: P
         "allow_folder": str(tmp_path),
         "timeout": "90.0",
         "max_body_mib": "1",
-        "max_memory_mib": "2",
         "max_in_flight": "3",
         "max_waiting": "0",
         "dataset": str(LEROBOT / "toy_v21"),

@@ -12,7 +12,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
 import requests
@@ -104,7 +103,7 @@ def test_pairs_of_two_frame_sizes_are_scored(film: Gateway, video: Gateway, ask:
     assert answered(ask(film, samples)) == numbers(expected(film, samples))
 
 
-@pytest.mark.parametrize("num_frames", [1, 2, 9, 40])
+@pytest.mark.parametrize("num_frames", [1, 9])
 def test_frame_steps_score_each_frame_on_its_prefix(tiny: Gateway, ask: Ask, num_frames: int) -> None:
     samples = [progress(embedded(num_frames, num_frames))]
     answer = answered(ask(tiny, samples, use_frame_steps=True))
@@ -160,8 +159,6 @@ UPSTREAM_FIELDS: Json = {  # what the FastAPI server's clients send besides
     "partial_success": None,
     "metadata": {"fps": 3, "camera": {"name": "wrist"}},
 }
-
-
 UPSTREAM_KINDS: dict[str, Callable[[int, int], Json]] = {
     "frames": lambda seed, t: filmed(
         seed,
@@ -300,12 +297,3 @@ def test_a_gateway_that_is_told_to_stop_answers_what_it_has_begun(triton: Triton
         assert json.loads(connection.getresponse().read()) == answer
         connection.close()
         assert gateway.process.wait(WITHIN_S) in (0, -signal.SIGTERM)
-
-
-def test_one_connection_serves_many_requests_of_httpx(tiny: Gateway) -> None:
-    with httpx.Client(base_url=tiny.url) as client:
-        for seed in range(5):
-            sample = progress(embedded(seed, 1 + seed))
-            response = client.post("/evaluate_batch", content=dumped([sample]))
-            assert response.json() == expected(tiny, [sample])
-            assert client.post("/evaluate_batch", content="[").status_code == 422

@@ -18,7 +18,6 @@ import pytest
 import requests
 import schemathesis
 from hypothesis import HealthCheck, given, settings
-from typer.testing import CliRunner
 
 import goldens
 from gateway_requests import (
@@ -28,7 +27,6 @@ from gateway_requests import (
     SECOND,
     TINY,
     TOLERANCE,
-    TRUTH_S,
     VIDEO,
     Triton,
     answered,
@@ -52,7 +50,6 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.transport.status import read_status
-from rfm_commands.cli import app
 
 pytestmark = pytest.mark.triton
 
@@ -101,9 +98,7 @@ def test_health_has_asked_every_model(film: Gateway) -> None:
 def test_a_server_that_hangs_is_unhealthy_with_the_reason(triton: Triton, strict: Gateway) -> None:
     assert requests.get(f"{strict.url}/health").ok
     with paused(triton):  # what was found before is told for a second more
-        hung_s = time.monotonic()
         poll(lambda: requests.get(f"{strict.url}/health").status_code == 503)
-        assert time.monotonic() - hung_s < TRUTH_S
         assert "no answer within" in failure(requests.get(f"{strict.url}/health"), 503)
     poll(lambda: requests.get(f"{strict.url}/health").ok)
 
@@ -151,15 +146,6 @@ def test_metrics_count_what_was_asked(tiny: Gateway) -> None:
     requests.get(f"{tiny.url}/nowhere")
     assert [after - b for after, b in zip(counts(), before, strict=True)] == [1, 1, 1, 1, 2, 1, 1]
     assert tiny.metric("requests_in_flight") == 0
-
-
-def test_the_schemas_are_told(tiny: Gateway) -> None:
-    assert "swagger" in requests.get(f"{tiny.url}/docs").text
-    document = requests.get(f"{tiny.url}/openapi.json").json()
-    names = ("evaluate_batch", "evaluate_batch_npy", "gpu_status", "health", "model_info", "metrics")
-    assert document["paths"].keys() == {f"/{name}" for name in names}
-    codes = document["paths"]["/evaluate_batch"]["post"]["responses"].keys()
-    assert codes == {"200", "408", "413", "422", "502", "503", "504"}
 
 
 @pytest.fixture(scope="module")
@@ -235,60 +221,6 @@ def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed(trito
     assert len(started) >= 4  # Triton, its model process, the first gateway and the second
     assert not [child for child in started if Path(f"/proc/{child}").exists()]
     assert not list(SHARED_MEMORY.glob(f"*_rfm_{process.pid}_*"))
-
-
-BAD_OPTIONS: dict[str, tuple[list[str], str]] = {
-    "no URL": (
-        ["--triton", "localhost:8001"],
-        "url: expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
-    ),
-    "no folder": (["--allow-folder", "nowhere"], "No such file or directory"),
-    "no key file": (["--api-key-file", "nowhere"], "--api-key-file: expected a text file, got"),
-    "an empty key": (
-        ["--api-key-file", os.devnull],
-        "--api-key-file: expected a key, here or in RFM_GATEWAY_API_KEY, got no character",
-    ),
-    "less memory than a body": (
-        ["--max-memory-mib", "100"],
-        "--max-memory-mib: expected at least max_body_mib (512), got less",
-    ),
-    "no port": (["--port", "0"], "Input should be greater than or equal to 1"),
-    "an address of another machine": (["--host", "192.0.2.1"], "Cannot assign requested address; --host names another"),
-    "a time-out that never ends": (["--timeout", "inf"], "Input should be less than or equal to 86400"),
-}
-
-
-@pytest.mark.parametrize(("options", "message"), BAD_OPTIONS.values(), ids=BAD_OPTIONS)
-def test_wrong_options_are_refused(options: list[str], message: str, tmp_path: Path) -> None:
-    given = ["gateway", *([] if "--triton" in options else ["--triton", "grpc://localhost:1"]), *options]
-    result = CliRunner().invoke(app, given, env={"COLUMNS": "200"})
-    assert result.exit_code == 2
-    assert message in result.output
-
-
-WITHOUT_GATEWAY = "import sys; sys.modules['rfm_gateway'] = None; sys.argv = {words}; from {module} import main; main()"
-
-
-@pytest.mark.parametrize(
-    ("module", "words", "message"),
-    [
-        (
-            "rfm_client.cli",
-            ["rfm-client", "gateway", "--triton", "grpc://localhost:1"],
-            "pip install ./client ./gateway",
-        ),
-        ("rfm_commands.cli", ["rfm", "serve", "--gateway-port", "8100"], "pip install ./client ./gateway ."),
-    ],
-    ids=["rfm-client", "rfm"],
-)
-def test_a_gateway_that_is_not_installed_is_told_with_the_command_that_installs_it(
-    module: str, words: list[str], message: str
-) -> None:
-    program = WITHOUT_GATEWAY.format(words=words, module=module)
-    done = subprocess.run([sys.executable, "-c", program], stderr=subprocess.PIPE, text=True, check=False)
-    assert done.returncode == 1
-    assert done.stderr.endswith(f"{message}\n")
-    assert len(done.stderr.splitlines()) == 1
 
 
 def test_the_client_encodes_a_trajectory_once_for_many_questions(film: Gateway, tiny: Gateway) -> None:

@@ -20,14 +20,7 @@ import requests
 from gateways import Gateway, running
 from proxies import Proxy
 from rfm.launch.process import Endpoints
-from rfm_client import (
-    PreferenceSample,
-    ProgressSample,
-    Result,
-    Sample,
-    SimilaritySample,
-    Trajectory,
-)
+from rfm_client import PreferenceSample, ProgressSample, Result, Sample, SimilaritySample, Trajectory
 from small_network import SMALL
 
 Json: TypeAlias = dict[str, Any]
@@ -37,29 +30,14 @@ Array: TypeAlias = npt.NDArray[Any]
 
 
 Ask: TypeAlias = Callable[..., requests.Response]
-
-
 TINY, FILM, VIDEO = "rfm", "film", "film_video"  # models: two numbers a frame; encoders; vision-language in video mode
-
-
 TINY_CONFIG = replace(
     SMALL, video_feature_dim=2, text_feature_dim=2, hidden_dim=8, num_layers=1, num_attention_heads=2, max_len=16,
     progress_bins=10,
 )  # fmt: skip
-
-
 FILM_DIMS = (48, 32)  # widths D and Dt of FILM's encoders
-
-
 FRAME_STEPS = 4
-
-
 TOLERANCE = 1e-5  # where requests may share batches in different ways
-
-
-TRUTH_S = 5.0  # within which health is to tell that a server hangs
-
-
 SIDES = {
     "progress": ("trajectory",),
     "preference": ("chosen_trajectory", "rejected_trajectory"),
@@ -233,8 +211,6 @@ SEED_PAYLOAD = """[
     }
   }
 ]"""  # of the FastAPI evaluation server's README
-
-
 FIRST, SECOND = embedded(1, 3), embedded(2, 2)
 
 
@@ -256,8 +232,6 @@ def of_frames(frames: Any, **fields: Any) -> Json:
 
 
 FRAMES_AT, TASK_AT = ["trajectory", "frames"], ["trajectory", "task"]
-
-
 BLACK = np.zeros((2, 8, 8, 3), np.uint8)
 
 
@@ -272,11 +246,7 @@ def check_refused(response: requests.Response, *told: tuple[Sequence[Any], str])
 
 
 FORM = {"sample_0": dumped(progress(FIRST))}
-
-
 MULTIPART = "multipart/form-data; boundary=b"
-
-
 NAMED = b'--b\r\nContent-Disposition: form-data; name="sample_0"\r\n\r\n'
 
 

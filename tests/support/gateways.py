@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Gateways as processes."""
+"""Gateways, as processes and inside the test."""
 
 from __future__ import annotations
 
@@ -8,19 +8,25 @@ import os
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import requests
 from prometheus_client.parser import text_string_to_metric_families
 
 from rfm.launch.endpoints import free_ports
 from rfm.launch.process import Endpoints
-from rfm_client import (
-    RewardClient,
-)
+from rfm_client import RewardClient
+from rfm_gateway.app import create_app
+from rfm_gateway.config import GatewayConfig
+
+with warnings.catch_warnings():  # it would rather have httpx2
+    warnings.simplefilter("ignore")
+    from starlette.testclient import TestClient as TestClient
 
 WITHIN_S = 60
 
@@ -45,6 +51,9 @@ class Gateway:
 
     def connect(self) -> http.client.HTTPConnection:
         return http.client.HTTPConnection(self.url.removeprefix("http://"), timeout=WITHIN_S)
+
+    def get(self, path: str, **options: Any) -> requests.Response:
+        return requests.get(f"{self.url}{path}", timeout=WITHIN_S, **options)
 
     def metric(self, name: str, **labels: str) -> float:
         """Of the gateway's own; 0 before it is first counted."""
@@ -91,3 +100,11 @@ def running(
     finally:
         process.terminate()
         process.wait(WITHIN_S)
+
+
+@contextmanager
+def inside(api_key: str | None = None, **settings: Any) -> Iterator[TestClient]:
+    """A gateway inside this process, before no Triton."""
+    app = create_app(GatewayConfig(triton="grpc://127.0.0.1:1", **settings), api_key)
+    with TestClient(app, raise_server_exceptions=False) as client:
+        yield client

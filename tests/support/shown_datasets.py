@@ -19,11 +19,9 @@ from rfm_client.labelling import LabelOptions, label, open_dataset
 CAMERAS = ("observation.images.front", "observation.images.wrist")
 CODINGS = {
     "far between": ("libx264", {"g": "60", "keyint_min": "60", "sc_threshold": "0", "bf": "0"}),
-    "frames that need later ones": (
-        "libx264", {"g": "60", "keyint_min": "60", "sc_threshold": "0", "bf": "3", "b_strategy": "0"},
-    ),
     "AV1": ("libsvtav1", {"g": "2", "preset": "12"}),
-}  # fmt: skip
+}
+NEEDS_LATER = ("libx264", {"g": "60", "keyint_min": "60", "sc_threshold": "0", "bf": "3", "b_strategy": "0"})
 
 
 def copied(name: str, folder: Path) -> Path:

@@ -1,23 +1,25 @@
 # SPDX-License-Identifier: MIT
 """The datasets that the page shows: LeRobot's, in folders that the operator names, with labels or without.
 
-Their files are read where they are. A link that leaves a dataset's folder is followed nowhere: whoever made the dataset
-might have named files of this machine. Needs pyarrow. T frames of an episode.
+Their files are read where they are. A dataset with a link that leaves its folder is refused: whoever made it might have
+named files of this machine. Needs pyarrow. T frames of an episode.
 """
 
 from __future__ import annotations
 
+import io
 import json
-import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import numpy.typing as npt
+from fastapi import HTTPException
 
 from rfm_client.contract.results import SUCCESS_THRESHOLD
 from rfm_client.contract.settings import ConfigError
@@ -25,6 +27,7 @@ from rfm_client.data.datasets.films import Span
 from rfm_client.data.datasets.lerobot import LeRobotDataset
 from rfm_client.data.datasets.lerobot_rows import INFO_FILE
 from rfm_client.data.datasets.protocol import DatasetEpisode, DatasetError
+from rfm_client.data.film_files import FilmError, film_stream
 from rfm_client.data.orientation import ORIENTATIONS
 from rfm_client.labelling.label_files import (
     PROVENANCE_KEY,
@@ -35,18 +38,18 @@ from rfm_client.labelling.label_files import (
     read_episode_labels,
 )
 from rfm_client.labelling.summary import Summary, summarise
+from rfm_gateway.viewer import numbers_or_null
 
 NUM_BINS = 20  # of the final progress, from 0 to 1
 _SUMMARIES_AT_A_TIME = 8  # that are kept in memory
 
 
-class UnknownError(LookupError):
-    """Something that the datasets do not have, reported as ``where: expected X, got Y``."""
-
-
 @dataclass(frozen=True)
 class ShownDataset:
-    """A dataset that the page shows. root: its folder, without links on the way to it"""
+    """A dataset that the page shows. root: its folder, without links on the way to it
+
+    Its methods raise DatasetError for a broken dataset, HTTPException 404 for what it does not have.
+    """
 
     root: Path
     dataset: LeRobotDataset
@@ -76,7 +79,7 @@ class ShownDataset:
         return {"name": self.dataset.source, "kind": self.dataset.kind, "labels": names}
 
     def table(self, labels: str | None) -> dict[str, Any]:
-        """Every episode, with what these labels say of it at a glance. Raises DatasetError, UnknownError."""
+        """Every episode, with what these labels say of it at a glance."""
         file = self._labels(labels)
         summary = None if file is None else _summary(file, file.stat().st_mtime_ns)
         rows = {} if summary is None else dict(zip(summary.episodes.tolist(), _rows(summary), strict=True))
@@ -94,12 +97,12 @@ class ShownDataset:
                     "num_frames": episode.num_frames,
                     **rows.get(episode.index, {}),
                 }
-                for episode in self._episodes
+                for episode in self.dataset.episodes
             ],
         }
 
     def curves(self, number: int, labels: str | None) -> dict[str, Any]:
-        """An episode's curves over the time in it. Raises DatasetError, UnknownError."""
+        """An episode's curves over the time in it."""
         episode, file = self._episode(number), self._labels(labels)
         times_s = self.dataset.times_s(episode)
         times_s = times_s - times_s[0]
@@ -113,30 +116,22 @@ class ShownDataset:
             "curves": [] if found is None else _curves(found, len(times_s)),
         }
 
-    def span(self, number: int, camera: int) -> Span:
-        """Where an episode is in the film of a camera. Raises DatasetError, UnknownError."""
+    def video(self, number: int, camera: int, take: Callable[[int], object]) -> bytes:
+        """The frames of an episode as an MP4 file of their own. take: told how many bytes are taken, before they are"""
         cameras = self.dataset.info.films
         if not 0 <= camera < len(cameras):
-            raise UnknownError(f"camera: expected one of {len(cameras)} with films, got {camera}")
-        episode = self._episode(number)
-        _check_inside(self.root, self.dataset.film(episode, cameras[camera]))
-        return self.dataset.span(episode, cameras[camera])
+            raise HTTPException(404, f"camera: expected one of {len(cameras)} with films, got {camera}")
+        return _cut(self.dataset.span(self._episode(number), cameras[camera]), take)
 
     def without_folder(self, message: str) -> str:
         """A message for people elsewhere, whom the place of the dataset on this machine does not concern."""
         return message.replace(str(self.root), self.dataset.source)
 
-    @cached_property
-    def _episodes(self) -> Sequence[DatasetEpisode]:
-        for file in self.dataset.files():
-            if file.suffix == ".parquet":
-                _check_inside(self.root, file)
-        return self.dataset.episodes
-
     def _episode(self, number: int) -> DatasetEpisode:
-        if not 0 <= number < len(self._episodes):
-            raise UnknownError(f"episode: expected one from 0 to {len(self._episodes) - 1}, got {number}")
-        return self._episodes[number]
+        episodes = self.dataset.episodes
+        if not 0 <= number < len(episodes):
+            raise HTTPException(404, f"episode: expected one from 0 to {len(episodes) - 1}, got {number}")
+        return episodes[number]
 
     def _labels(self, name: str | None) -> Path | None:
         """The file of labels of this name, by default the first; None: there are no labels."""
@@ -144,19 +139,11 @@ class ShownDataset:
         if name is None:
             name = next(iter(files), None)
         if name is not None and name not in files:
-            raise UnknownError(f"labels: expected one of {', '.join(files) or 'none'}, got another")
-        file = None if name is None else files[name]
-        if file is not None:
-            _check_inside(self.root, file)
-        return file
+            raise HTTPException(404, f"labels: expected one of {', '.join(files) or 'none'}, got another")
+        return None if name is None else files[name]
 
     def _name_of(self, file: Path) -> str:
         return file.relative_to(self.root).as_posix()
-
-
-def _numbers(values: Iterable[float]) -> list[float | None]:
-    """Scores as JSON has them: null for one that is not there."""
-    return [None if math.isnan(value) else value for value in values]
 
 
 def _orientations(file: Path | None) -> Mapping[str, str]:
@@ -177,15 +164,15 @@ def _summary(file: Path, _changed_ns: int) -> Summary:
 def _rows(summary: Summary) -> list[dict[str, Any]]:
     """What a summary says of each episode."""
     columns: dict[str, Sequence[Any]] = {
-        "final_progress": _numbers(summary.final_progress.tolist()),
-        "backwards": _numbers(summary.backwards.tolist()),
+        "final_progress": numbers_or_null(summary.final_progress.tolist()),
+        "backwards": numbers_or_null(summary.backwards.tolist()),
     }
     never = summary.never_succeed
     if summary.best_success is not None and never is not None:
-        columns["best_success"] = _numbers(summary.best_success.tolist())
+        columns["best_success"] = numbers_or_null(summary.best_success.tolist())
         columns["never_succeeds"] = np.isin(summary.episodes, never).tolist()
     if summary.disagreement is not None:
-        columns["disagreement"] = _numbers(summary.disagreement.tolist())
+        columns["disagreement"] = numbers_or_null(summary.disagreement.tolist())
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
@@ -210,24 +197,76 @@ def _scores(curve: Curve, frames: npt.NDArray[np.int64], num_frames: int) -> dic
         if labelled is not None:
             of_all = np.full(num_frames, np.nan)
             of_all[frames] = labelled
-            scores[name] = _numbers(of_all.tolist())
+            scores[name] = numbers_or_null(of_all.tolist())
     return scores
 
 
 def _check_links(root: Path) -> None:
     """Raises DatasetError for a link in a folder that leads out of it."""
     for folder, folders, files in os.walk(root):
-        for name in (*folders, *files):
-            path = Path(folder, name)
-            if path.is_symlink():
-                _check_inside(root, path)
+        for path in (Path(folder, name) for name in (*folders, *files)):
+            try:
+                is_inside = not path.is_symlink() or path.resolve().is_relative_to(root)
+            except (OSError, RuntimeError):  # links in a circle
+                is_inside = False
+            if not is_inside:
+                raise DatasetError.at(
+                    path, "a file in the dataset's folder", "a link that leaves it: copy the file there"
+                )
 
 
-def _check_inside(root: Path, file: Path) -> None:
-    """Raises DatasetError for a file that lies elsewhere once its links are followed."""
+def _cut(span: Span, take: Callable[[int], object]) -> bytes:
+    """The frames of a span as an MP4 file, the first at 0 s. Nothing is encoded anew: the frames are equal.
+
+    Frames before the episode that others need are in the file, which tells players to leave them out.
+    """
+    clip = io.BytesIO()
     try:
-        is_inside = file.resolve().is_relative_to(root)
-    except (OSError, RuntimeError):  # links in a circle
-        is_inside = False
-    if not is_inside:
-        raise DatasetError.at(file, "a file in the dataset's folder", "a link that leaves it: copy the file there")
+        with av.open(str(span.file), format="mov") as film:  # a play list would be read as what it names
+            stream = film_stream(film)
+            packets = _packets(film, stream, span, take)
+            zero = min(packet.pts for packet in packets if packet.pts * stream.time_base > _begin_s(span))
+            with av.open(clip, "w", format="mp4") as copy:
+                written = copy.add_stream_from_template(stream, opaque=True)  # no encoder is needed
+                for packet in packets:
+                    packet.pts -= zero
+                    packet.dts -= zero
+                    packet.stream = written
+                    copy.mux(packet)
+    except FilmError as error:
+        raise span.error(error.expected, error.got) from error
+    except (av.FFmpegError, OSError) as error:
+        raise span.error("a film of the episode", error.strerror or str(error)) from error
+    return clip.getvalue()
+
+
+def _begin_s(span: Span) -> float:
+    return float(span.times_s[0]) - span.tolerance_s
+
+
+def _packets(film: Any, stream: Any, span: Span, take: Callable[[int], object]) -> list[Any]:
+    """The packets of an episode, and those before it that it needs, in the order of decoding."""
+    begin_s, end_s = _begin_s(span), float(span.times_s[-1]) + span.tolerance_s
+    film.seek(max(round(begin_s / stream.time_base), 0), stream=stream)
+    packets: list[Any] = []
+    for packet in film.demux(stream):
+        if packet.pts is None or packet.dts is None:
+            continue
+        if packet.dts * stream.time_base > end_s:
+            break
+        take(packet.size)
+        if packet.is_keyframe and packet.pts * stream.time_base <= begin_s + 1.5 * span.tolerance_s:
+            packets = []  # the episode does not need what is before
+        packets.append(packet)
+    shown_s = [float(packet.pts * stream.time_base) for packet in packets]
+    while shown_s and shown_s[-1] > end_s:
+        del packets[-1], shown_s[-1]
+    num_shown = sum(begin_s <= time_s <= end_s for time_s in shown_s)
+    if num_shown != len(span.times_s) or not packets[0].is_keyframe:
+        raise span.error(f"{len(span.times_s)} frames from {span.times_s[0]:.4f} s on", f"{num_shown}")
+    if max(shown_s) > end_s:
+        remedy = "encode it without frames that need later ones: ffmpeg -i IN -bf 0 OUT"
+        raise span.error(
+            f"an episode that can be cut out of its film ({remedy})", "one that needs frames behind its end"
+        )
+    return packets

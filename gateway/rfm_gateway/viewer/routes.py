@@ -2,94 +2,149 @@
 """What the page asks: which models are served, the curve of a video, which of two videos does a task better.
 
 A curve comes as server-sent events: ``video`` tells its frames, ``scores`` some points, ``done`` or ``failed`` the end.
+Each frame is scored on its prefix, a few prefixes at a time.
 """
 
 from __future__ import annotations
 
 import asyncio
-import dataclasses
+import itertools
 import json
 import logging
+import math
 import time
-from collections.abc import AsyncIterator, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 import anyio
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 from starlette.datastructures import UploadFile
-from starlette.types import Receive, Scope, Send
 
 from rfm_client.async_client import AsyncRewardClient
-from rfm_client.contract.errors import InvalidSampleError, RewardError
+from rfm_client.contract.errors import InvalidSampleError, ModelNotFoundError, RewardError
 from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.results import PreferenceResult
+from rfm_client.contract.names import DEFAULT_MODEL, frames_name
+from rfm_client.contract.results import PreferenceResult, ProgressResult
 from rfm_client.contract.samples import ProgressSample, Trajectory
 from rfm_client.data.fitting import fitted
 from rfm_client.data.orientation import ORIENTATIONS
-from rfm_client.data.sampling import RULES, Rule, Sampling, trained_rule
+from rfm_client.data.sampling import RULES, Rule, Sampling, prefix_samples, trained_rule
+from rfm_client.transport.off_loop import off_loop
 from rfm_client.transport.status import read_status
-from rfm_gateway.body import COMPARE_ENDPOINT, SCORE_ENDPOINT, Admitted, BodyLimits, invalid, parts_of
-from rfm_gateway.cancellation import while_connected
+from rfm_gateway.body import BodyLimits, Decoded, invalid
 from rfm_gateway.config import GatewayConfig
-from rfm_gateway.memory import Share
-from rfm_gateway.observe import Metrics
-from rfm_gateway.versions import of_one_version
-from rfm_gateway.viewer.curves import Call, Parts, curve
-from rfm_gateway.viewer.models import Models, names_of
-from rfm_gateway.viewer.question import DEFAULT_FPS, Question
-from rfm_gateway.viewer.videos import Video, read_upload
+from rfm_gateway.observe import GatewayMetrics, while_connected
+from rfm_gateway.viewer import numbers_or_null
+from rfm_gateway.viewer.questions import DEFAULT_FPS, ShownVideo, VideoQuestion
 
+MOST_PREFIXES = 32  # of one video at a time
+MOST_BYTES = 64 * 2**20  # of the frames of these
 STATUS_TIMEOUT_S = 5.0
 _AS_THEY_COME = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}  # the second for proxies that gather answers
+_FRAMES_ENDING = frames_name("")
 
 logger = logging.getLogger("rfm_gateway")
 
 
 @dataclass(frozen=True)
-class Behind:
-    """What answers for the page. model: the one that is chosen unless the page says otherwise"""
+class _Asked:
+    """A question, the model that answers it, and the videos that it is about."""
 
-    config: GatewayConfig
-    model: str
-    models: Models
-    limits: BodyLimits
-    metrics: Metrics
+    question: VideoQuestion
+    sampling: Sampling
+    info: ModelInfo
+    videos: tuple[ShownVideo, ...]
+    request_id: str
 
 
-def viewer_routes(behind: Behind) -> APIRouter:
-    """The endpoints of the page. They are its own, and not those of the evaluation server."""
+def viewer_routes(
+    config: GatewayConfig,
+    new_client: Callable[..., AsyncRewardClient],
+    limits: BodyLimits,
+    max_decoded_bytes: int,
+    metrics: GatewayMetrics,
+) -> APIRouter:
+    """The endpoints of the page. They are its own, and not those of the evaluation server.
+
+    new_client: makes a client for the model of a name
+    max_decoded_bytes: of the videos of one request
+    """
     router = APIRouter(include_in_schema=False)
+    default_model = config.model or DEFAULT_MODEL
 
     @router.get("/viewer/served")
     async def served() -> Response:
-        return JSONResponse(await _served(behind))
+        models = [_told_of(name, info) for name, info in await _infos(config, new_client)]
+        rules = [{"name": rule, "frames": _frames_of(rule)} for rule in RULES]
+        about = {"models": models, "model": default_model, "rules": rules, "orientations": list(ORIENTATIONS)}
+        return JSONResponse({**about, "fps": DEFAULT_FPS, "url": config.triton_url})
 
-    @router.post(SCORE_ENDPOINT)
+    @router.post("/viewer/score")
     async def score(request: Request) -> Response:
-        with ExitStack() as stack:
-            asked = await _asked(behind, request, stack, ("video",))
-            asked.share.take(Parts.of(asked.videos[0].frames, asked.sampling).num_bytes)
-            call = Call(asked.sampling, behind.config.timeout, request.state.request_id)
-            return _Events(_score_events(behind, asked, call), stack.pop_all())
+        asked = await read(request, "video")
+        return StreamingResponse(events(asked), media_type="text/event-stream", headers=_AS_THEY_COME)
 
-    @router.post(COMPARE_ENDPOINT)
+    @router.post("/viewer/compare")
     async def compare(request: Request) -> Response:
-        with ExitStack() as stack:
-            asked = await _asked(behind, request, stack, ("first", "second"))
-            preferences = _preferences(asked, behind.config.timeout, request.state.request_id)
-            answer = await while_connected(request, preferences)
-        behind.metrics.samples.labels("preference").inc(len(answer["orders"]))
+        asked = await read(request, "first", "second")
+        async with new_client(model=asked.question.model) as client:
+            answer = await while_connected(request, _preferences(client, asked))
+        metrics.samples.labels("preference").inc(len(answer["orders"]))
         return JSONResponse(answer)
+
+    async def read(request: Request, *names: str) -> _Asked:
+        """What a request asks of its videos of these names. Raises RequestValidationError, HTTPException and
+        RewardError.
+        """
+        async with limits.form(request) as (fields, uploads):
+            question = VideoQuestion.of(fields, default_model)
+            async with new_client(model=question.model) as client:
+                info = await client.model_info(frames=True)
+            sampling = question.sampling(info)
+            videos = await while_connected(request, decoded(question, uploads, names))
+        return _Asked(question, sampling, info, videos, request.state.request_id)
+
+    async def decoded(
+        question: VideoQuestion, uploads: Mapping[str, UploadFile], names: tuple[str, ...]
+    ) -> tuple[ShownVideo, ...]:
+        taken = Decoded(max_decoded_bytes)
+        try:
+            with anyio.move_on_after(config.timeout):
+                return tuple([await question.video(uploads, name, taken) for name in names])
+        finally:
+            taken.end()
+        raise invalid((names[0],), f"expected videos that are read within {config.timeout:g} s, got longer ones")
+
+    async def events(asked: _Asked) -> AsyncIterator[str]:
+        """The events of one curve. What goes wrong is the last of them: the status of the answer has been sent."""
+        (video,) = asked.videos
+        num_frames, began_s, version = video.trajectory.num_frames, time.monotonic(), None
+        times_s = None if video.times_s is None else video.times_s.tolist()
+        yield _event("video", num_frames=num_frames, times_s=times_s, sampled_frames=asked.sampling.frames)
+        try:
+            sample = ProgressSample(video.trajectory)
+            fit = await asyncio.to_thread(fitted, sample, asked.info, subsample=False, resize=asked.question.resize)
+            async with new_client(model=asked.question.model) as client:
+                async for points in _curve(client, fit.sample.trajectories[0], asked):
+                    version = points["model_version"]
+                    metrics.samples.labels("progress").inc(len(points["progress"]))
+                    yield _event("scores", **points)
+        except RewardError as error:
+            yield _event("failed", detail=str(error))
+        except Exception as error:
+            logger.error("request %s: unexpected", asked.request_id, exc_info=error)
+            yield _event("failed", detail="the gateway failed; its log has the reason")
+        else:
+            yield _event("done", model_version=version, took_s=time.monotonic() - began_s)
 
     return router
 
 
-async def _served(behind: Behind) -> dict[str, Any]:
-    """What the page may ask for. Raises RewardError."""
-    config = behind.config
+async def _infos(config: GatewayConfig, new_client: Callable[..., AsyncRewardClient]) -> list[tuple[str, ModelInfo]]:
+    """What is served now for raw frames, by the names under which checkpoints were exported. Raises RewardError."""
     status = await asyncio.to_thread(
         read_status,
         config.triton_url,
@@ -97,24 +152,21 @@ async def _served(behind: Behind) -> dict[str, Any]:
         timeout_s=STATUS_TIMEOUT_S,
         access=config.access,
     )
-    infos = await behind.models.infos(names_of(status.models), STATUS_TIMEOUT_S)
-    return {
-        "models": [
-            {
-                "name": name,
-                "max_frames": info.max_frames,
-                "rule": trained_rule(info.trained_padding),
-                "versions": list(info.versions),
-                "source": info.source,
-            }
-            for name, info in infos
-        ],
-        "model": behind.model,
-        "rules": [{"name": rule, "frames": _frames_of(rule)} for rule in RULES],
-        "orientations": list(ORIENTATIONS),
-        "fps": DEFAULT_FPS,
-        "url": config.triton_url,
-    }
+    ready = {model.name for model in status.models if model.state == "READY" and model.name.endswith(_FRAMES_ENDING)}
+    infos = []
+    for name in sorted(each.removesuffix(_FRAMES_ENDING) for each in ready):
+        try:
+            async with new_client(model=name) as client:
+                infos.append((name, await client.model_info(frames=True, timeout_s=STATUS_TIMEOUT_S)))
+        except ModelNotFoundError:  # unloaded since it was listed
+            continue
+    return infos
+
+
+def _told_of(name: str, info: ModelInfo) -> dict[str, Any]:
+    rule = trained_rule(info.trained_padding)
+    about = {"name": name, "max_frames": info.max_frames, "rule": rule}
+    return {**about, "versions": list(info.versions), "source": info.source}
 
 
 def _frames_of(rule: Rule) -> int | str | None:
@@ -125,108 +177,47 @@ def _frames_of(rule: Rule) -> int | str | None:
         return "any"
 
 
-@dataclass(frozen=True)
-class _Asked:
-    """A question, the client that answers it, the videos that it is about, and what it holds of the memory."""
+async def _curve(client: AsyncRewardClient, trajectory: Trajectory, asked: _Asked) -> AsyncIterator[dict[str, Any]]:
+    """The points of a curve, in order. The first come alone, then twice as many, so that none waits long.
 
-    question: Question
-    sampling: Sampling
-    client: AsyncRewardClient
-    info: ModelInfo
-    videos: tuple[Video, ...]
-    share: Share
-
-    @property
-    def trajectories(self) -> list[Trajectory]:
-        """The videos as the client takes them."""
-        return [Trajectory(frames=video.frames, task=self.question.task) for video in self.videos]
-
-
-async def _asked(behind: Behind, request: Request, stack: ExitStack, names: tuple[str, ...]) -> _Asked:
-    """What a request asks. It holds its share of the memory as long as ``stack``.
-
-    Raises RequestValidationError, HTTPException, RewardError.
+    Raises RewardError.
     """
-    timeout_s = behind.config.timeout
-    admitted = stack.enter_context(behind.limits.admitted(request))
-    await admitted.wait_for_room(request.state.begin_by)
-    with anyio.fail_after(timeout_s) as arrival:
-        async with parts_of(admitted) as (fields, uploads):
-            arrival.deadline = float("inf")  # all of it has come
-            question = Question.of(fields, behind.model)
-            client, info = await behind.models.client(question.model, timeout_s)
-            sampling = question.sampling(info)
-            videos = await while_connected(request, _videos(admitted, uploads, names, question, timeout_s))
-    return _Asked(question, sampling, client, info, videos, admitted.share)
+    assert trajectory.frames is not None
+    sampling, frames = asked.sampling, trajectory.frames
+    sample_bytes = max(sampling.frames or 0, len(frames)) * math.prod(frames.shape[1:])
+    most = max(min(MOST_PREFIXES, MOST_BYTES // sample_bytes), 1)
+    samples, first, count = prefix_samples(trajectory, sampling), 0, 1
+
+    def following() -> list[ProgressSample]:
+        return list(itertools.islice(samples, count))
+
+    while part := await off_loop(count * sample_bytes, following):
+        results = cast("list[ProgressResult]", await client.evaluate(part, request_id=asked.request_id))
+        reads = [sampling.prefix(t).read for t in range(first, first + len(part))]
+        yield {
+            "first": first,
+            "progress": numbers_or_null(float(r.progress[read]) for r, read in zip(results, reads, strict=True)),
+            "success": numbers_or_null(float(r.success[read]) for r, read in zip(results, reads, strict=True)),
+            "model_version": results[-1].model_version,
+        }
+        first, count = first + len(part), min(2 * count, most)
 
 
-async def _videos(
-    admitted: Admitted, uploads: Mapping[str, UploadFile], names: Sequence[str], question: Question, timeout_s: float
-) -> tuple[Video, ...]:
-    """The videos of these names. Raises RequestValidationError, also for one that takes too long to read.
-
-    A thread that reads one that nobody waits for ends at its next frame: the request's share of the memory is over.
-    """
-    with anyio.move_on_after(timeout_s):
-        return tuple([await _video(admitted, uploads, name, question) for name in names])
-    raise invalid((names[0],), f"expected videos that are read within {timeout_s:g} s, got longer ones")
-
-
-async def _video(admitted: Admitted, uploads: Mapping[str, UploadFile], name: str, question: Question) -> Video:
-    if name not in uploads:
-        raise invalid((name,), "expected a video file, got none")
+async def _preferences(client: AsyncRewardClient, asked: _Asked) -> dict[str, Any]:
+    """What the model prefers when it is asked in one order and in the other. Raises RewardError."""
+    first, second = (video.trajectory for video in asked.videos)
+    preferred = partial(client.preference, subsample=True, resize=asked.question.resize, request_id=asked.request_id)
     try:
-        return await read_upload(uploads[name], question.fps, admitted.share.take, question.orient)
-    except InvalidSampleError as error:
-        where, _, message = error.message.partition(": ")
-        raise invalid((name if where == "video" else where,), message) from None
-
-
-async def _score_events(behind: Behind, asked: _Asked, call: Call) -> AsyncIterator[str]:
-    """The events of one curve. What goes wrong is the last of them: the status of the answer has been sent."""
-    (video,), (trajectory,) = asked.videos, asked.trajectories
-    began_s = time.monotonic()
-    times_s = None if video.times_s is None else video.times_s.tolist()
-    yield _event("video", {"num_frames": len(video.frames), "times_s": times_s, "sampled_frames": call.sampling.frames})
-    version = None
-    try:
-        sample = ProgressSample(trajectory)
-        fit = await asyncio.to_thread(fitted, sample, asked.info, subsample=False, resize=asked.question.resize)
-        async for points in curve(asked.client, fit.sample.trajectories[0], call):
-            version = points.model_version
-            behind.metrics.samples.labels("progress").inc(len(points.progress))
-            yield _event("scores", dataclasses.asdict(points))
-    except RewardError as error:
-        yield _event("failed", {"detail": str(error)})
-    except Exception as error:
-        logger.error("request %s: unexpected", call.request_id, exc_info=error)
-        yield _event("failed", {"detail": "the gateway failed; its log has the reason"})
-    else:
-        yield _event("done", {"model_version": version, "took_s": time.monotonic() - began_s})
-
-
-async def _preferences(asked: _Asked, timeout_s: float, request_id: str) -> dict[str, Any]:
-    """What one version of the model prefers when it is asked in one order and in the other. Raises RewardError."""
-    first, second = asked.trajectories
-
-    async def preferred(one: Trajectory, other: Trajectory) -> PreferenceResult:
-        return await asked.client.preference(
-            one, other, subsample=True, resize=asked.question.resize, timeout_s=timeout_s, request_id=request_id
-        )
-
-    async def both() -> Sequence[PreferenceResult]:
-        return await asyncio.gather(preferred(first, second), preferred(second, first))
-
-    try:
-        results = await of_one_version(both)
+        results = await asyncio.gather(preferred(first, second), preferred(second, first))
     except InvalidSampleError as error:
         where, _, message = error.message.partition(": ")
         raise invalid((where,), message) from None
-    orders = (("first", "second"), ("second", "first"))
     pair = PreferenceResult.of_both_orders(*results)
+    asked_orders = (("first", "second"), ("second", "first"))
     return {
         "orders": [
-            {"asked": names, "preference": result.preference} for names, result in zip(orders, results, strict=True)
+            {"asked": names, "preference": result.preference}
+            for names, result in zip(asked_orders, results, strict=True)
         ],
         "verdict": pair.verdict,
         "orders_agree": pair.orders_agree,
@@ -234,18 +225,5 @@ async def _preferences(asked: _Asked, timeout_s: float, request_id: str) -> dict
     }
 
 
-def _event(name: str, document: Mapping[str, Any]) -> str:
+def _event(name: str, **document: Any) -> str:
     return f"event: {name}\ndata: {json.dumps(document, allow_nan=False)}\n\n"
-
-
-class _Events(StreamingResponse):
-    """Server-sent events. ``held`` ends with the answer, also if nobody reads it."""
-
-    def __init__(self, events: AsyncIterator[str], held: ExitStack) -> None:
-        super().__init__(events, media_type="text/event-stream", headers=_AS_THEY_COME)
-        self._held = held
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Sends the events as they come."""
-        with self._held:
-            await super().__call__(scope, receive, send)

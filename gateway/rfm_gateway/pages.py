@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: MIT
+"""The files of the page and of the documentation of endpoints. All come with the gateway: no network is needed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from fastapi import FastAPI, Request, Response
+from starlette.staticfiles import StaticFiles
+
+_PACKAGE = Path(__file__).parent
+_POLICY = (  # where a page may take from what; no script and no style of its own text, nothing of elsewhere
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; media-src 'self' blob:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+_HEADERS = {
+    "Content-Security-Policy": _POLICY,
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-cache",  # asked for again, and answered with 304 as long as it is the same
+}
+
+
+class _Files(StaticFiles):
+    """The files of a folder, with the headers of a page."""
+
+    def file_response(self, *arguments: Any, **options: Any) -> Response:
+        response = super().file_response(*arguments, **options)
+        response.headers.update(_HEADERS)
+        return response
+
+
+def add_viewer(app: FastAPI) -> None:
+    """The page at ``/``, and its parts."""
+    _add(app, "/", "/viewer", _PACKAGE / "viewer" / "static", uplot=_PACKAGE / "vendored" / "uplot")
+
+
+def add_docs(app: FastAPI) -> None:
+    """Swagger UI at ``/docs``, and its parts."""
+    _add(app, "/docs", "/docs", _PACKAGE / "docs", **{"swagger-ui": _PACKAGE / "vendored" / "swagger-ui"})
+
+
+def _add(app: FastAPI, page: str, path: str, folder: Path, **vendored: Path) -> None:
+    files = _Files(directory=folder)
+
+    @app.api_route(page, methods=["GET", "HEAD"], include_in_schema=False)
+    async def index(request: Request) -> Response:
+        return await files.get_response("index.html", request.scope)
+
+    for name, each in vendored.items():
+        app.mount(f"{path}/{name}", _Files(directory=each))
+    app.mount(path, files)

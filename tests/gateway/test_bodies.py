@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: MIT
+"""What the gateway refuses before it asks Triton: keys, origins, and bodies that are no samples. No Triton is needed."""
+
+from __future__ import annotations
+
+import json
+import tracemalloc
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gateway_requests import (
+    FIRST,
+    FORM,
+    MULTIPART,
+    NAMED,
+    SEED_PAYLOAD,
+    check_refused,
+    dumped,
+    failure,
+    npy,
+    npy_of,
+    progress,
+)
+from gateways import TestClient, inside
+
+KEY, ORIGIN = "open sesame", "http://lab.example"
+NPY = "/evaluate_batch_npy"
+
+
+@pytest.fixture(scope="module")
+def gateway() -> Iterator[TestClient]:
+    with inside(max_body_mib=1) as client:
+        yield client
+
+
+BODIES: dict[str, tuple[bytes, list[Any], str]] = {
+    "nothing": (b"", [], "expected JSON, got: .*"),
+    "half an object": (b'{"samples": [', [], "expected JSON, got: .*"),
+    "no UTF-8": (b'["\xff"]', [], "expected JSON, got: .*"),
+    "half a character": (b'["\\ud800"]', [], "expected JSON, got: .*"),
+    "ten thousand brackets": (b"[" * 10_000, [], "expected JSON, got: recursion limit .*"),
+    "an empty list": (b"[]", ["samples"], "expected at least one sample, got none"),
+    "no samples": (b'{"samples": []}', ["samples"], "expected at least one sample, got none"),
+    "an empty object": (b"{}", ["samples"], "expected at least one sample, got none"),
+    "a number": (b"5", ["samples"], "expected a list of samples, got int"),
+    "null samples": (b'{"samples": null}', ["samples"], "expected a list of samples, got NoneType"),
+    "samples as an object": (b'{"samples": {}}', ["samples"], "expected a list of samples, got dict"),
+    "too many": (b"[%b5]" % (b"5," * 10_000), ["samples"], "expected at most 10000 samples, got 10001"),
+    "very many errors": (b"[%b5]" % (b"5," * 2000), [], "expected no faulty fields, got 2001"),
+    "no steps": (dumped({"samples": [progress(FIRST)], "use_frame_steps": 2}).encode(), ["use_frame_steps"], "expected true or false, got 2"),
+    "many steps": (dumped({"samples": [progress(FIRST)], "use_frame_steps": []}).encode(), ["use_frame_steps"], r"expected true or false, got \[\]"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("body", "path", "message"), BODIES.values(), ids=BODIES)
+def test_a_body_that_holds_no_samples_is_refused(
+    gateway: TestClient, body: bytes, path: list[Any], message: str
+) -> None:
+    check_refused(gateway.post("/evaluate_batch", content=body), (path, message))
+
+
+def test_words_for_numbers_are_refused_before_numpy_makes_each_as_wide_as_the_longest(gateway: TestClient) -> None:
+    body = dumped([progress({"video_embeddings": ["a" * 20_000, *["b"] * 10_000]})])
+    tracemalloc.start()
+    try:
+        check_refused(gateway.post("/evaluate_batch", content=body), (VIDEO_AT, "expected numbers, got something else"))
+        assert tracemalloc.get_traced_memory()[1] < 100 * 2**20
+    finally:
+        tracemalloc.stop()
+
+
+VIDEO_AT = ["samples", 0, "trajectory", "video_embeddings"]
+HUGE = "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000000, 2)}"
+NO_NPY = r"expected a \.npy file, got: .*"
+FILES = {
+    "truncated": (npy(np.ones((3, 2)))[:-4], NO_NPY),
+    "too long": (npy(np.ones((3, 2))) + b"1", r"expected a \.npy file of 48 bytes behind its header, got more"),
+    "a shape of petabytes": (npy_of(HUGE), NO_NPY),
+    "a negative shape": (npy_of(HUGE.replace("1000000000000000", "-1")), NO_NPY),
+    "pickled": (npy(np.array([[1, {}]], object), pickled=True), NO_NPY),
+    "text": (npy(np.array([["a", "b"]])), r"expected a \.npy file of numbers, got <U1"),
+    "complex": (npy(np.ones((3, 2), complex)), r"expected a \.npy file of numbers, got complex128"),
+    "no .npy file": (b"hello world", NO_NPY),
+    "empty": (b"", NO_NPY),
+    "half a header": (npy(np.ones((3, 2)))[:40], NO_NPY),
+    "an unbalanced header": (npy_of("{'descr': '<f4', ("), NO_NPY),
+    "a header that is no table": (npy_of("{[]: 1}"), NO_NPY),
+    "a type of nothing": (npy_of(HUGE.replace("'<f4'", "()")), NO_NPY),
+    "an endless header": (npy_of("-" * 20_000), NO_NPY),
+}
+
+
+@pytest.mark.parametrize(("file", "message"), FILES.values(), ids=FILES)
+def test_a_bad_npy_file_is_refused_at_its_field(gateway: TestClient, file: bytes, message: str) -> None:
+    form = {"sample_0": json.dumps(progress({"video_embeddings": {"__numpy_file__": "video"}}))}
+    check_refused(gateway.post(NPY, data=form, files={"video": ("video.npy", file)}), (VIDEO_AT, message))
+
+
+SAMPLE = (None, FORM["sample_0"])
+MISSING = dumped(progress({**FIRST, "video_embeddings": {"__numpy_file__": "other"}}))
+FORMS: dict[str, tuple[list[tuple[str, Any]], list[Any], str]] = {
+    "no sample": ([("use_frame_steps", (None, "true"))], ["samples"], "expected at least one sample, got none"),
+    "a gap": ([("sample_0", SAMPLE), ("sample_2", SAMPLE)], ["sample_1"], "expected a sample, got none, but sample_2"),
+    "no first": ([("sample_1", SAMPLE)], ["sample_0"], "expected a sample, got none, but sample_1"),
+    "another spelling": ([("sample_01", SAMPLE)], ["sample_01"], "expected sample_0, sample_1 and so on, got .*"),
+    "steps that are none": ([("sample_0", SAMPLE), ("use_frame_steps", (None, "yes"))], ["use_frame_steps"], ".*, got 'yes'"),
+    "no JSON": ([("sample_0", (None, "{"))], ["sample_0"], "expected JSON, got: .*"),
+    "no object": ([("sample_0", (None, "5"))], ["samples", 0], "expected an object, got 5"),
+    "JSON in JSON": ([("sample_0", (None, '"{}"'))], ["samples", 0], "expected an object, got '{}'"),
+    "a part that was not sent": ([("sample_0", (None, MISSING))], VIDEO_AT, r"expected a \.npy part named 'other', got none"),
+    "one field twice": ([("sample_0", SAMPLE)] * 2, ["sample_0"], "expected one part of this name, got several"),
+    "one file twice": ([("sample_0", SAMPLE), *[("a", ("a.npy", b""))] * 2], ["a"], "expected one part of this name, got several"),
+    "a sample as a file": ([("sample_0", ("sample_0", b"{}"))], ["sample_0"], "expected a form field, got a file"),
+    "steps as a file": ([("sample_0", SAMPLE), ("use_frame_steps", ("steps", b"true"))], ["use_frame_steps"], "expected a form field, got a file"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("parts", "path", "message"), FORMS.values(), ids=FORMS)
+def test_no_part_of_a_form_is_lost_silently(
+    gateway: TestClient, parts: list[tuple[str, Any]], path: list[Any], message: str
+) -> None:
+    check_refused(gateway.post(NPY, files=parts), (path, message))
+
+
+NAMELESS = b"--b\r\nContent-Disposition: form-data\r\n\r\nx\r\n--b--\r\n"
+NO_FORM = "content-type: expected multipart/form-data with a boundary, got"
+UNREADABLE: dict[str, tuple[int, str, str, bytes]] = {
+    "JSON": (415, f"{NO_FORM} application/json", "application/json", b"[]"),
+    "no content type": (415, f"{NO_FORM} none", "", b"[]"),
+    "no boundary": (415, f"{NO_FORM} multipart/form-data", "multipart/form-data", NAMED),
+    "no multipart": (400, "body: expected multipart/form-data, got: ", MULTIPART, b"hello"),
+    "nothing": (400, "body: expected its last boundary", MULTIPART, b""),
+    "no name": (400, "body: expected multipart/form-data, got: ", MULTIPART, NAMELESS),
+    "cut off": (400, "body: expected its last boundary", MULTIPART, NAMED + SAMPLE[1].encode() + b"\r\n" + NAMED + b"{"),
+    "cut off in a boundary": (400, "body: expected its last boundary", MULTIPART, NAMED + SAMPLE[1].encode() + b"\r\n--"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("code", "message", "content_type", "body"), UNREADABLE.values(), ids=UNREADABLE)
+def test_what_is_no_multipart_is_refused(
+    gateway: TestClient, code: int, message: str, content_type: str, body: bytes
+) -> None:
+    assert failure(gateway.post(NPY, content=body, headers={"Content-Type": content_type}), code).startswith(message)
+
+
+@pytest.mark.parametrize("charset", ["undefined", "punycode", "rot13", "base64", "idna", "nowhere", "\xfc", ""])
+def test_no_charset_breaks_the_gateway(gateway: TestClient, charset: str) -> None:
+    content_type = f'{MULTIPART}; charset="{charset}"'.encode("latin-1")
+    body = NAMED + b"{}\r\n--b--\r\n"
+    assert gateway.post(NPY, content=body, headers={"Content-Type": content_type}).status_code in (400, 422)  # type: ignore[dict-item]
+
+
+@pytest.mark.parametrize("path", ["/evaluate_batch", NPY, "/viewer/score", "/live/reports"])
+@pytest.mark.parametrize("content", [b" " * (2**20 + 1), [b" " * 2**19] * 3], ids=["announced", "in chunks"])
+def test_too_large_a_body_is_a_413(gateway: TestClient, path: str, content: Any) -> None:
+    form = (NAMED for _ in range(1)) if path in (NPY, "/viewer/score") else ()
+    body = content if isinstance(content, bytes) else (part for parts in (form, content) for part in parts)
+    kind = "application/json" if path == "/live/reports" else MULTIPART
+    response = gateway.post(path, content=body, headers={"Content-Type": kind})
+    assert failure(response, 413) == "body: expected at most 1048576 bytes, got more"
+
+
+def test_json_is_smaller_than_other_bodies() -> None:
+    with inside() as client:
+        response = client.post("/evaluate_batch", content=b" " * (32 * 2**20 + 1))
+        assert failure(response, 413) == "body: expected at most 33554432 bytes, got more"
+
+
+@pytest.mark.parametrize("path", ["/health", "/gpu_status", "/model_info", "/viewer/served", "/evaluate_batch"])
+def test_a_triton_that_is_down_is_a_503(gateway: TestClient, path: str) -> None:
+    response = gateway.get(path) if path != "/evaluate_batch" else gateway.post(path, content=SEED_PAYLOAD)
+    assert "connect" in failure(response, 503)
+    assert response.headers["Retry-After"] == "1"
+
+
+def test_unknown_paths_and_methods_are_told_as_json(gateway: TestClient) -> None:
+    assert failure(gateway.get("/evaluate"), 404) == "Not Found"
+    assert failure(gateway.post("/evaluate"), 404) == "Not Found"
+    assert failure(gateway.get("/evaluate_batch"), 405) == "Method Not Allowed"
+
+
+# Who may ask
+
+KEYS: dict[str, tuple[dict[str, Any], bool]] = {
+    "X-API-Key": ({"X-API-Key": KEY}, True),
+    "Bearer": ({"Authorization": f"Bearer {KEY}"}, True),
+    "none": ({}, False),
+    "another": ({"X-API-Key": "sesame"}, False),
+    "another bearer": ({"Authorization": "Bearer sesame"}, False),
+    "another scheme": ({"Authorization": f"Basic {KEY}"}, False),
+    "no letters": ({"X-API-Key": b"\xfc"}, False),
+}
+GUARDED = [
+    ("POST", "/evaluate_batch"), ("POST", NPY), ("GET", "/gpu_status"), ("GET", "/model_info"), ("GET", "/metrics"),
+    ("GET", "/viewer/served"), ("POST", "/viewer/score"), ("POST", "/viewer/compare"), ("POST", "/live/reports"),
+    ("GET", "/viewer/live"), ("GET", "/viewer/live/0/frame"), ("GET", "/viewer/datasets"), ("GET", "/viewer/datasets/0"),
+    ("GET", "/viewer/datasets/0/episodes/0"), ("GET", "/viewer/datasets/0/episodes/0/videos/0"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("headers", "is_right"), KEYS.values(), ids=KEYS)
+def test_only_the_key_opens(headers: dict[str, Any], is_right: bool) -> None:
+    with inside(KEY) as client:
+        for method, path in GUARDED:
+            response = client.request(method, path, headers=headers)
+            assert (response.status_code != 401) is is_right, path
+            if not is_right:
+                assert failure(response, 401) == "key: expected X-API-Key or Authorization: Bearer, got another or none"
+        for path in ("/", "/docs", "/openapi.json", "/viewer/main.js"):
+            assert client.get(path).status_code == 200
+        assert client.get("/health").status_code == 503  # there is no Triton
+
+
+def test_browsers_may_ask_from_the_named_origin_alone(gateway: TestClient) -> None:
+    allowed = "Access-Control-Allow-Origin"
+    preflight = {"Access-Control-Request-Method": "POST", "Access-Control-Request-Headers": "x-api-key"}
+    with inside(KEY, cors_origin=(ORIGIN,)) as client:
+        response = client.options("/evaluate_batch", headers=preflight | {"Origin": ORIGIN})
+        assert (response.status_code, response.headers[allowed]) == (200, ORIGIN)
+        response = client.post("/evaluate_batch", content=SEED_PAYLOAD, headers={"Origin": ORIGIN, "X-API-Key": KEY})
+        assert response.headers[allowed] == ORIGIN
+        other = {"Origin": "http://other.example"}
+        assert allowed not in client.options("/evaluate_batch", headers=preflight | other).headers
+        assert allowed not in client.get("/health", headers=other).headers
+    assert allowed not in gateway.get("/health", headers={"Origin": ORIGIN}).headers
+
+
+def test_the_schemas_are_those_of_the_evaluation_server_and_not_the_pages(gateway: TestClient) -> None:
+    document = gateway.get("/openapi.json").json()
+    names = ("evaluate_batch", "evaluate_batch_npy", "gpu_status", "health", "model_info", "metrics")
+    assert document["paths"].keys() == {f"/{name}" for name in names}
+    codes = document["paths"]["/evaluate_batch"]["post"]["responses"].keys()
+    assert codes == {"200", "408", "413", "422", "502", "503", "504"}

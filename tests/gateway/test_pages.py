@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: MIT
+"""The files of the page and of the endpoints' documentation. No Triton is needed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from gateways import TestClient, inside
+from paths import ROOT
+
+GATEWAY = ROOT / "gateway" / "rfm_gateway"
+STATIC = GATEWAY / "viewer" / "static"
+PAGE_BYTES = 300_000  # of the page without the charting library
+JAVASCRIPT, STYLE, HTML = "javascript", "text/css", "text/html"
+FILES = {
+    "": HTML,
+    "viewer/main.js": JAVASCRIPT,
+    "viewer/page.css": STYLE,
+    "viewer/uplot/uPlot.esm.js": JAVASCRIPT,
+    "docs": HTML,
+    "docs/swagger-ui/swagger-ui-bundle.js": JAVASCRIPT,
+    "docs/swagger-ui/swagger-ui.css": STYLE,
+}
+NO_FILES = [
+    "viewer/", "viewer/missing.js", "viewer/routes.py", "viewer/..%2fapp.py", "viewer/%2e%2e/%2e%2e/app.py",
+    "viewer//etc/passwd", "viewer/%2fetc%2fpasswd", "viewer/uplot/..%2f..%2fapp.py", "viewer/main.js%00.css",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def gateway() -> Iterator[TestClient]:
+    with inside() as client:
+        yield client
+
+
+@pytest.mark.parametrize(("path", "kind"), FILES.items())
+def test_every_file_has_its_type_and_the_policy_of_the_page(gateway: TestClient, path: str, kind: str) -> None:
+    response = gateway.get(f"/{path}")
+    assert response.status_code == 200
+    assert kind in response.headers["content-type"]
+    policy = dict(part.split(" ", 1) for part in response.headers["content-security-policy"].split("; "))
+    assert policy["default-src"] == "'none'"
+    assert policy["script-src"] == policy["style-src"] == policy["connect-src"] == "'self'"
+    assert "unsafe" not in response.headers["content-security-policy"]
+    assert response.headers["x-content-type-options"] == "nosniff"
+    again = gateway.get(f"/{path}", headers={"If-None-Match": response.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    assert gateway.head(f"/{path}").status_code == 200
+
+
+@pytest.mark.parametrize("path", NO_FILES)
+def test_no_other_file_is_served(gateway: TestClient, path: str) -> None:
+    response = gateway.get(f"/{path}")
+    assert (response.status_code, response.json()) == (404, {"detail": "Not Found"})
+
+
+def test_no_viewer_turns_the_page_off() -> None:
+    with inside(viewer=False) as gateway:
+        for path in ("/", "/viewer/main.js", "/viewer/served", "/viewer/datasets", "/viewer/live/0/frame"):
+            assert gateway.get(path).status_code == 404
+        for path in ("/viewer/score", "/live/reports"):
+            assert gateway.post(path).status_code == 404
+        assert gateway.get("/docs").status_code == 200
+
+
+def test_the_page_names_nothing_of_elsewhere_and_is_small() -> None:
+    for file in (*STATIC.iterdir(), *(GATEWAY / "docs").iterdir()):
+        assert "://" not in file.read_text(), file
+        assert "style=" not in file.read_text(), file
+    assert sum(file.stat().st_size for file in STATIC.iterdir()) < PAGE_BYTES
+
+
+@pytest.mark.parametrize(
+    "folder", [*GATEWAY.glob("vendored/*"), *Path(__file__).parent.glob("vendored/*")], ids=lambda p: p.name
+)
+def test_vendored_files_are_those_of_the_pinned_packages(folder: Path) -> None:
+    told = json.loads((folder / "vendored.json").read_text())
+    assert told.keys() == {"package", "version", "licence", "tarball_sha256", "files"}
+    assert "LICENSE" in told["files"]
+    there = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in folder.iterdir()}
+    del there["vendored.json"]
+    assert there == told["files"]
+
+
+@pytest.mark.slow
+def test_the_page_is_in_the_distribution(tmp_path: Path) -> None:
+    ignored = shutil.ignore_patterns("build", "*.egg-info", "__pycache__")
+    source = shutil.copytree(ROOT / "gateway", tmp_path / "gateway", ignore=ignored)
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    words = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(tmp_path), str(source)]
+    subprocess.run([*pip, *words], check=True, timeout=120)
+    (wheel,) = tmp_path.glob("*.whl")
+    kinds = ("docs/*", "viewer/static/*", "vendored/*/*")
+    expected = {f"rfm_gateway/{file.relative_to(GATEWAY)}" for kind in kinds for file in GATEWAY.glob(kind)}
+    assert expected <= set(zipfile.ZipFile(wheel).namelist())
