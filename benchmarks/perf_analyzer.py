@@ -31,7 +31,7 @@ from rich.console import Console
 
 from rfm.launch.installation import find_installation
 from rfm.launch.temporary import temporary_server
-from rfm_client.cli.perf_input import write_perf_analyzer_input
+from rfm_client.cli.made_up import write_perf_analyzer_input
 from rfm_client.cli.show import table
 
 WHEEL = "tritonclient==2.51.0"

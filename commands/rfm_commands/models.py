@@ -15,48 +15,38 @@ from typing import Annotated
 
 import typer
 
-from rfm.launch.admin_key import AdminKeyError, take_key
+from rfm.launch.admin_key import take_key
 from rfm.launch.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
+from rfm_client.cli.command import OptionsOf, with_options
+from rfm_client.cli.options import AccessFiles
 from rfm_client.transport.access import Access
+from rfm_commands.command import AdminKeyFile, RfmCommand, fail
 from rfm_commands.rollout import Rollout, models_of, previous_version
-from rfm_export.errors import ExportError
 
 DEFAULT_URL = "grpc://127.0.0.1:8001"
 SECURE = "grpcs://"
-EXIT_FAILED = 1
 
 app = typer.Typer(no_args_is_help=True)
 
-AdminKeyFile = Annotated[
-    Path | None,
-    typer.Option(help="File with the server's admin key; else RFM_ADMIN_KEY.", show_default=False),
-]
 Name = Annotated[str, typer.Argument(help="As in rfm export --name.")]
 Repository = Annotated[Path, typer.Option(help="The repository that the server reads.")]
 Url = Annotated[str, typer.Option(help="grpc://host:port of the server, with TLS grpcs://host:port.")]
 
 
 @app.callback()
+@with_options
 def models(
     context: typer.Context,
-    ca_file: Annotated[
-        Path | None, typer.Option(envvar="RFM_CA_FILE", help="Authorities (PEM) to trust; else gRPC's own.")
-    ] = None,
-    client_certificate: Annotated[
-        Path | None, typer.Option(envvar="RFM_CLIENT_CERTIFICATE", help="By which the server knows you (PEM).")
-    ] = None,
-    client_key: Annotated[
-        Path | None, typer.Option(envvar="RFM_CLIENT_KEY", help="The certificate's key (PEM).")
-    ] = None,
+    files: Annotated[AccessFiles, OptionsOf(AccessFiles, only=("ca_file", "client_certificate", "client_key"))],
 ) -> None:
     """List, load, unload and replace the models of a running server."""
     try:
-        context.obj = Access(ca_file, client_certificate, client_key)
+        context.obj = files.read()
     except ValueError as error:
-        raise _failed(error) from None
+        fail(str(error))
 
 
-@app.command("list")
+@app.command("list", cls=RfmCommand)
 def list_models(context: typer.Context, url: Url = DEFAULT_URL, admin_key_file: AdminKeyFile = None) -> None:
     """Each version of each model, its state, and why it is not ready."""
     with _server(context, url, admin_key_file) as server:
@@ -66,7 +56,7 @@ def list_models(context: typer.Context, url: Url = DEFAULT_URL, admin_key_file: 
         typer.echo("  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip())
 
 
-@app.command()
+@app.command(cls=RfmCommand)
 def load(
     context: typer.Context,
     name: Name,
@@ -81,7 +71,7 @@ def load(
             typer.echo(f"{model}: {', '.join(map(str, server.ready_versions(model)))} ready")
 
 
-@app.command()
+@app.command(cls=RfmCommand)
 def unload(
     context: typer.Context,
     name: Name,
@@ -97,7 +87,7 @@ def unload(
             typer.echo(f"{model}: unloaded")
 
 
-@app.command()
+@app.command(cls=RfmCommand)
 def rollout(
     context: typer.Context,
     name: Name,
@@ -115,7 +105,7 @@ def rollout(
         typer.echo(f"{name}: version {version} is served")
 
 
-@app.command()
+@app.command(cls=RfmCommand)
 def rollback(
     context: typer.Context,
     name: Name,
@@ -132,22 +122,12 @@ def rollback(
 
 @contextmanager
 def _server(context: typer.Context, url: str, admin_key_file: Path | None) -> Iterator[RepositoryApi]:
-    """The server; what goes wrong with it ends the command with one line."""
     access: Access = context.obj
-    try:
-        if access.uses_tls and not url.startswith(SECURE):
-            raise RepositoryApiError(f"url: expected {SECURE}host:port with certificates, got {url}")
-        with RepositoryApi(
-            url, take_key(admin_key_file, os.environ), access.grpc_options(url.partition(":")[0])
-        ) as server:
-            yield server
-    except (AdminKeyError, RepositoryApiError, ExportError, OSError) as error:
-        raise _failed(error) from None
-
-
-def _failed(error: Exception) -> typer.Exit:
-    typer.echo(f"rfm: {error}", err=True)
-    return typer.Exit(EXIT_FAILED)
+    if access.uses_tls and not url.startswith(SECURE):
+        raise RepositoryApiError(f"url: expected {SECURE}host:port with certificates, got {url}")
+    options = access.grpc_options(url.partition(":")[0])
+    with RepositoryApi(url, take_key(admin_key_file, os.environ), options) as server:
+        yield server
 
 
 def _row(entry: ModelVersion) -> tuple[str, ...]:

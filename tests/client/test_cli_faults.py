@@ -18,7 +18,7 @@ from gateways import Gateway, running
 from one_model import OneModelServer
 from rfm.launch.process import Endpoints
 from rfm_client import RewardClient, ServerUnavailableError
-from rfm_client.cli.options import ExitCode
+from rfm_client.cli.command import ExitCode
 from rfm_client.cli.scoring import WORKERS
 from rfm_client.transport.ports import wrong_port
 from rfm_serve import wait_for

@@ -35,11 +35,12 @@ from rfm_client import (
     RewardClient,
     Trajectory,
 )
+from rfm_client.cli.command import ExitCode
 from rfm_client.cli.commands import app
 from rfm_client.cli.comparing import LEGEND, Comparison
-from rfm_client.cli.options import ExitCode, Server
+from rfm_client.cli.options import ServerOptions
+from rfm_client.cli.pictures import Panel, plot
 from rfm_client.cli.scoring import Source
-from rfm_client.cli.show import Panel, plot
 from rfm_client.data.inputs import load_trajectory
 from shelves import Shelf
 from trajectories import random_trajectory
@@ -331,7 +332,7 @@ def test_compare_refuses_the_answers_of_two_versions(
 ) -> None:
     np.save(tmp_path / "small.npy", np.zeros((2, 40, 30, 3), np.uint8))  # of another size: a request of its own
     client = RewardClient("", transports=[Shelf(after=1)])
-    monkeypatch.setattr(Server, "connected", lambda _server: client)
+    monkeypatch.setattr(ServerOptions, "connected", lambda _server, _access: client)
     result = invoke("compare", video, tmp_path / "small.npy", "--task", TASK, "--url", "grpc://127.0.0.1:1")
     assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
     assert result.stderr == "rfm-client: model_version: expected one for all videos, got 1, 2: ask again\n"

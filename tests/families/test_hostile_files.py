@@ -329,9 +329,15 @@ def test_the_links_of_the_hubs_cache_are_followed(tmp_path: Path) -> None:
 
 BAD_SETTINGS = {
     "a billion laughs": (LAUGHS, r"serve\.yaml: expected a YAML file, got aliases that stand for more"),
-    "a path as name": ("name: ../../etc", r"serve\.yaml: name: expected letters, digits, _ and -, got"),
-    "an endless name": (f"name: {'a' * 300}", r"serve\.yaml: name: expected at most 100 characters, got 300"),
-    "a batch beyond int32": ("max_batch_size: 9999999999", r"serve\.yaml: max_batch_size: expected at most 2147483647"),
+    "a path as name": (
+        "export: {name: ../../etc}",
+        r"serve\.yaml: export\.name: expected letters, digits, _ and -, got",
+    ),
+    "an endless name": (f"export: {{name: {'a' * 300}}}", r"export\.name: expected at most 100 characters, got 300"),
+    "a batch beyond int32": (
+        "export: {max_batch_size: 9999999999}",
+        r"export\.max_batch_size: expected at most 2147483647",
+    ),
     "GPUs without end": ("num_gpus: 1000000000", r"serve\.yaml: num_gpus: expected at most 4096"),
     "a key twice": (
         "batch_size: 1\nbatch_size: 2",

@@ -15,9 +15,9 @@ from rfm_client.data.orientation import Orient
 from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.hdf5_labels import check_room, hdf5_labels, sibling, write_hdf5
 from rfm_client.labelling.labelled_before import LabelFile, joined, restore
-from rfm_client.labelling.options import Format, LabelOptions
+from rfm_client.labelling.options import Format, LabelOptions, RayOptions
 from rfm_client.labelling.plan import Plan, make_plan, selected
-from rfm_client.labelling.ray_engine import Connect, Job, RayOptions, finish_all_with_ray
+from rfm_client.labelling.ray_engine import Connect, Job, finish_all_with_ray
 from rfm_client.labelling.recipe import Recipe
 from rfm_client.labelling.run import Failure, Run, Watch
 from rfm_client.labelling.scorer import Scorer
