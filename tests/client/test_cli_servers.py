@@ -145,24 +145,22 @@ def test_status_shows_the_gpus_and_what_waits(served: Served, tmp_path: Path) ->
 
 
 def test_status_without_metrics_shows_the_rest_and_says_so(served: Served) -> None:
-    with silent_server() as (url, _):
-        address = url  # nobody listens there any more
+    address = free_url()
     result = invoke("status", "--url", served.url("http"), "--metrics-url", f"{address}/metrics")
     assert result.exit_code == 0
     assert f"no metrics of the machine: {address}/metrics: " in result.stdout
     assert "give their URL (--metrics-url)" in result.stdout
     requests, batches = rows(result.stdout, f"{MODEL} ")
     assert batches[6] == "load"
-    assert requests[1:3] == ["1", "READY"]
-    assert requests[5:] == ["-", "-"]
+    assert (requests[1:3], requests[5:]) == (["1", "READY"], ["-", "-"])
 
 
-def test_wait_returns_when_the_model_is_ready(served: Served, protocol: str) -> None:
-    result = ask(served, "wait", protocol=protocol)
+def test_wait_returns_when_the_model_is_ready(served: Served) -> None:
+    result = ask(served, "wait")
     assert (result.exit_code, result.output) == (0, "")
 
 
-def toy_samples(client: RewardClient, kind: str, lengths: str = "8", *, use_frames: bool = False) -> list[Sample]:
+def made_up(client: RewardClient, kind: str, lengths: str, *, use_frames: bool = False) -> list[Sample]:
     return MadeUpSamples(kind, 3, parse_lengths(lengths), use_frames, seed=5).samples(client)  # type: ignore[arg-type]
 
 
@@ -173,7 +171,7 @@ def test_sample_shows_what_the_client_gives(served: Served, kind: str, use_frame
     result = ask(served, "sample", *words, *(["--use-frames"] if use_frames else []), "--json", "-")
     assert (result.exit_code, result.stderr) == (0, "")
     with served.client("grpc", MODEL) as client:
-        samples = toy_samples(client, kind, "2,5", use_frames=use_frames)
+        samples = made_up(client, kind, "2,5", use_frames=use_frames)
         expected = client.evaluate(samples)
     answers = json.loads(result.stdout)["samples"]
     assert len(answers) == len(expected)
@@ -232,7 +230,7 @@ def test_bench_input_holds_the_tensors_of_the_contract(
     assert (result.exit_code, result.stderr) == (0, "")
     assert result.stdout == f"{expected} --async --concurrency-range 1:16:5\n"
     with served.client("grpc", MODEL) as client:
-        samples = toy_samples(client, kind, "4-6", use_frames=use_frames)
+        samples = made_up(client, kind, "4-6", use_frames=use_frames)
     requests = json.loads(target.read_text())["data"]
     assert len(requests) == 3
     for request, sample in zip(requests, samples, strict=True):
@@ -314,32 +312,24 @@ def test_an_interrupt_ends_it_without_a_traceback(words: list[str]) -> None:
     assert (process.returncode, told) == (ExitCode.INTERRUPTED, "rfm-client: interrupted\n")
 
 
+URL = "expected grpc://host:port or http://host:port, or grpcs:// or https://, got"
+LENGTHS = "expected a length (8), several (4,8,16) or a range (4-16)"
 USAGE: dict[str, tuple[list[str], str]] = {
     "no videos": (["score"], "Missing argument"),
     "unknown option": (["score", "a.mp4", "--what"], "No such option"),
-    "url": (
-        ["sample", "--url", "localhost:8001"],
-        "expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
-    ),
-    "status url": (
-        ["status", "--url", "localhost:8001"],
-        "expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
-    ),
+    "url": (["sample", "--url", "localhost:8001"], URL),
+    "port of a url": (["status", "--url", "http://localhost:99999"], URL),
     "json over a video": (["score", "--json", "a.mp4", "b.mp4"], "expected a file that ends in .json or -, got a.mp4"),
     "json nowhere": (["status", "--json", "/nowhere/a.json"], "expected a folder at /nowhere, got none"),
     "picture": (["score", "a.mp4", "--plot", "a.gif"], "expected a file that ends in .png, .pdf, .svg, got a.gif"),
     "many pictures": (["score", *["a.mp4"] * 51, "--plot", "a.png"], "expected at most 50 videos, got 51"),
     "array": (["score", "a.mp4", "--npy", "a.npz"], "expected a .npy file or a folder, got a.npz"),
     "one array": (["score", "a.mp4", "b.mp4", "--npy", "a.npy"], "expected a folder for 2 videos, got a.npy"),
-    "lengths": (["sample", "--num-frames", "8-4"], "expected a length (8), several (4,8,16) or a range (4-16)"),
-    "dense": (["score", "a.mp4", "--frame-steps", "1"], "expected 0 or at least 2, got 1"),
-    "port": (
-        ["status", "--url", "http://localhost:99999"],
-        "expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
-    ),
+    "lengths": (["sample", "--num-frames", "8-4"], LENGTHS),
+    "long": (["sample", "--num-frames", "10000"], LENGTHS),
+    "no length": (["sample", "--num-frames", "0"], LENGTHS),
+    "dense": (["score", "a.mp4", "--frame-steps", "1"], "'--frame-steps': expected 0 or at least 2, got 1"),
     "nothing to compare": (["compare", "a.mp4"], "expected at least 2 videos, got 1"),
-    "long": (["sample", "--num-frames", "10000"], "expected a length (8), several (4,8,16) or a range (4-16)"),
-    "no length": (["sample", "--num-frames", "0"], "expected a length (8), several (4,8,16) or a range (4-16)"),
     "metrics": (
         ["status", "--url", "http://a:1", "--url", "http://b:1", "--metrics-url", "http://a:2"],
         "expected one --url with it, got several",

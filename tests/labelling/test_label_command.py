@@ -233,13 +233,6 @@ def test_without_a_server_it_ends_at_once(output: Path) -> None:
     assert list(output.iterdir()) == []
 
 
-def test_score_names_the_command_for_a_file_of_several_episodes() -> None:
-    film = DATASET / "videos" / FRONT / "chunk-000" / "file-000.mp4"
-    result = invoke("score", film, "--task", "stack", "--url", f"grpc://127.0.0.1:{free_port()}")
-    assert result.exit_code != 0
-    assert "rfm-client label" in result.stderr or result.exit_code == ExitCode.UNAVAILABLE
-
-
 @pytest.mark.slow
 def test_an_engine_that_is_killed_gives_the_same_bytes_in_the_end(output: Path) -> None:
     def start(folder: Path) -> subprocess.Popen[bytes]:

@@ -79,7 +79,8 @@ class OptionsOf:
 
     def parameter(self, setting: Setting) -> inspect.Parameter:
         """What typer reads. Its default is None, so that a file or the settings' own default can decide."""
-        is_required, default = setting.name in self.required, self.defaults.get(setting.name, setting.default)
+        is_required = setting.name in self.required
+        default = None if is_required else self.defaults.get(setting.name, setting.default)
         option = self.option(setting)
         if default is True:
             option += f"/--{self.prefix}no-{setting.option.removeprefix('--')}"

@@ -27,7 +27,7 @@ from rfm_client.cli.command import (
 from rfm_client.cli.label import label
 from rfm_client.cli.made_up import MadeUpSamples, are_frames, write_perf_analyzer_input
 from rfm_client.cli.options import AccessFiles, OutputOptions, PrefixOptions, ServerOptions, VideoOptions
-from rfm_client.cli.show import Rows, print_tables, scores_table, status_tables
+from rfm_client.cli.show import RowByRow, print_tables, scores_table, status_tables
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.names import frames_name
@@ -83,7 +83,7 @@ def score(
     if prefix.sampling is not None and video.max_frames is not None:
         expected = f"expected no --max-frames with it, got {video.max_frames}"
         raise typer.BadParameter(expected, param_hint="'--sampling'")
-    rows = Rows(scoring.COLUMNS, videos)
+    rows = RowByRow(scoring.COLUMNS, videos)
     arrays = output.array_files(scoring.unique_stems(videos))
 
     def tell(number: int, outcome: scoring.Outcome) -> None:

@@ -153,7 +153,7 @@ class PrefixOptions(Settings):
         try:
             Sampling.of(self.sampling, self.frames, trained_frames=1)
         except ValueError as error:
-            raise ConfigError("frames", str(error)) from None
+            raise ConfigError("frames", str(error).removeprefix("frames: ")) from None
 
     @property
     def rule(self) -> str:

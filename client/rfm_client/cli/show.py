@@ -51,7 +51,7 @@ def shortened(name: str, width: int) -> str:
 
 
 @dataclass(frozen=True)
-class Name:
+class ShortName:
     """A name or a path in a table, shortened to the room that the table has."""
 
     text: str
@@ -88,7 +88,7 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, 
         header = textwrap.fill(column, max(widest, *map(len, column.split()))) if is_short and column else column
         shown.add_column(Text(header), overflow="fold", no_wrap=is_short)
     for row in rows:
-        shown.add_row(*map(Name, row[:names]), *map(Text, row[names:]))
+        shown.add_row(*map(ShortName, row[:names]), *map(Text, row[names:]))
     return shown
 
 
@@ -101,7 +101,7 @@ def print_tables(*tables: object) -> None:
     console.print(*tables, sep="\n", markup=False, highlight=False)
 
 
-class Rows:
+class RowByRow:
     """A table on standard output that is written row by row, as wide as the terminal.
 
     columns: headers and widths; the first is as wide as ``names``, all that it will have, and the terminal allow
