@@ -40,8 +40,8 @@ def gateway(config: Annotated[GatewayConfig, OPTIONS]) -> None:
         api_key, tls = config.api_key(os.environ), config.tls
         app = create_app(config, api_key)
         check_free(host, port, "gateway", port_option="--port")
-    except ConfigError as error:
-        raise OPTIONS.refused(error) from None
+    except ConfigError:  # with_options names its option
+        raise
     except (ValueError, OSError) as error:
         raise typer.BadParameter(str(error)) from None
     if api_key is None and not is_loopback(host):

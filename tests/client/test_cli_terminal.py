@@ -75,7 +75,7 @@ def test_scores_and_comparisons_fit_a_terminal_and_name_each_file(demo_server: E
     assert len(second) == 1
 
 
-@pytest.mark.parametrize("width", range(1, 40))
+@pytest.mark.parametrize("width", [1, 3, 4, 12, 20, 29, 30, 39])
 def test_a_name_is_shortened_in_the_middle(width: int) -> None:
     name = "/data/of/a/robot/episode_7.mp4"
     short = shortened(name, width)

@@ -122,37 +122,21 @@ BAD = {
         r"serve\.yaml: model_path: expected once, got export\.checkpoint twice",
     ),
     "a section that is a list": ("serve: [1]", r"serve\.yaml: serve: expected keys and values, got list"),
-    "a section that is false": ("serve: false", r"serve\.yaml: serve: expected keys and values, got bool"),
     "text for a number": ("batch_size: many", r"serve\.yaml: batch_size: expected int or null, got 'many'"),
-    "text for a number of a section": (
-        "export: {batch_size: many}",
-        r"serve\.yaml: export\.batch_size: expected int or null, got 'many'",
-    ),
     "true for a number": ("num_gpus: true", r"serve\.yaml: num_gpus: expected int or null, got True"),
     "a number for a file": ("serve: {grpc_key: 1}", r"serve\.yaml: serve\.grpc_key: expected str or null, got 1"),
     "numbers for texts": ("gateway: {cors_origin: [1]}", r"gateway\.cors_origin: expected list of str, got \[1\]"),
-    "text for texts": (
-        "gateway: {cors_origin: http://a}",
-        r"gateway\.cors_origin: expected list of str, got 'http://a'",
-    ),
-    "null for a number": ("gateway: {timeout: null}", r"serve\.yaml: gateway\.timeout: expected float, got None"),
     "no number": ("gateway: {timeout: .nan}", r"serve\.yaml: gateway\.timeout: expected a finite number, got nan"),
-    "infinity": ("gateway: {timeout: .inf}", r"serve\.yaml: gateway\.timeout: expected a finite number, got inf"),
     "a number for ever": ("gateway: {timeout: 1.0e+300}", r"gateway\.timeout: expected at most 86400\.0, got 1e\+300"),
     "seconds for ever": (
         "serve: {hang_s: 99999999999}",
         r"serve\.hang_s: expected at most 2147483647, got 99999999999",
     ),
-    "true for seconds": ("gateway: {timeout: true}", r"serve\.yaml: gateway\.timeout: expected float, got True"),
     "another dtype": (
         "export: {dtype: int8}",
         r"serve\.yaml: export\.dtype: expected one of float32, bfloat16, float16 or null, got 'int8'",
     ),
     "too small": ("batch_size: 0", r"serve\.yaml: batch_size: expected at least 1, got 0"),
-    "too small a batch": (
-        "export: {max_batch_size: 0}",
-        r"serve\.yaml: export\.max_batch_size: expected at least 1, got 0",
-    ),
     "a truth that is a number": ("gateway: {viewer: 1}", r"serve\.yaml: gateway\.viewer: expected bool, got 1"),
     "a port that is none": (
         "serve: {grpc_port: 70000}",
@@ -167,19 +151,11 @@ BAD = {
         "server_url: http://localhost:8000",
         r"server_url: expected an IP address without port \(http_port\), such as .*, got 'localhost:8000'",
     ),
-    "an IPv6 address with a port": (
-        'serve: {host: "[::1]:8000"}',
-        r"serve\.host: expected an IP .*, got '\[::1\]:8000'",
-    ),
     "an address of one link": ('serve: {host: "fe80::1%eth0"}', r"serve\.host: expected an IP .*, got 'fe80::1%eth0'"),
     "a host by name": ("serve: {host: gpu.example}", r"serve\.host: expected an IP address .*, got 'gpu\.example'"),
     "half a certificate": (
         "serve: {grpc_key: a}",
         r"serve\.yaml: serve\.grpc_certificate, grpc_key: expected both or none, got one",
-    ),
-    "half a certificate of the gateway": (
-        "gateway: {key: a}",
-        r"serve\.yaml: gateway\.certificate, key: expected both or none, got one",
     ),
     "less memory than a body": (
         "gateway: {max_memory_mib: 100}",

@@ -32,7 +32,6 @@ pytestmark = [pytest.mark.triton, pytest.mark.slow]
 CONNECTIONS = 24  # of each protocol; Triton has 8 threads for HTTP
 DEADLINE_S = 20.0
 POLL_S = 0.02
-LARGE_BYTES = 5 * 2**20
 WAITS_AT_IMPORT = """
 import time, pathlib
 pathlib.Path({begun!r}).touch()
@@ -99,18 +98,6 @@ def test_callers_are_answered_while_another_model_loads(running: Running, tmp_pa
             # What is told over gRPC does not wait either.
             assert ["held", "1", "LOADING"] in [line.split() for line in running.models("list").splitlines()]
     running.models("unload", "held")
-
-
-def test_a_large_configuration_is_loaded_and_told(running: Running) -> None:
-    """Larger than gRPC's own limit of a message, 4 MiB."""
-    export_plain(running.repository, "large")
-    with RepositoryApi(running.endpoints.grpc_url, KEY) as server:
-        server.load("large")
-        config = server.config("large", 1)
-        config["parameters"]["padding"] = {"string_value": "x" * LARGE_BYTES}
-        server.load("large", config)
-        assert len(server.config("large", 1)["parameters"]["padding"]["string_value"]) == LARGE_BYTES
-        server.unload("large")
 
 
 @pytest.mark.parametrize(

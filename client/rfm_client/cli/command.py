@@ -6,7 +6,7 @@ from __future__ import annotations
 import functools
 import inspect
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -116,19 +116,6 @@ class OptionsOf:
             given[each.name] = tuple(value) if isinstance(value, list) else value
         return given
 
-    def made(self, given: Given) -> Any:
-        """The settings with those given. Raises typer.BadParameter, which names the options."""
-        try:
-            return self.settings(**{**self.defaults, **given})
-        except ConfigError as error:
-            raise self.refused(error) from None
-
-    def refused(self, error: ConfigError) -> typer.BadParameter:
-        """The same error, of options. Raise it."""
-        known = settings_of(self.settings)
-        options = (self.option(known[name]) if name in known else name for name in error.key.split(", "))
-        return typer.BadParameter(error.expected, param_hint=f"'{', '.join(options)}'")
-
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
     """Gives a command an option for each setting of its parameters that are ``Settings`` or marked by ``OptionsOf``."""
@@ -143,10 +130,14 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(**values: Any) -> None:
-        for name, mark in marked.items():
-            given = mark.taken_from(values)
-            values[name] = given if get_args(hints[name])[:1] == (Given,) else mark.made(given)
-        command(**values)
+        try:
+            for name, mark in marked.items():
+                given = mark.taken_from(values)
+                is_given = get_args(hints[name])[:1] == (Given,)
+                values[name] = given if is_given else mark.settings(**{**mark.defaults, **given})
+            command(**values)
+        except ConfigError as error:
+            raise _named(error, marked.values()) from None
 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # what typer reads
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
@@ -239,6 +230,16 @@ def usage_errors(option: str) -> Iterator[None]:
 def missing_package(error: ImportError) -> str:
     """What is missing, with the command that installs it."""
     return str(error) if "pip install" in str(error) else f'{error}: pip install "./client[cli]"'
+
+
+def _named(error: ConfigError, marks: Iterable[OptionsOf]) -> Exception:
+    """Wrong usage of the options whose settings the error names; the error itself if it names others."""
+    keys = error.key.split(", ")
+    for mark in marks:
+        options = {each.name: mark.option(each) for each in mark.chosen}
+        if options.keys() >= set(keys):
+            return typer.BadParameter(error.expected, param_hint=f"'{', '.join(options[key] for key in keys)}'")
+    return error
 
 
 def _mark(hint: Any) -> OptionsOf | None:

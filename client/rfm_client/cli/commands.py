@@ -31,6 +31,7 @@ from rfm_client.cli.show import RowByRow, print_tables, scores_table, status_tab
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.names import frames_name
+from rfm_client.contract.settings import ConfigError
 
 MIN_COMPARED = 2
 
@@ -81,8 +82,7 @@ def score(
     """Progress and success at each frame of one or many videos. One that fails does not stop the others."""
     output.check(videos)
     if prefix.sampling is not None and video.max_frames is not None:
-        expected = f"expected no --max-frames with it, got {video.max_frames}"
-        raise typer.BadParameter(expected, param_hint="'--sampling'")
+        raise ConfigError("sampling", f"expected no --max-frames with it, got {video.max_frames}")
     rows = RowByRow(scoring.COLUMNS, videos)
     arrays = output.array_files(scoring.unique_stems(videos))
 

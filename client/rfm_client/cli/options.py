@@ -195,11 +195,8 @@ class OutputOptions(Settings):
                 raise ConfigError(name, f"expected a file that ends in {', '.join(endings)}{instead}, got {value}")
             if not Path(value).parent.is_dir():
                 raise ConfigError(name, f"expected a folder at {Path(value).parent}, got none")
-        if (
-            self.npy is not None
-            and not self._npy_is_folder
-            and not (self.npy.suffix == ".npy" and self.npy.parent.is_dir())
-        ):
+        can_be_made = self.npy is None or (self.npy.suffix in ("", ".npy") and self.npy.parent.is_dir())
+        if self.npy is not None and not self.npy.is_dir() and not can_be_made:
             raise ConfigError("npy", f"expected a .npy file or a folder, got {self.npy}")
 
     @property
@@ -207,24 +204,18 @@ class OutputOptions(Settings):
         """Whether tables are shown on standard output."""
         return self.json != STANDARD_OUTPUT
 
-    @property
-    def _npy_is_folder(self) -> bool:
-        return self.npy is not None and (self.npy.is_dir() or (not self.npy.suffix and self.npy.parent.is_dir()))
-
     def check(self, videos: Sequence[str]) -> None:
-        """Raises typer.BadParameter for more videos than they take."""
+        """Raises ConfigError for more videos than they take."""
         if self.plot is not None and len(videos) > MAX_PICTURED:
-            expected = f"expected at most {MAX_PICTURED} videos, got {len(videos)}"
-            raise typer.BadParameter(expected, param_hint="'--plot'")
-        if self.npy is not None and not self._npy_is_folder and len(videos) > 1:
-            expected = f"expected a folder for {len(videos)} videos, got {self.npy}"
-            raise typer.BadParameter(expected, param_hint="'--npy'")
+            raise ConfigError("plot", f"expected at most {MAX_PICTURED} videos, got {len(videos)}")
+        if self.npy is not None and self.npy.suffix == ".npy" and len(videos) > 1:
+            raise ConfigError("npy", f"expected a folder for {len(videos)} videos, got {self.npy}")
 
     def array_files(self, stems: Sequence[str]) -> list[Path]:
         """The .npy file of each video; none if none is asked for."""
         if self.npy is None:
             return []
-        if not self._npy_is_folder:
+        if self.npy.suffix == ".npy":
             return [self.npy]
         self.npy.mkdir(exist_ok=True)
         return [self.npy / f"{stem}.npy" for stem in stems]
