@@ -10,7 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated, Any, ClassVar, Literal
 
 import typer
@@ -35,6 +34,8 @@ from rfm_client.labelling.run import Watch
 from rfm_client.labelling.scorer import ClientScorer, Scorer
 from rfm_client.labelling.summary import Summary, summarise
 from rfm_client.transport.access import Access
+
+SPEED_OVER_S = 600.0  # an episode may take minutes
 
 _MIB = 2**20
 
@@ -225,32 +226,30 @@ class ProgressBar(Watch):
 
     def __init__(self, say: Say) -> None:
         from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn, TimeRemainingColumn
+        from rich.text import Text
+
+        class Rate(TextColumn):
+            def render(self, task: Task) -> Text:
+                return Text(f"{task.speed:.1f}/s" if task.speed else "")
 
         console = Console(stderr=True)
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), Rate(""), TimeRemainingColumn())
         self._say = say
         self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TimeRemainingColumn(),
+            *columns,
             console=console,
             transient=True,
             disable=not console.is_terminal,
+            speed_estimate_period=SPEED_OVER_S,
         )
-        self._task: Any = None
-        self._num_scored = 0
-        self._began_s = 0.0
         self.num_begun = 0
 
     def __enter__(self) -> ProgressBar:
         self._bar.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
     def note(self, text: str) -> None:
@@ -259,7 +258,7 @@ class ProgressBar(Watch):
 
     def checking(self, num_episodes: int) -> None:
         """The bar counts the episodes that are checked."""
-        self._next("checking episodes", num_episodes, 0)
+        self._begin("checking episodes", num_episodes, 0)
 
     def checked(self, episode: Episode) -> None:
         """The bar advances by one episode."""
@@ -269,14 +268,12 @@ class ProgressBar(Watch):
         """The bar counts frames of labels."""
         if num_finished:
             self.note(f"{num_finished} of {num_frames} frames are labelled already")
-        self._began_s, self._num_scored, self.num_begun = time.monotonic(), 0, num_frames
-        self._next("labelling frames", num_frames, num_finished)
+        self.num_begun = num_frames
+        self._begin("labelling frames", num_frames, num_finished)
 
     def scored(self, episode: Episode) -> None:
-        """The episode's frames more."""
-        self._num_scored += episode.num_frames
-        took_s = time.monotonic() - self._began_s
-        self._advance(episode.num_frames, rate=f"{self._num_scored / max(took_s, 1e-9):.1f} frames/s")
+        """The bar advances by the frames of the episode."""
+        self._advance(episode.num_frames)
 
     def failed(self, episode: Episode, error: RewardError) -> None:
         """Writes a line with the reason."""
@@ -284,14 +281,14 @@ class ProgressBar(Watch):
         self._say(text if text.startswith(episode.name) else f"{episode.name}: {text}")
         self._advance(episode.num_frames)
 
-    def _next(self, text: str, total: int, completed: int) -> None:
-        if self._task is not None:
-            self._bar.remove_task(self._task)
-        self._task = self._bar.add_task(text, total=total, completed=completed, rate="")
+    def _begin(self, text: str, total: int, completed: int) -> None:
+        for task in self._bar.task_ids:
+            self._bar.remove_task(task)
+        self._bar.add_task(text, total=total, completed=completed)
 
-    def _advance(self, by: int, rate: str = "") -> None:
-        if self._task is not None:
-            self._bar.update(self._task, advance=by, rate=rate)
+    def _advance(self, by: int) -> None:
+        for task in self._bar.task_ids:
+            self._bar.advance(task, by)
 
 
 def _measured_s(plan: Plan, dataset: Dataset, scorer: Scorer, workers: int) -> float:
