@@ -6,6 +6,7 @@ from __future__ import annotations
 import itertools
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -198,12 +199,15 @@ def exit_code_of_outcomes(outcomes: Sequence[Outcome]) -> ExitCode:
 
 def unique_stems(names: Sequence[str]) -> list[str]:
     """A name for files about each source: its own without folder and ending, numbered where that is taken."""
-    stems: list[str] = []
+    stems: dict[str, None] = {}
+    repeated: Counter[str] = Counter()
     for name in names:
-        stem = PurePath(name.partition("?")[0]).stem or "video"
-        numbered = (f"{stem}_{number}" for number in itertools.count(2))
-        stems.append(next(free for free in itertools.chain([stem], numbered) if free not in stems))
-    return stems
+        stem = free = PurePath(name.partition("?")[0]).stem or "video"
+        while free in stems:
+            repeated[stem] += 1
+            free = f"{stem}_{repeated[stem] + 1}"
+        stems[free] = None
+    return list(stems)
 
 
 def fitted_to(
