@@ -73,7 +73,7 @@ def export(
     given: Annotated[Given, OptionsOf(ExportConfig)],
     repository: Annotated[Path, typer.Option(help="Triton model repository.")],
     source: Annotated[
-        str | None, typer.Argument(metavar="[CHECKPOINT]", help="As --checkpoint.", show_default=False)
+        str | None, typer.Argument(metavar="CHECKPOINT", help="As --checkpoint.", show_default=False)
     ] = None,
     config_file: ConfigFile = None,
     other_machine: Annotated[

@@ -98,7 +98,7 @@ def score(
             rows.write(outcome.row)
 
     with scoring.recorder(output.rrd, videos) as record, server.connected(context.obj) as client:
-        outcomes = scoring.score_all(client, videos, video, prefix, tell, record)
+        outcomes = scoring.Asking(client, video, prefix, record).score_all(videos, tell)
     rows.end(prefix.rule)
     output.write_json(documents.score_document(server, video, prefix, outcomes))
     panels = [outcome.panel for outcome in outcomes if isinstance(outcome, scoring.Scored)]

@@ -114,42 +114,36 @@ class Failed:
 
 Outcome: TypeAlias = Scored | Failed
 Tell = Callable[[int, Outcome], None]  # is called with the number of a source, and what came of it
-Record = Callable[[int, Source, FrameScores], None]  # with its frames, too, before they are forgotten; by any thread
+Record = Callable[[int, Source, FrameScores], None]  # is called by any thread
 
 
-def score_all(
-    client: RewardClient,
-    names: Sequence[str],
-    video: VideoOptions,
-    prefix: PrefixOptions,
-    tell: Tell,
-    record: Record | None = None,
-) -> list[Outcome]:
-    """The outcome of each source, in order; each is told when it is there."""
-    asking = _Asking(client, video, prefix, record)
-    with ThreadPoolExecutor(WORKERS) as pool, _progress_bar(len(names)) as advance:
-        try:
-            numbers: dict[Future[Outcome], int] = {
-                pool.submit(asking.outcome, number, name): number for number, name in enumerate(names)
-            }
-            for future in as_completed(numbers):
-                tell(numbers[future], future.result())
-                advance()
-        except BaseException:  # an interrupt, or a full disk: what has not begun shall not
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    return [future.result() for future in numbers]
+@dataclass
+class Asking:
+    """Scores one source after the other, until no server answers any more. For several threads.
 
+    record: is given each source with its frames, before they are forgotten; None: nothing is recorded
+    """
 
-class _Asking:
-    """Asks about one source after the other, until no server answers any more. For several threads."""
+    client: RewardClient
+    video: VideoOptions
+    prefix: PrefixOptions
+    record: Record | None = None
+    _gone: RewardError | None = None
 
-    def __init__(self, client: RewardClient, video: VideoOptions, prefix: PrefixOptions, record: Record | None) -> None:
-        self._client = client
-        self._video = video
-        self._prefix = prefix
-        self._record = record
-        self._gone: RewardError | None = None
+    def score_all(self, names: Sequence[str], tell: Tell) -> list[Outcome]:
+        """The outcome of each source, in order; each is told when it is there."""
+        with ThreadPoolExecutor(WORKERS) as pool, _progress_bar(len(names)) as advance:
+            try:
+                numbers: dict[Future[Outcome], int] = {
+                    pool.submit(self.outcome, number, name): number for number, name in enumerate(names)
+                }
+                for future in as_completed(numbers):
+                    tell(numbers[future], future.result())
+                    advance()
+            except BaseException:  # an interrupt, or a full disk: what has not begun shall not
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+        return [future.result() for future in numbers]
 
     def outcome(self, number: int, name: str) -> Outcome:
         """The scores of the source of this number, or why there are none."""
@@ -157,23 +151,23 @@ class _Asking:
         if self._gone is not None:
             return Failed(name, self._gone, NOT_ASKED, is_server_gone=True)
         try:
-            source = Source.read(name, self._video)
+            source = Source.read(name, self.video)
             if self._gone is not None:
                 return Failed(name, self._gone, NOT_ASKED, is_server_gone=True)
-            result = _evaluate(self._client, ProgressSample(source.trajectory), self._video, self._prefix)
+            result = _evaluate(self.client, ProgressSample(source.trajectory), self.video, self.prefix)
         except ImportError as error:
             return Failed(name, error, missing_package(error))
         except (RewardError, OSError) as error:
             message = str(error).removesuffix(f" ({name})")  # the report names the source in any case
             return Failed(name, error, message, is_server_gone=self._is_server_gone(error))
-        if self._record is not None:
-            self._record(number, source, result)
+        if self.record is not None:
+            self.record(number, source, result)
         return Scored(
             name=name,
             result=result,
             num_frames=source.trajectory.num_frames,
             times_s=source.times_of(result),
-            panel=source.panel(f'{PurePath(name).name}: "{self._video.task}"', result),
+            panel=source.panel(f'{PurePath(name).name}: "{self.video.task}"', result),
             took_s=time.monotonic() - started_s,
         )
 
@@ -183,7 +177,7 @@ class _Asking:
             error, (ServerUnavailableError, DeadlineExceededError)
         ):
             return False
-        if self._gone is None and not self._client.is_ready(timeout_s=PROBE_S):
+        if self._gone is None and not self.client.is_ready(timeout_s=PROBE_S):
             self._gone = error
         return self._gone is not None
 
