@@ -21,8 +21,6 @@ from rfm.engine import Engine
 from rfm.launch.installation import find_installation
 from rfm.launch.process import Endpoints
 
-SHARED_SERVERS = ("served", "demo_server")  # fixtures that start a server for all who only ask
-
 torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that tests start, which share the cores with other tests
 os.environ[RUN] = uuid.uuid4().hex  # by which tests know what this run has started
@@ -37,9 +35,10 @@ def engine() -> Callable[[str], Engine]:
 
 @pytest.fixture(scope="session")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """The one server of all tests that only ask: a reference checkpoint of each kind, and the demo's as ``rfm``."""
     folder = tmp_path_factory.mktemp("served")
-    repository = folder / "model_repository"
-    for config in (*goldens.REWIND, *goldens.WITH_ENCODERS, *goldens.VLM):
+    repository = shutil.copytree(ROOT / "model_repository", folder / "model_repository")
+    for config in goldens.SERVED:
         rfm_export.export(config.checkpoint, repository, serve_config(config, config.name))
     with (
         (folder / "tritonserver.log").open("wb") as log,
@@ -49,15 +48,9 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 
 @pytest.fixture(scope="session")
-def demo_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Endpoints]:
-    """A server of the demo's repository, whose checkpoint has the default name."""
-    folder = tmp_path_factory.mktemp("demo")
-    repository = shutil.copytree(ROOT / "model_repository", folder / "model_repository")
-    with (
-        (folder / "tritonserver.log").open("wb") as log,
-        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
-    ):
-        yield server.endpoints
+def demo_server(served: Served) -> Endpoints:
+    """Where the demo's checkpoint is asked under the name that clients expect."""
+    return served.endpoints
 
 
 @pytest.fixture(autouse=True)
@@ -80,13 +73,12 @@ def protocol(request: pytest.FixtureRequest) -> str:
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Whoever asks a server of the whole run asks a Triton. Where two processes test, one of them has that server.
+    """Whoever asks the shared server asks a Triton. Where two processes test, one of them has that server.
 
     The tests of a file stay together, too, since they share what its fixtures start.
     """
     for item in items:
-        names = getattr(item, "fixturenames", ())
-        shared = next((server for server in SHARED_SERVERS if server in names), None)
+        shared = "served" in getattr(item, "fixturenames", ())
         if shared:
             item.add_marker("triton")
-        item.add_marker(pytest.mark.xdist_group(shared or str(item.path)))
+        item.add_marker(pytest.mark.xdist_group("served" if shared else str(item.path)))

@@ -4,13 +4,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
-from types import TracebackType
-from typing import TYPE_CHECKING, Literal, cast, overload
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
-from rfm_client.call import Call, CallOptions, check_known
 from rfm_client.contract.errors import DeadlineExceededError, InvalidSampleError, ModelNotFoundError, RewardError
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.names import DEFAULT_MODEL, Part, encoder_name, frames_name
@@ -19,11 +17,11 @@ from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample
 from rfm_client.episodes.async_episodes import AsyncEpisode, AsyncEpisodes
 from rfm_client.episodes.options import EpisodeOptions, EpisodeSettings
 from rfm_client.episodes.windows import Window, WindowScorer
-from rfm_client.scorer import Scorer
-from rfm_client.transport.access import Access, AccessOptions
+from rfm_client.scoring.call import Call, CallOptions
+from rfm_client.scoring.samples import SampleScorer
+from rfm_client.transport.access import Access
 from rfm_client.transport.calls import Transport, connect
 from rfm_client.transport.deadline import Deadline, check_timeout
-from rfm_client.transport.host_names import of_urls
 from rfm_client.transport.in_flight import InFlight
 from rfm_client.transport.one_process import OneProcess
 from rfm_client.transport.servers import PROBE_TIMEOUT_S, Servers
@@ -36,24 +34,6 @@ DEFAULT_IN_FLIGHT = 128  # twice the usual batch: while one is scored, the next 
 READY_POLL_S = 0.2
 
 
-class ClientOptions(AccessOptions, total=False):
-    """How a client works.
-
-    model: name under which the checkpoint was exported (``rfm``); raw frames go to ``<model>_frames``
-    timeout_s: the longest that a call may take, retries included, at most 1e9; there is no endless wait (60)
-    retry: send again what failed because a server was down, restarting or full, until the time is up (True)
-    max_in_flight: requests under way at a time (128); more wait their turn
-    shared_memory: large inputs go through memory that client and server map, if both are on one host (False)
-    ca_file, client_certificate, client_key, headers, api_key: as Access has them
-    """
-
-    model: str
-    timeout_s: float
-    retry: bool
-    max_in_flight: int
-    shared_memory: bool
-
-
 class AsyncRewardClient(OneProcess):
     """A connection to one or several servers of the same checkpoint, for one event loop.
 
@@ -62,6 +42,12 @@ class AsyncRewardClient(OneProcess):
     urls: ``grpc://host:8001`` or ``http://host:8000``, with TLS ``grpcs://`` or ``https://``, one or several. The
         server with the fewest requests under way gets the next one. A server that fails is left out until it is
         ready again.
+    model: name under which the checkpoint was exported; raw frames go to ``<model>_frames``
+    timeout_s: the longest that a call may take, retries included, at most 1e9; there is no endless wait
+    retry: send again what failed because a server was down, restarting or full, until the time is up
+    max_in_flight: requests under way at a time; more wait their turn
+    shared_memory: large inputs go through memory that client and server map, if both are on one host
+    ca_file, client_certificate, client_key, headers, api_key: as Access has them
     transports: instead of connections to ``urls``, for tests and unusual networks
     """
 
@@ -69,21 +55,28 @@ class AsyncRewardClient(OneProcess):
         self,
         urls: str | Iterable[str],
         *,
+        model: str = DEFAULT_MODEL,
+        timeout_s: float = DEFAULT_TIMEOUT_S,
+        retry: bool = True,
+        max_in_flight: int = DEFAULT_IN_FLIGHT,
+        shared_memory: bool = False,
+        ca_file: str | Path | None = None,
+        client_certificate: str | Path | None = None,
+        client_key: str | Path | None = None,
+        headers: Mapping[str, str] | None = None,
+        api_key: str | None = None,
         transports: Sequence[Transport] | None = None,
-        **options: Unpack[ClientOptions],
     ) -> None:
-        check_known(options, ClientOptions)
-        urls = [urls] if isinstance(urls, str) else urls
-        shared_memory = options.get("shared_memory", False)
-        access = Access.of(options)
-        fixed, names = of_urls([] if transports else urls, partial(connect, shared_memory=shared_memory, access=access))
-        self._model = options.get("model", DEFAULT_MODEL)
-        self._timeout_s = options.get("timeout_s", DEFAULT_TIMEOUT_S)
-        check_timeout(self._timeout_s)
-        self._servers = Servers(transports or fixed, retry=options.get("retry", True), names=names)
-        in_flight = InFlight(options.get("max_in_flight", DEFAULT_IN_FLIGHT))
-        self._scorer = Scorer(self._model, self._servers, in_flight)
-        self._windows = WindowScorer(self._model, self._scorer)
+        check_timeout(timeout_s)
+        access = Access(ca_file, client_certificate, client_key, headers or {}, api_key)
+        if not transports:
+            urls = [urls] if isinstance(urls, str) else urls
+            transports = [connect(url, shared_memory=shared_memory, access=access) for url in urls]
+        self._model = model
+        self._timeout_s = timeout_s
+        self._servers = Servers(transports, retry=retry)
+        self._scorer = SampleScorer(model, self._servers, InFlight(max_in_flight))
+        self._windows = WindowScorer(model, self._scorer)
         self._is_closed = False
         self._loop: asyncio.AbstractEventLoop | None = None  # that it was first used in
 
@@ -173,7 +166,7 @@ class AsyncRewardClient(OneProcess):
         self, windows: Sequence[Window], *, timeout_s: float | None = None
     ) -> list[Result | RewardError]:
         """The result or error of each window, a progress question about frames that the server may know."""
-        return await self._windows.outcomes(windows, Call.of({}, self._deadline(timeout_s)))
+        return await self._windows.outcomes(windows, self._call({"timeout_s": timeout_s}))
 
     async def score_window(self, window: Window) -> ProgressResult:
         """The result of a window. Raises RewardError."""
@@ -188,7 +181,7 @@ class AsyncRewardClient(OneProcess):
         """The trajectory with embeddings of its frames and its task in place of the frames, for a checkpoint that is
         served with encoders. A trajectory that is scored often is then encoded once. Raises RewardError.
         """
-        return await self._scorer.embeddings(trajectory, self._deadline(timeout_s), request_id)
+        return await self._scorer.embeddings(trajectory, self._call({"timeout_s": timeout_s, "request_id": request_id}))
 
     async def is_ready(self, *, timeout_s: float | None = None) -> bool:
         """Whether a server answers and has the model ready, for embeddings or for raw frames."""
@@ -216,7 +209,7 @@ class AsyncRewardClient(OneProcess):
         Raises ModelNotFoundError if it is not served.
         """
         name = frames_name(self._model) if frames else self._model
-        return await self._scorer.model_infos.get(name, self._deadline(timeout_s), refresh=refresh)
+        return await self._scorer.model_info(name, self._deadline(timeout_s), refresh=refresh)
 
     async def model_infos(self, *, timeout_s: float | None = None) -> dict[Part, list[ModelInfo]]:
         """What every server that answers says now of the checkpoint's models, as far as it serves them: the one for
@@ -241,15 +234,12 @@ class AsyncRewardClient(OneProcess):
     async def close(self) -> None:
         """Closes the connections and gives shared memory back."""
         self._is_closed = True
-        self._scorer.model_infos.close()
         await self._servers.close()
 
     async def __aenter__(self) -> AsyncRewardClient:
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self.close()
 
     async def _why_unready(self) -> str:
@@ -262,8 +252,9 @@ class AsyncRewardClient(OneProcess):
         return ""
 
     def _call(self, options: CallOptions) -> Call:
-        """The call that begins now, with these options."""
-        return Call.of(options, self._deadline(options.get("timeout_s")))
+        """The call that begins now, with these options. Raises TypeError for an unknown one."""
+        others: dict[str, Any] = {**options}
+        return Call(self._deadline(others.pop("timeout_s", None)), **others)
 
     def _deadline(self, timeout_s: float | None) -> Deadline:
         """Deadline of a call which begins now; timeout_s: None: the client's."""

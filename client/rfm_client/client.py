@@ -4,22 +4,22 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future
-from types import TracebackType
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
-from rfm_client.async_client import AsyncRewardClient, ClientOptions
-from rfm_client.call import CallOptions
+from rfm_client.async_client import DEFAULT_IN_FLIGHT, DEFAULT_TIMEOUT_S, AsyncRewardClient
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.names import Part
+from rfm_client.contract.names import DEFAULT_MODEL, Part
 from rfm_client.contract.results import PreferenceResult, ProgressResult, Result, SimilarityResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from rfm_client.data.fitting import snapshot
 from rfm_client.episodes.episodes import Episode, Episodes
 from rfm_client.episodes.options import EpisodeSettings
 from rfm_client.episodes.windows import Window
+from rfm_client.scoring.call import CallOptions
 from rfm_client.transport.calls import Transport
 from rfm_client.transport.loop_thread import LoopThread
 from rfm_client.transport.one_process import OneProcess
@@ -39,10 +39,32 @@ class RewardClient(OneProcess):
         self,
         urls: str | Iterable[str],
         *,
+        model: str = DEFAULT_MODEL,
+        timeout_s: float = DEFAULT_TIMEOUT_S,
+        retry: bool = True,
+        max_in_flight: int = DEFAULT_IN_FLIGHT,
+        shared_memory: bool = False,
+        ca_file: str | Path | None = None,
+        client_certificate: str | Path | None = None,
+        client_key: str | Path | None = None,
+        headers: Mapping[str, str] | None = None,
+        api_key: str | None = None,
         transports: Sequence[Transport] | None = None,
-        **options: Unpack[ClientOptions],
     ) -> None:
-        self._client = AsyncRewardClient(urls, transports=transports, **options)
+        self._client = AsyncRewardClient(
+            urls,
+            model=model,
+            timeout_s=timeout_s,
+            retry=retry,
+            max_in_flight=max_in_flight,
+            shared_memory=shared_memory,
+            ca_file=ca_file,
+            client_certificate=client_certificate,
+            client_key=client_key,
+            headers=headers,
+            api_key=api_key,
+            transports=transports,
+        )
         self._loop = LoopThread("rfm-client")
         self._finalizer = weakref.finalize(self, _close, self._client, self._loop)
 
@@ -166,9 +188,7 @@ class RewardClient(OneProcess):
     def __enter__(self) -> RewardClient:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

@@ -18,7 +18,7 @@ from rfm_client.cli.options import VideoOptions
 from rfm_client.cli.show import scores_table, status_tables
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.status import read_status
+from rfm_client.transport.status import read_status
 from rfm_commands.command import OF_A_CHECKPOINT, TritonPath, fail
 
 if TYPE_CHECKING:

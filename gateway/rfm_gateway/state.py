@@ -19,9 +19,9 @@ from rfm_client.contract.errors import (
 from rfm_client.contract.made_up import blank_trajectory
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.names import PROBE_PREFIX, encoder_name, frames_name
-from rfm_client.status import Device, ServerStatus, read_status
 from rfm_client.transport.access import Access
 from rfm_client.transport.deadline import Deadline, timeout
+from rfm_client.transport.status import Device, ServerStatus, read_status
 from rfm_gateway import schema
 
 HEALTH_TIMEOUT_S = 3.5  # of all probes; with HEALTH_KEPT_S less than the 5 s within which it is to be true

@@ -14,7 +14,6 @@ from environments import MODEL, LateClient
 from paths import ROOT
 from reference_server import Served
 from rfm_client import RewardClient
-from stand_ins import clock, patient  # noqa: F401  fixtures
 
 
 @pytest.fixture(scope="module")

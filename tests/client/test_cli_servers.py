@@ -47,7 +47,7 @@ from rfm_client.cli.made_up import MadeUpSamples, parse_lengths
 from rfm_client.cli.scoring import unique_stems
 from rfm_client.cli.show import number
 from rfm_client.contract.wire import encode_samples
-from rfm_client.status import read_status
+from rfm_client.transport.status import read_status
 from rfm_serve import wait_for
 from trajectories import random_trajectory
 from vlm import PLAIN as VLM

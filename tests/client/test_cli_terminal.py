@@ -16,7 +16,7 @@ from client_commands import RFM_CLIENT, TASK
 from rfm.launch.process import Endpoints
 from rfm_client.cli.command import ExitCode
 from rfm_client.cli.show import shortened, status_tables, table
-from rfm_client.status import ModelStatus, ServerStatus
+from rfm_client.transport.status import ModelStatus, ServerStatus
 from terminals import WIDTH, on_terminal
 
 pytestmark = pytest.mark.triton

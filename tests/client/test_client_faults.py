@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from faulty_servers import heavy, ours_in_dev_shm, regions, trajectory, url_of
+from faulty_servers import heavy, ours_in_dev_shm, trajectory, url_of
 from mixtures import assert_same
 from one_model import OneModelServer, answered
 from proxies import Proxy
@@ -95,19 +95,6 @@ def test_calls_survive_a_restart_of_the_server(repository: Path, protocol: str) 
             outcomes.wait_for(ProgressResult)
         assert outcomes.errors == []
         assert_same(expected, client.progress(trajectory(0)))
-
-
-def test_without_retries_a_restart_is_an_error(repository: Path, protocol: str) -> None:
-    endpoints = Endpoints.free()
-    with ExitStack() as servers, RewardClient(url_of(endpoints, protocol), retry=False) as client:
-        server = servers.enter_context(OneModelServer(repository, endpoints))
-        with calling(client, threads=2) as outcomes:
-            outcomes.wait_for(ProgressResult)
-            server.stop()
-            outcomes.wait_for(ServerUnavailableError)
-            servers.enter_context(OneModelServer(repository, endpoints))
-            outcomes.wait_for(ProgressResult)
-    assert {type(error) for error in outcomes.errors} == {ServerUnavailableError}
 
 
 def test_of_two_servers_one_may_be_killed_and_come_back(tmp_path: Path, repository: Path, protocol: str) -> None:
@@ -205,21 +192,6 @@ def test_a_server_that_hangs_does_not_hold_what_shares_memory_with_it(repository
         finally:
             server.signal(signal.SIGCONT)
         assert ours_in_dev_shm() == before
-
-
-def test_a_client_with_another_dev_shm_takes_nothing_back(
-    repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    endpoints = Endpoints.free()
-    with OneModelServer(repository, endpoints), RewardClient(endpoints.grpc_url, shared_memory=True) as client:
-        expected = client.progress(heavy(), frame_steps=2)
-        before = regions(endpoints)
-        monkeypatch.setattr("rfm_client.transport.shared_memory.FOLDER", tmp_path)
-        with RewardClient(endpoints.grpc_url, shared_memory=True) as stranger:
-            assert_same(stranger.progress(heavy(), frame_steps=2), expected)
-        monkeypatch.undo()
-        assert "no shared memory" in caplog.text
-        assert regions(endpoints) == before != set()
 
 
 @pytest.fixture

@@ -39,8 +39,7 @@ from rfm_client import (
 )
 from rfm_client.contract import wire
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.prefixes import of_prefixes, prefix_samples
-from rfm_client.data.sampling import RULES, Rule, Sampling
+from rfm_client.data.sampling import RULES, Rule, Sampling, of_prefixes, prefix_samples
 from rfm_client.episodes import Episode, SuccessRule
 from rfm_client.transport.access import Access
 from rfm_client.transport.calls import Answer, GrpcTransport

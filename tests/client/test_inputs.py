@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -80,16 +78,6 @@ def test_tensors_are_fetched_from_the_gpu() -> None:
     np.testing.assert_array_equal(filmed.positions, FRAMES)
 
 
-def test_inputs_import_nothing_heavy() -> None:
-    check = (
-        "import sys, rfm_client, rfm_client.data.inputs, rfm_client.data.resize\n"
-        "rfm_client.data.inputs.as_trajectory({'observation.image': [[[[0.5] * 3]]]})\n"
-        "print(sorted({'torch', 'PIL', 'av', 'pandas'} & set(sys.modules)))"
-    )
-    output = subprocess.run([sys.executable, "-c", check], check=True, capture_output=True, text=True).stdout
-    assert output.strip() == "[]"
-
-
 def items(**more: Any) -> list[dict[str, Any]]:
     """One dict a step, as indexing a LeRobot dataset gives them."""
     return [
@@ -102,14 +90,11 @@ EPISODES: dict[str, Any] = {
     "tensor, channels first": {TOP: channels_first(FRAMES)},
     "tensor, channels last": {TOP: torch.from_numpy(FRAMES) / 255},
     "uint8 tensor, channels first": {TOP: torch.from_numpy(FRAMES).permute(0, 3, 1, 2)},
-    "with a gradient": {TOP: channels_first(FRAMES).requires_grad_()},
     "float16": {TOP: channels_first(FRAMES).half()},
     "float64 array": {TOP: FRAMES / 255},
     "uint8 array, channels first": {TOP: FRAMES.transpose(0, 3, 1, 2)},
     "list of float tensors": {TOP: list(channels_first(FRAMES))},
-    "tuple of uint8 arrays": {TOP: tuple(FRAMES)},
     "PIL images": {TOP: [Image.fromarray(frame) for frame in FRAMES]},
-    "a camera without a name": {"observation.image": channels_first(FRAMES)},
     "our own keys": {"frames": FRAMES},
     "our own keys, float": {"frames": channels_first(FRAMES)},
     "one dict a step": items(),
@@ -141,7 +126,6 @@ TASKS: dict[str, tuple[Any, str]] = {
     "text": ("lift", "lift"),
     "a list of one": (["lift"], "lift"),
     "one a step": (["lift"] * 4, "lift"),
-    "an array": (np.array("lift"), "lift"),
     "an array of one a step": (np.array(["lift", "lift"]), "lift"),
 }
 
@@ -181,10 +165,7 @@ BAD_EPISODES: dict[str, tuple[Any, str | None, str]] = {
     "no images": ({TOP: torch.ones(4, 5)}, None, f"{TOP}: expected {SHAPED}, got float32 [4, 5]"),
     "one image": ({TOP: FRAMES[0]}, None, f"{TOP}: expected {SHAPED}, got uint8 [6, 8, 3]"),
     "grey images": ({TOP: FRAMES[..., :1]}, None, f"{TOP}: expected {SHAPED}, got uint8 [4, 6, 8, 1]"),
-    "a number": ({TOP: 0.5}, None, f"{TOP}: expected {SHAPED}, got float64 [1]"),
-    "integers": ({TOP: FRAMES.astype(np.int64)}, None, f"{TOP}: expected {SHAPED}, got int64 [4, 6, 8, 3]"),
     "nothing in it": ({TOP: []}, None, f"{TOP}: expected images of one type and size, got none"),
-    "pixels without an edge": ({TOP: FRAMES[:, :0]}, None, f"{TOP}: expected {SHAPED}, got uint8 [4, 0, 8, 3]"),
     "images of several sizes": (
         {TOP: [FRAMES[0], FRAMES[0, :3]]},
         None,
@@ -199,11 +180,6 @@ BAD_EPISODES: dict[str, tuple[Any, str | None, str]] = {
         {TOP: FRAMES.astype(np.float32)},
         None,
         f"{TOP}: expected {SHAPED}, got values from 0 to 249 (of floats in 0..255: float_frames_to_uint8)",
-    ),
-    "normalised floats": (
-        {"frames": np.full((1, 2, 2, 3), -0.5)},
-        None,
-        f"frames: expected {SHAPED}, got values from -0.5 to -0.5 (of floats in 0..255: float_frames_to_uint8)",
     ),
     "NaN": (
         {TOP: np.full((1, 2, 2, 3), np.nan)},
@@ -246,8 +222,6 @@ BAD_EPISODES: dict[str, tuple[Any, str | None, str]] = {
         "frames: expected at least one frame of at least one pixel, got uint8 [0, 6, 8, 3]",
     ),
     "an array": (FRAMES, None, "episode: expected a dict, or one dict a step, got ndarray"),
-    "a path": ("film.mp4", None, "episode: expected a dict, or one dict a step, got str"),
-    "None": (None, None, "episode: expected a dict, or one dict a step, got NoneType"),
     "no steps": ([], None, "episode: expected a dict, or one dict a step, got nothing"),
 }
 
@@ -324,13 +298,6 @@ def text_file(file: Path) -> None:
     file.write_text("frames")
 
 
-def broken_npz(file: Path) -> None:
-    np.savez(file, frames=FRAMES)
-    content = bytearray(file.read_bytes())
-    content[200:240] = bytes(40)
-    file.write_bytes(content)
-
-
 def broken_header(file: Path) -> None:
     header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3\n"  # a bracket is missing
     file.write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(24))
@@ -339,8 +306,6 @@ def broken_header(file: Path) -> None:
 BAD_FILES: dict[str, tuple[str, Callable[[Path], Any], str]] = {
     "a text": ("text.npy", text_file, r"^file: expected arrays .*, got .*pickled.* \(.*text\.npy\)$"),
     "an empty file": ("empty.npy", Path.touch, r"^file: expected arrays .*, got No data left in file \(.*\)$"),
-    "a broken archive": ("film.npz", broken_npz, r"^file: expected arrays .*, got Bad CRC-32 .*film\.npz\)$"),
-    "a broken header": ("film.npy", broken_header, r"^file: expected arrays .*, got .*film\.npy\)$"),
     "no file": ("nothing.npy", lambda file: None, r"^file: expected arrays .*, got .*No such file.*nothing\.npy\)$"),
     "one text embedding": (
         "text.npy",

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import goldens
-from client_commands import MODEL, TASK, ask, assert_scores
+from client_commands import MODEL, TASK, ask, assert_scores, invoke
 from paths import GOLDEN
 from reference_server import Served
 from rfm_client import ProgressSample, Trajectory
@@ -53,54 +53,43 @@ def test_each_rule_shows_the_frames_that_the_original_takes(file: Path) -> None:
         seen.add((sampling.rule, sampling.frames))
         if sampling.rule == "rint_pad":
             unpadded = Sampling("rint", sampling.frames).prefix(t).indices
-            assert unpadded.tolist() == indices[: len(indices) - prefix.num_padding], (sampling, t)
+            assert unpadded.tolist() == indices[: min(t + 1, sampling.frames or 0)], (sampling, t)
     assert {rule for rule, _ in seen} == set(RULES) - {"all", "rint"}
     assert len(seen) == 3 * 6 + 2
 
 
-PADDED = {
-    "linspace_trunc repeats frames and pads none": (Sampling("linspace_trunc", 4), 1, [0, 0, 0, 1], 0, 3),
-    "linspace_trunc of one frame shows the first": (Sampling("linspace_trunc", 1), 9, [0], 0, 0),
-    "linspace_round rounds half to even": (Sampling("linspace_round", 3), 5, [0, 2, 5], 0, 2),
-    "rint does not pad": (Sampling("rint", 4), 1, [0, 1], 0, 1),
-    "rint of one frame shows the newest": (Sampling("rint", 1), 9, [9], 0, 0),
-    "rint of a long episode": (Sampling("rint", 4), 9, [0, 3, 6, 9], 0, 3),
-    "rint_pad reads a padded slot": (Sampling("rint_pad", 4), 1, [0, 1, 1, 1], 2, 3),
-    "rint_pad of one frame shows the newest": (Sampling("rint_pad", 1), 9, [9], 0, 0),
-    "rint_pad of a long episode": (Sampling("rint_pad", 4), 9, [0, 3, 6, 9], 0, 3),
-    "rewind online reads a padded slot": (Sampling("rewind_pad16_online"), 2, [0, 1, *[2] * 14], 13, 15),
-    "rewind offline reads the frame's own": (Sampling("rewind_pad16_offline"), 2, [0, 1, *[2] * 14], 13, 2),
-    "rewind offline of a long episode": (Sampling("rewind_pad16_offline"), 15, list(range(16)), 0, 15),
-    "all": (Sampling("all"), 3, [0, 1, 2, 3], 0, 3),
+READ = {
+    "linspace_trunc repeats frames and pads none": (Sampling("linspace_trunc", 4), 1, [0, 0, 0, 1], 3),
+    "linspace_trunc of one frame shows the first": (Sampling("linspace_trunc", 1), 9, [0], 0),
+    "linspace_round rounds half to even": (Sampling("linspace_round", 3), 5, [0, 2, 5], 2),
+    "rint does not pad": (Sampling("rint", 4), 1, [0, 1], 1),
+    "rint of one frame shows the newest": (Sampling("rint", 1), 9, [9], 0),
+    "rint of a long episode": (Sampling("rint", 4), 9, [0, 3, 6, 9], 3),
+    "rint_pad reads a padded slot": (Sampling("rint_pad", 4), 1, [0, 1, 1, 1], 3),
+    "rint_pad of one frame shows the newest": (Sampling("rint_pad", 1), 9, [9], 0),
+    "rint_pad of a long episode": (Sampling("rint_pad", 4), 9, [0, 3, 6, 9], 3),
+    "rewind online reads a padded slot": (Sampling("rewind_pad16_online"), 2, [0, 1, *[2] * 14], 15),
+    "rewind offline reads the frame's own": (Sampling("rewind_pad16_offline"), 2, [0, 1, *[2] * 14], 2),
+    "rewind offline of a long episode": (Sampling("rewind_pad16_offline"), 15, list(range(16)), 15),
+    "all": (Sampling("all"), 3, [0, 1, 2, 3], 3),
 }
 
 
-@pytest.mark.parametrize(("sampling", "t", "indices", "padding", "read"), PADDED.values(), ids=PADDED)
-def test_a_rule_says_what_is_padding_and_which_slot_counts(
-    sampling: Sampling, t: int, indices: list[int], padding: int, read: int
-) -> None:
+@pytest.mark.parametrize(("sampling", "t", "indices", "read"), READ.values(), ids=READ)
+def test_a_rule_says_which_slot_counts(sampling: Sampling, t: int, indices: list[int], read: int) -> None:
     prefix = sampling.prefix(t)
-    assert (prefix.indices.tolist(), prefix.num_padding, prefix.read) == (indices, padding, read)
+    assert (prefix.indices.tolist(), prefix.read) == (indices, read)
     assert prefix.indices[prefix.read] == t or sampling.frames == 1
     slots = prefix.frame_slots
     assert prefix.indices[slots].tolist() == sorted(set(indices))
     assert slots[-1] == read
 
 
-def test_no_rule_shows_a_frame_behind_the_newest() -> None:
-    for sampling in (Sampling.of(rule, None, trained_frames=8) for rule in RULES):
-        for t in range(60):
-            indices = sampling.prefix(t).indices
-            assert (np.diff(indices) >= 0).all()
-            assert 0 <= indices[0] <= indices[-1] <= t
-
-
 def test_a_long_clip_is_cut_as_in_training() -> None:
-    assert thinned(10, 1).tolist() == [9]  # type: ignore[union-attr]
-    assert thinned(10, 4).tolist() == [0, 3, 6, 9]  # type: ignore[union-attr]
-    assert thinned(6, 3).tolist() == [0, 2, 5]  # type: ignore[union-attr]
-    assert thinned(10, 10) is None
-    assert thinned(10, None) is None
+    cut = {(10, 1): [9], (10, 4): [0, 3, 6, 9], (6, 3): [0, 2, 5], (10, 10): None, (10, None): None}
+    for asked, expected in cut.items():
+        kept = thinned(*asked)
+        assert (None if kept is None else kept.tolist()) == expected
 
 
 REFUSED: dict[str, tuple[Any, ...]] = {
@@ -166,8 +155,6 @@ CONTRADICTIONS = {
 
 @pytest.mark.parametrize(("words", "message"), CONTRADICTIONS.values(), ids=CONTRADICTIONS)
 def test_score_refuses_contradictory_sampling(video: Path, words: list[object], message: str) -> None:
-    from client_commands import invoke
-
     result = invoke("score", video, "--task", TASK, *words)
     assert result.exit_code == 2
     assert message in result.stderr

@@ -6,9 +6,12 @@ from __future__ import annotations
 import socket
 import struct
 import threading
+import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
+import grpc
 import pytest
 
 from rfm_client import (
@@ -20,9 +23,11 @@ from rfm_client import (
     ServerUnavailableError,
 )
 from rfm_client.contract.triton import error_of
+from rfm_client.transport.connection import grpc_options
 from trajectories import random_trajectory
 
 TIMEOUT_S = 1.0
+WITHIN_S = 30.0
 NO_JSON = b"HTTP/1.1 200 OK\r\nContent-Type: text/html\r\nContent-Length: 9\r\n\r\n<html></>"
 NO_ANSWER = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\nContent-Length: 2\r\n\r\n{}"
 BAD_GATEWAY = (
@@ -140,7 +145,7 @@ def failure(url: str) -> ServerUnavailableError:
             "failed to connect to all addresses; last error: UNKNOWN: ipv4:10.0.0.1:8001: Connection reset by peer",
             False,
         ),
-        ("failed to connect to all addresses; last error: UNKNOWN: ipv4:10.0.0.1:8001: Connection refused", False),
+        ("connections to all backends failing; last error: UNKNOWN: ipv4:10.0.0.1:1: Connection reset by peer", False),
         ("the queue is full: 8 requests wait already", False),
         ("Stub process 'rfm_0_0' is not healthy.", True),
     ],
@@ -149,3 +154,39 @@ def test_which_errors_a_request_may_have_caused(message: str, may_have_ended: bo
     error = error_of("StatusCode.UNAVAILABLE", message, InvalidSampleError)
     assert isinstance(error, ServerUnavailableError)
     assert error.may_have_ended_server is may_have_ended
+
+
+def test_requests_are_spread_over_the_addresses_of_a_name() -> None:
+    """A list of addresses stands for the name: none of several can be had without a DNS server."""
+    counts = [0, 0]
+
+    def serve(number: int) -> grpc.Server:
+        def answer(content: bytes, _context: grpc.ServicerContext) -> bytes:
+            counts[number] += 1
+            return content
+
+        handlers = {"Echo": grpc.unary_unary_rpc_method_handler(answer)}
+        server = grpc.server(ThreadPoolExecutor(1), (grpc.method_handlers_generic_handler("test", handlers),))
+        ports.append(server.add_insecure_port("127.0.0.1:0"))
+        server.start()
+        return server
+
+    ports: list[int] = []
+    servers = [serve(number) for number in range(2)]
+    target = f"ipv4:{','.join(f'127.0.0.1:{port}' for port in ports)}"
+    try:
+        with grpc.insecure_channel(target, grpc_options("name:8001")) as channel:
+            echo = channel.unary_unary("/test/Echo")
+            end_s = time.monotonic() + WITHIN_S
+            while not all(counts):
+                assert echo(b"once") == b"once"
+                assert time.monotonic() < end_s
+    finally:
+        for server in servers:
+            server.stop(None)
+
+
+def test_a_name_that_nobody_knows_is_told() -> None:
+    client = RewardClient("grpc://rfm-servers.invalid:8001", retry=False, timeout_s=WITHIN_S)
+    with client, pytest.raises(RewardError, match=r"resol|DNS"):
+        client.model_info()

@@ -6,9 +6,10 @@ from __future__ import annotations
 import re
 import socket
 import tracemalloc
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
 
@@ -18,9 +19,8 @@ import pytest
 
 import clip
 from paths import VIDEOS
-from pictures import TURNS, Matrix, numbered, numbers, turn, write_video
+from pictures import numbered, numbers, write_video
 from rfm_client import InvalidSampleError
-from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.inputs import load_trajectory
 from rfm_client.data.video import read_video
 
@@ -66,28 +66,6 @@ def test_frames_of_a_variable_rate_are_even_in_number(tmp_path: Path) -> None:
     assert numbers(read_video(tmp_path / "film.mp4", 0.82), 10) == [0, 2, 4, 6, 9]
 
 
-def test_packets_without_a_frame_do_not_count(tmp_path: Path) -> None:
-    write_video(tmp_path / "film.mp4", numbered(10), shown_from=4)
-    with av.open(str(tmp_path / "film.mp4")) as container:
-        assert container.streams.video[0].frames == 10  # as the container tells, wrongly
-    assert numbers(read_video(tmp_path / "film.mp4"), 10) == [4, 5, 6, 7, 8, 9]
-    assert numbers(read_video(tmp_path / "film.mp4", 5), 10) == [4, 6, 9]
-
-
-@pytest.mark.parametrize(("matrix", "shown"), TURNS.values(), ids=TURNS)
-def test_a_turned_or_mirrored_video_is_read_as_it_is_shown(
-    tmp_path: Path, matrix: Matrix, shown: Callable[[UInt8Array], UInt8Array]
-) -> None:
-    picture = np.zeros((1, 32, 64, 3), np.uint8)
-    picture[:, :16, :32], picture[:, :16, 32:], picture[:, 16:, :32] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
-    write_video(tmp_path / "film.mp4", picture)
-    turn(tmp_path / "film.mp4", matrix)
-    upright = shown(picture[0])
-    read = read_video(tmp_path / "film.mp4")[0]
-    assert read.shape == upright.shape
-    assert np.abs(read.astype(int) - upright).mean() < 3
-
-
 def test_only_the_picked_frames_of_a_long_video_are_held(tmp_path: Path) -> None:
     frames = numbered(200)
     write_video(tmp_path / "film.mp4", frames)
@@ -112,24 +90,12 @@ def test_a_sound_is_no_video(tmp_path: Path) -> None:
     assert str(refused.value) == f"video: expected a file with a video stream, got none ({tmp_path / 'sound.mp4'})"
 
 
-class FileServer(ThreadingHTTPServer):
+class FileRequest(SimpleHTTPRequestHandler):
     """Serves the files of a folder, and notes what was asked for; ``/short/...`` ends before its end."""
 
-    def __init__(self, folder: Path) -> None:
-        super().__init__(("127.0.0.1", 0), FileRequest)
-        self.folder = folder
-        self.asked: list[str] = []
-
-    def url(self, path: str) -> str:
-        return f"http://127.0.0.1:{self.server_port}/{path}"
-
-
-class FileRequest(BaseHTTPRequestHandler):
-    server: FileServer
-
     def do_GET(self) -> None:
-        self.server.asked.append(self.path)
-        file = self.server.folder / Path(self.path.partition("?")[0]).name
+        self.server.asked.append(self.path)  # type: ignore[attr-defined]
+        file = Path(self.directory, Path(self.path.partition("?")[0]).name)
         if not file.exists():
             self.send_error(404)
             return
@@ -144,28 +110,30 @@ class FileRequest(BaseHTTPRequestHandler):
 
 
 @contextmanager
-def serving(folder: Path) -> Iterator[FileServer]:
-    with FileServer(folder) as server:
+def serving(folder: Path) -> Iterator[tuple[str, list[str]]]:
+    """The URL of a server of the folder's files, and the paths that it is asked for."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(FileRequest, directory=str(folder))) as server:
+        server.asked = []  # type: ignore[attr-defined]
         thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
         try:
-            yield server
+            yield f"http://127.0.0.1:{server.server_port}", server.asked  # type: ignore[attr-defined]
         finally:
             server.shutdown()
             thread.join()
 
 
 def test_a_url_is_downloaded_once_and_read_as_the_file_is(film: Path) -> None:
-    with serving(film.parent) as server:
-        loaded = load_trajectory(server.url("clip.mp4?token=3"), task=clip.TASK, fps=3)
-        assert server.asked == ["/clip.mp4?token=3"]
+    with serving(film.parent) as (url, asked):
+        loaded = load_trajectory(f"{url}/clip.mp4?token=3", task=clip.TASK, fps=3)
+        assert asked == ["/clip.mp4?token=3"]
     np.testing.assert_array_equal(loaded.positions, read_video(film, 3))
 
 
 @pytest.mark.parametrize("file", sorted(VIDEOS.glob("*.mp4")), ids=lambda file: file.stem)
 def test_a_robot_video_is_the_same_behind_a_url(file: Path) -> None:
-    with serving(VIDEOS) as server:
-        np.testing.assert_array_equal(read_video(server.url(file.name), 3), read_video(file, 3))
+    with serving(VIDEOS) as (url, _):
+        np.testing.assert_array_equal(read_video(f"{url}/{file.name}", 3), read_video(file, 3))
 
 
 BAD_URLS = {
@@ -178,10 +146,10 @@ BAD_URLS = {
 @pytest.mark.parametrize(("path", "reason"), BAD_URLS.values(), ids=BAD_URLS)
 def test_a_url_that_fails_is_told_with_its_reason(film: Path, path: str, reason: str) -> None:
     (film.parent / "text.mp4").write_text("no video")
-    with serving(film.parent) as server, pytest.raises(InvalidSampleError) as refused:
-        load_trajectory(server.url(path))
+    with serving(film.parent) as (url, _), pytest.raises(InvalidSampleError) as refused:
+        load_trajectory(f"{url}/{path}")
     expected = f"video: expected a file with a video stream, got {reason} "
-    assert re.fullmatch(expected + re.escape(f"({server.url(path)})"), str(refused.value))
+    assert re.fullmatch(expected + re.escape(f"({url}/{path})"), str(refused.value))
 
 
 def test_a_server_that_says_nothing_is_given_up() -> None:

@@ -175,11 +175,14 @@ def test_success_that_lacks_at_all_frames_is_not_predicted(row: int) -> None:
             got.succeeded()
 
 
-@pytest.mark.parametrize("shape", [(3,), (2, 5)], ids=str)
-def test_an_answer_of_fewer_rows_or_axes_is_an_error(shape: tuple[int, ...]) -> None:
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [((3,), "scores of sample 0"), ((2, 5), "scores of sample 2"), ((3, 4), "4 finite scores, got")],
+)
+def test_an_answer_of_fewer_rows_positions_or_axes_is_an_error(shape: tuple[int, ...], message: str) -> None:
     samples, sent = results()
     tensors = wire.encode_results(sent, 5, OUTPUTS) | {"success": np.ones(shape, np.float32)}
-    with pytest.raises(InferenceFailedError, match="success: expected scores of sample"):
+    with pytest.raises(InferenceFailedError, match=f"success: expected {message}"):
         wire.decode_results(tensors, samples)
 
 

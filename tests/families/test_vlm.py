@@ -183,8 +183,9 @@ def test_an_ordinary_film_over_the_token_budget_is_scored() -> None:
 
 def test_a_mixture_over_the_wire_equals_its_samples_alone(served: Served, protocol: str) -> None:
     samples = mixture()
-    alone = [load_engine(WITH_SIMILARITY).evaluate([sample])[0] for sample in samples]
-    with served.client(protocol, WITH_SIMILARITY) as client:
+    model = "q25_video_avg_disc10"
+    alone = [load_engine(model).evaluate([sample])[0] for sample in samples]
+    with served.client(protocol, model) as client:
         for result, expected in zip(client.evaluate(samples), alone, strict=True):
             assert_close(result, expected, MIXED_TOLERANCE)
 

@@ -51,7 +51,7 @@ from rfm_client import (
     ModelNotFoundError,
     Trajectory,
 )
-from rfm_client.status import read_status
+from rfm_client.transport.status import read_status
 from rfm_commands.cli import app
 
 pytestmark = pytest.mark.triton

@@ -13,8 +13,7 @@ from pyarrow import parquet
 
 from labelling import LEROBOT
 from rfm_client import InferenceFailedError, InvalidSampleError, ProgressResult, RewardClient
-from rfm_client.data.prefixes import of_prefixes
-from rfm_client.data.sampling import Sampling
+from rfm_client.data.sampling import Sampling, of_prefixes
 from rfm_client.labelling import ClientScorer, LabelOptions, label, open_dataset
 from shelves import V1, V2, Kept, Shelf
 

@@ -11,11 +11,11 @@ import av
 import numpy as np
 import pytest
 
-from encoding import encode
+from encoding import encode_here
 from pictures import TURNS, Matrix, numbered, numbers, turn, write_video
 from rfm_client import InvalidSampleError
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.datasets.films import Packets, Span, decode
+from rfm_client.data.datasets.films import Span, decode, film_packets
 from rfm_client.data.video import frame_times_s, read_video
 from rfm_client.labelling import DatasetError, open_dataset
 
@@ -37,13 +37,21 @@ def labelled(file: Path) -> UInt8Array:
     return np.stack(list(dataset.frames(episode, "video")))
 
 
+def assert_both_refuse(file: Path, reason: str) -> None:
+    """Both readers give the reason, a pattern."""
+    with pytest.raises(InvalidSampleError, match=rf"^video: {reason}.* \({file}\)$"):
+        read_video(file)
+    with pytest.raises(DatasetError, match=rf"{file}: {reason}"):
+        labelled(file)
+
+
 @pytest.mark.parametrize(("matrix", "shown"), TURNS.values(), ids=TURNS)
-def test_a_turned_or_mirrored_film_is_labelled_upright_as_it_is_scored(
+def test_a_turned_or_mirrored_film_is_read_upright(
     tmp_path: Path, matrix: Matrix, shown: Callable[[UInt8Array], UInt8Array]
 ) -> None:
     file = tmp_path / "film.mp4"
-    pictures = np.ascontiguousarray(numbered(3)[:, :, :16])
-    pictures[:, :8] //= 2
+    pictures = np.zeros((3, 32, 64, 3), np.uint8)
+    pictures[:, :16, :32], pictures[:, :16, 32:], pictures[:, 16:, :32] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
     write_video(file, pictures)
     turn(file, matrix)
     read = labelled(file)
@@ -57,16 +65,17 @@ def test_a_turned_or_mirrored_film_is_labelled_upright_as_it_is_scored(
 def test_a_film_that_is_shown_aslant_is_refused(tmp_path: Path, matrix: Matrix) -> None:
     write_video(tmp_path / "film.mp4", numbered(3))
     turn(tmp_path / "film.mp4", matrix)
-    refused = r"expected a film that is shown upright or by quarter turns \(turn it: ffmpeg -i IN OUT\), got one that"
-    with pytest.raises(InvalidSampleError, match=f"^video: {refused}"):
-        read_video(tmp_path / "film.mp4")
-    with pytest.raises(DatasetError, match=f"film.mp4: {refused}"):
-        labelled(tmp_path / "film.mp4")
+    reason = r"expected a film that is shown upright or by quarter turns \(turn it: ffmpeg -i IN OUT\), got one that"
+    assert_both_refuse(tmp_path / "film.mp4", reason)
 
 
 def test_packets_that_are_not_shown_are_no_frames(tmp_path: Path) -> None:
-    write_video(tmp_path / "film.mp4", numbered(10), shown_from=4)
-    assert numbers(labelled(tmp_path / "film.mp4"), 10) == [4, 5, 6, 7, 8, 9]
+    file = tmp_path / "film.mp4"
+    write_video(file, numbered(10), shown_from=4)
+    with av.open(str(file)) as container:
+        assert container.streams.video[0].frames == 10  # as the container tells, wrongly
+    assert numbers(labelled(file), 10) == numbers(read_video(file), 10) == [4, 5, 6, 7, 8, 9]
+    assert numbers(read_video(file, 5), 10) == [4, 6, 9]
 
 
 # Pixel format, matrix and range (1: limited, 2: full) of a film, as ITU-T H.273 numbers them; 2: no matrix is named.
@@ -137,36 +146,28 @@ GREY = {"gray": False, "gray10le": True, "gray12le": True, "gray16le": True, "yu
 @pytest.mark.parametrize(("pixels", "is_depth"), GREY.items())
 def test_films_of_one_deep_channel_are_refused_as_depth_maps(tmp_path: Path, pixels: str, is_depth: bool) -> None:
     file = tmp_path / "film.mkv"
-    with av.open(str(file), "w") as container:
-        stream: Any = container.add_stream("ffv1", rate=10)
-        stream.height, stream.width, stream.pix_fmt = 32, 32, pixels
-        for image in numbered(3):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
-        container.mux(stream.encode())
-    if not is_depth:
+    encode_here(file, numbered(3), "ffv1", pixels=pixels)
+    if is_depth:
+        refused = rf"expected a film of colours \(leave a depth camera out .*\), got {pixels}, as depth maps have"
+        assert_both_refuse(file, refused)
+    else:
         assert numbers(read_video(file), 3) == numbers(labelled(file), 3) == [0, 1, 2]
-        return
-    refused = rf"expected a film of colours \(leave a depth camera out .*\), got {pixels}, as depth maps have"
-    with pytest.raises(InvalidSampleError, match=f"^video: {refused}"):
-        read_video(file)
-    with pytest.raises(DatasetError, match=f"film.mkv: {refused}"):
-        labelled(file)
 
 
 def write_streams(file: Path, *films: tuple[UInt8Array, bool]) -> None:
     """Several films in one file, and whether each is an attached picture."""
     with av.open(str(file), "w") as container:
-        streams: list[Any] = [
-            container.add_stream("mjpeg" if attached else "libx264", rate=10) for _, attached in films
-        ]
-        for stream, (frames, attached) in zip(streams, films, strict=True):
+        streams: list[Any] = []
+        for frames, attached in films:
+            stream: Any = container.add_stream("mjpeg" if attached else "libx264", rate=10)
             stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], "yuvj420p" if attached else "yuv420p"
             if attached:
                 stream.disposition = av.stream.Disposition.attached_pic.value
+            streams.append(stream)
         for stream, (frames, _) in zip(streams, films, strict=True):
-            for image in frames:
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
-            container.mux(stream.encode())
+            for image in [*frames, None]:
+                frame = None if image is None else av.VideoFrame.from_ndarray(image, format="rgb24")
+                container.mux(stream.encode(frame))
 
 
 def test_cover_art_is_no_film(tmp_path: Path) -> None:
@@ -177,10 +178,7 @@ def test_cover_art_is_no_film(tmp_path: Path) -> None:
     assert numbers(read_video(file), 5) == numbers(labelled(file), 5) == [0, 1, 2, 3, 4]
     np.testing.assert_allclose(frame_times_s(file, 5), np.arange(5) / 10)
     write_streams(file, (numbered(1), True))
-    with pytest.raises(InvalidSampleError, match=r"^video: expected a file with a video stream, got none "):
-        read_video(file)
-    with pytest.raises(DatasetError, match=r"film\.mp4: expected a file with a video stream, got none"):
-        labelled(file)
+    assert_both_refuse(file, "expected a file with a video stream, got none")
 
 
 def test_a_file_of_several_films_is_refused(tmp_path: Path) -> None:
@@ -190,11 +188,9 @@ def test_a_file_of_several_films_is_refused(tmp_path: Path) -> None:
         r"expected one video stream \(take one: ffmpeg -i IN -map 0:v:N -c copy OUT\), "
         r"got 2: 0:v:\d \(h264, 32x16\), 0:v:\d \(h264, 32x32\)"
     )
-    for read in (read_video, lambda file: frame_times_s(file, 5)):
-        with pytest.raises(InvalidSampleError, match=f"^video: {refused}"):
-            read(file)
-    with pytest.raises(DatasetError, match=rf"film\.mp4: {refused}"):
-        labelled(file)
+    assert_both_refuse(file, refused)
+    with pytest.raises(InvalidSampleError, match=f"^video: {refused}"):
+        frame_times_s(file, 5)
 
 
 def test_the_decoder_is_told_with_its_versions(tmp_path: Path) -> None:
@@ -205,25 +201,18 @@ def test_the_decoder_is_told_with_its_versions(tmp_path: Path) -> None:
     assert told.startswith(f"PyAV {av.__version__}, libswscale {swscale}, libavcodec ")
 
 
-def with_container(options: dict[str, str] | None = None, codec: str = "libx264", sound_s: float = 0.0) -> Write:
-    """Writes a film with these options of its container, and with sound of this length."""
-
-    def write(file: Path, frames: UInt8Array) -> None:
-        with av.open(str(file), "w", options=options or {}) as container:
-            stream: Any = container.add_stream(codec, rate=10, options={"g": "10"})
-            stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], "yuv420p"
-            sound: Any = container.add_stream("libopus", rate=48_000, layout="mono") if sound_s else None
-            for image in frames:
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
-            container.mux(stream.encode())
-            if sound:
-                silence = np.zeros((1, round(48_000 * sound_s)), np.float32)
-                heard = av.AudioFrame.from_ndarray(silence, format="fltp", layout="mono")
-                heard.sample_rate = 48_000
-                container.mux(sound.encode(heard))
-                container.mux(sound.encode())
-
-    return write
+def with_sound(file: Path, frames: UInt8Array) -> None:
+    """A film whose sound is twice as long."""
+    with av.open(str(file), "w") as container:
+        stream: Any = container.add_stream("libx264", rate=10, options={"g": "10"})
+        stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], "yuv420p"
+        sound: Any = container.add_stream("libopus", rate=48_000, layout="mono")
+        for image in [*frames, None]:
+            container.mux(stream.encode(None if image is None else av.VideoFrame.from_ndarray(image, format="rgb24")))
+        heard = av.AudioFrame.from_ndarray(np.zeros((1, 9 * 48_000), np.float32), format="fltp", layout="mono")
+        heard.sample_rate = 48_000
+        for audio in (heard, None):
+            container.mux(sound.encode(audio))
 
 
 def at_irregular_times(file: Path, frames: UInt8Array) -> None:
@@ -243,15 +232,15 @@ class Pipe:
         self._file.close()
 
 
+def coded(codec: str = "libx264", **more: Any) -> Write:
+    """Writes a film with this codec. more: as in ``encode_here``"""
+    return lambda file, frames: encode_here(file, frames, codec, **more)
+
+
 def live(codec: str) -> Write:
     def write(file: Path, frames: UInt8Array) -> None:
         pipe = Pipe(file)
-        with av.open(pipe, "w", format="matroska") as container:
-            stream: Any = container.add_stream(codec, rate=10)
-            stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], "yuv420p"
-            for image in frames:
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
-            container.mux(stream.encode())
+        encode_here(pipe, frames, codec, format="matroska")
         pipe.close()
 
     return write
@@ -260,26 +249,25 @@ def live(codec: str) -> Write:
 BROKEN_OFF: dict[str, tuple[str, Write]] = {
     "Matroska": ("film.mkv", write_video),
     "Matroska of a variable rate": ("film.mkv", at_irregular_times),
-    "Matroska with longer sound": ("film.mkv", with_container(sound_s=9)),
-    "WebM": ("film.webm", lambda file, frames: encode(file, frames, "libvpx", {"deadline": "realtime"})),
+    "Matroska with longer sound": ("film.mkv", with_sound),
+    "WebM": ("film.webm", coded("libvpx", options={"deadline": "realtime"})),
     "MP4": ("film.mp4", write_video),
-    "MP4 with its index in front": ("film.mp4", with_container({"movflags": "+faststart"})),
-    "MP4 in fragments": ("film.mp4", with_container({"movflags": "+frag_keyframe+empty_moov"})),
-    "AVI": ("film.avi", with_container(codec="mpeg4")),
+    "MP4 with its index in front": ("film.mp4", coded(of_container={"movflags": "+faststart"})),
+    "MP4 in fragments": ("film.mp4", coded(of_container={"movflags": "+frag_keyframe+empty_moov"})),
+    "AVI": ("film.avi", coded("mpeg4")),
 }
 WHOLE: dict[str, tuple[str, Write]] = BROKEN_OFF | {
     "Matroska recorded live": ("film.mkv", live("libx264")),
     "Matroska recorded live, whose rate is told": ("film.mkv", live("mpeg4")),
     "raw Matroska recorded live": ("film.mkv", live("rawvideo")),
-    "MPEG-TS": ("film.ts", with_container()),
+    "MPEG-TS": ("film.ts", coded()),
 }
 
 
 @pytest.mark.parametrize(("name", "write"), WHOLE.values(), ids=WHOLE)
 def test_a_whole_film_is_read(tmp_path: Path, name: str, write: Write) -> None:
     write(tmp_path / name, noise())
-    assert len(read_video(tmp_path / name)) == NUM_FRAMES
-    assert len(labelled(tmp_path / name)) == NUM_FRAMES
+    assert len(read_video(tmp_path / name)) == len(labelled(tmp_path / name)) == NUM_FRAMES
 
 
 CUTS = [
@@ -296,12 +284,8 @@ def test_a_film_that_breaks_off_is_refused(tmp_path: Path, name: str, write: Wri
     write(file, noise())
     with av.open(str(file)) as container:
         begins = sorted(packet.pos for packet in container.demux(video=0) if packet.size)
-    content = file.read_bytes()
-    file.write_bytes(content[: begins[24] + num_bytes])
-    with pytest.raises(InvalidSampleError, match=r"^video: expected a whole file, got .*film\.\w+\)$"):
-        read_video(file)
-    with pytest.raises(DatasetError, match=r"film\.\w+: expected a whole video file, got "):
-        labelled(file)
+    file.write_bytes(file.read_bytes()[: begins[24] + num_bytes])
+    assert_both_refuse(file, r"expected a whole video file, got ")
 
 
 def test_a_film_that_breaks_off_is_told_with_its_sizes(tmp_path: Path) -> None:
@@ -309,55 +293,39 @@ def test_a_film_that_breaks_off_is_told_with_its_sizes(tmp_path: Path) -> None:
     content = (tmp_path / "film.mkv").read_bytes()
     (tmp_path / "film.mkv").write_bytes(content[: len(content) * 6 // 10])
     told = f"the first {len(content) * 6 // 10} bytes of at least {len(content)}"
-    with pytest.raises(DatasetError, match=f"film.mkv: expected a whole video file, got {told}$"):
-        labelled(tmp_path / "film.mkv")
+    assert_both_refuse(tmp_path / "film.mkv", f"expected a whole video file, got {told}")
 
 
-def spoil(file: Path, number: int) -> None:
-    """Noise amid a frame."""
+def in_groups(file: Path) -> None:
+    """A film in which a frame is spoilt. Each 20th frame needs no other; the others are made from the one before.
+
+    x264 notices damage in CAVLC.
+    """
+    options = {"preset": "ultrafast", "bf": "0", "g": "20", "sc_threshold": "0"}
+    encode_here(file, noise(), "libx264", options)
+    assert len(read_video(file)) == len(labelled(file)) == NUM_FRAMES
     with av.open(str(file)) as container:
-        packet = [packet for packet in container.demux(video=0) if packet.size][number]
+        packet = [packet for packet in container.demux(video=0) if packet.size][5]
         start = packet.pos + packet.size // 3
     content = bytearray(file.read_bytes())
     content[start : start + 40] = np.random.default_rng(1).integers(0, 256, 40, np.uint8).tobytes()
     file.write_bytes(content)
 
 
-def in_groups(file: Path, frames: UInt8Array) -> None:
-    """Each 20th frame needs no other; the others are made from the one before. x264 notices damage in CAVLC."""
-    options = {"preset": "ultrafast", "bf": "0", "g": "20", "sc_threshold": "0"}
-    with av.open(str(file), "w") as container:
-        stream: Any = container.add_stream("libx264", rate=10, options=options)
-        stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], "yuv420p"
-        for image in frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
-        container.mux(stream.encode())
-
-
-REFUSED = "expected an undamaged frame, got one that the decoder marks, or is made from such a one"
-
-
-def test_a_frame_that_the_decoder_marks_as_damaged_is_refused(tmp_path: Path) -> None:
-    file = tmp_path / "film.mp4"
-    in_groups(file, noise())
-    assert len(read_video(file)) == len(labelled(file)) == NUM_FRAMES
-    spoil(file, 5)
-    with pytest.raises(InvalidSampleError, match=rf"^video: frame 5: {REFUSED} \(.*film\.mp4\)$"):
-        read_video(file)
-    with pytest.raises(DatasetError, match=rf"^film\.mp4: .*film\.mp4: frame 5: {REFUSED}$"):
-        labelled(file)
-
-
 def test_damage_counts_up_to_the_next_key_frame_and_only_in_frames_that_are_used(tmp_path: Path) -> None:
     file = tmp_path / "film.mp4"
-    in_groups(file, noise())
-    spoil(file, 5)
-    with pytest.raises(InvalidSampleError, match=rf"^video: frame 13: {REFUSED}"):
+    in_groups(file)
+    refused = "expected an undamaged frame, got one that the decoder marks, or is made from such a one"
+    with pytest.raises(InvalidSampleError, match=rf"^video: frame 5: {refused} \(.*film\.mp4\)$"):
+        read_video(file)
+    with pytest.raises(DatasetError, match=rf"^film\.mp4: .*film\.mp4: frame 5: {refused}$"):
+        labelled(file)
+    with pytest.raises(InvalidSampleError, match=rf"^video: frame 13: {refused}"):
         read_video(file, 1)  # frames 0, 13, 26 and 39
     assert len(read_video(file, start_s=0, end_s=0.5)) == 5
     assert len(read_video(file, start_s=2, end_s=4)) == 20
     for first, count in ((0, 5), (20, 20)):
-        times_s = Packets.read(file).times_s[first : first + count]
+        times_s = film_packets(file).times_s[first : first + count]
         assert len(list(decode(Span(file, times_s, 0.05, "episode")))) == count
 
 
@@ -376,7 +344,7 @@ def test_a_film_that_begins_amid_a_stream_is_not_called_damaged(
     tmp_path: Path, codec: str, options: dict[str, str], at_key_frame: bool
 ) -> None:
     """As cutting without encoding leaves it: the decoder leaves out what it cannot show."""
-    encode(tmp_path / "all.mkv", noise(), codec, options)
+    encode_here(tmp_path / "all.mkv", noise(), codec, options)
     with av.open(str(tmp_path / "all.mkv")) as whole, av.open(str(tmp_path / "film.mkv"), "w") as part:
         stream = part.add_stream_from_template(whole.streams.video[0])
         packets = [packet for packet in whole.demux(video=0) if packet.dts is not None]

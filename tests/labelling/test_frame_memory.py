@@ -15,9 +15,8 @@ import pytest
 from labelling import BrightnessScorer
 from rfm_client import InvalidSampleError, ProgressResult, ProgressSample
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.datasets.protocol import Contents
-from rfm_client.labelling import Episode, LabelOptions, Report, episode_scores, label, run
-from rfm_client.labelling.frame_memory import FrameMemory
+from rfm_client.labelling import Dataset, DatasetEpisode, LabelOptions, Report, episode_scores, label, run
+from rfm_client.labelling.episode_scores import FrameMemory
 
 NUM_FRAMES, SIDE = 2000, 32
 FILM_BYTES = NUM_FRAMES * SIDE * SIDE * 3
@@ -30,25 +29,27 @@ def small_requests(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(episode_scores, "MAX_BYTES", FILM_BYTES // 50)
 
 
-class LongFilms:
+class LongFilms(Dataset):
     """Episodes of one camera, whose frames are made when they are asked for."""
 
-    kind, source, revision = "made up", "long films", None
-    cameras, depth_cameras, notes = ("front",), (), ()
-    left_out: dict[str, str] = {}  # noqa: RUF012
-    orientations: dict[str, Any] = {}  # noqa: RUF012
+    kind, source, cameras = "made up", "long films", ("front",)
 
     def __init__(self, root: Path, num_episodes: int, num_more: int = 0) -> None:
-        self.root, self.num_more = root, num_more
-        self.episodes = [Episode(i, f"film {i}", "wait", NUM_FRAMES, i * NUM_FRAMES) for i in range(num_episodes)]
+        self.root, self.num_episodes, self.num_more = root, num_episodes, num_more
+
+    def read_episodes(self) -> list[DatasetEpisode]:
+        return [DatasetEpisode(i, f"film {i}", "wait", NUM_FRAMES, i * NUM_FRAMES) for i in range(self.num_episodes)]
 
     def decoder(self, camera: str) -> None:
         return None
 
-    def check(self, episode: Episode, camera: str) -> Contents:
-        return Contents(str(episode.index), FILM_BYTES)
+    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+        return str(episode.index)
 
-    def frames(self, episode: Episode, camera: str) -> Iterator[UInt8Array]:
+    def check(self, episode: DatasetEpisode, camera: str) -> int:
+        return FILM_BYTES
+
+    def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         return (np.full((SIDE, SIDE, 3), t % 256, np.uint8) for t in range(NUM_FRAMES + self.num_more))
 
 
@@ -80,26 +81,18 @@ def test_each_frame_of_a_film_is_held_once(output: Path, mode: dict[str, Any]) -
     assert 1 <= peak < 1.7
 
 
-@pytest.mark.parametrize("scorer", [BrightnessScorer, Refusing])
-def test_all_workers_together_hold_no_more_than_fits(
-    output: Path, scorer: type[BrightnessScorer], monkeypatch: pytest.MonkeyPatch
+BOUNDS = {"of one and a half films": (int(1.5 * FILM_BYTES), BrightnessScorer), "below one film": (1, BrightnessScorer)}
+BOUNDS["and an episode that failed holds nothing"] = (int(1.5 * FILM_BYTES), Refusing)
+
+
+@pytest.mark.parametrize(("max_bytes", "scorer"), BOUNDS.values(), ids=BOUNDS)
+def test_all_workers_together_hold_no_more_than_fits_or_one_film(
+    output: Path, max_bytes: int, scorer: type[BrightnessScorer], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And an episode that failed holds nothing."""
-    monkeypatch.setattr(run, "FrameMemory", functools.partial(FrameMemory, int(1.5 * FILM_BYTES)))
+    monkeypatch.setattr(run, "FrameMemory", functools.partial(FrameMemory, max_bytes))
     options = LabelOptions(output=output, workers=WORKERS, frames=2)
     peak, report = peak_films(LongFilms(output, 2 * WORKERS), options, scorer())
     assert len(report.failures) == (2 * WORKERS if scorer is Refusing else 0)
-    assert 1 <= peak < 2
-
-
-def test_a_film_that_is_larger_than_all_that_fits_is_labelled_alone(
-    output: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(run, "FrameMemory", functools.partial(FrameMemory, 1))
-    peak, report = peak_films(
-        LongFilms(output, 3), LabelOptions(output=output, workers=3, frames=2), BrightnessScorer()
-    )
-    assert report.failures == []
     assert 1 <= peak < 2
 
 

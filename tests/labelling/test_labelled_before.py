@@ -4,35 +4,25 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import av
 import h5py
 import numpy as np
-import pyarrow.compute as pc
 import pytest
 from pyarrow import parquet
 
-from labelling import LEROBOT, BrightnessScorer
-from rfm_client.labelling import DatasetError, LabelOptions, Watch, label, open_dataset
+from labelling import LEROBOT, BrightnessScorer, Notes
+from rfm_client.labelling import DatasetError, LabelOptions, label, open_dataset
 
 TOY = LEROBOT / "toy_v30_many"
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 CAMERAS = (WRIST, FRONT)  # not in the order of their names
 PROGRESS = "rfm_progress.parquet"
-ALL_FRAMES = 428
 EPISODE_FRAMES = [episode.num_frames for episode in open_dataset(TOY).episodes]
-
-
-class Notes(Watch):
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def note(self, text: str) -> None:
-        self.lines.append(text)
 
 
 def labelled(root: Path, output: Path, **options: Any) -> tuple[int, list[str]]:
@@ -42,12 +32,9 @@ def labelled(root: Path, output: Path, **options: Any) -> tuple[int, list[str]]:
     return scorer.num_samples // len(CAMERAS), notes.lines
 
 
-def contents(output: Path) -> dict[str, bytes]:
-    return {str(file.relative_to(output)): file.read_bytes() for file in sorted(output.rglob("*.parquet"))}
-
-
 def labels(output: Path) -> dict[str, bytes]:
-    return {name: content for name, content in contents(output).items() if ".rfm_parts" not in name}
+    files = [file for file in sorted(output.rglob("*.parquet")) if ".rfm_parts" not in file.parts]
+    return {str(file.relative_to(output)): file.read_bytes() for file in files}
 
 
 @pytest.fixture(scope="module")
@@ -81,12 +68,6 @@ def test_labels_of_further_episodes_are_joined_to_those_that_are_there(
     assert len(labels(output)) == (len(formats) or 2)
 
 
-def test_the_run_says_what_lerobot_makes_of_episodes_without_labels(output: Path) -> None:
-    _, notes = labelled(TOY, output, limit=2)
-    lerobot = "; LeRobot's reader gives frames of the others the weight 1.0"
-    assert notes[-1] == f"2 of the dataset's 10 episodes have labels{lerobot}"
-
-
 OTHERS: dict[str, tuple[BrightnessScorer, dict[str, Any], str]] = {
     "frames": (BrightnessScorer(), {"frames": 8}, "sampling.frames: 4 there, 8 now"),
     "rule": (BrightnessScorer(), {"sampling": "linspace_round"}, "sampling.rule: {rule} there, linspace_round now"),
@@ -96,6 +77,7 @@ OTHERS: dict[str, tuple[BrightnessScorer, dict[str, Any], str]] = {
         f"cameras: {FRONT} there, {WRIST} now; decoders.{WRIST}: none there, {{decoder}} now; "
         f"decoders.{FRONT}: {{decoder}} there, none now",
     ),
+    "what tells files": (BrightnessScorer(), {"verify": True}, "verify: False there, True now"),
     "weights": (BrightnessScorer(digest="new"), {}, "checkpoint.weights_digest: brightness there, new now"),
     "settings": (BrightnessScorer(settings="new"), {}, "checkpoint.settings_digest: settings there, new now"),
 }
@@ -116,7 +98,7 @@ def test_labels_of_another_recipe_are_refused_with_the_setting_that_differs(
         label(open_dataset(TOY), scorer, LabelOptions(**changed))
     got = f"{output / PROGRESS}: expected no labels, or those of the same recipe, got {expected}"
     assert str(caught.value) == f"{got}: choose another --name, or --overwrite"
-    assert labels(output) == before
+    assert (labels(output), scorer.num_samples) == (before, 0)
 
     notes = Notes()
     label(open_dataset(TOY), scorer, LabelOptions(**{**changed, "overwrite": True}), notes)
@@ -133,10 +115,6 @@ def test_another_decoder_is_another_recipe(output: Path) -> None:
     dataset.decoder = lambda camera: "PyAV 1.0"  # type: ignore[method-assign]
     with pytest.raises(DatasetError, match=rf"got decoders\.{FRONT}: PyAV \d+\.\S+.* there, PyAV 1\.0 now: choose"):
         label(dataset, BrightnessScorer(), options)
-
-
-def copy_of_toy(folder: Path) -> Path:
-    return shutil.copytree(TOY, folder / TOY.name)
 
 
 def demonstrations(file: Path, num_demos: int, *, changed: int | None = None, seed: int = 0) -> Path:
@@ -169,11 +147,9 @@ def test_an_hdf5_file_s_labels_are_joined_too(tmp_path: Path, in_place: bool) ->
     demos, whole = (demonstrations(tmp_path / name, 4) for name in ("demos.hdf5", "whole.hdf5"))
     written = [file if in_place else file.with_name(f"{file.stem}.rfm_rewards.hdf5") for file in (demos, whole)]
     label_demonstrations(whole, in_place=in_place, parts=str(tmp_path / "parts"))
-    assert label_demonstrations(demos, in_place=in_place, episodes=[1, 3]) == 6 + 8
-    shutil.rmtree(tmp_path / ".rfm_parts")
-    assert label_demonstrations(demos, in_place=in_place, episodes=[0]) == 5
-    shutil.rmtree(tmp_path / ".rfm_parts")
-    assert label_demonstrations(demos, in_place=in_place) == 7
+    for episodes, expected in ([1, 3], 6 + 8), ([0], 5), (None, 7):
+        assert label_demonstrations(demos, in_place=in_place, episodes=episodes) == expected
+        shutil.rmtree(tmp_path / ".rfm_parts")
     assert hdf5_labels(written[0]) == hdf5_labels(written[1])
 
 
@@ -195,7 +171,9 @@ def test_an_episode_that_has_changed_is_labelled_again_where_it_is_chosen(tmp_pa
 def test_labels_of_another_dataset_of_the_same_name_are_not_replaced(tmp_path: Path, output: Path) -> None:
     one, another = (demonstrations(tmp_path / str(seed) / "demos.hdf5", 3, seed=seed) for seed in (0, 1))
     label_demonstrations(one, output=output)
-    with pytest.raises(DatasetError, match="expected labels of this dataset's episodes, got those of others: choose"):
+    with pytest.raises(
+        DatasetError, match=r"expected labels of this dataset's episodes, got those of others, .*: choo"
+    ):
         label_demonstrations(another, output=output)
     assert label_demonstrations(another, output=output, overwrite=True) == 5 + 6 + 7
 
@@ -212,52 +190,54 @@ def test_labels_of_an_episode_that_the_dataset_has_lost_are_dropped_only_when_as
     assert len(hdf5_labels(tmp_path / "demos.rfm_rewards.hdf5")) == 2 * 3
 
 
-def without_last_episode(root: Path) -> None:
-    """The dataset as it was before its last episode came: LeRobot appended it to the files that were there."""
-    (meta,) = (root / "meta" / "episodes").rglob("*.parquet")
-    (rows,) = (root / "data").rglob("*.parquet")
-    last = parquet.read_table(meta).to_pylist()[-1]
-    for file in (meta, rows):
-        table = parquet.read_table(file, partitioning=None)
-        parquet.write_table(table.filter(pc.not_equal(table["episode_index"], last["episode_index"])), file)
-    for camera in (FRONT, WRIST):
-        chunk, number, from_s = (
-            last[f"videos/{camera}/{name}"] for name in ("chunk_index", "file_index", "from_timestamp")
-        )
-        assert from_s > 0
-        cut(root / "videos" / camera / f"chunk-{chunk:03d}" / f"file-{number:03d}.mp4", from_s)
-    info = json.loads((root / "meta" / "info.json").read_text())
-    info["total_episodes"] -= 1
-    info["total_frames"] -= last["length"]
-    (root / "meta" / "info.json").write_text(json.dumps(info))
-
-
-def cut(film: Path, end_s: float) -> None:
-    """Leaves the packets from here on away, the others as they are."""
-    whole = film.rename(film.with_suffix(".whole"))
-    with av.open(str(whole), format="mp4") as source, av.open(str(film), "w") as shorter:
-        template = source.streams.video[0]
-        stream = shorter.add_stream_from_template(template)
-        for packet in source.demux(template):
-            if packet.size and float(packet.pts * packet.time_base) < end_s - 0.01:
-                packet.stream = stream
-                shorter.mux(packet)
-    whole.unlink()
-
-
-def test_a_dataset_that_has_grown_is_labelled_where_it_is_new(
-    tmp_path: Path, output: Path, undisturbed: dict[str, bytes]
+@pytest.mark.parametrize("verify", [False, True])
+def test_labels_of_a_film_hold_until_its_time_changes_or_where_they_are_verified_its_content(
+    tmp_path: Path, output: Path, verify: bool
 ) -> None:
-    """Its films have grown with it: the packets of the episodes that were there are the same."""
-    root = copy_of_toy(tmp_path)
-    without_last_episode(root)
-    scored, _ = labelled(root, output)
-    assert scored == ALL_FRAMES - EPISODE_FRAMES[9]
-    shutil.rmtree(root)
-    copy_of_toy(tmp_path)
-    scored, _ = labelled(root, output)
-    assert scored == EPISODE_FRAMES[9]
-    assert labels(output) == undisturbed
+    root = shutil.copytree(TOY, tmp_path / TOY.name)
+    film = root / "videos" / FRONT / "chunk-000" / "file-001.mp4"  # of episodes 4 to 7
+    assert labelled(root, output, verify=verify)[0] == sum(EPISODE_FRAMES)
+    for file in root.rglob("*.mp4"):
+        os.utime(file, (1, 1))
+    if not verify:
+        with pytest.raises(DatasetError, match=r"labels of this dataset's episodes, got those of others, or of copies"):
+            labelled(root, output)
+        assert labelled(root, output, overwrite=True)[0] == sum(EPISODE_FRAMES)
+        os.utime(film, (2, 2))
+        assert labelled(root, output)[0] == sum(EPISODE_FRAMES[4:8])
+        return
+    assert labelled(root, output, verify=True)[0] == 0
+    film.write_bytes(film.read_bytes() + bytes(8))
+    os.utime(film, (1, 1))
+    assert labelled(root, output, verify=True)[0] == sum(EPISODE_FRAMES[4:8])
+
+
+def test_films_are_read_only_where_labels_are_missing(tmp_path: Path, output: Path) -> None:
+    root = shutil.copytree(TOY, tmp_path / TOY.name)
+    labelled(root, output)
+    for film in root.rglob("*.mp4"):
+        status = film.stat()
+        film.write_bytes(bytes(status.st_size))
+        os.utime(film, ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert labelled(root, output)[0] == 0
+    with pytest.raises(DatasetError, match=r"\.mp4: expected a whole video file"):
+        labelled(root, output, name="others")
+
+
+def test_a_dataset_that_has_grown_is_labelled_where_it_is_new(tmp_path: Path, output: Path) -> None:
+    whole = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "whole")
+    root = shutil.copytree(whole, tmp_path / "growing")
+    info = json.loads((whole / "meta" / "info.json").read_text())
+    lines = (whole / "meta" / "episodes.jsonl").read_text().splitlines(keepends=True)
+    last = json.loads(lines[-1])["length"]
+    shorter = {**info, "total_episodes": len(lines) - 1, "total_frames": info["total_frames"] - last}
+    (root / "meta" / "info.json").write_text(json.dumps(shorter))
+    (root / "meta" / "episodes.jsonl").write_text("".join(lines[:-1]))
+    assert labelled(root, output)[0] == info["total_frames"] - last
+    for name in ("info.json", "episodes.jsonl"):
+        shutil.copy(whole / "meta" / name, root / "meta" / name)
+    assert labelled(root, output)[0] == last
+    assert len(parquet.read_table(output / PROGRESS)) == info["total_frames"]
 
 
 BY_OTHERS: dict[str, tuple[Callable[[Path], object], str]] = {

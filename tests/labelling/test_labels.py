@@ -14,7 +14,7 @@ import pytest
 from pyarrow import parquet
 
 import goldens
-from labelling import LEROBOT, BrightnessScorer
+from labelling import LEROBOT, BrightnessScorer, Notes
 from paths import ROOT
 from rfm_client import ProgressSample, RewardClient, Trajectory
 from rfm_client.data.sampling import RULES, Sampling
@@ -24,7 +24,6 @@ from rfm_client.labelling import (
     DatasetError,
     LabelOptions,
     Report,
-    Watch,
     iter_episodes,
     label,
     open_dataset,
@@ -78,17 +77,9 @@ def test_a_checkpoint_is_another_with_other_settings(tmp_path: Path, file: str) 
     assert facts().settings_digest != before.settings_digest
 
 
-def columns(file: Path) -> dict[str, np.ndarray[Any, Any]]:
-    return {name: column.to_numpy() for name, column in zip(*table_of(file), strict=True)}
-
-
-def table_of(file: Path) -> tuple[list[str], list[Any]]:
-    table = parquet.read_table(file)
-    return table.column_names, table.columns
-
-
 def progress_of(report: Report) -> dict[str, np.ndarray[Any, Any]]:
-    return columns(report.files[0])
+    table = parquet.read_table(report.files[0])
+    return {name: column.to_numpy() for name, column in zip(table.column_names, table.columns, strict=True)}
 
 
 def area_under_curve(scores: Any, is_success: Any) -> float:
@@ -98,12 +89,19 @@ def area_under_curve(scores: Any, is_success: Any) -> float:
 
 @pytest.mark.triton
 @pytest.mark.parametrize("root", DATASETS)
-def test_triton_and_the_engine_give_every_frame_the_score_of_its_prefix(
+def test_triton_and_the_engine_score_each_frame_on_its_prefix_and_tell_successes_from_failures(
     client: RewardClient, root: Path, output: Path
 ) -> None:
     dataset = open_dataset(root)
     (output / "engine").mkdir()
-    served = progress_of(label(dataset, ClientScorer(client), LabelOptions(output=output)))
+    report = label(dataset, ClientScorer(client), LabelOptions(output=output))
+    kinds = json.loads((root.parent / "kinds.json").read_text())[root.name]
+    assert report.summary is not None
+    is_success = np.array(kinds) == "success"
+    assert area_under_curve(report.summary.final_progress, is_success) >= 0.95
+    assert set(report.summary.episodes[is_success]).isdisjoint(report.summary.never_succeed)
+
+    served = progress_of(report)
     own = progress_of(label(dataset, engine_scorer(), LabelOptions(output=output / "engine")))
     assert list(served) == list(own)
     np.testing.assert_array_equal(served["index"], np.arange(sum(e.num_frames for e in dataset.episodes)))
@@ -126,17 +124,6 @@ def test_triton_and_the_engine_give_every_frame_the_score_of_its_prefix(
             )
     fused = np.mean([[scores[0] for scores in by_hand[camera]] for camera in by_hand], axis=0)
     np.testing.assert_allclose(served["progress_sparse"][: episode.num_frames], fused, rtol=0, atol=TOLERANCE)
-
-
-@pytest.mark.triton
-@pytest.mark.parametrize("root", DATASETS)
-def test_final_progress_tells_successes_from_failures(client: RewardClient, root: Path, output: Path) -> None:
-    report = label(open_dataset(root), ClientScorer(client), LabelOptions(output=output))
-    kinds = json.loads((root.parent / "kinds.json").read_text())[root.name]
-    assert report.summary is not None
-    is_success = np.array(kinds) == "success"
-    assert area_under_curve(report.summary.final_progress, is_success) >= 0.95
-    assert set(report.summary.episodes[is_success]).isdisjoint(report.summary.never_succeed)
 
 
 @pytest.mark.triton
@@ -251,27 +238,10 @@ def test_lerobot_s_reader_finds_a_delta_for_every_frame(output: Path) -> None:
     """As its reader of today is documented: by the global index, with the end of the episode for what lies behind."""
     dataset = open_dataset(LEROBOT / "toy_v30_many")
     told = progress_of(label(dataset, BrightnessScorer(), LabelOptions(output=output)))
-    progress = dict(zip(told["index"].tolist(), told["progress_sparse"].tolist(), strict=True))
     assert not np.isnan(told["progress_sparse"]).any()
-    bounds = {
-        episode: (
-            told["index"][told["episode_index"] == episode].min(),
-            told["index"][told["episode_index"] == episode].max(),
-        )
-        for episode in np.unique(told["episode_index"])
-    }
     for episode in dataset.episodes:
-        first, last = bounds[episode.index]
-        assert (first, last) == (episode.first_index, episode.first_index + episode.num_frames - 1)
-        assert all(min(index + 16, last) in progress for index in range(first, last + 1))
-
-
-class Notes(Watch):
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def note(self, text: str) -> None:
-        self.lines.append(text)
+        own = told["index"][told["episode_index"] == episode.index]
+        np.testing.assert_array_equal(own, episode.first_index + np.arange(episode.num_frames))
 
 
 LEROBOT_S = "LeRobot's reader gives frames of the others the weight 1.0"

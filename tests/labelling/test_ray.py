@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from rfm_client.labelling import (
     open_dataset,
 )
 from rfm_client.labelling.label import plan_labels
-from rfm_client.labelling.ray_engine import EpisodeActor, Job
+from rfm_client.labelling.ray_engine import EpisodeActor, RayJob
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::FutureWarning", "ignore::DeprecationWarning", "ignore::ResourceWarning"
@@ -42,58 +42,40 @@ def contents(output: Path) -> list[bytes]:
     return [(output / name).read_bytes() for name in FILES]
 
 
-class ClosingScorer(BrightnessScorer):
-    """Refuses as soon as it is closed, as a client does."""
+class OpenScorer(BrightnessScorer):
+    """Refuses as soon as it is closed, as a client does, and keeps the frames that it is shown."""
 
-    is_open = True
+    def __init__(self) -> None:
+        super().__init__()
+        self.is_open = True
+        self.seen: list[Any] = []
 
     def evaluate(self, samples: Any) -> list[ProgressResult]:
         if not self.is_open:
             raise RewardError("this scorer is closed")
+        self.seen += [frame for sample in samples for frame in sample.trajectory.frames]
         return super().evaluate(samples)
 
 
-def test_a_scorer_is_open_as_long_as_its_actor_lives(output: Path) -> None:
-    scorer = ClosingScorer()
+def test_an_actor_opens_the_dataset_as_it_is_told_and_its_scorer_for_as_long_as_it_lives(output: Path) -> None:
+    scorer, told = OpenScorer(), {"task": "juggle", "override_task": True, "orient": Orient("rotate90")}
 
     @contextmanager
     def connect() -> Iterator[Scorer]:
-        try:
-            yield scorer
-        finally:
-            scorer.is_open = False
+        yield scorer
+        scorer.is_open = False
 
-    plan = plan_labels(open_dataset(ROOT), scorer, LabelOptions(output=output, limit=3))
-    actor = EpisodeActor(Job(str(ROOT), None, connect, plan, str(output / "parts"), workers=1))
+    dataset = open_dataset(ROOT, **told)  # type: ignore[arg-type]
+    plan = plan_labels(dataset, scorer, LabelOptions(output=output, limit=3, cameras=(dataset.cameras[0],)))
+    actor = EpisodeActor(RayJob(str(ROOT), told, connect, plan, str(output / "parts"), workers=1))
     assert actor({"places": [[0, 2]]}) == {"place": [0, 2], "reason": ["", ""]}
     assert actor({"places": [[1]]}) == {"place": [1], "reason": [""]}
     assert scorer.is_open
     del actor
     assert not scorer.is_open
-
-
-class SeeingScorer(BrightnessScorer):
-    """Keeps the frames that it is shown."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.seen: list[Any] = []
-
-    def evaluate(self, samples: Any) -> list[ProgressResult]:
-        self.seen += [frame for sample in samples for frame in sample.trajectory.frames]
-        return super().evaluate(samples)
-
-
-def test_an_actor_opens_the_dataset_as_it_is_told(output: Path) -> None:
-    scorer, told = SeeingScorer(), {"task": "juggle", "override_task": True, "orient": Orient("rotate90")}
-    dataset = open_dataset(ROOT, **told)  # type: ignore[arg-type]
-    plan = plan_labels(dataset, scorer, LabelOptions(output=output, limit=1, cameras=(dataset.cameras[0],)))
-    job = Job(str(ROOT), "juggle", lambda: nullcontext(scorer), plan, str(output), 1, True, Orient("rotate90"))
-    assert EpisodeActor(job)({"places": [[0]]}) == {"place": [0], "reason": [""]}
     assert scorer.tasks == {"juggle"}
-    (episode, *_), stored = dataset.episodes, open_dataset(ROOT)
-    last = list(stored.frames(episode, dataset.cameras[0]))[-1]
-    assert any(np.array_equal(frame, np.rot90(last, -1)) for frame in scorer.seen)
+    stored = list(open_dataset(ROOT).frames(dataset.episodes[0], dataset.cameras[0]))
+    assert any(np.array_equal(frame, np.rot90(stored[-1], -1)) for frame in scorer.seen)
 
 
 @pytest.fixture
@@ -123,18 +105,9 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 
 @pytest.mark.slow
-def test_a_cluster_writes_the_files_that_one_process_writes(
+def test_a_cluster_goes_on_without_a_node_that_is_killed_and_writes_what_one_process_writes(
     cluster: Any, output: Path, undisturbed: list[bytes]
 ) -> None:
-    report = label_with_ray(
-        str(ROOT), slow, LabelOptions(output=output, workers=2), ray=RayOptions(cluster.address, actors=2)
-    )
-    assert report.failures == []
-    assert contents(output) == undisturbed
-
-
-@pytest.mark.slow
-def test_a_cluster_goes_on_without_a_node_that_is_killed(cluster: Any, output: Path, undisturbed: list[bytes]) -> None:
     node = cluster.add_node(num_cpus=2, object_store_memory=10**8)
 
     class Killing(Watch):
@@ -147,27 +120,23 @@ def test_a_cluster_goes_on_without_a_node_that_is_killed(cluster: Any, output: P
 
     watch = Killing()
     options = LabelOptions(output=output, workers=1)
-    label_with_ray(str(ROOT), slow, options, watch, ray=RayOptions(cluster.address, actors=3))
-    assert watch.count == 10
+    report = label_with_ray(str(ROOT), slow, options, watch, ray=RayOptions(cluster.address, actors=3))
+    assert (report.failures, watch.count) == ([], 10)
     assert contents(output) == undisturbed
 
 
 @pytest.mark.slow
 def test_one_machine_goes_on_with_what_a_cluster_has_left(cluster: Any, output: Path, undisturbed: list[bytes]) -> None:
-    options = LabelOptions(output=output)
-    report = label_with_ray(str(ROOT), picky, options, ray=RayOptions(cluster.address, actors=2))
+    options, on = LabelOptions(output=output), RayOptions(cluster.address, actors=2)
+    report = label_with_ray(str(ROOT), absent, options, ray=on)
+    assert [str(failure.error) for failure in report.failures] == ["no server"] * 10
+    report = label_with_ray(str(ROOT), picky, options, ray=on)
     assert report.files == []
     assert {str(failure.error) for failure in report.failures} == {"task: expected another one, got this"}
     rest = BrightnessScorer()
     label(open_dataset(ROOT), rest, options)
     assert rest.num_samples == 2 * sum(failure.episode.num_frames for failure in report.failures)
     assert contents(output) == undisturbed
-
-
-@pytest.mark.slow
-def test_what_no_actor_can_label_is_told(cluster: Any, output: Path) -> None:
-    report = label_with_ray(str(ROOT), absent, LabelOptions(output=output), ray=RayOptions(cluster.address))
-    assert [str(failure.error) for failure in report.failures] == ["no server"] * 10
 
 
 @pytest.mark.triton

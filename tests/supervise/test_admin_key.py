@@ -24,7 +24,7 @@ from rfm.launch.admin_key import VARIABLE, AdminKeyError, take_key
 from rfm.launch.installation import ServerStartError, find_installation
 from rfm.launch.process import Endpoints, TritonServer
 from rfm_client import ProgressSample, RewardClient
-from rfm_client.status import read_status
+from rfm_client.transport.status import read_status
 from rollout import NAME, RFM
 from trajectories import random_trajectory
 

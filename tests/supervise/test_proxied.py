@@ -23,9 +23,9 @@ from commands import EXIT_S
 from rfm.launch.process import Endpoints
 from rfm.launch.triton_options import MAX_HTTP_BYTES
 from rfm_client import AccessDeniedError, ServerUnavailableError
-from rfm_client.status import read_status
 from rfm_client.transport.access import Access
 from rfm_client.transport.loop_thread import LoopThread
+from rfm_client.transport.status import read_status
 from secured import (
     KEY,
     TRAJECTORY,

@@ -21,8 +21,8 @@ from rfm.launch.installation import find_installation
 from rfm.launch.process import Endpoints, TritonServer
 from rfm.launch.tls import GrpcTls
 from rfm_client import ServerUnavailableError
-from rfm_client.status import read_status
 from rfm_client.transport.access import Access
+from rfm_client.transport.status import read_status
 from rfm_commands.cli import app
 from secured import (
     AT_ONCE_S,

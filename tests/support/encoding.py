@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -29,15 +30,26 @@ def encode(file: Path, frames: Sequence[np.ndarray[Any, Any]], codec: str, optio
         subprocess.run([sys.executable, __file__, file, array, codec, json.dumps(options)], check=True)
 
 
-def main(file: str, array: str, codec: str, options: str) -> None:
-    frames = np.load(array)
-    with av.open(file, "w") as container:
-        stream: Any = container.add_stream(codec, rate=FPS, options=json.loads(options))
-        stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], "yuv420p"
+def encode_here(
+    target: Any,
+    frames: Sequence[np.ndarray[Any, Any]] | np.ndarray[Any, Any],
+    codec: str = "libx264",
+    options: Mapping[str, str] | None = None,
+    *,
+    pixels: str = "yuv420p",
+    rate: Fraction = Fraction(FPS),
+    of_container: Mapping[str, str] | None = None,
+    format: str | None = None,
+) -> None:
+    """Writes a video in this process, for other encoders. target: a path, or what has ``write``"""
+    target = str(target) if isinstance(target, Path) else target
+    with av.open(target, "w", format=format, options=dict(of_container or {})) as container:
+        stream: Any = container.add_stream(codec, rate=rate, options=dict(options or {}))
+        stream.height, stream.width, stream.pix_fmt = *frames[0].shape[:2], pixels
         for image in frames:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode())
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    encode_here(sys.argv[1], np.load(sys.argv[2]), sys.argv[3], json.loads(sys.argv[4]))

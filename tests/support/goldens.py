@@ -228,11 +228,17 @@ VLM = configs("vlm")
 CASES = [case for config in (*REWIND, *WITH_ENCODERS) for case in config.cases()]
 VLM_CASES = [case for config in VLM for case in config.cases()]
 ANSWERED = [case for case in (*CASES, *VLM_CASES) if not case.is_refused]
-REFUSED = [case for case in (*CASES, *VLM_CASES) if case.is_refused]
 
 
 def config(name: str) -> Config:
     return next(config for config in (*REWIND, *WITH_ENCODERS, *VLM) if config.name == name)
+
+
+# What the shared server serves: ReWiND, ReWiND with encoders, Qwen3-VL on images, Qwen2.5-VL on video. Each reference
+# case runs on the engine; through Triton one of each of these, and one that is refused.
+SERVED = [config(name) for name in ("c1_t1_disc10", "enc_c1_t1_disc10", "q3_tok_disc10", "q25_video_avg_disc10")]
+SERVED_CASES = [next(case for case in each.cases() if case.file.stem.startswith("mixed")) for each in SERVED]
+REFUSED_CASE = next(case for each in SERVED for case in each.cases() if case.is_refused)
 
 
 def sample_type(sample: Sample) -> str:

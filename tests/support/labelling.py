@@ -17,7 +17,7 @@ import numpy as np
 
 from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, RewardError, Trajectory
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.labelling import CheckpointFacts, LabelOptions, Scorer, label, open_dataset
+from rfm_client.labelling import CheckpointFacts, LabelOptions, Scorer, Watch, label, open_dataset
 from rfm_client.labelling.options import parse_shard
 
 LEROBOT = Path(__file__).parents[1] / "lerobot"
@@ -76,6 +76,16 @@ class AbsentScorer(BrightnessScorer):
 
     def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
         raise RewardError("no server")
+
+
+class Notes(Watch):
+    """Keeps what a run says."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def note(self, text: str) -> None:
+        self.lines.append(text)
 
 
 @contextmanager

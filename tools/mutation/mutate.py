@@ -66,7 +66,7 @@ TESTS: dict[str, tuple[str, ...]] = {
         "test_vlm",
         "test_vlm_checkpoint",
     ),
-    "client/rfm_client/contract/wire.py": ("test_wire", "test_samples", "test_properties"),
+    "client/rfm_client/contract/wire/*.py": ("test_wire", "test_samples", "test_properties"),
     "rfm/triton_model/batch_model.py": ("test_batch_model", "test_pipeline", "test_logs"),
     "rfm/triton_model/guard.py": ("test_guard",),
     "rfm/triton_model/pipeline.py": ("test_pipeline",),

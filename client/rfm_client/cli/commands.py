@@ -152,7 +152,7 @@ def status(
     ] = None,
 ) -> None:
     """The server's models, requests, batches, GPUs and memory."""
-    from rfm_client.status import read_status
+    from rfm_client.transport.status import read_status
 
     if metrics_url is not None and len(server.urls) > 1:
         raise typer.BadParameter("expected one --url with it, got several", param_hint="'--metrics-url'")

@@ -15,7 +15,7 @@ from rfm_client.cli.options import PrefixOptions, ServerOptions, VideoOptions
 from rfm_client.cli.scoring import Outcome, Scored, Times
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
-from rfm_client.status import ServerStatus
+from rfm_client.transport.status import ServerStatus
 
 SIDES = ("first", "second")  # of a comparison
 

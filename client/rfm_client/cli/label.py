@@ -20,12 +20,11 @@ from rfm_client.cli.show import print_tables, table
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
 from rfm_client.data.datasets.opening import open_dataset
-from rfm_client.data.datasets.protocol import Dataset, Episode
+from rfm_client.data.datasets.protocol import Dataset, DatasetEpisode
 from rfm_client.data.orientation import ORIENTATIONS, Orient
-from rfm_client.labelling.episode_scores import episode_columns
+from rfm_client.labelling.episode_scores import FrameMemory, episode_columns
 from rfm_client.labelling.finished_episodes import Parts
-from rfm_client.labelling.frame_memory import FrameMemory
-from rfm_client.labelling.label import Outputs, Report, label_with_ray, plan_labels
+from rfm_client.labelling.label import Outputs, Report, check_frames, label_with_ray, plan_labels
 from rfm_client.labelling.label import label as label_dataset
 from rfm_client.labelling.options import LabelOptions, RayOptions
 from rfm_client.labelling.plan import Item, Plan, selected
@@ -172,8 +171,9 @@ class Labelling:
         dataset = self._dataset()
         with self.connect() as scorer, ProgressBar(self.say) as watch:
             plan = plan_labels(dataset, scorer, self.labels, watch)
+            num_bytes = check_frames(dataset, plan.recipe, plan.items, watch)
             took_s = _measured_s(plan, dataset, scorer, self.labels.workers)
-        _print(_plan_rows(plan, dataset, took_s))
+        _print(_plan_rows(plan, dataset, num_bytes, took_s))
 
     def _tell(self, report: Report) -> ExitCode:
         if report.failures:
@@ -260,7 +260,7 @@ class ProgressBar(Watch):
         """The bar counts the episodes that are checked."""
         self._begin("checking episodes", num_episodes, 0)
 
-    def checked(self, episode: Episode) -> None:
+    def checked(self, episode: DatasetEpisode) -> None:
         """The bar advances by one episode."""
         self._advance(1)
 
@@ -271,11 +271,11 @@ class ProgressBar(Watch):
         self.num_begun = num_frames
         self._begin("labelling frames", num_frames, num_finished)
 
-    def scored(self, episode: Episode) -> None:
+    def scored(self, episode: DatasetEpisode) -> None:
         """The bar advances by the frames of the episode."""
         self._advance(episode.num_frames)
 
-    def failed(self, episode: Episode, error: RewardError) -> None:
+    def failed(self, episode: DatasetEpisode, error: RewardError) -> None:
         """Writes a line with the reason."""
         text = str(error)
         self._say(text if text.startswith(episode.name) else f"{episode.name}: {text}")
@@ -307,14 +307,14 @@ def _measured_s(plan: Plan, dataset: Dataset, scorer: Scorer, workers: int) -> f
     return took_s * plan.num_frames / sum(item.episode.num_frames for item in first)
 
 
-def _plan_rows(plan: Plan, dataset: Dataset, took_s: float) -> list[tuple[str, str]]:
+def _plan_rows(plan: Plan, dataset: Dataset, num_bytes: int, took_s: float) -> list[tuple[str, str]]:
     tasks = sorted({item.episode.task for item in plan.items})
     cameras = plan.recipe.cameras
     return [
         ("dataset", f"{dataset.kind}: {dataset.source}" + (f"@{dataset.revision}" if dataset.revision else "")),
         ("episodes", str(len(plan.items))),
         ("frames", f"{plan.num_frames}, of {len(cameras)} cameras: {plan.num_frames * len(cameras)} to be decoded"),
-        ("to be decoded", f"{sum(item.num_bytes for item in plan.items) / _MIB:.1f} MiB"),
+        ("to be decoded", f"{num_bytes / _MIB:.1f} MiB"),
         (f"tasks: {len(tasks)}", "; ".join(tasks[:5]) + (" ..." if len(tasks) > 5 else "")),
         ("it will take about", f"{took_s:.0f} s"),
     ]

@@ -32,8 +32,7 @@ from rfm_client.contract.errors import (
 from rfm_client.contract.results import FrameScores, ProgressResult, Result
 from rfm_client.contract.samples import ProgressSample, Trajectory
 from rfm_client.data.fitting import FittedSample, fitted, with_frame_indices
-from rfm_client.data.prefixes import of_prefixes, prefix_samples
-from rfm_client.data.sampling import Sampling
+from rfm_client.data.sampling import Sampling, of_prefixes, prefix_samples
 
 PREFIXES_AT_A_TIME = 64  # of one video: their frames lie in memory
 WORKERS = 8  # videos that are read, and lie in memory, at a time

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
-from rfm_client.status import DEVICE_METRICS, Device, ModelStatus, ServerStatus
+from rfm_client.transport.status import DEVICE_METRICS, Device, ModelStatus, ServerStatus
 
 if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderResult

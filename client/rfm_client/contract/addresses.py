@@ -3,11 +3,8 @@
 
 from __future__ import annotations
 
-import errno
 import ipaddress
-import os
 import re
-import socket
 import ssl
 from pathlib import Path
 
@@ -45,30 +42,6 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host.lower() == "localhost"
-
-
-def from_here(host: str) -> str:
-    """The address at which this machine reaches a server that listens at ``host``, be it at all addresses."""
-    return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
-
-
-def in_url(host: str) -> str:
-    """An address as URLs write it: IPv6 in brackets."""
-    return f"[{host}]" if ":" in host else host
-
-
-def check_free(host: str, port: int, where: str, *, port_option: str, host_option: str = "--host") -> None:
-    """Raises ValueError (``where: ...``) unless a server could listen there now, with the option that mends it."""
-    try:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        socket.create_server((host, port), family=family).close()
-    except (OSError, OverflowError) as error:
-        number = getattr(error, "errno", None)
-        reason = os.strerror(number) if number and number > 0 else str(error)
-        is_of_port = number in (errno.EADDRINUSE, errno.EACCES) or isinstance(error, OverflowError)
-        remedy = f"give another with {port_option if is_of_port else host_option}"
-        expected = f"a free port of this machine at {in_url(host)}:{port}"
-        raise ValueError(f"{where}: expected {expected}, got: {reason}; {remedy}") from error
 
 
 def _is_ipv6(host: str) -> bool:

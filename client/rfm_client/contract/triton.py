@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How a server says what went wrong: the status of an answer, and its wording where the status does not say enough.
+"""What went wrong between client and server, in our own errors: the one table of tritonclient's.
 
 Statuses are as tritonclient gives them: gRPC's by name, HTTP's by number. tests/triton/test_wording.py asks a real
 Triton for each of its phrases.
@@ -8,6 +8,8 @@ Triton for each of its phrases.
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
+from typing import Any
 
 from rfm_client.contract import errors
 from rfm_client.contract.wire import SECOND_FRAMES
@@ -33,8 +35,11 @@ NO_VERSIONS = "no available versions"  # of a model that is being loaded again, 
 LOST_REGION = "Unable to find shared memory region"  # of a server that was started again
 REGION_IN_USE = "it is currently in use"  # of a region to unmap: tests/client/test_shared_memory_faults.py
 RESTRICTED = "is restricted, expecting header"  # of an API that wants a key
+LATE = "no answer in time"
 
-_NO_CONNECTION = re.compile("failed to connect|errors resolving|resolution failed")  # of gRPC itself: nothing was sent
+_NO_CONNECTION = re.compile(  # of gRPC itself: nothing was sent
+    "failed to connect|connections to all backends failing|errors resolving|resolution failed"
+)
 _LOST_CONNECTION = re.compile("Socket closed|Connection reset|Broken pipe|connection termination")  # or of a proxy
 _NO_TRUST = re.compile(f"CERTIFICATE|certificate|[Vv]erification [Cc]heck failed|WRONG_VERSION_NUMBER|{RESTRICTED}")
 _WRONG_SHAPE = re.compile(  # behind the batch axis, which the caller did not make
@@ -44,22 +49,64 @@ _NO_SECOND_FRAMES = re.compile(rf"expected \d+ inputs but got .*'{SECOND_FRAMES}
 _TOO_MANY_FRAMES = re.compile(r"\bnum_frames: expected at most \d")
 _PREFIX = re.compile(r"^(\[request id: [^\]]*\] )?(in ensemble '[^']*', )?")  # the caller knows both
 
+_START = "start the server there (rfm serve), or give the URL of one that runs"
+_NO_PROXY = "unset that variable, or add the server's host to no_proxy"
+_SHOW_KEY = "show the key that it wants with api_key (--api-key-file) or headers"
+_TRUST = {
+    "[Hh]ostname|IP address mismatch": "use a host name in the URL that its certificate has",
+    "expired|not yet valid": "renew its certificate, or set the clock",
+    "(?i)verify.failed": "name its authority, or its self-signed certificate itself, with ca_file (--ca-file)",
+    "(?i)certificate.required": "show a certificate with client_certificate, client_key (--client-certificate, ...)",
+}
 
-def is_denied(status: str, message: str) -> bool:
-    """Whether one side refused the other: no key, a wrong one, or a certificate that is not trusted."""
-    return status in DENIED or (status == "StatusCode.UNAVAILABLE" and _NO_TRUST.search(message) is not None)
+
+def error_from(
+    raised: Exception,
+    url: str,
+    *,
+    proxy: str | None = None,
+    bad_request: type[errors.RewardError] = errors.InvalidSampleError,
+) -> errors.RewardError | None:
+    """The error that an exception of tritonclient, or of a library below it, means to a caller; None: no such one.
+
+    proxy: through which the call went (``grpc_proxy``)
+    bad_request: what INVALID_ARGUMENT means; Triton answers it for an unknown model, too
+    """
+    where = f"{url} through {proxy}" if proxy else url
+    for kind in type(raised).__mro__:  # by name: those libraries are imported late, or not at all
+        match kind.__name__:
+            case "InferenceServerException":
+                return _error_of_answer(raised, url, proxy, bad_request)
+            case "TimeoutError":  # in Python 3.10 asyncio's, too
+                return errors.DeadlineExceededError(f"{where}: {LATE}")
+            case "SSLError" | "ClientSSLError":
+                return denied(url, "", str(raised))
+            case "ClientResponseError":
+                return errors.InferenceFailedError(f"{url}: no answer of an HTTP server: {type(raised).__name__}")
+            case "ClientConnectorError" | "OSError" | "EOFError" | "HTTPException":
+                return unreachable(url, str(raised) or type(raised).__name__)
+            case "ClientError":  # of aiohttp, after the request was sent
+                lost = unreachable(url, str(raised) or type(raised).__name__)
+                lost.may_have_ended_server = True
+                return lost
+            case "ValueError" | "LookupError" | "TypeError" | "AttributeError":  # reading what is no answer of Triton
+                return errors.InferenceFailedError(f"{url}: the answer cannot be read: {raised!r}")
+    return None
 
 
-def is_unreachable(status: str, message: str) -> bool:
-    """Whether gRPC found no connection to the server."""
-    return status == "StatusCode.UNAVAILABLE" and _NO_CONNECTION.search(message) is not None
+def _error_of_answer(
+    answer: Any, url: str, proxy: str | None, bad_request: type[errors.RewardError]
+) -> errors.RewardError:
+    status, message = str(answer.status()), answer.message() or ""
+    if is_denied(status, message):
+        return denied(url, status, message)
+    if status == "StatusCode.UNAVAILABLE" and _NO_CONNECTION.search(message):
+        return unreachable(url, message, proxy)
+    return error_of(status, message, bad_request)
 
 
 def error_of(status: str, message: str, bad_request: type[errors.RewardError]) -> errors.RewardError:
-    """The error that an answer of Triton means to a caller.
-
-    bad_request: what INVALID_ARGUMENT means; Triton answers it for an unknown model, too
-    """
+    """The error that an answer of Triton means to a caller; ``bad_request`` as of ``error_from``."""
     text = _PREFIX.sub("", message or "no reason given")
     shape = _WRONG_SHAPE.search(text)
     if shape is not None:
@@ -80,3 +127,29 @@ def error_of(status: str, message: str, bad_request: type[errors.RewardError]) -
         is_lost = _LOST_CONNECTION.search(text) is not None and not _NO_CONNECTION.search(text)
         error.may_have_ended_server = is_lost or status in BAD_GATEWAY
     return error
+
+
+def is_denied(status: str, message: str) -> bool:
+    """Whether one side refused the other: no key, a wrong one, or a certificate that is not trusted."""
+    return status in DENIED or (status == "StatusCode.UNAVAILABLE" and _NO_TRUST.search(message) is not None)
+
+
+def denied(url: str, status: str, message: str) -> errors.AccessDeniedError:
+    """The error of two sides of which one refuses the other, with what mends it."""
+    is_keyed = status in DENIED or RESTRICTED in message
+    fitting = (remedy for words, remedy in _TRUST.items() if re.search(words, message))
+    remedy = _SHOW_KEY if is_keyed else next(fitting, None)
+    return errors.AccessDeniedError(f"{url}: access denied: {message}{f': {remedy}' if remedy else ''}")
+
+
+def unreachable(url: str, reason: str, proxy: str | None = None) -> errors.ServerUnavailableError:
+    """The error of a server to which there is no connection, be it because of a proxy."""
+    if proxy is None:
+        return errors.ServerUnavailableError(f"{url}: no connection: {reason}: {_START}")
+    return errors.ServerUnavailableError(f"{url}: no connection through {proxy}: {reason}: {_NO_PROXY}")
+
+
+def not_served(message: str, served: Collection[str]) -> errors.ModelNotFoundError:
+    """The error of a server that lacks a model, with those that it serves."""
+    names = ", ".join(sorted(served)) or "none"
+    return errors.ModelNotFoundError(f"{message}; served: {names}: give the checkpoint's name with model (--model)")

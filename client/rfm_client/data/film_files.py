@@ -9,9 +9,11 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 import numpy as np
+import numpy.typing as npt
 
 from rfm_client.contract.samples import UInt8Array
 
@@ -30,18 +32,6 @@ _BOX_BYTES = 8  # size and kind of an MP4 box (ISO 14496-12)
 _BIG = 1  # a size that says that 8 more bytes tell it
 _FRAMES = b"mdat"
 _BOXES = (b"ftyp", b"styp", b"free", b"skip", b"wide", b"moov", b"moof", b"sidx", b"uuid", b"emsg", b"prft", _FRAMES)
-
-
-def broken_off(file: BinaryIO) -> str | None:
-    """What is there of an MP4, Matroska or WebM file that is shorter than it says itself; None: nothing is missing.
-
-    The container's sizes tell it, not its duration: they are exact whatever the frame rate and the sound. A file that
-    does not know its size, as live recordings do not, is believed; so is any other format.
-    """
-    there = file.seek(0, os.SEEK_END)
-    file.seek(0)
-    declared = _matroska_bytes(file) if file.read(4) == _EBML.to_bytes(4, "big") else _mp4_bytes(file, there)
-    return f"the first {there} bytes of at least {declared}" if declared is not None and declared > there else None
 
 
 class FilmError(Exception):
@@ -86,9 +76,54 @@ def film_stream(container: Any) -> Any:
     return stream
 
 
-def film_packets(container: Any, stream: Any) -> Iterator[Any]:
-    """The packets of the stream that are shown, as a film that was cut without encoding has others too."""
-    return (packet for packet in container.demux(stream) if packet.size and not packet.is_discard)
+@dataclass(frozen=True, eq=False)
+class Packets:
+    """What a film holds, read without decoding it.
+
+    count: of its frames that are shown, as far as each has a packet of its own
+    times_s: float64 [N], rising, of those that have a time stamp
+    num_bytes: how many bytes each of these has
+    corrupt: numbers of the packets that are broken
+    tick_s: what times are multiples of
+    fps: frames a second on average; 0: the file does not say it
+    """
+
+    count: int
+    times_s: npt.NDArray[np.float64]
+    num_bytes: tuple[int, ...]
+    corrupt: tuple[int, ...]
+    tick_s: float
+    fps: float
+
+
+def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
+    """The packets of a film. Counts them, since what the container says may be wrong.
+
+    container: FFmpeg's name of the format that the file is read as; None: whatever it looks like
+
+    Raises FilmError, as for a file that breaks off, and what PyAV raises.
+    """
+    missing = _broken_off(file)
+    if missing is not None:
+        raise FilmError("a whole video file", missing)
+    file.seek(0)
+    timed: list[tuple[float, int]] = []
+    corrupt: list[int] = []
+    count = 0
+    with import_av().open(file, format=container) as opened:
+        stream = film_stream(opened)
+        for packet in opened.demux(stream):
+            if not packet.size or packet.is_discard:  # not shown, as a film that was cut without encoding has them
+                continue
+            if packet.pts is not None:
+                timed.append((float(packet.pts * packet.time_base), packet.size))
+            if packet.is_corrupt:
+                corrupt.append(count)
+            count += 1
+        tick_s, fps = float(stream.time_base), float(stream.average_rate or 0)
+    timed.sort()
+    times_s = np.array([time_s for time_s, _ in timed])
+    return Packets(count, times_s, tuple(size for _, size in timed), tuple(corrupt), tick_s, fps)
 
 
 def upright(frame: Any) -> UInt8Array:
@@ -141,7 +176,7 @@ def _rgb(frame: Any) -> UInt8Array:
     return image
 
 
-def _shown(image: UInt8Array, matrix: np.ndarray[Any, np.dtype[np.int32]]) -> UInt8Array:
+def _shown(image: UInt8Array, matrix: npt.NDArray[np.int32]) -> UInt8Array:
     """The image by a display matrix: x' = a x + c y, y' = b x + d y, y downwards (ISO 14496-12)."""
     a, b, _, c, d = (float(value) for value in matrix[:5])
     is_turned = max(abs(a), abs(d)) < _NEARLY * min(abs(b), abs(c))
@@ -151,6 +186,18 @@ def _shown(image: UInt8Array, matrix: np.ndarray[Any, np.dtype[np.int32]]) -> UI
     across, down = (c, b) if is_turned else (a, d)
     image = image.swapaxes(0, 1) if is_turned else image
     return image[:: -1 if down < 0 else 1, :: -1 if across < 0 else 1]
+
+
+def _broken_off(file: BinaryIO) -> str | None:
+    """What is there of an MP4, Matroska or WebM file that is shorter than it says itself; None: nothing is missing.
+
+    The container's sizes tell it, not its duration: they are exact whatever the frame rate and the sound. A file that
+    does not know its size, as live recordings do not, is believed; so is any other format.
+    """
+    there = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    declared = _matroska_bytes(file) if file.read(4) == _EBML.to_bytes(4, "big") else _mp4_bytes(file, there)
+    return f"the first {there} bytes of at least {declared}" if declared is not None and declared > there else None
 
 
 def _matroska_bytes(file: BinaryIO) -> int | None:

@@ -10,9 +10,8 @@ from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
 from rfm_client.contract.samples import ProgressSample, Sample, Trajectory, with_trajectories
-from rfm_client.data.prefixes import taken
 from rfm_client.data.resize import resize_frames
-from rfm_client.data.sampling import FrameIndices, thinned
+from rfm_client.data.sampling import FrameIndices, taken, thinned
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,12 @@ from zipfile import BadZipFile
 import numpy as np
 import numpy.typing as npt
 
+from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import Trajectory, UInt8Array, as_array
 from rfm_client.data.orientation import Orientation, turned
 from rfm_client.data.video import is_url, read_video
 
-MAX_UINT8 = 255
 BROKEN_NPY = (  # what numpy raises of a broken .npy header
     *(ValueError, TypeError, LookupError, SyntaxError),
     *(tokenize.TokenError, MemoryError, RecursionError),
@@ -33,7 +33,6 @@ _CAMERA_PREFIX = "observation.images."  # LeRobot's keys, followed by the camera
 _ONLY_CAMERA = "observation.image"  # of its datasets of one camera without a name
 _IS_PAD = "_is_pad"  # bool [T] beside a camera: steps before the episode's start or after its end
 _FRAMES = "uint8 or float in 0..1 [T, H, W, 3] or [T, 3, H, W]"
-_KEYS = f"{_CAMERA_PREFIX}<camera>, frames or video_embeddings"
 
 
 def load_trajectory(
@@ -128,8 +127,8 @@ def _columns(steps: Iterable[Mapping[str, Any]]) -> Mapping[str, Any]:
     """Each key's values at all steps, None where a step lacks it."""
     items = list(steps) if isinstance(steps, Iterable) else [steps]
     strangers = [type(item).__name__ for item in items if not isinstance(item, Mapping)]
-    if strangers or not items:
-        raise InvalidSampleError.at("episode", "a dict, or one dict a step", (strangers or ["nothing"])[0])
+    got = [*strangers, "nothing"][0]
+    require("episode", bool(items) and not strangers, "a dict, or one dict a step", got, InvalidSampleError)
     keys = dict.fromkeys(key for item in items for key in item)
     return {key: [item.get(key) for item in items] for key in keys}
 
@@ -138,8 +137,8 @@ def _only(columns: Mapping[str, Any], key: str, default: Any) -> Any:
     """The value that the key has at every step. Raises InvalidSampleError for several."""
     values = _values(columns[key]) if key in columns else [default]
     for value in values:
-        if value != values[0]:
-            raise InvalidSampleError.at(key, "the same at all steps", f"{values[0]!r} and {value!r}")
+        got = f"{values[0]!r} and {value!r}"
+        require(key, value == values[0], "the same at all steps", got, InvalidSampleError)
     return values[0] if values else default
 
 
@@ -159,7 +158,9 @@ def _camera_key(columns: Mapping[str, Any], camera: str | None) -> str:
     if _ONLY_CAMERA in columns:
         cameras[_ONLY_CAMERA.rpartition(".")[2]] = _ONLY_CAMERA
     if not cameras:
-        raise InvalidSampleError.at("episode", _KEYS, f"the keys {', '.join(columns)}")
+        raise InvalidSampleError.at(
+            "episode", f"{_CAMERA_PREFIX}<camera>, frames or video_embeddings", f"the keys {', '.join(columns)}"
+        )
     if camera is None and len(cameras) == 1:
         (camera,) = cameras
     if camera not in cameras:
@@ -171,9 +172,8 @@ def _frames(where: str, values: Any) -> UInt8Array:
     """uint8 [T, H, W, 3]."""
     images = [as_array(image) for image in values] if isinstance(values, Sequence) else np.atleast_1d(as_array(values))
     kinds = {(image.dtype, image.shape) for image in images}
-    if len(kinds) != 1:
-        got = " and ".join(sorted(f"{dtype} {list(shape)}" for dtype, shape in kinds)) or "none"
-        raise InvalidSampleError.at(where, "images of one type and size", got)
+    got = " and ".join(sorted(f"{dtype} {list(shape)}" for dtype, shape in kinds)) or "none"
+    require(where, len(kinds) == 1, "images of one type and size", got, InvalidSampleError)
     ((dtype, shape),) = kinds
     if (dtype != np.uint8 and dtype.kind != "f") or len(shape) != 3 or 3 not in (shape[0], shape[2]) or 0 in shape:
         raise InvalidSampleError.at(where, _FRAMES, f"{dtype} {[len(images), *shape]}")
@@ -183,15 +183,14 @@ def _frames(where: str, values: Any) -> UInt8Array:
 
 def _uint8(where: str, image: npt.NDArray[Any]) -> UInt8Array:
     lowest, highest = float(image.min()), float(image.max())
-    if not (lowest >= 0 and highest <= 1):  # nor NaN
-        got = f"values from {lowest:g} to {highest:g} (of floats in 0..255: float_frames_to_uint8)"
-        raise InvalidSampleError.at(where, _FRAMES, got)
-    scaled = image.astype(np.float32) * np.float32(MAX_UINT8)
-    return scaled.round().astype(np.uint8)
+    got = f"values from {lowest:g} to {highest:g} (of floats in 0..255: float_frames_to_uint8)"
+    require(where, lowest >= 0 and highest <= 1, _FRAMES, got, InvalidSampleError)  # and not NaN
+    return (image.astype(np.float32) * np.float32(255)).round().astype(np.uint8)
 
 
 def _padding(where: str, marks: Any, num_frames: int) -> npt.NDArray[np.bool_]:
     padding = as_array(marks)
-    if padding.dtype != bool or padding.shape != (num_frames,):
-        raise InvalidSampleError.at(where, f"bool [{num_frames}]", f"{padding.dtype} {list(padding.shape)}")
+    got = f"{padding.dtype} {list(padding.shape)}"
+    is_of_frames = padding.dtype == bool and padding.shape == (num_frames,)
+    require(where, is_of_frames, f"bool [{num_frames}]", got, InvalidSampleError)
     return padding

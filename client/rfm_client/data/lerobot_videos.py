@@ -2,8 +2,8 @@
 """Which video files of LeRobot datasets are no film of one episode.
 
 Up to v2.1 a dataset has one film for each episode and camera. Since v3.0 one file holds many episodes, one behind the
-other, and only tables in Parquet say where each begins. Read as one film, such a file would be scored as one long
-episode. So it is refused unless the dataset has one episode in all. No table is read: that would need pyarrow.
+other. Read as one film, it would be scored as one long episode: it is refused unless the dataset has one episode in
+all. No table is read: that would need pyarrow.
 """
 
 from __future__ import annotations
@@ -15,12 +15,10 @@ from urllib.parse import unquote, urlsplit
 
 from rfm_client.contract.errors import InvalidSampleError
 
-_ONE_EPISODE = "a film of one episode"
 _INSTEAD = (
     "label the dataset with rfm-client label, or name the part of the file that is one episode: start_s and end_s of "
     "load_trajectory (meta/episodes tells its from_timestamp and to_timestamp)"
 )
-_INFO = Path("meta", "info.json")
 _FILM_AN_EPISODE = re.compile(r"v[12]\.")
 _SHARED_FILE = re.compile(r"/videos/[^/]+/chunk-\d+/file-\d+\.\w+$")  # the layout of v3.0
 
@@ -33,7 +31,7 @@ def check_local_film(source: str | Path) -> None:
     given = Path(source).absolute()
     for file in dict.fromkeys((given, given.resolve())):  # a download may consist of links into a cache
         for folder in file.parents:
-            info = _info(folder / _INFO)
+            info = _info(folder / "meta" / "info.json")
             if info is not None:
                 _check_dataset(info, file, folder)
                 return
@@ -43,6 +41,11 @@ def check_local_film(source: str | Path) -> None:
 def check_film_behind(url: str) -> None:
     """Raises InvalidSampleError for such a file behind a URL, judged by the URL's path alone."""
     _check_layout(unquote(urlsplit(url).path))
+
+
+def _check_layout(path: str) -> None:
+    if _SHARED_FILE.search(path):
+        raise _refusal("a file in the layout of LeRobot v3.0, which holds many episodes")
 
 
 def _info(file: Path) -> dict[str, object] | None:
@@ -66,10 +69,5 @@ def _check_dataset(info: dict[str, object], film: Path, root: Path) -> None:
     raise _refusal(f"a LeRobot {version} file that holds {held} episodes")
 
 
-def _check_layout(path: str) -> None:
-    if _SHARED_FILE.search(path):
-        raise _refusal("a file in the layout of LeRobot v3.0, which holds many episodes")
-
-
 def _refusal(got: str) -> InvalidSampleError:
-    return InvalidSampleError.at("video", _ONE_EPISODE, f"{got}: {_INSTEAD}")
+    return InvalidSampleError.at("video", "a film of one episode", f"{got}: {_INSTEAD}")

@@ -36,7 +36,7 @@ def resize_frames(frames: UInt8Array, size: FrameSize) -> UInt8Array:
     """uint8 [T, H, W, 3], as small as a checkpoint of this frame size reads them; the same array if they are.
 
     Resized by Pillow: bicubic, but ``longest`` Lanczos, as SmolVLM. What the network then reads is for SmolVLM the
-    same to the bit, for ReWiND within one grey level. Qwen's backbones read the same if ``exact`` is the size that
+    same to the bit, for ReWiND within a grey level or two. Qwen's backbones read the same if ``exact`` is the size that
     they read; if they round it to whole patches, frames are resized twice, and single pixels differ by up to 15.
     """
     Image = load_pillow()  # noqa: N806  as Pillow writes it

@@ -1,36 +1,25 @@
 # SPDX-License-Identifier: MIT
 """Which frames of an episode a model is shown when the newest is frame t: the rules in use, by name.
 
-    rule                  shows of the frames 0..t                             padding              read at
-    linspace_trunc        linspace(0, t, K), cut to whole numbers              none                 last slot
-    linspace_round        linspace(0, t, K), rounded half to even              none                 last slot
-    rint                  all while t + 1 <= K, then linspace(0, t, K)         none                 last slot
-                          rounded half to even
-    rint_pad              the same                                             the last frame, to   last slot
-                                                                               K slots
-    rewind_pad16_online   all while t + 1 <= 16, then linspace(0, t, 16) cut   the last frame, to   last slot
-                                                                               16 slots
-    rewind_pad16_offline  the same                                             the same             slot min(t, 15)
-    all                   all                                                  none                 last slot
+``docs/guides/sampling.md`` has them in a table, with who uses which. No rule shows a frame after t.
 
-``linspace_trunc`` is what the evaluation server's frame steps do (``frame_steps`` on the wire), ``linspace_round``
-LeRobot's Robometer labels, ``rint_pad`` the RL loop and relabelling of ``robometer``, ``rint`` the same for a
-checkpoint whose training did not pad; the two readings of ``rewind_pad16`` are those of the first ReWiND code, online
-and for offline labels. The first two repeat frames while t + 1 < K, and with K = 1 they show frame 0; ``rint`` and
-``rint_pad`` then show frame t. No rule shows a frame after t.
-
-Shapes: K frames that the rule shows, S slots of the sample that is sent.
+Shapes: K frames that the rule shows, S slots of the sample that is sent, T frames of the episode.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 import numpy.typing as npt
 
+from rfm_client.contract.checks import require
+from rfm_client.contract.errors import InferenceFailedError
 from rfm_client.contract.numbers import checked_count
+from rfm_client.contract.results import ProgressResult
+from rfm_client.contract.samples import ProgressSample, Trajectory
 
 Rule: TypeAlias = Literal[
     "linspace_trunc", "linspace_round", "rint", "rint_pad", "rewind_pad16_online", "rewind_pad16_offline", "all"
@@ -41,6 +30,7 @@ RULES: tuple[Rule, ...] = get_args(Rule)
 REWIND_FRAMES = 16  # of the first ReWiND code, whatever its checkpoint
 
 _REWIND: tuple[Rule, ...] = ("rewind_pad16_online", "rewind_pad16_offline")
+_PADDED: tuple[Rule, ...] = ("rint_pad", *_REWIND)  # with the newest frame, to K slots
 
 
 def trained_rule(trained_padding: bool) -> Rule:
@@ -53,12 +43,10 @@ class Prefix:
     """What a model is shown of the frames 0..t, and where its answer about frame t is.
 
     indices: int64 [S], the frame in each slot, padding included
-    num_padding: how many of the last slots are padding
     read: the slot whose score is that of frame t
     """
 
     indices: FrameIndices
-    num_padding: int
     read: int
 
     @property
@@ -83,17 +71,15 @@ class Sampling:
     frames: int | None = None
 
     def __post_init__(self) -> None:
-        if self.rule not in RULES:
-            raise ValueError(f"sampling: expected one of {', '.join(RULES)}, got {self.rule!r}")
-        if self.rule == "all" and self.frames is not None:
-            raise ValueError(f"frames: expected none with the rule all, got {self.frames}")
-        if self.rule in _REWIND:
-            if self.frames not in (None, REWIND_FRAMES):
-                raise ValueError(f"frames: expected {REWIND_FRAMES} with the rule {self.rule}, got {self.frames}")
+        require("sampling", self.rule in RULES, f"one of {', '.join(RULES)}", repr(self.rule))
+        with_rule = f"with the rule {self.rule}"
+        if self.rule == "all":
+            require("frames", self.frames is None, f"none {with_rule}", self.frames)
+        elif self.rule in _REWIND:
+            require("frames", self.frames in (None, REWIND_FRAMES), f"{REWIND_FRAMES} {with_rule}", self.frames)
             object.__setattr__(self, "frames", REWIND_FRAMES)
-        elif self.rule != "all":
-            if self.frames is None:
-                raise ValueError(f"frames: expected at least 1 with the rule {self.rule}, got None")
+        else:
+            require("frames", self.frames is not None, f"at least 1 {with_rule}", self.frames)
             object.__setattr__(self, "frames", checked_count("frames", self.frames))
 
     @classmethod
@@ -109,9 +95,8 @@ class Sampling:
         rule = rule or trained_rule(trained_padding)
         if frames is None and rule not in (*_REWIND, "all"):
             frames = trained_frames
-            if frames is None:
-                got = "none, and the checkpoint does not say how many it was trained on"
-                raise ValueError(f"frames: expected how many frames the rule {rule} shows the model, got {got}")
+            got = "none, and the checkpoint does not say how many it was trained on"
+            require("frames", frames is not None, f"how many frames the rule {rule} shows the model", got)
         return cls(rule, frames)
 
     def __str__(self) -> str:
@@ -120,18 +105,18 @@ class Sampling:
     def prefix(self, t: int) -> Prefix:
         """What the model is shown when frame ``t``, counted from 0, is the newest."""
         if self.frames is None:
-            return _unpadded(np.arange(t + 1))
-        if self.rule == "linspace_trunc":
-            return _unpadded(np.linspace(0, t, self.frames).astype(np.int64))
-        if self.rule == "linspace_round":
-            return _unpadded(np.linspace(0, t, self.frames).round().astype(np.int64))
-        if self.rule == "rint":
-            return _unpadded(_rint(t, self.frames))
-        if self.rule == "rint_pad":
-            return _padded(_rint(t, self.frames), self.frames)
-        shown = np.arange(t + 1) if t < self.frames else np.linspace(0, t, self.frames).astype(np.int64)
-        read = self.frames - 1 if self.rule == "rewind_pad16_online" else len(shown) - 1
-        return _padded(shown, self.frames, read)
+            shown = np.arange(t + 1)
+        elif self.rule in ("rint", "rint_pad"):
+            shown = _rint(t, self.frames)
+        elif self.rule in _REWIND and t < self.frames:
+            shown = np.arange(t + 1)
+        else:
+            even = np.linspace(0, t, self.frames)
+            shown = (even.round() if self.rule == "linspace_round" else even).astype(np.int64)
+        own_slot = len(shown) - 1
+        if self.frames is not None and self.rule in _PADDED:
+            shown = np.append(shown, np.repeat(t, self.frames - len(shown)))
+        return Prefix(shown, own_slot if self.rule == "rewind_pad16_offline" else len(shown) - 1)
 
 
 def thinned(num_frames: int, limit: int | None) -> FrameIndices | None:
@@ -142,19 +127,47 @@ def thinned(num_frames: int, limit: int | None) -> FrameIndices | None:
     return None if limit is None or num_frames <= limit else _rint(num_frames - 1, limit)
 
 
+def taken(trajectory: Trajectory, indices: FrameIndices) -> Trajectory:
+    """The trajectory of these of its frames, or frame embeddings; its text stays."""
+    if trajectory.frames is not None:
+        return replace(trajectory, frames=trajectory.frames[indices])
+    assert trajectory.video_embeddings is not None  # a Trajectory has one of them
+    return replace(trajectory, video_embeddings=trajectory.video_embeddings[indices])
+
+
+def prefix_samples(trajectory: Trajectory, sampling: Sampling) -> Iterator[ProgressSample]:
+    """The sample of each prefix 0..t of the trajectory, made one after the other. Raises InvalidSampleError."""
+    for t in range(trajectory.num_frames):
+        yield ProgressSample(taken(trajectory, sampling.prefix(t).indices))
+
+
+def of_prefixes(results: Sequence[ProgressResult], sampling: Sampling) -> ProgressResult:
+    """The result of the episode: frame t's score is the one of the prefix 0..t at the slot that the rule reads.
+
+    results: [T], of the samples of ``prefix_samples``
+
+    Raises InferenceFailedError if several versions of the checkpoint gave them.
+    """
+    versions = sorted({str(result.model_version) for result in results})
+    if len(versions) > 1:
+        raise InferenceFailedError(f"model_version: expected one for all frames, got {', '.join(versions)}: ask again")
+    reads = [sampling.prefix(t).read for t in range(len(results))]
+    return ProgressResult(
+        progress=np.array([result.progress[read] for result, read in zip(results, reads, strict=True)], np.float32),
+        success=np.array([result.success[read] for result, read in zip(results, reads, strict=True)], np.float32),
+        model_version=results[-1].model_version,
+    )
+
+
+def of_frames(result: ProgressResult, prefix: Prefix) -> ProgressResult:
+    """The scores of the frames that a prefix shows, each once, without padding."""
+    slots = prefix.frame_slots
+    return replace(result, progress=result.progress[slots], success=result.success[slots])
+
+
 def _rint(t: int, frames: int) -> FrameIndices:
     if t < frames:
         return np.arange(t + 1)
     if frames == 1:
         return np.array([t], np.int64)
     return np.linspace(0, t, frames).round().astype(np.int64)  # 0 and t are whole, and rounding keeps the order
-
-
-def _unpadded(indices: FrameIndices) -> Prefix:
-    return Prefix(indices, 0, len(indices) - 1)
-
-
-def _padded(shown: FrameIndices, slots: int, read: int | None = None) -> Prefix:
-    num_padding = max(slots - len(shown), 0)
-    indices = np.append(shown, np.repeat(shown[-1:], num_padding))
-    return Prefix(indices, num_padding, slots - 1 if read is None else read)

@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from http.client import HTTPException
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any, BinaryIO
+from typing import BinaryIO
 from urllib.error import HTTPError
 
 import numpy as np
@@ -24,11 +24,11 @@ from rfm_client.data.film_files import (
     DAMAGED,
     UNDAMAGED,
     FilmError,
-    broken_off,
-    film_packets,
+    Packets,
     film_stream,
     import_av,
     judged,
+    read_packets,
     upright,
 )
 from rfm_client.data.lerobot_videos import check_film_behind, check_local_film
@@ -36,7 +36,6 @@ from rfm_client.data.lerobot_videos import check_film_behind, check_local_film
 DOWNLOAD_TIMEOUT_S = 60.0
 
 _EXPECTED = "a file with a video stream"
-_WHOLE = "a whole file"
 _RGB_BYTES = 3  # of a pixel
 
 
@@ -51,7 +50,7 @@ def frame_indices(total: int, native_fps: float, fps: float) -> npt.NDArray[np.i
 
 
 def is_url(source: str | Path) -> bool:
-    """Whether ``read_video`` downloads the source."""
+    """True if ``read_video`` downloads the source."""
     return isinstance(source, str) and source.lower().startswith(("http://", "https://"))
 
 
@@ -82,16 +81,31 @@ def read_video(
     are returned, for a file of several films or of depth maps, and for one of several LeRobot episodes
     (``lerobot_videos``) unless ``start_s`` and ``end_s`` name a part of it.
     """
-    av = import_av()
+    import_av()
     _check_numbers(fps, start_s, end_s, timeout_s)
+    take = take or (lambda num_bytes: None)
     with _errors_of(source):
         if start_s is None or end_s is None:
             check_film_behind(str(source)) if is_url(source) else check_local_film(source)
         with _opened(source, timeout_s) as file:
-            decoder = _Decoder(av, file, take or _untold, container)
-            if (start_s, end_s) == (None, None):
-                return _sampled(decoder, fps)
-            return _part(decoder, fps, start_s, end_s)
+            packets = read_packets(file, container)
+            if packets.count - 1 in packets.corrupt:
+                raise FilmError("a whole video file", f"one that breaks off in frame {packets.count - 1}")
+            is_part = (start_s, end_s) != (None, None)
+            if not packets.fps and (is_part or fps is not None):
+                raise FilmError("a frame rate", "none")
+            first, end = _part(packets, start_s, end_s) if is_part else (0, packets.count)
+            frames, total = _decoded(file, _picked(first, end, packets, fps), take, container)
+            if is_part and (total != packets.count or len(packets.times_s) != total):
+                raise FilmError(f"{packets.count} frames with time stamps", f"{total}")
+            if total != packets.count:  # a packet may hold several frames
+                frames, total = _decoded(file, _picked(0, total, packets, fps), take, container)
+        if not total:
+            raise FilmError("at least one frame", "none")
+        if len({frame.shape for frame in frames}) > 1:
+            raise FilmError("frames of one size", "several")
+        take(sum(frame.nbytes for frame in frames))
+        return np.stack(frames)
 
 
 def frame_times_s(file: str | Path, num_frames: int, *, container: str | None = None) -> npt.NDArray[np.float64] | None:
@@ -99,12 +113,12 @@ def frame_times_s(file: str | Path, num_frames: int, *, container: str | None = 
 
     container: as in ``read_video``
     """
-    with _errors_of(file), import_av().open(str(file), format=container) as opened:
-        packets = film_packets(opened, film_stream(opened))
-        times = sorted(float(packet.pts * packet.time_base) for packet in packets if packet.pts is not None)
-    if len(times) < num_frames:
+    with _errors_of(file), Path(file).open("rb") as opened:
+        times_s = read_packets(opened, container).times_s
+    if len(times_s) < num_frames:
         return None
-    return np.array(times)[_spread(len(times), num_frames)] - times[0]
+    since_first_s: npt.NDArray[np.float64] = times_s - times_s[0]
+    return since_first_s[_spread(len(times_s), num_frames)]
 
 
 @contextmanager
@@ -158,96 +172,38 @@ def _download(url: str, file: BinaryIO, timeout_s: float) -> None:
     except (OSError, HTTPException, ValueError) as error:
         if isinstance(error, HTTPError):
             error.close()  # it is a response too, and holds the connection
-        raise InvalidSampleError.at("video", _EXPECTED, str(error)) from error
+        raise FilmError(_EXPECTED, str(error)) from error
 
 
-def _untold(_num_bytes: int) -> None:
-    """For callers who do not ask how much memory is taken."""
-
-
-def _sampled(decoder: _Decoder, fps: float | None) -> UInt8Array:
-    """The frames at ``fps``, decoded once if each packet holds one frame, as nearly always, and else once more."""
-    num_packets, native_fps = decoder.length()
-    if fps is None:
-        fps = native_fps = 1.0
-    if not native_fps:
-        raise InvalidSampleError.at("video", "a frame rate", "none")
-    frames, total = decoder.frames(frame_indices(num_packets, native_fps, fps).tolist())
-    if total != num_packets:
-        frames, total = decoder.frames(frame_indices(total, native_fps, fps).tolist())
-    if not total:
-        raise InvalidSampleError.at("video", "at least one frame", "none")
-    if len({frame.shape for frame in frames}) > 1:
-        raise InvalidSampleError.at("video", "frames of one size", "several")
-    return decoder.stacked(frames)
-
-
-def _part(decoder: _Decoder, fps: float | None, start_s: float | None, end_s: float | None) -> UInt8Array:
-    """The frames at ``fps`` of the part from ``start_s`` to before ``end_s``, within half a frame."""
-    num_packets, native_fps = decoder.length()
-    if not native_fps:
-        raise InvalidSampleError.at("video", "a frame rate", "none")
-    times_s = decoder.times_s()
-    half_s = 0.5 / native_fps
-    first, end = np.searchsorted(times_s, [(start_s or 0.0) - half_s, (math.inf if end_s is None else end_s) - half_s])
+def _part(packets: Packets, start_s: float | None, end_s: float | None) -> tuple[int, int]:
+    """Numbers of the first frame from ``start_s`` and the first from ``end_s`` on, within half a frame."""
+    half_s, times_s = 0.5 / packets.fps, packets.times_s
+    bounds_s = [(start_s or 0.0) - half_s, (math.inf if end_s is None else end_s) - half_s]
+    first, end = np.searchsorted(times_s, bounds_s).tolist()
     if first >= end:
         got = f"{start_s} to {end_s} of {times_s[-1] if len(times_s) else 0.0:g} s"
         raise InvalidSampleError.at("start_s to end_s", "a part with frames", got)
-    native_fps, fps = (1.0, 1.0) if fps is None else (native_fps, fps)
-    frames, total = decoder.frames((first + frame_indices(int(end - first), native_fps, fps)).tolist())
-    if total != num_packets or len(times_s) != total:
-        raise InvalidSampleError.at("video", f"{num_packets} frames with time stamps", str(total))
-    return decoder.stacked(frames)
+    return first, end
 
 
-class _Decoder:
-    """Reads a video file with PyAV, from its start each time. take, container: as in ``read_video``"""
+def _picked(first: int, end: int, packets: Packets, fps: float | None) -> set[int]:
+    """Numbers of the frames that stand for those from ``first`` to before ``end`` at ``fps``."""
+    own_fps, fps = (1.0, 1.0) if fps is None else (packets.fps, fps)
+    return set((first + frame_indices(end - first, own_fps, fps)).tolist())
 
-    def __init__(self, av: Any, file: BinaryIO, take: Callable[[int], object], container: str | None) -> None:
-        self._av = av
-        self._file = file
-        self._take = take
-        self._container = container
 
-    def length(self) -> tuple[int, float]:
-        """Packets, which are counted since what the container says may be wrong, and frames a second (0: unknown).
-
-        Raises InvalidSampleError for a file that breaks off.
-        """
-        missing = broken_off(self._file)
-        if missing is not None:
-            raise InvalidSampleError.at("video", _WHOLE, missing)
-        with self._opened() as container:
-            stream = film_stream(container)
-            are_broken = [packet.is_corrupt for packet in film_packets(container, stream)]
-            if are_broken and are_broken[-1]:
-                raise InvalidSampleError.at("video", _WHOLE, f"one that breaks off in frame {len(are_broken) - 1}")
-            return len(are_broken), float(stream.average_rate or 0)
-
-    def times_s(self) -> npt.NDArray[np.float64]:
-        """float64 [T], the time stamps of the packets that have one, in order."""
-        with self._opened() as container:
-            packets = film_packets(container, film_stream(container))
-            return np.sort([float(packet.pts * packet.time_base) for packet in packets if packet.pts is not None])
-
-    def frames(self, indices: Collection[int]) -> tuple[list[UInt8Array], int]:
-        """The frames of these indices, and how many there are in all. Raises InvalidSampleError for a damaged one."""
-        wanted, picked, total = set(indices), [], 0
-        with self._opened() as container:
-            for frame, is_damaged in judged(container.decode(film_stream(container))):
-                self._take(frame.width * frame.height * _RGB_BYTES if total in wanted else 0)
-                if total in wanted:
-                    if is_damaged:
-                        raise InvalidSampleError.at(f"video: frame {total}", UNDAMAGED, DAMAGED)
-                    picked.append(upright(frame))
-                total += 1
-        return picked, total
-
-    def stacked(self, frames: list[UInt8Array]) -> UInt8Array:
-        """uint8 [T, H, W, 3], the frames in one array."""
-        self._take(sum(frame.nbytes for frame in frames))
-        return np.stack(frames)
-
-    def _opened(self) -> Any:
-        self._file.seek(0)
-        return self._av.open(self._file, format=self._container)
+def _decoded(
+    file: BinaryIO, wanted: set[int], take: Callable[[int], object], container: str | None
+) -> tuple[Sequence[UInt8Array], int]:
+    """The wanted frames, and how many there are in all. Raises InvalidSampleError for a damaged one."""
+    picked, total = [], 0
+    file.seek(0)
+    with import_av().open(file, format=container) as opened:
+        for frame, is_damaged in judged(opened.decode(film_stream(opened))):
+            take(frame.width * frame.height * _RGB_BYTES if total in wanted else 0)
+            if total in wanted:
+                if is_damaged:
+                    raise InvalidSampleError.at(f"video: frame {total}", UNDAMAGED, DAMAGED)
+                picked.append(upright(frame))
+            total += 1
+    return picked, total

@@ -20,9 +20,8 @@ from rfm_client.contract.results import ProgressResult, Result
 from rfm_client.contract.samples import UInt8Array, as_array
 from rfm_client.data.camera_fusion import FUSES
 from rfm_client.data.orientation import turned
-from rfm_client.data.prefixes import of_frames
 from rfm_client.data.resize import resize_frames
-from rfm_client.data.sampling import Prefix, Sampling
+from rfm_client.data.sampling import Prefix, Sampling, of_frames
 from rfm_client.episodes.frames import checked_frame, copied, orientations_of
 from rfm_client.episodes.live import LiveEpisode
 from rfm_client.episodes.options import EpisodeOptions

@@ -10,8 +10,10 @@ import math
 import operator
 import uuid
 import weakref
+from collections.abc import Mapping
+from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -20,10 +22,7 @@ from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.resize import load_pillow
 from rfm_client.episodes.live_reports import Address, Reporter
 from rfm_client.episodes.scores import StepScore
-from rfm_client.transport.access import Access, AccessOptions
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
+from rfm_client.transport.access import Access
 
 MOST_LETTERS = 2000  # that a gateway takes
 
@@ -68,18 +67,29 @@ class LiveView:
 
     url: ``http://host:port`` or ``https://host:port`` of the gateway
     name: what the page calls the run
-    access: as of AccessOptions; ``api_key`` is the gateway's key
+    others: as of a client; ``api_key`` is the gateway's key
 
     A context manager that closes it. It may be pickled: each process then reports by itself. A process that was forked
     reports nothing, and logs a warning.
     Raises ValueError for what cannot be used, ImportError without Pillow (``rfm-client[resize]``).
     """
 
-    def __init__(self, url: str, *, name: str = "", **access: Unpack[AccessOptions]) -> None:
+    def __init__(
+        self,
+        url: str,
+        *,
+        name: str = "",
+        ca_file: str | Path | None = None,
+        client_certificate: str | Path | None = None,
+        client_key: str | Path | None = None,
+        headers: Mapping[str, str] | None = None,
+        api_key: str | None = None,
+    ) -> None:
         load_pillow()
         self.name = name
-        self._url, self._options = url, access
-        self._reporter = Reporter(Address.of(url, Access.of(access)))
+        self._url = url
+        self._access = Access(ca_file, client_certificate, client_key, headers or {}, api_key)
+        self._reporter = Reporter(Address.of(url, self._access))
         weakref.finalize(self, self._reporter.stop).atexit = False  # the reporter closes itself then
 
     def episode(self, task: str, env: int = 0, threshold: float = 0.5) -> LiveEpisode:
@@ -109,10 +119,10 @@ class LiveView:
         self.close()
 
     def __reduce__(self) -> tuple[object, ...]:
-        return _rebuilt, (self._url, self.name, self._options)
+        return _rebuilt, (self._url, self.name, self._access.options)
 
 
-def _rebuilt(url: str, name: str, access: AccessOptions) -> LiveView:
+def _rebuilt(url: str, name: str, access: dict[str, Any]) -> LiveView:
     return LiveView(url, name=name, **access)
 
 

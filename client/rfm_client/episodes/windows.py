@@ -16,14 +16,14 @@ from itertools import groupby
 
 import numpy as np
 
-from rfm_client.call import Call
 from rfm_client.contract import wire
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, RewardError
 from rfm_client.contract.named_frames import NamedTrajectory, frame_digest
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.results import ProgressResult, Result
 from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array, check_task
-from rfm_client.scorer import Scorer, for_each
+from rfm_client.scoring.call import Call
+from rfm_client.scoring.samples import SampleScorer, for_each
 from rfm_client.transport.off_loop import off_loop
 
 MAX_NEW_BYTES = 3 * 2**20  # of frames in a request, so that the server prepares one while another is sent
@@ -100,7 +100,7 @@ class WindowScorer:
     model: name under which the checkpoint was exported
     """
 
-    def __init__(self, model: str, scorer: Scorer) -> None:
+    def __init__(self, model: str, scorer: SampleScorer) -> None:
         self._model = frames_name(model)
         self._scorer = scorer
         self._remembered = Remembered()
@@ -108,7 +108,7 @@ class WindowScorer:
     async def outcomes(self, windows: Sequence[Window], call: Call) -> list[Result | RewardError]:
         """The result or error of each window."""
         try:
-            info = await self._scorer.model_infos.get(self._model, call.deadline)
+            info = await self._scorer.model_info(self._model, call.deadline)
         except RewardError as error:
             return for_each(error, len(windows))
         if not info.by_digest:

@@ -18,9 +18,8 @@ from rfm_client.contract.results import ProgressResult, Result
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.camera_fusion import FUSES, Fuse, check_fuse, checked_cameras
 from rfm_client.data.orientation import Orientation, turned
-from rfm_client.data.prefixes import of_frames
 from rfm_client.data.resize import resize_frames
-from rfm_client.data.sampling import Prefix, Rule, Sampling
+from rfm_client.data.sampling import Prefix, Rule, Sampling, of_frames
 from rfm_client.episodes.frames import checked_frame, orientations_of
 from rfm_client.episodes.live import LiveView
 from rfm_client.episodes.options import SuccessRule

@@ -8,7 +8,7 @@ with RewardClient("grpc://localhost:8001") as client:
     report = label(open_dataset("my_dataset"), ClientScorer(client), LabelOptions(cameras=("top",)))
 """
 
-from rfm_client.data.datasets import Dataset, DatasetError, Episode, Orient, iter_episodes, open_dataset
+from rfm_client.data.datasets import Dataset, DatasetEpisode, DatasetError, Orient, iter_episodes, open_dataset
 from rfm_client.labelling.label import Report, label, label_with_ray
 from rfm_client.labelling.label_files import EpisodeLabels, find_label_files, read_episode_labels
 from rfm_client.labelling.options import LabelOptions, RayOptions, parse_episodes
@@ -20,8 +20,8 @@ __all__ = [
     "CheckpointFacts",
     "ClientScorer",
     "Dataset",
+    "DatasetEpisode",
     "DatasetError",
-    "Episode",
     "EpisodeLabels",
     "LabelOptions",
     "Orient",

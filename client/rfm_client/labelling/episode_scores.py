@@ -4,7 +4,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from traceback import clear_frames
 from typing import TypeAlias
 
 import numpy as np
@@ -13,23 +16,48 @@ from rfm_client.contract.errors import InferenceFailedError
 from rfm_client.contract.results import ProgressResult
 from rfm_client.contract.samples import Float32Array, ProgressSample, Trajectory, UInt8Array
 from rfm_client.data.camera_fusion import FUSES
-from rfm_client.data.datasets.protocol import Dataset, DatasetError, Episode
-from rfm_client.data.prefixes import of_prefixes, prefix_samples
+from rfm_client.data.datasets.protocol import Dataset, DatasetEpisode, require
 from rfm_client.data.resize import resize_frames
-from rfm_client.labelling.frame_memory import FrameMemory
-from rfm_client.labelling.recipe import Recipe
-from rfm_client.labelling.scorer import Scorer, joined_embeddings
+from rfm_client.data.sampling import of_prefixes, prefix_samples
+from rfm_client.labelling.plan import Recipe
+from rfm_client.labelling.scorer import Scorer
 
 Columns: TypeAlias = dict[str, Float32Array]
 
 PROGRESS, SUCCESS = "progress", "success"
 FRAMES_AT_A_TIME = 64  # of one request to the encoder: as many as it encodes in one forward pass
 MAX_BYTES = 32 * 2**20  # of the samples that are made and sent together
+MAX_FRAME_BYTES = 2 * 2**30  # that the workers of a process hold together
+
+
+class FrameMemory:
+    """A bound on the frames that all workers together hold; more only where one film alone has more."""
+
+    def __init__(self, max_bytes: int = MAX_FRAME_BYTES) -> None:
+        self._max_bytes = max_bytes
+        self._held_bytes = 0
+        self._changed = threading.Condition()
+
+    @contextmanager
+    def holding(self, num_bytes: int) -> Iterator[None]:
+        """Holds so many bytes, after a wait until they fit. A worker that holds some must not ask for more."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._held_bytes or self._held_bytes + num_bytes <= self._max_bytes)
+            self._held_bytes += num_bytes
+        try:
+            yield
+        except Exception as error:
+            clear_frames(error.__traceback__)  # or the error would hold them for as long as it is there itself
+            raise
+        finally:
+            with self._changed:
+                self._held_bytes -= num_bytes
+                self._changed.notify_all()
 
 
 def episode_columns(
     dataset: Dataset,
-    episode: Episode,
+    episode: DatasetEpisode,
     scorer: Scorer,
     recipe: Recipe,
     *,
@@ -49,7 +77,7 @@ def episode_columns(
         frames = _checked(dataset.frames(episode, camera), episode, camera)
         chunks = _shrunk(frames, recipe, go_on)
         if recipe.checkpoint.encodes:
-            trajectory = joined_embeddings([scorer.encode(chunk, episode.task) for chunk in chunks])
+            trajectory = _joined([scorer.encode(chunk, episode.task) for chunk in chunks])
             by_camera[camera] = _scores(trajectory, scorer, recipe, go_on)
         else:
             first = next(chunks)
@@ -89,7 +117,13 @@ def _shrunk(frames: Iterator[UInt8Array], recipe: Recipe, go_on: Callable[[], No
         yield stacked
 
 
-def _held(first: UInt8Array, others: Iterator[UInt8Array], episode: Episode) -> Trajectory:
+def _joined(parts: Sequence[Trajectory]) -> Trajectory:
+    """One trajectory of the embeddings of parts that follow one another."""
+    embeddings = np.concatenate([part.positions for part in parts])
+    return Trajectory(video_embeddings=embeddings, text_embedding=parts[0].text_embedding)
+
+
+def _held(first: UInt8Array, others: Iterator[UInt8Array], episode: DatasetEpisode) -> Trajectory:
     """All frames of the episode, in one array."""
     frames = np.empty((episode.num_frames, *first.shape[1:]), np.uint8)
     start = 0
@@ -113,21 +147,19 @@ def _by_bytes(samples: Iterable[ProgressSample]) -> Iterator[list[ProgressSample
         yield together
 
 
-def _checked(frames: Iterator[UInt8Array], episode: Episode, camera: str) -> Iterator[UInt8Array]:
+def _checked(frames: Iterator[UInt8Array], episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
     """The frames. Raises DatasetError if there are more or fewer than the episode has, or of several sizes."""
     where, count, shape = f"{episode.name}: {camera}", 0, None
     for frame in frames:
-        if shape not in (None, frame.shape):
-            raise DatasetError.at(f"{where}: frame {count}", f"the size {shape}", str(frame.shape))
-        shape = frame.shape
+        shape = shape or frame.shape
+        require(f"{where}: frame {count}", frame.shape == shape, f"the size {shape}", frame.shape)
         count += 1
         if count <= episode.num_frames:
             yield frame
-    if count != episode.num_frames:
-        raise DatasetError.at(where, f"{episode.num_frames} frames", str(count))
+    require(where, count == episode.num_frames, f"{episode.num_frames} frames", count)
 
 
-def _check_numbers(name: str, scores: list[Float32Array], episode: Episode) -> None:
+def _check_numbers(name: str, scores: list[Float32Array], episode: DatasetEpisode) -> None:
     for score in scores:
         if score.shape != (episode.num_frames,) or not np.isfinite(score).all():
             got = "NaN: this checkpoint does not predict it" if np.isnan(score).any() else str(list(score.shape))

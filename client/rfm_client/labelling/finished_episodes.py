@@ -16,14 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from rfm_client.data.datasets.protocol import DatasetError
+from rfm_client.data.datasets.protocol import DatasetError, require
 from rfm_client.labelling.episode_scores import Columns
 from rfm_client.labelling.plan import Item
 
-DIGEST_KEY = b"rfm.digest"
-SUFFIX = ".parquet"
+IDENTITY = ("index", "episode_index", "frame_index")  # columns of every table of labels
 
-_TEMPORARY = ".tmp-"
+_DIGEST_KEY = b"rfm.digest"
+_SUFFIX = ".parquet"
 
 
 class Parts:
@@ -40,35 +40,20 @@ class Parts:
         except ImportError as error:
             raise ImportError('labelling needs pyarrow and fsspec: pip install "./client[label]"') from error
         self.url = url
-        self.fs, self.root = url_to_fs(url)
-        self.is_local = isinstance(self.fs, LocalFileSystem)
-        with self.writing():
-            self.fs.makedirs(self.root, exist_ok=True)
-
-    @contextmanager
-    def writing(self) -> Iterator[None]:
-        """Makes an OSError say what to do; a FileExistsError stays as it is."""
-        try:
-            yield
-        except FileExistsError:
-            raise
-        except OSError as error:
-            got = f"{error.strerror or error}: make room or name another place with --parts, and run the same command"
-            raise OSError(f"{self.url}: expected a folder that can be written, got {got}") from error
-
-    def path(self, name: str) -> str:
-        """The path of a file in the file system."""
-        return f"{self.root}/{name}"
+        self._fs, self._root = url_to_fs(url)
+        self._is_local = isinstance(self._fs, LocalFileSystem)
+        with self._writing():
+            self._fs.makedirs(self._root, exist_ok=True)
 
     def finished(self, items: Sequence[Item]) -> set[str]:
         """Keys of the items whose parts are there."""
-        self.fs.invalidate_cache()
-        names = {path.rpartition("/")[2] for path in self.fs.ls(self.root, detail=False)}
-        return {item.key for item in items if item.key + SUFFIX in names}
+        self._fs.invalidate_cache()
+        names = {path.rpartition("/")[2] for path in self._fs.ls(self._root, detail=False)}
+        return {item.key for item in items if item.key + _SUFFIX in names}
 
     def has(self, item: Item) -> bool:
-        """Whether the item's part is there."""
-        return bool(self.fs.exists(self.path(item.key + SUFFIX)))
+        """True if the item's part is there."""
+        return bool(self._fs.exists(self._path(item)))
 
     def write(self, item: Item, columns: Columns) -> None:
         """Writes the item's part, or leaves none. Raises OSError."""
@@ -76,48 +61,58 @@ class Parts:
         from pyarrow import parquet
 
         count, first = item.episode.num_frames, item.episode.first_index
-        identity = {
-            "index": np.arange(first, first + count, dtype=np.int64),
-            "episode_index": np.full(count, item.episode.index, np.int64),
-            "frame_index": np.arange(count, dtype=np.int64),
-        }
-        table = pa.table({**identity, **columns}).replace_schema_metadata({DIGEST_KEY: item.digest})
+        rows = (np.arange(first, first + count), np.full(count, item.episode.index), np.arange(count))
+        identity = {name: values.astype(np.int64) for name, values in zip(IDENTITY, rows, strict=True)}
+        table = pa.table({**identity, **columns}).replace_schema_metadata({_DIGEST_KEY: item.digest})
         content = io.BytesIO()
         parquet.write_table(table, content)
-        with self.writing():
-            self.put(item.key + SUFFIX, content.getvalue())
+        with self._writing():
+            if self._is_local:
+                _write_whole(Path(self._path(item)), content.getvalue())
+            else:
+                self._fs.pipe_file(self._path(item), content.getvalue())  # object stores show no half of an object
 
     def read(self, item: Item) -> Any:
         """The item's table. Raises DatasetError for a part that is missing or not whole."""
         import pyarrow as pa
         from pyarrow import parquet
 
-        path = self.path(item.key + SUFFIX)
+        path = self._path(item)
         try:
             # without Arrow's threads: one that let go of Python's bytes as the interpreter ends would abort it
-            part = parquet.ParquetFile(pa.BufferReader(self.fs.cat_file(path)), pre_buffer=False)
+            part = parquet.ParquetFile(pa.BufferReader(self._fs.cat_file(path)), pre_buffer=False)
             table = part.read(use_threads=False)
         except FileNotFoundError as error:
             raise DatasetError.at(path, "a part for each episode", "none") from error
         except (OSError, pa.ArrowException) as error:
             raise DatasetError.at(path, "a whole part", f"{error}: delete it, and run the same command") from error
-        digest = (table.schema.metadata or {}).get(DIGEST_KEY, b"").decode()
-        if digest != item.digest or table.num_rows != item.episode.num_frames:
-            got = f"another, of {table.num_rows} frames: delete it, and run the same command"
-            raise DatasetError.at(path, f"the part of {item.episode.name}", got)
+        digest = (table.schema.metadata or {}).get(_DIGEST_KEY, b"").decode()
+        is_own = digest == item.digest and table.num_rows == item.episode.num_frames
+        got = f"another, of {table.num_rows} frames: delete it, and run the same command"
+        require(path, is_own, f"the part of {item.episode.name}", got)
         return table
 
-    def put(self, name: str, content: bytes) -> None:
-        """Writes a file that others see whole or not at all. Raises OSError."""
-        if not self.is_local:
-            self.fs.pipe_file(self.path(name), content)  # object stores show no half of an object
-            return
-        temporary = Path(self.path(f"{_TEMPORARY}{uuid.uuid4().hex}"))
+    def _path(self, item: Item) -> str:
+        return f"{self._root}/{item.key}{_SUFFIX}"
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Makes an OSError say what to do."""
         try:
-            with temporary.open("wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(self.path(name))
-        finally:
-            temporary.unlink(missing_ok=True)
+            yield
+        except OSError as error:
+            got = f"{error.strerror or error}: make room or name another place with --parts, and run the same command"
+            raise OSError(f"{self.url}: expected a folder that can be written, got {got}") from error
+
+
+def _write_whole(file: Path, content: bytes) -> None:
+    """Writes a file that others see whole or not at all."""
+    temporary = file.with_name(f".tmp-{uuid.uuid4().hex}")
+    try:
+        with temporary.open("wb") as opened:
+            opened.write(content)
+            opened.flush()
+            os.fsync(opened.fileno())
+        temporary.replace(file)
+    finally:
+        temporary.unlink(missing_ok=True)

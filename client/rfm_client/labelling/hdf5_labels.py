@@ -14,21 +14,15 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from rfm_client.data.datasets.hdf5 import Hdf5Dataset
-from rfm_client.data.datasets.protocol import DatasetError
+from rfm_client.data.datasets.protocol import DatasetError, require
 from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS, Columns
-from rfm_client.labelling.finished_episodes import Parts
-from rfm_client.labelling.labelled_before import OF_ANOTHER_PROGRAM, LabelFile
+from rfm_client.labelling.finished_episodes import IDENTITY, Parts
+from rfm_client.labelling.label_files import canonical_json
+from rfm_client.labelling.labelled_before import LabelFile
 from rfm_client.labelling.plan import Item, Plan
-from rfm_client.labelling.sidecars import IDENTITY, canonical_json
 
 _DATASET_BYTES, _FILE_BYTES = 2**12, 2**20  # more than HDF5 takes for a dataset of one column, and for all attributes
 _REMEDY = "make room, or leave --in-place away: then the labels are in a file of their own"
-
-
-def sibling(dataset: Hdf5Dataset, folder: Path, name: str) -> Path:
-    """The file of labels of its own."""
-    return folder / f"{dataset.file.stem}.{name}_rewards.hdf5"
 
 
 def hdf5_labels(file: Path, name: str) -> LabelFile | None:
@@ -41,23 +35,20 @@ def hdf5_labels(file: Path, name: str) -> LabelFile | None:
         with h5py.File(file, "r") as opened:
             group = opened.get("data", {})
             attributes = getattr(group, "attrs", {})
-            provenance, digests = attributes.get(_provenance(name)), attributes.get(_episodes(name))
+            provenance, digests = attributes.get(f"{name}_provenance"), attributes.get(f"{name}_episodes")
             if provenance is None and not _labels(group, name):
                 return None
-            is_whole = _unfinished(name) not in attributes
     except OSError as error:
-        raise DatasetError.at(file, "an HDF5 file", str(error)) from error
-    flaw = OF_ANOTHER_PROGRAM if is_whole else "labels of a run that did not end"
-    return LabelFile.of(file, provenance, digests, lambda items: _read(file, name, items), flaw)
+        raise DatasetError.at(file, "an HDF5 file", error) from error
+    return LabelFile.of(file, provenance, digests, lambda items: _read(file, name, items))
 
 
 def check_room(file: Path, plan: Plan) -> None:
     """Raises DatasetError if the disk has no room for a copy of the dataset's file with labels in it."""
     target = file.resolve()
     needed, free = target.stat().st_size + _most_bytes(plan), shutil.disk_usage(target.parent).free
-    if free < needed:
-        expected = f"{needed} bytes of free disk, for a copy that takes its place when it is whole"
-        raise DatasetError.at(file, expected, f"{free}: {_REMEDY}")
+    expected = f"{needed} bytes of free disk, for a copy that takes its place when it is whole"
+    require(file, free >= needed, expected, f"{free}: {_REMEDY}")
 
 
 def write_hdf5(file: Path, plan: Plan, parts: Parts, name: str, *, in_place: bool) -> None:
@@ -110,14 +101,13 @@ def _write(group: Any, plan: Plan, parts: Parts, name: str) -> None:
     """The labels of the plan in place of all of this name."""
     for label in _labels(group, name):
         del group[label]
-    group.attrs.pop(_unfinished(name), None)
     for item in plan.items:
         table = parts.read(item)
         demo = group.require_group(item.episode.name)
         for column in (each for each in table.column_names if each not in IDENTITY):
             demo.create_dataset(f"{name}_{column}", data=table[column].to_numpy())
-    group.attrs[_provenance(name)] = canonical_json(plan.provenance()).decode()
-    group.attrs[_episodes(name)] = canonical_json(plan.digests()).decode()
+    group.attrs[f"{name}_provenance"] = canonical_json(plan.provenance()).decode()
+    group.attrs[f"{name}_episodes"] = canonical_json(plan.digests()).decode()
 
 
 def _read(file: Path, name: str, items: Sequence[Item]) -> Iterator[tuple[Item, Columns]]:
@@ -135,16 +125,3 @@ def _labels(group: Any, name: str) -> list[str]:
     column = re.compile(rf"{re.escape(name)}_({PROGRESS}|{SUCCESS})(\..+)?")
     demos = {demo: content for demo, content in group.items() if hasattr(content, "keys")}
     return [f"{demo}/{each}" for demo, content in demos.items() for each in content if column.fullmatch(each)]
-
-
-def _provenance(name: str) -> str:
-    return f"{name}_provenance"
-
-
-def _episodes(name: str) -> str:
-    return f"{name}_episodes"
-
-
-def _unfinished(name: str) -> str:
-    """What files have in place of the provenance that version 0.1.0 did not write to the end."""
-    return f"{name}_unfinished"

@@ -1,10 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""Files of labels read back: what their columns are, and the curves of one episode. Needs pyarrow. T frames."""
+"""The Parquet files of labels that training reads, written and read: one row a frame, in the dataset's order.
+
+``<name>_progress.parquet``: the form of LeRobot's reward-aligned behaviour cloning and of the Hub's visualizer. Columns
+int64 ``index``, ``episode_index``, ``frame_index``, then float32 ``progress_sparse``, ``success``, and each camera's.
+
+``reward_signals/<name>.parquet``: the form of LeRobot's frame signals (schema version 1), as its open pull requests
+propose it. The same first columns, then ``reward.<name>.progress``, ``reward.<name>.success_probability``, and each
+camera's, with a description of each in the metadata.
+
+Needs pyarrow. T frames of an episode.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import json
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,58 +24,170 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.samples import Float32Array
-from rfm_client.data.datasets.protocol import DatasetError
-from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS
+from rfm_client.data.datasets.protocol import DatasetError, require
+from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS, Columns
+from rfm_client.labelling.finished_episodes import IDENTITY, Parts
+from rfm_client.labelling.labelled_before import LabelFile
+from rfm_client.labelling.plan import Item, Plan
 
 PROGRESS_ENDING = "_progress.parquet"
 SIGNALS_FOLDER = "reward_signals"
+PROVENANCE_KEY = b"rfm.provenance"
+SIGNALS_PROVENANCE_KEY = b"lerobot.reward_scoring.provenance"
 
-_PROGRESS_NAMES = ("progress_sparse", "progress_dense", "progress")
+_EPISODES_KEY = b"rfm.episodes"  # the digest of each, so that a later run knows whether its labels still hold
+_ROWS_AT_A_TIME = 2**17  # of one row group
 _OWN_NAME = "rfm"  # of labels whose name nobody chose
+_PROGRESS_NAMES = ("progress_sparse", "progress_dense", "progress")
+_SIGNAL_NAMES = {PROGRESS: "progress", SUCCESS: "success_probability"}
+_DESCRIPTIONS = {PROGRESS: "Share of the task that is done", SUCCESS: "Probability that the task is done"}
 
 
 @dataclass(frozen=True)
-class LabelColumns:
-    """Names of the columns of scores in a file of labels.
+class Sidecar:
+    """One file of labels to be written.
 
-    success: None: the checkpoint does not predict it
-    progress_of, success_of: each camera's, where there are several
+    columns: name of each column of scores, by its name in the parts
+    metadata: of the Parquet schema
     """
 
-    progress: str
-    success: str | None
-    progress_of: Mapping[str, str]
-    success_of: Mapping[str, str]
+    path: Path
+    columns: Mapping[str, str]
+    metadata: Mapping[bytes, bytes]
 
-    @classmethod
-    def among(cls, file: object, names: Sequence[str]) -> LabelColumns:
-        """Those of either form of file. Raises DatasetError if there is no progress, or no episode."""
-        if "episode_index" not in names:
-            raise DatasetError.at(file, "the column episode_index", ", ".join(names))
-        for name in _PROGRESS_NAMES:
-            if name in names:
-                return cls._named(names, name, PROGRESS, SUCCESS)
-        for name in names:
-            if name.startswith("reward.") and name.endswith(".progress"):
-                return cls._named(names, name, name, name.removesuffix("progress") + "success_probability")
-        raise DatasetError.at(file, "a column of progress", ", ".join(names))
 
-    @classmethod
-    def _named(cls, names: Sequence[str], fused: str, progress: str, success: str) -> LabelColumns:
-        """progress, success: how the names of each camera's columns begin"""
-        has_success = success in names
-        success_of = _by_camera(names, success) if has_success else {}
-        return cls(fused, success if has_success else None, _by_camera(names, progress), success_of)
+def progress_file(path: Path, plan: Plan, columns: Sequence[str]) -> Sidecar:
+    """The progress file for these columns of the parts."""
+    checkpoint = plan.recipe.checkpoint
+    model = checkpoint.source or checkpoint.weights_digest
+    metadata = {
+        b"reward_model_path": (f"{model}@{checkpoint.revision}" if checkpoint.revision else model).encode(),
+        PROVENANCE_KEY: canonical_json(plan.provenance()),
+        _EPISODES_KEY: canonical_json(plan.digests()),
+    }
+    return Sidecar(path, {name: "progress_sparse" if name == PROGRESS else name for name in columns}, metadata)
 
-    @property
-    def all(self) -> list[str]:
-        """Every column of scores."""
-        return [
-            self.progress,
-            *([self.success] if self.success else []),
-            *self.progress_of.values(),
-            *self.success_of.values(),
-        ]
+
+def signals_file(path: Path, plan: Plan, columns: Sequence[str], name: str) -> Sidecar:
+    """The file of frame signals for these columns of the parts."""
+    signals = {}
+    for column in columns:
+        score, dot, camera = column.partition(".")
+        signals[column] = f"reward.{name}.{_SIGNAL_NAMES[score]}{dot}{camera}"
+    metadata = {
+        "format": b"lerobot.frame_signals",
+        "schema_version": b"1",
+        "provenance": canonical_json(plan.provenance()),
+        "descriptors": canonical_json({signals[column]: _descriptor(column) for column in columns}),
+        "episode_indices": canonical_json([item.episode.index for item in plan.items]),
+    }
+    ordered = dict(sorted(signals.items(), key=lambda signal: signal[1]))
+    named = {f"lerobot.reward_scoring.{key}".encode(): value for key, value in metadata.items()}
+    return Sidecar(path, ordered, {**named, _EPISODES_KEY: canonical_json(plan.digests())})
+
+
+def _descriptor(column: str) -> dict[str, Any]:
+    score, _, camera = column.partition(".")
+    return {
+        "description": _DESCRIPTIONS[score] + (f", seen by {camera}" if camera else ""),
+        "direction": "higher",
+        "bounds": [0.0, 1.0],
+        "unit": None,
+        "missing_values": "forbidden",
+        "allow_nan": False,  # how another revision of the proposal says the same
+    }
+
+
+def write_sidecars(plan: Plan, parts: Parts, sidecars: Sequence[Sidecar]) -> None:
+    """Streams the parts into all files, and puts each in its place when it is whole.
+
+    Raises DatasetError for a missing part, or one with other columns than the first, and OSError: then no file changes.
+    """
+    if not sidecars:
+        return
+    written = {sidecar.path.with_name(f".{sidecar.path.name}.{uuid.uuid4().hex}"): sidecar for sidecar in sidecars}
+    try:
+        for file in written:
+            file.parent.mkdir(parents=True, exist_ok=True)
+        _stream(plan, parts, written)
+        for file, sidecar in written.items():
+            file.replace(sidecar.path)
+    except OSError as error:
+        got = f"{error}: make room, or name another folder with --output and this one's --parts {parts.url}"
+        raise OSError(f"{sidecars[0].path.parent}: expected to write the labels, got {got}") from error
+    finally:
+        for file in written:
+            file.unlink(missing_ok=True)
+
+
+def _stream(plan: Plan, parts: Parts, sidecars: Mapping[Path, Sidecar]) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    writers: dict[Path, Any] = {}
+    try:
+        for table in _row_groups(plan, parts):
+            for file, sidecar in sidecars.items():
+                own = table.select([*IDENTITY, *sidecar.columns])
+                own = own.rename_columns([*IDENTITY, *sidecar.columns.values()])
+                if file not in writers:
+                    fields = [pa.field(field.name, field.type, nullable=False) for field in own.schema]
+                    writers[file] = parquet.ParquetWriter(file, pa.schema(fields, metadata=dict(sidecar.metadata)))
+                writers[file].write_table(own.cast(writers[file].schema), row_group_size=_ROWS_AT_A_TIME)
+    finally:
+        for writer in writers.values():
+            writer.close()
+
+
+def _row_groups(plan: Plan, parts: Parts) -> Iterator[Any]:
+    """The rows of all parts in order, about _ROWS_AT_A_TIME together."""
+    import pyarrow as pa
+
+    together: list[Any] = []
+    names: list[str] = []
+    following = -1
+    for item in plan.items:
+        table, name, first = parts.read(item), item.episode.name, item.episode.first_index
+        names = names or table.column_names
+        require(name, table.column_names == names, f"the columns {', '.join(names)}", ", ".join(table.column_names))
+        require(name, first > following, f"rows after {following}", first)
+        following = first + item.episode.num_frames - 1
+        together.append(table.replace_schema_metadata(None))
+        if sum(map(len, together)) >= _ROWS_AT_A_TIME:
+            yield pa.concat_tables(together)
+            together = []
+    if together:
+        yield pa.concat_tables(together)
+
+
+def parquet_labels(path: Path, option: str = "--name") -> LabelFile | None:
+    """The labels in the file of this path; None: there is none. option: chooses another path"""
+    from pyarrow import ArrowException, parquet
+
+    if not path.exists():
+        return None
+    try:
+        metadata = parquet.read_schema(path).metadata or {}
+    except (OSError, ArrowException):
+        metadata = {}
+    provenance = metadata.get(PROVENANCE_KEY, metadata.get(SIGNALS_PROVENANCE_KEY))
+    found = LabelFile.of(path, provenance, metadata.get(_EPISODES_KEY), lambda items: _read(path, items))
+    return replace(found, option=option)
+
+
+def _read(path: Path, items: Sequence[Item]) -> Iterator[tuple[Item, Columns]]:
+    table = read_label_table(path)
+    episodes = table["episode_index"].to_numpy()
+    names = [name for name in table.column_names if name not in IDENTITY]
+    for item in items:
+        start, end = np.searchsorted(episodes, [item.episode.index, item.episode.index + 1]).tolist()
+        rows = table.slice(start, end - start)
+        yield item, {name: rows[name].to_numpy() for name in names}
+
+
+def canonical_json(document: Any) -> bytes:
+    """The document as JSON, the same bytes for the same document."""
+    return json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,43 +223,56 @@ def find_label_files(root: Path) -> list[Path]:
     return sorted(files, key=lambda file: file.name.removesuffix(PROGRESS_ENDING) != _OWN_NAME)
 
 
-def read_label_table(file: Path, *, episode: int | None = None, more: Sequence[str] = ()) -> tuple[Any, LabelColumns]:
-    """The table of a file of labels: ``episode_index``, all scores, and ``more`` columns. Raises DatasetError.
+def read_label_table(file: Path, *, episode: int | None = None) -> Any:
+    """The table of a file of labels of either form, whose columns of scores are named as in the parts.
 
-    episode: the rows of this one alone
+    These are ``progress``, ``success``, and each camera's, ``progress.<camera>``. episode: the rows of this one alone
+
+    Raises DatasetError.
     """
     from pyarrow import ArrowException, parquet
 
     try:
-        columns = LabelColumns.among(file, parquet.read_schema(file).names)
+        names = parquet.read_schema(file).names
+        columns = {**{name: name for name in IDENTITY if name in names}, **_score_columns(file, names)}
         filters = None if episode is None else [("episode_index", "=", episode)]
-        names = ["episode_index", *more, *columns.all]
-        table = parquet.read_table(file, columns=names, filters=filters, partitioning=None)
+        table = parquet.read_table(file, columns=list(columns.values()), filters=filters, partitioning=None)
     except (OSError, ArrowException) as error:
-        raise DatasetError.at(file, "a file of labels", str(error)) from error
-    missing = [name for name in names if name not in table.column_names]
-    if missing:
-        raise DatasetError.at(file, f"the column {missing[0]}", ", ".join(table.column_names))
-    return table, columns
+        raise DatasetError.at(file, "a file of labels", error) from error
+    return table.select(list(columns.values())).rename_columns(list(columns))
 
 
 def read_episode_labels(file: Path, episode: int) -> EpisodeLabels | None:
     """The labels of an episode; None: the file has none of it. Raises DatasetError."""
-    table, columns = read_label_table(file, episode=episode, more=("frame_index",))
+    table = read_label_table(file, episode=episode)
+    require(file, "frame_index" in table.column_names, "the column frame_index", ", ".join(table.column_names))
     if not len(table):
         return None
 
-    def curve(progress: str, success: str | None) -> Curve:
-        return Curve(table[progress].to_numpy(), None if success is None else table[success].to_numpy())
+    def curve(dot_camera: str = "") -> Curve:
+        success = f"{SUCCESS}{dot_camera}"
+        has_success = success in table.column_names
+        return Curve(table[f"{PROGRESS}{dot_camera}"].to_numpy(), table[success].to_numpy() if has_success else None)
 
-    return EpisodeLabels(
-        frames=table["frame_index"].to_numpy(),
-        fused=curve(columns.progress, columns.success),
-        cameras={
-            camera: curve(progress, columns.success_of.get(camera)) for camera, progress in columns.progress_of.items()
-        },
-    )
+    cameras = [name.partition(".")[2] for name in table.column_names if name.startswith(f"{PROGRESS}.")]
+    return EpisodeLabels(table["frame_index"].to_numpy(), curve(), {camera: curve(f".{camera}") for camera in cameras})
 
 
-def _by_camera(names: Sequence[str], begin: str) -> dict[str, str]:
-    return {name.removeprefix(f"{begin}."): name for name in names if name.startswith(f"{begin}.")}
+def _score_columns(file: Path, names: Sequence[str]) -> dict[str, str]:
+    """The columns of scores by their names in the parts. Raises DatasetError if there is no progress, or no episode."""
+    require(file, "episode_index" in names, "the column episode_index", ", ".join(names))
+    own = next((name for name in _PROGRESS_NAMES if name in names), None)
+    signal = next((name for name in names if name.startswith("reward.") and name.endswith(".progress")), None)
+    progress = own or signal
+    if progress is None:
+        raise DatasetError.at(file, "a column of progress", ", ".join(names))
+    begins = {PROGRESS: PROGRESS, SUCCESS: SUCCESS}
+    if own is None:
+        begins = {PROGRESS: progress, SUCCESS: progress.removesuffix("progress") + _SIGNAL_NAMES[SUCCESS]}
+    columns = {PROGRESS: progress}
+    if begins[SUCCESS] in names:
+        columns[SUCCESS] = begins[SUCCESS]
+    for score in list(columns):
+        begin = begins[score]
+        columns |= {score + name.removeprefix(begin): name for name in names if name.startswith(f"{begin}.")}
+    return columns

@@ -11,8 +11,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from rfm_client.contract.samples import Float32Array
-from rfm_client.data.datasets.protocol import Dataset, DatasetError
+from rfm_client.data.datasets.protocol import Dataset, DatasetError, require
 from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS, Columns
 from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.plan import Item, Plan, make_plan
@@ -21,8 +20,7 @@ from rfm_client.labelling.run import Watch
 Reader: TypeAlias = Callable[[Sequence[Item]], Iterator[tuple[Item, Columns]]]
 
 OF_ANOTHER_PROGRAM = "labels of another program"
-_NO_RECIPE = {"writer"}  # of provenance: what does not decide the labels of an episode
-_NO_RECIPE_OF_DATASET = {"digest", "revision", "source"}  # the digests of the episodes tell it from another one
+_OTHERS = "those of others, or of copies (label with --verify to tell copies by their content)"
 
 
 @dataclass(frozen=True)
@@ -51,24 +49,31 @@ class LabelFile:
         flaw_of_ours = None if by_episode else "no digests of its episodes"
         return cls(path, flaw_of_ours, told, {int(index): digest for index, digest in by_episode.items()}, read)
 
-    def check_recipe(self, plan: Plan) -> None:
-        """Raises DatasetError unless its labels are of the plan's recipe; says which settings differ."""
+    def check(self, plan: Plan, dataset: Dataset, known: Mapping[int, Item]) -> Mapping[int, Item]:
+        """The items of its episodes. Raises DatasetError if its labels would be lost, or are not those of the frames.
+
+        known: the items that are chosen to be labelled, or of which other files have labels
+        """
         there, now = _settings(_recipe(self.provenance)), _settings(_recipe(plan.provenance()))
         names = [name for name in dict.fromkeys([*now, *there]) if there.get(name) != now.get(name)]
-        differ = [f"{name}: {there.get(name, 'none')} there, {now.get(name, 'none')} now" for name in names]
-        if self.flaw is not None or differ:
-            got = "; ".join(differ) if self.provenance and differ else self.flaw or ""
-            raise DatasetError.at(self.path, "no labels, or those of the same recipe", got)
+        differ = "; ".join(f"{name}: {there.get(name, 'none')} there, {now.get(name, 'none')} now" for name in names)
+        got = (self.provenance and differ) or self.flaw or ""
+        require(self.path, self.flaw is None and not differ, "no labels, or those of the same recipe", got)
 
-    def check_episodes(self, items: Mapping[int, Item], chosen: Mapping[int, Item]) -> None:
-        """Raises DatasetError unless its episodes are these items, or are chosen to be labelled again."""
-        others = [index for index, digest in self.digests.items() if digest != items[index].digest]
-        if len(others) == len(self.digests):
-            raise DatasetError.at(self.path, "labels of this dataset's episodes", "those of others")
-        for index in others:
-            if index not in chosen:
-                expected = f"the frames and rows of its labels in {self.path}, or --episodes with {index}"
-                raise DatasetError.at(items[index].episode.name, expected, "others")
+        episodes = {episode.index: episode for episode in dataset.episodes}
+        lost = set(self.digests) - set(episodes)
+        expected = f"labels of the dataset's {len(episodes)} episodes"
+        require(self.path, not lost, expected, f"some of episode {min(lost, default=None)}")
+        others = [episodes[index] for index in sorted(self.digests) if index not in known]
+        items = {item.episode.index: item for item in make_plan(dataset, plan.recipe, others).items}
+        found = {index: {**known, **items}[index] for index in self.digests}
+        changed = [index for index, digest in self.digests.items() if found[index].digest != digest]
+        require(self.path, len(changed) < len(self.digests), "labels of this dataset's episodes", _OTHERS)
+        chosen = {item.episode.index for item in plan.items}
+        for index in changed:
+            expected = f"the frames and rows of its labels in {self.path}, or --episodes with {index}"
+            require(found[index].episode.name, index in chosen, expected, "others")
+        return found
 
 
 def joined(plan: Plan, dataset: Dataset, files: Sequence[LabelFile], overwrite: bool, watch: Watch) -> Plan:
@@ -77,65 +82,40 @@ def joined(plan: Plan, dataset: Dataset, files: Sequence[LabelFile], overwrite: 
     Raises DatasetError for a file whose labels would be lost, or would not be those of the frames any more. On
     ``overwrite`` such a file is replaced.
     """
-    chosen = {item.episode.index: item for item in plan.items}
-    known: Mapping[int, Item] = chosen
+    known: Mapping[int, Item] = {item.episode.index: item for item in plan.items}
     for file in files:
         try:
-            file.check_recipe(plan)
-            more = {**known, **_items(plan, dataset, file, known, watch)}
-            file.check_episodes(more, chosen)
+            known = {**known, **file.check(plan, dataset, known)}
         except DatasetError as error:
             if not overwrite:
                 raise DatasetError(f"{error}: choose another {file.option}, or --overwrite") from error
             lost = f"; its labels of {len(file.digests)} episodes are replaced" if file.digests else ""
             watch.note(f"--overwrite: {error}{lost}")
-        else:
-            known = more
-    if len(known) > len(chosen):
-        watch.note(f"labels of {len(known) - len(chosen)} other episodes are there, and are kept")
+    if len(known) > len(plan.items):
+        watch.note(f"labels of {len(known) - len(plan.items)} other episodes are there, and are kept")
     return replace(plan, items=[known[index] for index in sorted(known)])
 
 
 def restore(plan: Plan, parts: Parts, files: Sequence[LabelFile]) -> None:
     """Writes the parts of the plan that are gone, and whose labels the files have. Raises OSError."""
-    recipe = plan.recipe
-    order = [name + camera for name in (PROGRESS, SUCCESS) for camera in ("", *(f".{each}" for each in recipe.cameras))]
+    cameras = ("", *(f".{camera}" for camera in plan.recipe.cameras))
+    order = [name + camera for name in (PROGRESS, SUCCESS) for camera in cameras]
     finished = parts.finished(plan.items)
     for file in files:
-        gone = [
-            item
-            for item in plan.items
-            if item.key not in finished and file.digests.get(item.episode.index) == item.digest
-        ]
+        missing = [item for item in plan.items if item.key not in finished]
+        gone = [item for item in missing if file.digests.get(item.episode.index) == item.digest]
         for item, columns in file.read(gone) if gone else ():
             scores = {name: columns[name] for name in order if name in columns}
-            if scores and all(_is_whole(each, item) for each in scores.values()):
+            of_all = [len(each) == item.episode.num_frames and np.isfinite(each).all() for each in scores.values()]
+            if of_all and all(of_all):
                 parts.write(item, scores)
                 finished.add(item.key)
 
 
-def _is_whole(scores: Float32Array, item: Item) -> bool:
-    return len(scores) == item.episode.num_frames and bool(np.isfinite(scores).all())
-
-
-def _items(plan: Plan, dataset: Dataset, file: LabelFile, known: Mapping[int, Item], watch: Watch) -> dict[int, Item]:
-    """The items of the file's episodes that are not known. Raises DatasetError."""
-    episodes = {episode.index: episode for episode in dataset.episodes}
-    lost = sorted(set(file.digests) - set(episodes))
-    if lost:
-        raise DatasetError.at(
-            file.path, f"labels of the dataset's {len(episodes)} episodes", f"some of episode {lost[0]}"
-        )
-    others = [episodes[index] for index in sorted(file.digests) if index not in known]
-    watch.checking(len(others))
-    return {item.episode.index: item for item in make_plan(dataset, plan.recipe, others, watch.checked).items}
-
-
 def _recipe(provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """What decides labels, whatever the episode."""
-    document = {name: value for name, value in provenance.items() if name not in _NO_RECIPE}
-    dataset = document.get("dataset", {})
-    return {**document, "dataset": {key: dataset[key] for key in dataset if key not in _NO_RECIPE_OF_DATASET}}
+    """What decides labels, whatever the episode: the digests of episodes tell a dataset from another one."""
+    dataset = provenance.get("dataset", {})
+    return {**provenance, "writer": None, "dataset": {"kind": dataset.get("kind")}}
 
 
 def _settings(document: Mapping[str, Any]) -> dict[str, str]:

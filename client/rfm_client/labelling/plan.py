@@ -5,26 +5,119 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from rfm_client.data.datasets.protocol import Dataset, DatasetError, Episode, digest_of
-from rfm_client.labelling.options import LabelOptions
-from rfm_client.labelling.recipe import Recipe
+from rfm_client.data.camera_fusion import Fuse
+from rfm_client.data.datasets.protocol import (
+    Dataset,
+    DatasetEpisode,
+    chosen_cameras,
+    digest_of,
+    require,
+)
+from rfm_client.data.orientation import Orientation
+from rfm_client.data.sampling import Sampling
+from rfm_client.labelling.options import LabelOptions, Mode
+from rfm_client.labelling.scorer import CheckpointFacts
+
+_RECIPE_FORMAT = 4  # another one wherever the same recipe would give other scores, or other digests
+_OF_TRAINING = {True: "as upstream's training pads shorter clips", False: "the checkpoint's training did not pad"}
+_OF_CHECKPOINT = "the most in training; if the checkpoint does not say, the most its network takes"
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How an episode's frames become labels: what decides them besides the frames.
+
+    decoders: what decodes each camera's pictures, since versions differ in colours; None: they are stored as pixels
+    orientations: of the cameras that are turned
+    verify: films are told from others by their content
+    """
+
+    checkpoint: CheckpointFacts
+    cameras: tuple[str, ...]
+    decoders: Mapping[str, str | None]
+    orientations: Mapping[str, Orientation]
+    sampling: Sampling
+    mode: Mode
+    fuse: Fuse
+    resize: bool
+    verify: bool
+
+    @classmethod
+    def of(cls, options: LabelOptions, dataset: Dataset, checkpoint: CheckpointFacts) -> Recipe:
+        """The recipe that the options, or else the dataset and the checkpoint, decide.
+
+        Raises DatasetError for a camera that is not there, ValueError if nobody says how many frames the rule shows.
+        """
+        require(dataset.source, bool(dataset.cameras), "at least one camera", "none")
+        cameras = chosen_cameras(dataset, options.cameras)
+        rule = "all" if options.mode == "whole" else options.sampling
+        return cls(
+            checkpoint,
+            cameras,
+            decoders={camera: dataset.decoder(camera) for camera in cameras},
+            orientations={camera: turn for camera, turn in dataset.orientations.items() if camera in cameras},
+            sampling=Sampling.of(
+                rule, options.frames, checkpoint.max_frames, trained_padding=checkpoint.trained_padding
+            ),
+            mode=options.mode,
+            fuse=options.fuse,
+            resize=options.resize,
+            verify=options.verify,
+        )
+
+    def in_one_pass(self, num_frames: int) -> bool:
+        """True if one pass over an episode of so many frames gives every frame's score."""
+        rule, frames = self.sampling.rule, self.sampling.frames
+        shows_all = rule == "all" or (rule == "rint" and frames is not None and num_frames <= frames)
+        return self.mode == "whole" or (shows_all and self.checkpoint.is_causal)
+
+    def document(self) -> dict[str, Any]:
+        """The recipe as provenance tells it."""
+        return {
+            "format": _RECIPE_FORMAT,
+            "checkpoint": self.checkpoint.document(),
+            "cameras": list(self.cameras),
+            "decoders": dict(self.decoders),
+            "orientations": dict(self.orientations),
+            "sampling": asdict(self.sampling),
+            "mode": self.mode,
+            "fuse": self.fuse if len(self.cameras) > 1 else None,
+            "resize": str(self.checkpoint.frame_size) if self.resize else None,
+            "verify": self.verify,
+        }
+
+    def told(self, options: LabelOptions) -> list[str]:
+        """What is done, a line each, with who decided it."""
+        lines = [f"cameras: {', '.join(self.cameras)} ({'asked for' if options.cameras else 'all but depth cameras'})"]
+        if self.mode == "whole":
+            lines.append("mode: whole: the score of frame t may depend on later frames, unless the network is causal")
+        else:
+            who = "asked for" if options.sampling else _OF_TRAINING[self.checkpoint.trained_padding]
+            lines.append(f"sampling: {self.sampling.rule} ({who})")
+        if self.sampling.frames is not None:
+            lines.append(f"frames: {self.sampling.frames} ({'asked for' if options.frames else _OF_CHECKPOINT})")
+        return lines + [f"fuse: {self.fuse} of {len(self.cameras)} cameras"] * (len(self.cameras) > 1)
+
+    def check_lengths(self, episodes: Sequence[DatasetEpisode]) -> None:
+        """Raises DatasetError for an episode that the checkpoint cannot take at once, where it must."""
+        limit = self.checkpoint.max_frames
+        longest = max(episodes, key=lambda episode: episode.num_frames)
+        shows_all = self.mode == "whole" or self.sampling.frames is None
+        fits = not shows_all or limit is None or longest.num_frames <= limit
+        got = f"{longest.num_frames}: use mode prefix and a rule with a number of frames"
+        require(longest.name, fits, f"at most {limit} frames, as the checkpoint takes", got)
 
 
 @dataclass(frozen=True)
 class Item:
-    """One episode to be labelled.
+    """One episode to be labelled. digest: of everything that decides its labels"""
 
-    digest: of everything that decides its labels
-    num_bytes: of its frames as they are stored
-    """
-
-    episode: Episode
+    episode: DatasetEpisode
     digest: str
-    num_bytes: int
 
     @property
     def key(self) -> str:
@@ -60,14 +153,13 @@ class Plan:
         return {"writer": f"rfm-client {version}", "dataset": dataset, **self.recipe.document()}
 
 
-def selected(dataset: Dataset, options: LabelOptions) -> list[Episode]:
+def selected(dataset: Dataset, options: LabelOptions) -> list[DatasetEpisode]:
     """The episodes that the options choose. Raises DatasetError for one that the dataset does not have."""
     episodes = {episode.index: episode for episode in dataset.episodes}
     wanted = sorted(episodes) if options.episodes is None else sorted(set(options.episodes))
     missing = [index for index in wanted if index not in episodes]
-    if missing or not wanted:
-        expected = f"some of the {len(episodes)} of the dataset"
-        raise DatasetError.at("episodes", expected, ", ".join(map(str, missing[:5])) or "none")
+    got = ", ".join(map(str, missing[:5])) or "none"
+    require("episodes", bool(wanted) and not missing, f"some of the {len(episodes)} of the dataset", got)
     chosen = [episodes[index] for index in wanted[: options.limit]]
     if options.shard is not None:
         i, n = options.shard
@@ -75,21 +167,12 @@ def selected(dataset: Dataset, options: LabelOptions) -> list[Episode]:
     return chosen
 
 
-def make_plan(
-    dataset: Dataset, recipe: Recipe, episodes: Sequence[Episode], checked: Callable[[Episode], None]
-) -> Plan:
-    """The plan. Finds every frame of every episode; raises DatasetError for the first that is not there.
-
-    checked: called after each episode
-    """
-    document = json.dumps(recipe.document(), sort_keys=True).encode()
+def make_plan(dataset: Dataset, recipe: Recipe, episodes: Iterable[DatasetEpisode]) -> Plan:
+    """The plan of these episodes. Looks at no frame of a film; raises DatasetError for a file that is not there."""
+    document = json.dumps(recipe.document(), sort_keys=True)
     items = []
     for episode in episodes:
-        contents = {camera: dataset.check(episode, camera) for camera in recipe.cameras}
-        films = [f"{camera} {content.digest}".encode() for camera, content in contents.items()]
-        about = f"{episode.index} {episode.first_index} {episode.num_frames} {episode.task}".encode()
-        num_bytes = sum(content.num_bytes for content in contents.values())
-        items.append(Item(episode, digest_of([document, about, *films]), num_bytes))
-        checked(episode)
-    told = {"kind": dataset.kind, "source": dataset.source, "revision": dataset.revision}
-    return Plan(items, recipe, told)
+        about = f"{episode.index} {episode.first_index} {episode.num_frames} {episode.task}"
+        films = [f"{each} {dataset.identity(episode, each, verify=recipe.verify)}" for each in recipe.cameras]
+        items.append(Item(episode, digest_of(part.encode() for part in (document, about, *films))))
+    return Plan(items, recipe, {"kind": dataset.kind, "source": dataset.source, "revision": dataset.revision})

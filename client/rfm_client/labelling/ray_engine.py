@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Labels on a Ray cluster: Ray Data hands episodes to actors, each of which holds a scorer. Needs ``rfm-client[ray]``.
 
-Ray only schedules. Parts, claims and provenance are those of a run without Ray, so either goes on with what the other
-has left. Dataset and parts must be at the same place for every node: a shared folder, or for the parts a URL.
+Ray only schedules. Parts and provenance are those of a run without Ray, so either goes on with what the other has left.
+Dataset and parts must be at the same place for every node: a shared folder, or for the parts a URL.
 """
 
 from __future__ import annotations
@@ -14,44 +14,41 @@ from typing import Any, TypeAlias
 
 from rfm_client.contract.errors import RewardError
 from rfm_client.data.datasets.opening import open_dataset
-from rfm_client.data.orientation import Orient
 from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.options import RayOptions
 from rfm_client.labelling.plan import Plan
-from rfm_client.labelling.run import Failure, Run, Watch
+from rfm_client.labelling.run import Failure, Run, Watch, begin, by_episode
 from rfm_client.labelling.scorer import Scorer
 
 Connect: TypeAlias = Callable[[], AbstractContextManager[Scorer]]
 
-BATCHES_AN_ACTOR = 4  # at least, where there are enough episodes, so that all actors end at about the same time
+_BATCHES_AN_ACTOR = 4  # at least, where there are enough episodes, so that all actors end at about the same time
 
 
 @dataclass(frozen=True)
-class Job:
+class RayJob:
     """What every actor is told.
 
-    source, task, override_task, orient: with which the dataset is opened
+    source, opening: with which ``open_dataset`` opens the dataset
     connect: gives the actor's scorer
     """
 
     source: str
-    task: str | None
+    opening: Mapping[str, Any]
     connect: Connect
     plan: Plan
     parts: str
     workers: int
-    override_task: bool = False
-    orient: Orient = Orient()
 
 
 class EpisodeActor:
     """Labels batches of episodes: while one is scored, the next is decoded."""
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: RayJob) -> None:
         self._held = ExitStack()  # what it holds is closed as soon as nothing refers to it
         self._job = job
         self._parts = Parts(job.parts)
-        self._dataset = open_dataset(job.source, task=job.task, override_task=job.override_task, orient=job.orient)
+        self._dataset = open_dataset(job.source, **job.opening)
         self._scorer = self._held.enter_context(job.connect())  # open as long as the actor lives
 
     def __del__(self) -> None:
@@ -70,21 +67,23 @@ class EpisodeActor:
         }
 
 
-def finish_all_with_ray(job: Job, options: RayOptions, watch: Watch) -> list[Failure]:
+def finish_all_with_ray(job: RayJob, options: RayOptions, watch: Watch) -> list[Failure]:
     """Labels what has no part, on a cluster. Gives what failed; raises what stops an actor, as ``RewardError``."""
-    ray = _import_ray()
-    items = job.plan.items
-    finished = Parts(job.parts).finished(items)
-    num_finished = sum(item.episode.num_frames for item in items if item.key in finished)
-    watch.begin(job.plan.num_frames, num_finished)
-    places = [place for place, item in enumerate(items) if item.key not in finished]
+    try:
+        import ray
+        import ray.data
+    except ImportError as error:
+        raise ImportError('labelling on a cluster needs Ray: pip install "./client[ray]"') from error
+    pending = {item.key for item in begin(job.plan, Parts(job.parts), watch)}
+    places = [place for place, item in enumerate(job.plan.items) if item.key in pending]
     if not places:
         return []
-    labelled = _labelled(ray, job, options, places)
+    if not ray.is_initialized():
+        ray.init(address=options.address, log_to_driver=False, include_dashboard=False)
     failures = []
     try:
-        for row in labelled.iter_rows():
-            episode = items[row["place"]].episode
+        for row in _labelled(ray, job, options, places).iter_rows():
+            episode = job.plan.items[row["place"]].episode
             if row["reason"]:
                 failures.append(Failure(episode, RewardError(row["reason"])))
                 watch.failed(episode, failures[-1].error)
@@ -92,15 +91,15 @@ def finish_all_with_ray(job: Job, options: RayOptions, watch: Watch) -> list[Fai
                 watch.scored(episode)
     except ray.exceptions.RayError as error:
         raise RewardError(f"ray: expected actors that label, got {str(error).strip().splitlines()[-1]}") from error
-    return sorted(failures, key=lambda failure: failure.episode.index)
+    return by_episode(failures)
 
 
-def _labelled(ray: Any, job: Job, options: RayOptions, places: Sequence[int]) -> Any:
-    """The Ray dataset whose rows come as episodes are labelled; connects to the cluster."""
-    if not ray.is_initialized():
-        ray.init(address=options.address, log_to_driver=False, include_dashboard=False)
+def _labelled(ray: Any, job: RayJob, options: RayOptions, places: Sequence[int]) -> Any:
+    """The Ray dataset whose rows come as episodes are labelled."""
     ray.data.DataContext.get_current().enable_progress_bars = False
-    batches = _batches(places, options.actors, job.workers)
+    # as many episodes together as an actor has under way, fewer if there are few for each actor
+    size = max(1, min(job.workers, len(places) // (options.actors * _BATCHES_AN_ACTOR)))
+    batches = [list(places[start : start + size]) for start in range(0, len(places), size)]
     dataset = ray.data.from_items([{"places": batch} for batch in batches], override_num_blocks=len(batches))
     return dataset.map_batches(
         EpisodeActor,
@@ -110,18 +109,3 @@ def _labelled(ray: Any, job: Job, options: RayOptions, places: Sequence[int]) ->
         compute=ray.data.ActorPoolStrategy(size=min(options.actors, len(batches))),
         num_gpus=options.num_gpus_per_actor,
     )
-
-
-def _batches(places: Sequence[int], actors: int, workers: int) -> list[list[int]]:
-    """As many episodes together as an actor has under way, fewer if there are few for each actor."""
-    size = max(1, min(workers, len(places) // (actors * BATCHES_AN_ACTOR)))
-    return [list(places[start : start + size]) for start in range(0, len(places), size)]
-
-
-def _import_ray() -> Any:
-    try:
-        import ray
-        import ray.data
-    except ImportError as error:
-        raise ImportError('labelling on a cluster needs Ray: pip install "./client[ray]"') from error
-    return ray

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Labels the episodes of a plan that have no part yet, several at a time, beside other processes that do the same."""
+"""Labels the episodes of a plan that have no part yet, several at a time."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from enum import Enum, auto
 
 from rfm_client.contract.errors import (
     AccessDeniedError,
@@ -19,16 +18,13 @@ from rfm_client.contract.errors import (
     RewardError,
     ServerUnavailableError,
 )
-from rfm_client.data.datasets.protocol import Dataset, Episode
-from rfm_client.labelling.claims import Claims
-from rfm_client.labelling.episode_scores import episode_columns
+from rfm_client.data.datasets.protocol import Dataset, DatasetEpisode
+from rfm_client.labelling.episode_scores import FrameMemory, episode_columns
 from rfm_client.labelling.finished_episodes import Parts
-from rfm_client.labelling.frame_memory import FrameMemory
 from rfm_client.labelling.plan import Item, Plan
 from rfm_client.labelling.scorer import Scorer
 
-POLL_S = 0.5  # how often episodes that others work on are looked at
-NOT_ABOUT_ONE_EPISODE = (ServerUnavailableError, DeadlineExceededError, ModelNotFoundError, AccessDeniedError)
+_NOT_ABOUT_ONE_EPISODE = (ServerUnavailableError, DeadlineExceededError, ModelNotFoundError, AccessDeniedError)
 
 
 class Watch:
@@ -40,16 +36,16 @@ class Watch:
     def checking(self, num_episodes: int) -> None:
         """So many episodes are about to be checked."""
 
-    def checked(self, episode: Episode) -> None:
+    def checked(self, episode: DatasetEpisode) -> None:
         """All frames of the episode are there."""
 
     def begin(self, num_frames: int, num_finished: int) -> None:
         """So many frames are about to be scored, of which some are finished already."""
 
-    def scored(self, episode: Episode) -> None:
-        """The episode is finished, here or by another process."""
+    def scored(self, episode: DatasetEpisode) -> None:
+        """The episode is finished."""
 
-    def failed(self, episode: Episode, error: RewardError) -> None:
+    def failed(self, episode: DatasetEpisode, error: RewardError) -> None:
         """The episode cannot be labelled."""
 
 
@@ -57,14 +53,8 @@ class Watch:
 class Failure:
     """An episode that has no labels, and why."""
 
-    episode: Episode
+    episode: DatasetEpisode
     error: RewardError
-
-
-class _Fate(Enum):
-    FINISHED = auto()
-    CLAIMED = auto()  # by another process
-    NOT_NOW = auto()  # it failed, or the run is stopping
 
 
 class _StoppedError(RewardError):
@@ -72,7 +62,7 @@ class _StoppedError(RewardError):
 
 
 class Run:
-    """One process's share of a plan."""
+    """The labelling of a plan by the threads of this process."""
 
     def __init__(self, plan: Plan, dataset: Dataset, scorer: Scorer, parts: Parts, watch: Watch) -> None:
         self._plan, self._dataset, self._scorer, self._parts, self._watch = plan, dataset, scorer, parts, watch
@@ -81,81 +71,49 @@ class Run:
         self._lock = threading.Lock()
         self._failures: list[Failure] = []
         self._cause: Exception | None = None
-        self._waited_for: set[str] = set()
 
     def finish_all(self, workers: int) -> list[Failure]:
-        """Labels what has no part; waits for episodes that other processes have claimed. Gives what failed.
+        """Labels what has no part, several episodes at a time. Gives what failed.
 
         Raises, after the episodes under way have ended, what no episode is to blame for: a server that is gone
         (RewardError), a full disk (OSError).
         """
-        finished = self._parts.finished(self._plan.items)
-        num_finished = sum(item.episode.num_frames for item in self._plan.items if item.key in finished)
-        self._watch.begin(self._plan.num_frames, num_finished)
-        pending = [item for item in self._plan.items if item.key not in finished]
-        with Claims(self._parts) as claims:
-            while pending:
-                fates = self._attempt(pending, claims, workers)
-                if self._cause is not None:
-                    raise self._cause
-                claimed = [item for item, fate in zip(pending, fates, strict=True) if fate is _Fate.CLAIMED]
-                if len(claimed) == len(pending):
-                    self._wait_for(claimed[0], claims)
-                pending = claimed
-        return sorted(self._failures, key=lambda failure: failure.episode.index)
-
-    def _wait_for(self, item: Item, claims: Claims) -> None:
-        if item.key not in self._waited_for:
-            self._waited_for.add(item.key)
-            self._watch.note(f"waiting for {item.episode.name}: {claims.told(item)}")
-        self._stopping.wait(POLL_S)
-
-    def _attempt(self, items: Sequence[Item], claims: Claims, workers: int) -> list[_Fate]:
+        pending = begin(self._plan, self._parts, self._watch)
         with ThreadPoolExecutor(workers, thread_name_prefix="rfm-label") as pool:
             try:
-                return list(pool.map(lambda item: self._label(item, claims), items))
+                list(pool.map(self._label, pending))
             except BaseException:
                 self._stopping.set()
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
+        if self._cause is not None:
+            raise self._cause
+        return by_episode(self._failures)
 
-    def _label(self, item: Item, claims: Claims) -> _Fate:
-        if self._stopping.is_set():
-            return _Fate.NOT_NOW
+    def _label(self, item: Item) -> None:
         try:
-            if not self._parts.has(item):
-                if not claims.take(item):
-                    return _Fate.CLAIMED
-                try:
-                    self._score(item)
-                finally:
-                    claims.give_back(item)
+            self._go_on()
+            if not self._parts.has(item):  # or another process has finished it meanwhile
+                self._score(item)
+            self._watch.scored(item.episode)
         except _StoppedError:
-            return _Fate.NOT_NOW
+            return
         except RewardError as error:
             is_of_one = isinstance(error, ProcessEndedError)  # after the client has asked twice
-            if isinstance(error, NOT_ABOUT_ONE_EPISODE) and not is_of_one:
-                return self._stop(error)
+            if isinstance(error, _NOT_ABOUT_ONE_EPISODE) and not is_of_one:
+                self._stop(error)
+                return
             with self._lock:
                 self._failures.append(Failure(item.episode, error))
             self._watch.failed(item.episode, error)
-            return _Fate.NOT_NOW
         except (OSError, ImportError) as error:
-            return self._stop(error)
-        self._watch.scored(item.episode)
-        return _Fate.FINISHED
+            self._stop(error)
 
     def _score(self, item: Item) -> None:
-        if self._parts.has(item):  # another process has finished it meanwhile
-            return
+        recipe, memory = self._plan.recipe, self._memory
         try:
             columns = episode_columns(
-                self._dataset,
-                item.episode,
-                self._scorer,
-                self._plan.recipe,
-                memory=self._memory,
-                go_on=self._go_on,
+                self._dataset, item.episode, self._scorer, recipe, memory=memory, go_on=self._go_on
             )
         except InferenceFailedError:  # perhaps of a checkpoint that came meanwhile
             self._check_checkpoint()
@@ -174,12 +132,23 @@ class Run:
             self._stop(error)
             raise _StoppedError from error
 
-    def _stop(self, cause: Exception) -> _Fate:
+    def _stop(self, cause: Exception) -> None:
         with self._lock:
             self._cause = self._cause or cause
         self._stopping.set()
-        return _Fate.NOT_NOW
 
     def _go_on(self) -> None:
         if self._stopping.is_set():
             raise _StoppedError
+
+
+def begin(plan: Plan, parts: Parts, watch: Watch) -> list[Item]:
+    """The items that have no part yet; tells the watch how many frames that is."""
+    finished = parts.finished(plan.items)
+    watch.begin(plan.num_frames, sum(item.episode.num_frames for item in plan.items if item.key in finished))
+    return [item for item in plan.items if item.key not in finished]
+
+
+def by_episode(failures: Sequence[Failure]) -> list[Failure]:
+    """The failures in the order of their episodes."""
+    return sorted(failures, key=lambda failure: failure.episode.index)

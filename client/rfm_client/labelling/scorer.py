@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol, cast
 
-import numpy as np
-
 from rfm_client.client import RewardClient
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.frame_size import FrameSize
@@ -109,10 +107,3 @@ def _digests(infos: Sequence[ModelInfo]) -> tuple[str, str | None, str | None]:
             f"model {infos[0].name}", "the same weights_digest, settings_digest at every server", told
         )
     return digests.pop()
-
-
-def joined_embeddings(parts: Sequence[Trajectory]) -> Trajectory:
-    """One trajectory of the embeddings of parts that follow one another; the text is the first's."""
-    return Trajectory(
-        video_embeddings=np.concatenate([part.positions for part in parts]), text_embedding=parts[0].text_embedding
-    )

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,12 +12,14 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.results import SUCCESS_THRESHOLD
-from rfm_client.data.datasets.protocol import DatasetError
+from rfm_client.data.datasets.protocol import require
+from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS
 from rfm_client.labelling.finished_episodes import Parts
-from rfm_client.labelling.label_files import LabelColumns, read_label_table
+from rfm_client.labelling.label_files import read_label_table
 from rfm_client.labelling.plan import Plan
 
-BACKWARDS_BY = 0.01  # the kappa of reward-aligned behaviour cloning: less is noise
+_BACKWARDS_BY = 0.01  # the kappa of reward-aligned behaviour cloning: less is noise
+_MOST_LISTED = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +31,7 @@ class Summary:
     best_success: float32 [E], the highest of each; None: the checkpoint does not predict success
     backwards: float64 [E], share of steps on which progress falls by more than 0.01
     disagreement: float64 [E], how far the cameras' progress is apart, in the mean over its frames; None: there are no
-    scores of several cameras
+        scores of several cameras
     num_frames: of all episodes
     """
 
@@ -48,70 +50,58 @@ class Summary:
     def rows(self) -> list[tuple[str, str]]:
         """What a table tells, line by line."""
         quantiles = np.quantile(self.final_progress, [0, 0.25, 0.5, 0.75, 1])
-        failing = self.never_succeed
         names = ("lowest", "lower quarter", "median", "upper quarter", "highest")
+        failing = "-"
+        if self.never_succeed is not None:
+            numbers = self.never_succeed.tolist()
+            more = " ..." if len(numbers) > _MOST_LISTED else ""
+            failing = f"{len(numbers)}: {', '.join(map(str, numbers[:_MOST_LISTED]))}{more}"
         return [
             ("episodes", str(len(self.episodes))),
             ("frames", str(self.num_frames)),
             *((f"final progress: {name}", f"{value:.4f}") for name, value in zip(names, quantiles, strict=True)),
-            ("episodes that never succeed", "-" if failing is None else f"{len(failing)}: {_listed(failing.tolist())}"),
+            ("episodes that never succeed", failing),
             ("steps on which progress falls", f"{self.backwards.mean():.1%}"),
         ]
 
 
 def summarise(file: Path) -> Summary:
     """The summary of a progress file or a file of frame signals. Raises DatasetError for another file."""
-    table, columns = read_label_table(file)
-    if not len(table):
-        raise DatasetError.at(file, "labels", "none")
+    table = read_label_table(file)
+    require(file, len(table) > 0, "labels", "none")
     episodes = table["episode_index"].to_numpy()
-    starts = np.flatnonzero(np.diff(episodes, prepend=episodes[0] - 1))
-    return _joined(
-        [
-            _of_episode(int(episodes[start]), table.slice(start, end - start), columns)
-            for start, end in zip(starts, [*starts[1:], len(table)], strict=True)
-        ]
+    starts = np.flatnonzero(np.diff(episodes, prepend=episodes[0] - 1)).tolist()
+    ends = [*starts[1:], len(table)]
+    return _of_episodes(
+        (int(episodes[start]), table.slice(start, end - start)) for start, end in zip(starts, ends, strict=True)
     )
 
 
 def summary_of_parts(plan: Plan, parts: Parts) -> Summary:
     """The summary of the parts of a plan."""
-    summaries = []
-    for item in plan.items:
-        table = parts.read(item)
-        columns = LabelColumns.among(item.episode.name, table.column_names)
-        summaries.append(_of_episode(item.episode.index, table, columns))
-    return _joined(summaries)
+    return _of_episodes((item.episode.index, parts.read(item)) for item in plan.items)
 
 
-def _of_episode(index: int, table: Any, columns: LabelColumns) -> Summary:
-    progress = table[columns.progress].to_numpy()
-    success = None if columns.success is None else table[columns.success].to_numpy()
-    cameras = [table[name].to_numpy() for name in columns.progress_of.values()]
+def _of_episodes(tables: Iterable[tuple[int, Any]]) -> Summary:
+    """The summary of episodes by their numbers and their tables, whose columns are those of parts."""
+    numbers, final, best, backwards, apart = [], [], [], [], []
+    num_frames = 0
+    for number, table in tables:
+        progress = table[PROGRESS].to_numpy()
+        cameras = [table[name].to_numpy() for name in table.column_names if name.startswith(f"{PROGRESS}.")]
+        numbers.append(number)
+        final.append(progress[-1])
+        backwards.append(np.mean(np.diff(progress) < -_BACKWARDS_BY) if len(progress) > 1 else 0.0)
+        if SUCCESS in table.column_names:
+            best.append(table[SUCCESS].to_numpy().max())
+        if cameras:
+            apart.append(np.ptp(np.stack(cameras), axis=0).mean(dtype=np.float64))
+        num_frames += len(progress)
     return Summary(
-        episodes=np.array([index], np.int64),
-        final_progress=progress[-1:],
-        best_success=None if success is None else success.max(keepdims=True),
-        backwards=np.array([np.mean(np.diff(progress) < -BACKWARDS_BY) if len(progress) > 1 else 0.0]),
-        disagreement=np.ptp(np.stack(cameras), axis=0).mean(dtype=np.float64, keepdims=True) if cameras else None,
-        num_frames=len(progress),
+        episodes=np.array(numbers, np.int64),
+        final_progress=np.array(final, np.float32),
+        best_success=np.array(best, np.float32) if best else None,
+        backwards=np.array(backwards, np.float64),
+        disagreement=np.array(apart, np.float64) if apart else None,
+        num_frames=num_frames,
     )
-
-
-def _joined(summaries: Sequence[Summary]) -> Summary:
-    """One summary of the episodes of several."""
-    success = [each.best_success for each in summaries if each.best_success is not None]
-    disagreement = [each.disagreement for each in summaries if each.disagreement is not None]
-    return Summary(
-        episodes=np.concatenate([each.episodes for each in summaries]),
-        final_progress=np.concatenate([each.final_progress for each in summaries]),
-        best_success=np.concatenate(success) if success else None,
-        backwards=np.concatenate([each.backwards for each in summaries]),
-        disagreement=np.concatenate(disagreement) if disagreement else None,
-        num_frames=sum(each.num_frames for each in summaries),
-    )
-
-
-def _listed(numbers: Sequence[int], most: int = 12) -> str:
-    shown = ", ".join(map(str, numbers[:most]))
-    return shown + (" ..." if len(numbers) > most else "")

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""How a server is reached that is not open to all: whom to trust, with what to answer for oneself, what to show."""
+"""Credentials for a protected server: certificate authorities, client certificate, headers, key."""
 
 from __future__ import annotations
 
 import re
 import ssl
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypedDict, cast
+from typing import Any
 
 from rfm_client.contract.addresses import check_authorities, load_certificate
 
@@ -20,19 +20,9 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*")
 _VALUE = re.compile("[!-~]([ -~]*[!-~])?")  # visible ASCII; blanks inside
 
 
-class AccessOptions(TypedDict, total=False):
-    """The fields of Access as keyword arguments, each optional."""
-
-    ca_file: str | Path | None
-    client_certificate: str | Path | None
-    client_key: str | Path | None
-    headers: Mapping[str, str]
-    api_key: str | None
-
-
 @dataclass(frozen=True)
 class Access:
-    """What a connection takes beyond a URL. Raises ValueError for what cannot be used, without showing a key.
+    """Credentials of a client. Raises ValueError for what cannot be used, without showing a key.
 
     ca_file: certificates (PEM) of the authorities that may vouch for the server; None: those of the system
     client_certificate, client_key: files (PEM) by which a server knows this client (mutual TLS); both or none
@@ -62,22 +52,10 @@ class Access:
         """Whether it has something that means nothing without TLS."""
         return self.ca_file is not None or self.client_certificate is not None
 
-    @classmethod
-    def of(cls, options: AccessOptions) -> Access:
-        """The access that a client's options describe; options of other kinds are left out."""
-        given = cast("dict[str, Any]", options)
-        return cls(**{name: given[name] for name in AccessOptions.__annotations__ if name in given})
-
     @property
-    def options(self) -> AccessOptions:
-        """The same as options of a RewardClient."""
-        return {
-            "ca_file": self.ca_file,
-            "client_certificate": self.client_certificate,
-            "client_key": self.client_key,
-            "headers": self.headers,
-            "api_key": self.api_key,
-        }
+    def options(self) -> dict[str, Any]:
+        """The same as keyword arguments of a client."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @property
     def shown(self) -> dict[str, str]:

@@ -28,9 +28,10 @@ UNACKNOWLEDGED_MS = 10_000
 SILENT_S = 1.0
 
 _UNBOUNDED = -1
-GRPC_OPTIONS: dict[str, int] = {
+GRPC_OPTIONS: dict[str, int | str] = {
     "grpc.max_send_message_length": _UNBOUNDED,
     "grpc.max_receive_message_length": _UNBOUNDED,
+    "grpc.lb_policy_name": "round_robin",  # over the addresses of a name; looked up again when a connection ends
     "grpc.initial_reconnect_backoff_ms": 100,
     "grpc.max_reconnect_backoff_ms": 2000,  # two minutes otherwise, when the server may long be back
     "grpc.keepalive_time_ms": PING_MS,
@@ -39,16 +40,17 @@ GRPC_OPTIONS: dict[str, int] = {
 }
 
 
-def grpc_options(address: str) -> dict[str, int]:
-    """Options of a channel to ``host:port``, the name by which the server is known."""
-    return GRPC_OPTIONS if grpc_proxy(address) else {**GRPC_OPTIONS, "grpc.enable_http_proxy": 0}
+def grpc_options(address: str) -> list[tuple[str, int | str]]:
+    """Options of a channel to ``host:port``."""
+    options = GRPC_OPTIONS if grpc_proxy(address) else {**GRPC_OPTIONS, "grpc.enable_http_proxy": 0}
+    return list(options.items())
 
 
 class Connection:
     """One of tritonclient's asyncio clients, for one event loop. It closes itself when it is left and not used."""
 
     def __init__(self, client: Any) -> None:
-        self.client = client
+        self._client = client
         self._num_calls = 0
         self._is_left = False
         self._silent_since_s: float | None = None  # since the first call that nothing has come after
@@ -61,7 +63,7 @@ class Connection:
         if self._silent_since_s is None:
             self._silent_since_s = time.monotonic()
         try:
-            yield self.client
+            yield self._client
         finally:
             self._num_calls -= 1
             self._close_if_unused()
@@ -88,9 +90,9 @@ class Connection:
     async def close(self) -> None:
         """Closes the connection, even if calls still use it."""
         if self._closing is None:
-            self._closing = asyncio.create_task(self.client.close())
+            self._closing = asyncio.create_task(self._client.close())
         await self._closing
 
     def _close_if_unused(self) -> None:
         if self._is_left and not self._num_calls and self._closing is None:
-            self._closing = asyncio.create_task(self.client.close())
+            self._closing = asyncio.create_task(self._client.close())

@@ -15,8 +15,7 @@ from rfm_client.async_client import AsyncRewardClient
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.results import ProgressResult
 from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array
-from rfm_client.data.prefixes import prefix_samples
-from rfm_client.data.sampling import Sampling
+from rfm_client.data.sampling import Sampling, prefix_samples
 from rfm_client.transport.off_loop import off_loop
 from rfm_gateway.versions import check_one, versions_of
 

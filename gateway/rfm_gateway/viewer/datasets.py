@@ -23,11 +23,17 @@ from rfm_client.contract.results import SUCCESS_THRESHOLD
 from rfm_client.contract.settings import ConfigError
 from rfm_client.data.datasets.films import Span
 from rfm_client.data.datasets.lerobot import LeRobotDataset
-from rfm_client.data.datasets.lerobot_info import INFO_FILE
-from rfm_client.data.datasets.protocol import DatasetError, Episode
+from rfm_client.data.datasets.lerobot_rows import INFO_FILE
+from rfm_client.data.datasets.protocol import DatasetEpisode, DatasetError
 from rfm_client.data.orientation import ORIENTATIONS
-from rfm_client.labelling.label_files import Curve, EpisodeLabels, find_label_files, read_episode_labels
-from rfm_client.labelling.sidecars import PROVENANCE_KEY, SIGNALS_PROVENANCE_KEY
+from rfm_client.labelling.label_files import (
+    PROVENANCE_KEY,
+    SIGNALS_PROVENANCE_KEY,
+    Curve,
+    EpisodeLabels,
+    find_label_files,
+    read_episode_labels,
+)
 from rfm_client.labelling.summary import Summary, summarise
 
 NUM_BINS = 20  # of the final progress, from 0 to 1
@@ -121,13 +127,13 @@ class ShownDataset:
         return message.replace(str(self.root), self.dataset.source)
 
     @cached_property
-    def _episodes(self) -> Sequence[Episode]:
+    def _episodes(self) -> Sequence[DatasetEpisode]:
         for file in self.dataset.files():
             if file.suffix == ".parquet":
                 _check_inside(self.root, file)
         return self.dataset.episodes
 
-    def _episode(self, number: int) -> Episode:
+    def _episode(self, number: int) -> DatasetEpisode:
         if not 0 <= number < len(self._episodes):
             raise UnknownError(f"episode: expected one from 0 to {len(self._episodes) - 1}, got {number}")
         return self._episodes[number]

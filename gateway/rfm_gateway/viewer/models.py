@@ -10,7 +10,7 @@ from rfm_client.async_client import AsyncRewardClient
 from rfm_client.contract.errors import ModelNotFoundError, RewardError
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.names import frames_name
-from rfm_client.status import ModelStatus
+from rfm_client.transport.status import ModelStatus
 
 _FRAMES_ENDING = frames_name("")
 

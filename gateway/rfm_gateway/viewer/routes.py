@@ -30,7 +30,7 @@ from rfm_client.contract.samples import ProgressSample, Trajectory
 from rfm_client.data.fitting import fitted
 from rfm_client.data.orientation import ORIENTATIONS
 from rfm_client.data.sampling import RULES, Rule, Sampling, trained_rule
-from rfm_client.status import read_status
+from rfm_client.transport.status import read_status
 from rfm_gateway.body import COMPARE_ENDPOINT, SCORE_ENDPOINT, Admitted, BodyLimits, invalid, parts_of
 from rfm_gateway.cancellation import while_connected
 from rfm_gateway.config import GatewayConfig

@@ -2,7 +2,7 @@
 """Datasets of episodes, of any layout: LeRobot, HDF5, folders of videos. Needs ``pip install "./client[label]"``."""
 
 from rfm_client.data.datasets.opening import open_dataset
-from rfm_client.data.datasets.protocol import Dataset, DatasetError, Episode, iter_episodes
+from rfm_client.data.datasets.protocol import Dataset, DatasetEpisode, DatasetError, iter_episodes
 from rfm_client.data.orientation import Orient
 
-__all__ = ["Dataset", "DatasetError", "Episode", "Orient", "iter_episodes", "open_dataset"]
+__all__ = ["Dataset", "DatasetEpisode", "DatasetError", "Orient", "iter_episodes", "open_dataset"]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -16,22 +17,48 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.datasets.protocol import DIGEST_BYTES, Contents, DatasetError, digest_of
+from rfm_client.data.datasets.protocol import DatasetError, require
 from rfm_client.data.film_files import (
     DAMAGED,
     UNDAMAGED,
     FilmError,
-    broken_off,
-    film_packets,
+    Packets,
     film_stream,
     import_av,
     judged,
+    read_packets,
     upright,
 )
 
 Times = npt.NDArray[np.float64]
 
-_FRAMES_BEFORE = 1  # to which a decoder is sent back: time stamps are rounded
+_READ_BYTES = 2**20
+_DIGESTS_AT_A_TIME = 2**16
+
+
+def film_identity(file: Path, *, verify: bool, revision: str | None = None) -> str:
+    """What tells a film from others: its size and time of change, or with ``verify`` its SHA-256.
+
+    revision: of the Hub, whose files have other times on every machine: it stands for the time. Raises DatasetError.
+    """
+    try:
+        status = file.stat()
+        if verify:
+            return _sha256(file, status.st_size, status.st_ctime_ns)
+    except FileNotFoundError as error:
+        raise DatasetError.at(file, "a video file", "none") from error
+    except OSError as error:
+        raise DatasetError.at(file, "a readable video file", error.strerror) from error
+    return f"{status.st_size} {revision or status.st_mtime_ns}"
+
+
+@lru_cache(_DIGESTS_AT_A_TIME)
+def _sha256(file: Path, _size: int, _changed_ns: int) -> str:
+    digest = hashlib.sha256()
+    with file.open("rb") as opened:
+        while content := opened.read(_READ_BYTES):
+            digest.update(content)
+    return digest.hexdigest()
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,55 +82,20 @@ class Span:
         return DatasetError.at(f"{self.where}: {self.file}", expected, got)
 
 
-@dataclass(frozen=True, eq=False)
-class Packets:
-    """What a film holds, read without decoding it.
-
-    times_s: float64 [N], rising
-    digests: of each frame's bytes, in the same order
-    sizes: how many bytes each has
-    tick_s: what times are multiples of
-    fps: frames a second on average; 0: the file does not say it
-    """
-
-    times_s: Times
-    digests: tuple[bytes, ...]
-    sizes: tuple[int, ...]
-    tick_s: float
-    fps: float
-
-    @classmethod
-    def read(cls, file: Path, container: str | None = None) -> Packets:
-        """The packets of all frames. Raises DatasetError for a missing or truncated file, and one of several films."""
-        av = import_av()
-        found: list[tuple[float, bytes, int]] = []
-        try:
-            with file.open("rb") as opened:
-                missing = broken_off(opened)
-            if missing is not None:
-                raise DatasetError.at(file, "a whole video file", missing)
-            with av.open(str(file), format=container) as film:
-                stream = film_stream(film)
-                for packet in film_packets(film, stream):
-                    if packet.is_corrupt:
-                        raise DatasetError.at(file, "a whole video file", f"one whose frame {len(found)} is broken")
-                    if packet.pts is not None:
-                        digest = hashlib.blake2b(bytes(packet), digest_size=DIGEST_BYTES).digest()
-                        found.append((float(packet.pts * packet.time_base), digest, packet.size))
-                tick_s, fps = float(stream.time_base), float(stream.average_rate or 0)
-        except FilmError as error:
-            raise DatasetError.at(file, error.expected, error.got) from error
-        except FileNotFoundError as error:
-            raise DatasetError.at(file, "a video file", "none") from error
-        except (av.FFmpegError, OSError) as error:
-            raise DatasetError.at(file, "a whole video file", error.strerror or str(error)) from error
-        found.sort()
-        times_s, digests, sizes = zip(*found, strict=True) if found else ((), (), ())
-        return cls(np.array(times_s), digests, sizes, tick_s, fps)
-
-    def contents(self, frames: slice = slice(None)) -> Contents:
-        """What these frames are made of."""
-        return Contents(digest_of(self.digests[frames]), sum(self.sizes[frames]))
+def film_packets(file: Path, container: str | None = None) -> Packets:
+    """The packets of a film's frames. Raises DatasetError for a missing or truncated file, and one of several films."""
+    av = import_av()
+    try:
+        with file.open("rb") as opened:
+            packets = read_packets(opened, container)
+    except FilmError as error:
+        raise DatasetError.at(file, error.expected, error.got) from error
+    except FileNotFoundError as error:
+        raise DatasetError.at(file, "a video file", "none") from error
+    except (av.FFmpegError, OSError) as error:
+        raise DatasetError.at(file, "a whole video file", error.strerror or error) from error
+    require(file, not packets.corrupt, "a whole video file", f"one whose frames {packets.corrupt[:3]} are broken")
+    return packets
 
 
 def decode(span: Span) -> Iterator[UInt8Array]:
@@ -121,8 +113,6 @@ def decode(span: Span) -> Iterator[UInt8Array]:
         raise span.error(error.expected, error.got) from error
     except (av.FFmpegError, OSError) as error:
         raise span.error(f"frame {num_given} to be decoded", error.strerror or str(error)) from error
-    if num_given != len(span.times_s):
-        raise span.error(f"{len(span.times_s)} frames", f"{num_given}")
 
 
 def _decoded(container: Any, span: Span) -> Iterator[Any]:
@@ -130,7 +120,8 @@ def _decoded(container: Any, span: Span) -> Iterator[Any]:
     stream = film_stream(container)
     stream.thread_type = "AUTO"
     first_s = float(span.times_s[0])
-    container.seek(max(int((first_s - _FRAMES_BEFORE * 2 * span.tolerance_s) / stream.time_base), 0), stream=stream)
+    # one frame earlier: time stamps are rounded
+    container.seek(max(int((first_s - 2 * span.tolerance_s) / stream.time_base), 0), stream=stream)
     frames = container.decode(stream)
     first = next(frames, None)
     if first is None or first.time > first_s + span.tolerance_s:  # the film's index has led too far

@@ -10,29 +10,41 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.datasets.hdf5_pictures import CAMERA_FORM, fault, listed, pictures_in
-from rfm_client.data.datasets.other_layouts import ALOHA, ALOHA_GROUP
-from rfm_client.data.datasets.protocol import Contents, DatasetError, Episode, GivenTask, contents_of, orientations_of
-from rfm_client.data.orientation import Orient, Orientation, turned
+from rfm_client.data.datasets.protocol import (
+    Dataset,
+    DatasetEpisode,
+    DatasetError,
+    GivenTask,
+    digest_of,
+    orientations_of,
+    require,
+)
+from rfm_client.data.orientation import Orient, Orientation
 
 SUFFIXES = (".hdf5", ".h5")
-FRAMES_AT_A_TIME = 64
+ALOHA_GROUP = "observations/images"
+ALOHA = (
+    "ALOHA's layout, an episode a file (observations/images): convert its folder to LeRobot with openpi's "
+    "examples/aloha_real/convert_aloha_data_to_lerobot.py"
+)
 
+_FRAMES_AT_A_TIME = 64
 _DEMO = re.compile(r"demo_(\d+)$")
 _SENTENCES = ("language_instruction", "language", "lang")  # where problem_info and env_args may hold it
 _LIBERO: Orientation = "flip-vertical"  # as upstream's training data and evaluation turn it
 _LIBERO_CAMERAS = ("agentview_rgb", "eye_in_hand_rgb")
 _NO_PICTURES = "robomimic's dataset_states_to_obs.py renders the pictures of a low-dimensional file"
+_LEAST_SIZE_PX = 8  # a smaller array of numbers is no picture
+_ENCODED = (b"\xff\xd8\xff", b"\x89PNG")  # how JPEG and PNG begin
 
 
-class Hdf5Dataset:
+class Hdf5Dataset(Dataset):
     """The demonstrations of one file.
 
     task: what the caller says of their task
@@ -40,8 +52,6 @@ class Hdf5Dataset:
     """
 
     kind = "HDF5"
-    revision = None
-    depth_cameras: Sequence[str] = ()  # depth maps are not uint8 [T, H, W, 3]
 
     def __init__(self, file: Path, *, task: GivenTask = GivenTask(), orient: Orient = Orient()) -> None:
         self.file = file
@@ -49,86 +59,64 @@ class Hdf5Dataset:
         self.source = file.name
         self._task = task
         with self._opened() as opened:
-            demos = self._demos_in(opened)
+            demos = _demos_in(file, opened)
             self._demos = {index: name for index, (name, _) in demos.items()}
-            self.cameras, self.left_out = self._cameras_in(dict(demos.values()))
+            self.cameras, self.left_out = _cameras_in(file, dict(demos.values()))
             is_libero, is_upright = _is_libero(opened["data"].attrs), _is_upright(opened["data"].attrs)
         defaults: dict[str, Orientation] = dict.fromkeys(self.cameras, _LIBERO) if is_libero and not is_upright else {}
         self.orientations = orientations_of(orient, self.cameras, defaults)
         untold = [camera for camera in self.cameras if orient.default is None and camera not in orient.cameras]
         self.notes = [] if is_upright else _notes(untold, is_libero)
 
-    @cached_property
-    def episodes(self) -> Sequence[Episode]:
-        """All demonstrations, by their numbers. Raises DatasetError."""
+    def read_episodes(self) -> Sequence[DatasetEpisode]:
         with self._opened() as opened:
             task = self._task.of(f"{self.file}: problem_info or env_args", _task_of(opened["data"].attrs))
             lengths = {name: self._length(opened, name) for name in self._demos.values()}
         firsts = np.cumsum([0, *lengths.values()]).tolist()
         episodes = [
-            Episode(index, name, task, lengths[name], first)
+            DatasetEpisode(index, name, task, lengths[name], first)
             for (index, name), first in zip(self._demos.items(), firsts, strict=False)
         ]
         self._task.check_used(episodes)
         return episodes
 
     def decoder(self, camera: str) -> str | None:
-        """None: frames are stored as pixels."""
         return None
 
-    def check(self, episode: Episode, camera: str) -> Contents:
-        """What the frames are made of, as they are stored. Reads all of them; raises DatasetError."""
-        return contents_of(frame.tobytes() for frame in self._stored(episode, camera))
+    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+        return digest_of(frame.tobytes() for frame in self.stored_frames(episode, camera))
 
-    def frames(self, episode: Episode, camera: str) -> Iterator[UInt8Array]:
-        """The frames, uint8 [H, W, 3], turned as ``orientations`` says. Raises DatasetError."""
-        orientation = self.orientations.get(camera, "none")
-        return (turned(frame, orientation) for frame in self._stored(episode, camera))
-
-    def _stored(self, episode: Episode, camera: str) -> Iterator[UInt8Array]:
-        where = f"{self.file}: data/{episode.name}/obs/{camera}"
+    def check(self, episode: DatasetEpisode, camera: str) -> int:
         with self._opened() as opened:
-            film = opened["data"][episode.name]["obs"].get(camera)
-            if film is None or fault(film) or len(film) != episode.num_frames:
-                got = "none" if film is None else f"{film.dtype} {list(film.shape)}"
-                raise DatasetError.at(where, f"uint8 [{episode.num_frames}, H, W, 3]", got)
-            for start in range(0, episode.num_frames, FRAMES_AT_A_TIME):
+            return int(self._film(opened, episode, camera).nbytes)
+
+    def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
+        with self._opened() as opened:
+            film = self._film(opened, episode, camera)
+            for start in range(0, episode.num_frames, _FRAMES_AT_A_TIME):
                 try:
-                    yield from film[start : start + FRAMES_AT_A_TIME]
+                    yield from film[start : start + _FRAMES_AT_A_TIME]
                 except OSError as error:
-                    raise DatasetError.at(where, "readable frames", str(error)) from error
+                    raise DatasetError.at(self._where(episode, camera), "readable frames", error) from error
 
-    def _demos_in(self, opened: Any) -> dict[int, tuple[str, Any]]:
-        """Name and content of each demonstration, by its number. Raises DatasetError."""
-        if ALOHA_GROUP in opened:
-            raise DatasetError.at(self.file, "data/demo_0/obs/<camera>", ALOHA)
-        group = opened.get("data")
-        names = list(group) if hasattr(group, "keys") else []
-        demos = {int(match[1]): (name, group[name]) for name in names if (match := _DEMO.match(name))}
-        if not demos:
-            got = ", ".join(names) or f"none: the file holds {', '.join(opened) or 'nothing'}"
-            raise DatasetError.at(f"{self.file}: data", "demo_0, demo_1 and so on", got)
-        return dict(sorted(demos.items()))
+    def _film(self, opened: Any, episode: DatasetEpisode, camera: str) -> Any:
+        film = opened["data"][episode.name]["obs"].get(camera)
+        is_film = film is not None and not _fault(film) and len(film) == episode.num_frames
+        got = "none" if film is None else _form(film)
+        require(self._where(episode, camera), is_film, f"uint8 [{episode.num_frames}, H, W, 3]", got)
+        return film
 
-    def _cameras_in(self, demos: Mapping[str, Any]) -> tuple[Sequence[str], Mapping[str, str]]:
-        """The cameras of all demonstrations, and other pictures with what is wrong. Raises DatasetError if all are."""
-        faults = pictures_in(demos)
-        cameras = tuple(name for name, reason in faults.items() if not reason)
-        if not cameras:
-            name, first = next(iter(demos.items()))
-            told = "; ".join(f"{picture}: {reason}" for picture, reason in faults.items())
-            got = told or f"{listed(first.get('obs', {}))}: {_NO_PICTURES}"
-            raise DatasetError.at(f"{self.file}: data/{name}/obs", f"{CAMERA_FORM} in every demonstration", got)
-        return cameras, {name: reason for name, reason in faults.items() if reason}
+    def _where(self, episode: DatasetEpisode, camera: str) -> str:
+        return f"{self.file}: data/{episode.name}/obs/{camera}"
 
     def _length(self, opened: Any, name: str) -> int:
         """T of a demonstration: that of its actions, if there are some, and of each camera."""
         demo = opened["data"][name]
         lengths = {f"obs/{camera}": len(demo["obs"][camera]) for camera in self.cameras}
         lengths |= {"actions": len(demo["actions"])} if "actions" in demo else {}
-        if len(set(lengths.values())) != 1 or 0 in lengths.values():
-            got = ", ".join(f"{key} {length}" for key, length in lengths.items())
-            raise DatasetError.at(f"{self.file}: data/{name}", "one length, above 0", got)
+        is_one = len(set(lengths.values())) == 1 and 0 not in lengths.values()
+        got = ", ".join(f"{key} {length}" for key, length in lengths.items())
+        require(f"{self.file}: data/{name}", is_one, "one length, above 0", got)
         return next(iter(lengths.values()))
 
     def _opened(self) -> Any:
@@ -139,7 +127,77 @@ class Hdf5Dataset:
         try:
             return h5py.File(self.file, "r")
         except OSError as error:
-            raise DatasetError.at(self.file, "an HDF5 file", str(error)) from error
+            raise DatasetError.at(self.file, "an HDF5 file", error) from error
+
+
+def _demos_in(file: Path, opened: Any) -> dict[int, tuple[str, Any]]:
+    """Name and content of each demonstration, by its number. Raises DatasetError."""
+    require(file, ALOHA_GROUP not in opened, "data/demo_0/obs/<camera>", ALOHA)
+    group = opened.get("data")
+    names = list(group) if hasattr(group, "keys") else []
+    demos = {int(match[1]): (name, group[name]) for name in names if (match := _DEMO.match(name))}
+    got = ", ".join(names) or f"none: the file holds {', '.join(opened) or 'nothing'}"
+    require(f"{file}: data", bool(demos), "demo_0, demo_1 and so on", got)
+    return dict(sorted(demos.items()))
+
+
+def _cameras_in(file: Path, demos: Mapping[str, Any]) -> tuple[Sequence[str], Mapping[str, str]]:
+    """The cameras of all demonstrations, and other pictures with what is wrong. Raises DatasetError if all are."""
+    observations = {name: demo.get("obs", {}) for name, demo in demos.items()}
+    faults: dict[str, str] = {}
+    for of_demo in observations.values():
+        for name, value in of_demo.items():
+            if name not in faults and _is_picture(value):
+                faults[name] = next(filter(None, (_fault_in(*each, name) for each in observations.items())), "")
+    cameras = tuple(name for name, reason in faults.items() if not reason)
+    first, stored = next(iter(observations.items()))
+    forms = ", ".join(f"{name} {_form(value)}" for name, value in stored.items()) or "none"
+    got = "; ".join(f"{picture}: {reason}" for picture, reason in faults.items()) or f"{forms}: {_NO_PICTURES}"
+    expected = "a camera as uint8 [T, H, W, 3] in every demonstration"
+    require(f"{file}: data/{first}/obs", bool(cameras), expected, got)
+    return cameras, {name: reason for name, reason in faults.items() if reason}
+
+
+def _fault_in(demo: str, observations: Mapping[str, Any], name: str) -> str:
+    value = observations.get(name)
+    return f"missing in {demo}" if value is None else _fault(value)
+
+
+def _fault(value: Any) -> str:
+    """What keeps an observation from being a camera's frames; "": nothing."""
+    if not hasattr(value, "shape"):
+        return "a group: expected its pictures one level up"
+    shape = value.shape if len(value.shape) == 4 else (0, 0, 0, 0)
+    if _is_encoded(value):
+        what = "JPEG or PNG files: store decoded pictures as uint8 [T, H, W, 3]"
+    elif shape[3] == 3:
+        what = "" if value.dtype == np.uint8 else "not uint8: store colours as 0..255"
+    elif shape[3] == 4:
+        what = "RGBA: store its first three channels, if they are uint8 RGB"
+    elif shape[1] in (3, 4):
+        what = "channels first: store it as uint8 [T, H, W, 3]"
+    else:
+        what = "a depth map, a mask or another form: no colours as uint8 [T, H, W, 3]"
+    return what and f"{_form(value)}, {what}"
+
+
+def _form(value: Any) -> str:
+    return f"{value.dtype} {list(value.shape)}" if hasattr(value, "shape") else "(a group)"
+
+
+def _is_picture(value: Any) -> bool:
+    if not hasattr(value, "shape"):
+        return any(_is_picture(each) for each in value.values())
+    if len(value.shape) == 3:
+        return all(size >= _LEAST_SIZE_PX for size in value.shape[1:])
+    return len(value.shape) > 3 or _is_encoded(value)
+
+
+def _is_encoded(value: Any) -> bool:
+    """Whether the observation holds a JPEG or PNG file for each step."""
+    if len(value.shape) not in (1, 2) or not value.shape[0] or value.dtype.kind not in "OSVu":
+        return False
+    return bool(np.asarray(value[0]).tobytes().startswith(_ENCODED))
 
 
 def _notes(untold: Sequence[str], is_libero: bool) -> Sequence[str]:
@@ -156,7 +214,6 @@ def _notes(untold: Sequence[str], is_libero: bool) -> Sequence[str]:
 
 
 def _is_libero(attributes: Mapping[str, Any]) -> bool:
-    """Whether the file says that LIBERO wrote it."""
     env_names = (attributes.get("env_name"), _document(attributes, "env_args").get("env_name"), attributes.get("tag"))
     has_problem = not {"problem_name", "language_instruction"}.isdisjoint(_document(attributes, "problem_info"))
     is_named = any("libero" in str(name).lower() for name in env_names)

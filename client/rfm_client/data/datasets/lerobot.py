@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """LeRobot datasets of all versions, without LeRobot: frame t is the dataset's frame t. Needs pyarrow, and PyAV.
 
-A film has as many frames as the rows of its episodes, at the same times (``lerobot_films``), or it is refused.
+A film has as many frames as the rows of its episodes, each at its row's time, or it is refused: nothing tells which row
+a frame belongs to. It may begin at another time than its rows, for all of them alike.
 """
 
 from __future__ import annotations
@@ -16,30 +17,30 @@ import numpy as np
 
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.datasets import lerobot_v21, lerobot_v30
-from rfm_client.data.datasets.films import Span, Times, decode
-from rfm_client.data.datasets.lerobot_films import Film, Part
-from rfm_client.data.datasets.lerobot_info import Info
-from rfm_client.data.datasets.lerobot_rows import Entry, RowReader, read_table
-from rfm_client.data.datasets.protocol import Contents, DatasetError, Episode, GivenTask, contents_of, orientations_of
-from rfm_client.data.film_files import decoder
-from rfm_client.data.orientation import Orient, turned
+from rfm_client.data.datasets.films import Span, Times, decode, film_identity, film_packets
+from rfm_client.data.datasets.lerobot_rows import Entry, Info, RowReader, read_table
+from rfm_client.data.datasets.protocol import (
+    Dataset,
+    DatasetEpisode,
+    DatasetError,
+    GivenTask,
+    digest_of,
+    orientations_of,
+    require,
+)
+from rfm_client.data.film_files import Packets, decoder
+from rfm_client.data.orientation import Orient
 
-FILMS_AT_A_TIME = 4  # whose tables of packets are kept in memory
-
+_FILMS_AT_A_TIME = 4  # whose tables of packets are kept in memory
+_TOLERANCE_S = 1e-4  # LeRobot's own between the time of a row and that of its frame
+_CONTAINER = {".mp4": "mov"}  # FFmpeg's names by suffix: a play list of another's would be read as what it names
+_AGAIN = "write the dataset again, or leave this film's episodes out (--episodes)"
 _COLOURS = ("1", "L", "LA", "P", "RGB", "RGBA")  # Pillow's names of what has 8 bits a channel, or fewer
 _DEEP = ";16"  # how Pillow names 16 bits a channel that it cuts to 8
 
 
-class LeRobotDataset:
-    """A LeRobot dataset in a local folder.
-
-    source, revision: of the Hub, if it came from there
-    task: what the caller says of tasks
-    orient: how pictures are turned
-    """
-
-    left_out: Mapping[str, str] = {}
-    notes: Sequence[str] = ()
+class LeRobotDataset(Dataset):
+    """A LeRobot dataset in a local folder. source, revision: of the Hub, if it came from there"""
 
     def __init__(
         self,
@@ -53,79 +54,76 @@ class LeRobotDataset:
         self.root = root
         self.source = source or root.resolve().name
         self.revision = revision
-        self.info = Info.read(root)
-        self._film = lru_cache(FILMS_AT_A_TIME)(self._read_film)
-        version = lerobot_v30 if self.info.version == "v3.0" else lerobot_v21
-        entries: Iterator[Entry] = version.read_entries(root, self.info)
+        self.info = info = Info.read(root)
+        self.kind = f"LeRobot {info.version}"
+        self.cameras = (*info.films, *info.images)
+        self.depth_cameras = info.depth
+        self.orientations = orientations_of(orient, self.cameras)
+        version = lerobot_v30 if info.version == "v3.0" else lerobot_v21
+        entries: Iterator[Entry] = version.read_entries(info)
         self._entries = {entry.index: entry for entry in entries}
         self._task = task
         self._rows = RowReader({} if task.overrides else version.read_tasks(root), task)
-        self.orientations = orientations_of(orient, self.cameras)
-        self._check_totals()
+        self._film = lru_cache(_FILMS_AT_A_TIME)(self._read_film)
+        is_whole = sorted(self._entries) == list(range(info.total_episodes))
+        require(root / "meta", is_whole, f"{info.total_episodes} episodes, as info.json says", len(self._entries))
+        num_frames = sum(entry.length for entry in self._entries.values())
+        is_whole = num_frames == info.total_frames
+        require(root / "meta", is_whole, f"{info.total_frames} frames, as info.json says", num_frames)
 
-    @property
-    def kind(self) -> str:
-        """Its layout, with the version."""
-        return f"LeRobot {self.info.version}"
-
-    @property
-    def cameras(self) -> Sequence[str]:
-        """Keys of the features that are video or images."""
-        return (*self.info.films, *self.info.images)
-
-    @property
-    def depth_cameras(self) -> Sequence[str]:
-        """Those whose pictures are depth maps."""
-        return self.info.depth
-
-    @cached_property
-    def episodes(self) -> Sequence[Episode]:
-        """All episodes. Reads and checks the rows of all of them; raises DatasetError."""
-        episodes = [self._episode(entry) for _, entry in sorted(self._entries.items())]
+    def read_episodes(self) -> Sequence[DatasetEpisode]:
+        episodes = []
+        for _, entry in sorted(self._entries.items()):
+            rows = self._rows.read(entry)
+            episodes.append(DatasetEpisode(entry.index, entry.where, rows.task, len(rows.times_s), rows.first_index))
         self._task.check_used(episodes)
         return episodes
 
-    def check(self, episode: Episode, camera: str) -> Contents:
-        """What the episode's frames are made of; each is there. Raises DatasetError."""
+    def decoder(self, camera: str) -> str | None:
+        return decoder() if camera in self.info.films else _pillow()
+
+    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+        if camera not in self.info.films:
+            return digest_of(self._images(episode, camera))
+        entry = self._entries[episode.index]
+        film, from_s = entry.films[camera]
+        times = digest_of([self._rows.read(entry).times_s.tobytes()])
+        return f"{film_identity(film, verify=verify, revision=self.revision)} {from_s} {times}"
+
+    def check(self, episode: DatasetEpisode, camera: str) -> int:
         if camera in self.info.films:
-            return self._film(camera, self.film(episode, camera)).contents(episode.index)
+            packets, frames = self._film(camera, self.film(episode, camera))
+            return sum(packets.num_bytes[frames[episode.index]])
         images = self._images(episode, camera)
         for t, image in enumerate(images):
-            _opened_image(self._where(episode, camera, t), image)
-        return contents_of(images)
+            _opened_image(_where(episode, camera, t), image)
+        return sum(map(len, images))
 
-    def frames(self, episode: Episode, camera: str) -> Iterator[UInt8Array]:
-        """The episode's frames, uint8 [H, W, 3], turned as ``orientations`` says. Raises DatasetError."""
-        orientation = self.orientations.get(camera, "none")
-        return (turned(frame, orientation) for frame in self._stored(episode, camera))
-
-    def _stored(self, episode: Episode, camera: str) -> Iterator[UInt8Array]:
+    def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         if camera in self.info.films:
             return decode(self.span(episode, camera))
         images = self._images(episode, camera)
-        return (_decoded_image(self._where(episode, camera, t), image) for t, image in enumerate(images))
+        return (_decoded_image(_where(episode, camera, t), image) for t, image in enumerate(images))
 
-    def times_s(self, episode: Episode) -> Times:
+    def times_s(self, episode: DatasetEpisode) -> Times:
         """float64 [T], when each frame was taken, from the start of the episode. Raises DatasetError."""
         return self._rows.read(self._entries[episode.index]).times_s
 
-    def film(self, episode: Episode, camera: str) -> Path:
+    def film(self, episode: DatasetEpisode, camera: str) -> Path:
         """The film of a camera, one of ``info.films``, that the episode is in."""
         return self._entries[episode.index].films[camera][0]
 
-    def span(self, episode: Episode, camera: str) -> Span:
+    def span(self, episode: DatasetEpisode, camera: str) -> Span:
         """Where the episode's frames are in that film. Raises DatasetError if its frames and rows differ."""
-        film = self._film(camera, self.film(episode, camera))
-        return film.span(episode.index, f"{episode.name}: {camera}", self.info.fps)
+        file = self.film(episode, camera)
+        packets, frames = self._film(camera, file)
+        where, container = f"{episode.name}: {camera}", _CONTAINER.get(file.suffix.lower())
+        return Span(file, packets.times_s[frames[episode.index]], 0.5 / self.info.fps, where, container)
 
     def files(self) -> set[Path]:
         """The tables and films that the episodes are in."""
         entries = self._entries.values()
         return {entry.data_file for entry in entries} | {film for entry in entries for film, _ in entry.films.values()}
-
-    def decoder(self, camera: str) -> str | None:
-        """PyAV or Pillow, with the versions that decide what a picture looks like."""
-        return decoder() if camera in self.info.films else _pillow()
 
     @cached_property
     def _in_film(self) -> Mapping[tuple[str, Path], Sequence[Entry]]:
@@ -136,24 +134,41 @@ class LeRobotDataset:
                 found.setdefault((camera, file), []).append(entry)
         return found
 
-    def _read_film(self, camera: str, file: Path) -> Film:
-        parts = [
-            Part(entry.index, entry.where, entry.films[camera][1] + self._rows.read(entry).times_s)
-            for entry in self._in_film[camera, file]
-        ]
-        return Film.read(file, camera, parts, self.info.fps)
+    def _read_film(self, camera: str, file: Path) -> tuple[Packets, Mapping[int, slice]]:
+        """A film, and which of its frames are each episode's. Raises DatasetError where frames and rows differ."""
+        entries = self._in_film[camera, file]
+        parts = [(entry, entry.films[camera][1] + self._rows.read(entry).times_s) for entry in entries]
+        parts.sort(key=lambda part: float(part[1][0]))
+        rows_s = np.concatenate([times_s for _, times_s in parts])
+        packets = film_packets(file, _CONTAINER.get(file.suffix.lower()))
+        fps, rates = self.info.fps, ""
+        if packets.fps and f"{packets.fps:.2f}" != f"{self.info.fps:.2f}":
+            rates = f" (the film has {packets.fps:.2f} frames a second, meta/info.json says {fps:g})"
 
-    def _episode(self, entry: Entry) -> Episode:
-        rows = self._rows.read(entry)
-        return Episode(entry.index, entry.where, rows.task, len(rows.times_s), rows.first_index)
+        where = " to ".join(dict.fromkeys((parts[0][0].where, parts[-1][0].where)))
+        got = f"{len(packets.times_s)}{rates}; {_AGAIN}"
+        is_whole = len(packets.times_s) == len(rows_s)
+        require(f"{where}: {camera}: {file}", is_whole, f"{len(rows_s)} frames, one for each row", got)
 
-    def _images(self, episode: Episode, camera: str) -> list[bytes]:
+        offsets_s = packets.times_s - rows_s
+        tolerance_s = min(max(_TOLERANCE_S, packets.tick_s), 0.25 / fps)
+        if np.ptp(offsets_s) > 2 * tolerance_s:  # no one offset is within the tolerance of all
+            k = int(np.argmax(np.abs(offsets_s - offsets_s[0]) > tolerance_s))
+            where = [f"{entry.where}, row {t}" for entry, times_s in parts for t in range(len(times_s))][k]
+            remedy = f"ffmpeg -r {fps:g} -i IN OUT gives it that rate" if rates else _AGAIN
+            got = f"one at {packets.times_s[k]:.4f} s{rates}; {remedy}"
+            raise DatasetError.at(f"{where}: {camera}: {file}", f"its frame at {rows_s[k] + offsets_s[0]:.4f} s", got)
+        ends = np.cumsum([len(times_s) for _, times_s in parts]).tolist()
+        return packets, {
+            entry.index: slice(end - len(times_s), end) for (entry, times_s), end in zip(parts, ends, strict=True)
+        }
+
+    def _images(self, episode: DatasetEpisode, camera: str) -> list[bytes]:
         """The episode's images as they are stored: encoded as PNG or JPEG."""
         file = self._entries[episode.index].data_file
         stored = read_table(file, [camera], filters=[("episode_index", "=", episode.index)])[camera].to_pylist()
-        if len(stored) != episode.num_frames:
-            raise DatasetError.at(f"{file}: {camera}", f"{episode.num_frames} images", str(len(stored)))
-        return [self._image_bytes(self._where(episode, camera, t), image) for t, image in enumerate(stored)]
+        require(f"{file}: {camera}", len(stored) == episode.num_frames, f"{episode.num_frames} images", len(stored))
+        return [self._image_bytes(_where(episode, camera, t), image) for t, image in enumerate(stored)]
 
     def _image_bytes(self, where: str, image: Any) -> bytes:
         image = image if isinstance(image, dict) else {}
@@ -167,16 +182,9 @@ class LeRobotDataset:
         except OSError as error:
             raise DatasetError.at(where, "an image file", f"{error.strerror} ({path})") from error
 
-    def _where(self, episode: Episode, camera: str, t: int) -> str:
-        return f"{episode.name}: {camera}: frame {t}"
 
-    def _check_totals(self) -> None:
-        where, info = self.root / "meta", self.info
-        if len(self._entries) != info.total_episodes or sorted(self._entries) != list(range(info.total_episodes)):
-            raise DatasetError.at(where, f"{info.total_episodes} episodes, as info.json says", str(len(self._entries)))
-        num_frames = sum(entry.length for entry in self._entries.values())
-        if num_frames != info.total_frames:
-            raise DatasetError.at(where, f"{info.total_frames} frames, as info.json says", str(num_frames))
+def _where(episode: DatasetEpisode, camera: str, t: int) -> str:
+    return f"{episode.name}: {camera}: frame {t}"
 
 
 def _decoded_image(where: str, image: bytes) -> UInt8Array:
@@ -184,7 +192,7 @@ def _decoded_image(where: str, image: bytes) -> UInt8Array:
         try:
             return np.asarray(opened.convert("RGB"))
         except OSError as error:
-            raise DatasetError.at(where, "an image", str(error)) from error
+            raise DatasetError.at(where, "an image", error) from error
 
 
 def _opened_image(where: str, image: bytes) -> Any:
@@ -195,11 +203,11 @@ def _opened_image(where: str, image: bytes) -> Any:
     try:
         opened = Image.open(io.BytesIO(image))
     except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise DatasetError.at(where, "an image", str(error)) from error
+        raise DatasetError.at(where, "an image", error) from error
     is_deep = _DEEP in str(opened.tile)
-    if opened.mode not in _COLOURS or is_deep:
-        expected = "a picture of 8-bit colours (convert it, or leave a depth camera out: --cameras)"
-        raise DatasetError.at(where, expected, f"{opened.format} of {'16-bit ' * is_deep}{opened.mode}")
+    expected = "a picture of 8-bit colours (convert it, or leave a depth camera out: --cameras)"
+    got = f"{opened.format} of {'16-bit ' * is_deep}{opened.mode}"
+    require(where, opened.mode in _COLOURS and not is_deep, expected, got)
     return opened
 
 

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""The rows of a LeRobot dataset: which frames each episode has, when, and what its task is. Needs pyarrow."""
+"""What the tables of a LeRobot dataset say: ``meta/info.json``, each episode's entry, and the rows. Needs pyarrow."""
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,10 +14,92 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.data.datasets.protocol import DatasetError, GivenTask
+from rfm_client.data.datasets.protocol import DatasetError, GivenTask, require
 
-ROW_COLUMNS = ("index", "episode_index", "frame_index", "timestamp", "task_index")
-FILES_AT_A_TIME = 4  # whose rows are kept in memory
+INFO_FILE = Path("meta", "info.json")
+VERSIONS = ("v2.0", "v2.1", "v3.0")
+
+_ROW_COLUMNS = ("index", "episode_index", "frame_index", "timestamp", "task_index")
+_FILES_AT_A_TIME = 4  # whose rows are kept in memory
+_OF_PICTURES = ("info", "video_info")  # what a feature says of its pictures, by the version of the writer
+_DEPTH_MARKS = ("video.is_depth_map", "is_depth_map")
+
+
+@dataclass(frozen=True)
+class Info:
+    """What a LeRobot dataset says of itself.
+
+    films, images: keys of its cameras whose frames are in video files, and of those whose frames are in its tables
+    depth: keys of those of both whose pictures are depth maps
+    total_frames: of all episodes
+    data_path, video_path: templates of the paths of its files
+    """
+
+    root: Path
+    version: str
+    fps: float
+    films: tuple[str, ...]
+    images: tuple[str, ...]
+    depth: tuple[str, ...]
+    total_episodes: int
+    total_frames: int
+    chunks_size: int
+    data_path: str
+    video_path: str | None
+
+    @classmethod
+    def read(cls, root: Path) -> Info:
+        """The information in ``root``. Raises DatasetError."""
+        file = root / INFO_FILE
+        try:
+            document = json.loads(file.read_bytes())
+        except (OSError, ValueError, RecursionError) as error:
+            raise DatasetError.at(file, "a readable JSON file", error) from error
+        require(file, isinstance(document, dict), "a JSON object", type(document).__name__)
+
+        def field(name: str, *kinds: type) -> Any:
+            value = document.get(name)
+            is_of_kind = isinstance(value, kinds) and not isinstance(value, bool)
+            expected = " or ".join(kind.__name__ for kind in kinds)
+            require(f"{file}: {name}", is_of_kind, expected, "none" if value is None else repr(value))
+            return value
+
+        features = {key: feature for key, feature in field("features", dict).items() if isinstance(feature, dict)}
+        films, images = (
+            tuple(key for key, feature in features.items() if feature.get("dtype") == kind)
+            for kind in ("video", "image")
+        )
+        version, fps = field("codebase_version", str), float(field("fps", int, float))
+        require(f"{file}: codebase_version", version in VERSIONS, f"one of {', '.join(VERSIONS)}", repr(version))
+        require(f"{file}: fps", 0 < fps < math.inf, "a number above 0", repr(fps))
+        return cls(
+            root,
+            version,
+            fps,
+            films,
+            images,
+            depth=tuple(key for key in (*films, *images) if _is_depth(features[key])),
+            total_episodes=field("total_episodes", int),
+            total_frames=field("total_frames", int),
+            chunks_size=field("chunks_size", int),
+            data_path=field("data_path", str),
+            video_path=field("video_path", str) if films else None,
+        )
+
+    def path(self, template: str | None, **values: Any) -> Path:
+        """The file that a template names, inside the dataset. Raises DatasetError."""
+        try:
+            path = (template or "").format(**values)
+        except (LookupError, ValueError) as error:
+            raise DatasetError.at(INFO_FILE, f"a path of {', '.join(values)}", repr(template)) from error
+        is_inside = bool(path) and not Path(path).is_absolute() and ".." not in Path(path).parts
+        require(INFO_FILE, is_inside, "a path inside the dataset", repr(path))
+        return self.root / path
+
+
+def _is_depth(feature: Mapping[str, Any]) -> bool:
+    told = [feature[name] for name in _OF_PICTURES if isinstance(feature.get(name), dict)]
+    return any(each.get(mark) is True for each in told for mark in _DEPTH_MARKS)
 
 
 @dataclass(frozen=True)
@@ -42,7 +126,7 @@ class Entry:
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class EpisodeRows:
     """The rows of one episode. times_s: float64 [T], from the start of the episode, rising"""
 
     first_index: int
@@ -59,31 +143,34 @@ class RowReader:
     def __init__(self, tasks: Mapping[int, str | None], given: GivenTask) -> None:
         self._tasks = tasks
         self._given = given
-        self._columns = lru_cache(FILES_AT_A_TIME)(_read_columns)
+        self._columns = lru_cache(_FILES_AT_A_TIME)(_read_columns)
 
-    def read(self, entry: Entry) -> Rows:
+    def read(self, entry: Entry) -> EpisodeRows:
         """The episode's rows. Raises DatasetError where they and its metadata contradict each other."""
         columns = self._columns(entry.data_file)
-        own = np.flatnonzero(columns["episode_index"] == entry.index)
-        where = f"{entry.where}: {entry.data_file}"
-        if len(own) != entry.length or not len(own):
-            raise DatasetError.at(where, f"{max(entry.length, 1)} rows, as its metadata say", f"{len(own)}")
-        _check_counts(where, columns["index"][own], columns["frame_index"][own], entry.first_index)
-        times_s = columns["timestamp"][own].astype(np.float64)
-        if not (np.isfinite(times_s).all() and (np.diff(times_s) > 0).all()):
-            raise DatasetError.at(f"{where}: timestamp", "rising numbers", "others")
-        return Rows(int(columns["index"][own][0]), times_s, self._task(entry, where, columns["task_index"][own]))
+        is_own = columns["episode_index"] == entry.index
+        rows = {name: column[is_own] for name, column in columns.items()}
+        where, num_rows = f"{entry.where}: {entry.data_file}", int(is_own.sum())
+        is_whole = num_rows == entry.length and num_rows > 0
+        require(where, is_whole, f"{max(entry.length, 1)} rows, as its metadata say", num_rows)
+        first = int(rows["index"][0]) if entry.first_index is None else entry.first_index
+        for name, expected in (("frame_index", np.arange(num_rows)), ("index", first + np.arange(num_rows))):
+            t = int(np.argmax(rows[name] != expected))
+            require(f"{where}: {name}", bool(rows[name][t] == expected[t]), f"{expected[t]} in row {t}", rows[name][t])
+        times_s = rows["timestamp"].astype(np.float64)
+        is_rising = bool(np.isfinite(times_s).all() and (np.diff(times_s) > 0).all())
+        require(f"{where}: timestamp", is_rising, "rising numbers", "others")
+        return EpisodeRows(first, times_s, self._task(entry, where, rows["task_index"]))
 
     def _task(self, entry: Entry, where: str, task_indices: npt.NDArray[np.int64]) -> str:
         if self._given.overrides:
             return self._given.of(where, None)
         used = np.unique(task_indices).tolist()
-        if len(used) != 1:
-            raise DatasetError.at(f"{where}: task_index", "one task in an episode", f"{len(used)}: {used}")
+        require(f"{where}: task_index", len(used) == 1, "one task in an episode", f"{len(used)}: {used}")
         own = self._tasks.get(used[0])
         task = self._given.of(f"{entry.where}: task {used[0]} in meta/tasks", own)
-        if entry.tasks and task == own and task not in entry.tasks:
-            raise DatasetError.at(f"{entry.where}: meta/episodes: tasks", repr(task), repr(list(entry.tasks)))
+        is_named = not entry.tasks or task != own or task in entry.tasks
+        require(f"{entry.where}: meta/episodes: tasks", is_named, repr(task), repr(list(entry.tasks)))
         return task
 
 
@@ -99,26 +186,12 @@ def read_table(file: Path, columns: list[str] | None = None, filters: Any = None
     except FileNotFoundError as error:
         raise DatasetError.at(file, "a Parquet file", "none") from error
     except (OSError, pyarrow.ArrowException) as error:
-        raise DatasetError.at(file, "a readable Parquet file", str(error)) from error
-    missing = [name for name in columns or [] if name not in table.column_names]
-    if missing:
-        raise DatasetError.at(file, f"the column {missing[0]}", ", ".join(table.column_names))
+        raise DatasetError.at(file, "a readable Parquet file", error) from error
+    for name in columns or []:
+        require(file, name in table.column_names, f"the column {name}", ", ".join(table.column_names))
     return table
 
 
 def _read_columns(file: Path) -> Mapping[str, npt.NDArray[Any]]:
-    table = read_table(file, list(ROW_COLUMNS))
-    return {name: table[name].to_numpy() for name in ROW_COLUMNS}
-
-
-def _check_counts(
-    where: str, indices: npt.NDArray[np.int64], frames: npt.NDArray[np.int64], first_index: int | None
-) -> None:
-    expected = np.arange(len(indices))
-    if not np.array_equal(frames, expected):
-        t = int(np.flatnonzero(frames != expected)[0])
-        raise DatasetError.at(f"{where}: frame_index", f"{t} in row {t}", str(frames[t]))
-    first = int(indices[0]) if first_index is None else first_index
-    if not np.array_equal(indices, first + expected):
-        t = int(np.flatnonzero(indices != first + expected)[0])
-        raise DatasetError.at(f"{where}: index", f"{first + t} in row {t}", str(indices[t]))
+    table = read_table(file, list(_ROW_COLUMNS))
+    return {name: table[name].to_numpy() for name in _ROW_COLUMNS}

@@ -8,17 +8,17 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from rfm_client.data.datasets.lerobot_info import Info
-from rfm_client.data.datasets.lerobot_rows import Entry
-from rfm_client.data.datasets.protocol import DatasetError
+from rfm_client.contract.numbers import checked_count
+from rfm_client.data.datasets.lerobot_rows import Entry, Info
+from rfm_client.data.datasets.protocol import DatasetError, require
 
 EPISODES_FILE = Path("meta", "episodes.jsonl")
 TASKS_FILE = Path("meta", "tasks.jsonl")
 
 
-def read_entries(root: Path, info: Info) -> Iterator[Entry]:
+def read_entries(info: Info) -> Iterator[Entry]:
     """The episodes that the metadata list. Raises DatasetError."""
-    for where, line in _lines(root / EPISODES_FILE):
+    for where, line in _lines(info.root / EPISODES_FILE):
         index, length = _number(where, line, "episode_index"), _number(where, line, "length")
         values = {"episode_chunk": index // info.chunks_size, "episode_index": index}
         tasks = line.get("tasks")
@@ -27,8 +27,8 @@ def read_entries(root: Path, info: Info) -> Iterator[Entry]:
             tasks=[task for task in tasks if isinstance(task, str)] if isinstance(tasks, list) else [],
             length=length,
             first_index=None,
-            data_file=info.path(root, info.data_path, **values),
-            films={key: (info.path(root, info.video_path, **values, video_key=key), 0.0) for key in info.films},
+            data_file=info.path(info.data_path, **values),
+            films={key: (info.path(info.video_path, **values, video_key=key), 0.0) for key in info.films},
         )
 
 
@@ -53,13 +53,12 @@ def _lines(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
             line = json.loads(text)
         except (ValueError, RecursionError) as error:
             raise DatasetError.at(where, "a JSON object", str(error)) from error
-        if not isinstance(line, dict):
-            raise DatasetError.at(where, "a JSON object", type(line).__name__)
+        require(where, isinstance(line, dict), "a JSON object", type(line).__name__)
         yield where, line
 
 
 def _number(where: str, line: Mapping[str, Any], name: str) -> int:
-    value = line.get(name)
-    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-        raise DatasetError.at(f"{where}: {name}", "a whole number from 0", repr(value))
-    return value
+    try:
+        return checked_count(f"{where}: {name}", line.get(name), least=0)
+    except ValueError as error:
+        raise DatasetError(str(error)) from error

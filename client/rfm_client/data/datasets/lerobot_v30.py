@@ -7,9 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from rfm_client.data.datasets.lerobot_info import Info
-from rfm_client.data.datasets.lerobot_rows import Entry, read_table
-from rfm_client.data.datasets.protocol import DatasetError
+from rfm_client.data.datasets.lerobot_rows import Entry, Info, read_table
+from rfm_client.data.datasets.protocol import require
 
 EPISODES_FOLDER = Path("meta", "episodes")
 TASKS_FILE = Path("meta", "tasks.parquet")
@@ -21,15 +20,14 @@ _OF_AN_EPISODE = (
 _OF_A_FILM = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
 
 
-def read_entries(root: Path, info: Info) -> Iterator[Entry]:
+def read_entries(info: Info) -> Iterator[Entry]:
     """The episodes that the metadata list. Raises DatasetError."""
-    files = sorted((root / EPISODES_FOLDER).rglob("*.parquet"))
-    if not files:
-        raise DatasetError.at(root / EPISODES_FOLDER, "Parquet files", "none")
+    files = sorted((info.root / EPISODES_FOLDER).rglob("*.parquet"))
+    require(info.root / EPISODES_FOLDER, bool(files), "Parquet files", "none")
     of_films = [f"videos/{key}/{name}" for key in info.films for name in _OF_A_FILM]
     for file in files:
         for row in read_table(file, [*_OF_AN_EPISODE, *of_films]).to_pylist():
-            yield _entry(root, info, file, row)
+            yield _entry(info, file, row)
 
 
 def read_tasks(root: Path) -> dict[int, str | None]:
@@ -41,35 +39,33 @@ def read_tasks(root: Path) -> dict[int, str | None]:
     columns: dict[str, list[Any]] = read_table(file).to_pydict()
     numbers = columns.pop("task_index", None)
     texts = [values for values in columns.values() if all(value is None or isinstance(value, str) for value in values)]
-    if numbers is None or len(texts) != 1:
-        raise DatasetError.at(file, "task_index and one column of sentences", ", ".join(["task_index"] * bool(numbers)))
-    return dict(zip(numbers, texts[0], strict=True))
+    got = f"{'no ' * (numbers is None)}task_index and {len(texts)} of them"
+    require(file, numbers is not None and len(texts) == 1, "task_index and one column of sentences", got)
+    return dict(zip(numbers or (), texts[0], strict=True))
 
 
-def _entry(root: Path, info: Info, file: Path, row: dict[str, Any]) -> Entry:
+def _entry(info: Info, file: Path, row: dict[str, Any]) -> Entry:
     index, length = row["episode_index"], row["length"]
     where = f"episode {index}: {file}"
-    missing = [name for name, value in row.items() if value is None]
-    if missing:
-        raise DatasetError.at(f"{where}: {missing[0]}", "a value", "none")
+    for name, value in row.items():
+        require(f"{where}: {name}", value is not None, "a value", "none")
     first, end = row["dataset_from_index"], row["dataset_to_index"]
-    if end - first != length:
-        raise DatasetError.at(f"{where}: length", f"{end - first}, from {first} to {end}", str(length))
+    require(f"{where}: length", end - first == length, f"{end - first}, from {first} to {end}", length)
     data = {"chunk_index": row["data/chunk_index"], "file_index": row["data/file_index"]}
     return Entry(
         index=index,
         tasks=row["tasks"],
         length=length,
         first_index=first,
-        data_file=info.path(root, info.data_path, **data),
-        films={key: _film(root, info, where, row, key) for key in info.films},
+        data_file=info.path(info.data_path, **data),
+        films={key: _film(info, where, row, key) for key in info.films},
     )
 
 
-def _film(root: Path, info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path, float]:
+def _film(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path, float]:
     chunk, number, from_s, to_s = (row[f"videos/{key}/{name}"] for name in _OF_A_FILM)
-    expected_s = row["length"] / info.fps
-    if abs((to_s - from_s) - expected_s) > 0.5 / info.fps:
-        expected, got = f"{expected_s:.4f} s for {row['length']} frames", f"{to_s - from_s:.4f} s"
-        raise DatasetError.at(f"{where}: videos/{key}: from_timestamp to to_timestamp", expected, got)
-    return info.path(root, info.video_path, video_key=key, chunk_index=chunk, file_index=number), float(from_s)
+    lasts_s, expected_s = to_s - from_s, row["length"] / info.fps
+    is_as_long = abs(lasts_s - expected_s) <= 0.5 / info.fps
+    expected = f"{expected_s:.4f} s for {row['length']} frames"
+    require(f"{where}: videos/{key}: from_timestamp to to_timestamp", is_as_long, expected, f"{lasts_s:.4f} s")
+    return info.path(info.video_path, video_key=key, chunk_index=chunk, file_index=number), float(from_s)

@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""A dataset by its path or Hub id, whatever its layout."""
+"""A dataset by its path or Hub id, whatever its layout; of a layout that is not read, how it becomes one that is."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 
-from rfm_client.data.datasets.hdf5 import SUFFIXES, Hdf5Dataset
+from rfm_client.data.datasets.hdf5 import ALOHA, ALOHA_GROUP, SUFFIXES, Hdf5Dataset
 from rfm_client.data.datasets.lerobot import LeRobotDataset
-from rfm_client.data.datasets.lerobot_info import INFO_FILE
-from rfm_client.data.datasets.other_layouts import described
-from rfm_client.data.datasets.protocol import Dataset, DatasetError, GivenTask
+from rfm_client.data.datasets.lerobot_rows import INFO_FILE
+from rfm_client.data.datasets.protocol import Dataset, DatasetError, GivenTask, require
 from rfm_client.data.datasets.videos import TABLES, VideoFolder
 from rfm_client.data.orientation import Orient
 
@@ -19,6 +18,19 @@ _LAYOUTS = (
     f"a LeRobot dataset ({INFO_FILE}), an HDF5 file ({', '.join(SUFFIXES)}), "
     f"a folder of videos with {' or '.join(TABLES)}, or a Hub id org/name[@revision]"
 )
+_TABLE = "list the videos in tasks.csv (columns video, task)"
+_UNREAD = {  # what is to be done with a layout that is not read, by the names of its files
+    r"meta_data": "a LeRobot dataset of v1: convert it to v2.0 with convert_dataset_v1_to_v2.py of lerobot/datasets/v2 "
+    "(LeRobot 0.3), and label that",
+    r"features\.json|.*\.tfrecord.*": "an RLDS (TensorFlow) dataset: convert it to LeRobot with openx2lerobot of "
+    "https://github.com/Tavish9/any4lerobot",
+    r".*\.zarr(\.zip)?|\.z(group|array|attrs|metadata)|zarr\.json": "Zarr arrays: convert them to LeRobot with "
+    "https://github.com/arpitg1304/forge, or write each episode's pictures to a video "
+    f"(imageio.mimwrite('0.mp4', frames, fps=10)) and {_TABLE}",
+    r".*\.(bag|mcap|db3)": "a rosbag: convert it to LeRobot with https://github.com/arpitg1304/forge, or write each "
+    f"camera's topic to a video (the package rosbags reads it without ROS) and {_TABLE}",
+}
+_PICTURES, _FILMS = ("png", "jpg", "jpeg"), ("mp4", "mkv", "mov", "webm", "avi")
 
 
 def open_dataset(
@@ -38,9 +50,8 @@ def open_dataset(
         return LeRobotDataset(path, task=given, orient=orient)
     if path.exists():
         has_table = path.suffix.lower() in (".csv", ".json") or any((path / table).is_file() for table in TABLES)
-        other = None if has_table else described(path)
-        if other is not None or (path.is_file() and not has_table):
-            raise DatasetError.at(path, _LAYOUTS, other or "another file")
+        other = None if has_table else _unread(path)
+        require(path, has_table or (other is None and path.is_dir()), _LAYOUTS, other or "another file")
         return VideoFolder(path, task=given, orient=orient)
     match = _HUB_ID.fullmatch(str(source))
     if match is None:
@@ -58,5 +69,47 @@ def _from_hub(name: str, revision: str | None, task: GivenTask, orient: Orient) 
         folder = Path(snapshot_download(name, repo_type="dataset", revision=revision))
     except (OSError, ValueError) as error:  # what the Hub's library raises, requests' errors included
         raise DatasetError.at(name, "a local dataset or one of the Hub", str(error).splitlines()[0]) from error
+    if not (folder / INFO_FILE).is_file():
+        raise DatasetError.at(name, f"a LeRobot dataset's {INFO_FILE}", _unread(folder) or "none")
     commit = folder.name  # the folder is called after it
     return LeRobotDataset(folder, source=name, revision=commit, task=task, orient=orient)
+
+
+def _unread(path: Path) -> str | None:
+    """What lies at a path that no reader takes, and what to do with it; None: nothing of a known form."""
+    found = [path] if path.is_file() else [each for below in ("*", "*/*") for each in path.glob(below)]
+    names = [path.name, *(each.name for each in found)]
+    for pattern, what in _UNREAD.items():
+        if any(re.fullmatch(pattern, name, re.IGNORECASE) for name in names):
+            return what
+    if path.is_file():
+        is_film = path.suffix.lower().lstrip(".") in _FILMS
+        return "a video: label its folder, with tasks.csv in it (columns video, task)" if is_film else None
+    if files := _pattern(path, [suffix.lstrip(".") for suffix in SUFFIXES]):
+        loop = f'for f in {files}; do rfm-client label "$f"; done'
+        return ALOHA if _is_aloha(path, files) else f"a folder of HDF5 files, each a dataset of its own: {loop}"
+    pictures = None if _pattern(path, _FILMS) else _pattern(path, _PICTURES)
+    if pictures is None:
+        return None
+    encoding = "ffmpeg -framerate 10 -i - -c:v libx264rgb -crf 0"
+    if pictures.parent == path:
+        film = f"cat $(ls -v {pictures}) | {encoding} {path}/0.mp4"
+    else:
+        film = f"for e in {pictures.parent}/; do cat $(ls -v $e{pictures.name}) | {encoding} ${{e%/}}.mp4; done"
+    return f"a folder of pictures: make a video of each episode ({film}) and {_TABLE}"
+
+
+def _is_aloha(folder: Path, pattern: Path) -> bool:
+    try:
+        import h5py
+
+        with h5py.File(next(iter(folder.glob(str(pattern.relative_to(folder))))), "r") as opened:
+            return ALOHA_GROUP in opened
+    except (ImportError, OSError):  # it is a folder of HDF5 files all the same
+        return False
+
+
+def _pattern(folder: Path, suffixes: tuple[str, ...] | list[str]) -> Path | None:
+    """The pattern of the folder's files with one of these suffixes, or of those one level below; None: it has none."""
+    patterns = [f"{below}*.{suffix}" for below in ("", "*/") for suffix in suffixes]
+    return next((folder / pattern for pattern in patterns if any(folder.glob(pattern))), None)

@@ -11,94 +11,80 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterator, Mapping, Sequence, Set
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.datasets.films import Packets, Span, decode
+from rfm_client.data.datasets.films import Span, decode, film_identity, film_packets
 from rfm_client.data.datasets.protocol import (
-    Contents,
+    Dataset,
+    DatasetEpisode,
     DatasetError,
-    Episode,
     GivenTask,
     chosen_cameras,
     orientations_of,
+    require,
 )
 from rfm_client.data.film_files import decoder
 from rfm_client.data.lerobot_videos import check_local_film
-from rfm_client.data.orientation import Orient, turned
+from rfm_client.data.orientation import Orient
 
 TABLES = ("tasks.csv", "tasks.json")
-CAMERA = "video"
 
 _FILES_AT_A_TIME = 4
 
 
-class VideoFolder:
-    """Videos and their tasks.
-
-    table: the file of tasks, or the folder that holds it
-    task: what the caller says of tasks
-    orient: how pictures are turned
-    """
+class VideoFolder(Dataset):
+    """Videos and their tasks. table: the file of tasks, or the folder that holds it"""
 
     kind = "videos"
-    revision = None
-    cameras: Sequence[str] = (CAMERA,)
-    depth_cameras: Sequence[str] = ()
-    left_out: Mapping[str, str] = {}
-    notes: Sequence[str] = ()
+    cameras = ("video",)
 
     def __init__(self, table: Path, *, task: GivenTask = GivenTask(), orient: Orient = Orient()) -> None:
         self._table = _table_in(table) if table.is_dir() else table
         self.root = self._table.parent
         self.source = self.root.resolve().name
-        self._packets = lru_cache(_FILES_AT_A_TIME)(Packets.read)
+        self._packets = lru_cache(_FILES_AT_A_TIME)(film_packets)
         self._task = task
         self.orientations = orientations_of(orient, self.cameras)
         self._tasks = _read(self._table, {"video"} if task.text else {"video", "task"})
 
-    @cached_property
-    def episodes(self) -> Sequence[Episode]:
-        """All videos, in the table's order. Counts their frames; raises DatasetError."""
-        episodes: list[Episode] = []
+    def read_episodes(self) -> Sequence[DatasetEpisode]:
+        episodes: list[DatasetEpisode] = []
         first = 0
         for index, (name, own) in enumerate(self._tasks.items()):
             task = self._task.of(f"{self._table}: {name}", own)
             check_local_film(self.root / name)
             num_frames = len(self._packets(self.root / name).times_s)
-            if not num_frames:
-                raise DatasetError.at(self.root / name, "frames", "none")
-            episodes.append(Episode(index, name, task.strip(), num_frames, first))
+            require(self.root / name, num_frames > 0, "frames", "none")
+            episodes.append(DatasetEpisode(index, name, task.strip(), num_frames, first))
             first += num_frames
         self._task.check_used(episodes)
         return episodes
 
     def decoder(self, camera: str) -> str | None:
-        """PyAV, with the versions that decide what a frame looks like."""
         return decoder()
 
-    def check(self, episode: Episode, camera: str) -> Contents:
-        """What the video's frames are made of. Raises DatasetError."""
-        chosen_cameras(self, [camera])
-        return self._packets(self.root / episode.name).contents()
+    def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
+        return film_identity(self.root / episode.name, verify=verify)
 
-    def frames(self, episode: Episode, camera: str) -> Iterator[UInt8Array]:
-        """The video's frames, uint8 [H, W, 3], turned as ``orientations`` says. Raises DatasetError."""
+    def check(self, episode: DatasetEpisode, camera: str) -> int:
+        chosen_cameras(self, [camera])
+        return sum(self._packets(self.root / episode.name).num_bytes)
+
+    def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         file = self.root / episode.name
         times_s = self._packets(file).times_s
         gaps_s = times_s[1:] - times_s[:-1]
         tolerance_s = 0.5 * float(gaps_s.min()) if len(gaps_s) else 0.5
-        orientation = self.orientations.get(camera, "none")
-        return (turned(frame, orientation) for frame in decode(Span(file, times_s, tolerance_s, episode.name)))
+        return decode(Span(file, times_s, tolerance_s, episode.name))
 
 
 def _table_in(folder: Path) -> Path:
     found = [folder / name for name in TABLES if (folder / name).is_file()]
-    if len(found) != 1:
-        all_of_one = f'(cd {folder}; (echo video; ls *.mp4) > tasks.csv) and --task "what is to be done"'
-        got = "both" if found else f"none: write it, or, if all videos have one task, {all_of_one}"
-        raise DatasetError.at(folder, f"one of {' and '.join(TABLES)} with the task of each video", got)
+    all_of_one = f'(cd {folder}; (echo video; ls *.mp4) > tasks.csv) and --task "what is to be done"'
+    got = "both" if found else f"none: write it, or, if all videos have one task, {all_of_one}"
+    require(folder, len(found) == 1, f"one of {' and '.join(TABLES)} with the task of each video", got)
     return found[0]
 
 
@@ -107,7 +93,7 @@ def _read(table: Path, required: Set[str]) -> Mapping[str, str | None]:
     try:
         text = table.read_text(encoding="utf-8-sig")  # with the mark that spreadsheets put before it, or without
     except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError.at(table, "a readable table of tasks", str(error)) from error
+        raise DatasetError.at(table, "a readable table of tasks", error) from error
     return _from_json(table, text) if table.suffix.lower() == ".json" else _from_csv(table, text, required)
 
 
@@ -115,7 +101,7 @@ def _from_json(table: Path, text: str) -> Mapping[str, str | None]:
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise DatasetError.at(table, "JSON", str(error)) from error
+        raise DatasetError.at(table, "JSON", error) from error
     if not isinstance(document, dict) or not document:
         raise DatasetError.at(table, "an object of tasks by video", type(document).__name__)
     return document
@@ -123,20 +109,15 @@ def _from_json(table: Path, text: str) -> Mapping[str, str | None]:
 
 def _from_csv(table: Path, text: str, required: Set[str]) -> Mapping[str, str | None]:
     rows = csv.DictReader(text.splitlines())
-    if required - set(rows.fieldnames or ()):
-        got = ", ".join(rows.fieldnames or ()) or "none"
-        raise DatasetError.at(table, "the columns video and task", f"{got} (--task stands for the column task)")
+    columns = rows.fieldnames or ()
+    got = f"{', '.join(columns) or 'none'} (--task stands for the column task)"
+    require(table, not required - set(columns), "the columns video and task", got)
     tasks: dict[str, str | None] = {}
-    num_columns = len(rows.fieldnames or ())
     for row in rows:
-        cells = [cell for cell in row.values() if isinstance(cell, str)]
-        num_cells = len(cells) + len(row.get(None, ()))  # the reader's key of what has no column
-        if num_cells != num_columns:
-            expected = f"{num_columns} cells (text with a comma in quotes)"
-            raise DatasetError.at(f"{table}: line {rows.line_num}", expected, str(num_cells))
-        if row["video"] in tasks:
-            raise DatasetError.at(f"{table}: line {rows.line_num}", "each video once", row["video"])
+        where = f"{table}: line {rows.line_num}"
+        num_cells = sum(isinstance(cell, str) for cell in row.values()) + len(row.get(None, ()))  # of no column
+        require(where, num_cells == len(columns), f"{len(columns)} cells (text with a comma in quotes)", num_cells)
+        require(where, row["video"] not in tasks, "each video once", row["video"])
         tasks[row["video"]] = row.get("task")
-    if not tasks:
-        raise DatasetError.at(table, "at least one video", "none")
+    require(table, bool(tasks), "at least one video", "none")
     return tasks

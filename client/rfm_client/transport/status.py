@@ -7,12 +7,10 @@ Where the repository's index needs a key (``rfm serve``), the models are those t
 from __future__ import annotations
 
 import re
-import ssl
 import textwrap
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from http.client import HTTPException
 from typing import Any, TypeAlias
 
@@ -20,13 +18,8 @@ from tritonclient.utils import InferenceServerException
 
 from rfm_client.contract import triton
 from rfm_client.contract.addresses import split_url
-from rfm_client.contract.errors import (
-    DeadlineExceededError,
-    InferenceFailedError,
-    ServerUnavailableError,
-)
+from rfm_client.contract.errors import DeadlineExceededError, ServerUnavailableError
 from rfm_client.contract.proxies import grpc_proxy, open_url
-from rfm_client.transport import remedies
 from rfm_client.transport.access import Access
 from rfm_client.transport.connection import grpc_options
 from rfm_client.transport.ports import OF_A_PORT, wrong_port
@@ -197,31 +190,21 @@ def read_status(
 
 def _read(url: str, metrics_url: str | None, timeout_s: float, access: Access) -> ServerStatus:
     scheme, address = split_url(url)
-    proxy = grpc_proxy(address) if scheme.startswith("grpc") else None
     try:
-        read_server = _read_over_grpc if scheme.startswith("grpc") else _read_over_http
-        server = read_server(scheme, address, timeout_s, access)
+        server = _read_server(scheme, address, timeout_s, access)
         metrics_url = metrics_url or f"http://{address.rpartition(':')[0]}:{METRICS_PORT}/metrics"
         metrics = _read_metrics(metrics_url, timeout_s)
         models = tuple(_models(server, metrics))
-    except InferenceServerException as error:
-        status, message = str(error.status()), error.message() or ""
-        if triton.is_denied(status, message):
-            raise remedies.denied(url, status, message) from error
-        if triton.is_unreachable(status, message):
-            raise remedies.unreachable(url, message, proxy) from error
-        if status in triton.OUT_OF_TIME:
-            where = f"{url} through {proxy}" if proxy else url
-            raise DeadlineExceededError(f"{where}: {message}") from error
-        raise ServerUnavailableError(f"{url}: {message}") from error
-    except TimeoutError as error:
-        raise DeadlineExceededError(f"{url}: no answer within {timeout_s:g} s") from error
-    except ssl.SSLError as error:
-        raise remedies.denied(url, "", str(error)) from error
-    except (OSError, EOFError, HTTPException) as error:
-        raise remedies.unreachable(url, str(error)) from error
-    except (ValueError, LookupError, TypeError, AttributeError) as error:  # reading what is no answer of Triton
-        raise InferenceFailedError(f"{url}: the answer cannot be read: {error!r}") from error
+    except Exception as raised:
+        proxy = grpc_proxy(address) if scheme.startswith("grpc") else None
+        error = triton.error_from(raised, url, proxy=proxy)
+        if error is None:
+            raise
+        if isinstance(error, DeadlineExceededError):
+            error = DeadlineExceededError(
+                f"{url}{f' through {proxy}' if proxy else ''}: no answer within {timeout_s:g} s"
+            )
+        raise error from raised
     return ServerStatus(url, server.version, server.ready, models, metrics_url, metrics.error, metrics.devices)
 
 
@@ -235,55 +218,46 @@ class _Server:
     statistics: list[dict[str, Any]]
 
 
-def _read_over_http(scheme: str, address: str, timeout_s: float, access: Access) -> _Server:
-    import tritonclient.http
+def _read_server(scheme: str, address: str, timeout_s: float, access: Access) -> _Server:
+    limited: dict[str, Any] = {}
+    as_json: dict[str, Any] = {}
+    client: Any
+    if scheme.startswith("grpc"):
+        import tritonclient.grpc
 
-    client = tritonclient.http.InferenceServerClient(
-        address, connection_timeout=timeout_s, network_timeout=timeout_s, **access.http_options(scheme)
-    )
+        limited = {"client_timeout": timeout_s}
+        as_json = {"as_json": True, **limited}
+        options = access.grpc_options(scheme)
+        client = tritonclient.grpc.InferenceServerClient(address, channel_args=grpc_options(address), **options)
+    else:
+        import tritonclient.http
+
+        options = {"connection_timeout": timeout_s, "network_timeout": timeout_s, **access.http_options(scheme)}
+        client = tritonclient.http.InferenceServerClient(address, **options)
     access.show_with_each_request(client)
-    try:
-        version = client.get_server_metadata()["version"]
-        statistics = client.get_inference_statistics()["model_stats"]
-        index = _if_open(client.get_model_repository_index) or _index(statistics, client.is_model_ready)
-        return _Server(version, client.is_server_ready(), index, statistics)
-    finally:
-        client.close()
-
-
-def _read_over_grpc(scheme: str, address: str, timeout_s: float, access: Access) -> _Server:
-    import tritonclient.grpc
-
-    client = tritonclient.grpc.InferenceServerClient(
-        address, channel_args=list(grpc_options(address).items()), **access.grpc_options(scheme)
-    )
-    access.show_with_each_request(client)
-    as_json = {"as_json": True, "client_timeout": timeout_s}
     try:
         version = client.get_server_metadata(**as_json)["version"]
         statistics = client.get_inference_statistics(**as_json).get("model_stats", [])
-        index = _if_open(partial(client.get_model_repository_index, **as_json)).get("models")
-        index = index or _index(statistics, partial(client.is_model_ready, client_timeout=timeout_s))
-        return _Server(version, client.is_server_ready(client_timeout=timeout_s), index, statistics)
+        index = _index(client, statistics, as_json, limited)
+        return _Server(version, client.is_server_ready(**limited), index, statistics)
     finally:
         client.close()
 
 
-def _if_open(read: Callable[[], Any]) -> Any:
-    """The answer; nothing where only a key would give it."""
+def _index(
+    client: Any, statistics: list[dict[str, Any]], as_json: dict[str, Any], limited: dict[str, Any]
+) -> list[dict[str, Any]]:
+    """The repository's index; where only a key would give it, that of the models which are loaded."""
     try:
-        return read()
+        index = client.get_model_repository_index(**as_json)
+        return list(index.get("models", []) if as_json else index)
     except InferenceServerException as error:
         if triton.RESTRICTED not in (error.message() or ""):
             raise
-        return {}
-
-
-def _index(statistics: list[dict[str, Any]], is_ready: Callable[[str, str], bool]) -> list[dict[str, Any]]:
-    """The entries of the repository's index for the models that are loaded, made from their statistics."""
     keys = sorted((entry["name"], int(entry["version"])) for entry in statistics)
+    states = {True: "READY", False: "UNAVAILABLE"}
     return [
-        {"name": name, "version": str(version), "state": "READY" if is_ready(name, str(version)) else "UNAVAILABLE"}
+        {"name": name, "version": str(version), "state": states[client.is_model_ready(name, str(version), **limited)]}
         for name, version in keys
     ]
 
@@ -326,36 +300,34 @@ def _read_metrics(url: str, timeout_s: float) -> _Metrics:
     try:
         samples = _scrape(url, timeout_s)
         sampled_by_s = time.monotonic() + _SAMPLING_S
-        while _is_unsampled(samples) and time.monotonic() < sampled_by_s:
+        while any(each.name == _SAMPLED_METRIC and not each.value for each in samples):
+            if time.monotonic() >= sampled_by_s:
+                break
             time.sleep(_POLL_S)
             samples = _scrape(url, timeout_s)
     except (OSError, HTTPException, ValueError) as error:
-        return _Metrics(error=f"no metrics of the machine: {url}: {_short(error)}: give their URL ({METRICS_OPTION})")
-    devices: dict[str, dict[str, float]] = {}
-    for sample in samples:
-        match = _DEVICE_METRIC.fullmatch(sample.name)
-        if match:
-            devices.setdefault(sample.labels.get("gpu_uuid", match[1].upper()), {})[match[2]] = sample.value
+        reason = textwrap.shorten(str(error), _REASON_CHARACTERS)
+        return _Metrics(error=f"no metrics of the machine: {url}: {reason}: give their URL ({METRICS_OPTION})")
     refused = [sample for sample in samples if sample.labels.get("outcome") == _REFUSED]
+    num_samples = _totals(samples, f"{_BATCH_SAMPLES_METRIC}_sum")
+    scoring_s = _totals(samples, *(f"{name}_sum" for name in _SCORING_METRICS))
     return _Metrics(
-        devices=tuple(
-            Device(
-                name,
-                values.get("utilization"),
-                values.get("memory_used_bytes"),
-                values.get("memory_total_bytes"),
-                _work(samples, name),
-            )
-            for name, values in devices.items()
-        ),
+        devices=_devices(samples),
         pending={version: int(count) for version, count in _totals(samples, PENDING_METRIC).items()},
-        batches=_batches(samples),
+        batches={  # of each version that tells of them: not of models that are not ours, or older
+            version: Batches(int(count), int(num_samples[version]), scoring_s[version] * _MS_PER_S)
+            for version, count in _totals(samples, f"{_BATCH_SAMPLES_METRIC}_count").items()
+        },
         refused={version: int(count) for version, count in _totals(refused, _SAMPLES_METRIC).items()},
     )
 
 
-def _short(error: Exception) -> str:
-    return textwrap.shorten(str(error), _REASON_CHARACTERS)
+def _scrape(url: str, timeout_s: float) -> list[Any]:
+    from prometheus_client.parser import text_string_to_metric_families
+
+    with open_url(url, timeout_s) as answer:
+        families = text_string_to_metric_families(answer.read().decode())
+        return [sample for family in families for sample in family.samples]
 
 
 def _totals(samples: list[Any], *names: str) -> dict[_Version, float]:
@@ -368,39 +340,28 @@ def _totals(samples: list[Any], *names: str) -> dict[_Version, float]:
     return totals
 
 
-def _batches(samples: list[Any]) -> dict[_Version, Batches]:
-    """What each version tells of its batches; nothing of models that are not ours, or older."""
-    num_samples = _totals(samples, f"{_BATCH_SAMPLES_METRIC}_sum")
-    scoring_s = _totals(samples, *(f"{name}_sum" for name in _SCORING_METRICS))
-    return {
-        version: Batches(int(count), int(num_samples[version]), scoring_s[version] * _MS_PER_S)
-        for version, count in _totals(samples, f"{_BATCH_SAMPLES_METRIC}_count").items()
-    }
-
-
-def _work(samples: list[Any], device: str) -> dict[str, DeviceWork]:
-    """The work on one device by model.
-
-    Triton names the GPU of a count. A count without a GPU is the processor's.
-    """
-    counts: dict[str, dict[str, float]] = {}
+def _devices(samples: list[Any]) -> tuple[Device, ...]:
+    """The devices by name, and what each model has done there. A count without a GPU is the processor's."""
+    values: dict[str, dict[str, float]] = {}
+    work: dict[str, dict[str, DeviceWork]] = {}
     for sample in samples:
-        if sample.name in (_REQUESTS_METRIC, _COMPUTE_METRIC) and sample.labels.get("gpu_uuid", _PROCESSOR) == device:
-            of_model = counts.setdefault(sample.labels["model"], {_REQUESTS_METRIC: 0, _COMPUTE_METRIC: 0})
-            of_model[sample.name] += sample.value
-    return {
-        model: DeviceWork(int(count[_REQUESTS_METRIC]), count[_COMPUTE_METRIC] / _US_PER_S)
-        for model, count in counts.items()
-    }
-
-
-def _scrape(url: str, timeout_s: float) -> list[Any]:
-    from prometheus_client.parser import text_string_to_metric_families
-
-    with open_url(url, timeout_s) as answer:
-        families = text_string_to_metric_families(answer.read().decode())
-        return [sample for family in families for sample in family.samples]
-
-
-def _is_unsampled(samples: list[Any]) -> bool:
-    return any(sample.name == _SAMPLED_METRIC and not sample.value for sample in samples)
+        match = _DEVICE_METRIC.fullmatch(sample.name)
+        if match:
+            values.setdefault(sample.labels.get("gpu_uuid", match[1].upper()), {})[match[2]] = sample.value
+        if sample.name in (_REQUESTS_METRIC, _COMPUTE_METRIC):
+            models, model = work.setdefault(sample.labels.get("gpu_uuid", _PROCESSOR), {}), sample.labels["model"]
+            done = models.get(model, DeviceWork(0, 0.0))
+            if sample.name == _REQUESTS_METRIC:
+                models[model] = replace(done, requests=done.requests + int(sample.value))
+            else:
+                models[model] = replace(done, compute_s=done.compute_s + sample.value / _US_PER_S)
+    return tuple(
+        Device(
+            name,
+            of_one.get("utilization"),
+            of_one.get("memory_used_bytes"),
+            of_one.get("memory_total_bytes"),
+            work.get(name, {}),
+        )
+        for name, of_one in values.items()
+    )

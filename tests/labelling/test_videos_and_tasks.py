@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Datasets of HDF5 and of videos, and the labels of HDF5 files."""
+"""Folders of videos with a table of tasks, and the tasks that a caller gives for any dataset."""
 
 from __future__ import annotations
 
@@ -7,146 +7,15 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 from pyarrow import parquet
 
-from labelling import LEROBOT, BrightnessScorer, brightness
+from labelling import LEROBOT, BrightnessScorer
 from pictures import numbered, numbers, write_video
 from rfm_client.labelling import DatasetError, LabelOptions, label, open_dataset
-
-LENGTHS = (5, 7, 3)
-TASK = "put the bowl on the stove"
-
-
-def frames_of(index: int, camera: str) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    size = 24 if camera == "agentview_rgb" else 16
-    return np.random.default_rng([index, size]).integers(0, 256, (LENGTHS[index], size, size, 3), np.uint8)
-
-
-@pytest.fixture
-def libero(tmp_path: Path) -> Path:
-    """As LIBERO writes it: the sentence in problem_info, two cameras of two sizes, actions and states."""
-    file = tmp_path / "demos.hdf5"
-    with h5py.File(file, "w") as opened:
-        data = opened.create_group("data")
-        data.attrs["problem_info"] = json.dumps({"language_instruction": TASK})
-        data.attrs["env_args"] = json.dumps({"env_name": "Libero"})
-        for index, length in reversed(list(enumerate(LENGTHS))):
-            demo = data.create_group(f"demo_{index}")
-            demo["actions"] = np.zeros((length, 7))
-            for camera in ("agentview_rgb", "eye_in_hand_rgb"):
-                demo[f"obs/{camera}"] = frames_of(index, camera)
-            demo["obs/gripper_states"] = np.zeros((length, 2))
-    return file
-
-
-def test_an_hdf5_file_gives_its_demonstrations_in_the_order_of_their_numbers(libero: Path) -> None:
-    dataset = open_dataset(libero)
-    assert (dataset.kind, dataset.source, dataset.root) == ("HDF5", "demos.hdf5", libero.parent)
-    assert list(dataset.cameras) == ["agentview_rgb", "eye_in_hand_rgb"]
-    told = [(e.index, e.name, e.task, e.num_frames, e.first_index) for e in dataset.episodes]
-    assert told == [(0, "demo_0", TASK, 5, 0), (1, "demo_1", TASK, 7, 5), (2, "demo_2", TASK, 3, 12)]
-    for episode in dataset.episodes:
-        for camera in dataset.cameras:
-            upright = frames_of(episode.index, camera)[:, ::-1]  # as upstream turns LIBERO's
-            np.testing.assert_array_equal(list(dataset.frames(episode, camera)), upright)
-            assert dataset.check(episode, camera).num_bytes == frames_of(episode.index, camera).nbytes
-
-
-def expected(index: int) -> Any:
-    both = [brightness(frames_of(index, camera)) for camera in ("agentview_rgb", "eye_in_hand_rgb")]
-    return np.mean(both, axis=0)
-
-
-def test_labels_of_an_hdf5_file_go_to_a_file_beside_it(libero: Path) -> None:
-    before = libero.read_bytes()
-    report = label(open_dataset(libero), BrightnessScorer(), LabelOptions())
-    assert report.files == [libero.with_name("demos.rfm_rewards.hdf5")]
-    assert libero.read_bytes() == before
-    with h5py.File(report.files[0]) as opened:
-        assert sorted(opened["data"]) == ["demo_0", "demo_1", "demo_2"]
-        provenance = json.loads(opened["data"].attrs["rfm_provenance"])
-        assert provenance["dataset"]["kind"] == "HDF5"
-        for index in range(3):
-            demo = opened[f"data/demo_{index}"]
-            assert demo["rfm_progress"].dtype == np.float32
-            np.testing.assert_allclose(demo["rfm_progress"], expected(index), atol=1e-6)
-            np.testing.assert_allclose(
-                demo["rfm_progress.agentview_rgb"], brightness(frames_of(index, "agentview_rgb")), atol=1e-6
-            )
-            assert demo["rfm_success"].shape == (LENGTHS[index],)
-    label(open_dataset(libero), BrightnessScorer(), LabelOptions())  # the same again
-    with pytest.raises(DatasetError, match=r"rfm_rewards\.hdf5: .* same recipe, got sampling\.frames: 16 there, 2 now"):
-        label(open_dataset(libero), BrightnessScorer(), LabelOptions(frames=2))
-
-
-def test_labels_go_into_the_hdf5_file_when_asked(libero: Path) -> None:
-    scorer = BrightnessScorer()
-    for _ in range(2):
-        report = label(open_dataset(libero), scorer, LabelOptions(in_place=True, name="mine"))
-        assert report.files == [libero]
-    assert scorer.num_samples == 2 * sum(LENGTHS)
-    with h5py.File(libero) as opened:
-        np.testing.assert_allclose(opened["data/demo_1/mine_progress"], expected(1), atol=1e-6)
-        assert opened["data/demo_1/actions"].shape == (7, 7)
-    assert report.summary is not None
-    np.testing.assert_allclose(report.summary.final_progress, [expected(index)[-1] for index in range(3)], atol=1e-6)
-
-
-def test_an_hdf5_file_may_have_parquet_labels(libero: Path) -> None:
-    report = label(open_dataset(libero), BrightnessScorer(), LabelOptions(formats=("progress",)))
-    table = parquet.read_table(report.files[0])
-    assert table["index"].to_pylist() == list(range(15))
-
-
-def broken(change: Any) -> Any:
-    def apply(file: Path) -> None:
-        with h5py.File(file, "r+") as opened:
-            change(opened["data"])
-
-    return apply
-
-
-def shorten(data: Any) -> None:
-    del data["demo_1/actions"]
-    data["demo_1/actions"] = np.zeros((6, 7))
-
-
-BROKEN: dict[str, tuple[Any, str]] = {
-    "lengths that differ": (
-        broken(shorten),
-        r"data/demo_1: expected one length, above 0, got obs/agentview_rgb 7, .*actions 6",
-    ),
-    "a camera that is missing": (
-        broken(lambda data: data["demo_2/obs"].pop("eye_in_hand_rgb")),
-        r"cameras: expected some of agentview_rgb, got 'eye_in_hand_rgb', which is left out: missing in demo_2",
-    ),
-    "no task": (
-        broken(lambda data: data.attrs.__delitem__("problem_info")),
-        r"problem_info or env_args: expected a task as a sentence, got none",
-    ),
-    "no demonstration": (
-        broken(lambda data: [data.pop(name) for name in list(data)]),
-        r"data: expected demo_0, demo_1 and so on, got none",
-    ),
-    "a truncated file": (
-        lambda file: file.write_bytes(file.read_bytes()[:3000]),
-        r"demos\.hdf5: expected an HDF5 file, got ",
-    ),
-}
-
-
-@pytest.mark.parametrize(("break_it", "message"), BROKEN.values(), ids=BROKEN)
-def test_an_hdf5_file_that_contradicts_itself_is_refused(libero: Path, break_it: Any, message: str) -> None:
-    break_it(libero)
-    scorer = BrightnessScorer()
-    with pytest.raises(DatasetError, match=message):
-        label(open_dataset(libero), scorer, LabelOptions(cameras=("agentview_rgb", "eye_in_hand_rgb")))
-    assert scorer.num_samples == 0
 
 
 @pytest.fixture
@@ -165,12 +34,10 @@ def videos(tmp_path: Path) -> Path:
         ("tasks.json", '{"b.mp4": "stack the cups", "day/a.mp4": "open the box"}'),
     ],
 )
-@pytest.mark.parametrize("by_table", [True, False])
-def test_a_folder_of_videos_is_read_in_the_order_of_its_table(
-    videos: Path, name: str, text: str, by_table: bool, output: Path
-) -> None:
+def test_a_folder_of_videos_is_read_in_the_order_of_its_table(videos: Path, name: str, text: str, output: Path) -> None:
     (videos / name).write_text(text)
-    dataset = open_dataset(videos / name if by_table else videos)
+    dataset = open_dataset(videos)
+    assert open_dataset(videos / name).episodes == dataset.episodes
     assert [(e.name, e.task, e.num_frames, e.first_index) for e in dataset.episodes] == [
         ("b.mp4", "stack the cups", 6, 0),
         ("day/a.mp4", "open the box", 4, 6),
@@ -186,7 +53,6 @@ def test_a_folder_of_videos_is_read_in_the_order_of_its_table(
     ("name", "text"),
     [
         ("tasks.csv", '\ufeffvideo,task\r\nb.mp4,"put the block in the bowl, then close the lid"\r\n'),
-        ("tasks.json", '\ufeff{"b.mp4": "put the block in the bowl, then close the lid"}'),
         ("tasks.csv", 'video,task\nb.mp4," put the block in the bowl, then close the lid "\n'),
         ("tasks.json", '{"b.mp4": "put the block in the bowl, then close the lid\\n"}'),
     ],

@@ -10,15 +10,15 @@ from copy import copy
 from functools import partial
 from typing import Any, TypeAlias, TypeVar
 
-from rfm_client.batching import groups, model_of, padded_bytes, parts
-from rfm_client.call import Call, new_request_ids
 from rfm_client.contract import wire
-from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, RewardError
+from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, ModelNotFoundError, RewardError
+from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.names import encoder_name
 from rfm_client.contract.results import Result
 from rfm_client.contract.samples import Sample, Trajectory
 from rfm_client.data.fitting import FittedSample, fitted, whole, with_frame_indices
-from rfm_client.model_infos import ModelInfos
+from rfm_client.scoring.batching import groups, model_of, padded_bytes, parts
+from rfm_client.scoring.call import Call
 from rfm_client.transport.calls import Answer
 from rfm_client.transport.deadline import Deadline
 from rfm_client.transport.in_flight import InFlight
@@ -31,7 +31,7 @@ Outcome: TypeAlias = Result | RewardError
 _EMBEDDINGS = (wire.VIDEO_EMBEDDINGS, wire.TEXT_EMBEDDING)
 
 
-class Scorer:
+class SampleScorer:
     """Scores samples on the servers of one client, for one event loop.
 
     model: name of the model that scores embeddings
@@ -41,7 +41,7 @@ class Scorer:
         self._model = model
         self._servers = servers
         self._in_flight = in_flight
-        self.model_infos = ModelInfos(servers)
+        self._infos: dict[str, ModelInfo] = {}  # until another version of the model answers
 
     async def result(self, sample: Sample, call: Call) -> Result:
         """The result of one sample. Raises RewardError."""
@@ -67,14 +67,24 @@ class Scorer:
             outcomes[index] = outcome if isinstance(outcome, RewardError) else with_frame_indices(outcome, indices)
         return [outcomes[index] for index in range(len(samples))]
 
-    async def embeddings(self, trajectory: Trajectory, deadline: Deadline, request_id: str | None) -> Trajectory:
+    async def embeddings(self, trajectory: Trajectory, call: Call) -> Trajectory:
         """The trajectory with embeddings in place of its frames. Raises RewardError."""
         if trajectory.frames is None:
             raise InvalidSampleError.at("trajectory", "frames", "video_embeddings")
         tensors, model = partial(wire.encode_frames, trajectory), encoder_name(self._model)
-        size, name = trajectory.frames.nbytes, next(new_request_ids(request_id))
-        answer = await self.infer(model, size, tensors, _EMBEDDINGS, deadline, name)
+        size, request_id = trajectory.frames.nbytes, next(call.request_ids)
+        answer = await self.infer(model, size, tensors, _EMBEDDINGS, call.deadline, request_id)
         return wire.decode_embeddings(answer.tensors, trajectory)
+
+    async def model_info(self, model: str, deadline: Deadline, *, refresh: bool = False) -> ModelInfo:
+        """What the server says of ``model``, requested once unless ``refresh``. Raises RewardError."""
+        if refresh or model not in self._infos:
+            try:
+                self._infos[model] = await self._servers.model_info(model, deadline)
+            except ModelNotFoundError:
+                self._infos.pop(model, None)
+                raise
+        return self._infos[model]
 
     async def _fitted(self, sample: Sample, call: Call) -> FittedSample:
         """The sample as it is sent. Raises RewardError."""
@@ -82,7 +92,7 @@ class Scorer:
         if not (call.subsample or call.resize):
             return fit
         call.deadline.remaining_s()
-        info = await self.model_infos.get(model_of(sample, self._model), call.deadline)
+        info = await self.model_info(model_of(sample, self._model), call.deadline)
         # in a thread: resizing takes a while, and other calls wait for this event loop
         return await asyncio.to_thread(fitted, sample, info, subsample=call.subsample, resize=call.resize)
 
@@ -93,7 +103,7 @@ class Scorer:
         if len(group) == 1:
             return zip(group, await self._request(model, [samples[group[0]]], call), strict=True)
         try:
-            limit = (await self.model_infos.get(model, call.deadline)).max_batch_size
+            limit = (await self.model_info(model, call.deadline)).max_batch_size
         except RewardError as error:
             return zip(group, for_each(error, len(group)), strict=True)
         requests = [[samples[index] for index in part] for part in parts(samples, group, limit)]
@@ -133,7 +143,9 @@ class Scorer:
         async with self._in_flight.room(num_bytes, deadline):  # tensors are made in turn, so they do not pile up
             inputs = await off_loop(num_bytes, tensors)
             answer = await self._servers.infer(model, inputs, outputs, deadline, request_id=request_id)
-        self.model_infos.note_answer(model, answer.model_version)
+        known = self._infos.get(model)
+        if known is not None and known.versions and answer.model_version not in known.versions:
+            del self._infos[model]
         return answer
 
 

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: MIT
+"""Results as tensors, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.contract.errors import InferenceFailedError
+from rfm_client.contract.results import (
+    BatchTiming,
+    FrameScores,
+    PreferenceResult,
+    ProgressResult,
+    Result,
+    SimilarityResult,
+)
+from rfm_client.contract.samples import Float32Array, PreferenceSample, ProgressSample, Sample, SimilaritySample
+from rfm_client.contract.wire.specs import (
+    PREFERENCE,
+    PROGRESS,
+    PROGRESS_LOGITS,
+    SIMILARITY,
+    SUCCESS,
+    TIMING_MS,
+    Tensors,
+    pad_stack,
+)
+
+_OF_FRAMES = (PROGRESS, SUCCESS, PROGRESS_LOGITS)  # outputs [B, P, ...], named as the fields of FrameScores
+_OF_SAMPLES = (PREFERENCE, SIMILARITY)  # outputs [B, 1], named as the fields of results
+
+
+def outputs_for(samples: Sequence[Sample]) -> tuple[str, ...]:
+    """The scores that these samples ask for. The others would be NaN, and cost their way from the server."""
+    kinds = set(map(type, samples))
+    asked_by = {PREFERENCE: PreferenceSample, SIMILARITY: SimilaritySample}
+    return (PROGRESS, SUCCESS, *(name for name, kind in asked_by.items() if kind in kinds))
+
+
+def encode_results(results: Sequence[Result], num_positions: int, outputs: Collection[str]) -> Tensors:
+    """The requested outputs of one request of ``num_positions`` = P; what a result lacks is NaN, never 0."""
+    return {name: _encoded(name, results, num_positions) for name in outputs}
+
+
+def decode_results(
+    tensors: Mapping[str, npt.NDArray[Any]], samples: Sequence[Sample], model_version: str | None = None
+) -> list[Result]:
+    """The results of the samples of one request, which ``model_version`` answered.
+
+    Raises InferenceFailedError for an answer that lacks a score: a missing reward is no reward of 0 or NaN. Success
+    alone may be NaN, at all frames: then the checkpoint does not predict it.
+    """
+    return [_decode_result(tensors, row, sample, model_version) for row, sample in enumerate(samples)]
+
+
+def decode_progress(
+    tensors: Mapping[str, npt.NDArray[Any]], row: int, num_frames: int, model_version: str | None = None
+) -> ProgressResult:
+    """The result of one sample of type progress, whose trajectory has ``num_frames``. Raises InferenceFailedError."""
+    scores = _scores_between(tensors, row, slice(0, num_frames))
+    return ProgressResult(
+        progress=scores.progress,
+        success=scores.success,
+        progress_logits=scores.progress_logits,
+        timing=_timing(tensors, row),
+        model_version=model_version,
+    )
+
+
+def _encoded(name: str, results: Sequence[Result], num_positions: int) -> Float32Array:
+    if name in _OF_FRAMES:
+        rows = [[getattr(scores, name) for scores in _frame_scores(result)] for result in results]
+        return pad_stack(rows, num_positions, fill=np.nan)
+    if name in _OF_SAMPLES:
+        return np.array([[getattr(result, name, np.nan)] for result in results], np.float32)
+    if name == TIMING_MS:
+        timings = [result.timing or BatchTiming(np.nan, np.nan) for result in results]
+        return np.array([[timing.collate_ms, timing.forward_ms] for timing in timings], np.float32)
+    raise KeyError(name)
+
+
+def _frame_scores(result: Result) -> tuple[FrameScores, ...]:
+    if isinstance(result, ProgressResult):
+        return (result,)
+    if isinstance(result, PreferenceResult):
+        return (result.first, result.second)
+    return (result.reference, result.other)
+
+
+def _decode_result(
+    tensors: Mapping[str, npt.NDArray[Any]], row: int, sample: Sample, model_version: str | None
+) -> Result:
+    num_first, *num_second = (trajectory.num_frames for trajectory in sample.trajectories)
+    if isinstance(sample, ProgressSample):
+        return decode_progress(tensors, row, num_first, model_version)
+    first = _scores_between(tensors, row, slice(0, num_first))
+    second = _scores_between(tensors, row, slice(num_first, num_first + sum(num_second)))
+    of_request: dict[str, Any] = {"timing": _timing(tensors, row), "model_version": model_version}
+    if isinstance(sample, PreferenceSample):
+        preference = float(_present(tensors, PREFERENCE, row, slice(0, 1))[0])
+        return PreferenceResult(preference=preference, first=first, second=second, **of_request)
+    similarity = float(_present(tensors, SIMILARITY, row, slice(0, 1))[0])
+    return SimilarityResult(similarity=similarity, reference=first, other=second, **of_request)
+
+
+def _timing(tensors: Mapping[str, npt.NDArray[Any]], row: int) -> BatchTiming | None:
+    return BatchTiming(*tensors[TIMING_MS][row].tolist()) if TIMING_MS in tensors else None
+
+
+def _scores_between(tensors: Mapping[str, npt.NDArray[Any]], row: int, positions: slice) -> FrameScores:
+    logits = _present(tensors, PROGRESS_LOGITS, row, positions) if PROGRESS_LOGITS in tensors else None
+    return FrameScores(
+        progress=_present(tensors, PROGRESS, row, positions),
+        success=_present(tensors, SUCCESS, row, positions, may_lack=True),
+        progress_logits=logits,
+    )
+
+
+def _present(
+    tensors: Mapping[str, npt.NDArray[Any]], name: str, row: int, positions: slice, *, may_lack: bool = False
+) -> Float32Array:
+    """One row's scores at some positions. Raises InferenceFailedError unless all are there and finite.
+
+    may_lack: they may also be NaN throughout, of a checkpoint that does not predict them
+    """
+    scores, count = tensors[name], positions.stop - positions.start
+    if scores.ndim < 2 or row >= len(scores):
+        raise InferenceFailedError(f"{name}: expected scores of sample {row}, got an array {list(scores.shape)}")
+    part: Float32Array = scores[row, positions]
+    is_good = np.isfinite(part).all() or (may_lack and np.isnan(part).all())
+    if len(part) != count or not is_good:
+        raise InferenceFailedError(f"{name}: expected {count} finite scores, got {part.tolist()}")
+    return part

@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: MIT
+"""Samples as tensors, and back: requests to a reward model and to an encoder, and the encoder's answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, TypeAlias, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError
+from rfm_client.contract.named_frames import (
+    DIGEST_BYTES,
+    NamedFootage,
+    NamedProgressSample,
+    NamedTrajectory,
+    frame_digest,
+)
+from rfm_client.contract.samples import (
+    Footage,
+    PreferenceSample,
+    ProgressSample,
+    Sample,
+    SimilaritySample,
+    Trajectory,
+    UInt8Array,
+    stackable,
+)
+from rfm_client.contract.wire.specs import (
+    FRAME_DIGESTS,
+    FRAME_STEPS,
+    FRAMES,
+    NUM_FRAMES,
+    SAMPLE_TYPE,
+    SECOND_FRAMES,
+    TASK,
+    TEXT_EMBEDDING,
+    VIDEO_EMBEDDINGS,
+    SampleType,
+    Tensors,
+    encoder_inputs,
+    pad_stack,
+)
+
+Decoded = TypeVar("Decoded")
+Row: TypeAlias = dict[str, npt.NDArray[Any]]  # of the tensors of one request: those of one sample
+
+_SAMPLE_TYPES = {
+    ProgressSample: SampleType.PROGRESS,
+    PreferenceSample: SampleType.PREFERENCE,
+    SimilaritySample: SampleType.SIMILARITY,
+}
+
+
+def encode_samples(samples: Sequence[Sample]) -> Tensors:
+    """One request for samples whose positions have the same shape beyond the time axis, trajectory by trajectory."""
+    tensors: Tensors = {
+        SAMPLE_TYPE: np.array([[_SAMPLE_TYPES[type(sample)]] for sample in samples], np.uint8),
+        NUM_FRAMES: np.array([_lengths(sample) for sample in samples], np.int32),
+        FRAME_STEPS: np.array([[getattr(sample, "frame_steps", 0)] for sample in samples], np.int32),
+    }
+    texts = [sample.trajectories[0] for sample in samples]
+    has_frames = texts[0].frames is not None
+    arrays = zip(*(stackable(sample.trajectories) for sample in samples), strict=True)
+    for name, rows in zip((FRAMES, SECOND_FRAMES) if has_frames else (VIDEO_EMBEDDINGS,), arrays, strict=False):
+        tensors[name] = pad_stack([[trajectory.positions for trajectory in row] for row in rows])
+    if has_frames:
+        tensors[TASK] = np.array([[text.task.encode()] for text in texts], np.object_)
+    else:
+        embeddings = [text.text_embedding for text in texts if text.text_embedding is not None]
+        tensors[TEXT_EMBEDDING] = embeddings[0][np.newaxis] if len(embeddings) == 1 else np.stack(embeddings)
+    return tensors
+
+
+def decode_samples(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Sample | NamedProgressSample]:
+    """The samples of one request. Raises InvalidSampleError that names the sample and the field."""
+    return _decode_rows(tensors, _decode_sample)
+
+
+def encode_frames(trajectory: Trajectory) -> Tensors:
+    """One request to the encoder, for one trajectory of raw frames."""
+    tensors = encode_samples([ProgressSample(trajectory)])
+    return {spec.name: tensors[spec.name] for spec in encoder_inputs() if spec.name in tensors}
+
+
+def decode_embeddings(tensors: Mapping[str, npt.NDArray[Any]], trajectory: Trajectory) -> Trajectory:
+    """The encoder's answer for one trajectory. Raises InferenceFailedError if it lacks an embedding."""
+    count, video, text = trajectory.num_frames, tensors[VIDEO_EMBEDDINGS], tensors[TEXT_EMBEDDING]
+    if video.ndim != 3 or text.ndim != 2 or video.shape[:2] != (1, count) or len(text) != 1:
+        raise InferenceFailedError(f"embeddings: expected [1, {count}, D] and [1, Dt], got {video.shape}, {text.shape}")
+    try:
+        return Trajectory(video_embeddings=video[0], text_embedding=text[0], task=trajectory.task)
+    except InvalidSampleError as error:
+        raise InferenceFailedError(f"embeddings: {error}") from error
+
+
+def decode_trajectories(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Footage | NamedFootage]:
+    """What the encoder is to encode: of each sample the frames of its trajectories, without padding, and its task."""
+    return _decode_rows(tensors, _decode_footage)
+
+
+def encode_named(trajectories: Sequence[NamedTrajectory], sent: Sequence[UInt8Array]) -> Tensors:
+    """One request for the progress of each trajectory, whose frames have the digests.
+
+    sent: uint8 [H, W, 3] of one size, the frames that the model may not know; none: it knows all
+    """
+    count = len(trajectories)
+    num_rows = -(-len(sent) // count)
+    shape = sent[0].shape if sent else (1, 1, 3)  # an input is never empty
+    frames = np.zeros((count, max(num_rows, 1), *shape), np.uint8)
+    for index, frame in enumerate(sent):
+        frames[index % count, index // count] = frame
+    digests = [[np.frombuffer(b"".join(named.digests), np.uint8).reshape(-1, DIGEST_BYTES)] for named in trajectories]
+    return {
+        SAMPLE_TYPE: np.full((count, 1), SampleType.PROGRESS, np.uint8),
+        NUM_FRAMES: np.array([[named.num_frames, 0] for named in trajectories], np.int32),
+        FRAME_STEPS: np.zeros((count, 1), np.int32),
+        FRAMES: frames,
+        FRAME_DIGESTS: pad_stack(digests),
+        TASK: np.array([[named.task.encode()] for named in trajectories], np.object_),
+    }
+
+
+def encode_trajectories(encoded: Sequence[Footage], num_positions: int, outputs: Collection[str]) -> Tensors:
+    """The requested outputs of the encoder for one request of ``num_positions`` = P, padded with zeros."""
+    rows = [[trajectory.positions for trajectory in footage.trajectories] for footage in encoded]
+    texts = [footage.trajectories[0].text_embedding for footage in encoded]
+    embeddings = {
+        VIDEO_EMBEDDINGS: pad_stack(rows, num_positions),
+        TEXT_EMBEDDING: np.stack([text for text in texts if text is not None]),
+    }
+    return {name: embeddings[name] for name in outputs}
+
+
+def _lengths(sample: Sample) -> tuple[int, int]:
+    first, *second = (trajectory.num_frames for trajectory in sample.trajectories)
+    return first, sum(second)
+
+
+def _decode_rows(
+    tensors: Mapping[str, npt.NDArray[Any]], decode: Callable[[Row, dict[bytes, UInt8Array]], Decoded]
+) -> list[Decoded]:
+    """What ``decode`` makes of each sample, and of the pixels that came, by the digests that it computes of them."""
+    pixels = {}
+    if FRAME_DIGESTS in tensors:
+        if SECOND_FRAMES in tensors:
+            raise InvalidSampleError.at(FRAME_DIGESTS, f"none with {SECOND_FRAMES}", "both")
+        pixels = {frame_digest(frame): frame for frames in tensors[FRAMES] for frame in frames}
+    count = len(tensors[NUM_FRAMES])
+    decoded = []
+    for index in range(count):
+        try:
+            decoded.append(decode({name: array[index] for name, array in tensors.items()}, pixels))
+        except InvalidSampleError as error:
+            if count == 1:
+                raise
+            raise error.inside(f"samples[{index}]") from None
+    return decoded
+
+
+def _decode_sample(row: Row, pixels: dict[bytes, UInt8Array]) -> Sample | NamedProgressSample:
+    sample_type, frame_steps = int(row[SAMPLE_TYPE][0]), int(row[FRAME_STEPS][0])
+    lengths = row[NUM_FRAMES].tolist()
+    if sample_type not in list(SampleType):
+        known = ", ".join(f"{t.value} ({t.name.lower()})" for t in SampleType)
+        raise InvalidSampleError.at(SAMPLE_TYPE, f"one of {known}", str(sample_type))
+    if sample_type == SampleType.PROGRESS:
+        if lengths[0] < 1 or lengths[1] != 0:
+            raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, 0] for progress", str(lengths))
+        positions, _ = _positions(row, lengths)
+        if FRAME_DIGESTS in row:
+            return NamedProgressSample(_named(row, positions, pixels), frame_steps)
+        return ProgressSample(_trajectory(row, positions), frame_steps)
+    if FRAME_DIGESTS in row:
+        raise InvalidSampleError.at(SAMPLE_TYPE, f"progress with {FRAME_DIGESTS}", SampleType(sample_type).name.lower())
+    if min(lengths) < 1:
+        raise InvalidSampleError.at(NUM_FRAMES, "at least one frame of each of the two trajectories", str(lengths))
+    if frame_steps != 0:
+        raise InvalidSampleError.at(FRAME_STEPS, "0 unless the sample is of type progress", str(frame_steps))
+    first, second = (_trajectory(row, array) for array in _positions(row, lengths))
+    return (PreferenceSample if sample_type == SampleType.PREFERENCE else SimilaritySample)(first, second)
+
+
+def _decode_footage(row: Row, pixels: dict[bytes, UInt8Array]) -> Footage | NamedFootage:
+    lengths = row[NUM_FRAMES].tolist()
+    if lengths[0] < 1 or lengths[1] < 0:
+        raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, at least 0]", str(lengths))
+    arrays = [array for array in _positions(row, lengths) if len(array)]
+    if FRAME_DIGESTS in row:
+        return NamedFootage(tuple(_named(row, array, pixels) for array in arrays))
+    return Footage(tuple(_trajectory(row, array) for array in arrays))
+
+
+def _trajectory(row: Row, positions: npt.NDArray[Any]) -> Trajectory:
+    if FRAMES in row:
+        return Trajectory(frames=positions, task=_task(row))
+    return Trajectory(video_embeddings=positions, text_embedding=row[TEXT_EMBEDDING])
+
+
+def _named(row: Row, digests: npt.NDArray[Any], pixels: dict[bytes, UInt8Array]) -> NamedTrajectory:
+    return NamedTrajectory(tuple(map(bytes, digests)), pixels, _task(row))
+
+
+def _positions(row: Row, lengths: Sequence[int]) -> list[npt.NDArray[Any]]:
+    """The frame positions of the first and the second trajectory of one sample, without padding.
+
+    Both are in one array or, if there are second frames, each is in its own.
+    """
+    if SECOND_FRAMES in row:
+        return [_unpadded(row, name, length) for name, length in zip((FRAMES, SECOND_FRAMES), lengths, strict=True)]
+    name = next(name for name in (FRAME_DIGESTS, FRAMES, VIDEO_EMBEDDINGS) if name in row)
+    both = _unpadded(row, name, sum(lengths))
+    return [both[: lengths[0]], both[lengths[0] :]]
+
+
+def _unpadded(row: Row, name: str, total: int) -> npt.NDArray[Any]:
+    """Positions up to ``total``; what lies behind must be padding, or num_frames is wrong."""
+    positions = row[name]
+    if total > len(positions):
+        raise InvalidSampleError.at(NUM_FRAMES, f"at most the {len(positions)} frames in {name}", str(total))
+    if total < len(positions) and positions[total:].any():
+        raise InvalidSampleError.at(name, f"zeros behind the {total} frames that num_frames tells", "other values")
+    return positions[:total]
+
+
+def _task(row: Row) -> str:
+    raw = row[TASK][0]
+    try:
+        return raw.decode() if isinstance(raw, bytes) else str(raw)
+    except UnicodeDecodeError:
+        raise InvalidSampleError.at(TASK, "UTF-8 text", "other bytes") from None

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: MIT
+"""Names, types and dimensions of the tensors. The only place where they stand; letters as in the package."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.contract.named_frames import DIGEST_BYTES
+
+Tensors: TypeAlias = dict[str, npt.NDArray[Any]]
+
+SAMPLE_TYPE = "sample_type"
+NUM_FRAMES = "num_frames"
+FRAME_STEPS = "frame_steps"
+VIDEO_EMBEDDINGS = "video_embeddings"
+TEXT_EMBEDDING = "text_embedding"
+FRAMES = "frames"
+SECOND_FRAMES = "second_frames"
+FRAME_DIGESTS = "frame_digests"
+TASK = "task"
+
+PROGRESS = "progress"
+SUCCESS = "success"
+PREFERENCE = "preference"
+SIMILARITY = "similarity"
+PROGRESS_LOGITS = "progress_logits"
+TIMING_MS = "timing_ms"
+
+REQUEST_ID = re.compile(r"[\w.:/+=@-]{1,64}", re.ASCII)  # what a request's id may be
+
+UNKNOWN_FRAMES = "digests of frames that this model knows or has been sent"  # what is told of others
+
+VARIABLE = -1  # a dimension that differs from request to request
+
+
+class SampleType(IntEnum):
+    """Values of the ``sample_type`` input."""
+
+    PROGRESS = 0
+    PREFERENCE = 1
+    SIMILARITY = 2
+
+
+@dataclass(frozen=True)
+class TensorSpec:
+    """Name, element type and dimensions (without the batch axis) of one input or output.
+
+    ragged: requests in which the variable dimensions differ may still share a batch.
+    optional: a request may leave it out; those with it and those without share no batch.
+    """
+
+    name: str
+    datatype: Literal["UINT8", "INT32", "FP32", "BYTES"]
+    dims: tuple[int, ...]
+    ragged: bool = False
+    optional: bool = False
+
+
+_NUM_FRAMES_SPEC = TensorSpec(NUM_FRAMES, "INT32", (2,))
+_QUESTION_SPECS = (TensorSpec(SAMPLE_TYPE, "UINT8", (1,)), _NUM_FRAMES_SPEC, TensorSpec(FRAME_STEPS, "INT32", (1,)))
+_FRAMES_SPECS = (
+    TensorSpec(FRAMES, "UINT8", (VARIABLE, VARIABLE, VARIABLE, 3), ragged=True),
+    TensorSpec(SECOND_FRAMES, "UINT8", (VARIABLE, VARIABLE, VARIABLE, 3), ragged=True, optional=True),
+    TensorSpec(TASK, "BYTES", (1,)),
+)
+_DIGESTS_SPEC = TensorSpec(FRAME_DIGESTS, "UINT8", (VARIABLE, DIGEST_BYTES), ragged=True, optional=True)
+
+
+def embedding_inputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
+    """Inputs of a model that scores embeddings of widths D = video_dim and Dt = text_dim."""
+    video = TensorSpec(VIDEO_EMBEDDINGS, "FP32", (VARIABLE, video_dim), ragged=True)
+    return (*_QUESTION_SPECS, video, TensorSpec(TEXT_EMBEDDING, "FP32", (text_dim,)))
+
+
+def frame_inputs(*, by_digest: bool = False) -> tuple[TensorSpec, ...]:
+    """Inputs of a model that scores raw frames. ``by_digest``: of one that takes the digests of those it knows."""
+    return (*_QUESTION_SPECS, *_FRAMES_SPECS, *([_DIGESTS_SPEC] if by_digest else []))
+
+
+def encoder_inputs(*, by_digest: bool = False) -> tuple[TensorSpec, ...]:
+    """Inputs of the encoder; num_frames keeps it from encoding padding. ``by_digest``: as of ``frame_inputs``."""
+    return (_NUM_FRAMES_SPEC, *_FRAMES_SPECS, *([_DIGESTS_SPEC] if by_digest else []))
+
+
+def encoder_outputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
+    """Outputs of the encoder: what ``embedding_inputs`` takes in place of frames and task."""
+    return tuple(
+        TensorSpec(spec.name, spec.datatype, spec.dims)
+        for spec in embedding_inputs(video_dim, text_dim)
+        if spec.name in (VIDEO_EMBEDDINGS, TEXT_EMBEDDING)
+    )
+
+
+def score_outputs(progress_bins: int | None) -> tuple[TensorSpec, ...]:
+    """Outputs of every reward model; progress_bins is K of a discrete checkpoint, None of a continuous one."""
+    scores = (
+        TensorSpec(PROGRESS, "FP32", (VARIABLE,)),
+        TensorSpec(SUCCESS, "FP32", (VARIABLE,)),
+        TensorSpec(PREFERENCE, "FP32", (1,)),
+        TensorSpec(SIMILARITY, "FP32", (1,)),
+        TensorSpec(TIMING_MS, "FP32", (2,)),
+    )
+    if progress_bins is None:
+        return scores
+    return (*scores, TensorSpec(PROGRESS_LOGITS, "FP32", (VARIABLE, progress_bins)))
+
+
+def num_positions(inputs: Mapping[str, npt.NDArray[Any]]) -> int:
+    """P, the frame positions of one request: its widths of the time axis, added up."""
+    if FRAME_DIGESTS in inputs:
+        return int(inputs[FRAME_DIGESTS].shape[1])
+    return sum(int(inputs[name].shape[1]) for name in (FRAMES, SECOND_FRAMES, VIDEO_EMBEDDINGS) if name in inputs)
+
+
+def pad_stack(
+    rows: Sequence[Sequence[npt.NDArray[Any]]], length: int | None = None, *, fill: float = 0
+) -> npt.NDArray[Any]:
+    """[B, length, ...] from B rows of arrays [P, ...] of one dtype, which lie one after the other.
+
+    length: the longest row's unless given
+    """
+    if length is None:
+        length = max(sum(map(len, parts)) for parts in rows)
+    first = rows[0][0]
+    if len(rows) == 1 and sum(map(len, rows[0])) == length:  # a single sample: no padding, and of one array no copy
+        return (first if len(rows[0]) == 1 else np.concatenate(rows[0]))[np.newaxis]
+    shape = len(rows), length, *first.shape[1:]
+    padded = np.full(shape, fill, first.dtype) if fill else np.zeros(shape, first.dtype)
+    for row, parts in zip(padded, rows, strict=True):
+        start = 0
+        for part in parts:
+            row[start : start + len(part)] = part
+            start += len(part)
+    return padded

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: MIT
+"""What results say: votes over success, rewards, verdicts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rfm_client import FrameScores, InferenceFailedError, PreferenceResult
+
+VOTES: dict[str, tuple[list[float], int, float, bool]] = {
+    "the last frame": ([0.1, 0.9], 1, 0.5, True),
+    "reaching is enough": ([0.5], 1, 0.5, True),
+    "two of three": ([0.9, 0.2, 0.9], 3, 0.5, True),
+    "half is no majority": ([0.9, 0.2], 2, 0.5, False),
+    "fewer frames than asked": ([0.9], 5, 0.5, True),
+    "a higher threshold": ([0.9], 1, 0.95, False),
+    "only the last count": ([0.9, 0.9, 0.1], 1, 0.5, False),
+}
+
+
+@pytest.mark.parametrize(("success", "last", "threshold", "expected"), VOTES.values(), ids=VOTES)
+def test_success_is_voted_over_the_last_frames(
+    success: list[float], last: int, threshold: float, expected: bool
+) -> None:
+    scores = FrameScores(progress=np.zeros(1, np.float32), success=np.array(success, np.float32))
+    assert scores.succeeded(last=last, threshold=threshold) is expected
+
+
+def test_progress_becomes_a_reward() -> None:
+    progress = np.array([0.25, 0.5, 0.375], np.float32)
+    scores = FrameScores(progress=progress, success=progress)
+    assert scores.last_progress == 0.375
+    np.testing.assert_array_equal(scores.progress_deltas, np.array([0, 0.25, -0.125], np.float32))
+
+
+@pytest.mark.parametrize("name", ["last_progress", "progress_deltas", "succeeded"])
+def test_what_a_checkpoint_does_not_predict_becomes_no_number(name: str) -> None:
+    nothing = np.full(2, np.nan, np.float32)
+    scores = FrameScores(progress=nothing, success=nothing)
+    with pytest.raises(ValueError, match="got NaN: this checkpoint does not predict it"):
+        getattr(scores, name)() if name == "succeeded" else getattr(scores, name)
+
+
+VERDICTS: dict[str, tuple[float, float | None, float, bool | None, str | None]] = {
+    "first, asked once": (0.9, None, 0.9, None, "first"),
+    "second, asked once": (0.1, None, 0.1, None, "second"),
+    "even, asked once": (0.5, None, 0.5, None, None),
+    "first": (0.75, 0.25, 0.75, True, "first"),
+    "second": (0.25, 0.875, 0.1875, True, "second"),
+    "disagree": (0.75, 0.75, 0.5, False, None),
+    "disagree, though the mean is high": (1.0, 0.625, 0.6875, False, None),
+    "one is even": (0.75, 0.5, 0.625, False, None),
+    "both are even": (0.5, 0.5, 0.5, True, None),
+}
+
+
+def preferred(preference: float, version: str = "1") -> PreferenceResult:
+    scores = FrameScores(progress=np.zeros(2, np.float32), success=np.zeros(2, np.float32))
+    return PreferenceResult(preference=preference, first=scores, second=scores, model_version=version)
+
+
+@pytest.mark.parametrize(("asked", "swapped", "mean", "agree", "verdict"), VERDICTS.values(), ids=VERDICTS)
+def test_there_is_a_verdict_where_the_orders_agree(
+    asked: float, swapped: float | None, mean: float, agree: bool | None, verdict: str | None
+) -> None:
+    result = preferred(asked)
+    if swapped is not None:
+        result = PreferenceResult.of_both_orders(result, preferred(swapped))
+        assert result.both_orders == (asked, 1 - swapped)
+    assert (result.preference, result.orders_agree, result.verdict) == (mean, agree, verdict)
+
+
+def test_orders_that_two_versions_answered_are_an_error() -> None:
+    with pytest.raises(InferenceFailedError, match=r"^model_version: expected one for both orders, got 1, 2: ask"):
+        PreferenceResult.of_both_orders(preferred(0.5), preferred(0.5, "2"))
