@@ -10,7 +10,7 @@ import ipaddress
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias
 
 from rfm.parameters import DEFAULT_HANG_S
 from rfm_client.contract.addresses import MAX_PORT, is_loopback
@@ -27,7 +27,8 @@ DEFAULT_FEATURE_CACHE_MB = 256  # 80,000 embeddings of 768 numbers; of a 4B Qwen
 MAX_OF_A_MACHINE = 4096  # GPUs, instances, threads
 MAX_INT32 = 2**31 - 1
 MAX_NAME = 100  # characters; it becomes the name of a folder
-_DTYPES = ("float32", "bfloat16", "float16")
+Dtype: TypeAlias = Literal["float32", "bfloat16", "float16"]
+
 _COUNT = {"least": 1, "most": MAX_INT32}
 _PORT = {"least": 1, "most": MAX_PORT}
 _OF_A_MACHINE = {"most": MAX_OF_A_MACHINE}
@@ -36,6 +37,8 @@ _OF_A_MACHINE = {"most": MAX_OF_A_MACHINE}
 @dataclass(frozen=True)
 class ExportConfig(Settings):
     """What ``rfm export`` writes into a repository. To change it, export again."""
+
+    TITLE: ClassVar[str] = "Export (section export of the file)"
 
     checkpoint: str | None = setting(None, "Folder, or Hugging Face id org/name[/subfolder][@tag].")
     name: str = setting(DEFAULT_MODEL, "Model name in the repository; raw frames are scored by NAME_frames.")
@@ -58,9 +61,7 @@ class ExportConfig(Settings):
     max_sample_tokens: int = setting(
         DEFAULT_SAMPLE_TOKENS, "Most tokens of one sample, in dense mode of one frame's; it bounds memory.", **_COUNT
     )
-    dtype: str | None = setting(
-        None, "float32, bfloat16 or float16 of the network; else as checkpoint and device decide.", one_of=_DTYPES
-    )
+    dtype: Dtype | None = setting(None, "Number type of the network; else as checkpoint and device decide.")
     image_encoder: str | None = setting(None, "Folder or id of ReWiND's image encoder.")
     text_encoder: str | None = setting(None, "Folder or id of ReWiND's text encoder.")
     base_model: str | None = setting(
@@ -103,6 +104,8 @@ class ServeConfig(Settings):
 
     ``host`` may be written as a URL, as in the FastAPI server's file; it is the address alone here.
     """
+
+    TITLE: ClassVar[str] = "Triton and its watch (section serve of the file)"
 
     host: str = setting(DEFAULT_HOST, "IP address to listen on, 0.0.0.0 or :: for all of IPv4 or IPv6.")
     http_port: int = setting(8000, "Triton's HTTP port.", **_PORT)

@@ -1,24 +1,70 @@
 # SPDX-License-Identifier: MIT
-"""A video's scores from a server, as a table and a picture. What ``rfm demo`` shows."""
+"""``rfm demo``: a video's scores from a server that runs as long as it takes, as a table and a picture."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated
 
-from rich.console import Console
+import typer
 
+from rfm.config import ExportConfig
 from rfm.launch.endpoints import Endpoints
+from rfm.launch.temporary import stopped_by_signals, temporary_server
 from rfm_client import RewardClient, Trajectory
-from rfm_client.cli.show import Panel, plot, scores_table, status_tables
+from rfm_client.cli.command import Given, OptionsOf, with_options
+from rfm_client.cli.options import VideoOptions
+from rfm_client.cli.show import scores_table, status_tables
+from rfm_client.contract.names import frames_name
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.video import frame_times_s
 from rfm_client.transport.status import read_status
+from rfm_commands.command import OF_A_CHECKPOINT, TritonPath, fail
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+REPOSITORY = Path("model_repository")
+
+
+@with_options
+def demo(
+    video: Annotated[Path, typer.Option(help="Video file to score.")],
+    asked: Annotated[VideoOptions, OptionsOf(VideoOptions, only=("task", "fps"), required=("task",))],
+    given: Annotated[Given, OptionsOf(ExportConfig, only=OF_A_CHECKPOINT)],
+    repository: Annotated[Path, typer.Option(help="Repository to serve, if no checkpoint is given.")] = REPOSITORY,
+    output: Annotated[Path, typer.Option(help="Folder for the plot and Triton's log.")] = Path("demo_output"),
+    tritonserver: TritonPath = None,
+) -> None:
+    """Serve a checkpoint, score one video, plot, and stop everything."""
+    try:
+        import av  # noqa: F401  which reads the video
+        from rich.console import Console
+
+        from rfm_client.data.video import read_video
+    except ImportError as error:
+        fail(f'the demo needs {error.name}: pip install ".[demo,encoders,triton]"')
+    console, settings = Console(), ExportConfig(**given)
+    with stopped_by_signals(), TemporaryDirectory(prefix="rfm-demo-") as folder:
+        frames = read_video(video, asked.fps)
+        try:
+            output.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            fail(f"{output}: expected a folder that can be made, got: {error.strerror}; --output names another one")
+        if settings.checkpoint is not None:
+            repository = _exported_frames(settings.checkpoint, settings, Path(folder) / "model_repository")
+        with temporary_server(repository, output / "tritonserver.log", tritonserver) as endpoints:
+            score_video(endpoints, video, frames, asked.task, output / "rewards.png", console)
+            show_metrics(endpoints, console)
 
 
 def score_video(
     endpoints: Endpoints, video: Path, frames: UInt8Array, task: str, picture: Path, console: Console
 ) -> None:
     """Scores the video's frames, or as many, evenly, as the checkpoint takes, and draws a picture."""
+    from rfm_client.cli.pictures import Panel, plot
+    from rfm_client.data.video import frame_times_s
+
     with RewardClient(endpoints.grpc_url) as client:
         result = client.progress(Trajectory(frames=frames, task=task), subsample=True)
     if len(result.progress) < len(frames):
@@ -32,3 +78,13 @@ def show_metrics(endpoints: Endpoints, console: Console) -> None:
     """Prints what Triton counted while the demo ran."""
     status = read_status(endpoints.http_url, metrics_url=endpoints.metrics_url)
     console.print(*status_tables(status), sep="\n", markup=False, highlight=False)
+
+
+def _exported_frames(checkpoint: str, settings: ExportConfig, repository: Path) -> Path:
+    """The new repository of a checkpoint that scores frames."""
+    import rfm_export
+
+    rfm_export.export(checkpoint, repository, settings)
+    if not (repository / frames_name(settings.name)).exists():
+        fail(f"{checkpoint}: expected one that scores frames, got none; name --image-encoder, --text-encoder")
+    return repository

@@ -10,144 +10,126 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar, TypeAlias
 
 import typer
 
-from rfm.launch.admin_key import AdminKeyError, take_key
+from rfm.launch.admin_key import take_key
 from rfm.launch.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
+from rfm_client.cli.command import OptionsOf, with_options
+from rfm_client.cli.options import AccessFiles
+from rfm_client.contract.settings import Settings, setting
 from rfm_client.transport.access import Access
+from rfm_commands.command import RfmCommand, fail
 from rfm_commands.rollout import Rollout, models_of, previous_version
-from rfm_export.errors import ExportError
 
-DEFAULT_URL = "grpc://127.0.0.1:8001"
 SECURE = "grpcs://"
-EXIT_FAILED = 1
 
 app = typer.Typer(no_args_is_help=True)
 
-AdminKeyFile = Annotated[
-    Path | None,
-    typer.Option(help="File with the server's admin key; else RFM_ADMIN_KEY.", show_default=False),
-]
-Name = Annotated[str, typer.Argument(help="As in rfm export --name.")]
-Repository = Annotated[Path, typer.Option(help="The repository that the server reads.")]
-Url = Annotated[str, typer.Option(help="grpc://host:port of the server, with TLS grpcs://host:port.")]
+
+@dataclass(frozen=True)
+class AdministeredServer(Settings):
+    """A running server whose models are changed, and the repository that it reads."""
+
+    TITLE: ClassVar[str] = "Server"
+
+    repository: Path = setting(Path(), "The repository that the server reads.")
+    url: str = setting("grpc://127.0.0.1:8001", "grpc://host:port of the server, with TLS grpcs://host:port.")
+    admin_key_file: Path | None = setting(None, "File with the server's admin key; else RFM_ADMIN_KEY.")
+
+    @contextmanager
+    def connected(self, context: typer.Context) -> Iterator[RepositoryApi]:
+        """Its API. Raises AdminKeyError, RepositoryApiError."""
+        access: Access = context.obj
+        if access.uses_tls and not self.url.startswith(SECURE):
+            raise RepositoryApiError(f"url: expected {SECURE}host:port with certificates, got {self.url}")
+        options = access.grpc_options(self.url.partition(":")[0])
+        with RepositoryApi(self.url, take_key(self.admin_key_file, os.environ), options) as api:
+            yield api
+
+
+ExportedName = Annotated[str, typer.Argument(help="As in rfm export --name.")]
+Administered: TypeAlias = Annotated[AdministeredServer, OptionsOf(AdministeredServer, required=("repository",))]
 
 
 @app.callback()
+@with_options
 def models(
     context: typer.Context,
-    ca_file: Annotated[
-        Path | None, typer.Option(envvar="RFM_CA_FILE", help="Authorities (PEM) to trust; else gRPC's own.")
-    ] = None,
-    client_certificate: Annotated[
-        Path | None, typer.Option(envvar="RFM_CLIENT_CERTIFICATE", help="By which the server knows you (PEM).")
-    ] = None,
-    client_key: Annotated[
-        Path | None, typer.Option(envvar="RFM_CLIENT_KEY", help="The certificate's key (PEM).")
-    ] = None,
+    files: Annotated[AccessFiles, OptionsOf(AccessFiles, only=("ca_file", "client_certificate", "client_key"))],
 ) -> None:
     """List, load, unload and replace the models of a running server."""
     try:
-        context.obj = Access(ca_file, client_certificate, client_key)
+        context.obj = files.read()
     except ValueError as error:
-        raise _failed(error) from None
+        fail(str(error))
 
 
-@app.command("list")
-def list_models(context: typer.Context, url: Url = DEFAULT_URL, admin_key_file: AdminKeyFile = None) -> None:
+@app.command("list", cls=RfmCommand)
+@with_options
+def list_models(
+    context: typer.Context,
+    server: Annotated[AdministeredServer, OptionsOf(AdministeredServer, only=("url", "admin_key_file"))],
+) -> None:
     """Each version of each model, its state, and why it is not ready."""
-    with _server(context, url, admin_key_file) as server:
-        rows = [_row(entry) for entry in server.index()]
+    with server.connected(context) as api:
+        rows = [_row(entry) for entry in api.index()]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         typer.echo("  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip())
 
 
-@app.command()
-def load(
-    context: typer.Context,
-    name: Name,
-    repository: Repository,
-    url: Url = DEFAULT_URL,
-    admin_key_file: AdminKeyFile = None,
-) -> None:
+@app.command(cls=RfmCommand)
+@with_options
+def load(context: typer.Context, name: ExportedName, server: Administered) -> None:
     """Serve NAME as its configurations say. It is new, or was unloaded."""
-    with _server(context, url, admin_key_file) as server:
-        for model in models_of(repository, name):
-            server.load(model)
-            typer.echo(f"{model}: {', '.join(map(str, server.ready_versions(model)))} ready")
+    with server.connected(context) as api:
+        for model in models_of(server.repository, name):
+            api.load(model)
+            typer.echo(f"{model}: {', '.join(map(str, api.ready_versions(model)))} ready")
 
 
-@app.command()
-def unload(
-    context: typer.Context,
-    name: Name,
-    repository: Repository,
-    url: Url = DEFAULT_URL,
-    admin_key_file: AdminKeyFile = None,
-) -> None:
+@app.command(cls=RfmCommand)
+@with_options
+def unload(context: typer.Context, name: ExportedName, server: Administered) -> None:
     """Stop serving NAME when the requests in flight are answered. Its files stay."""
-    with _server(context, url, admin_key_file) as server:
-        for model in reversed(models_of(repository, name)):
-            server.unload(model)
-            server.wait_gone(model)
+    with server.connected(context) as api:
+        for model in reversed(models_of(server.repository, name)):
+            api.unload(model)
+            api.wait_gone(model)
             typer.echo(f"{model}: unloaded")
 
 
-@app.command()
+@app.command(cls=RfmCommand)
+@with_options
 def rollout(
     context: typer.Context,
-    name: Name,
+    name: ExportedName,
     version: Annotated[int, typer.Argument(min=1, help="The version folder to serve.")],
-    repository: Repository,
-    url: Url = DEFAULT_URL,
-    admin_key_file: AdminKeyFile = None,
+    server: Administered,
 ) -> None:
     """Serve another version of NAME without losing a request.
 
     It is loaded beside the old one, probed, then alone. If it fails the old one stays.
     """
-    with _server(context, url, admin_key_file) as server:
-        Rollout(repository, name, server, typer.echo).to(version)
-        typer.echo(f"{name}: version {version} is served")
+    with server.connected(context) as api:
+        _roll_out(server, name, api, version)
 
 
-@app.command()
-def rollback(
-    context: typer.Context,
-    name: Name,
-    repository: Repository,
-    url: Url = DEFAULT_URL,
-    admin_key_file: AdminKeyFile = None,
-) -> None:
+@app.command(cls=RfmCommand)
+@with_options
+def rollback(context: typer.Context, name: ExportedName, server: Administered) -> None:
     """Serve the version before this one, as rollout does."""
-    with _server(context, url, admin_key_file) as server:
-        version = previous_version(repository, name, server)
-        Rollout(repository, name, server, typer.echo).to(version)
-        typer.echo(f"{name}: version {version} is served")
+    with server.connected(context) as api:
+        _roll_out(server, name, api, previous_version(server.repository, name, api))
 
 
-@contextmanager
-def _server(context: typer.Context, url: str, admin_key_file: Path | None) -> Iterator[RepositoryApi]:
-    """The server; what goes wrong with it ends the command with one line."""
-    access: Access = context.obj
-    try:
-        if access.uses_tls and not url.startswith(SECURE):
-            raise RepositoryApiError(f"url: expected {SECURE}host:port with certificates, got {url}")
-        with RepositoryApi(
-            url, take_key(admin_key_file, os.environ), access.grpc_options(url.partition(":")[0])
-        ) as server:
-            yield server
-    except (AdminKeyError, RepositoryApiError, ExportError, OSError) as error:
-        raise _failed(error) from None
-
-
-def _failed(error: Exception) -> typer.Exit:
-    typer.echo(f"rfm: {error}", err=True)
-    return typer.Exit(EXIT_FAILED)
+def _roll_out(server: AdministeredServer, name: str, api: RepositoryApi, version: int) -> None:
+    Rollout(server.repository, name, api, typer.echo).to(version)
+    typer.echo(f"{name}: version {version} is served")
 
 
 def _row(entry: ModelVersion) -> tuple[str, ...]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import typer
 
+from rfm_client.cli.command import Command
 from rfm_gateway.command import gateway
 
 if __name__ == "__main__":
     app = typer.Typer(add_completion=False, rich_markup_mode=None)  # without tables that cut the names of options off
-    app.command()(gateway)
+    app.command(cls=Command)(gateway)
     app()

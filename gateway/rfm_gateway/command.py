@@ -6,25 +6,27 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from typing import Annotated
 
 import typer
 
+from rfm_client.cli.command import OptionsOf, with_options
 from rfm_client.contract.addresses import is_loopback
 from rfm_client.contract.listening import check_free, from_here, in_url
 from rfm_client.contract.settings import ConfigError, settings_of
 from rfm_gateway.config import GatewayConfig
-from rfm_gateway.options import Given, refused, with_options
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8000
 KEEP_ALIVE_S = 30
 STOP_WITHIN_S = 30
+OPTIONS = OptionsOf(GatewayConfig, required=("triton",), defaults={"host": DEFAULT_HOST, "port": DEFAULT_PORT})
 
 logger = logging.getLogger("rfm_gateway")
 
 
-@with_options(GatewayConfig, into="given", required=("triton",))
-def gateway(*, given: Given) -> None:
+@with_options
+def gateway(config: Annotated[GatewayConfig, OPTIONS]) -> None:
     """Serve the FastAPI server's endpoints before a Triton server."""
     try:
         import uvicorn
@@ -33,14 +35,13 @@ def gateway(*, given: Given) -> None:
     except ModuleNotFoundError as error:
         raise typer.BadParameter(f"the gateway needs {error.name}: pip install ./client ./gateway") from None
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    host, port = config.host or DEFAULT_HOST, config.port or DEFAULT_PORT
     try:
-        config = GatewayConfig(**given)
         api_key, tls = config.api_key(os.environ), config.tls
         app = create_app(config, api_key)
-        host, port = config.host or DEFAULT_HOST, config.port or DEFAULT_PORT
         check_free(host, port, "gateway", port_option="--port")
-    except ConfigError as error:
-        raise refused(error, GatewayConfig) from None
+    except ConfigError:  # with_options names its option
+        raise
     except (ValueError, OSError) as error:
         raise typer.BadParameter(str(error)) from None
     if api_key is None and not is_loopback(host):
@@ -65,7 +66,7 @@ def gateway_command(config: GatewayConfig) -> list[str]:
     for name, each in settings_of(GatewayConfig).items():
         value = getattr(config, name)
         if isinstance(value, bool):
-            words.append(each.option if value else each.no_option)
+            words.append(each.option if value else each.option.replace("--", "--no-", 1))
             continue
         values = value if isinstance(value, tuple) else () if value is None else (value,)
         words += [word for value in values for word in (each.option, str(value))]

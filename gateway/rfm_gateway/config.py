@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from rfm_client.contract.addresses import MAX_PORT, check_certificate, split_url
 from rfm_client.contract.listening import check_free
@@ -27,6 +27,8 @@ class GatewayConfig(Settings):
 
     Where it listens and whom it asks may be None: ``rfm serve`` and ``rfm gateway`` have different defaults for that.
     """
+
+    TITLE: ClassVar[str] = "Gateway (section gateway of the file)"
 
     port: int | None = setting(
         None, "Port to listen on; else rfm serve runs no gateway, and rfm gateway takes 8000.", least=1, most=MAX_PORT

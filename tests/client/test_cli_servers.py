@@ -24,7 +24,6 @@ from client_commands import (
     MODEL,
     RFM_CLIENT,
     TASK,
-    TOLERANCE,
     WIDTHS,
     ask,
     assert_scores,
@@ -37,21 +36,16 @@ from client_commands import (
 from reference_server import Served
 from rfm_client import (
     FrameScores,
-    PreferenceSample,
     ProgressResult,
-    ProgressSample,
     RewardClient,
     Sample,
-    SimilaritySample,
 )
+from rfm_client.cli.command import EXIT_CODES, ExitCode
 from rfm_client.cli.commands import app
-from rfm_client.cli.options import EXIT_CODES, ExitCode
-from rfm_client.cli.outputs import frame_document
-from rfm_client.cli.perf_input import perf_analyzer_input
+from rfm_client.cli.documents import frame_document
+from rfm_client.cli.made_up import MadeUpSamples, parse_lengths
 from rfm_client.cli.scoring import unique_stems
 from rfm_client.cli.show import number
-from rfm_client.cli.toy import SampleKind, Toy, parse_lengths
-from rfm_client.contract import wire
 from rfm_client.contract.wire import encode_samples
 from rfm_client.transport.status import read_status
 from rfm_serve import wait_for
@@ -151,29 +145,23 @@ def test_status_shows_the_gpus_and_what_waits(served: Served, tmp_path: Path) ->
 
 
 def test_status_without_metrics_shows_the_rest_and_says_so(served: Served) -> None:
-    with silent_server() as (url, _):
-        address = url  # nobody listens there any more
+    address = free_url()
     result = invoke("status", "--url", served.url("http"), "--metrics-url", f"{address}/metrics")
     assert result.exit_code == 0
     assert f"no metrics of the machine: {address}/metrics: " in result.stdout
     assert "give their URL (--metrics-url)" in result.stdout
     requests, batches = rows(result.stdout, f"{MODEL} ")
     assert batches[6] == "load"
-    assert requests[1:3] == ["1", "READY"]
-    assert requests[5:] == ["-", "-"]
+    assert (requests[1:3], requests[5:]) == (["1", "READY"], ["-", "-"])
 
 
-def test_status_looks_for_metrics_at_the_server_s_host(served: Served) -> None:
-    assert read_status(served.url("grpc")).metrics_url == "http://127.0.0.1:8002/metrics"
-
-
-def test_wait_returns_when_the_model_is_ready(served: Served, protocol: str) -> None:
-    result = ask(served, "wait", protocol=protocol)
+def test_wait_returns_when_the_model_is_ready(served: Served) -> None:
+    result = ask(served, "wait")
     assert (result.exit_code, result.output) == (0, "")
 
 
-def toy_samples(client: RewardClient, kind: str, lengths: str = "8", *, use_frames: bool = False) -> list[Sample]:
-    return Toy(SampleKind(kind), 3, parse_lengths(lengths), use_frames, seed=5).samples(client)
+def made_up(client: RewardClient, kind: str, lengths: str, *, use_frames: bool = False) -> list[Sample]:
+    return MadeUpSamples(kind, 3, parse_lengths(lengths), use_frames, seed=5).samples(client)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("use_frames", [False, True], ids=["embeddings", "frames"])
@@ -183,7 +171,7 @@ def test_sample_shows_what_the_client_gives(served: Served, kind: str, use_frame
     result = ask(served, "sample", *words, *(["--use-frames"] if use_frames else []), "--json", "-")
     assert (result.exit_code, result.stderr) == (0, "")
     with served.client("grpc", MODEL) as client:
-        samples = toy_samples(client, kind, "2,5", use_frames=use_frames)
+        samples = made_up(client, kind, "2,5", use_frames=use_frames)
         expected = client.evaluate(samples)
     answers = json.loads(result.stdout)["samples"]
     assert len(answers) == len(expected)
@@ -214,25 +202,8 @@ def test_sample_shows_a_table_and_tells_of_each_that_fails(served: Served) -> No
     assert result.stdout == ""
     good = ask(served, "sample", "--sample-type", "preference", "--num-samples", 1)
     with served.client("grpc", MODEL) as client:
-        (expected,) = client.evaluate(Toy(SampleKind.preference, 1, [8], False, 0).samples(client))
+        (expected,) = client.evaluate(MadeUpSamples("preference", 1).samples(client))
     assert f"P(first) = {expected.preference:.4f}" in good.stdout  # type: ignore[union-attr]
-
-
-LENGTHS = {"8": [8], "4,8,16": [4, 8, 16], "4-6": [4, 5, 6], "1, 3-4": [1, 3, 4]}
-
-
-@pytest.mark.parametrize(("text", "lengths"), LENGTHS.items(), ids=LENGTHS)
-def test_lengths_are_one_several_or_a_range(text: str, lengths: list[int]) -> None:
-    assert parse_lengths(text) == lengths
-
-
-@pytest.mark.parametrize("kind", ["progress", "preference", "similarity"])
-def test_toy_samples_have_the_lengths_in_turn(served: Served, kind: str) -> None:
-    with served.client("grpc", MODEL) as client:
-        samples = toy_samples(client, kind, "4,8,16")
-    lengths = [trajectory.num_frames for sample in samples for trajectory in sample.trajectories]
-    assert sorted(lengths[:3]) == [4, 8, 16]
-    assert lengths[3:] == lengths[: len(lengths) - 3]
 
 
 def decoded(tensor: dict[str, Any], like: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -259,7 +230,7 @@ def test_bench_input_holds_the_tensors_of_the_contract(
     assert (result.exit_code, result.stderr) == (0, "")
     assert result.stdout == f"{expected} --async --concurrency-range 1:16:5\n"
     with served.client("grpc", MODEL) as client:
-        samples = toy_samples(client, kind, "4-6", use_frames=use_frames)
+        samples = made_up(client, kind, "4-6", use_frames=use_frames)
     requests = json.loads(target.read_text())["data"]
     assert len(requests) == 3
     for request, sample in zip(requests, samples, strict=True):
@@ -268,28 +239,6 @@ def test_bench_input_holds_the_tensors_of_the_contract(
         for tensor, array in tensors.items():
             assert decoded(request[tensor], array).dtype == array.dtype
             np.testing.assert_array_equal(decoded(request[tensor], array), array)
-
-
-def test_the_input_file_s_requests_are_answered(served: Served, triton: Any) -> None:
-    """Sent as perf_analyzer sends them: each entry as a request of one sample."""
-    first, second = (random_trajectory(seed, length, *WIDTHS) for seed, length in ((1, 3), (2, 7)))
-    samples: list[Sample] = [ProgressSample(first), PreferenceSample(first, second), SimilaritySample(first, second)]
-    for sample, request in zip(samples, perf_analyzer_input(samples)["data"], strict=True):
-        tensors = []
-        for name, like in encode_samples([sample]).items():
-            tensors.append(
-                tritonclient.http.InferInput(
-                    name, [1, *request[name]["shape"]], tritonclient.utils.np_to_triton_dtype(like.dtype)
-                )
-            )
-            tensors[-1].set_data_from_numpy(decoded(request[name], like))
-        answer = triton.infer(MODEL, tensors)
-        with served.client("http", MODEL) as client:
-            (expected,) = client.evaluate([sample])
-        scores = expected if isinstance(expected, ProgressResult) else getattr(expected, "first", None)
-        if scores is not None:
-            progress = answer.as_numpy(wire.PROGRESS)[0, :3]
-            np.testing.assert_allclose(progress, scores.progress, rtol=0, atol=TOLERANCE)
 
 
 def free_url() -> str:
@@ -306,10 +255,9 @@ ASKING = {
 }
 
 
-@pytest.mark.parametrize("scheme", ["grpc", "http"])
 @pytest.mark.parametrize("words", ASKING.values(), ids=ASKING)
-def test_no_server_is_told_at_once(words: list[str], scheme: str) -> None:
-    result = invoke(*words, "--url", free_url().replace("http", scheme))
+def test_no_server_is_told_at_once(words: list[str]) -> None:
+    result = invoke(*words, "--url", free_url())
     assert result.exit_code == ExitCode.UNAVAILABLE
     assert re.fullmatch(r"rfm-client: .*\n", result.stderr), result.stderr
     assert "start the server there (rfm serve), or give the URL of one that runs" in result.stderr
@@ -364,32 +312,24 @@ def test_an_interrupt_ends_it_without_a_traceback(words: list[str]) -> None:
     assert (process.returncode, told) == (ExitCode.INTERRUPTED, "rfm-client: interrupted\n")
 
 
+URL = "expected grpc://host:port or http://host:port, or grpcs:// or https://, got"
+LENGTHS = "expected a length (8), several (4,8,16) or a range (4-16)"
 USAGE: dict[str, tuple[list[str], str]] = {
     "no videos": (["score"], "Missing argument"),
     "unknown option": (["score", "a.mp4", "--what"], "No such option"),
-    "url": (
-        ["sample", "--url", "localhost:8001"],
-        "expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
-    ),
-    "status url": (
-        ["status", "--url", "localhost:8001"],
-        "expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
-    ),
-    "json over a video": (["score", "--json", "a.mp4", "b.mp4"], "expected a .json file or -, got a.mp4"),
+    "url": (["sample", "--url", "localhost:8001"], URL),
+    "port of a url": (["status", "--url", "http://localhost:99999"], URL),
+    "json over a video": (["score", "--json", "a.mp4", "b.mp4"], "expected a file that ends in .json or -, got a.mp4"),
     "json nowhere": (["status", "--json", "/nowhere/a.json"], "expected a folder at /nowhere, got none"),
     "picture": (["score", "a.mp4", "--plot", "a.gif"], "expected a file that ends in .png, .pdf, .svg, got a.gif"),
     "many pictures": (["score", *["a.mp4"] * 51, "--plot", "a.png"], "expected at most 50 videos, got 51"),
     "array": (["score", "a.mp4", "--npy", "a.npz"], "expected a .npy file or a folder, got a.npz"),
     "one array": (["score", "a.mp4", "b.mp4", "--npy", "a.npy"], "expected a folder for 2 videos, got a.npy"),
-    "lengths": (["sample", "--num-frames", "8-4"], "expected a length (8), several (4,8,16) or a range (4-16)"),
-    "dense": (["score", "a.mp4", "--frame-steps", "1"], "expected 0 or at least 2, got 1"),
-    "port": (
-        ["status", "--url", "http://localhost:99999"],
-        "expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
-    ),
+    "lengths": (["sample", "--num-frames", "8-4"], LENGTHS),
+    "long": (["sample", "--num-frames", "10000"], LENGTHS),
+    "no length": (["sample", "--num-frames", "0"], LENGTHS),
+    "dense": (["score", "a.mp4", "--frame-steps", "1"], "'--frame-steps': expected 0 or at least 2, got 1"),
     "nothing to compare": (["compare", "a.mp4"], "expected at least 2 videos, got 1"),
-    "long": (["sample", "--num-frames", "10000"], "expected a length (8), several (4,8,16) or a range (4-16)"),
-    "no length": (["sample", "--num-frames", "0"], "expected a length (8), several (4,8,16) or a range (4-16)"),
     "metrics": (
         ["status", "--url", "http://a:1", "--url", "http://b:1", "--metrics-url", "http://a:2"],
         "expected one --url with it, got several",

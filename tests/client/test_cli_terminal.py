@@ -14,7 +14,7 @@ from rich.console import Console
 import clip
 from client_commands import RFM_CLIENT, TASK
 from rfm.launch.process import Endpoints
-from rfm_client.cli.options import ExitCode
+from rfm_client.cli.command import ExitCode
 from rfm_client.cli.show import shortened, status_tables, table
 from rfm_client.transport.status import ModelStatus, ServerStatus
 from terminals import WIDTH, on_terminal
@@ -75,7 +75,7 @@ def test_scores_and_comparisons_fit_a_terminal_and_name_each_file(demo_server: E
     assert len(second) == 1
 
 
-@pytest.mark.parametrize("width", range(1, 40))
+@pytest.mark.parametrize("width", [1, 3, 4, 12, 20, 29, 30, 39])
 def test_a_name_is_shortened_in_the_middle(width: int) -> None:
     name = "/data/of/a/robot/episode_7.mp4"
     short = shortened(name, width)

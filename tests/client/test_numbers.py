@@ -20,8 +20,7 @@ from rfm_client.data.sampling import Sampling
 from rfm_client.data.video import read_video
 from rfm_client.episodes.steps import EpisodeOptions, SuccessRule
 from rfm_client.gym import RewardOptions
-from rfm_client.labelling.options import LabelOptions
-from rfm_client.labelling.ray_engine import RayOptions
+from rfm_client.labelling.options import LabelOptions, RayOptions
 
 URL = "grpc://127.0.0.1:1"
 SCORES = FrameScores(progress=np.full(4, 0.5, np.float32), success=np.full(4, 0.5, np.float32))

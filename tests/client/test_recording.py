@@ -18,7 +18,7 @@ import clip
 from client_commands import TASK, invoke
 from rfm.launch.process import Endpoints
 from rfm_client import FrameScores
-from rfm_client.cli.options import ExitCode
+from rfm_client.cli.command import ExitCode
 from rfm_client.data.inputs import load_trajectory
 from rfm_client.data.video import frame_times_s
 from rfm_client.integrations.recording import FRAME, TIME, Recording

@@ -147,7 +147,7 @@ def test_score_scores_each_frame_on_its_prefix(served: Served, video: Path, rule
 
 
 CONTRADICTIONS = {
-    "a number without a rule": (["--frames", 4], "Invalid value for --frames: expected --sampling with it, got none"),
+    "a number without a rule": (["--frames", 4], "Invalid value for '--frames': expected --sampling with it, got none"),
     "two ways of sampling": (["--sampling", "all", "--frame-steps", 4], "expected no --frame-steps with it, got 4"),
     "a number that the rule does not take": (["--sampling", "all", "--frames", 4], "expected none with the rule all"),
 }

@@ -321,9 +321,6 @@ def test_an_export_says_which_config_yaml_and_which_encoders_it_took(tmp_path: P
     assert again == []  # an export of an export knows of no run
 
 
-NOTE = "batch_size has no effect, as in the FastAPI server; max_batch_size bounds a batch"
-
-
 def export_as_upstream_serves(folder: Path, *words: str, num_gpus: int) -> Result:
     file = folder / "eval_config_server.yaml"
     file.write_text(EVAL_CONFIG_SERVER.replace("num_gpus: 1", f"num_gpus: {num_gpus}"))
@@ -331,14 +328,9 @@ def export_as_upstream_serves(folder: Path, *words: str, num_gpus: int) -> Resul
     return CliRunner().invoke(app, [*command, "--repository", str(folder / "repository"), *words])
 
 
-def test_upstream_s_batch_size_bounds_nothing_and_says_so(tmp_path: Path) -> None:
+def test_upstream_s_batch_size_bounds_nothing(tmp_path: Path) -> None:
     result = export_as_upstream_serves(tmp_path, num_gpus=0)
     assert result.exit_code == 0, result.output
-    file = f"rfm: {tmp_path}/eval_config_server.yaml"
-    later = "max_workers, server_url, server_port: of no effect at export, only at serve"
-    notes = (of_run(EMBEDDINGS.checkpoint.parent), *map(untrained, HEADS))
-    told = "".join(f"rfm: {note}\n" for note in notes)
-    assert result.stderr == f"{file}: {later}\n{file}: {NOTE}\n{told}"
     assert read(tmp_path / "repository", "rfm").max_batch_size == ExportConfig().max_batch_size
 
 

@@ -271,9 +271,15 @@ def test_the_links_of_the_hubs_cache_are_followed(tmp_path: Path) -> None:
 
 
 BAD_SETTINGS = {
-    "a path as name": ("name: ../../etc", r"serve\.yaml: name: expected letters, digits, _ and -, got"),
-    "an endless name": (f"name: {'a' * 300}", r"serve\.yaml: name: expected at most 100 characters, got 300"),
-    "a batch beyond int32": ("max_batch_size: 9999999999", r"serve\.yaml: max_batch_size: expected at most 2147483647"),
+    "a path as name": (
+        "export: {name: ../../etc}",
+        r"serve\.yaml: export\.name: expected letters, digits, _ and -, got",
+    ),
+    "an endless name": (f"export: {{name: {'a' * 300}}}", r"export\.name: expected at most 100 characters, got 300"),
+    "a batch beyond int32": (
+        "export: {max_batch_size: 9999999999}",
+        r"export\.max_batch_size: expected at most 2147483647",
+    ),
     "GPUs without end": ("num_gpus: 1000000000", r"serve\.yaml: num_gpus: expected at most 4096"),
 }
 

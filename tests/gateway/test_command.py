@@ -47,10 +47,10 @@ BAD_OPTIONS: dict[str, tuple[list[str], str]] = {
         "url: expected grpc://host:port or http://host:port, or grpcs:// or https://, got",
     ),
     "no folder": (["--allow-folder", "nowhere"], "No such file or directory"),
-    "no key file": (["--api-key-file", "nowhere"], "--api-key-file: expected a text file, got"),
+    "no key file": (["--api-key-file", "nowhere"], "'--api-key-file': expected a text file, got"),
     "an empty key": (
         ["--api-key-file", os.devnull],
-        "--api-key-file: expected a key, here or in RFM_GATEWAY_API_KEY, got no character",
+        "'--api-key-file': expected a key, here or in RFM_GATEWAY_API_KEY, got no character",
     ),
     "no port": (["--port", "0"], "Input should be greater than or equal to 1"),
     "an address of another machine": (["--host", "192.0.2.1"], "Cannot assign requested address; --host names another"),

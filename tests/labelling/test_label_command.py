@@ -27,7 +27,7 @@ from labelling import LEROBOT
 from one_model import BriefServer
 from paths import ROOT
 from rfm.launch.process import Endpoints
-from rfm_client.cli.options import ExitCode
+from rfm_client.cli.command import ExitCode
 from rfm_commands.cli import app
 from toy_world import Task, make_clip
 
@@ -211,10 +211,10 @@ def test_what_cannot_be_labelled_ends_with_one_line(output: Path) -> None:
 
 
 WRONG = {
-    "a shard": (["--shard", "3/3"], "shard: expected i/n with i from 0 to n - 1, got 3/3"),
+    "a shard": (["--shard", "3/3"], "'--shard': expected i/n with i from 0 to n - 1, got 3/3"),
     "episodes": (["--episodes", "5:2"], "episodes: expected numbers and ranges such as 0:100,205, got '5:2'"),
-    "a format": (["--format", "csv"], "format: expected some of progress, signals, hdf5, got 'csv'"),
-    "a rule in mode whole": (["--mode", "whole", "--sampling", "rint_pad"], "sampling: expected all in mode whole"),
+    "a format": (["--format", "csv"], "'--format': expected one of progress, signals, hdf5, got 'csv'"),
+    "a rule in mode whole": (["--mode", "whole", "--sampling", "rint_pad"], "'--sampling': expected all in mode whole"),
     "an orientation": (["--orient", "up"], "orient: expected one of none, rotate180, "),
     "a camera twice": (["--orient", "a=none", "--orient", "a=rotate90"], "expected each camera once, got 'a=rotate90'"),
 }
@@ -231,13 +231,6 @@ def test_without_a_server_it_ends_at_once(output: Path) -> None:
     result = invoke("label", DATASET, "--output", output, "--url", f"grpc://127.0.0.1:{free_port()}")
     assert result.exit_code == ExitCode.UNAVAILABLE
     assert list(output.iterdir()) == []
-
-
-def test_score_names_the_command_for_a_file_of_several_episodes() -> None:
-    film = DATASET / "videos" / FRONT / "chunk-000" / "file-000.mp4"
-    result = invoke("score", film, "--task", "stack", "--url", f"grpc://127.0.0.1:{free_port()}")
-    assert result.exit_code != 0
-    assert "rfm-client label" in result.stderr or result.exit_code == ExitCode.UNAVAILABLE
 
 
 @pytest.mark.slow

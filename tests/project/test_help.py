@@ -13,8 +13,10 @@ from click import Command
 from click.testing import CliRunner
 from typer.main import get_command
 
+from rfm.config import ServeConfig
 from rfm_client.cli.commands import app as rfm_client
 from rfm_commands.cli import app as rfm
+from rfm_gateway.config import GatewayConfig
 
 COMMON = {"COLUMNS": "80", "TERMINAL_WIDTH": "80"}
 
@@ -45,6 +47,15 @@ def test_no_name_and_no_sentence_is_cut_off(name: str) -> None:
     done = CliRunner().invoke(top, [*name.split()[1:], "--help"], env=COMMON, prog_name=name.split()[0])
     assert done.exit_code == 0
     assert_whole(done.output, COMMANDS[name])
+
+
+def test_options_stand_in_groups_and_an_example_below() -> None:
+    shown = CliRunner().invoke(COMMANDS["rfm"], ["serve", "--help"], env=COMMON, prog_name="rfm").output
+    places = [
+        shown.index(f"\n{title}:\n") for title in ("Options", ServeConfig.TITLE, GatewayConfig.TITLE, "  Example")
+    ]
+    assert places == sorted(places)
+    assert "\n    rfm serve my_models --gateway-port 8100 -- --log-verbose=1\n" in shown
 
 
 def test_so_it_is_where_there_is_the_gateway_alone(tmp_path: Path) -> None:

@@ -146,7 +146,7 @@ def test_labelling_is_imported_without_an_extra() -> None:
 
 def test_rfm_serve_and_rfm_models_start_without_pytorch() -> None:
     """It would take them two seconds and 200 MB."""
-    modules = "rfm_commands.cli, rfm_commands.rollout, rfm_commands.unused_settings, rfm.supervise.supervisor"
+    modules = "rfm_commands.cli, rfm_commands.rollout, rfm.supervise.supervisor"
     code = f"import sys, {modules}; sys.exit('torch' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 

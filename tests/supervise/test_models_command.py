@@ -19,7 +19,6 @@ from tritonclient.grpc import model_config_pb2 as pb
 import rollout
 from administered import KEY, PLAIN, Running, export_plain
 from engines import load_engine
-from rfm.engine import Engine
 from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
 from rfm_client import ModelNotFoundError, ProgressSample, RewardClient, ServerError
 from rfm_commands import rollout as rfm_rollout
@@ -30,16 +29,8 @@ from trajectories import random_trajectory
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
-
-TOLERANCE = 1e-5
-
-
 CONNECTIONS = 24  # of each protocol; Triton has 8 threads for HTTP
-
-
 DEADLINE_S = 20.0
-
-
 POLL_S = 0.02
 
 
@@ -143,18 +134,6 @@ def test_a_server_that_cannot_be_reached_is_told(url: str, words: tuple[str, ...
     assert done.returncode == 1
     (told,) = done.stderr.splitlines()
     assert told.startswith(f"rfm: {message}")
-
-
-def test_two_checkpoints_stand_side_by_side_under_two_names(running: Running, other_plain: Path) -> None:
-    for name, checkpoint in {"a": PLAIN.checkpoint, "b": other_plain}.items():
-        export_plain(running.repository, name, checkpoint)
-        running.models("load", name)
-    sample = ProgressSample(random_trajectory(1, 5))
-    expected = [load_engine(PLAIN.name), Engine.from_checkpoint(other_plain)]
-    for name, engine in zip(("a", "b"), expected, strict=True):
-        with running.client(name) as client:
-            assert difference(client.evaluate([sample])[0], engine.evaluate([sample])[0]) <= TOLERANCE
-    assert difference(*(engine.evaluate([sample])[0] for engine in expected)) > rollout.CLEARLY
 
 
 def test_a_rollout_and_a_rollback_lose_no_request_and_mix_no_versions(running: Running, tmp_path: Path) -> None:
@@ -300,7 +279,7 @@ def three_models(tmp_path_factory: pytest.TempPathFactory) -> Path:
 PARTS = ("rfm_encoder", "rfm", "rfm_frames")
 
 
-@pytest.mark.parametrize("loads", range(5))
+@pytest.mark.parametrize("loads", [0, 2, 4])
 @pytest.mark.parametrize("returns", [True, False], ids=["and comes back", "for good"])
 def test_a_server_that_goes_away_leaves_what_a_restart_serves(
     three_models: Path, monkeypatch: pytest.MonkeyPatch, loads: int, returns: bool

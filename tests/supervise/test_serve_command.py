@@ -28,7 +28,7 @@ from rfm.config import ExportConfig
 from rfm.launch import installation
 from rfm.launch.endpoints import free_ports
 from rfm.launch.installation import ServerStartError, find_installation
-from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.process import Endpoints, TritonServer, short_spin
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_serve import children, serving, wait_for
 
@@ -57,7 +57,7 @@ def test_the_committed_repository_is_served_until_a_signal(number: signal.Signal
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["serve", "--repository", str(REPOSITORY)],
+        ["serve", str(REPOSITORY)],
         [
             "demo",
             "--repository",
@@ -67,7 +67,6 @@ def test_the_committed_repository_is_served_until_a_signal(number: signal.Signal
             "--task",
             clip.TASK,
         ],
-        ["tune", "--repository", str(REPOSITORY), "--output", "tuned.yaml"],
     ],
     ids=lambda words: words[0],
 )
@@ -111,7 +110,7 @@ def environment(pid: int) -> set[str]:
     return set(Path("/proc", str(pid), "environ").read_text().split("\0"))
 
 
-def test_neither_triton_nor_a_model_process_has_a_key_in_its_environment(
+def test_a_gateway_beside_triton_shows_its_page_and_it_alone_has_its_key(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     keys = {name: f"a-secret-of-{name}" for name in ("RFM_ADMIN_KEY", "RFM_GATEWAY_API_KEY")}
@@ -119,8 +118,12 @@ def test_neither_triton_nor_a_model_process_has_a_key_in_its_environment(
         monkeypatch.setenv(name, key)
     repository = tmp_path / "model_repository"
     shutil.copytree(REPOSITORY, repository)
-    with serving(repository, f"--gateway-port={Endpoints.free().http_port}") as served:
+    link = f"http://127.0.0.1:{Endpoints.free().http_port}/"
+    with serving(repository, f"--gateway-port={urlsplit(link).port}") as served:
         served.wait_ready()
+        poll(lambda: f"look at rewards in the browser: {link}\n" in served.log.read_text())
+        poll(lambda: answers(link.rstrip("/")))
+        assert "<title>Rewards of robot videos</title>" in httpx.get(link).text
         (gateway,) = [pid for pid in children(served.process.pid, ".") if pid != served.triton]
         for pid in (served.triton, *served.model_processes()):
             assert not [word for word in environment(pid) if "a-secret-of-" in word]
@@ -130,28 +133,14 @@ def test_neither_triton_nor_a_model_process_has_a_key_in_its_environment(
         ]
 
 
-@pytest.mark.parametrize("own", [{}, {"GOMP_SPINCOUNT": "7"}, {"OMP_WAIT_POLICY": "passive"}])
+OWN = [({}, {"GOMP_SPINCOUNT": "10000"}), ({"GOMP_SPINCOUNT": "7"}, {}), ({"OMP_WAIT_POLICY": "passive"}, {})]
+
+
+@pytest.mark.parametrize(("own", "added"), OWN)
 def test_threads_spin_shortly_unless_the_environment_says_how_they_wait(
-    own: dict[str, str], monkeypatch: pytest.MonkeyPatch
+    own: dict[str, str], added: dict[str, str]
 ) -> None:
-    for name in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY"):
-        monkeypatch.delenv(name, raising=False)
-    for name, value in own.items():
-        monkeypatch.setenv(name, value)
-    given = TritonServer(REPOSITORY, Endpoints.free(), find_installation())._environment()
-    waits = {name: given[name] for name in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY") if name in given}
-    assert waits == (own or {"GOMP_SPINCOUNT": "10000"})
-
-
-def test_the_page_of_a_gateway_beside_triton_is_where_its_link_says(tmp_path: Path) -> None:
-    repository = tmp_path / "model_repository"
-    shutil.copytree(REPOSITORY, repository)
-    link = f"http://127.0.0.1:{Endpoints.free().http_port}/"
-    with serving(repository, f"--gateway-port={urlsplit(link).port}") as served:
-        served.wait_ready()
-        poll(lambda: f"look at rewards in the browser: {link}\n" in served.log.read_text())
-        poll(lambda: answers(link.rstrip("/")))
-        assert "<title>Rewards of robot videos</title>" in httpx.get(link).text
+    assert short_spin(own) == added
 
 
 def test_a_model_that_cannot_be_loaded_is_named(tmp_path: Path) -> None:
@@ -171,14 +160,12 @@ def test_a_model_that_cannot_be_loaded_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("option", "what"), [("http", "HTTP"), ("grpc", "gRPC"), ("metrics", "metrics"), ("gateway", "gateway: port")]
 )
-@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
-def test_a_port_that_is_taken_is_named_with_its_option(host: str, option: str, what: str) -> None:
-    family, at = (socket.AF_INET6, "[::1]") if ":" in host else (socket.AF_INET, host)
-    with nothing_left_behind(), socket.create_server((host, 0), family=family) as taken:
+def test_a_port_that_is_taken_is_named_with_its_option(option: str, what: str) -> None:
+    with nothing_left_behind(), socket.create_server(("::1", 0), family=socket.AF_INET6) as taken:
         port = taken.getsockname()[1]
-        words = [*command(REPOSITORY, Endpoints.free()), "--host", host, f"--{option}-port={port}"]
+        words = [*command(REPOSITORY, Endpoints.free()), "--host=::1", f"--{option}-port={port}"]
         result = subprocess.run(words, capture_output=True, text=True, timeout=EXIT_S, check=False)
-    told = f"rfm: {what}: expected a free port of this machine at {at}:{port}, got: Address already in use; "
+    told = f"rfm: {what}: expected a free port of this machine at [::1]:{port}, got: Address already in use; "
     assert result.returncode == 1
     assert result.stderr.splitlines()[-1] == f"{told}--{option}-port names another port"
 

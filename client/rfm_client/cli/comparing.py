@@ -15,9 +15,11 @@ from pathlib import PurePath
 from statistics import fmean
 from typing import TYPE_CHECKING, cast
 
-from rfm_client.cli.options import Server
-from rfm_client.cli.scoring import Question, Source, fitted_to
-from rfm_client.cli.show import Panel, number, table
+from rfm_client.cli.options import VideoOptions
+from rfm_client.cli.pictures import Panel
+from rfm_client.cli.scoring import Source, fitted_to
+from rfm_client.cli.show import number, table
+from rfm_client.client import RewardClient
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError
 from rfm_client.contract.results import FrameScores, PreferenceResult
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Trajectory
@@ -122,15 +124,14 @@ class Comparison:
         return (*names, *map(number, (*(pair.both_orders or ()), pair.preference)), orders)
 
 
-def compare(server: Server, names: Sequence[str], question: Question) -> Comparison:
+def compare(client: RewardClient, names: Sequence[str], video: VideoOptions) -> Comparison:
     """Which source does the task of the first best. Raises RewardError."""
-    with server.connected() as client:
-        sources = [Source.read(name, question) for name in names]
-        trajectories = [_of_one_task(sources[0], source) for source in sources]
-        fits = [fitted_to(client, ProgressSample(trajectory), question) for trajectory in trajectories]
-        sent = [fit.sample.trajectories[0] for fit in fits]
-        orders = list(itertools.permutations(range(len(sources)), 2))
-        answers = client.evaluate([PreferenceSample(sent[first], sent[second]) for first, second in orders])
+    sources = [Source.read(name, video) for name in names]
+    trajectories = [_of_one_task(sources[0], source) for source in sources]
+    fits = [fitted_to(client, ProgressSample(trajectory), video) for trajectory in trajectories]
+    sent = [fit.sample.trajectories[0] for fit in fits]
+    orders = list(itertools.permutations(range(len(sources)), 2))
+    answers = client.evaluate([PreferenceSample(sent[first], sent[second]) for first, second in orders])
     kept = [fit.frame_indices[0] for fit in fits]
     results = {
         order: cast(PreferenceResult, with_frame_indices(answer, [kept[index] for index in order]))

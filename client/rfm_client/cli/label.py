@@ -1,23 +1,45 @@
 # SPDX-License-Identifier: MIT
-"""``rfm-client label``: a reward for every frame of a dataset, from servers."""
+"""``rfm-client label``, and what ``rfm label`` shares with it: a reward for every frame of a dataset."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Annotated
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
 
 import typer
 
-from rfm_client.async_client import DEFAULT_TIMEOUT_S
-from rfm_client.cli import options
-from rfm_client.cli.label_flags import LabelFlags, with_label_flags
-from rfm_client.cli.options import Server
-from rfm_client.contract.names import DEFAULT_MODEL
+from rfm_client.cli.command import ExitCode, report, with_options
+from rfm_client.cli.options import ServerOptions
+from rfm_client.cli.show import print_tables, table
+from rfm_client.contract.errors import RewardError
+from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
+from rfm_client.data.datasets.opening import open_dataset
+from rfm_client.data.datasets.protocol import Dataset, DatasetEpisode
+from rfm_client.data.orientation import ORIENTATIONS, Orient
+from rfm_client.labelling.episode_scores import FrameMemory, episode_columns
+from rfm_client.labelling.finished_episodes import Parts
+from rfm_client.labelling.label import Outputs, Report, check_frames, label_with_ray, plan_labels
+from rfm_client.labelling.label import label as label_dataset
+from rfm_client.labelling.options import LabelOptions, RayOptions
+from rfm_client.labelling.plan import Item, Plan, selected
+from rfm_client.labelling.ray_engine import Connect
+from rfm_client.labelling.run import Watch
 from rfm_client.labelling.scorer import ClientScorer, Scorer
+from rfm_client.labelling.summary import Summary, summarise
 from rfm_client.transport.access import Access
 
-Source = Annotated[
+SPEED_OVER_S = 600.0  # an episode may take minutes
+
+_MIB = 2**20
+
+Say = Callable[[str], None]
+DatasetArgument = Annotated[
     str,
     typer.Argument(
         metavar="DATASET",
@@ -26,27 +48,278 @@ Source = Annotated[
 ]
 
 
-@with_label_flags
+@dataclass(frozen=True)
+class EpisodeTexts(Settings):
+    """How the episodes of a dataset are read. Raises ConfigError."""
+
+    TITLE: ClassVar[str] = "Dataset"
+
+    task: str | None = setting(None, "What is to be done in the episodes that do not say it, as a sentence.")
+    override_task: bool = setting(False, "Put --task in the place of the tasks that episodes have.")
+    orient: Texts = setting(
+        (),
+        "Turn stored pictures upright, of all cameras or of one; may be repeated. Else as stored; LIBERO's HDF5 files "
+        "flip-vertical.",
+        metavar="[CAMERA=]" + "|".join(ORIENTATIONS),
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        try:
+            Orient.parse(self.orient)
+        except ValueError as error:
+            raise ConfigError("orient", str(error)) from None
+
+    @property
+    def opening(self) -> dict[str, Any]:
+        """With what ``open_dataset`` opens the dataset."""
+        return {"task": self.task, "override_task": self.override_task, "orient": Orient.parse(self.orient)}
+
+
+@dataclass(frozen=True)
+class RunOptions(Settings):
+    """What a command does beside the labels, or in their place."""
+
+    TITLE: ClassVar[str] = "Run"
+
+    engine: Literal["threads", "ray"] = setting("threads", "threads: in this process. ray: by actors of a Ray cluster.")
+    dry_run: bool = setting(False, "Check everything, measure a few episodes, write nothing.")
+    report: bool = setting(False, "Only show the summary of labels that are there.")
+    picture: bool = setting(True, "Draw the summary: NAME_summary.png in the output.")
+    rrd: Path | None = setting(
+        None,
+        "Record frames and scores of each labelled episode for Rerun's viewer: a .rrd file each.",
+        metavar="FOLDER",
+    )
+
+
+@with_options
 def label(
     context: typer.Context,
-    dataset: Source,
-    urls: options.Urls,
-    model: options.Model = DEFAULT_MODEL,
-    timeout: options.TimeoutS = DEFAULT_TIMEOUT_S,
-    *,
-    flags: LabelFlags,
+    dataset: DatasetArgument,
+    server: ServerOptions,
+    texts: EpisodeTexts,
+    labels: LabelOptions,
+    run: RunOptions,
+    ray: RayOptions,
 ) -> None:
     """Write a reward for every frame where training reads it.
 
     The same command goes on with what is missing.
     """
-    from rfm_client.cli.label_display import run
-
     access: Access = context.obj  # the context itself cannot travel to other machines
 
     @contextmanager
     def connect() -> Iterator[Scorer]:
-        with Server(urls, model, timeout, access).connected() as client:
+        with server.connected(access) as client:
             yield ClientScorer(client)
 
-    raise typer.Exit(run(dataset, flags, connect, options.report))
+    raise typer.Exit(Labelling(dataset, texts, labels, run, ray, connect, report).run())
+
+
+@dataclass(frozen=True)
+class Labelling:
+    """A labelling run of a command: label, try, or only report.
+
+    source: of ``open_dataset``; connect: gives a scorer; say: is called with a line for a person
+    """
+
+    source: str
+    texts: EpisodeTexts
+    labels: LabelOptions
+    options: RunOptions
+    ray: RayOptions
+    connect: Connect
+    say: Say
+
+    def run(self) -> ExitCode:
+        """Does what the options say. Raises RewardError, OSError and ImportError."""
+        if self.options.report:
+            self._report()
+            return ExitCode.OK
+        if self.options.dry_run:
+            self._try()
+            return ExitCode.OK
+        if self.options.rrd is not None:
+            from rfm_client.integrations.recording import load_rerun
+
+            load_rerun()  # or it would be found missing when all is labelled
+            self.options.rrd.mkdir(parents=True, exist_ok=True)
+        report = self._label()
+        status = self._tell(report)
+        if self.options.rrd is not None:
+            self._record(self.options.rrd, report)
+        return status
+
+    def _label(self) -> Report:
+        watch = ProgressBar(self.say)
+        try:
+            with watch:
+                if self.options.engine == "ray":
+                    opening = self.texts.opening
+                    return label_with_ray(self.source, self.connect, self.labels, watch, ray=self.ray, **opening)
+                dataset = self._dataset()
+                with self.connect() as scorer:
+                    return label_dataset(dataset, scorer, self.labels, watch)
+        except (RewardError, OSError, KeyboardInterrupt):
+            if watch.num_begun:
+                self.say("what is finished stays: the same command goes on with the rest")
+            raise
+
+    def _try(self) -> None:
+        """Checks everything, measures a few episodes, writes nothing."""
+        dataset = self._dataset()
+        with self.connect() as scorer, ProgressBar(self.say) as watch:
+            plan = plan_labels(dataset, scorer, self.labels, watch)
+            num_bytes = check_frames(dataset, plan.recipe, plan.items, watch)
+            took_s = _measured_s(plan, dataset, scorer, self.labels.workers)
+        _print(_plan_rows(plan, dataset, num_bytes, took_s))
+
+    def _tell(self, report: Report) -> ExitCode:
+        if report.failures:
+            failed = f"{len(report.failures)} episodes failed"
+            self.say(f"{failed}, so no file was written; the others are kept in {report.parts}")
+            return ExitCode.FAILED
+        if report.summary is None:
+            self.say(f"this shard is labelled; the same command without --shard writes the files from {report.parts}")
+            return ExitCode.OK
+        self._show(report.summary, report.files[0])
+        for file in report.files:
+            typer.echo(f"{file}")
+        return ExitCode.OK
+
+    def _record(self, folder: Path, report: Report) -> None:
+        """Records what is labelled, also by a run before."""
+        from rfm_client.integrations.recording import record_episodes
+
+        dataset = self._dataset()
+        chosen = {episode.index for episode in selected(dataset, self.labels)}
+        plan = replace(report.plan, items=[item for item in report.plan.items if item.episode.index in chosen])
+        for file in record_episodes(folder, dataset, plan, Parts(report.parts)):
+            typer.echo(f"{file}")
+
+    def _report(self) -> None:
+        """Shows the summary of labels that are there: of a dataset, or a file."""
+        path = Path(self.source)
+        if path.is_dir() or self.labels.output is not None:
+            outputs = Outputs(self.labels.output or path, self.labels)
+            files = [*outputs.progress, *outputs.signals]
+            path = next((file for file in files if file.exists()), files[0])
+        self._show(summarise(path), path)
+
+    def _show(self, summary: Summary, file: Path) -> None:
+        _print(summary.rows())
+        if self.options.picture:
+            from rfm_client.cli.pictures import draw_summary
+
+            beside = file.parent.parent if file.parent.name == "reward_signals" else file.parent
+            picture = (self.labels.output or beside) / f"{self.labels.name}_summary.png"
+            draw_summary(picture, summary)
+            typer.echo(f"{picture}")
+
+    def _dataset(self) -> Dataset:
+        return open_dataset(self.source, **self.texts.opening)
+
+
+class ProgressBar(Watch):
+    """Shows a run: lines on standard error and, on a terminal, a bar with frames a second and the time left."""
+
+    def __init__(self, say: Say) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn, TimeRemainingColumn
+        from rich.text import Text
+
+        class Rate(TextColumn):
+            def render(self, task: Task) -> Text:
+                return Text(f"{task.speed:.1f}/s" if task.speed else "")
+
+        console = Console(stderr=True)
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), Rate(""), TimeRemainingColumn())
+        self._say = say
+        self._bar = Progress(
+            *columns,
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+            speed_estimate_period=SPEED_OVER_S,
+        )
+        self.num_begun = 0
+
+    def __enter__(self) -> ProgressBar:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def note(self, text: str) -> None:
+        """Writes a line of its own."""
+        self._say(f"note: {text}")
+
+    def checking(self, num_episodes: int) -> None:
+        """The bar counts the episodes that are checked."""
+        self._begin("checking episodes", num_episodes, 0)
+
+    def checked(self, episode: DatasetEpisode) -> None:
+        """The bar advances by one episode."""
+        self._advance(1)
+
+    def begin(self, num_frames: int, num_finished: int) -> None:
+        """The bar counts frames of labels."""
+        if num_finished:
+            self.note(f"{num_finished} of {num_frames} frames are labelled already")
+        self.num_begun = num_frames
+        self._begin("labelling frames", num_frames, num_finished)
+
+    def scored(self, episode: DatasetEpisode) -> None:
+        """The bar advances by the frames of the episode."""
+        self._advance(episode.num_frames)
+
+    def failed(self, episode: DatasetEpisode, error: RewardError) -> None:
+        """Writes a line with the reason."""
+        text = str(error)
+        self._say(text if text.startswith(episode.name) else f"{episode.name}: {text}")
+        self._advance(episode.num_frames)
+
+    def _begin(self, text: str, total: int, completed: int) -> None:
+        for task in self._bar.task_ids:
+            self._bar.remove_task(task)
+        self._bar.add_task(text, total=total, completed=completed)
+
+    def _advance(self, by: int) -> None:
+        for task in self._bar.task_ids:
+            self._bar.advance(task, by)
+
+
+def _measured_s(plan: Plan, dataset: Dataset, scorer: Scorer, workers: int) -> float:
+    """How long the plan takes, after the first episodes, as many as are under way at a time."""
+    first = plan.items[:workers]
+    memory = FrameMemory()
+
+    def score(item: Item) -> None:
+        episode_columns(dataset, item.episode, scorer, plan.recipe, memory=memory, go_on=lambda: None)
+
+    score(first[0])  # once without the clock, so that what happens once does not count
+    began_s = time.monotonic()
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(score, first))
+    took_s = time.monotonic() - began_s
+    return took_s * plan.num_frames / sum(item.episode.num_frames for item in first)
+
+
+def _plan_rows(plan: Plan, dataset: Dataset, num_bytes: int, took_s: float) -> list[tuple[str, str]]:
+    tasks = sorted({item.episode.task for item in plan.items})
+    cameras = plan.recipe.cameras
+    return [
+        ("dataset", f"{dataset.kind}: {dataset.source}" + (f"@{dataset.revision}" if dataset.revision else "")),
+        ("episodes", str(len(plan.items))),
+        ("frames", f"{plan.num_frames}, of {len(cameras)} cameras: {plan.num_frames * len(cameras)} to be decoded"),
+        ("to be decoded", f"{num_bytes / _MIB:.1f} MiB"),
+        (f"tasks: {len(tasks)}", "; ".join(tasks[:5]) + (" ..." if len(tasks) > 5 else "")),
+        ("it will take about", f"{took_s:.0f} s"),
+    ]
+
+
+def _print(rows: Sequence[tuple[str, str]]) -> None:
+    print_tables(table("", ("labels", ""), rows))
+    sys.stdout.flush()

@@ -1,274 +1,231 @@
 # SPDX-License-Identifier: MIT
-"""What all commands have in common: options, exit codes, errors on one line, the connection."""
+"""Options that several commands of ``rfm-client`` have, each declared once: servers, videos, outputs."""
 
 from __future__ import annotations
 
-import math
-import sys
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from enum import IntEnum
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Any, ClassVar
 
 import typer
-from typer.core import TyperCommand
 
 from rfm_client.async_client import DEFAULT_TIMEOUT_S
+from rfm_client.cli.command import STANDARD_OUTPUT, usage_errors
 from rfm_client.client import RewardClient
 from rfm_client.contract import errors
 from rfm_client.contract.names import DEFAULT_MODEL
+from rfm_client.contract.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS
+from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
 from rfm_client.data.orientation import Orientation
 from rfm_client.data.sampling import Rule, Sampling
 from rfm_client.transport.access import Access
 
 DEFAULT_URL = "grpc://localhost:8001"
-STANDARD_OUTPUT = "-"
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.001, 86_400
-RECORDING = ".rrd"
-PICTURES = (".png", ".pdf", ".svg")
-
-
-class ExitCode(IntEnum):
-    """How a command ended, for scripts."""
-
-    OK = 0
-    FAILED = 1
-    USAGE = 2
-    UNAVAILABLE = 3
-    DEADLINE = 4
-    NO_MODEL = 5
-    INTERRUPTED = 130
-
-
-EXIT_CODES = (
-    "Exit codes: 0 done; 1 a sample (or anything not named here) failed; 2 wrong usage; 3 server unavailable; "
-    "4 out of time; 5 model not served; 130 interrupted. Errors are written to standard error, one a line."
-)
-
-_ERROR_CODES: dict[type[BaseException], ExitCode] = {
-    errors.ServerUnavailableError: ExitCode.UNAVAILABLE,
-    errors.DeadlineExceededError: ExitCode.DEADLINE,
-    errors.ModelNotFoundError: ExitCode.NO_MODEL,
-}
-
-
-def finite(value: float) -> float:
-    """Refuses infinity and NaN, which are within any bounds. Raises typer.BadParameter."""
-    if not math.isfinite(value):
-        raise typer.BadParameter(f"expected a number, got {value}")
-    return value
-
-
-Urls = Annotated[
-    list[str],
-    typer.Option(
-        "--url",
-        envvar="RFM_URL",
-        default_factory=lambda: [DEFAULT_URL],
-        show_default=DEFAULT_URL,
-        help="grpc://host:8001 or http://host:8000, with TLS grpcs:// or https://. Again for more servers of the same "
-        "checkpoint.",
-    ),
-]
-CaFile = Annotated[
-    Path | None, typer.Option(envvar="RFM_CA_FILE", help="Authorities (PEM) to trust; else the system's.")
-]
-ClientCertificate = Annotated[
-    Path | None,
-    typer.Option(envvar="RFM_CLIENT_CERTIFICATE", help="Certificate that this client shows to the server (PEM)."),
-]
-ClientKey = Annotated[Path | None, typer.Option(envvar="RFM_CLIENT_KEY", help="The certificate's key (PEM).")]
-ApiKeyFile = Annotated[
-    Path | None, typer.Option(envvar="RFM_API_KEY_FILE", help="File with the key that requests show as Bearer.")
-]
-Model = Annotated[str, typer.Option("--model", help="Name under which the checkpoint was exported.")]
-TimeoutS = Annotated[
-    float,
-    typer.Option(
-        "--timeout", min=MIN_TIMEOUT_S, max=MAX_TIMEOUT_S, callback=finite, help="Seconds that a request may take."
-    ),
-]
-Json = Annotated[
-    str | None,
-    typer.Option("--json", metavar="[FILE|-]", help="Write JSON to a .json file; alone or -: print it, and no table."),
-]
-Plot = Annotated[
-    Path | None, typer.Option("--plot", metavar="FILE", help="Draw frames and scores: .png, .pdf or .svg.")
-]
-Recorded = Annotated[
-    Path | None,
-    typer.Option("--rrd", metavar="FILE", help="Record frames and scores on one timeline for Rerun's viewer: .rrd."),
-]
-Task = Annotated[str, typer.Option("--task", help="What is to be done, as a sentence.")]
-Fps = Annotated[
-    float, typer.Option("--fps", min=0.001, callback=finite, help="Frames a second that are taken from a video.")
-]
-Subsample = Annotated[
-    bool, typer.Option(help="Score no more frames than the checkpoint was trained on, evenly spaced; else all.")
-]
-SamplingRule = Annotated[
-    Rule | None,
-    typer.Option("--sampling", help="Rule by which each frame is scored on its prefix (see docs/guides/sampling.md)."),
-]
-SampledFrames = Annotated[
-    int | None,
-    typer.Option("--frames", min=1, help="Frames that the rule shows the model; else as many as in training."),
-]
-Orient = Annotated[
-    Orientation,
-    typer.Option("--orient", help="Turn frames upright before they are scored (see docs/guides/label-a-dataset.md)."),
-]
-MaxFrames = Annotated[int | None, typer.Option(min=1, help="Score at most so many frames, evenly.")]
-Resize = Annotated[bool, typer.Option("--resize", help="Make frames as small as the checkpoint reads them, then send.")]
-
-
-class OneLineCommand(TyperCommand):
-    """A command whose errors take one line and never a traceback, and whose ``--json`` may stand alone."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Gives a ``--json`` without a value the value ``-``, which the parser could not."""
-        completed: list[str] = []
-        for index, word in enumerate(args):
-            completed.append(word)
-            following = args[index + 1] if index + 1 < len(args) else "--"
-            if word == "--json" and following.startswith("-") and following != STANDARD_OUTPUT:
-                completed.append(STANDARD_OUTPUT)
-        return super().parse_args(ctx, completed)
-
-    def invoke(self, ctx: Any) -> Any:
-        """Runs the command, and reports an error on one line."""
-        with errors_on_one_line():
-            return super().invoke(ctx)
+MAX_PICTURED = 50  # videos; one picture of more could not be looked at, nor drawn much further
+_ENDINGS = {"json": (".json",), "plot": (".png", ".pdf", ".svg"), "rrd": (".rrd",)}
 
 
 @dataclass(frozen=True)
-class Server:
+class AccessFiles(Settings):
+    """Files with which a server is reached that is not open to all."""
+
+    ca_file: Path | None = setting(None, "Authorities (PEM) to trust; else the system's.", variable="RFM_CA_FILE")
+    client_certificate: Path | None = setting(
+        None, "Certificate that this client shows to the server (PEM).", variable="RFM_CLIENT_CERTIFICATE"
+    )
+    client_key: Path | None = setting(None, "The certificate's key (PEM).", variable="RFM_CLIENT_KEY")
+    api_key_file: Path | None = setting(
+        None, "File with the key that requests show as Bearer.", variable="RFM_API_KEY_FILE"
+    )
+
+    def read(self) -> Access:
+        """What the files hold. Raises ValueError for what cannot be used."""
+        try:
+            api_key = None if self.api_key_file is None else self.api_key_file.read_text().strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ValueError(f"api_key_file: expected a text file, got {error}") from None
+        return Access(self.ca_file, self.client_certificate, self.client_key, api_key=api_key)
+
+
+@dataclass(frozen=True)
+class ServerOptions(Settings):
     """The servers and model of a command, and how long a request may take."""
 
-    urls: list[str]
-    model: str = DEFAULT_MODEL
-    timeout_s: float = DEFAULT_TIMEOUT_S
-    access: Access = field(default_factory=Access)
+    TITLE: ClassVar[str] = "Server"
+
+    urls: Texts = setting(
+        (DEFAULT_URL,),
+        "grpc://host:8001 or http://host:8000, with TLS grpcs:// or https://. Again for more servers of the same "
+        "checkpoint.",
+        flag="--url",
+        variable="RFM_URL",
+    )
+    model: str = setting(DEFAULT_MODEL, "Name under which the checkpoint was exported.")
+    timeout_s: float = setting(
+        DEFAULT_TIMEOUT_S,
+        "Seconds that a request may take.",
+        flag="--timeout",
+        least=MIN_TIMEOUT_S,
+        most=MAX_TIMEOUT_S,
+    )
+
+    @property
+    def origin(self) -> dict[str, Any]:
+        """What JSON documents say of it."""
+        return {"servers": list(self.urls), "model": self.model}
+
+    def client(self, access: Access, **options: Any) -> RewardClient:
+        """A client. Raises typer.BadParameter for a URL that is none."""
+        with usage_errors("'--url'"):
+            return RewardClient(
+                self.urls, model=self.model, **{"timeout_s": self.timeout_s, **access.options, **options}
+            )
 
     @contextmanager
-    def connected(self) -> Iterator[RewardClient]:
+    def connected(self, access: Access) -> Iterator[RewardClient]:
         """A client, once one of the servers answers and serves the model. If none does, it fails without a wait."""
-        with usage_errors("--url"):
-            client = RewardClient(self.urls, model=self.model, timeout_s=self.timeout_s, **self.access.options)
-        with client:
-            self._check()
+        with self.client(access) as client:
+            self._check(access)
             yield client
 
-    def _check(self) -> None:
+    def _check(self, access: Access) -> None:
         problems = []
         for url in self.urls:
-            with RewardClient(
-                url, model=self.model, timeout_s=self.timeout_s, retry=False, **self.access.options
-            ) as client:
+            with RewardClient(url, model=self.model, timeout_s=self.timeout_s, retry=False, **access.options) as one:
                 try:
-                    _check_served(client)
+                    try:
+                        one.model_info()
+                    except errors.ModelNotFoundError:
+                        one.model_info(frames=True)
                     return
                 except errors.RewardError as error:
                     problems.append(error)
         raise problems[0]
 
 
-def read_access(ca_file: Path | None, certificate: Path | None, key: Path | None, key_file: Path | None) -> Access:
-    """Reads the files. Raises typer.BadParameter."""
-    with usage_errors("--ca-file, --client-certificate, --client-key, --api-key-file"):
+@dataclass(frozen=True)
+class VideoOptions(Settings):
+    """How videos are read, and which of their frames are sent."""
+
+    TITLE: ClassVar[str] = "Videos"
+
+    task: str = setting("", "What is to be done, as a sentence.")
+    fps: float = setting(3.0, "Frames a second that are taken from a video.", least=0.001)
+    max_frames: int | None = setting(None, "Score at most so many frames, evenly.", least=1)
+    subsample: bool = setting(True, "Score no more frames than the checkpoint was trained on, evenly spaced; else all.")
+    resize: bool = setting(False, "Make frames as small as the checkpoint reads them, then send.")
+    orient: Orientation = setting(
+        "none", "Turn frames upright before they are scored (see docs/guides/label-a-dataset.md)."
+    )
+
+
+@dataclass(frozen=True)
+class PrefixOptions(Settings):
+    """Whether each frame is scored on its prefix, and by which rule that is sampled; else all in one pass."""
+
+    TITLE: ClassVar[str] = "Prefixes"
+
+    frame_steps: int = setting(
+        0,
+        "Dense mode: score frame t on its prefix 0..t alone, sampled to so many frames.",
+        least=0,
+        most=MAX_FRAME_STEPS,
+    )
+    sampling: Rule | None = setting(
+        None, "Rule by which each frame is scored on its prefix (see docs/guides/sampling.md)."
+    )
+    frames: int | None = setting(None, "Frames that the rule shows the model; else as many as in training.", least=1)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if 0 < self.frame_steps < MIN_FRAME_STEPS:
+            raise ConfigError("frame_steps", f"expected 0 or at least {MIN_FRAME_STEPS}, got {self.frame_steps}")
+        if self.sampling is None:
+            if self.frames is not None:
+                raise ConfigError("frames", "expected --sampling with it, got none")
+            return
+        if self.frame_steps:
+            raise ConfigError("sampling", f"expected no --frame-steps with it, got {self.frame_steps}")
         try:
-            api_key = None if key_file is None else key_file.read_text().strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise ValueError(f"expected a text file, got {error}") from None
-        return Access(ca_file, certificate, key, api_key=api_key)
+            Sampling.of(self.sampling, self.frames, trained_frames=1)
+        except ValueError as error:
+            raise ConfigError("frames", str(error).removeprefix("frames: ")) from None
+
+    @property
+    def rule(self) -> str:
+        """Which frames decide the score of a frame, as a line for people."""
+        if self.frame_steps:
+            return f"Each frame is scored on its prefix: linspace_trunc, {self.frame_steps} frames."
+        if self.sampling is not None:
+            frames = f", {self.frames} frames" if self.frames else ""
+            return f"Each frame is scored on its prefix: {self.sampling}{frames}."
+        return "All frames in one pass; labels and the page score each prefix (--sampling)."
 
 
-def exit_code(error: BaseException) -> ExitCode:
-    """The exit code of a command that fails with this error."""
-    return next((code for kind, code in _ERROR_CODES.items() if isinstance(error, kind)), ExitCode.FAILED)
+@dataclass(frozen=True)
+class OutputOptions(Settings):
+    """Where results are written. Raises ConfigError, before the first request, for where they cannot be."""
 
+    TITLE: ClassVar[str] = "Outputs"
 
-def exit_code_of(failures: Sequence[Exception], *, some_succeeded: bool) -> ExitCode:
-    """The exit code of a command of whose samples some failed: a special one only if all failed for that one reason."""
-    codes = {exit_code(error) for error in failures}
-    if not codes:
-        return ExitCode.OK
-    return codes.pop() if len(codes) == 1 and not some_succeeded else ExitCode.FAILED
+    json: str | None = setting(
+        None, "Write JSON to a .json file; alone or -: print it, and no table.", metavar="[FILE|-]"
+    )
+    plot: Path | None = setting(None, "Draw frames and scores: .png, .pdf or .svg.", metavar="FILE")
+    rrd: Path | None = setting(
+        None, "Record frames and scores on one timeline for Rerun's viewer: .rrd.", metavar="FILE"
+    )
+    npy: Path | None = setting(
+        None,
+        "Write float32 [T, 2], progress and success: to a .npy file (one video), or one a video to a folder.",
+        metavar="FILE|FOLDER",
+    )
 
+    def __post_init__(self) -> None:
+        for name, endings in _ENDINGS.items():
+            value = getattr(self, name)
+            if value is None or value == STANDARD_OUTPUT:
+                continue
+            if Path(value).suffix not in endings:
+                instead = " or -" if name == "json" else ""
+                raise ConfigError(name, f"expected a file that ends in {', '.join(endings)}{instead}, got {value}")
+            if not Path(value).parent.is_dir():
+                raise ConfigError(name, f"expected a folder at {Path(value).parent}, got none")
+        can_be_made = self.npy is None or (self.npy.suffix in ("", ".npy") and self.npy.parent.is_dir())
+        if self.npy is not None and not self.npy.is_dir() and not can_be_made:
+            raise ConfigError("npy", f"expected a .npy file or a folder, got {self.npy}")
 
-def report(message: str) -> None:
-    """Writes the message as one line to standard error."""
-    print(f"rfm-client: {' '.join(message.split())}", file=sys.stderr, flush=True)  # above a progress bar, if any
+    @property
+    def prints_tables(self) -> bool:
+        """Whether tables are shown on standard output."""
+        return self.json != STANDARD_OUTPUT
 
+    def check(self, videos: Sequence[str]) -> None:
+        """Raises ConfigError for more videos than they take."""
+        if self.plot is not None and len(videos) > MAX_PICTURED:
+            raise ConfigError("plot", f"expected at most {MAX_PICTURED} videos, got {len(videos)}")
+        if self.npy is not None and self.npy.suffix == ".npy" and len(videos) > 1:
+            raise ConfigError("npy", f"expected a folder for {len(videos)} videos, got {self.npy}")
 
-def fail(message: str, code: ExitCode) -> NoReturn:
-    """Reports the message and ends the command."""
-    report(message)
-    raise typer.Exit(code)
+    def array_files(self, stems: Sequence[str]) -> list[Path]:
+        """The .npy file of each video; none if none is asked for."""
+        if self.npy is None:
+            return []
+        if self.npy.suffix == ".npy":
+            return [self.npy]
+        self.npy.mkdir(exist_ok=True)
+        return [self.npy / f"{stem}.npy" for stem in stems]
 
-
-@contextmanager
-def usage_errors(option: str) -> Iterator[None]:
-    """A ValueError becomes wrong usage of ``option``."""
-    try:
-        yield
-    except ValueError as error:
-        raise typer.BadParameter(str(error), param_hint=option) from error
-
-
-@contextmanager
-def errors_on_one_line() -> Iterator[None]:
-    """Whatever can be expected to go wrong ends the command with a line and its exit code."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        fail("interrupted", ExitCode.INTERRUPTED)
-    except BrokenPipeError:  # the reader of the output has closed the pipe
-        raise
-    except ImportError as error:
-        fail(missing_package(error), ExitCode.FAILED)
-    except (errors.RewardError, OSError) as error:
-        fail(str(error), exit_code(error))
-
-
-def missing_package(error: ImportError) -> str:
-    """What is missing, with the command that installs it."""
-    return str(error) if "pip install" in str(error) else f'{error}: pip install "./client[cli]"'
-
-
-def check_outputs(json: str | None, plot: Path | None, rrd: Path | None = None) -> None:
-    """Checks, before the first request, that results can be written. Raises typer.BadParameter."""
-    if json is not None and json != STANDARD_OUTPUT and Path(json).suffix != ".json":
-        raise typer.BadParameter(f"expected a .json file or -, got {json}", param_hint="--json")
-    if plot is not None and plot.suffix not in PICTURES:
-        raise typer.BadParameter(f"expected a file that ends in {', '.join(PICTURES)}, got {plot}", param_hint="--plot")
-    if rrd is not None and rrd.suffix != RECORDING:
-        raise typer.BadParameter(f"expected a file that ends in {RECORDING}, got {rrd}", param_hint="--rrd")
-    for option, file in (("--json", json), ("--plot", plot), ("--rrd", rrd)):
-        if file is not None and not Path(file).parent.is_dir():
-            raise typer.BadParameter(f"expected a folder at {Path(file).parent}, got none", param_hint=option)
-
-
-def check_sampling(rule: Rule | None, frames: int | None, *, others: Mapping[str, object]) -> None:
-    """Checks that the rule takes the number of frames. Raises typer.BadParameter.
-
-    others: values of options that say otherwise which frames are scored, by their names
-    """
-    if rule is None:
-        if frames is not None:
-            raise typer.BadParameter("expected --sampling with it, got none", param_hint="--frames")
-        return
-    for option, value in others.items():
-        if value:
-            raise typer.BadParameter(f"expected no {option} with it, got {value}", param_hint="--sampling")
-    with usage_errors("--frames"):
-        Sampling.of(rule, frames, trained_frames=1)
-
-
-def _check_served(client: RewardClient) -> None:
-    try:
-        client.model_info()
-    except errors.ModelNotFoundError:
-        client.model_info(frames=True)
+    def write_json(self, document: Mapping[str, Any]) -> None:
+        """Writes the document to the file, to standard output, or not at all."""
+        if self.json is None:
+            return
+        text = json.dumps(document, indent=2, allow_nan=False)
+        if self.json == STANDARD_OUTPUT:
+            typer.echo(text)
+        else:
+            Path(self.json).write_text(f"{text}\n")

@@ -1,25 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""Scores and a server's state as a person would look at them: tables and a plot. Needs ``rfm-client[cli]``."""
+"""Scores and a server's state as a person would look at them: tables. Needs ``rfm-client[cli]``."""
 
 from __future__ import annotations
 
+import itertools
 import math
 import textwrap
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-import numpy.typing as npt
-
 from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
-from rfm_client.contract.samples import Float32Array, UInt8Array
 from rfm_client.transport.status import DEVICE_METRICS, Device, ModelStatus, ServerStatus
 
 if TYPE_CHECKING:
-    from matplotlib.figure import SubFigure
     from rich.console import Console, ConsoleOptions, RenderResult
     from rich.measure import Measurement
     from rich.table import Table
@@ -27,13 +21,8 @@ if TYPE_CHECKING:
 FILE_WIDTH = 200
 SHORT_CELL = 16  # characters that a column of figures shows in any case
 SHORTEST_NAME = 12
-GAP = "..."
-STRIP_FRAMES = 8
-WIDTH_IN = 10.0
-COLUMN_WIDTH_IN = 7.0  # where panels stand side by side
-PANEL_HEIGHT_IN = 4.0
-DOTS_PER_IN = 200
-MAX_PANELS = 50  # one picture of more could not be looked at, nor drawn much further
+CUT = "..."  # in the place of what is left out of a name
+GAP = "  "  # between columns of rows that come one by one
 
 STATUS_LEGEND = (
     "since load: since the model was loaded, warm-up included, as Triton's statistics count; since start: since Triton "
@@ -44,7 +33,6 @@ STATUS_LEGEND = (
 )
 
 _GIB = 2**30
-_CURVES = (("progress", "tab:blue", "-", "o"), ("success", "tab:green", "--", "s"))
 
 
 def number(value: float | None, digits: int = 4) -> str:
@@ -54,16 +42,16 @@ def number(value: float | None, digits: int = 4) -> str:
 
 def shortened(name: str, width: int) -> str:
     """The name in at most ``width`` characters: what is left out is in the middle, and no part of a file's own name."""
-    if len(name) <= width or width <= len(GAP):
+    if len(name) <= width or width <= len(CUT):
         return name[:width]
-    kept = width - len(GAP)
+    kept = width - len(CUT)
     file_name = len(name) - max(name.rfind("/"), 0)  # with the slash before it
     end = file_name if kept // 2 <= file_name <= kept else kept - kept // 2
-    return f"{name[: kept - end]}{GAP}{name[len(name) - end :]}"
+    return f"{name[: kept - end]}{CUT}{name[len(name) - end :]}"
 
 
 @dataclass(frozen=True)
-class Name:
+class ShortName:
     """A name or a path in a table, shortened to the room that the table has."""
 
     text: str
@@ -100,7 +88,7 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, 
         header = textwrap.fill(column, max(widest, *map(len, column.split()))) if is_short and column else column
         shown.add_column(Text(header), overflow="fold", no_wrap=is_short)
     for row in rows:
-        shown.add_row(*map(Name, row[:names]), *map(Text, row[names:]))
+        shown.add_row(*map(ShortName, row[:names]), *map(Text, row[names:]))
     return shown
 
 
@@ -111,6 +99,38 @@ def print_tables(*tables: object) -> None:
     console = Console()
     console = console if console.is_terminal else Console(width=FILE_WIDTH)
     console.print(*tables, sep="\n", markup=False, highlight=False)
+
+
+class RowByRow:
+    """A table on standard output that is written row by row, as wide as the terminal.
+
+    columns: headers and widths; the first is as wide as ``names``, all that it will have, and the terminal allow
+    """
+
+    def __init__(self, columns: Sequence[tuple[str, int]], names: Sequence[str]) -> None:
+        from rich.console import Console
+
+        console = Console()
+        self._headers, widths = zip(*columns, strict=True)
+        room = (console.width if console.is_terminal else FILE_WIDTH) - sum(widths) - len(GAP) * len(columns)
+        self._widths = [max(SHORTEST_NAME, min(max(map(len, names)), room)), *widths[1:]]
+        self._is_begun = False
+
+    def write(self, cells: Sequence[str]) -> None:
+        """Writes a row at once; before the first, the headers."""
+        lines: list[Sequence[str]] = [[shortened(cells[0], self._widths[0]), *cells[1:]]]
+        if not self._is_begun:
+            self._is_begun = True
+            headers = [textwrap.wrap(header, width) for header, width in zip(self._headers, self._widths, strict=True)]
+            lines = [*itertools.zip_longest(*headers, fillvalue=""), ["-" * width for width in self._widths], *lines]
+        for line in lines:
+            row = GAP.join(cell.ljust(width) for cell, width in zip(line, self._widths, strict=True))
+            print(f"{GAP}{row}".rstrip(), flush=True)
+
+    def end(self, text: str) -> None:
+        """Writes a line below the table, if it has a row."""
+        if self._is_begun:
+            print(f"\n{GAP}{text}", flush=True)
 
 
 def scores_table(title: str, rows: Sequence[tuple[str, Result]]) -> Table:
@@ -152,93 +172,6 @@ def status_tables(status: ServerStatus) -> list[Table | str]:
             table(f"machine, from {DEVICE_METRICS}", ("device", "utilization", "memory used", "memory"), rows),
         ]
     return shown
-
-
-@dataclass(frozen=True, eq=False)
-class Panel:
-    """What a plot shows of one trajectory.
-
-    positions: float64 [T], where each scored frame stands on the time axis
-    unit: of the positions, ``s`` or ``frame``
-    strip: uint8 [S, H, W, 3], some of the frames; None: the trajectory is of embeddings
-    strip_positions: float64 [S]
-    """
-
-    title: str
-    scores: FrameScores
-    positions: npt.NDArray[np.float64]
-    unit: str
-    strip: UInt8Array | None
-    strip_positions: npt.NDArray[np.float64]
-
-    @classmethod
-    def of(
-        cls,
-        title: str,
-        scores: FrameScores,
-        frames: UInt8Array | None = None,
-        times_s: npt.NDArray[np.float64] | None = None,
-    ) -> Panel:
-        """The panel of a trajectory's scores, with all its frames and their times [T], as far as they are known.
-
-        Of the frames it keeps only copies of those that it shows.
-        """
-        scored = np.arange(len(scores.progress)) if scores.frame_indices is None else scores.frame_indices
-        positions = scored.astype(np.float64) if times_s is None else times_s[scored]
-        shown = np.unique(np.linspace(0, len(scored) - 1, STRIP_FRAMES).round().astype(int))
-        strip = None if frames is None else frames[scored[shown]]
-        return cls(title, scores, positions, "frame" if times_s is None else "s", strip, positions[shown])
-
-
-def plot(file: Path, panels: Sequence[Panel], title: str | None = None, *, columns: int = 1) -> None:
-    """Writes a picture, in the format that the file's name ends in: per panel a film strip, and below it the scores.
-
-    columns: panels that stand side by side
-    """
-    try:
-        import matplotlib
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError('plots need matplotlib: pip install "./client[cli]"') from error
-
-    rows = [panels[start : start + columns] for start in range(0, len(panels), columns)]
-    heights_in = [PANEL_HEIGHT_IN * (1 if any(panel.strip is not None for panel in row) else 0.7) for row in rows]
-    with matplotlib.rc_context({"pdf.fonttype": 42, "text.parse_math": False}):  # fonts that journals take
-        figure = Figure(
-            figsize=(WIDTH_IN if columns == 1 else COLUMN_WIDTH_IN * columns, sum(heights_in)), layout="constrained"
-        )
-        if title is not None:
-            figure.suptitle(title)
-        parts = figure.subfigures(len(rows), columns, squeeze=False, height_ratios=heights_in)
-        for part, panel in zip(parts.flat, panels):  # noqa: B905 - the last row may have room left
-            _draw(part, panel)
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Glyph")  # letters that the font lacks are drawn as boxes
-            figure.savefig(file, dpi=DOTS_PER_IN)
-
-
-def _draw(part: SubFigure, panel: Panel) -> None:
-    columns = len(panel.strip_positions)
-    if panel.strip is None:
-        axes = part.add_subplot()
-    else:
-        grid = part.add_gridspec(2, columns, height_ratios=[1, 2])
-        for column, (frame, position) in enumerate(zip(panel.strip, panel.strip_positions, strict=True)):
-            picture = part.add_subplot(grid[0, column])
-            picture.imshow(frame)
-            picture.set_axis_off()
-            picture.set_title(f"{position:.1f} s" if panel.unit == "s" else f"{position:.0f}", fontsize=8)
-        axes = part.add_subplot(grid[1, :])
-    for name, colour, line, marker in _CURVES:
-        scores: Float32Array = getattr(panel.scores, name)
-        if np.isnan(scores).all():
-            axes.plot([], [], color=colour, label=f"{name}: not predicted")
-        else:
-            axes.plot(panel.positions, scores, color=colour, linestyle=line, marker=marker, markersize=4, label=name)
-    axes.set(xlabel="time (s)" if panel.unit == "s" else "frame", ylabel="score", ylim=(-0.02, 1.02))
-    axes.grid(alpha=0.3)
-    axes.legend(loc="upper left", fontsize=8)
-    part.suptitle(panel.title, fontsize=10)
 
 
 def _requests_row(model: ModelStatus) -> tuple[str, ...]:

@@ -6,9 +6,10 @@ from __future__ import annotations
 import math
 import types
 import typing
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, Literal, TypeAlias
 
 Texts: TypeAlias = tuple[str, ...]
 
@@ -32,8 +33,11 @@ class ConfigError(ValueError):
 class Setting:
     """One field of a ``Settings``.
 
-    least, most: bounds of a number; one_of: the texts that it takes, if not any
-    has_option: whether commands have an option for it
+    least, most: bounds of a number
+    flag: its name on a command line; None: made of its own name
+    metavar, variable: what a command's help shows for a value, and an environment variable that gives one
+    parse: makes the value of the text on a command line; raises ValueError
+    has_option: False: only files and programs set it
     """
 
     name: str
@@ -42,40 +46,59 @@ class Setting:
     help: str
     least: float | None = None
     most: float | None = None
-    one_of: Texts = ()
+    flag: str | None = None
+    metavar: str | None = None
+    variable: str | None = None
+    parse: Callable[[str], Any] | None = None
     has_option: bool = True
 
     @property
     def option(self) -> str:
         """The option of this setting, in a command that has no other settings of that name."""
-        return f"--{self.name.replace('_', '-')}"
-
-    @property
-    def no_option(self) -> str:
-        """The option that says no, of a setting that is true or false."""
-        return f"--no-{self.name.replace('_', '-')}"
+        return self.flag or f"--{self.name.replace('_', '-')}"
 
     def from_plain(self, value: Any) -> Any:
         """The value that YAML or JSON spells so. Raises ConfigError for one of another type."""
-        kinds = typing.get_args(self.kind) if isinstance(self.kind, types.UnionType) else (self.kind,)
-        for kind in kinds:
+        for kind in self._kinds:
             if _spells(value, kind):
                 return None if value is None else kind(value)
-        names = " or ".join(_NAMES.get(kind) or kind.__name__ for kind in kinds)
-        raise ConfigError(self.name, f"expected {names}, got {value!r:.200}")
+        raise ConfigError(self.name, f"expected {self._expected}, got {value!r:.200}")
 
     def check(self, value: Any) -> None:
-        """Raises ConfigError for a value that is out of bounds."""
+        """Raises ConfigError for a value that is out of bounds, or none of the choices."""
         if value is None:
             return
+        if self._choices and value not in self._choices:
+            raise ConfigError(self.name, f"expected {self._expected}, got {value!r:.200}")
         if self.least is not None and not _is_number(value):
             raise ConfigError(self.name, f"expected a finite number, got {value!r:.200}")
         if self.least is not None and value < self.least:
             raise ConfigError(self.name, f"expected at least {self.least}, got {value}")
         if self.most is not None and value > self.most:
             raise ConfigError(self.name, f"expected at most {self.most}, got {value}")
-        if self.one_of and value not in self.one_of:
-            raise ConfigError(self.name, f"expected one of {', '.join(self.one_of)} or null, got {value!r}")
+
+    @property
+    def _parts(self) -> tuple[Any, ...]:
+        is_union = typing.get_origin(self.kind) in (types.UnionType, typing.Union)
+        return typing.get_args(self.kind) if is_union else (self.kind,)
+
+    @property
+    def _choices(self) -> Texts:
+        """The texts that a value may be; none: any."""
+        return tuple(
+            text for part in self._parts if typing.get_origin(part) is Literal for text in typing.get_args(part)
+        )
+
+    @property
+    def _kinds(self) -> tuple[Any, ...]:
+        """The types of a value."""
+        return tuple(str if typing.get_origin(part) is Literal else part for part in self._parts)
+
+    @property
+    def _expected(self) -> str:
+        kinds = [kind for kind in self._kinds if not (self._choices and kind is str)]
+        choices = [f"one of {', '.join(self._choices)}"] if self._choices else []
+        return " or ".join([*choices, *(_NAMES.get(kind) or kind.__name__ for kind in kinds)])
 
 
 def setting(default: Any, help: str, **more: Any) -> Any:
@@ -84,7 +107,12 @@ def setting(default: Any, help: str, **more: Any) -> Any:
 
 
 class Settings:
-    """Base of frozen dataclasses whose fields are each a ``setting``. Raises ConfigError for what is out of bounds."""
+    """Base of frozen dataclasses whose fields are each a ``setting``. Raises ConfigError for what is out of bounds.
+
+    TITLE: what a command's help writes above their options
+    """
+
+    TITLE: ClassVar[str] = "Options"
 
     def __post_init__(self) -> None:
         for each in settings_of(type(self)).values():

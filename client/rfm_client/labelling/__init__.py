@@ -11,8 +11,7 @@ with RewardClient("grpc://localhost:8001") as client:
 from rfm_client.data.datasets import Dataset, DatasetEpisode, DatasetError, Orient, iter_episodes, open_dataset
 from rfm_client.labelling.label import Report, label, label_with_ray
 from rfm_client.labelling.label_files import EpisodeLabels, find_label_files, read_episode_labels
-from rfm_client.labelling.options import LabelOptions, parse_episodes
-from rfm_client.labelling.ray_engine import RayOptions
+from rfm_client.labelling.options import LabelOptions, RayOptions, parse_episodes
 from rfm_client.labelling.run import Watch
 from rfm_client.labelling.scorer import CheckpointFacts, ClientScorer, Scorer
 from rfm_client.labelling.summary import Summary, summarise

@@ -24,9 +24,9 @@ from rfm_client.labelling.label_files import (
     write_sidecars,
 )
 from rfm_client.labelling.labelled_before import LabelFile, joined, restore
-from rfm_client.labelling.options import Format, LabelOptions
+from rfm_client.labelling.options import Format, LabelOptions, RayOptions
 from rfm_client.labelling.plan import Item, Plan, Recipe, make_plan, selected
-from rfm_client.labelling.ray_engine import Connect, RayJob, RayOptions, finish_all_with_ray
+from rfm_client.labelling.ray_engine import Connect, RayJob, finish_all_with_ray
 from rfm_client.labelling.run import Failure, Run, Watch
 from rfm_client.labelling.scorer import Scorer
 from rfm_client.labelling.summary import Summary, summary_of_parts

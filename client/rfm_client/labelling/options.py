@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a caller says of a labelling run, checked once."""
+"""What a caller says of a labelling run, checked once: fields for programs, options for command lines."""
 
 from __future__ import annotations
 
@@ -7,87 +7,21 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias, get_args
+from typing import ClassVar, Literal, TypeAlias, get_args
 
-from rfm_client.contract.numbers import checked_count
-from rfm_client.data.camera_fusion import FUSES, Fuse
+from rfm_client.contract.numbers import checked_count, checked_finite
+from rfm_client.contract.settings import ConfigError, Settings, setting
+from rfm_client.data.camera_fusion import Fuse
 from rfm_client.data.sampling import Rule
 
 Mode: TypeAlias = Literal["prefix", "whole"]
 Format: TypeAlias = Literal["progress", "signals", "hdf5"]
 
-MODES: tuple[Mode, ...] = get_args(Mode)
 FORMATS: tuple[Format, ...] = get_args(Format)
 DEFAULT_WORKERS = 4
 
 _NAME = re.compile(r"[A-Za-z0-9][\w-]{0,63}")
 _RANGE = re.compile(r"(\d+)(?::(\d+))?")
-
-
-@dataclass(frozen=True, kw_only=True)
-class LabelOptions:
-    """How a dataset is labelled. Raises ValueError.
-
-    output: folder of the files; None: the dataset's own
-    name: of the reward; the files are ``<name>_progress.parquet`` and ``reward_signals/<name>.parquet``
-    alias: the progress file is written under this name, too: ``sarm_progress`` is what LeRobot's training reads
-    formats: which files; empty: ``progress`` and ``signals``, of an HDF5 dataset ``hdf5``
-    cameras: each is scored, and the scores fused; empty: all but depth cameras
-    sampling, frames: the rule by which frame t's prefix is sampled, and to how many frames; None: as the checkpoint was
-        trained (``Sampling.of``)
-    mode: ``prefix``: frame t is scored on the frames up to t; ``whole``: all frames of an episode are scored together
-    fuse: how the scores of several cameras become one
-    resize: frames are made as small as the checkpoint reads them before they are sent
-    episodes: some of the dataset's, by number; None: all
-    limit: at most so many episodes
-    shard: (i, n): part i, from 0, of n equal parts; then only parts are written, and a run without shard puts them
-        together
-    parts: folder or URL of the finished episodes; None: ``.<name>_parts`` in the output
-    workers: episodes under way at a time
-    overwrite: a file of another provenance is replaced
-    verify: films are told from others by their SHA-256, not by their size and time of change
-    in_place: with the format ``hdf5``: rewards are written into the dataset's own file
-    """
-
-    output: Path | None = None
-    name: str = "rfm"
-    alias: str | None = None
-    formats: Sequence[Format] = ()
-    cameras: Sequence[str] = ()
-    sampling: Rule | None = None
-    frames: int | None = None
-    mode: Mode = "prefix"
-    fuse: Fuse = "mean"
-    resize: bool = False
-    episodes: Sequence[int] | None = None
-    limit: int | None = None
-    shard: tuple[int, int] | None = None
-    parts: str | None = None
-    workers: int = DEFAULT_WORKERS
-    overwrite: bool = False
-    in_place: bool = False
-    verify: bool = False
-
-    def __post_init__(self) -> None:
-        for where, name in (("name", self.name), ("alias", self.alias)):
-            if name is not None and not _NAME.fullmatch(name):
-                raise ValueError(f"{where}: expected 1 to 64 letters, digits, _ or -, got {name!r}")
-        for each in self.formats:
-            _check_one_of("formats", each, FORMATS)
-        _check_one_of("mode", self.mode, MODES)
-        _check_one_of("fuse", self.fuse, tuple(FUSES))
-        if len(set(self.cameras)) != len(self.cameras):
-            raise ValueError(f"cameras: expected each once, got {', '.join(self.cameras)}")
-        if self.mode == "whole" and self.sampling not in (None, "all"):
-            raise ValueError(f"sampling: expected all in mode whole, which shows every frame, got {self.sampling}")
-        for where, numbers in (("episodes", self.episodes), ("shard", self.shard)):
-            if numbers is not None:
-                object.__setattr__(self, where, tuple(checked_count(where, each, least=0) for each in numbers))
-        if self.shard is not None and self.shard[0] >= self.shard[1]:
-            raise ValueError(f"shard: expected i/n with i from 0 to n - 1, got {self.shard[0]}/{self.shard[1]}")
-        for where, number in (("workers", self.workers), ("limit", self.limit), ("frames", self.frames)):
-            if number is not None:
-                object.__setattr__(self, where, checked_count(where, number))
 
 
 def parse_episodes(text: str) -> list[int]:
@@ -109,6 +43,97 @@ def parse_shard(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def _check_one_of(where: str, value: str, allowed: Sequence[str]) -> None:
-    if value not in allowed:
-        raise ValueError(f"{where}: expected one of {', '.join(allowed)}, got {value!r}")
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(text.split(",")) if text else ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelOptions(Settings):
+    """How a dataset is labelled. Raises ConfigError, a ValueError.
+
+    formats: empty: ``progress`` and ``signals``, of an HDF5 dataset ``hdf5``
+    cameras: empty: all but depth cameras
+    sampling, frames: None: as the checkpoint was trained (``Sampling.of``)
+    episodes: by number; None: all
+    shard: (i, n): part i, from 0, of n equal parts; then only parts are written, and a run without shard puts them
+        together
+    parts: None: ``.<name>_parts`` in the output
+    """
+
+    TITLE: ClassVar[str] = "Labels"
+
+    output: Path | None = setting(None, "Folder of the labels; else the dataset's own.")
+    name: str = setting("rfm", "Name of the reward: NAME_progress.parquet and reward_signals/NAME.parquet.")
+    alias: str | None = setting(
+        None, "Write the progress file under this name, too: sarm_progress is what LeRobot reads."
+    )
+    formats: Sequence[Format] = setting(
+        (),
+        "Files to write; else progress,signals, of an HDF5 file hdf5.",
+        flag="--format",
+        metavar=",".join(FORMATS),
+        parse=_names,
+    )
+    cameras: Sequence[str] = setting(
+        (), "Cameras to score; else all but depth ones.", metavar="KEY[,KEY...]", parse=_names
+    )
+    fuse: Fuse = setting("mean", "How the scores of several cameras become one.")
+    sampling: Rule | None = setting(
+        None, "Rule by which frame t's prefix is sampled; else that of the checkpoint's training."
+    )
+    frames: int | None = setting(None, "Frames that the rule shows the model; else as many as in training.", least=1)
+    mode: Mode = setting("prefix", "prefix: frame t is scored on the frames up to t. whole: all frames together.")
+    resize: bool = setting(False, "Make frames as small as the checkpoint reads them, then send.")
+    episodes: Sequence[int] | None = setting(
+        None, "Some of the episodes, by number.", metavar="0:100,205", parse=parse_episodes
+    )
+    limit: int | None = setting(None, "At most so many episodes.", least=1)
+    shard: tuple[int, int] | None = setting(
+        None, "Label part I of N alone, from 0; run without it to write the files.", metavar="I/N", parse=parse_shard
+    )
+    parts: str | None = setting(
+        None, "Where finished episodes are kept; else .NAME_parts in the output.", metavar="FOLDER|URL"
+    )
+    workers: int = setting(DEFAULT_WORKERS, "Episodes under way at a time.", least=1)
+    overwrite: bool = setting(False, "Replace labels of another recipe; those of the same are kept.")
+    verify: bool = setting(False, "Tell films from others by their SHA-256, not by their size and time of change.")
+    in_place: bool = setting(False, "Write the labels into the HDF5 file itself.")
+
+    def __post_init__(self) -> None:
+        for name in ("workers", "limit", "frames"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, checked_count(name, getattr(self, name)))
+        for name in ("episodes", "shard"):
+            if getattr(self, name) is not None:
+                numbers = tuple(checked_count(name, each, least=0) for each in getattr(self, name))
+                object.__setattr__(self, name, numbers)
+        super().__post_init__()
+        for name in ("name", "alias"):
+            value = getattr(self, name)
+            if value is not None and not _NAME.fullmatch(value):
+                raise ConfigError(name, f"expected 1 to 64 letters, digits, _ or -, got {value!r}")
+        for each in self.formats:
+            if each not in FORMATS:
+                raise ConfigError("formats", f"expected one of {', '.join(FORMATS)}, got {each!r}")
+        if len(set(self.cameras)) != len(self.cameras):
+            raise ConfigError("cameras", f"expected each once, got {', '.join(self.cameras)}")
+        if self.mode == "whole" and self.sampling not in (None, "all"):
+            raise ConfigError("sampling", f"expected all in mode whole, which shows every frame, got {self.sampling}")
+        if self.shard is not None and self.shard[0] >= self.shard[1]:
+            raise ConfigError("shard", f"expected i/n with i from 0 to n - 1, got {self.shard[0]}/{self.shard[1]}")
+
+
+@dataclass(frozen=True)
+class RayOptions(Settings):
+    """Where and how many Ray actors label. Raises ConfigError, a ValueError."""
+
+    TITLE: ClassVar[str] = "With --engine ray"
+
+    address: str | None = setting(None, "Ray cluster; else one that is found, or made here.")
+    actors: int = setting(1, "Ray actors, each with a scorer.", least=1)
+    num_gpus_per_actor: float = setting(0.0, "GPUs of its node that a Ray actor takes.", least=0)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "actors", checked_count("actors", self.actors))
+        object.__setattr__(self, "num_gpus_per_actor", checked_finite("num_gpus_per_actor", self.num_gpus_per_actor))
+        super().__post_init__()

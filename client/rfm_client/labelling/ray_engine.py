@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 from rfm_client.contract.errors import RewardError
-from rfm_client.contract.numbers import checked_count, checked_finite
 from rfm_client.data.datasets.opening import open_dataset
 from rfm_client.labelling.finished_episodes import Parts
+from rfm_client.labelling.options import RayOptions
 from rfm_client.labelling.plan import Plan
 from rfm_client.labelling.run import Failure, Run, Watch, begin, by_episode
 from rfm_client.labelling.scorer import Scorer
@@ -23,25 +23,6 @@ from rfm_client.labelling.scorer import Scorer
 Connect: TypeAlias = Callable[[], AbstractContextManager[Scorer]]
 
 _BATCHES_AN_ACTOR = 4  # at least, where there are enough episodes, so that all actors end at about the same time
-
-
-@dataclass(frozen=True)
-class RayOptions:
-    """Where and how many actors label.
-
-    address: of the cluster; None: one that is found, or else made on this machine
-    actors: each holds a scorer
-    num_gpus_per_actor: of a node's GPUs that an actor takes; 0 for actors that ask servers
-    """
-
-    address: str | None = None
-    actors: int = 1
-    num_gpus_per_actor: float = 0.0
-
-    def __post_init__(self) -> None:
-        checked_count("actors", self.actors)
-        if checked_finite("num_gpus_per_actor", self.num_gpus_per_actor) < 0:
-            raise ValueError(f"num_gpus_per_actor: expected 0 or more, got {self.num_gpus_per_actor}")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: MIT
+"""What every command of ours is: options made of settings, errors on one line, exit codes."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import sys
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Annotated, Any, NoReturn, TypeAlias, get_args, get_type_hints
+
+import typer
+from typer.core import TyperCommand
+
+from rfm_client.contract import errors
+from rfm_client.contract.settings import ConfigError, Setting, Settings, Texts, settings_of
+
+STANDARD_OUTPUT = "-"
+
+Given: TypeAlias = dict[str, Any]  # values of the options that were given, by the names of the settings
+
+
+class ExitCode(IntEnum):
+    """How a command ended, for scripts."""
+
+    OK = 0
+    FAILED = 1
+    USAGE = 2
+    UNAVAILABLE = 3
+    DEADLINE = 4
+    NO_MODEL = 5
+    INTERRUPTED = 130
+
+
+EXIT_CODES = (
+    "Exit codes: 0 done; 1 a sample (or anything not named here) failed; 2 wrong usage; 3 server unavailable; "
+    "4 out of time; 5 model not served; 130 interrupted. Errors are written to standard error, one a line."
+)
+
+_ERROR_CODES: dict[type[BaseException], ExitCode] = {
+    errors.ServerUnavailableError: ExitCode.UNAVAILABLE,
+    errors.DeadlineExceededError: ExitCode.DEADLINE,
+    errors.ModelNotFoundError: ExitCode.NO_MODEL,
+}
+
+
+@dataclass(frozen=True)
+class OptionsOf:
+    """Marks a parameter of a command that gets settings. ``Given``: only those given; else an object of ``settings``.
+
+    prefix: before each option's name
+    only: settings that have an option; none: all
+    required: settings that must be given
+    defaults: values of settings that are not given, in the place of their own defaults
+    """
+
+    settings: type[Settings]
+    prefix: str = ""
+    only: Collection[str] = ()
+    required: Collection[str] = ()
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def chosen(self) -> list[Setting]:
+        """The settings that have an option."""
+        known = settings_of(self.settings).values()
+        return [each for each in known if each.has_option and (not self.only or each.name in self.only)]
+
+    def option(self, setting: Setting) -> str:
+        """The option of a setting, with the prefix."""
+        return f"--{self.prefix}{setting.option.removeprefix('--')}"
+
+    def name(self, setting: Setting) -> str:
+        """The parameter that typer makes of an option."""
+        return f"{self.prefix}{setting.name}".replace("-", "_")
+
+    def parameter(self, setting: Setting) -> inspect.Parameter:
+        """What typer reads. Its default is None, so that a file or the settings' own default can decide."""
+        is_required = setting.name in self.required
+        default = None if is_required else self.defaults.get(setting.name, setting.default)
+        option = self.option(setting)
+        if default is True:
+            option += f"/--{self.prefix}no-{setting.option.removeprefix('--')}"
+        described = typer.Option(
+            option,
+            help=setting.help if default in (None, (), "", False) else f"{setting.help}  [default: {_shown(default)}]",
+            min=setting.least,
+            max=setting.most,
+            metavar=setting.metavar,
+            envvar=setting.variable,
+            show_default=False,
+            rich_help_panel=self.settings.TITLE,
+        )
+        kind = str if setting.parse else list[str] if setting.kind == Texts else setting.kind
+        return inspect.Parameter(
+            self.name(setting),
+            inspect.Parameter.KEYWORD_ONLY,
+            default=inspect.Parameter.empty if is_required else None,
+            annotation=Annotated[kind if is_required else kind | None, described],
+        )
+
+    def taken_from(self, values: dict[str, Any]) -> Given:
+        """The settings that were given, out of the values of all options. Raises typer.BadParameter."""
+        given = {}
+        for each in self.chosen:
+            value = values.pop(self.name(each))
+            if value in (None, []):
+                continue
+            try:
+                value = each.parse(value) if each.parse else value
+            except ValueError as error:
+                raise typer.BadParameter(str(error), param_hint=f"'{self.option(each)}'") from None
+            given[each.name] = tuple(value) if isinstance(value, list) else value
+        return given
+
+
+def with_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Gives a command an option for each setting of its parameters that are ``Settings`` or marked by ``OptionsOf``."""
+    hints = get_type_hints(command, include_extras=True)
+    marked = {name: mark for name, hint in hints.items() if (mark := _mark(hint)) is not None}
+    parameters: list[inspect.Parameter] = []
+    for name, parameter in inspect.signature(command).parameters.items():
+        if name in marked:
+            parameters += map(marked[name].parameter, marked[name].chosen)
+        else:
+            parameters.append(parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY))
+
+    @functools.wraps(command)
+    def run(**values: Any) -> None:
+        try:
+            for name, mark in marked.items():
+                given = mark.taken_from(values)
+                is_given = get_args(hints[name])[:1] == (Given,)
+                values[name] = given if is_given else mark.settings(**{**mark.defaults, **given})
+            command(**values)
+        except ConfigError as error:
+            raise _named(error, marked.values()) from None
+
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # what typer reads
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return run
+
+
+class Command(TyperCommand):
+    """A command whose help has a section for each group of options, and whose ``--json`` may stand alone.
+
+    Its errors take one line and never a traceback.
+    """
+
+    program = "rfm-client"
+    expected: tuple[type[Exception], ...] = (errors.RewardError, OSError)
+    has_codes = True  # of its own for errors that scripts want to tell apart
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Gives a ``--json`` without a value the value ``-``, which the parser could not."""
+        completed: list[str] = []
+        for index, word in enumerate(args):
+            completed.append(word)
+            following = args[index + 1] if index + 1 < len(args) else "--"
+            if word == "--json" and following.startswith("-") and following != STANDARD_OUTPUT:
+                completed.append(STANDARD_OUTPUT)
+        return super().parse_args(ctx, completed)
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Writes a section for the arguments, one for the command's own options, and one for each group of settings."""
+        sections: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if record is not None:
+                is_argument = parameter.param_type_name == "argument"
+                title = "Arguments" if is_argument else getattr(parameter, "rich_help_panel", None) or "Options"
+                sections.setdefault(title, []).append(record)
+        for title, records in sections.items():
+            if records:
+                with formatter.section(title):
+                    formatter.write_dl(records)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Runs the command, and reports an error on one line."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            code, message = ExitCode.INTERRUPTED, "interrupted"
+        except BrokenPipeError:  # the reader of the output has closed the pipe
+            raise
+        except ImportError as error:
+            code, message = ExitCode.FAILED, missing_package(error)
+        except self.expected as error:
+            code, message = exit_code(error) if self.has_codes else ExitCode.FAILED, str(error)
+        report(message, self.program)
+        raise typer.Exit(code)
+
+
+def exit_code(error: BaseException) -> ExitCode:
+    """The exit code of a command that fails with this error."""
+    return next((code for kind, code in _ERROR_CODES.items() if isinstance(error, kind)), ExitCode.FAILED)
+
+
+def exit_code_of(failures: Sequence[Exception], *, some_succeeded: bool) -> ExitCode:
+    """The exit code of a command of whose samples some failed: a special one only if all failed for that one reason."""
+    codes = {exit_code(error) for error in failures}
+    if not codes:
+        return ExitCode.OK
+    return codes.pop() if len(codes) == 1 and not some_succeeded else ExitCode.FAILED
+
+
+def report(message: str, program: str = "rfm-client") -> None:
+    """Writes the message as one line to standard error."""
+    print(f"{program}: {' '.join(message.split())}", file=sys.stderr, flush=True)  # above a progress bar, if any
+
+
+def fail(message: str, program: str = "rfm-client") -> NoReturn:
+    """Reports the message and ends the command."""
+    report(message, program)
+    raise typer.Exit(ExitCode.FAILED)
+
+
+@contextmanager
+def usage_errors(option: str) -> Iterator[None]:
+    """A ValueError becomes wrong usage of ``option``."""
+    try:
+        yield
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint=option) from error
+
+
+def missing_package(error: ImportError) -> str:
+    """What is missing, with the command that installs it."""
+    return str(error) if "pip install" in str(error) else f'{error}: pip install "./client[cli]"'
+
+
+def _named(error: ConfigError, marks: Iterable[OptionsOf]) -> Exception:
+    """Wrong usage of the options whose settings the error names; the error itself if it names others."""
+    keys = error.key.split(", ")
+    for mark in marks:
+        options = {each.name: mark.option(each) for each in mark.chosen}
+        if options.keys() >= set(keys):
+            return typer.BadParameter(error.expected, param_hint=f"'{', '.join(options[key] for key in keys)}'")
+    return error
+
+
+def _mark(hint: Any) -> OptionsOf | None:
+    if isinstance(hint, type) and issubclass(hint, Settings):
+        return OptionsOf(hint)
+    return next((mark for mark in get_args(hint)[1:] if isinstance(mark, OptionsOf)), None)
+
+
+def _shown(default: Any) -> str:
+    if isinstance(default, bool):
+        return "yes"
+    return " ".join(map(str, default)) if isinstance(default, tuple) else str(default)

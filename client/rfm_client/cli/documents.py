@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: MIT
+"""The JSON documents of the commands. A score that a checkpoint does not predict is null, never a number."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.cli.comparing import Comparison
+from rfm_client.cli.options import PrefixOptions, ServerOptions, VideoOptions
+from rfm_client.cli.scoring import Outcome, Scored, Times
+from rfm_client.contract.errors import RewardError
+from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
+from rfm_client.transport.status import ServerStatus
+
+SIDES = ("first", "second")  # of a comparison
+
+
+def score_document(
+    server: ServerOptions, video: VideoOptions, prefix: PrefixOptions, outcomes: Sequence[Outcome]
+) -> dict[str, Any]:
+    """The JSON document that ``score --json`` writes."""
+    asked = {"frame_steps": prefix.frame_steps, "sampling": prefix.sampling, "sampled_frames": prefix.frames}
+    return {**server.origin, **_asked(video), **asked, "videos": [_outcome(outcome) for outcome in outcomes]}
+
+
+def comparison_document(server: ServerOptions, video: VideoOptions, comparison: Comparison) -> dict[str, Any]:
+    """What ``compare --json`` writes; a ``preference`` is the probability that the first of an order is preferred.
+
+    Of two videos it also has the answer to the order given, ``preference``, the verdict of both orders, and scores as
+    ``first`` and ``second``. No verdict, rank or ranking is null.
+    """
+    names = [source.name for source in comparison.sources]
+    videos = [
+        {
+            "source": source.name,
+            "num_frames": source.trajectory.num_frames,
+            **frame_document(scores, source.times_of(scores)),
+            "wins": wins,
+            "rank": rank,
+        }
+        for source, scores, wins, rank in zip(
+            comparison.sources, comparison.scores, comparison.wins, comparison.ranks, strict=True
+        )
+    ]
+    orders = [
+        {"first": names[first], "second": names[second], "preference": result.preference}
+        for (first, second), result in comparison.results.items()
+    ]
+    pairs = [
+        {"first": names[first], "second": names[second], **_verdict(comparison.pair(first, second))}
+        for first, second in comparison.couples()
+    ]
+    asked = comparison.results[0, 1]
+    document = {**server.origin, **_asked(video), "model_version": asked.model_version}
+    if len(videos) == len(SIDES):
+        document |= {"preference": asked.preference, **_verdict(comparison.pair(0, 1))}
+        document |= dict(zip(SIDES, videos, strict=True))
+    best_first = comparison.ranking
+    ranking = None if best_first is None else [videos[index] for index in best_first]
+    return {**document, "orders": orders, "pairs": pairs, "videos": videos, "ranking": ranking}
+
+
+def samples_document(server: ServerOptions, kind: str, outcomes: Sequence[Result | RewardError]) -> dict[str, Any]:
+    """The JSON document that ``sample --json`` writes."""
+    samples = [
+        _error(outcome, str(outcome)) if isinstance(outcome, RewardError) else result_document(outcome)
+        for outcome in outcomes
+    ]
+    return {**server.origin, "sample_type": kind, "samples": samples}
+
+
+def result_document(result: Result, times_s: Sequence[Times | None] = (None, None)) -> dict[str, Any]:
+    """A result of any type; times_s of the scored frames of its trajectories."""
+    version = {"model_version": result.model_version}
+    if isinstance(result, ProgressResult):
+        return {**version, **frame_document(result, times_s[0])}
+    if isinstance(result, PreferenceResult):
+        answer, names = {"preference": result.preference}, SIDES
+    else:
+        answer, names = {"similarity": result.similarity}, ("reference", "other")
+    scores = {name: frame_document(getattr(result, name), t) for name, t in zip(names, times_s, strict=True)}
+    return {**version, **answer, **scores}
+
+
+def frame_document(scores: FrameScores, times_s: Times | None) -> dict[str, Any]:
+    """Scores of each frame; frame_indices among the frames that were read."""
+    indices = np.arange(len(scores.progress)) if scores.frame_indices is None else scores.frame_indices
+    return {
+        "progress": _or_null(scores.progress),
+        "success": _or_null(scores.success),
+        "frame_indices": indices.tolist(),
+        "frame_times_s": None if times_s is None else times_s.tolist(),
+    }
+
+
+def status_document(statuses: Sequence[ServerStatus]) -> dict[str, Any]:
+    """The JSON document that ``status --json`` writes."""
+    servers = []
+    for status in statuses:
+        models = [
+            {
+                **asdict(model),
+                "samples_per_batch": model.samples_per_batch,
+                "queue_ms_per_request": model.queue_ms_per_request,
+                "compute_ms_per_batch": model.compute_ms_per_batch,
+            }
+            for model in status.models
+        ]
+        servers.append({**asdict(status), "models": models})
+    return {"servers": servers}
+
+
+def _asked(video: VideoOptions) -> dict[str, Any]:
+    return {"task": video.task, "fps": video.fps, "orient": video.orient}
+
+
+def _outcome(outcome: Outcome) -> dict[str, Any]:
+    if not isinstance(outcome, Scored):
+        return {"source": outcome.name, **_error(outcome.error, outcome.message)}
+    about = {"source": outcome.name, "num_frames": outcome.num_frames, "took_s": outcome.took_s}
+    return {**about, **result_document(outcome.result, (outcome.times_s,))}
+
+
+def _verdict(pair: PreferenceResult) -> dict[str, Any]:
+    return {"verdict": pair.verdict, "orders_agree": pair.orders_agree}
+
+
+def _error(error: Exception, message: str) -> dict[str, Any]:
+    return {"error": message, "error_type": type(error).__name__}
+
+
+def _or_null(scores: npt.NDArray[np.float32]) -> list[float] | None:
+    """The scores [T] as float64 of the same value; None if the checkpoint does not predict them."""
+    return None if np.isnan(scores).all() else scores.tolist()

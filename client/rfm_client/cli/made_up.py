@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: MIT
+"""Samples made up from a seed, to see that a server answers and how fast; also as input of ``perf_analyzer``.
+
+Their scores mean nothing. The file has the format of perf_analyzer's ``--input-data`` (its docs/input_data.md): under
+``data`` one entry a request, each tensor as ``content`` in row-major order and ``shape`` without the batch axis, which
+perf_analyzer adds. Numbers are base64 of their little-endian bytes.
+"""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import json
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from rfm_client.client import RewardClient
+from rfm_client.contract.errors import ModelNotFoundError
+from rfm_client.contract.made_up import random_trajectory
+from rfm_client.contract.model_info import ModelInfo
+from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
+from rfm_client.contract.settings import Settings, setting
+from rfm_client.contract.wire import encode_samples
+
+TASK = "put the block in the bowl"
+
+SampleType: TypeAlias = Literal["progress", "preference", "similarity"]
+
+_LENGTHS = re.compile(r"([1-9][0-9]{0,3})(?:-([1-9][0-9]{0,3}))?")  # a longer one would only fill the memory
+
+
+def parse_lengths(text: str) -> list[int]:
+    """The lengths that ``8``, ``4,8,16`` or ``4-16`` names. Raises ValueError."""
+    lengths: list[int] = []
+    for part in text.split(","):
+        match = _LENGTHS.fullmatch(part.strip())
+        if match is None or int(match[2] or match[1]) < int(match[1]):
+            raise ValueError(f"expected a length (8), several (4,8,16) or a range (4-16), got {text!r}")
+        lengths += range(int(match[1]), int(match[2] or match[1]) + 1)
+    return lengths
+
+
+@dataclass(frozen=True)
+class MadeUpSamples(Settings):
+    """Samples of one type, as many as ``num_samples``, whose trajectories have the lengths in turn."""
+
+    TITLE: ClassVar[str] = "Samples"
+
+    sample_type: SampleType = setting("progress", "What a sample asks.")
+    num_samples: int = setting(4, "Samples to make up.", least=1, most=10_000)
+    num_frames: Sequence[int] = setting(
+        (8,),
+        "Frames of a trajectory: one length, several or a range, in turn.",
+        metavar="N|N,M,...|N-M",
+        parse=parse_lengths,
+    )
+    use_frames: bool = setting(False, "Random frames, also where embeddings would do.")
+    seed: int = setting(0, "Seed of the random numbers.", least=0)
+
+    def samples(self, client: RewardClient) -> list[Sample]:
+        """The samples, in the widths of the served checkpoint. Raises ModelNotFoundError if it does not take them."""
+        info = self._model_info(client)
+        random = np.random.default_rng(self.seed)
+        trajectories = self._trajectories(random, info)
+        if self.sample_type == "progress":
+            return [ProgressSample(next(trajectories)) for _ in range(self.num_samples)]
+        pair = PreferenceSample if self.sample_type == "preference" else SimilaritySample
+        return [pair(next(trajectories), next(trajectories)) for _ in range(self.num_samples)]
+
+    def _model_info(self, client: RewardClient) -> ModelInfo:
+        if not self.use_frames:
+            with suppress(ModelNotFoundError):
+                return client.model_info()
+        return client.model_info(frames=True)
+
+    def _trajectories(self, random: np.random.Generator, info: ModelInfo) -> Iterator[Trajectory]:
+        for length in itertools.cycle(random.permutation(self.num_frames).tolist()):
+            yield random_trajectory(random, length, info.widths, task=TASK)
+
+
+def are_frames(samples: Sequence[Sample]) -> bool:
+    """Whether made-up samples are of raw frames."""
+    return samples[0].trajectories[0].frames is not None
+
+
+def perf_analyzer_input(samples: Sequence[Sample]) -> dict[str, Any]:
+    """The document: a request a sample, as RewardClient would send it alone."""
+    requests = [encode_samples([sample]) for sample in samples]
+    return {"data": [{name: _tensor(array[0]) for name, array in request.items()} for request in requests]}
+
+
+def write_perf_analyzer_input(file: Path, samples: Sequence[Sample]) -> None:
+    """Writes the samples to ``file``, in perf_analyzer's JSON format."""
+    file.write_text(json.dumps(perf_analyzer_input(samples)))
+
+
+def _tensor(array: npt.NDArray[Any]) -> dict[str, Any]:
+    if array.dtype == np.object_:  # BYTES: text, as it is
+        return {"content": [element.decode() for element in array.ravel()], "shape": list(array.shape)}
+    little_endian = array.astype(array.dtype.newbyteorder("<"), copy=False)
+    return {"content": {"b64": base64.b64encode(little_endian.tobytes()).decode()}, "shape": list(array.shape)}

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: MIT
+"""What the commands of ``rfm`` share: errors on one line, options, what they tell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+
+from rfm.checkpoint.content import CheckpointError
+from rfm.launch.admin_key import AdminKeyError
+from rfm.launch.installation import ServerStartError
+from rfm.launch.repository_api import RepositoryApiError
+from rfm_client import RewardError
+from rfm_client.cli import command
+from rfm_client.contract.settings import ConfigError
+from rfm_export.errors import ExportError
+
+OF_A_CHECKPOINT = ("checkpoint", "image_encoder", "text_encoder", "base_model")  # settings of an export
+
+AdminKeyFile = Annotated[
+    Path | None, typer.Option(help="File with the server's admin key; else RFM_ADMIN_KEY.", show_default=False)
+]
+TritonPath = Annotated[
+    Path | None, typer.Option("--tritonserver", help="tritonserver program; else PATH, else the nvidia-pytriton wheel.")
+]
+
+
+class RfmCommand(command.Command):
+    """A command whose expected errors take one line, and end it with 1."""
+
+    program = "rfm"
+    has_codes = False
+    expected = (
+        *(AdminKeyError, CheckpointError, ConfigError, ExportError, RepositoryApiError, RewardError),
+        *(ServerStartError, OSError),
+    )
+
+
+def say(line: str) -> None:
+    """Writes a line to standard error."""
+    command.report(line, RfmCommand.program)
+
+
+def fail(message: str) -> NoReturn:
+    """Says why, and ends the command."""
+    command.fail(message, RfmCommand.program)
