@@ -13,9 +13,8 @@ from typing import Any
 import httpx
 import pytest
 
-from rfm import proc
 from rfm.config import ConfigError, ServeConfig
-from rfm.launch import endpoints
+from rfm.launch import endpoints, proc
 from rfm.launch.endpoints import PORTS, Endpoints, GrpcTls, check_version, free_ports
 from rfm.launch.installation import Installation, ServerStartError, find_installation
 from rfm.launch.process import TritonServer
