@@ -163,7 +163,7 @@ def site(folder: Path, export: Callable[[Path], object] | None = None) -> Iterat
     (export or (lambda repository: export_faulty(repository, folder)))(repository)
     key_file.touch(0o600)
     key_file.write_text("the-key-of-this-run")
-    config.write_text(f"hang_s: {HANG_S}\n")
+    config.write_text(f"serve: {{hang_s: {HANG_S}}}\n")
     port = Endpoints.free().http_port
     with serving(repository, f"--gateway-port={port}", f"--admin-key-file={key_file}", f"--config={config}") as served:
         start_s = served.wait_ready()

@@ -72,7 +72,7 @@ def administered(repository: Path, **settings: int) -> Iterator[Serving]:
     key_file, config = repository.parent / "key", repository.parent / "serve.yaml"
     key_file.touch(0o600)
     key_file.write_text(KEY)
-    config.write_text("".join(f"{name}: {value}\n" for name, value in settings.items()))
+    config.write_text("serve:\n" + "".join(f"  {name}: {value}\n" for name, value in settings.items()))
     with serving(repository, f"--admin-key-file={key_file}", f"--config={config}") as served:
         served.wait_ready()
         yield served

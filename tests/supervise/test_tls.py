@@ -307,7 +307,7 @@ def test_the_gateway_s_own_certificate_is_not_the_caller_s_fault(
 def test_half_a_certificate_of_the_gateway_is_refused(papers: Papers) -> None:
     done = rfm_client("gateway", "--triton", "grpc://127.0.0.1:1", "--certificate", papers.certificate)
     assert done.returncode == 2
-    assert "--certificate, --key: expected both or none, got one" in done.stderr
+    assert "'--certificate, --key': expected both or none, got one" in done.stderr
 
 
 def test_rfm_serve_heals_with_tls(mutual: Endpoints, papers: Papers, mutual_folder: Path, repository: Path) -> None:
