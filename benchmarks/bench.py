@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, gettempdir
 from typing import Any
 
 import report
@@ -228,7 +228,8 @@ def _ours(place: Path) -> Iterator[str]:
 
 @contextmanager
 def _commit(words: list[str]) -> Iterator[str]:
-    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    # Not here, from where Python would import this commit's packages.
+    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=gettempdir())
     assert process.stdout is not None
     try:
         while not (line := process.stdout.readline()).startswith("grpc"):

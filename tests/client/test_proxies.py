@@ -60,12 +60,14 @@ def test_a_gateway_reaches_its_triton_without_a_proxy(demo_server: Endpoints, tm
 
 
 @pytest.mark.parametrize("variable", ["http_proxy", "https_proxy", "grpc_proxy"])
-def test_other_hosts_are_reached_through_it(proxy: HttpProxy, monkeypatch: pytest.MonkeyPatch, variable: str) -> None:
+def test_other_hosts_are_reached_through_it(
+    proxy: HttpProxy, demo_server: Endpoints, monkeypatch: pytest.MonkeyPatch, variable: str
+) -> None:
     monkeypatch.setenv(variable, proxy.url)
     with RewardClient(f"grpc://{ELSEWHERE}:8001", retry=False) as client:
         assert client.model_info().name == "rfm"
     assert proxy.asked == [f"{ELSEWHERE}:8001"]
-    assert read_status(f"grpc://{ELSEWHERE}:8001").ready
+    assert read_status(f"grpc://{ELSEWHERE}:8001", metrics_url=demo_server.metrics_url).ready  # the proxy has no HTTP
 
 
 @pytest.mark.parametrize("variable", ["http_proxy", "https_proxy", "grpc_proxy"])

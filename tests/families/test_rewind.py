@@ -143,14 +143,16 @@ def test_every_variant_scores_as_torchs_own_transformer(config: RewindConfig) ->
         np.testing.assert_allclose(numbers(outcome), expected.numpy(), rtol=0, atol=TOLERANCE)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_no_mix_of_lengths_and_types_changes_a_result(seed: int) -> None:
-    random = np.random.default_rng(seed)
-    samples = samples_for(SMALL)
+@pytest.mark.parametrize("config", VARIANTS.values(), ids=VARIANTS)
+@pytest.mark.parametrize("token_budget", [64, 16_384])
+def test_no_mix_of_lengths_and_types_changes_a_result(config: RewindConfig, token_budget: int) -> None:
+    random = np.random.default_rng(token_budget)
+    samples = samples_for(config)
     samples += [ProgressSample(trajectory(t, t), frame_steps=3) for t in (2, 5)]
-    engine = engine_of(build(SMALL))
-    alone = [numbers(engine.evaluate([sample])[0]) for sample in samples]
-    for size in range(1, 60):
+    network = build(config)
+    alone = [numbers(engine_of(network).evaluate([sample])[0]) for sample in samples]
+    engine = engine_of(network, token_budget=token_budget)
+    for size in (2, 3, 4, 5, 7, 11, 18, 29, 47):
         chosen = random.integers(0, len(samples), size)
         for index, outcome in zip(chosen, engine.evaluate([samples[i] for i in chosen]), strict=True):
             np.testing.assert_allclose(numbers(outcome), alone[index], rtol=0, atol=TOLERANCE)
