@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -89,24 +88,21 @@ def test_callers_share_batches_and_a_bad_sample_fails_alone(served: Served, prot
     busy = (
         plug() if model == MODEL else [ProgressSample(film(1000 + (protocol == "grpc"), 16, 2500, 2500))]
     )  # not cached
-    start = threading.Barrier(len(samples))
     with (
-        RewardClient(served.url(protocol), model=model, max_in_flight=len(samples) + 4) as client,
-        ThreadPoolExecutor(len(samples) + 1) as pool,
+        RewardClient(served.url(protocol), model=model, max_in_flight=len(samples)) as client,
+        served.client("http", model) as other,  # a large request would hold up those behind it on one gRPC connection
+        ThreadPoolExecutor(1) as pool,
     ):
+        client.evaluate(samples, return_errors=True)  # the first batches after a start were seen to be small
         before = counts(served, works)
-
-        def ask(sample: Sample) -> object:
-            start.wait()
-            return client.evaluate([sample], return_errors=True)[0]
-
-        plugged = pool.submit(client.evaluate, busy)
+        plugged = pool.submit(other.evaluate, busy)
         wait_until_at_work(works)
-        outcomes = list(pool.map(ask, samples))
+        asked = [client.submit(sample) for sample in samples]
+        outcomes = [future.exception() or future.result() for future in asked]
         plugged.result()
         requests, executions = (after - b for after, b in zip(counts(served, works), before, strict=True))
     assert requests >= len(samples) - 1
-    assert executions <= requests // 2  # how many share one depends on how fast this machine starts the callers
+    assert executions <= requests // 4
     refused = outcomes.pop(BAD)
     assert isinstance(refused, InvalidSampleError)
     assert "num_frames: expected at most 16" in str(refused)
