@@ -51,7 +51,7 @@ class Stage:
     def saved(self, name: str) -> bytes:
         """A file that the page has just let the browser save."""
         file = self.downloads / name
-        poll(file.exists)
+        poll(lambda: file.exists() and file.stat().st_size > 0)
         content = file.read_bytes()
         file.unlink()
         return content
