@@ -24,8 +24,8 @@ BIN = Path(sys.executable).parent
 CAUGHT = 0.95
 # What is changed, and the tests of which one must fail.
 PARTS = {
-    "client/rfm_client/contract/wire*": "tests/contract tests/families/test_properties.py",
-    "rfm/layers/*.py": "tests/families/test_linear.py tests/families/test_precision.py tests/families/test_rewind.py",
+    "client/rfm_client/contract/wire/*.py": "tests/contract tests/families/test_properties.py",
+    "rfm/engine/layers.py": "tests/families/test_linear.py tests/families/test_precision.py tests/families/test_rewind.py",
     "rfm/rewind/*.py": "tests/families/test_rewind.py tests/families/test_encoders.py tests/families/test_checkpoint.py",
     "rfm/vlm/*.py": "tests/families -k vlm",
     "rfm/triton_model/batch_model.py": "tests/triton/test_batch_model.py tests/triton/test_pipeline.py",
