@@ -15,7 +15,6 @@ from typing import Any
 
 import pytest
 import requests
-from prometheus_client.parser import text_string_to_metric_families
 
 import rfm_export
 from gateway_requests import (
@@ -25,7 +24,6 @@ from gateway_requests import (
     SECOND,
     TINY,
     TINY_CONFIG,
-    Ask,
     Json,
     Triton,
     answered,
@@ -39,7 +37,7 @@ from gateway_requests import (
     preference,
     progress,
 )
-from gateways import Gateway, poll, running
+from gateways import Gateway, metric_at, poll, running
 from one_model import BriefServer
 from rfm.config import ExportConfig
 from rfm.launch.installation import find_installation
@@ -53,36 +51,31 @@ from rfm_gateway.state import STALL_S, TritonState
 pytestmark = pytest.mark.triton
 
 
-def ended(connection: http.client.HTTPConnection) -> tuple[http.client.HTTPResponse, str]:
-    response = connection.getresponse()
-    detail = str(json.loads(response.read())["detail"])
-    connection.close()
-    return response, detail
-
-
-HALF = ({"Content-Length": "100"}, b'{"samples": [')
-MULTIPART_HALF = ({"Content-Length": "100", "Content-Type": MULTIPART}, NAMED)
-HALVES = {"/evaluate_batch": HALF, "/evaluate_batch_npy": MULTIPART_HALF}
+HALVES = {
+    "/evaluate_batch": ({"Content-Length": "100"}, b'{"samples": ['),
+    "/evaluate_batch_npy": ({"Content-Length": "100", "Content-Type": MULTIPART}, NAMED),
+}
 
 
 @pytest.mark.parametrize(("path", "half"), HALVES.items(), ids=HALVES)
 def test_a_body_that_does_not_come_is_a_408(strict: Gateway, path: str, half: Any) -> None:
-    response, detail = ended(begun(strict, *half, path=path))
-    assert (response.status, detail) == (408, "body: expected all of it in time, got a part")
-    assert response.getheader("Connection") == "close"
+    connection = begun(strict, *half, path=path)
+    response = connection.getresponse()
+    assert (response.status, response.getheader("Connection")) == (408, "close")
+    assert json.loads(response.read())["detail"] == "body: expected all of it in time, got a part"
+    connection.close()
 
 
 def test_more_requests_than_allowed_are_a_503_and_health_is_not_one(strict: Gateway) -> None:
-    for path, half in HALVES.items():  # each is answered 408 in the end
-        connection = begun(strict, *half, path=path)
-        poll(lambda: strict.metric("requests_in_flight") == 1)
-        response = ask_json(strict, [progress(FIRST)])
-        assert failure(response, 503) == "expected at most 1 evaluations at a time, got more"
-        assert response.headers["Retry-After"] == "1"
-        assert requests.get(f"{strict.url}/health").ok
-        connection.close()
-        poll(lambda: strict.metric("requests_in_flight") == 0)
-        assert answered(ask_json(strict, [progress(FIRST)]))
+    connection = begun(strict, *HALVES["/evaluate_batch"])
+    poll(lambda: strict.metric("requests_in_flight") == 1)
+    response = ask_json(strict, [progress(FIRST)])
+    assert failure(response, 503) == "expected at most 1 evaluations at a time, got more"
+    assert response.headers["Retry-After"] == "1"
+    assert requests.get(f"{strict.url}/health").ok
+    connection.close()
+    poll(lambda: strict.metric("requests_in_flight") == 0)
+    assert answered(ask_json(strict, [progress(FIRST)]))
 
 
 def test_a_caller_who_leaves_is_no_failure_of_the_gateway(tiny: Gateway) -> None:
@@ -170,9 +163,7 @@ class Gated:
             self.gate.with_name(f"{self.gate.name}.at_work").unlink(missing_ok=True)
 
     def metric(self, name: str, **labels: str) -> float:
-        families = text_string_to_metric_families(requests.get(self.endpoints.metrics_url).text)
-        samples = (sample for family in families for sample in family.samples)
-        return sum(s.value for s in samples if s.name == name and labels.items() <= s.labels.items())
+        return metric_at(self.endpoints.metrics_url, name, **labels)
 
 
 @pytest.fixture(scope="module")
@@ -224,11 +215,8 @@ def test_health_is_told_while_a_model_works(gated: Gated) -> None:
     with gated.working() as first:
         second = post_body(gated.gateway, progress(FIRST))
         poll(lambda: gated.metric("nv_inference_pending_request_count") == 1)
-        assert answered(requests.get(f"{gated.gateway.url}/health")) == {
-            "status": "healthy",
-            "available_gpus": 0,
-            "total_gpus": 1,
-        }
+        health = {"status": "healthy", "available_gpus": 0, "total_gpus": 1}
+        assert answered(requests.get(f"{gated.gateway.url}/health")) == health
         now_s = [0.0]
 
         async def ask() -> None:
@@ -239,17 +227,16 @@ def test_health_is_told_while_a_model_works(gated: Gated) -> None:
                 now_s[0] += STALL_S
                 await state.health()
 
-        with pytest.raises(
-            ServerUnavailableError, match=r"rfm: no answer within 1\.5 s, and nothing finished for 30 s"
-        ):
+        hangs = r"rfm: no answer within 1\.5 s, and nothing finished for 30 s"
+        with pytest.raises(ServerUnavailableError, match=hangs):
             asyncio.run(ask())
     for caller in (first, second):
         assert caller.getresponse().status == 200
         caller.close()
 
 
-def test_no_score_in_time_is_a_504(triton: Triton, strict: Gateway, ask: Ask) -> None:
-    assert answered(ask(strict, [progress(FIRST)]))
+def test_no_score_in_time_is_a_504(triton: Triton, strict: Gateway) -> None:
+    assert answered(ask_json(strict, [progress(FIRST)]))
     with paused(triton):
-        assert failure(ask(strict, [progress(FIRST)]), 504) == "Triton: no answer within 1 s"
-    assert answered(ask(strict, [progress(FIRST)]))
+        assert failure(ask_json(strict, [progress(FIRST)]), 504) == "Triton: no answer within 1 s"
+    assert answered(ask_json(strict, [progress(FIRST)]))

@@ -24,11 +24,7 @@ from rfm_client import PreferenceSample, ProgressSample, Result, Sample, Similar
 from small_network import SMALL
 
 Json: TypeAlias = dict[str, Any]
-
-
 Array: TypeAlias = npt.NDArray[Any]
-
-
 Ask: TypeAlias = Callable[..., requests.Response]
 TINY, FILM, VIDEO = "rfm", "film", "film_video"  # models: two numbers a frame; encoders; vision-language in video mode
 TINY_CONFIG = replace(
@@ -65,11 +61,8 @@ def fixture_of(model: str, *options: str) -> Any:
 def embedded(seed: int, num_frames: int, dims: tuple[int, int] = (2, 2), **fields: Any) -> Json:
     random = np.random.default_rng(seed)
     video = random.standard_normal((num_frames, dims[0]), np.float32)
-    return {
-        "task": "lift",
-        "video_embeddings": video,
-        "text_embedding": random.standard_normal(dims[1], np.float32),
-    } | (fields)
+    text = random.standard_normal(dims[1], np.float32)
+    return {"task": "lift", "video_embeddings": video, "text_embedding": text, **fields}
 
 
 def filmed(seed: int, num_frames: int, size_px: int = 32, **fields: Any) -> Json:
@@ -192,34 +185,18 @@ def failure(response: requests.Response, code: int) -> str:
     return str(response.json()["detail"])
 
 
-SEED_PAYLOAD = """[
-  {
-    "sample_type": "preference",
-    "chosen_trajectory": {
-      "task": "pick_place",
-      "video_embeddings": [[0.1, 0.2], [0.3, 0.4]],
-      "text_embedding": [0.5, 0.6],
-      "target_progress": [0.2, 0.6, 1.0],
-      "frames_shape": [2, 2]
-    },
-    "rejected_trajectory": {
-      "task": "pick_place",
-      "video_embeddings": [[-0.1, -0.2], [-0.3, -0.4]],
-      "text_embedding": [0.0, 0.1],
-      "target_progress": [0.1, 0.3, 0.5],
-      "frames_shape": [2, 2]
-    }
-  }
-]"""  # of the FastAPI evaluation server's README
+def seed_side(video: Any, text: Any, target: Any) -> Json:
+    shown = {"task": "pick_place", "video_embeddings": video, "text_embedding": text}
+    return {**shown, "target_progress": target, "frames_shape": [2, 2]}
+
+
+SEED_PAYLOAD = [  # of the FastAPI evaluation server's README
+    preference(
+        seed_side([[0.1, 0.2], [0.3, 0.4]], [0.5, 0.6], [0.2, 0.6, 1.0]),
+        seed_side([[-0.1, -0.2], [-0.3, -0.4]], [0.0, 0.1], [0.1, 0.3, 0.5]),
+    )
+]
 FIRST, SECOND = embedded(1, 3), embedded(2, 2)
-
-
-def ask_part(gateway: Gateway, part: bytes) -> requests.Response:
-    """FIRST with this as its embeddings' file."""
-    text = FIRST["text_embedding"].tolist()
-    sample = progress({"video_embeddings": {"__numpy_file__": "video"}, "text_embedding": text})
-    form = {"sample_0": json.dumps(sample)}
-    return requests.post(f"{gateway.url}/evaluate_batch_npy", data=form, files={"video": ("video.npy", part)})
 
 
 def npy_of(header: str, content: bytes = b"", version: int = 1) -> bytes:
@@ -231,7 +208,6 @@ def of_frames(frames: Any, **fields: Any) -> Json:
     return progress({"task": "lift", "frames": frames, **fields})
 
 
-FRAMES_AT, TASK_AT = ["trajectory", "frames"], ["trajectory", "task"]
 BLACK = np.zeros((2, 8, 8, 3), np.uint8)
 
 
@@ -245,7 +221,6 @@ def check_refused(response: requests.Response, *told: tuple[Sequence[Any], str])
         assert re.fullmatch(message, error["msg"], re.DOTALL), error["msg"]
 
 
-FORM = {"sample_0": dumped(progress(FIRST))}
 MULTIPART = "multipart/form-data; boundary=b"
 NAMED = b'--b\r\nContent-Disposition: form-data; name="sample_0"\r\n\r\n'
 
