@@ -30,7 +30,7 @@ KEY = "open sesame"
 DEMO, BRIGHT, PLAIN, *CODED = range(3 + len(CODINGS))  # labelled by the demo, by brightness, not; coded otherwise
 VIDEOS = "#episode-videos video"
 PLAYERS = f"{VIDEOS}, #episode-time"  # the videos, then the slider
-ARE_THERE = "[...document.querySelectorAll('%s')].every((video) => !video.seeking && video.readyState >= 2)" % VIDEOS
+ARE_THERE = f"[...document.querySelectorAll('{VIDEOS}')].every((video) => !video.seeking && video.readyState >= 2)"
 
 
 @dataclass(frozen=True)
