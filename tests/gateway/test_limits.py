@@ -6,10 +6,6 @@ from __future__ import annotations
 import asyncio
 import http.client
 import json
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +40,6 @@ from rfm.launch.installation import find_installation
 from rfm.launch.process import Endpoints
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer
-from rfm.triton_model.batch_model import GIVEN_UP_S
 from rfm_client import AsyncRewardClient, ServerUnavailableError
 from rfm_gateway.state import STALL_S, TritonState
 
@@ -142,97 +137,63 @@ TritonPythonModel.load = load
 """
 
 
-@dataclass(frozen=True)
-class Gated:
-    """A gateway before a Triton whose model works on its batch for as long as the file ``gate`` is there."""
-
-    gateway: Gateway
-    endpoints: Endpoints
-    gate: Path
-
-    @contextmanager
-    def working(self) -> Iterator[http.client.HTTPConnection]:
-        """Within it, the model works on the request of the connection."""
-        self.gate.touch()
-        try:
-            caller = post_body(self.gateway, progress(FIRST))
-            poll(self.gate.with_name(f"{self.gate.name}.at_work").exists)
-            yield caller
-        finally:
-            self.gate.unlink()
-            self.gate.with_name(f"{self.gate.name}.at_work").unlink(missing_ok=True)
-
-    def metric(self, name: str, **labels: str) -> float:
-        return metric_at(self.endpoints.metrics_url, name, **labels)
-
-
-@pytest.fixture(scope="module")
-def gated(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransformer) -> Iterator[Gated]:
-    folder = tmp_path_factory.mktemp("gated")
-    repository, checkpoint, gate = folder / "model_repository", folder / "two_wide", folder / "gate"
+@pytest.mark.slow
+def test_while_a_model_works_health_is_told_and_callers_who_hang_up_cost_no_forward(
+    tiny_network: RewindTransformer, tmp_path: Path
+) -> None:
+    """The preference is asked last: once it is counted, so is whatever was scored before it."""
+    repository, checkpoint, gate = tmp_path / "model_repository", tmp_path / "two_wide", tmp_path / "gate"
     RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()).save(checkpoint)
     rfm_export.export(checkpoint, repository, ExportConfig(name=TINY, num_gpus=0, torch_threads=1))
     model = repository / TINY / "1" / "model.py"
     model.write_text(model.read_text() + CLOSED_GATE.format(gate=str(gate)))
-    with (
-        (folder / "tritonserver.log").open("wb") as log,
-        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
-        running(server.endpoints, folder) as gateway,
-    ):
-        yield Gated(gateway, server.endpoints, gate)
+    samples, now_s = [progress(FIRST), preference(FIRST, SECOND)], [0.0]
 
+    async def ask_health() -> None:
+        async with AsyncRewardClient(endpoints.grpc_url) as client:
+            urls = endpoints.grpc_url, endpoints.metrics_url
+            state = TritonState(client, *urls, TINY, clock_s=lambda: now_s[0])
+            assert (await state.health()).status == "healthy"
+            now_s[0] += STALL_S
+            await state.health()
 
-@pytest.mark.slow
-def test_callers_who_hang_up_cost_no_forward(gated: Gated) -> None:
-    """Preferences are asked last: once one is counted, a moment later, so is whatever was scored before it."""
+    def metric(name: str, **labels: str) -> float:
+        return metric_at(endpoints.metrics_url, name, **labels)
 
     def scored(sample_type: str) -> float:
-        return gated.metric("rfm_samples_total", outcome="scored", sample_type=sample_type)
+        return metric("rfm_samples_total", outcome="scored", sample_type=sample_type)
 
-    samples = [progress(FIRST), preference(FIRST, SECOND)]
-    answers = [expected(gated.gateway, [sample]) for sample in samples]
-    poll(lambda: scored("preference") == 1)
-    progress_before = scored("progress")
-    with gated.working() as first:
-        leaving = [post_body(gated.gateway, progress(FIRST)) for _ in range(12)]
-        poll(lambda: gated.metric("nv_inference_pending_request_count") == len(leaving))
+    with (
+        (tmp_path / "tritonserver.log").open("wb") as log,
+        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+        running(server.endpoints, tmp_path) as gateway,
+    ):
+        endpoints = server.endpoints
+        answers = [expected(gateway, [sample]) for sample in samples]
+        poll(lambda: scored("preference") == 1)
+        progress_before = scored("progress")
+        gate.touch()
+        first = post_body(gateway, samples[0])
+        poll(gate.with_name("gate.at_work").exists)
+        leaving = [post_body(gateway, samples[0]) for _ in range(12)]
+        poll(lambda: metric("nv_inference_pending_request_count") == len(leaving))
         for caller in leaving:
             caller.close()
-        poll(lambda: gated.gateway.metric("requests_total", code="499") == len(leaving))
-        last = post_body(gated.gateway, samples[1])  # behind what has told Triton that they left
-        poll(lambda: gated.metric("nv_inference_pending_request_count") >= 1)
-        time.sleep(2 * GIVEN_UP_S)  # behind a batch that took less, the model does not ask who has left
-    for caller, answer in zip((first, last), answers, strict=True):
-        assert json.loads(caller.getresponse().read()) == numbers(answer)
-        caller.close()
-    poll(lambda: scored("preference") == 2)
-    assert scored("progress") == progress_before + 1
-    assert gated.gateway.metric("requests_in_flight") == 0
-
-
-@pytest.mark.slow
-def test_health_is_told_while_a_model_works(gated: Gated) -> None:
-    with gated.working() as first:
-        second = post_body(gated.gateway, progress(FIRST))
-        poll(lambda: gated.metric("nv_inference_pending_request_count") == 1)
+        poll(lambda: gateway.metric("requests_total", code="499") == len(leaving))
+        last = post_body(gateway, samples[1])
+        poll(lambda: metric("nv_inference_pending_request_count") >= 1)
         health = {"status": "healthy", "available_gpus": 0, "total_gpus": 1}
-        assert answered(requests.get(f"{gated.gateway.url}/health")) == health
-        now_s = [0.0]
-
-        async def ask() -> None:
-            async with AsyncRewardClient(gated.endpoints.grpc_url) as client:
-                urls = gated.endpoints.grpc_url, gated.endpoints.metrics_url
-                state = TritonState(client, *urls, TINY, clock_s=lambda: now_s[0])
-                assert (await state.health()).status == "healthy"
-                now_s[0] += STALL_S
-                await state.health()
-
+        assert answered(requests.get(f"{gateway.url}/health")) == health
         hangs = r"rfm: no answer within 1\.5 s, and nothing finished for 30 s"
         with pytest.raises(ServerUnavailableError, match=hangs):
-            asyncio.run(ask())
-    for caller in (first, second):
-        assert caller.getresponse().status == 200
-        caller.close()
+            asyncio.run(ask_health())
+        gate.unlink()
+        for caller, answer in zip((first, last), answers, strict=True):
+            assert json.loads(caller.getresponse().read()) == numbers(answer)
+            caller.close()
+        poll(lambda: scored("preference") == 2)
+        assert scored("progress") == progress_before + 1
+        assert gateway.metric("requests_in_flight") == 0
 
 
 def test_no_score_in_time_is_a_504(triton: Triton, strict: Gateway) -> None:
