@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import tracemalloc
 from collections.abc import Iterator
 from typing import Any
 
@@ -47,16 +46,6 @@ def test_a_body_that_holds_no_samples_is_refused(
     check_refused(gateway.post("/evaluate_batch", content=body), (path, message))
 
 
-def test_words_for_numbers_are_refused_before_numpy_makes_each_as_wide_as_the_longest(gateway: TestClient) -> None:
-    body = dumped([progress({"video_embeddings": ["a" * 20_000, *["b"] * 10_000]})])
-    tracemalloc.start()
-    try:
-        check_refused(gateway.post("/evaluate_batch", content=body), (VIDEO_AT, "expected numbers, got something else"))
-        assert tracemalloc.get_traced_memory()[1] < 100 * 2**20
-    finally:
-        tracemalloc.stop()
-
-
 VIDEO_AT = ["samples", 0, "trajectory", "video_embeddings"]
 HUGE = "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000000, 2)}"
 NO_NPY = r"expected a \.npy file, got: .*"
@@ -64,12 +53,10 @@ FILES = {
     "truncated": (npy(np.ones((3, 2)))[:-4], NO_NPY),
     "too long": (npy(np.ones((3, 2))) + b"1", r"expected a \.npy file of 48 bytes behind its header, got more"),
     "a shape of petabytes": (npy_of(HUGE), NO_NPY),
-    "a negative shape": (npy_of(HUGE.replace("1000000000000000", "-1")), NO_NPY),
     "pickled": (npy(np.array([[1, {}]], object), pickled=True), NO_NPY),
     "text": (npy(np.array([["a", "b"]])), r"expected a \.npy file of numbers, got <U1"),
     "complex": (npy(np.ones((3, 2), complex)), r"expected a \.npy file of numbers, got complex128"),
     "no .npy file": (b"hello world", NO_NPY),
-    "half a header": (npy(np.ones((3, 2)))[:40], NO_NPY),
     "an unbalanced header": (npy_of("{'descr': '<f4', ("), NO_NPY),
     "a type of nothing": (npy_of(HUGE.replace("'<f4'", "()")), NO_NPY),
     "an endless header": (npy_of("-" * 20_000), NO_NPY),

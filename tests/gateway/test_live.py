@@ -24,7 +24,6 @@ from rfm_gateway.viewer.live import (
     FORGOTTEN_AFTER_S,
     MOST_BODY_BYTES,
     MOST_EPISODES,
-    MOST_POINTS,
     LiveEpisodes,
     LiveReport,
 )
@@ -190,14 +189,6 @@ def test_a_view_reports_with_the_key_and_is_warned_of_a_wrong_one(
         assert gateway.get(f"/viewer/live/{found['id']}/frame", headers={"X-API-Key": KEY}).ok
     assert "got 401" in caplog.text
     assert KEY not in caplog.text
-
-
-def test_a_curve_keeps_its_newest_points() -> None:
-    episodes = LiveEpisodes()
-    for first in (0, 2000):
-        taken(episodes, report(episode(1, *[step(first + number) for number in range(2000)])))
-    (found,) = episodes.since("")["episodes"]
-    assert found["steps"] == list(range(4000 - MOST_POINTS, 4000))
 
 
 def test_those_that_have_ended_go_first_then_those_that_were_silent_for_longest() -> None:

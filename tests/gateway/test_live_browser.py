@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from selenium.webdriver import Keys
 
 from browsers import Browser
 from gateways import Gateway, free_port, poll, running
@@ -135,14 +134,6 @@ def test_without_episodes_the_page_tells_how_to_report_them(page: Page, client: 
     assert not page.browser["no-live"].is_displayed()
     names["live"].close()
     page.shows("Episode", {"state": "ended"})
-
-
-def test_the_arrow_keys_reach_the_tab(page: Page) -> None:
-    page.browser["live-tab"].send_keys(Keys.ARROW_RIGHT)
-    assert page.browser["score-panel"].is_displayed()
-    page.browser["score-tab"].send_keys(Keys.ARROW_LEFT)
-    assert page.browser["live-panel"].is_displayed()
-    assert page.browser.run("return document.activeElement.id") == "live-tab"
 
 
 def test_a_curve_has_the_numbers_that_add_returned(page: Page, client: RewardClient) -> None:

@@ -25,13 +25,11 @@ from labelling import LEROBOT, BrightnessScorer
 from pictures import TURNS, turn
 from rfm_client.contract.settings import ConfigError
 from rfm_client.data.datasets.lerobot import LeRobotDataset
-from rfm_client.data.orientation import Orient
 from rfm_client.labelling import LabelOptions, label, open_dataset, summarise
-from rfm_client.labelling.options import Format
 from rfm_gateway.config import GatewayConfig
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew
 
-V21, V30, PLAIN = range(3)  # numbers of the datasets: two with labels, one without
+V21, V30 = range(2)  # numbers of the datasets with labels; one without follows
 FILM = "videos/observation.images.front/chunk-000/file-000.mp4"  # of the episodes below
 OF_FILM = range(4)
 NEEDS_LATER = {"g": "60", "keyint_min": "60", "sc_threshold": "0", "bf": "3", "b_strategy": "0"}
@@ -61,15 +59,6 @@ def get(folders: list[Path]) -> Iterator[Get]:
         yield answers
 
 
-def test_the_datasets_are_told_in_their_order(get: Get) -> None:
-    told = get("").json()["datasets"]
-    assert [(each["name"], each["kind"], each["labels"]) for each in told] == [
-        ("toy_v21", "LeRobot v2.1", ["rfm_progress.parquet"]),
-        ("toy_v30_many", "LeRobot v3.0", ["rfm_progress.parquet"]),
-        ("toy_v30_many", "LeRobot v3.0", []),
-    ]
-
-
 @pytest.mark.parametrize("number", [V21, V30])
 def test_the_table_tells_what_the_labels_say_of_each_episode(get: Get, folders: list[Path], number: int) -> None:
     told = get(f"/{number}").json()
@@ -94,23 +83,6 @@ def test_the_table_tells_what_the_labels_say_of_each_episode(get: Get, folders: 
     counts, edges = np.histogram(summary.final_progress, bins=20, range=(0, 1))
     assert told["bins"] == {"edges": edges.tolist(), "counts": counts.tolist()}
     assert (told["labels"], told["cameras"], told["threshold"]) == ("rfm_progress.parquet", list(CAMERAS), 0.5)
-
-
-@pytest.mark.parametrize("form", ["progress", "signals"])
-def test_the_table_tells_how_pictures_were_turned_for_the_labels(tmp_path: Path, form: Format) -> None:
-    root = copied("toy_v21", tmp_path)
-    turned = open_dataset(root, orient=Orient.parse(["wrist=rotate180"]))
-    label(turned, BrightnessScorer(), LabelOptions(limit=1, formats=(form,)))
-    with serving(root) as get:
-        assert get("/0").json()["orientations"] == ["none", "rotate180"]
-
-
-def test_a_dataset_without_labels_lists_tasks_and_lengths(get: Get) -> None:
-    told = get(f"/{PLAIN}").json()
-    assert (told["labels"], told["bins"]) == (None, None)
-    assert {tuple(row) for row in told["episodes"]} == {("episode", "task", "num_frames")}
-    curves = get(f"/{PLAIN}/episodes/3").json()
-    assert (len(curves["times_s"]), curves["curves"]) == (told["episodes"][3]["num_frames"], [])
 
 
 @pytest.mark.parametrize(("number", "episode"), [(V21, 7), (V30, 9)])
