@@ -74,7 +74,9 @@ def quiet_browser(browser: Browser) -> Iterator[Browser]:
     """The browser, which asks nothing outside this machine in the test and whose console shows no error."""
     browser.complaints()
     yield browser
-    assert [url for url in browser.asked() if not url.startswith(("http://127.0.0.1:", "blob:", "data:"))] == []
+    asked = browser.asked()
+    assert asked
+    assert [url for url in asked if not url.startswith(("http://127.0.0.1:", "blob:", "data:"))] == []
     assert [line for line in browser.complaints() if "viewer/score" not in line] == []  # of the files it refuses
 
 

@@ -43,6 +43,9 @@ class Page:
 
     def open(self) -> None:
         self.browser.open(self.url)
+        self.show()
+
+    def show(self) -> None:
         self.browser["dataset-tab"].click()
         self.browser.until("document.querySelector('#episodes tr')")
 
@@ -292,8 +295,9 @@ def test_the_key_opens_datasets_and_one_that_breaks_says_why(
             browser.until("document.getElementById('errors').textContent.startsWith('key: expected X-API-Key')")
             browser.write("key", key)
             browser.all("#key-form button")[0].click()
+        browser.until("document.getElementById('model').value")
         page = Page(gateway.url, browser, (root,))
-        page.open()
+        page.show()
         page.at_rest(1)
         next(root.rglob("*front/episode_000002.mp4")).write_text("no video")
         browser.run("document.querySelector('#episodes tr[data-episode=\"2\"] button').click()")
