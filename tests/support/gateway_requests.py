@@ -20,7 +20,7 @@ import requests
 from gateways import Gateway, running
 from proxies import Proxy
 from rfm.launch.process import Endpoints
-from rfm_client import PreferenceSample, ProgressSample, Result, Sample, SimilaritySample, Trajectory
+from rfm_client import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from small_network import SMALL
 
 Json: TypeAlias = dict[str, Any]
@@ -130,15 +130,11 @@ def of_client(sample: Json, frame_steps: int) -> Sample:
     return (PreferenceSample if sample["sample_type"] == "preference" else SimilaritySample)(first, *others)
 
 
-def scores(gateway: Gateway, samples: Sequence[Json], frame_steps: int = 0) -> list[Any]:
-    with gateway.client() as client:
-        results: list[Result] = client.evaluate([of_client(sample, frame_steps) for sample in samples])
-    return results
-
-
 def expected(gateway: Gateway, samples: Sequence[Json], *, frame_steps: int = 0, group: int = 1) -> Json:
     """The FastAPI server's answer with the numbers that RewardClient gets."""
-    pairs = list(zip(samples, scores(gateway, samples, frame_steps), strict=True))
+    with gateway.client() as client:
+        results: list[Any] = client.evaluate([of_client(sample, frame_steps) for sample in samples])
+    pairs = list(zip(samples, results, strict=True))
     of = {kind: [(s, r) for s, r in pairs if s["sample_type"] == kind] for kind in SIDES}
     told: Json = dict.fromkeys(("outputs_preference", "outputs_progress", "outputs_success", "outputs_similarity"))
     if of["preference"]:
