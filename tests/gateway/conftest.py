@@ -11,6 +11,7 @@ import torch
 
 import goldens
 import rfm_export
+from browsers import Browser, chromium
 from engines import serve_config
 from gateway_requests import (
     FILM,
@@ -59,6 +60,24 @@ def triton(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransfo
         endpoints = Endpoints(http_port=http.port, grpc_port=grpc.port, metrics_port=metrics.port)
         yield Triton(repository, endpoints, (http, grpc, metrics))
     assert set(SHARED_MEMORY.glob(ours)) <= regions
+
+
+@pytest.fixture(scope="package")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """The one browser of all tests of the page."""
+    with chromium(tmp_path_factory.mktemp("downloads")) as started:
+        yield started
+
+
+@pytest.fixture
+def quiet_browser(browser: Browser) -> Iterator[Browser]:
+    """The browser, which asks nothing outside this machine in the test and whose console shows no error."""
+    browser.complaints()
+    yield browser
+    asked = browser.asked()
+    assert asked
+    assert [url for url in asked if not url.startswith(("http://127.0.0.1:", "blob:", "data:"))] == []
+    assert [line for line in browser.complaints() if "viewer/score" not in line] == []  # of the files it refuses
 
 
 tiny, film, video = fixture_of(TINY), fixture_of(FILM), fixture_of(VIDEO)

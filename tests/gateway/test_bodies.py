@@ -4,30 +4,18 @@
 from __future__ import annotations
 
 import json
-import tracemalloc
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 
-from gateway_requests import (
-    FIRST,
-    FORM,
-    MULTIPART,
-    NAMED,
-    SEED_PAYLOAD,
-    check_refused,
-    dumped,
-    failure,
-    npy,
-    npy_of,
-    progress,
-)
+from gateway_requests import FIRST, MULTIPART, NAMED, check_refused, dumped, failure, npy, npy_of, progress
 from gateways import TestClient, inside
 
 KEY, ORIGIN = "open sesame", "http://lab.example"
 NPY = "/evaluate_batch_npy"
+SAMPLE = dumped(progress(FIRST))
 
 
 @pytest.fixture(scope="module")
@@ -36,23 +24,19 @@ def gateway() -> Iterator[TestClient]:
         yield client
 
 
+NO_SAMPLE, NO_STEPS = "expected at least one sample, got none", "expected true or false, got "
 BODIES: dict[str, tuple[bytes, list[Any], str]] = {
-    "nothing": (b"", [], "expected JSON, got: .*"),
     "half an object": (b'{"samples": [', [], "expected JSON, got: .*"),
     "no UTF-8": (b'["\xff"]', [], "expected JSON, got: .*"),
-    "half a character": (b'["\\ud800"]', [], "expected JSON, got: .*"),
     "ten thousand brackets": (b"[" * 10_000, [], "expected JSON, got: recursion limit .*"),
-    "an empty list": (b"[]", ["samples"], "expected at least one sample, got none"),
-    "no samples": (b'{"samples": []}', ["samples"], "expected at least one sample, got none"),
-    "an empty object": (b"{}", ["samples"], "expected at least one sample, got none"),
+    "an empty list": (b"[]", ["samples"], NO_SAMPLE),
+    "an empty object": (b"{}", ["samples"], NO_SAMPLE),
     "a number": (b"5", ["samples"], "expected a list of samples, got int"),
-    "null samples": (b'{"samples": null}', ["samples"], "expected a list of samples, got NoneType"),
     "samples as an object": (b'{"samples": {}}', ["samples"], "expected a list of samples, got dict"),
     "too many": (b"[%b5]" % (b"5," * 10_000), ["samples"], "expected at most 10000 samples, got 10001"),
     "very many errors": (b"[%b5]" % (b"5," * 2000), [], "expected no faulty fields, got 2001"),
-    "no steps": (dumped({"samples": [progress(FIRST)], "use_frame_steps": 2}).encode(), ["use_frame_steps"], "expected true or false, got 2"),
-    "many steps": (dumped({"samples": [progress(FIRST)], "use_frame_steps": []}).encode(), ["use_frame_steps"], r"expected true or false, got \[\]"),
-}  # fmt: skip
+    "no steps": (b'{"samples": [5], "use_frame_steps": 2}', ["use_frame_steps"], f"{NO_STEPS}2"),
+}
 
 
 @pytest.mark.parametrize(("body", "path", "message"), BODIES.values(), ids=BODIES)
@@ -62,16 +46,6 @@ def test_a_body_that_holds_no_samples_is_refused(
     check_refused(gateway.post("/evaluate_batch", content=body), (path, message))
 
 
-def test_words_for_numbers_are_refused_before_numpy_makes_each_as_wide_as_the_longest(gateway: TestClient) -> None:
-    body = dumped([progress({"video_embeddings": ["a" * 20_000, *["b"] * 10_000]})])
-    tracemalloc.start()
-    try:
-        check_refused(gateway.post("/evaluate_batch", content=body), (VIDEO_AT, "expected numbers, got something else"))
-        assert tracemalloc.get_traced_memory()[1] < 100 * 2**20
-    finally:
-        tracemalloc.stop()
-
-
 VIDEO_AT = ["samples", 0, "trajectory", "video_embeddings"]
 HUGE = "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000000, 2)}"
 NO_NPY = r"expected a \.npy file, got: .*"
@@ -79,15 +53,11 @@ FILES = {
     "truncated": (npy(np.ones((3, 2)))[:-4], NO_NPY),
     "too long": (npy(np.ones((3, 2))) + b"1", r"expected a \.npy file of 48 bytes behind its header, got more"),
     "a shape of petabytes": (npy_of(HUGE), NO_NPY),
-    "a negative shape": (npy_of(HUGE.replace("1000000000000000", "-1")), NO_NPY),
     "pickled": (npy(np.array([[1, {}]], object), pickled=True), NO_NPY),
     "text": (npy(np.array([["a", "b"]])), r"expected a \.npy file of numbers, got <U1"),
     "complex": (npy(np.ones((3, 2), complex)), r"expected a \.npy file of numbers, got complex128"),
     "no .npy file": (b"hello world", NO_NPY),
-    "empty": (b"", NO_NPY),
-    "half a header": (npy(np.ones((3, 2)))[:40], NO_NPY),
     "an unbalanced header": (npy_of("{'descr': '<f4', ("), NO_NPY),
-    "a header that is no table": (npy_of("{[]: 1}"), NO_NPY),
     "a type of nothing": (npy_of(HUGE.replace("'<f4'", "()")), NO_NPY),
     "an endless header": (npy_of("-" * 20_000), NO_NPY),
 }
@@ -99,23 +69,22 @@ def test_a_bad_npy_file_is_refused_at_its_field(gateway: TestClient, file: bytes
     check_refused(gateway.post(NPY, data=form, files={"video": ("video.npy", file)}), (VIDEO_AT, message))
 
 
-SAMPLE = (None, FORM["sample_0"])
+ZERO = ("sample_0", (None, SAMPLE))
 MISSING = dumped(progress({**FIRST, "video_embeddings": {"__numpy_file__": "other"}}))
+TWICE, NO_FILE = "expected one part of this name, got several", "expected a form field, got a file"
 FORMS: dict[str, tuple[list[tuple[str, Any]], list[Any], str]] = {
-    "no sample": ([("use_frame_steps", (None, "true"))], ["samples"], "expected at least one sample, got none"),
-    "a gap": ([("sample_0", SAMPLE), ("sample_2", SAMPLE)], ["sample_1"], "expected a sample, got none, but sample_2"),
-    "no first": ([("sample_1", SAMPLE)], ["sample_0"], "expected a sample, got none, but sample_1"),
-    "another spelling": ([("sample_01", SAMPLE)], ["sample_01"], "expected sample_0, sample_1 and so on, got .*"),
-    "steps that are none": ([("sample_0", SAMPLE), ("use_frame_steps", (None, "yes"))], ["use_frame_steps"], ".*, got 'yes'"),
+    "no sample": ([("use_frame_steps", (None, "true"))], ["samples"], NO_SAMPLE),
+    "a gap": ([ZERO, ("sample_2", ZERO[1])], ["sample_1"], "expected a sample, got none, but sample_2"),
+    "another spelling": ([("sample_01", ZERO[1])], ["sample_01"], "expected sample_0, sample_1 and so on, got .*"),
+    "other steps": ([ZERO, ("use_frame_steps", (None, "yes"))], ["use_frame_steps"], f"{NO_STEPS}'yes'"),
     "no JSON": ([("sample_0", (None, "{"))], ["sample_0"], "expected JSON, got: .*"),
-    "no object": ([("sample_0", (None, "5"))], ["samples", 0], "expected an object, got 5"),
     "JSON in JSON": ([("sample_0", (None, '"{}"'))], ["samples", 0], "expected an object, got '{}'"),
-    "a part that was not sent": ([("sample_0", (None, MISSING))], VIDEO_AT, r"expected a \.npy part named 'other', got none"),
-    "one field twice": ([("sample_0", SAMPLE)] * 2, ["sample_0"], "expected one part of this name, got several"),
-    "one file twice": ([("sample_0", SAMPLE), *[("a", ("a.npy", b""))] * 2], ["a"], "expected one part of this name, got several"),
-    "a sample as a file": ([("sample_0", ("sample_0", b"{}"))], ["sample_0"], "expected a form field, got a file"),
-    "steps as a file": ([("sample_0", SAMPLE), ("use_frame_steps", ("steps", b"true"))], ["use_frame_steps"], "expected a form field, got a file"),
-}  # fmt: skip
+    "no part": ([("sample_0", (None, MISSING))], VIDEO_AT, r"expected a \.npy part named 'other', got none"),
+    "one field twice": ([ZERO] * 2, ["sample_0"], TWICE),
+    "one file twice": ([ZERO, *[("a", ("a.npy", b""))] * 2], ["a"], TWICE),
+    "a sample as a file": ([("sample_0", ("sample_0", b"{}"))], ["sample_0"], NO_FILE),
+    "steps as a file": ([ZERO, ("use_frame_steps", ("steps", b"true"))], ["use_frame_steps"], NO_FILE),
+}
 
 
 @pytest.mark.parametrize(("parts", "path", "message"), FORMS.values(), ids=FORMS)
@@ -127,16 +96,19 @@ def test_no_part_of_a_form_is_lost_silently(
 
 NAMELESS = b"--b\r\nContent-Disposition: form-data\r\n\r\nx\r\n--b--\r\n"
 NO_FORM = "content-type: expected multipart/form-data with a boundary, got"
+NO_PARTS, NO_END = "body: expected multipart/form-data, got: ", "body: expected its last boundary"
+WHOLE = NAMED + SAMPLE.encode() + b"\r\n"
 UNREADABLE: dict[str, tuple[int, str, str, bytes]] = {
     "JSON": (415, f"{NO_FORM} application/json", "application/json", b"[]"),
     "no content type": (415, f"{NO_FORM} none", "", b"[]"),
     "no boundary": (415, f"{NO_FORM} multipart/form-data", "multipart/form-data", NAMED),
-    "no multipart": (400, "body: expected multipart/form-data, got: ", MULTIPART, b"hello"),
-    "nothing": (400, "body: expected its last boundary", MULTIPART, b""),
-    "no name": (400, "body: expected multipart/form-data, got: ", MULTIPART, NAMELESS),
-    "cut off": (400, "body: expected its last boundary", MULTIPART, NAMED + SAMPLE[1].encode() + b"\r\n" + NAMED + b"{"),
-    "cut off in a boundary": (400, "body: expected its last boundary", MULTIPART, NAMED + SAMPLE[1].encode() + b"\r\n--"),
-}  # fmt: skip
+    "no multipart": (400, NO_PARTS, MULTIPART, b"hello"),
+    "no name": (400, NO_PARTS, MULTIPART, NAMELESS),
+    "a charset of nothing": (400, NO_PARTS, f"{MULTIPART}; charset=undefined", WHOLE + b"--b--\r\n"),
+    "nothing": (400, NO_END, MULTIPART, b""),
+    "cut off": (400, NO_END, MULTIPART, WHOLE + NAMED + b"{"),
+    "cut off in a boundary": (400, NO_END, MULTIPART, WHOLE + b"--"),
+}
 
 
 @pytest.mark.parametrize(("code", "message", "content_type", "body"), UNREADABLE.values(), ids=UNREADABLE)
@@ -146,18 +118,11 @@ def test_what_is_no_multipart_is_refused(
     assert failure(gateway.post(NPY, content=body, headers={"Content-Type": content_type}), code).startswith(message)
 
 
-@pytest.mark.parametrize("charset", ["undefined", "punycode", "rot13", "base64", "idna", "nowhere", "\xfc", ""])
-def test_no_charset_breaks_the_gateway(gateway: TestClient, charset: str) -> None:
-    content_type = f'{MULTIPART}; charset="{charset}"'.encode("latin-1")
-    body = NAMED + b"{}\r\n--b--\r\n"
-    assert gateway.post(NPY, content=body, headers={"Content-Type": content_type}).status_code in (400, 422)  # type: ignore[dict-item]
-
-
 @pytest.mark.parametrize("path", ["/evaluate_batch", NPY, "/viewer/score", "/live/reports"])
 @pytest.mark.parametrize("content", [b" " * (2**20 + 1), [b" " * 2**19] * 3], ids=["announced", "in chunks"])
 def test_too_large_a_body_is_a_413(gateway: TestClient, path: str, content: Any) -> None:
-    form = (NAMED for _ in range(1)) if path in (NPY, "/viewer/score") else ()
-    body = content if isinstance(content, bytes) else (part for parts in (form, content) for part in parts)
+    is_form = path in (NPY, "/viewer/score")
+    body = content if isinstance(content, bytes) else iter([NAMED, *content] if is_form else content)
     kind = "application/json" if path == "/live/reports" else MULTIPART
     response = gateway.post(path, content=body, headers={"Content-Type": kind})
     assert failure(response, 413) == "body: expected at most 1048576 bytes, got more"
@@ -171,13 +136,12 @@ def test_json_is_smaller_than_other_bodies() -> None:
 
 @pytest.mark.parametrize("path", ["/health", "/gpu_status", "/model_info", "/viewer/served", "/evaluate_batch"])
 def test_a_triton_that_is_down_is_a_503(gateway: TestClient, path: str) -> None:
-    response = gateway.get(path) if path != "/evaluate_batch" else gateway.post(path, content=SEED_PAYLOAD)
+    response = gateway.get(path) if path != "/evaluate_batch" else gateway.post(path, content=SAMPLE)
     assert "connect" in failure(response, 503)
     assert response.headers["Retry-After"] == "1"
 
 
 def test_unknown_paths_and_methods_are_told_as_json(gateway: TestClient) -> None:
-    assert failure(gateway.get("/evaluate"), 404) == "Not Found"
     assert failure(gateway.post("/evaluate"), 404) == "Not Found"
     assert failure(gateway.get("/evaluate_batch"), 405) == "Method Not Allowed"
 
@@ -189,22 +153,23 @@ KEYS: dict[str, tuple[dict[str, Any], bool]] = {
     "Bearer": ({"Authorization": f"Bearer {KEY}"}, True),
     "none": ({}, False),
     "another": ({"X-API-Key": "sesame"}, False),
-    "another bearer": ({"Authorization": "Bearer sesame"}, False),
     "another scheme": ({"Authorization": f"Basic {KEY}"}, False),
     "no letters": ({"X-API-Key": b"\xfc"}, False),
 }
-GUARDED = [
-    ("POST", "/evaluate_batch"), ("POST", NPY), ("GET", "/gpu_status"), ("GET", "/model_info"), ("GET", "/metrics"),
-    ("GET", "/viewer/served"), ("POST", "/viewer/score"), ("POST", "/viewer/compare"), ("POST", "/live/reports"),
-    ("GET", "/viewer/live"), ("GET", "/viewer/live/0/frame"), ("GET", "/viewer/datasets"), ("GET", "/viewer/datasets/0"),
-    ("GET", "/viewer/datasets/0/episodes/0"), ("GET", "/viewer/datasets/0/episodes/0/videos/0"),
-]  # fmt: skip
+EPISODE = "/viewer/datasets/0/episodes/0"
+GUARDED = {
+    "POST": ("/evaluate_batch", NPY, "/viewer/score", "/viewer/compare", "/live/reports"),
+    "GET": (
+        *("/gpu_status", "/model_info", "/metrics", "/viewer/served", "/viewer/live", "/viewer/live/0/frame"),
+        *("/viewer/datasets", "/viewer/datasets/0", EPISODE, f"{EPISODE}/videos/0"),
+    ),
+}
 
 
-@pytest.mark.parametrize(("headers", "is_right"), KEYS.values(), ids=KEYS)
-def test_only_the_key_opens(headers: dict[str, Any], is_right: bool) -> None:
+def test_only_the_key_opens() -> None:
     with inside(KEY) as client:
-        for method, path in GUARDED:
+        asked = [(method, path, *key) for method, paths in GUARDED.items() for path in paths for key in KEYS.values()]
+        for method, path, headers, is_right in asked:
             response = client.request(method, path, headers=headers)
             assert (response.status_code != 401) is is_right, path
             if not is_right:
@@ -220,7 +185,7 @@ def test_browsers_may_ask_from_the_named_origin_alone(gateway: TestClient) -> No
     with inside(KEY, cors_origin=(ORIGIN,)) as client:
         response = client.options("/evaluate_batch", headers=preflight | {"Origin": ORIGIN})
         assert (response.status_code, response.headers[allowed]) == (200, ORIGIN)
-        response = client.post("/evaluate_batch", content=SEED_PAYLOAD, headers={"Origin": ORIGIN, "X-API-Key": KEY})
+        response = client.post("/evaluate_batch", content=SAMPLE, headers={"Origin": ORIGIN, "X-API-Key": KEY})
         assert response.headers[allowed] == ORIGIN
         other = {"Origin": "http://other.example"}
         assert allowed not in client.options("/evaluate_batch", headers=preflight | other).headers

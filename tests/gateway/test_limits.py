@@ -6,16 +6,11 @@ from __future__ import annotations
 import asyncio
 import http.client
 import json
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 import requests
-from prometheus_client.parser import text_string_to_metric_families
 
 import rfm_export
 from gateway_requests import (
@@ -25,7 +20,6 @@ from gateway_requests import (
     SECOND,
     TINY,
     TINY_CONFIG,
-    Ask,
     Json,
     Triton,
     answered,
@@ -39,50 +33,44 @@ from gateway_requests import (
     preference,
     progress,
 )
-from gateways import Gateway, poll, running
+from gateways import Gateway, metric_at, poll, running
 from one_model import BriefServer
 from rfm.config import ExportConfig
 from rfm.launch.installation import find_installation
 from rfm.launch.process import Endpoints
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer
-from rfm.triton_model.batch_model import GIVEN_UP_S
 from rfm_client import AsyncRewardClient, ServerUnavailableError
 from rfm_gateway.state import STALL_S, TritonState
 
 pytestmark = pytest.mark.triton
 
 
-def ended(connection: http.client.HTTPConnection) -> tuple[http.client.HTTPResponse, str]:
-    response = connection.getresponse()
-    detail = str(json.loads(response.read())["detail"])
-    connection.close()
-    return response, detail
-
-
-HALF = ({"Content-Length": "100"}, b'{"samples": [')
-MULTIPART_HALF = ({"Content-Length": "100", "Content-Type": MULTIPART}, NAMED)
-HALVES = {"/evaluate_batch": HALF, "/evaluate_batch_npy": MULTIPART_HALF}
+HALVES = {
+    "/evaluate_batch": ({"Content-Length": "100"}, b'{"samples": ['),
+    "/evaluate_batch_npy": ({"Content-Length": "100", "Content-Type": MULTIPART}, NAMED),
+}
 
 
 @pytest.mark.parametrize(("path", "half"), HALVES.items(), ids=HALVES)
 def test_a_body_that_does_not_come_is_a_408(strict: Gateway, path: str, half: Any) -> None:
-    response, detail = ended(begun(strict, *half, path=path))
-    assert (response.status, detail) == (408, "body: expected all of it in time, got a part")
-    assert response.getheader("Connection") == "close"
+    connection = begun(strict, *half, path=path)
+    response = connection.getresponse()
+    assert (response.status, response.getheader("Connection")) == (408, "close")
+    assert json.loads(response.read())["detail"] == "body: expected all of it in time, got a part"
+    connection.close()
 
 
 def test_more_requests_than_allowed_are_a_503_and_health_is_not_one(strict: Gateway) -> None:
-    for path, half in HALVES.items():  # each is answered 408 in the end
-        connection = begun(strict, *half, path=path)
-        poll(lambda: strict.metric("requests_in_flight") == 1)
-        response = ask_json(strict, [progress(FIRST)])
-        assert failure(response, 503) == "expected at most 1 evaluations at a time, got more"
-        assert response.headers["Retry-After"] == "1"
-        assert requests.get(f"{strict.url}/health").ok
-        connection.close()
-        poll(lambda: strict.metric("requests_in_flight") == 0)
-        assert answered(ask_json(strict, [progress(FIRST)]))
+    connection = begun(strict, *HALVES["/evaluate_batch"])
+    poll(lambda: strict.metric("requests_in_flight") == 1)
+    response = ask_json(strict, [progress(FIRST)])
+    assert failure(response, 503) == "expected at most 1 evaluations at a time, got more"
+    assert response.headers["Retry-After"] == "1"
+    assert requests.get(f"{strict.url}/health").ok
+    connection.close()
+    poll(lambda: strict.metric("requests_in_flight") == 0)
+    assert answered(ask_json(strict, [progress(FIRST)]))
 
 
 def test_a_caller_who_leaves_is_no_failure_of_the_gateway(tiny: Gateway) -> None:
@@ -149,107 +137,67 @@ TritonPythonModel.load = load
 """
 
 
-@dataclass(frozen=True)
-class Gated:
-    """A gateway before a Triton whose model works on its batch for as long as the file ``gate`` is there."""
-
-    gateway: Gateway
-    endpoints: Endpoints
-    gate: Path
-
-    @contextmanager
-    def working(self) -> Iterator[http.client.HTTPConnection]:
-        """Within it, the model works on the request of the connection."""
-        self.gate.touch()
-        try:
-            caller = post_body(self.gateway, progress(FIRST))
-            poll(self.gate.with_name(f"{self.gate.name}.at_work").exists)
-            yield caller
-        finally:
-            self.gate.unlink()
-            self.gate.with_name(f"{self.gate.name}.at_work").unlink(missing_ok=True)
-
-    def metric(self, name: str, **labels: str) -> float:
-        families = text_string_to_metric_families(requests.get(self.endpoints.metrics_url).text)
-        samples = (sample for family in families for sample in family.samples)
-        return sum(s.value for s in samples if s.name == name and labels.items() <= s.labels.items())
-
-
-@pytest.fixture(scope="module")
-def gated(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransformer) -> Iterator[Gated]:
-    folder = tmp_path_factory.mktemp("gated")
-    repository, checkpoint, gate = folder / "model_repository", folder / "two_wide", folder / "gate"
+@pytest.mark.slow
+def test_while_a_model_works_health_is_told_and_callers_who_hang_up_cost_no_forward(
+    tiny_network: RewindTransformer, tmp_path: Path
+) -> None:
+    """The preference is asked last: once it is counted, so is whatever was scored before it."""
+    repository, checkpoint, gate = tmp_path / "model_repository", tmp_path / "two_wide", tmp_path / "gate"
     RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()).save(checkpoint)
     rfm_export.export(checkpoint, repository, ExportConfig(name=TINY, num_gpus=0, torch_threads=1))
     model = repository / TINY / "1" / "model.py"
     model.write_text(model.read_text() + CLOSED_GATE.format(gate=str(gate)))
-    with (
-        (folder / "tritonserver.log").open("wb") as log,
-        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
-        running(server.endpoints, folder) as gateway,
-    ):
-        yield Gated(gateway, server.endpoints, gate)
+    samples, now_s = [progress(FIRST), preference(FIRST, SECOND)], [0.0]
 
+    async def ask_health() -> None:
+        async with AsyncRewardClient(endpoints.grpc_url) as client:
+            urls = endpoints.grpc_url, endpoints.metrics_url
+            state = TritonState(client, *urls, TINY, clock_s=lambda: now_s[0])
+            assert (await state.health()).status == "healthy"
+            now_s[0] += STALL_S
+            await state.health()
 
-@pytest.mark.slow
-def test_callers_who_hang_up_cost_no_forward(gated: Gated) -> None:
-    """Preferences are asked last: once one is counted, a moment later, so is whatever was scored before it."""
+    def metric(name: str, **labels: str) -> float:
+        return metric_at(endpoints.metrics_url, name, **labels)
 
     def scored(sample_type: str) -> float:
-        return gated.metric("rfm_samples_total", outcome="scored", sample_type=sample_type)
+        return metric("rfm_samples_total", outcome="scored", sample_type=sample_type)
 
-    samples = [progress(FIRST), preference(FIRST, SECOND)]
-    answers = [expected(gated.gateway, [sample]) for sample in samples]
-    poll(lambda: scored("preference") == 1)
-    progress_before = scored("progress")
-    with gated.working() as first:
-        leaving = [post_body(gated.gateway, progress(FIRST)) for _ in range(12)]
-        poll(lambda: gated.metric("nv_inference_pending_request_count") == len(leaving))
+    with (
+        (tmp_path / "tritonserver.log").open("wb") as log,
+        BriefServer(repository, Endpoints.free(), find_installation(), log=log) as server,
+        running(server.endpoints, tmp_path) as gateway,
+    ):
+        endpoints = server.endpoints
+        answers = [expected(gateway, [sample]) for sample in samples]
+        poll(lambda: scored("preference") == 1)
+        progress_before = scored("progress")
+        gate.touch()
+        first = post_body(gateway, samples[0])
+        poll(gate.with_name("gate.at_work").exists)
+        leaving = [post_body(gateway, samples[0]) for _ in range(12)]
+        poll(lambda: metric("nv_inference_pending_request_count") == len(leaving))
         for caller in leaving:
             caller.close()
-        poll(lambda: gated.gateway.metric("requests_total", code="499") == len(leaving))
-        last = post_body(gated.gateway, samples[1])  # behind what has told Triton that they left
-        poll(lambda: gated.metric("nv_inference_pending_request_count") >= 1)
-        time.sleep(2 * GIVEN_UP_S)  # behind a batch that took less, the model does not ask who has left
-    for caller, answer in zip((first, last), answers, strict=True):
-        assert json.loads(caller.getresponse().read()) == numbers(answer)
-        caller.close()
-    poll(lambda: scored("preference") == 2)
-    assert scored("progress") == progress_before + 1
-    assert gated.gateway.metric("requests_in_flight") == 0
+        poll(lambda: gateway.metric("requests_total", code="499") == len(leaving))
+        last = post_body(gateway, samples[1])
+        poll(lambda: metric("nv_inference_pending_request_count") >= 1)
+        health = {"status": "healthy", "available_gpus": 0, "total_gpus": 1}
+        assert answered(requests.get(f"{gateway.url}/health")) == health
+        hangs = r"rfm: no answer within 1\.5 s, and nothing finished for 30 s"
+        with pytest.raises(ServerUnavailableError, match=hangs):
+            asyncio.run(ask_health())
+        gate.unlink()
+        for caller, answer in zip((first, last), answers, strict=True):
+            assert json.loads(caller.getresponse().read()) == numbers(answer)
+            caller.close()
+        poll(lambda: scored("preference") == 2)
+        assert scored("progress") == progress_before + 1
+        assert gateway.metric("requests_in_flight") == 0
 
 
-@pytest.mark.slow
-def test_health_is_told_while_a_model_works(gated: Gated) -> None:
-    with gated.working() as first:
-        second = post_body(gated.gateway, progress(FIRST))
-        poll(lambda: gated.metric("nv_inference_pending_request_count") == 1)
-        assert answered(requests.get(f"{gated.gateway.url}/health")) == {
-            "status": "healthy",
-            "available_gpus": 0,
-            "total_gpus": 1,
-        }
-        now_s = [0.0]
-
-        async def ask() -> None:
-            async with AsyncRewardClient(gated.endpoints.grpc_url) as client:
-                urls = gated.endpoints.grpc_url, gated.endpoints.metrics_url
-                state = TritonState(client, *urls, TINY, clock_s=lambda: now_s[0])
-                assert (await state.health()).status == "healthy"
-                now_s[0] += STALL_S
-                await state.health()
-
-        with pytest.raises(
-            ServerUnavailableError, match=r"rfm: no answer within 1\.5 s, and nothing finished for 30 s"
-        ):
-            asyncio.run(ask())
-    for caller in (first, second):
-        assert caller.getresponse().status == 200
-        caller.close()
-
-
-def test_no_score_in_time_is_a_504(triton: Triton, strict: Gateway, ask: Ask) -> None:
-    assert answered(ask(strict, [progress(FIRST)]))
+def test_no_score_in_time_is_a_504(triton: Triton, strict: Gateway) -> None:
+    assert answered(ask_json(strict, [progress(FIRST)]))
     with paused(triton):
-        assert failure(ask(strict, [progress(FIRST)]), 504) == "Triton: no answer within 1 s"
-    assert answered(ask(strict, [progress(FIRST)]))
+        assert failure(ask_json(strict, [progress(FIRST)]), 504) == "Triton: no answer within 1 s"
+    assert answered(ask_json(strict, [progress(FIRST)]))

@@ -16,7 +16,6 @@ from gateway_requests import (
     BLACK,
     FILM,
     FILM_DIMS,
-    FRAMES_AT,
     Triton,
     answered,
     ask_json,
@@ -32,6 +31,7 @@ from gateway_requests import (
 from gateways import Gateway, running
 
 pytestmark = pytest.mark.triton
+FRAMES_AT, PATH_AT = ["samples", 0, "trajectory", "frames"], ["samples", 0, "trajectory", "embeddings_path"]
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_images_and_arrays_in_the_allowed_folder_are_read(shelf: tuple[Gateway, 
 
 
 OUTSIDE = ["../outside.png", "episode/../../outside.png", "/etc/passwd", "link_to_outside.png"]
-NOWHERE = ["folder_outside/outside.png", "missing.png", "episode", "", "circle", "a\0b", "a" * 5000]
+NOWHERE = ["folder_outside/outside.png", "missing.png", "episode", "circle", "a\0b", "a" * 5000]
 BAD_IMAGES = [
     *((name, "a file in the allowed folder") for name in (*OUTSIDE, *NOWHERE)),
     *((name, "an image file") for name in ("text.png", "episode.npy")),
@@ -91,23 +91,20 @@ BAD_FILES = [
 @pytest.mark.parametrize(("name", "wanted"), BAD_IMAGES, ids=[repr(name)[:30] for name, _ in BAD_IMAGES])
 def test_no_other_image_is_opened(shelf: tuple[Gateway, Path], name: str, wanted: str) -> None:
     response = ask_json(shelf[0], [of_frames(["episode/0.png", name])])
-    check_refused(response, (["samples", 0, *FRAMES_AT, 1], re.escape(f"expected {wanted}, got {name}")))
+    check_refused(response, ([*FRAMES_AT, 1], re.escape(f"expected {wanted}, got {name}")))
 
 
 @pytest.mark.parametrize(("name", "wanted"), BAD_FILES, ids=[name for name, _ in BAD_FILES])
 def test_no_other_array_is_opened(shelf: tuple[Gateway, Path], name: str, wanted: str) -> None:
     response = ask_json(shelf[0], [progress({"embeddings_path": name, "task": "lift"})])
-    at = ["samples", 0, "trajectory", "embeddings_path"]
-    check_refused(response, (at, re.escape(f"expected {wanted}, got {name}")))
+    check_refused(response, (PATH_AT, re.escape(f"expected {wanted}, got {name}")))
 
 
 def test_files_that_do_not_fit_are_refused(shelf: tuple[Gateway, Path]) -> None:
     response = ask_json(shelf[0], [of_frames(["episode/0.png", "larger.png"])])
-    check_refused(response, (["samples", 0, *FRAMES_AT], "expected images of one size, got different ones"))
+    check_refused(response, (FRAMES_AT, "expected images of one size, got different ones"))
     response = ask_json(shelf[0], [progress({"embeddings_path": "frames.npy", "task": "lift"})])
-    check_refused(
-        response, (["samples", 0, "trajectory", "embeddings_path"], "expected a file of embeddings, got frames")
-    )
+    check_refused(response, (PATH_AT, "expected a file of embeddings, got frames"))
 
 
 def test_files_are_refused_before_they_fill_the_memory(triton: Triton, tmp_path: Path) -> None:

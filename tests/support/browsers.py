@@ -11,12 +11,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from selenium.webdriver import Chrome, ChromeOptions
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
 from selenium.webdriver.remote.webelement import WebElement
 
 from gateways import poll
+from rfm_client.contract.samples import UInt8Array
 
 IMAGES_VARIABLE = "RFM_IMAGES"  # a folder for new pictures of the documents
 AXE = Path(__file__).parents[1] / "gateway" / "vendored" / "axe-core" / "axe.min.js"
@@ -31,12 +33,14 @@ QUIET = (  # nothing but the page asks for anything
 class Browser:
     """A page in Chromium."""
 
-    def __init__(self, driver: Chrome) -> None:
+    def __init__(self, driver: Chrome, downloads: Path) -> None:
         self.driver = driver
-        self._asked: list[str] = []
+        self.downloads = downloads
 
     def open(self, url: str) -> None:
+        """Opens the page, and waits until it offers a model."""
         self.driver.get(url)
+        self.until("document.getElementById('model').value")
 
     def __getitem__(self, name: str) -> WebElement:
         """The element of this id."""
@@ -71,6 +75,44 @@ class Browser:
         poll(is_there)
         return found[0]
 
+    def until_text(self, name: str, text: str) -> None:
+        """Waits until the element of this id has this text."""
+        poll(lambda: self[name].text == text)
+
+    def cells(self, rows: str) -> list[list[str]]:
+        """The text of each cell of the table rows that a selector finds."""
+        script = "[...row.children].map((cell) => cell.textContent)"
+        return list(self.run(f"return [...document.querySelectorAll('{rows}')].map((row) => {script})"))
+
+    def times_s(self, players: str) -> list[float]:
+        """Where the videos and sliders are that a selector finds."""
+        script = "Number(each.currentTime ?? each.value)"
+        return list(self.run(f"return [...document.querySelectorAll('{players}')].map((each) => {script})"))
+
+    def pixels(self, pictures: Sequence[WebElement]) -> list[UInt8Array]:
+        """What images and videos show now, each uint8 [H, W, 3]."""
+        found = self.run(
+            """
+            return arguments[0].map((picture) => {
+              const width = picture.videoWidth ?? picture.naturalWidth;
+              const height = picture.videoHeight ?? picture.naturalHeight;
+              const context = new OffscreenCanvas(width, height).getContext("2d");
+              context.drawImage(picture, 0, 0);
+              return [height, width, [...context.getImageData(0, 0, width, height).data]];
+            });
+            """,
+            pictures,
+        )
+        return [np.array(data, np.uint8).reshape(height, width, 4)[..., :3] for height, width, data in found]
+
+    def saved(self, name: str) -> bytes:
+        """A file that the page has just let the browser save."""
+        file = self.downloads / name
+        poll(lambda: file.exists() and file.stat().st_size > 0)
+        content = file.read_bytes()
+        file.unlink()
+        return content
+
     @contextmanager
     def theme(self, name: str) -> Iterator[None]:
         """The page as somebody sees it who prefers light or dark."""
@@ -89,8 +131,10 @@ class Browser:
         )
         return [(each["id"], each["impact"], [node["html"] for node in each["nodes"]]) for each in found]
 
-    def picture(self, file: Path) -> None:
+    def picture(self, name: str) -> None:
         """Saves a picture of the whole page."""
+        file = Path(os.environ.get(IMAGES_VARIABLE, self.downloads)) / name
+        self.run("document.activeElement.blur(); scrollTo(0, 0)")
         size = {"width": 1100, "height": 1000, "deviceScaleFactor": 1, "mobile": False}
         try:
             for _ in range(2):  # its height depends on its width
@@ -106,36 +150,27 @@ class Browser:
         return [entry["message"] for entry in self.driver.get_log("browser") if entry["level"] == "SEVERE"]
 
     def asked(self) -> list[str]:
-        """The addresses of all requests."""
-        for entry in self.driver.get_log("performance"):
-            message = json.loads(entry["message"])["message"]
-            if message["method"] == "Network.requestWillBeSent":
-                self._asked.append(message["params"]["request"]["url"])
-        return self._asked
+        """The addresses of all requests since the last time."""
+        messages = [json.loads(entry["message"])["message"] for entry in self.driver.get_log("performance")]
+        sent = (each["params"] for each in messages if each["method"] == "Network.requestWillBeSent")
+        return [each["request"]["url"] for each in sent]
 
 
 @contextmanager
-def chromium(downloads: Path, *options: str) -> Iterator[Browser]:
+def chromium(downloads: Path) -> Iterator[Browser]:
     """A browser that saves files in a folder."""
     programs = [shutil.which(name) for name in ("chromium", "chromedriver")]
     assert all(programs), "expected chromium and chromedriver in PATH, got none: make ops-tools"
     chosen = ChromeOptions()
     chosen.binary_location = str(programs[0])
     width, height = WINDOW_PX
-    is_root = ["--no-sandbox"] if os.geteuid() == 0 else []
-    for option in (
-        "--headless=new",
-        f"--window-size={width},{height}",
-        "--disable-dev-shm-usage",
-        *is_root,
-        *QUIET,
-        *options,
-    ):
+    as_root = ["--no-sandbox"] if os.geteuid() == 0 else []
+    for option in ("--headless=new", f"--window-size={width},{height}", "--disable-dev-shm-usage", *as_root, *QUIET):
         chosen.add_argument(option)
     chosen.add_experimental_option("prefs", {"download.default_directory": str(downloads)})
     chosen.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     driver = Chrome(options=chosen, service=Service(str(programs[1])))
     try:
-        yield Browser(driver)
+        yield Browser(driver, downloads)
     finally:
         driver.quit()

@@ -20,15 +20,11 @@ import requests
 from gateways import Gateway, running
 from proxies import Proxy
 from rfm.launch.process import Endpoints
-from rfm_client import PreferenceSample, ProgressSample, Result, Sample, SimilaritySample, Trajectory
+from rfm_client import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from small_network import SMALL
 
 Json: TypeAlias = dict[str, Any]
-
-
 Array: TypeAlias = npt.NDArray[Any]
-
-
 Ask: TypeAlias = Callable[..., requests.Response]
 TINY, FILM, VIDEO = "rfm", "film", "film_video"  # models: two numbers a frame; encoders; vision-language in video mode
 TINY_CONFIG = replace(
@@ -65,11 +61,8 @@ def fixture_of(model: str, *options: str) -> Any:
 def embedded(seed: int, num_frames: int, dims: tuple[int, int] = (2, 2), **fields: Any) -> Json:
     random = np.random.default_rng(seed)
     video = random.standard_normal((num_frames, dims[0]), np.float32)
-    return {
-        "task": "lift",
-        "video_embeddings": video,
-        "text_embedding": random.standard_normal(dims[1], np.float32),
-    } | (fields)
+    text = random.standard_normal(dims[1], np.float32)
+    return {"task": "lift", "video_embeddings": video, "text_embedding": text, **fields}
 
 
 def filmed(seed: int, num_frames: int, size_px: int = 32, **fields: Any) -> Json:
@@ -137,15 +130,11 @@ def of_client(sample: Json, frame_steps: int) -> Sample:
     return (PreferenceSample if sample["sample_type"] == "preference" else SimilaritySample)(first, *others)
 
 
-def scores(gateway: Gateway, samples: Sequence[Json], frame_steps: int = 0) -> list[Any]:
-    with gateway.client() as client:
-        results: list[Result] = client.evaluate([of_client(sample, frame_steps) for sample in samples])
-    return results
-
-
 def expected(gateway: Gateway, samples: Sequence[Json], *, frame_steps: int = 0, group: int = 1) -> Json:
     """The FastAPI server's answer with the numbers that RewardClient gets."""
-    pairs = list(zip(samples, scores(gateway, samples, frame_steps), strict=True))
+    with gateway.client() as client:
+        results: list[Any] = client.evaluate([of_client(sample, frame_steps) for sample in samples])
+    pairs = list(zip(samples, results, strict=True))
     of = {kind: [(s, r) for s, r in pairs if s["sample_type"] == kind] for kind in SIDES}
     told: Json = dict.fromkeys(("outputs_preference", "outputs_progress", "outputs_success", "outputs_similarity"))
     if of["preference"]:
@@ -192,34 +181,18 @@ def failure(response: requests.Response, code: int) -> str:
     return str(response.json()["detail"])
 
 
-SEED_PAYLOAD = """[
-  {
-    "sample_type": "preference",
-    "chosen_trajectory": {
-      "task": "pick_place",
-      "video_embeddings": [[0.1, 0.2], [0.3, 0.4]],
-      "text_embedding": [0.5, 0.6],
-      "target_progress": [0.2, 0.6, 1.0],
-      "frames_shape": [2, 2]
-    },
-    "rejected_trajectory": {
-      "task": "pick_place",
-      "video_embeddings": [[-0.1, -0.2], [-0.3, -0.4]],
-      "text_embedding": [0.0, 0.1],
-      "target_progress": [0.1, 0.3, 0.5],
-      "frames_shape": [2, 2]
-    }
-  }
-]"""  # of the FastAPI evaluation server's README
+def seed_side(video: Any, text: Any, target: Any) -> Json:
+    shown = {"task": "pick_place", "video_embeddings": video, "text_embedding": text}
+    return {**shown, "target_progress": target, "frames_shape": [2, 2]}
+
+
+SEED_PAYLOAD = [  # of the FastAPI evaluation server's README
+    preference(
+        seed_side([[0.1, 0.2], [0.3, 0.4]], [0.5, 0.6], [0.2, 0.6, 1.0]),
+        seed_side([[-0.1, -0.2], [-0.3, -0.4]], [0.0, 0.1], [0.1, 0.3, 0.5]),
+    )
+]
 FIRST, SECOND = embedded(1, 3), embedded(2, 2)
-
-
-def ask_part(gateway: Gateway, part: bytes) -> requests.Response:
-    """FIRST with this as its embeddings' file."""
-    text = FIRST["text_embedding"].tolist()
-    sample = progress({"video_embeddings": {"__numpy_file__": "video"}, "text_embedding": text})
-    form = {"sample_0": json.dumps(sample)}
-    return requests.post(f"{gateway.url}/evaluate_batch_npy", data=form, files={"video": ("video.npy", part)})
 
 
 def npy_of(header: str, content: bytes = b"", version: int = 1) -> bytes:
@@ -231,7 +204,6 @@ def of_frames(frames: Any, **fields: Any) -> Json:
     return progress({"task": "lift", "frames": frames, **fields})
 
 
-FRAMES_AT, TASK_AT = ["trajectory", "frames"], ["trajectory", "task"]
 BLACK = np.zeros((2, 8, 8, 3), np.uint8)
 
 
@@ -245,7 +217,6 @@ def check_refused(response: requests.Response, *told: tuple[Sequence[Any], str])
         assert re.fullmatch(message, error["msg"], re.DOTALL), error["msg"]
 
 
-FORM = {"sample_0": dumped(progress(FIRST))}
 MULTIPART = "multipart/form-data; boundary=b"
 NAMED = b'--b\r\nContent-Disposition: form-data; name="sample_0"\r\n\r\n'
 

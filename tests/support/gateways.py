@@ -56,15 +56,19 @@ class Gateway:
         return requests.get(f"{self.url}{path}", timeout=WITHIN_S, **options)
 
     def metric(self, name: str, **labels: str) -> float:
-        """Of the gateway's own; 0 before it is first counted."""
-        families = text_string_to_metric_families(requests.get(f"{self.url}/metrics").text)
-        samples = (sample for family in families for sample in family.samples)
-        return sum(s.value for s in samples if s.name == f"rfm_gateway_{name}" and labels.items() <= s.labels.items())
+        """Of the gateway's own."""
+        return metric_at(f"{self.url}/metrics", f"rfm_gateway_{name}", **labels)
 
 
 def free_port() -> int:
-    (port,) = free_ports(1)
-    return port
+    return free_ports(1)[0]
+
+
+def metric_at(url: str, name: str, **labels: str) -> float:
+    """A sum over the labels that are not given; 0 before the first is counted."""
+    families = text_string_to_metric_families(requests.get(url).text)
+    samples = (sample for family in families for sample in family.samples)
+    return sum(each.value for each in samples if each.name == name and labels.items() <= each.labels.items())
 
 
 def poll(is_so: Callable[[], bool]) -> None:
@@ -83,9 +87,9 @@ def answers(url: str) -> bool:
 
 @contextmanager
 def running(
-    endpoints: Endpoints, folder: Path, model: str = "rfm", *options: str, **environment: str
+    endpoints: Endpoints, folder: Path, model: str = "rfm", *options: str, port: int | None = None, **environment: str
 ) -> Iterator[Gateway]:
-    port = free_port()
+    port = port or free_port()
     command = [sys.executable, "-m", "rfm_gateway", "--triton", endpoints.grpc_url, "--port", str(port)]
     command += ["--metrics-url", endpoints.metrics_url, "--model", model, *options]
     log_file = folder / f"gateway_{port}.log"

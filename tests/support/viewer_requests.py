@@ -6,8 +6,6 @@ from __future__ import annotations
 import json
 import os
 import shlex
-import subprocess
-import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,12 +13,14 @@ from typing import Any
 
 import requests
 
+from client_commands import invoke
+
 SCORE, COMPARE, SERVED = "viewer/score", "viewer/compare", "viewer/served"
 
 Json = dict[str, Any]
 
 
-def post(url: str, path: str, files: dict[str, Path | bytes], headers: Json | None = None, **fields: Any) -> Any:
+def post(url: str, path: str, files: dict[str, Path | bytes], **fields: Any) -> requests.Response:
     """The response to a form of the page, whose answer is read as it comes."""
     with ExitStack() as stack:
         parts = {
@@ -29,7 +29,7 @@ def post(url: str, path: str, files: dict[str, Path | bytes], headers: Json | No
             else (file.name, stack.enter_context(file.open("rb")))
             for name, file in files.items()
         }
-        return requests.post(f"{url}/{path}", data=fields, files=parts, headers=headers, stream=True, timeout=60)
+        return requests.post(f"{url}/{path}", data=fields, files=parts, stream=True, timeout=60)
 
 
 def events(response: requests.Response) -> list[tuple[str, Json]]:
@@ -57,10 +57,15 @@ def curve_of(told: Sequence[tuple[str, Json]]) -> Json:
     return {"progress": progress, "success": success, "frame_times_s": video["times_s"]}
 
 
-def by_command_line(folder: Path, command: str) -> None:
-    """Runs a command line of ``rfm-client`` in the folder."""
-    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-    done = subprocess.run(
-        shlex.split(command), cwd=folder, env=environment, capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == 0, done.stderr
+def by_command_line(folder: Path, command: str) -> Json:
+    """What a command line of ``rfm-client`` writes to the JSON file that it names, run in this folder."""
+    program, *words = shlex.split(command)
+    assert program == "rfm-client"
+    here = Path.cwd()
+    os.chdir(folder)  # as a person does, who copies the line
+    try:
+        done = invoke(*words)
+        assert done.exit_code == 0, done.output
+        return dict(json.loads(Path(words[words.index("--json") + 1]).read_text()))
+    finally:
+        os.chdir(here)
