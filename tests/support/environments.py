@@ -59,9 +59,9 @@ def cart_pole_with_pixels() -> gym.Env[Any, Any]:
 
 
 def two_cameras(observation: dict[str, Any]) -> dict[str, UInt8Array]:
-    """A frame of each of two cameras, of different sizes."""
+    """A frame of each of two cameras, of different sizes, and what is none."""
     front = np.asarray(observation["pixels"], np.uint8)
-    return {"front": front, "wrist": 255 - front[::2, ::2]}
+    return {"front": front, "wrist": 255 - front[::2, ::2], "state": np.zeros(1, np.uint8)}
 
 
 def scores(client: RewardClient, film: Film, step: int, max_frames: int | None = MAX_FRAMES) -> ProgressResult:
