@@ -111,14 +111,6 @@ def test_a_reset_of_a_vector_takes_back_what_is_open_about_what_it_resets(late: 
     assert [answer.cancelled() for answer in late.submitted] == [True, True]
 
 
-def test_the_questions_of_a_step_go_in_one_request(late: LateClient) -> None:
-    options = RewardOptions(sampling="all")
-    env = RewardModelVectorWrapper(vector_env([cart_pole] * 3, NEXT_STEP), late, TASK, options)
-    env.reset(seed=0)
-    env.step(np.array([0, 1, 0]))
-    assert late.connection.lengths == [1, 2]
-
-
 def test_success_ends_an_episode_of_a_vector_that_the_caller_resets(client: RewardClient) -> None:
     options = RewardOptions(every=2, terminate_on_success=SuccessRule(threshold=0.0))
     env = RewardModelVectorWrapper(vector_env([cart_pole] * 2, DISABLED), client, TASK, options)

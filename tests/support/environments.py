@@ -114,11 +114,9 @@ class SlowConnection(GrpcTransport):
     def __init__(self, url: str) -> None:
         super().__init__(url, Access(), shared_memory=False)
         self.held: dict[int, Future[None]] = {}
-        self.lengths: list[int] = []
 
     async def infer(self, model: str, inputs: wire.Tensors, outputs: Any, timeout_s: float, **_id: str) -> Answer:
         length = int(inputs[wire.NUM_FRAMES].max())
-        self.lengths.append(length)
         if length in self.held:
             await asyncio.shield(asyncio.wrap_future(self.held[length]))  # several questions may wait for it
         return await super().infer(model, inputs, outputs, timeout_s)
