@@ -17,7 +17,6 @@ from environments import (
     MODEL,
     TASK,
     TOLERANCE,
-    Camera,
     LateClient,
     assert_close,
     cart_pole,
@@ -79,24 +78,6 @@ def test_a_vector_is_paid_as_its_environments_would_be(
     vector = RewardModelVectorWrapper(vector_env([cart_pole_with_pixels] * 2, mode), client, tasks, options)
     left, right = arrays(roll(vector, mode)), arrays(roll(vector_env(singles, mode), mode))
     torch.testing.assert_close(left, right, rtol=0, atol=TOLERANCE)
-
-
-@pytest.mark.parametrize("mode", [NEXT_STEP, DISABLED], ids=lambda mode: mode.name)
-def test_late_rewards_of_a_vector_s_rendered_frames_add_up(client: RewardClient, mode: AutoresetMode) -> None:
-    cameras = [Camera(cart_pole()), Camera(cart_pole())]
-    envs = vector_env([lambda: cameras[0], lambda: cameras[1]], mode)
-    env = RewardModelVectorWrapper(envs, client, TASK, RewardOptions(mode="delta", blocking=False))
-    steps = [told for told in roll(env, mode) if len(told) == 5]  # not the resets
-    env.close()
-    rewards = np.stack([reward for _, reward, *_ in steps])
-    is_paid = np.stack([infos["reward_model"]["_env_reward"] for *_, infos in steps])
-    assert (rewards[~is_paid] == 0).all()
-    for index, camera in enumerate(cameras):
-        paid = rewards[is_paid[:, index], index]
-        lengths = [len(film) - 1 for film in camera.films[:-1]]
-        for film, of_episode in zip(camera.films, np.split(paid, np.cumsum(lengths))[:-1], strict=False):
-            first, last = progress(client, film, [0, len(of_episode)])
-            assert_close(sum(of_episode), last - first)
 
 
 def test_a_reset_of_a_vector_takes_back_what_is_open_about_what_it_resets(late: LateClient) -> None:

@@ -102,26 +102,6 @@ def test_names_and_numbers_are_reported_as_a_gateway_takes_them(taker: Taker) ->
     assert first["steps"][0]["success"] is None  # the checkpoint does not predict it
 
 
-def test_an_episode_that_has_ended_takes_no_more_steps(taker: Taker) -> None:
-    with LiveView(taker.url) as view:
-        episode = view.episode("stack the cups")
-        episode.add(picture(), score(0))
-        episode.end()
-        episode.add(picture(), score(1))
-    (told,) = episodes_of(taker)
-    assert (told["ended"], [each["step"] for each in told["steps"]]) == (True, [0])
-
-
-def test_a_report_that_fails_does_not_end_the_reports(taker: Taker, caplog: pytest.LogCaptureFixture) -> None:
-    with LiveView(taker.url) as view:
-        episode = view.episode("stack the cups")
-        episode.add(np.zeros((4, 4, 4), np.uint8), score(0))
-        poll(lambda: "a live report has failed, and is dropped" in caplog.text)
-        episode.add(picture(), score(1))
-        poll(lambda: bool(taker.bodies))
-    assert [each["step"] for each in taker.steps()] == [1]
-
-
 WATCHED = """
 import os, sys
 import numpy as np
