@@ -8,13 +8,12 @@ import gc
 import os
 import signal
 import time
-import urllib.request
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
@@ -22,11 +21,8 @@ from prometheus_client.parser import text_string_to_metric_families
 import goldens
 import rfm_export
 from engines import serve_config
-from one_model import BriefServer
+from mixtures import TOLD_S
 from reference_server import Served
-from repositories import configure
-from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints
 from rfm_client import (
     AsyncRewardClient,
     InvalidSampleError,
@@ -40,25 +36,23 @@ from rfm_client import (
 from rfm_client.contract import wire
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.sampling import RULES, Rule, Sampling, of_prefixes, prefix_samples
-from rfm_client.episodes import Episode, SuccessRule
+from rfm_client.episodes import Episode
 from rfm_client.transport.access import Access
 from rfm_client.transport.calls import Answer, GrpcTransport
-from rfm_serve import serving
-
-pytestmark = pytest.mark.triton
+from rfm_serve import Serving, serving
 
 MODEL = "enc_c1_t1_disc10"
 IMAGES, VIDEO = "q3_tok_disc10", "q25_video_avg_disc10"
 TASK = "stack the cups"
+FOUR = Sampling("rint_pad", 4)
 TOLERANCE, VLM_TOLERANCE = 1e-5, 1e-4
-TOLD_S = 1.0  # in which the model tells Triton what it has counted
 
 
 def film(seed: int, count: int, size: tuple[int, int] = (40, 56)) -> UInt8Array:
     return np.random.default_rng(seed).integers(0, 256, (count, *size, 3), np.uint8)
 
 
-def offline(client: RewardClient, frames: UInt8Array, sampling: Sampling, task: str = TASK) -> ProgressResult:
+def offline(client: RewardClient, frames: UInt8Array, sampling: Sampling = FOUR, task: str = TASK) -> ProgressResult:
     """Each frame's score from the prefix that ends with it, all pixels sent."""
     results = client.evaluate(list(prefix_samples(Trajectory(frames=frames, task=task), sampling)))
     return of_prefixes([result for result in results if isinstance(result, ProgressResult)], sampling)
@@ -73,22 +67,7 @@ def online(episode: Episode, frames: UInt8Array) -> tuple[list[float], list[floa
 def assert_same(
     scores: tuple[Sequence[float], Sequence[float]], expected: ProgressResult, tolerance: float = TOLERANCE
 ) -> None:
-    np.testing.assert_allclose(scores[0], expected.progress, rtol=0, atol=tolerance)
-    np.testing.assert_allclose(scores[1], expected.success, rtol=0, atol=tolerance)
-
-
-def counted(endpoints: Endpoints, name: str, model: str = f"{MODEL}_encoder") -> float:
-    """What the metrics of the model that encodes frames say."""
-    time.sleep(TOLD_S)
-    with urllib.request.urlopen(endpoints.metrics_url, timeout=10) as answer:
-        families = list(text_string_to_metric_families(answer.read().decode()))
-    found = [
-        sample.value
-        for family in families
-        for sample in family.samples
-        if sample.name == f"rfm_{name}" and sample.labels["model"] == model
-    ]
-    return sum(found)
+    np.testing.assert_allclose(scores, (expected.progress, expected.success), rtol=0, atol=tolerance)
 
 
 class Recording(GrpcTransport):
@@ -98,28 +77,24 @@ class Recording(GrpcTransport):
         super().__init__(url, Access(), shared_memory=False)
         self.requests: list[wire.Tensors] = []
 
-    async def infer(self, model: str, inputs: wire.Tensors, outputs: object, timeout_s: float, **more: str) -> Answer:
+    async def infer(self, model: str, inputs: wire.Tensors, outputs: Any, timeout_s: float, **more: str) -> Answer:
         self.requests.append(inputs)
-        return await super().infer(model, inputs, outputs, timeout_s, **more)  # type: ignore[arg-type]
+        return await super().infer(model, inputs, outputs, timeout_s, **more)
 
     @property
-    def num_bytes(self) -> list[int]:
-        return [sum(array.nbytes for array in inputs.values()) for inputs in self.requests]
+    def most_bytes(self) -> int:
+        return max(sum(array.nbytes for array in inputs.values()) for inputs in self.requests)
 
 
 @pytest.fixture
-def recorded(served: Served) -> Iterator[tuple[Recording, RewardClient]]:
-    transport = Recording(served.url("grpc"))
+def transport(served: Served) -> Recording:
+    return Recording(served.url("grpc"))
+
+
+@pytest.fixture
+def client(transport: Recording) -> Iterator[RewardClient]:
     with RewardClient([], transports=[transport], model=MODEL) as client:
-        yield transport, client
-
-
-def settled(model: str, rule: Rule) -> tuple[Sampling, UInt8Array, float]:
-    """A rule with few frames, a film longer than that, and how far scores may differ."""
-    if model != MODEL:
-        return Sampling(rule, 4), film(3, 40, (56, 84)), VLM_TOLERANCE
-    frames = film(RULES.index(rule), 16 if rule == "all" else 40)  # the checkpoint takes 16 frames
-    return Sampling(rule, None if rule == "all" or rule.startswith("rewind") else 7), frames, TOLERANCE
+        yield client
 
 
 STEPPED = [
@@ -131,52 +106,53 @@ STEPPED = [
 
 @pytest.mark.parametrize(("model", "rule", "protocol"), STEPPED)
 def test_steps_have_the_scores_of_the_whole(served: Served, model: str, rule: Rule, protocol: str) -> None:
-    sampling, frames, tolerance = settled(model, rule)
-    number = None if rule == "all" else sampling.frames
+    number = None if rule == "all" or rule.startswith("rewind") else 7 if model == MODEL else 4
+    frames = film(RULES.index(rule), 16 if rule == "all" else 40, (40, 56) if model == MODEL else (56, 84))
     with served.client(protocol, model) as client, client.episode(TASK, sampling=rule, frames=number) as episode:
         assert client.model_info(frames=True).by_digest
-        assert_same(online(episode, frames), offline(client, frames, sampling), tolerance)
+        tolerance = TOLERANCE if model == MODEL else VLM_TOLERANCE
+        assert_same(online(episode, frames), offline(client, frames, Sampling(rule, number)), tolerance)
 
 
-@pytest.mark.parametrize(
-    ("model", "encodes"), [(MODEL, f"{MODEL}_encoder"), (IMAGES, f"{IMAGES}_frames"), (VIDEO, f"{VIDEO}_frames")]
-)
-def test_a_step_sends_and_encodes_its_new_frame_alone(served: Served, model: str, encodes: str) -> None:
-    transport, frames = Recording(served.url("grpc")), film(100, 12, (56, 84))
-    before = counted(served.endpoints, "frames_encoded_total", encodes)
-    with RewardClient([], transports=[transport], model=model) as client, client.episode(TASK, frames=4) as episode:
-        for frame in frames:
-            episode.add(frame)
-    assert [len(inputs[wire.FRAMES][0]) for inputs in transport.requests] == [1] * len(frames)
-    assert max(transport.num_bytes) < frames[0].nbytes + 512
-    encoded = counted(served.endpoints, "frames_encoded_total", encodes) - before
-    shown = [Sampling("rint_pad", 4).prefix(t).indices for t in range(len(frames))]
-    pairs = {tuple(pair) for indices in shown for pair in indices.reshape(-1, 2).tolist()}
-    assert encoded == (2 * len(pairs) if model == VIDEO else len(frames))
+def test_a_step_sends_its_new_frame_alone_and_nothing_is_encoded_twice(served: Served) -> None:
+    """Of a model that reads videos, each new pair of frames is encoded, as a model that reads frames reads each."""
+    encoders = {MODEL: f"{MODEL}_encoder", IMAGES: f"{IMAGES}_frames", VIDEO: f"{VIDEO}_frames"}
+    frames = film(100, 12, (56, 84))
 
+    def encoded() -> dict[str, float]:
+        """Frames so far, by model. Each has told Triton of all by now."""
+        time.sleep(TOLD_S)
+        families = list(text_string_to_metric_families(httpx.get(served.endpoints.metrics_url).text))
+        samples = [sample for family in families for sample in family.samples]
+        named = {each.labels["model"]: each.value for each in samples if each.name == "rfm_frames_encoded_total"}
+        return {model: named[encoder] for model, encoder in encoders.items()}
 
-def test_equal_frames_of_another_episode_are_not_encoded_again(
-    served: Served, recorded: tuple[Recording, RewardClient]
-) -> None:
-    transport, client = recorded
-    frames = film(101, 5)
-    with client.episode(TASK, frames=4) as episode:
-        first = online(episode, frames)
-    before = counted(served.endpoints, "frames_encoded_total")
-    with served.client("http", MODEL) as other, other.episode(TASK, frames=4) as episode:
-        np.testing.assert_allclose(online(episode, frames), first, atol=TOLERANCE)  # sent again: another client
-    with client.episode(TASK, frames=4) as episode:
-        np.testing.assert_allclose(online(episode, frames), first, atol=TOLERANCE)  # not even sent
+    def step(model: str) -> tuple[Recording, tuple[list[float], list[float]]]:
+        transport = Recording(served.url("grpc"))
+        with RewardClient([], transports=[transport], model=model) as client, client.episode(TASK, frames=4) as episode:
+            first = online(episode, frames)
+            episode.reset()
+            np.testing.assert_allclose(online(episode, frames), first, rtol=0, atol=VLM_TOLERANCE)
+        return transport, first
+
+    before = encoded()
+    firsts = {}
+    for model in encoders:
+        transport, firsts[model] = step(model)
+        assert [len(inputs[wire.FRAMES][0]) for inputs in transport.requests] == [1] * 2 * len(frames)
+        assert transport.most_bytes < frames[0].nbytes + 512
+        repeated = transport.requests[len(frames) :]
+        assert {inputs[wire.FRAMES].shape for inputs in repeated} == {(1, 1, 1, 1, 3)}  # known: not even sent
+    for model in encoders:  # another client sends them, and a caller of plain tensors uses the cache, too
+        np.testing.assert_allclose(step(model)[1], firsts[model], rtol=0, atol=VLM_TOLERANCE)
     with served.client("http", MODEL) as plain:
-        plain.progress(Trajectory(frames=frames[::-1], task=TASK))  # a caller of plain tensors uses the cache, too
-    assert counted(served.endpoints, "frames_encoded_total") == before
-    assert [inputs[wire.FRAMES].shape for inputs in transport.requests[-5:]] == [(1, 1, 1, 1, 3)] * 5
+        plain.progress(Trajectory(frames=frames[::-1], task=TASK))
+    pairs = {tuple(pair) for t in range(12) for pair in FOUR.prefix(t).indices.reshape(-1, 2).tolist()}
+    after = encoded()
+    assert {model: after[model] - before[model] for model in encoders} == {MODEL: 12, IMAGES: 12, VIDEO: 2 * len(pairs)}
 
 
-def test_episodes_side_by_side_are_one_request_and_score_alike(
-    served: Served, recorded: tuple[Recording, RewardClient]
-) -> None:
-    transport, client = recorded
+def test_episodes_side_by_side_are_one_request_and_score_alike(transport: Recording, client: RewardClient) -> None:
     films = np.stack([film(seed, 7) for seed in (200, 201, 202)], axis=1)  # [T, N, H, W, 3]
     tasks = ["stack the cups", "open the drawer", "stack the cups"]
     episodes = client.episodes(3, tasks, frames=4)
@@ -184,41 +160,39 @@ def test_episodes_side_by_side_are_one_request_and_score_alike(
     assert len(transport.requests) == len(films)
     for index, task in enumerate(tasks):
         scores = [float(step.progress[index]) for step in added], [float(step.success[index]) for step in added]
-        assert_same(scores, offline(client, films[:, index], Sampling("rint_pad", 4), task))
+        assert_same(scores, offline(client, films[:, index], task=task))
     assert added[-1].step.tolist() == [6, 6, 6]
 
 
-def test_a_mask_leaves_episodes_out_and_a_reset_begins_some_anew(served: Served) -> None:
+def test_a_mask_leaves_episodes_out_and_a_reset_begins_some_anew(client: RewardClient) -> None:
     frames = film(103, 4)
-    with served.client("grpc", MODEL) as client:
-        episodes = client.episodes(2, TASK, frames=4)
-        episodes.add(frames[[0, 1]])
-        scores = episodes.add([None, frames[2]], mask=[False, True])
-        assert np.isnan([scores.progress[0], scores.success[0]]).all()
-        assert not scores.succeeded[0]
-        assert scores.step.tolist() == [0, 1]
-        expected = offline(client, frames[[1, 2]], Sampling("rint_pad", 4))
-        np.testing.assert_allclose(scores.progress[1], expected.progress[-1], atol=TOLERANCE)
-        episodes.reset([False, True], task="open the drawer")
-        scores = episodes.add(frames[[3, 3]])
-        assert scores.step.tolist() == [1, 0]
-        expected = offline(client, frames[[3]], Sampling("rint_pad", 4), "open the drawer")
-        np.testing.assert_allclose(scores.progress[1], expected.progress[-1], atol=TOLERANCE)
-        with pytest.raises(ValueError, match=r"mask: expected bool \[2\], got int64 \[2\]"):
-            episodes.add(frames[[0, 1]], mask=[0, 1])
+    episodes = client.episodes(2, TASK, frames=4)
+    episodes.add(frames[[0, 1]])
+    scores = episodes.add([None, frames[2]], mask=[False, True])
+    assert np.isnan([scores.progress[0], scores.success[0]]).all()
+    assert not scores.succeeded[0]
+    assert scores.step.tolist() == [0, 1]
+    expected = offline(client, frames[[1, 2]])
+    np.testing.assert_allclose(scores.progress[1], expected.progress[-1], atol=TOLERANCE)
+    episodes.reset([False, True], task="open the drawer")
+    scores = episodes.add(frames[[3, 3]])
+    assert scores.step.tolist() == [1, 0]
+    expected = offline(client, frames[[3]], task="open the drawer")
+    np.testing.assert_allclose(scores.progress[1], expected.progress[-1], atol=TOLERANCE)
+    with pytest.raises(ValueError, match=r"mask: expected bool \[2\], got int64 \[2\]"):
+        episodes.add(frames[[0, 1]], mask=[0, 1])
 
 
-def test_cameras_are_scored_apart_and_fused(served: Served) -> None:
+def test_cameras_are_scored_apart_and_fused(client: RewardClient) -> None:
     front, wrist = film(104, 5), film(105, 5, (48, 48))  # of two sizes
-    with served.client("grpc", MODEL) as client:
-        apart = [offline(client, frames, Sampling("rint_pad", 4)).progress[-1] for frames in (front, wrist)]
-        for fuse, expected in {"mean": np.mean(apart), "min": min(apart), "max": max(apart)}.items():
-            episode = client.episode(TASK, frames=4, cameras=("front", "wrist"), fuse=fuse)  # type: ignore[arg-type]
-            scores = [episode.add({"front": a, "wrist": b}) for a, b in zip(front, wrist, strict=True)]
-            np.testing.assert_allclose(scores[-1].progress, expected, atol=TOLERANCE)
-        wanted = r"frames: expected frames of the cameras \['front', 'wrist'\], got frames of \['front'\]"
-        with pytest.raises(InvalidSampleError, match=wanted):
-            episode.add({"front": front[0]})
+    apart = [offline(client, frames).progress[-1] for frames in (front, wrist)]
+    for fuse, expected in {"mean": np.mean(apart), "min": min(apart), "max": max(apart)}.items():
+        episode = client.episode(TASK, frames=4, cameras=("front", "wrist"), fuse=fuse)  # type: ignore[arg-type]
+        scores = [episode.add({"front": a, "wrist": b}) for a, b in zip(front, wrist, strict=True)]
+        np.testing.assert_allclose(scores[-1].progress, expected, atol=TOLERANCE)
+    wanted = r"frames: expected frames of the cameras \['front', 'wrist'\], got frames of \['front'\]"
+    with pytest.raises(InvalidSampleError, match=wanted):
+        episode.add({"front": front[0]})
 
 
 @pytest.mark.parametrize(
@@ -227,71 +201,56 @@ def test_cameras_are_scored_apart_and_fused(served: Served) -> None:
         ("rotate180", lambda frame: frame[::-1, ::-1], lambda frame: frame[::-1, ::-1]),
         ({"front": "rotate90"}, lambda frame: np.rot90(frame, -1), lambda frame: frame),
         ({"front": "flip-vertical", "wrist": "flip-horizontal"}, np.flipud, np.fliplr),
+        ({"wrist": "rotate270"}, lambda frame: frame, np.rot90),
     ],
-    ids=["all cameras", "one of them", "each its own"],
+    ids=["all cameras", "one of them", "each its own", "the other one"],
 )
-def test_frames_are_scored_as_they_are_turned(served: Served, orient: Any, front_as: Any, wrist_as: Any) -> None:
-    front, wrist = film(104, 3), film(105, 3, (48, 48))
-    with served.client("grpc", MODEL) as client:
-        upright = client.episodes(1, TASK, sampling="all", cameras=("front", "wrist"))
-        turned = client.episode(TASK, sampling="all", cameras=("front", "wrist"), orient=orient)
-        for a, b in zip(front, wrist, strict=True):
-            expected = upright.add({"front": [front_as(a)], "wrist": [wrist_as(b)]})
-            assert turned.add({"front": a, "wrist": b}).progress == pytest.approx(expected.progress[0], abs=TOLERANCE)
-        one, another = (client.episode(TASK, sampling="all", orient=each) for each in ("rotate270", "none"))
-        for frame in front:
-            expected_one = another.add(np.rot90(frame))
-            assert one.add(frame).progress == pytest.approx(expected_one.progress, abs=TOLERANCE)
+def test_frames_are_scored_as_they_are_turned(client: RewardClient, orient: Any, front_as: Any, wrist_as: Any) -> None:
+    front, wrist = film(104, 3), film(105, 3, (48, 44))
+    upright = client.episode(TASK, sampling="all", cameras=("front", "wrist"))
+    turned = client.episode(TASK, sampling="all", cameras=("front", "wrist"), orient=orient)
+    for a, b in zip(front, wrist, strict=True):
+        expected = upright.add({"front": front_as(a), "wrist": wrist_as(b)})
+        assert turned.add({"front": a, "wrist": b}).progress == pytest.approx(expected.progress, abs=TOLERANCE)
 
 
-def test_the_success_rule_decides(served: Served) -> None:
-    frames = film(106, 3)
-    with served.client("grpc", MODEL) as client:
-        result = client.progress(Trajectory(frames=frames, task=TASK))
-        for threshold in (0.0, 1.0):
-            episode = client.episode(TASK, sampling="all", success=SuccessRule(threshold, last=2))
-            score = [episode.add(frame) for frame in frames][-1]
-            assert score.succeeded == result.succeeded(last=2, threshold=threshold)
-
-
-def test_a_frame_that_is_wrong_leaves_the_episode_as_it_was(served: Served) -> None:
+def test_a_frame_that_is_wrong_leaves_the_episode_as_it_was(client: RewardClient) -> None:
     frames = film(107, 3)
-    with served.client("grpc", MODEL) as client, client.episode(TASK, frames=4) as episode:
-        episode.add(frames[0])
-        with pytest.raises(InvalidSampleError, match=r"^frame: expected uint8 \[H, W, 3\], got float64 \[2, 2, 3\]"):
-            episode.add(np.zeros((2, 2, 3)))
-        with pytest.raises(InvalidSampleError, match=r"expected uint8 \[40, 56, 3\], as the episode's first, got"):
-            episode.add(film(0, 1, (8, 8))[0])
-        scores = [episode.add(frame) for frame in frames[1:]]
-        assert [score.step for score in scores] == [1, 2]
-        expected = offline(client, frames, Sampling("rint_pad", 4)).progress[1:]
-        np.testing.assert_allclose([score.progress for score in scores], expected, rtol=0, atol=TOLERANCE)
-        episodes = client.episodes(2, TASK, frames=4)
-        with pytest.raises(InvalidSampleError, match=r"^episodes\[1\]\.frame: expected uint8 \[H, W, 3\]"):
-            episodes.add([frames[0], np.zeros((2, 2, 3))])
-        assert episodes.add(frames[:2]).step.tolist() == [0, 0]
+    episode = client.episode(TASK, frames=4)
+    episode.add(frames[0])
+    with pytest.raises(InvalidSampleError, match=r"^frame: expected uint8 \[H, W, 3\], got float64 \[2, 2, 3\]"):
+        episode.add(np.zeros((2, 2, 3)))
+    with pytest.raises(InvalidSampleError, match=r"expected uint8 \[40, 56, 3\], as the episode's first, got"):
+        episode.add(film(0, 1, (8, 8))[0])
+    scores = [episode.add(frame) for frame in frames[1:]]
+    assert [score.step for score in scores] == [1, 2]
+    expected = offline(client, frames).progress[1:]
+    np.testing.assert_allclose([score.progress for score in scores], expected, rtol=0, atol=TOLERANCE)
+    episodes = client.episodes(2, TASK, frames=4)
+    with pytest.raises(InvalidSampleError, match=r"^episodes\[1\]\.frame: expected uint8 \[H, W, 3\]"):
+        episodes.add([frames[0], np.zeros((2, 2, 3))])
+    assert episodes.add(frames[:2]).step.tolist() == [0, 0]
 
 
-def test_the_newest_frame_takes_the_place_of_one_that_waits(served: Served) -> None:
-    frames = film(108, 30)
-    with served.client("grpc", MODEL) as client, client.episode(TASK, frames=4) as episode:
-        answers = [episode.add_nowait(frame) for frame in frames]
-        score = answers[-1].result()
-        taken = [index for index, answer in enumerate(answers) if not answer.cancelled()]
-        assert score.step == len(taken) - 1
-        assert (taken[0], taken[-1]) == (0, len(frames) - 1)
-        assert 1 < len(taken) < len(frames)
-        expected = offline(client, frames[taken], Sampling("rint_pad", 4))
-        np.testing.assert_allclose(score.progress, expected.progress[-1], atol=TOLERANCE)
-        with pytest.raises(InvalidSampleError, match="frame: expected uint8"):
-            episode.add_nowait(np.zeros((2, 2, 3))).result()
-        episode.reset("open the drawer")
-        assert episode.add(frames[0]).step == 0
+def test_the_newest_frame_takes_the_place_of_one_that_waits(client: RewardClient) -> None:
+    frames, episode = film(108, 30), client.episode(TASK, frames=4)
+    answers = [episode.add_nowait(frame) for frame in frames]
+    score = answers[-1].result()
+    taken = [index for index, answer in enumerate(answers) if not answer.cancelled()]
+    assert score.step == len(taken) - 1
+    assert (taken[0], taken[-1]) == (0, len(frames) - 1)
+    assert 1 < len(taken) < len(frames)
+    expected = offline(client, frames[taken])
+    np.testing.assert_allclose(score.progress, expected.progress[-1], atol=TOLERANCE)
+    with pytest.raises(InvalidSampleError, match="frame: expected uint8"):
+        episode.add_nowait(np.zeros((2, 2, 3))).result()
+    episode.reset("open the drawer")
+    assert episode.add(frames[0]).step == 0
 
 
-def test_frames_stay_in_the_order_in_which_they_were_added(served: Served) -> None:
-    """Whether they are waited for or not, and with a reset between them."""
-    frames = film(113, 4)
+def test_frames_stay_in_the_order_in_which_they_were_added(served: Served, client: RewardClient) -> None:
+    """Whether they are waited for or not, with a reset between them, and where somebody stops to wait for one."""
+    frames = film(113, 5)
 
     async def play() -> tuple[list[float], list[int]]:
         async with AsyncRewardClient(served.url("grpc"), model=MODEL) as client:
@@ -304,35 +263,19 @@ def test_frames_stay_in_the_order_in_which_they_were_added(served: Served) -> No
             third = episode.add_nowait(buffer)
             buffer[:] = 0  # drawn over before it was sent
             await episode.reset()
-            first = await episode.add(frames[0])
-            scores = [open_.result(), second, third.result(), first]
-            return [score.progress for score in scores], [score.step for score in scores]
-
-    with served.client("grpc", MODEL) as client:
-        expected = offline(client, frames[:3], Sampling("rint_pad", 4)).progress
-    progress, steps = asyncio.run(play())
-    assert steps == [0, 1, 2, 0]
-    np.testing.assert_allclose(progress, [*expected, expected[0]], rtol=0, atol=TOLERANCE)
-
-
-def test_who_stops_to_wait_for_a_reset_loses_no_answer(served: Served) -> None:
-    frames = film(114, 2)
-
-    async def play() -> float:
-        async with AsyncRewardClient(served.url("grpc"), model=MODEL) as client:
-            episode = client.episode(TASK, frames=4)
-            answer = episode.add_nowait(frames[0])
+            again = episode.add_nowait(frames[0])
             reset = asyncio.create_task(episode.reset())
             await asyncio.sleep(0)
             reset.cancel()
-            first = await answer
-            episode.add_nowait(frames[0]).cancel()  # then it is not part of the episode
-            assert (await episode.add(frames[1])).step == 1
-            return first.progress
+            await again  # no answer is lost
+            episode.add_nowait(frames[3]).cancel()  # then it is not part of the episode
+            scores = [open_.result(), second, third.result(), again.result(), await episode.add(frames[4])]
+            return [score.progress for score in scores], [score.step for score in scores]
 
-    with served.client("grpc", MODEL) as client:
-        expected = offline(client, frames[:1], Sampling("rint_pad", 4))
-    np.testing.assert_allclose(asyncio.run(play()), expected.progress[0], atol=TOLERANCE)
+    progress, steps = asyncio.run(play())
+    assert steps == [0, 1, 2, 0, 1]
+    expected = [*offline(client, frames[:3]).progress, *offline(client, frames[[0, 4]]).progress]
+    np.testing.assert_allclose(progress, expected, rtol=0, atol=TOLERANCE)
 
 
 def test_an_episode_keeps_its_client(served: Served) -> None:
@@ -341,8 +284,7 @@ def test_an_episode_keeps_its_client(served: Served) -> None:
     assert [episode.add(frame).step for frame in film(115, 2)] == [0, 1]
 
 
-def test_large_frames_go_in_several_requests(recorded: tuple[Recording, RewardClient]) -> None:
-    transport, client = recorded
+def test_large_frames_go_in_several_requests(transport: Recording, client: RewardClient) -> None:
     large = film(116, 5, (700, 700))  # 1.5 MB each
     episodes = client.episodes(5, TASK, frames=2)
     scores = episodes.add(large)
@@ -351,27 +293,25 @@ def test_large_frames_go_in_several_requests(recorded: tuple[Recording, RewardCl
     np.testing.assert_allclose(scores.progress, expected, atol=TOLERANCE)
     alike = client.episodes(5, TASK, frames=2)
     alike.add(np.repeat(film(117, 1, (700, 700)), 5, axis=0))  # each row of a request is as long as its longest
-    assert max(transport.num_bytes) < 4 * 2**20
+    assert transport.most_bytes < 4 * 2**20
 
 
-def test_a_request_of_very_many_frames_is_refused_before_memory_is_taken(served: Served) -> None:
-    frames = np.zeros((1, 140_000, 1, 1, 3), np.uint8)
-    named = {wire.FRAME_DIGESTS: np.zeros((1, 140_000, 32), np.uint8)}
+def test_a_request_of_very_many_frames_is_refused_before_memory_is_taken(transport: Recording) -> None:
     inputs = {
+        wire.FRAMES: np.zeros((1, 1, 1, 1, 3), np.uint8),
+        wire.FRAME_DIGESTS: np.zeros((1, 140_000, 32), np.uint8),
         wire.NUM_FRAMES: np.array([[140_000, 0]], np.int32),
         wire.TASK: np.array([[TASK.encode()]], np.object_),
     }
 
-    async def ask(**more: np.ndarray) -> None:
-        transport = GrpcTransport(served.url("grpc"), Access(), shared_memory=False)
+    async def ask() -> None:
         try:
-            await transport.infer(f"{MODEL}_encoder", {**inputs, **more}, [wire.VIDEO_EMBEDDINGS], 30)
+            await transport.infer(f"{MODEL}_encoder", inputs, [wire.VIDEO_EMBEDDINGS], 30)
         finally:
             await transport.close()
 
-    for more in ({wire.FRAMES: frames}, {wire.FRAMES: frames[:, :1], **named}):
-        with pytest.raises(InvalidSampleError, match=r"num_frames: expected at most 131072 frames in a request"):
-            asyncio.run(ask(**more))
+    with pytest.raises(InvalidSampleError, match="num_frames: expected at most 131072 frames in a request"):
+        asyncio.run(ask())
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
@@ -387,66 +327,54 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize(("given", "message"), REFUSED.values(), ids=REFUSED)
-def test_what_cannot_be_right_is_refused(served: Served, given: dict[str, Any], message: str) -> None:
+def test_what_cannot_be_right_is_refused(client: RewardClient, given: dict[str, Any], message: str) -> None:
     given = {"task": TASK, "frame": film(0, 1)[0], "frames": 4, **given}
-    with served.client("grpc", MODEL) as client, pytest.raises(ValueError, match=message):
-        frame = given.pop("frame")
+    frame = given.pop("frame")
+    with pytest.raises(ValueError, match=message):
         client.episode(**given).add(frame)
 
 
-def test_a_model_that_is_not_served_is_told(served: Served) -> None:
-    with served.client("grpc", "nobody") as client, pytest.raises(ModelNotFoundError):
-        client.episode(TASK, frames=4).add(film(0, 1)[0])
-    with served.client("grpc", MODEL) as client, pytest.raises(ValueError, match="expected one for each of 3 episodes"):
-        client.episodes(3, ["a", "b"])
+def test_a_model_that_is_not_served_and_tasks_that_are_too_few_are_told(served: Served) -> None:
+    with served.client("grpc", "not_served") as client:
+        with pytest.raises(ModelNotFoundError):
+            client.episode(TASK, frames=4).add(film(0, 1)[0])
+        with pytest.raises(ValueError, match="expected one for each of 3 episodes"):
+            client.episodes(3, ["a", "b"])
 
 
-def repository_of(folder: Path, checkpoint: str = MODEL, **changes: Any) -> Path:
-    config = goldens.config(checkpoint)
-    repository = folder / "model_repository"
-    rfm_export.export(config.checkpoint, repository, replace(serve_config(config, MODEL), **changes))
-    return repository
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
+    """An ``rfm serve`` of MODEL without a cache, and of IMAGES, whose process a test may kill."""
+    repository = tmp_path_factory.mktemp("own") / "model_repository"
+    for name, cache_mb in ((MODEL, 0), (IMAGES, 64)):
+        config = goldens.config(name)
+        rfm_export.export(config.checkpoint, repository, replace(serve_config(config, name), feature_cache_mb=cache_mb))
+    with serving(repository) as server:
+        server.wait_ready()
+        yield server
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("checkpoint", "killed", "tolerance"),
-    [(MODEL, f"{MODEL}_encoder", TOLERANCE), (IMAGES, f"{MODEL}_frames", VLM_TOLERANCE)],
-)
-def test_an_episode_goes_on_when_the_process_that_knew_its_frames_was_killed(
-    tmp_path: Path, checkpoint: str, killed: str, tolerance: float
-) -> None:
+@pytest.mark.triton
+def test_an_episode_goes_on_when_the_process_that_knew_its_frames_was_killed(own: Serving) -> None:
     frames = film(118, 9)
-    with serving(repository_of(tmp_path, checkpoint)) as served, served.client(model=MODEL) as client:
-        served.wait_ready()
-        with client.episode(TASK, frames=4) as episode:
-            scores = [episode.add(frame) for frame in frames[:5]]
-            (process,) = served.model_processes(killed)
-            os.kill(process, signal.SIGKILL)
-            while len(scores) < len(frames):
-                with suppress(ServerUnavailableError, ProcessEndedError):  # then the episode has not grown
-                    scores.append(episode.add(frames[len(scores)]))
-        expected = offline(client, frames, Sampling("rint_pad", 4))
+    with own.client(model=IMAGES) as client, client.episode(TASK, frames=4) as episode:
+        scores = [episode.add(frame) for frame in frames[:5]]
+        (pid,) = own.model_processes(f"{IMAGES}_frames")
+        os.kill(pid, signal.SIGKILL)
+        while len(scores) < len(frames):
+            with suppress(ServerUnavailableError, ProcessEndedError):  # then the episode has not grown
+                scores.append(episode.add(frames[len(scores)]))
+        expected = offline(client, frames)
     assert [score.step for score in scores] == list(range(len(frames)))
-    assert_same(([score.progress for score in scores], [score.success for score in scores]), expected, tolerance)
+    assert_same(([score.progress for score in scores], [score.success for score in scores]), expected, VLM_TOLERANCE)
 
 
 @pytest.mark.slow
-def test_servers_and_instances_that_know_different_frames_and_a_server_without_a_cache_score_alike(
-    tmp_path: Path,
-) -> None:
+def test_a_server_that_knows_some_frames_and_one_that_keeps_none_score_alike(served: Served, own: Serving) -> None:
     frames = film(112, 12)
-    two_instances = repository_of(tmp_path / "two")  # as on two GPUs
-    configure(two_instances / f"{MODEL}_encoder", instances=2)
-    plain = repository_of(tmp_path / "plain", feature_cache_mb=0)
-    first, second, third = Endpoints.free(), Endpoints.free(), Endpoints.free()
-    with (
-        BriefServer(two_instances, first, find_installation()),
-        BriefServer(two_instances, second, find_installation()),
-        BriefServer(plain, third, find_installation()),
-        RewardClient([each.grpc_url for each in (first, second, third)], model=MODEL) as client,
-    ):
-        expected = offline(client, frames, Sampling("rint_pad", 4))
+    with RewardClient([served.url("grpc"), own.endpoints.grpc_url], model=MODEL) as client:
+        expected = offline(client, frames)
         for _ in range(3):
             with client.episode(TASK, frames=4) as episode:
                 assert_same(online(episode, frames), expected)

@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, TypeAlias
 
 import gymnasium as gym
 import numpy as np
 
-from rfm_client import RewardClient, RewardError
+from rfm_client import RewardClient, ServerUnavailableError
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.episodes.windows import Window
 from shelves import Shelf
@@ -78,20 +78,19 @@ class CodedEnv(gym.Env[Any, Any]):
 class Recorder(RewardClient):
     """A client of a stand-in server, which keeps the frames' codes and the task of every question.
 
-    fails: which calls fail, by number, and with what
+    failing: number of the call that fails
     """
 
-    def __init__(self, fails: Callable[[int], RewardError | None] = lambda call: None) -> None:
+    def __init__(self, failing: int | None = None) -> None:
         super().__init__("", transports=[Shelf(has_encoder=False)], retry=False)
         self.calls: list[list[tuple[list[Code], str]]] = []
         self.pixels: list[list[UInt8Array]] = []  # of each window
-        self._fails = fails
+        self.failing = failing
 
     def score_windows(self, windows: Sequence[Window], **options: Any) -> Any:
         self.pixels += [[frame.pixels for frame in window.frames] for window in windows]
         codes = [[tuple(frame.pixels[0, 0].tolist()) for frame in window.frames] for window in windows]
         self.calls.append([(of_window, window.task) for of_window, window in zip(codes, windows, strict=True)])
-        error = self._fails(len(self.calls) - 1)
-        if error is not None:
-            return [error] * len(windows)
+        if len(self.calls) - 1 == self.failing:
+            return [ServerUnavailableError("the server is restarting")] * len(windows)
         return super().score_windows(windows, **options)

@@ -59,9 +59,9 @@ def cart_pole_with_pixels() -> gym.Env[Any, Any]:
 
 
 def two_cameras(observation: dict[str, Any]) -> dict[str, UInt8Array]:
-    """A frame of each of two cameras, of different sizes."""
+    """A frame of each of two cameras, of different sizes, and what is none."""
     front = np.asarray(observation["pixels"], np.uint8)
-    return {"front": front, "wrist": 255 - front[::2, ::2]}
+    return {"front": front, "wrist": 255 - front[::2, ::2], "state": np.zeros(1, np.uint8)}
 
 
 def scores(client: RewardClient, film: Film, step: int, max_frames: int | None = MAX_FRAMES) -> ProgressResult:
@@ -114,11 +114,9 @@ class SlowConnection(GrpcTransport):
     def __init__(self, url: str) -> None:
         super().__init__(url, Access(), shared_memory=False)
         self.held: dict[int, Future[None]] = {}
-        self.lengths: list[int] = []
 
     async def infer(self, model: str, inputs: wire.Tensors, outputs: Any, timeout_s: float, **_id: str) -> Answer:
         length = int(inputs[wire.NUM_FRAMES].max())
-        self.lengths.append(length)
         if length in self.held:
             await asyncio.shield(asyncio.wrap_future(self.held[length]))  # several questions may wait for it
         return await super().infer(model, inputs, outputs, timeout_s)
