@@ -32,6 +32,7 @@ from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.resize import as_jpeg, load_pillow
 from rfm_client.transport.access import Access
+from rfm_client.transport.lifetime import Closing
 
 if TYPE_CHECKING:
     from rfm_client.episodes.steps import StepScore
@@ -81,7 +82,7 @@ class LiveEpisode:
         self._reporter.end(self._about)
 
 
-class LiveView:
+class LiveView(Closing):
     """The tab Live of a gateway's page, for episodes: ``client.episode(task, live=LiveView("http://robot:8100"))``.
 
     One view serves any number of episodes and clients. It reports at most four times a second, for all together: the
@@ -134,12 +135,6 @@ class LiveView:
         not reported.
         """
         self._reporter.close()
-
-    def __enter__(self) -> LiveView:
-        return self
-
-    def __exit__(self, *_raised: object) -> None:
-        self.close()
 
     def __reduce__(self) -> tuple[object, ...]:
         return _rebuilt, (self._url, self.name, self._access.options)
