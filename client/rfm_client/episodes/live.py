@@ -20,6 +20,7 @@ import uuid
 import weakref
 from collections import deque
 from collections.abc import Mapping
+from functools import partial
 from http.client import HTTPConnection, HTTPException, HTTPSConnection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -137,7 +138,7 @@ class LiveView(Closing):
         self._reporter.close()
 
     def __reduce__(self) -> tuple[object, ...]:
-        return _rebuilt, (self._url, self.name, self._access.options)
+        return partial(LiveView, self._url, name=self.name, **self._access.options), ()
 
 
 class Reporter:
@@ -293,10 +294,6 @@ def report_body(steps: list[Entry], frames: Mapping[str, UInt8Array]) -> bytes:
             told["steps"].append(step)
     pictures = {key: base64.b64encode(as_jpeg(frame, LONGEST_PX)).decode() for key, frame in frames.items()}
     return json.dumps({"episodes": list(episodes.values()), "frames": pictures}, allow_nan=False).encode()
-
-
-def _rebuilt(url: str, name: str, access: Mapping[str, Any]) -> LiveView:
-    return LiveView(url, name=name, **access)
 
 
 def _or_none(score: float) -> float | None:

@@ -338,5 +338,9 @@ def _devices(samples: list[Any]) -> tuple[Device, ...]:
                 models[model] = replace(done, requests=done.requests + int(sample.value))
             else:
                 models[model] = replace(done, compute_s=done.compute_s + sample.value / _US_PER_S)
-    told = ("utilization", "memory_used_bytes", "memory_total_bytes")
-    return tuple(Device(name, *(of.get(each) for each in told), work=work.get(name, {})) for name, of in values.items())
+    return tuple(
+        Device(
+            name, of.get("utilization"), of.get("memory_used_bytes"), of.get("memory_total_bytes"), work.get(name, {})
+        )
+        for name, of in values.items()
+    )
