@@ -23,7 +23,7 @@ from rfm_client.transport.access import Access
 from rfm_client.transport.calls import Transport, connect
 from rfm_client.transport.deadline import Deadline, check_timeout
 from rfm_client.transport.in_flight import InFlight
-from rfm_client.transport.one_process import OneProcess
+from rfm_client.transport.lifetime import AsyncClosing, OneProcess
 from rfm_client.transport.servers import PROBE_TIMEOUT_S, Servers
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ DEFAULT_IN_FLIGHT = 128  # twice the usual batch: while one is scored, the next 
 READY_POLL_S = 0.2
 
 
-class AsyncRewardClient(OneProcess):
+class AsyncRewardClient(AsyncClosing, OneProcess):
     """A connection to one or several servers of the same checkpoint, for one event loop.
 
     Arrays of samples must not change while a call is awaited: they are sent as they are when it is their turn.
@@ -235,12 +235,6 @@ class AsyncRewardClient(OneProcess):
         """Closes the connections and gives shared memory back."""
         self._is_closed = True
         await self._servers.close()
-
-    async def __aenter__(self) -> AsyncRewardClient:
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self.close()
 
     async def _why_unready(self) -> str:
         try:

@@ -21,14 +21,14 @@ from rfm_client.episodes.steps import EpisodeSettings
 from rfm_client.episodes.windows import Window
 from rfm_client.scoring.call import CallOptions
 from rfm_client.transport.calls import Transport
+from rfm_client.transport.lifetime import Closing, OneProcess
 from rfm_client.transport.loop_thread import LoopThread
-from rfm_client.transport.one_process import OneProcess
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 
-class RewardClient(OneProcess):
+class RewardClient(Closing, OneProcess):
     """AsyncRewardClient without ``await``, thread-safe: its event loop runs in a thread of its own.
 
     Arguments and errors are AsyncRewardClient's. Closes itself as a context manager and at the interpreter's end.
@@ -184,12 +184,6 @@ class RewardClient(OneProcess):
     def close(self) -> None:
         """Cancels what is under way, closes the connections and gives shared memory back."""
         self._finalizer()
-
-    def __enter__(self) -> RewardClient:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def _close(client: AsyncRewardClient, loop: LoopThread) -> None:

@@ -12,7 +12,7 @@ import base64
 import itertools
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,8 +24,7 @@ import numpy.typing as npt
 from rfm_client.client import RewardClient
 from rfm_client.contract.errors import ModelNotFoundError
 from rfm_client.contract.made_up import random_trajectory
-from rfm_client.contract.model_info import ModelInfo
-from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
+from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample
 from rfm_client.contract.settings import Settings, setting
 from rfm_client.contract.wire import encode_samples
 
@@ -66,23 +65,18 @@ class MadeUpSamples(Settings):
 
     def samples(self, client: RewardClient) -> list[Sample]:
         """The samples, in the widths of the served checkpoint. Raises ModelNotFoundError if it does not take them."""
-        info = self._model_info(client)
+        info = None
+        if not self.use_frames:
+            with suppress(ModelNotFoundError):
+                info = client.model_info()
+        widths = (info or client.model_info(frames=True)).widths
         random = np.random.default_rng(self.seed)
-        trajectories = self._trajectories(random, info)
+        lengths = itertools.cycle(random.permutation(self.num_frames).tolist())
+        trajectories = (random_trajectory(random, length, widths, task=TASK) for length in lengths)
         if self.sample_type == "progress":
             return [ProgressSample(next(trajectories)) for _ in range(self.num_samples)]
         pair = PreferenceSample if self.sample_type == "preference" else SimilaritySample
         return [pair(next(trajectories), next(trajectories)) for _ in range(self.num_samples)]
-
-    def _model_info(self, client: RewardClient) -> ModelInfo:
-        if not self.use_frames:
-            with suppress(ModelNotFoundError):
-                return client.model_info()
-        return client.model_info(frames=True)
-
-    def _trajectories(self, random: np.random.Generator, info: ModelInfo) -> Iterator[Trajectory]:
-        for length in itertools.cycle(random.permutation(self.num_frames).tolist()):
-            yield random_trajectory(random, length, info.widths, task=TASK)
 
 
 def are_frames(samples: Sequence[Sample]) -> bool:

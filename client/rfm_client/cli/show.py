@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rfm_client.contract.results import FrameScores, PreferenceResult, ProgressResult, Result
-from rfm_client.transport.status import DEVICE_METRICS, Device, ModelStatus, ServerStatus
+from rfm_client.transport.status import DEVICE_METRICS, Device, ServerStatus
 
 if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderResult
@@ -157,48 +157,24 @@ def status_tables(status: ServerStatus) -> list[Table | str]:
     title = f"{status.url}: Triton{version}, {'ready' if status.ready else 'not ready'}"
     requests = ("model", "v", "state", "requests since load", "failed since load", "refused since start", "pending now")
     batches = ("model", "v", "batches", "samples each", "ms each", "queue ms", "since")
-    reasons = [f"{model.name} {model.version}: {model.reason}" for model in status.models if model.reason]
+    counted, batched = [], []
+    for model in status.models:
+        counts = model.requests_succeeded, model.requests_failed, model.samples_refused, model.requests_pending
+        counted.append((model.name, model.version, model.state, *(number(count, 0) for count in counts)))
+        times = number(model.compute_ms_per_batch, 2), number(model.queue_ms_per_request, 2)
+        each, since = number(model.samples_per_batch, 1), "start" if model.batches and model.batches.count else "load"
+        batched.append((model.name, model.version, str(model.batch_count), each, *times, since))
     shown: list[Table | str] = [
-        table(title, requests, [_requests_row(model) for model in status.models]),
-        *reasons,
-        table("", batches, [_batches_row(model) for model in status.models]),
+        table(title, requests, counted),
+        *(f"{model.name} {model.version}: {model.reason}" for model in status.models if model.reason),
+        table("", batches, batched),
         STATUS_LEGEND,
         *filter(None, [status.metrics_error]),
     ]
     if status.devices:
-        rows = [_device_row(device) for device in status.devices]
-        shown += [
-            "",
-            table(f"machine, from {DEVICE_METRICS}", ("device", "utilization", "memory used", "memory"), rows),
-        ]
+        columns = ("device", "utilization", "memory used", "memory")
+        shown += ["", table(f"machine, from {DEVICE_METRICS}", columns, [_device_row(each) for each in status.devices])]
     return shown
-
-
-def _requests_row(model: ModelStatus) -> tuple[str, ...]:
-    refused, pending = (
-        "-" if count is None else str(count) for count in (model.samples_refused, model.requests_pending)
-    )
-    return (
-        model.name,
-        model.version,
-        model.state,
-        str(model.requests_succeeded),
-        str(model.requests_failed),
-        refused,
-        pending,
-    )
-
-
-def _batches_row(model: ModelStatus) -> tuple[str, ...]:
-    return (
-        model.name,
-        model.version,
-        str(model.batch_count),
-        number(model.samples_per_batch, 1),
-        number(model.compute_ms_per_batch, 2),
-        number(model.queue_ms_per_request, 2),
-        "start" if model.batches and model.batches.count else "load",
-    )
 
 
 def _device_row(device: Device) -> tuple[str, ...]:

@@ -69,7 +69,8 @@ def film_stream(container: Any) -> Any:
     if not films:
         raise FilmError("a file with a video stream", "none")
     if len(films) > 1:
-        told = ", ".join(f"0:v:{n} ({_described(stream.codec_context)})" for n, stream in films.items())
+        codecs = {n: stream.codec_context for n, stream in films.items()}
+        told = ", ".join(f"0:v:{n} ({codec.name}, {codec.width}x{codec.height})" for n, codec in codecs.items())
         raise FilmError("one video stream (take one: ffmpeg -i IN -map 0:v:N -c copy OUT)", f"{len(films)}: {told}")
     (stream,) = films.values()
     _check_colours(stream.codec_context.format)
@@ -141,10 +142,6 @@ def judged(frames: Iterable[Any]) -> Iterator[tuple[Any, bool]]:
     for frame in frames:
         is_damaged = frame.is_corrupt or (is_damaged and not frame.key_frame)
         yield frame, is_damaged
-
-
-def _described(codec: Any) -> str:
-    return f"{codec.name}, {codec.width}x{codec.height}"
 
 
 def _check_colours(pixels: Any) -> None:

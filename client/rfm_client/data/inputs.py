@@ -100,7 +100,11 @@ def as_trajectory(
     key = _camera_key(columns, camera)
     frames = _frames(key, columns[key])
     if key + _IS_PAD in columns:
-        frames = frames[~_padding(key + _IS_PAD, columns[key + _IS_PAD], len(frames))]
+        padding = as_array(columns[key + _IS_PAD])
+        is_of_frames = padding.dtype == bool and padding.shape == (len(frames),)
+        got = f"{padding.dtype} {list(padding.shape)}"
+        require(key + _IS_PAD, is_of_frames, f"bool [{len(frames)}]", got, InvalidSampleError)
+        frames = frames[~padding]
     return Trajectory(frames=frames, task=task)
 
 
@@ -186,11 +190,3 @@ def _uint8(where: str, image: npt.NDArray[Any]) -> UInt8Array:
     got = f"values from {lowest:g} to {highest:g} (of floats in 0..255: float_frames_to_uint8)"
     require(where, lowest >= 0 and highest <= 1, _FRAMES, got, InvalidSampleError)  # and not NaN
     return (image.astype(np.float32) * np.float32(255)).round().astype(np.uint8)
-
-
-def _padding(where: str, marks: Any, num_frames: int) -> npt.NDArray[np.bool_]:
-    padding = as_array(marks)
-    got = f"{padding.dtype} {list(padding.shape)}"
-    is_of_frames = padding.dtype == bool and padding.shape == (num_frames,)
-    require(where, is_of_frames, f"bool [{num_frames}]", got, InvalidSampleError)
-    return padding

@@ -21,7 +21,7 @@ from rfm_client.data.sampling import Sampling
 from rfm_client.episodes.steps import EpisodeFrames, EpisodeOptions, StepQuestion, StepScore, StepScores, copied
 from rfm_client.episodes.windows import NamedFrame
 from rfm_client.transport.deadline import Deadline
-from rfm_client.transport.one_process import OneProcess
+from rfm_client.transport.lifetime import AsyncClosing, Closing, OneProcess
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from rfm_client.transport.loop_thread import LoopThread
 
 
-class AsyncEpisodes(OneProcess):
+class AsyncEpisodes(AsyncClosing, OneProcess):
     """N episodes that grow side by side, as those of vectorised environments; as few requests a step as fit. An async
     context manager that closes it.
 
@@ -103,12 +103,6 @@ class AsyncEpisodes(OneProcess):
             for episode in self._episodes:
                 episode.end()
 
-    async def __aenter__(self) -> AsyncEpisodes:
-        return self
-
-    async def __aexit__(self, *_raised: object) -> None:
-        await self.close()
-
     def _new(self, index: int) -> EpisodeFrames:
         where = f"episodes[{index}]" if len(self) > 1 else ""
         return EpisodeFrames(self._tasks[index], self._options, index, where)
@@ -162,7 +156,7 @@ class AsyncEpisodes(OneProcess):
         )
 
 
-class AsyncEpisode(OneProcess):
+class AsyncEpisode(AsyncClosing, OneProcess):
     """One episode that grows, for asyncio. Built by ``AsyncRewardClient.episode``. An async context manager that closes
     it.
     """
@@ -206,12 +200,6 @@ class AsyncEpisode(OneProcess):
         await self._settle()
         await self._episodes.close()
 
-    async def __aenter__(self) -> AsyncEpisode:
-        return self
-
-    async def __aexit__(self, *_raised: object) -> None:
-        await self.close()
-
     async def _settle(self) -> None:
         self._drop_waiting()
         if self._open is not None and not self._open.done():
@@ -232,7 +220,7 @@ class AsyncEpisode(OneProcess):
         return await self._add(frame)
 
 
-class Episodes(OneProcess):
+class Episodes(Closing, OneProcess):
     """AsyncEpisodes without ``await``. Built by ``RewardClient.episodes``, whose client lives as long as this.
 
     A context manager that closes it.
@@ -256,14 +244,8 @@ class Episodes(OneProcess):
         """Returns when no step is open. Who watches is told that the episodes have ended."""
         self._loop.wait(self._episodes.close())
 
-    def __enter__(self) -> Episodes:
-        return self
 
-    def __exit__(self, *_raised: object) -> None:
-        self.close()
-
-
-class Episode(OneProcess):
+class Episode(Closing, OneProcess):
     """AsyncEpisode without ``await``. Built by ``RewardClient.episode``, whose client lives as long as this.
 
     A context manager that closes it.
@@ -292,12 +274,6 @@ class Episode(OneProcess):
     def close(self) -> None:
         """Returns when no question is open; a frame that waits is dropped. Who watches is told that it has ended."""
         self._loop.wait(self._episode.close())
-
-    def __enter__(self) -> Episode:
-        return self
-
-    def __exit__(self, *_raised: object) -> None:
-        self.close()
 
 
 def _left_s(deadline: Deadline | None) -> float | None:

@@ -20,6 +20,7 @@ import uuid
 import weakref
 from collections import deque
 from collections.abc import Mapping
+from functools import partial
 from http.client import HTTPConnection, HTTPException, HTTPSConnection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -32,6 +33,7 @@ from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.resize import as_jpeg, load_pillow
 from rfm_client.transport.access import Access
+from rfm_client.transport.lifetime import Closing
 
 if TYPE_CHECKING:
     from rfm_client.episodes.steps import StepScore
@@ -81,7 +83,7 @@ class LiveEpisode:
         self._reporter.end(self._about)
 
 
-class LiveView:
+class LiveView(Closing):
     """The tab Live of a gateway's page, for episodes: ``client.episode(task, live=LiveView("http://robot:8100"))``.
 
     One view serves any number of episodes and clients. It reports at most four times a second, for all together: the
@@ -135,14 +137,8 @@ class LiveView:
         """
         self._reporter.close()
 
-    def __enter__(self) -> LiveView:
-        return self
-
-    def __exit__(self, *_raised: object) -> None:
-        self.close()
-
     def __reduce__(self) -> tuple[object, ...]:
-        return _rebuilt, (self._url, self.name, self._access.options)
+        return partial(LiveView, self._url, name=self.name, **self._access.options), ()
 
 
 class Reporter:
@@ -298,10 +294,6 @@ def report_body(steps: list[Entry], frames: Mapping[str, UInt8Array]) -> bytes:
             told["steps"].append(step)
     pictures = {key: base64.b64encode(as_jpeg(frame, LONGEST_PX)).decode() for key, frame in frames.items()}
     return json.dumps({"episodes": list(episodes.values()), "frames": pictures}, allow_nan=False).encode()
-
-
-def _rebuilt(url: str, name: str, access: Mapping[str, Any]) -> LiveView:
-    return LiveView(url, name=name, **access)
 
 
 def _or_none(score: float) -> float | None:

@@ -22,7 +22,7 @@ from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.results import SUCCESS_THRESHOLD, FrameScores, ProgressResult, Result
 from rfm_client.contract.samples import Float32Array, UInt8Array, as_array
-from rfm_client.data.camera_fusion import FUSES, Fuse, check_fuse, checked_cameras
+from rfm_client.data.camera_fusion import FUSES, Fuse
 from rfm_client.data.orientation import Orient, Orientation, turned
 from rfm_client.data.resize import resize_frames
 from rfm_client.data.sampling import Prefix, Rule, Sampling, of_frames
@@ -90,8 +90,11 @@ class EpisodeOptions:
     live: LiveView | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "cameras", checked_cameras(self.cameras))
-        check_fuse(self.fuse)
+        require("cameras", not isinstance(self.cameras, str), "a sequence of names", repr(self.cameras))
+        object.__setattr__(self, "cameras", tuple(self.cameras))
+        is_each_once = len(set(self.cameras)) == len(self.cameras)
+        require("cameras", is_each_once, "names that differ", list(self.cameras))
+        require("fuse", self.fuse in FUSES, f"one of {', '.join(FUSES)}", repr(self.fuse))
         Sampling.of(self.sampling, self.frames, trained_frames=1)  # whether rule and number go together
         unknown = [repr(camera) for camera in self._orient.cameras if camera not in self.cameras]
         cameras = list(self.cameras)

@@ -68,7 +68,11 @@ class RewardModelWrapper(gymnasium.Wrapper):
         self._payer = Payer(client, options)
         self._options = options
         self._task = task
-        self._autoresets = _autoresets(env)
+        self._autoresets: list[gymnasium.wrappers.Autoreset] = []  # among the wrappers of the environment
+        while isinstance(env, gymnasium.Wrapper):
+            if isinstance(env, gymnasium.wrappers.Autoreset):
+                self._autoresets.append(env)
+            env = env.env
         self._episode: PaidEpisode | None = None
         self._is_whole = False  # all frames of the episode are kept
         self._has_ended = False
@@ -136,16 +140,6 @@ def check_kind(env: Any, kind: type[Any]) -> None:
         got = f"{type(env).__module__}.{type(env).__name__}"
         remedy = "wrap each environment in RewardModelWrapper before you make another kind of vector of them"
         raise TypeError(f"env: expected a gymnasium {kind.__name__}, got {got}; {remedy}")
-
-
-def _autoresets(env: Any) -> list[gymnasium.wrappers.Autoreset]:
-    """Those among the wrappers of an environment."""
-    found = []
-    while isinstance(env, gymnasium.Wrapper):
-        if isinstance(env, gymnasium.wrappers.Autoreset):
-            found.append(env)
-        env = env.env
-    return found
 
 
 def _check_shows_its_end(info: Info) -> None:

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from rfm_client.contract.results import FrameScores
 from rfm_client.contract.samples import UInt8Array
+from rfm_client.transport.lifetime import Closing
 
 if TYPE_CHECKING:
     from rfm_client.data.datasets.protocol import Dataset
@@ -40,7 +41,7 @@ def load_rerun() -> Any:
     return rerun
 
 
-class Recording:
+class Recording(Closing):
     """A recording file to which trajectories are added, by any threads. The file is made with the first one.
 
     Each is an entity, which holds ``image``, ``progress`` and ``success``. Scores that the checkpoint does
@@ -90,12 +91,6 @@ class Recording:
         """Writes what is left to the file."""
         if self._stream is not None:
             self._stream.disconnect()
-
-    def __enter__(self) -> Recording:
-        return self
-
-    def __exit__(self, *_raised: object) -> None:
-        self.close()
 
     def _open(self) -> None:
         if self._stream is None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from rfm_client.data.datasets.protocol import DatasetError, require
 from rfm_client.labelling.episode_scores import Columns
-from rfm_client.labelling.plan import Item
+from rfm_client.labelling.plan import Item, Plan
 
 IDENTITY = ("index", "episode_index", "frame_index")  # columns of every table of labels
 
@@ -68,7 +68,8 @@ class Parts:
         parquet.write_table(table, content)
         with self._writing():
             if self._is_local:
-                _write_whole(Path(self._path(item)), content.getvalue())
+                with whole_file(Path(self._path(item))) as file:
+                    file.write_bytes(content.getvalue())
             else:
                 self._fs.pipe_file(self._path(item), content.getvalue())  # object stores show no half of an object
 
@@ -92,6 +93,24 @@ class Parts:
         require(path, is_own, f"the part of {item.episode.name}", got)
         return table
 
+    def read_all(self, plan: Plan) -> Any:
+        """The rows of all items of a plan, in order.
+
+        Raises DatasetError for a part that is missing, has other columns than the first, or is out of order.
+        """
+        import pyarrow as pa
+
+        tables: list[Any] = []
+        following = -1
+        for item in plan.items:
+            table, name, first = self.read(item), item.episode.name, item.episode.first_index
+            names = (tables or [table])[0].column_names
+            require(name, table.column_names == names, f"the columns {', '.join(names)}", ", ".join(table.column_names))
+            require(name, first > following, f"rows after {following}", first)
+            following = first + item.episode.num_frames - 1
+            tables.append(table.replace_schema_metadata(None))
+        return pa.concat_tables(tables)
+
     def _path(self, item: Item) -> str:
         return f"{self._root}/{item.key}{_SUFFIX}"
 
@@ -105,14 +124,14 @@ class Parts:
             raise OSError(f"{self.url}: expected a folder that can be written, got {got}") from error
 
 
-def _write_whole(file: Path, content: bytes) -> None:
-    """Writes a file that others see whole or not at all."""
-    temporary = file.with_name(f".tmp-{uuid.uuid4().hex}")
+@contextmanager
+def whole_file(target: Path) -> Iterator[Path]:
+    """A file to be written. At the end of the block it takes the place of ``target``, which others see whole or not."""
+    written = target.with_name(f".tmp-{uuid.uuid4().hex}")
     try:
-        with temporary.open("wb") as opened:
-            opened.write(content)
-            opened.flush()
-            os.fsync(opened.fileno())
-        temporary.replace(file)
+        yield written
+        with written.open("rb") as whole:
+            os.fsync(whole.fileno())
+        written.replace(target)
     finally:
-        temporary.unlink(missing_ok=True)
+        written.unlink(missing_ok=True)

@@ -6,17 +6,15 @@ They go to a file of their own beside the dataset, or into the dataset's file if
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-import uuid
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from rfm_client.data.datasets.protocol import DatasetError, require
 from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS, Columns
-from rfm_client.labelling.finished_episodes import IDENTITY, Parts
+from rfm_client.labelling.finished_episodes import IDENTITY, whole_file
 from rfm_client.labelling.label_files import canonical_json
 from rfm_client.labelling.labelled_before import LabelFile
 from rfm_client.labelling.plan import Item, Plan
@@ -51,34 +49,30 @@ def check_room(file: Path, plan: Plan) -> None:
     require(file, free >= needed, expected, f"{free}: {_REMEDY}")
 
 
-def write_hdf5(file: Path, plan: Plan, parts: Parts, name: str, *, in_place: bool) -> None:
-    """Writes the labels of all parts to a new file, which takes the file's place when it is whole.
+def write_hdf5(file: Path, plan: Plan, labels: Any, name: str, *, in_place: bool) -> None:
+    """Writes labels to a new file, which takes the file's place when it is whole.
 
+    labels: of ``Parts.read_all``
     in_place: the file is the dataset's own: the new one is a copy of it, in which the labels of this name give way
 
-    Raises DatasetError for a part that is missing, and OSError; then the file is as it was.
+    Raises OSError; then the file is as it was.
     """
     import h5py
 
     target = file.resolve()  # or a link would give way to the copy
-    written = target.with_name(f".{target.name}.{uuid.uuid4().hex}")
     try:
-        if in_place:
-            shutil.copy2(target, written)
-        else:
-            h5py.File(written, "w").close()
-        _reserve(written, _most_bytes(plan))
-        with h5py.File(written, "r+") as opened:
-            _write(opened.require_group("data"), plan, parts, name)
-        with written.open("rb") as whole:
-            os.fsync(whole.fileno())
-        written.replace(target)
+        with whole_file(target) as written:
+            if in_place:
+                shutil.copy2(target, written)
+            else:
+                h5py.File(written, "w").close()
+            _reserve(written, _most_bytes(plan))
+            with h5py.File(written, "r+") as opened:
+                _write(opened.require_group("data"), plan, labels, name)
     except (OSError, RuntimeError) as error:  # RuntimeError is how h5py reports some failed writes
         advice = _REMEDY if in_place else "make room, and run the same command"
         got = f"{error}, and no file has changed: {advice}"
         raise OSError(f"{file}: expected to write the labels, got {got}") from error
-    finally:
-        written.unlink(missing_ok=True)
 
 
 def _most_bytes(plan: Plan) -> int:
@@ -97,15 +91,17 @@ def _reserve(file: Path, num_bytes: int) -> None:
             num_bytes -= opened.write(bytes(min(num_bytes, _FILE_BYTES)))
 
 
-def _write(group: Any, plan: Plan, parts: Parts, name: str) -> None:
+def _write(group: Any, plan: Plan, labels: Any, name: str) -> None:
     """The labels of the plan in place of all of this name."""
+    columns = [column for column in labels.column_names if column not in IDENTITY]
+    start = 0
     for label in _labels(group, name):
         del group[label]
     for item in plan.items:
-        table = parts.read(item)
-        demo = group.require_group(item.episode.name)
-        for column in (each for each in table.column_names if each not in IDENTITY):
-            demo.create_dataset(f"{name}_{column}", data=table[column].to_numpy())
+        rows = labels.slice(start, item.episode.num_frames)
+        start += item.episode.num_frames
+        for column in columns:
+            group.require_group(item.episode.name).create_dataset(f"{name}_{column}", data=rows[column].to_numpy())
     group.attrs[f"{name}_provenance"] = canonical_json(plan.provenance()).decode()
     group.attrs[f"{name}_episodes"] = canonical_json(plan.digests()).decode()
 

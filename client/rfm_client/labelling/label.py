@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from rfm_client.data.datasets.hdf5 import Hdf5Dataset
 from rfm_client.data.datasets.opening import open_dataset
@@ -29,7 +30,7 @@ from rfm_client.labelling.plan import Item, Plan, Recipe, make_plan, selected
 from rfm_client.labelling.ray_engine import Connect, RayJob, finish_all_with_ray
 from rfm_client.labelling.run import Failure, Run, Watch
 from rfm_client.labelling.scorer import Scorer
-from rfm_client.labelling.summary import Summary, summary_of_parts
+from rfm_client.labelling.summary import Summary, summary_of
 
 _DEFAULTS = LabelOptions()
 _QUIET = Watch()
@@ -116,15 +117,18 @@ class Outputs:
         found += [hdf5_labels(path, self.options.name) for path in self.hdf5]
         return [each for each in found if each is not None]
 
-    def write(self, plan: Plan) -> list[Path]:
-        """Writes all files. Raises DatasetError for a part that is missing, and OSError."""
-        parts = self.parts
-        columns = [name for name in parts.read(plan.items[0]).column_names if name not in IDENTITY]
+    def write(self, plan: Plan, labels: Any) -> list[Path]:
+        """Writes the labels, those of all parts, to all files. Raises OSError."""
+        columns = [name for name in labels.column_names if name not in IDENTITY]
         sidecars = [progress_file(path, plan, columns) for path in self.progress]
         sidecars += [signals_file(path, plan, columns, self.options.name) for path in self.signals]
-        write_sidecars(plan, parts, sidecars)
+        try:
+            write_sidecars(labels, sidecars)
+        except OSError as error:
+            remedy = f"make room, or name another folder with --output and this one's --parts {self.parts.url}"
+            raise OSError(f"{self.folder}: expected to write the labels, got {error}: {remedy}") from error
         for file in self.hdf5:
-            write_hdf5(file, plan, parts, self.options.name, in_place=self.options.in_place)
+            write_hdf5(file, plan, labels, self.options.name, in_place=self.options.in_place)
         return [*(sidecar.path for sidecar in sidecars), *self.hdf5]
 
 
@@ -215,10 +219,11 @@ def _put_together(plan: Plan, outputs: Outputs, failures: Sequence[Failure], wat
     report = Report([], failures, outputs.parts.url, None, plan)
     if failures or outputs.options.shard is not None:
         return report
-    files = outputs.write(plan)
+    labels = outputs.parts.read_all(plan)
+    files = outputs.write(plan, labels)
     assert outputs.dataset is not None  # of a run
     num_episodes = len(outputs.dataset.episodes)
     if len(plan.items) < num_episodes:
         others = "; LeRobot's reader gives frames of the others the weight 1.0" if outputs.progress else ""
         watch.note(f"{len(plan.items)} of the dataset's {num_episodes} episodes have labels{others}")
-    return replace(report, files=files, summary=summary_of_parts(plan, outputs.parts))
+    return replace(report, files=files, summary=summary_of(labels))

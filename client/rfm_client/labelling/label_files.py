@@ -14,8 +14,8 @@ Needs pyarrow. T frames of an episode.
 from __future__ import annotations
 
 import json
-import uuid
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ import numpy.typing as npt
 from rfm_client.contract.samples import Float32Array
 from rfm_client.data.datasets.protocol import DatasetError, require
 from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS, Columns
-from rfm_client.labelling.finished_episodes import IDENTITY, Parts
+from rfm_client.labelling.finished_episodes import IDENTITY, whole_file
 from rfm_client.labelling.labelled_before import LabelFile
 from rfm_client.labelling.plan import Item, Plan
 
@@ -98,66 +98,25 @@ def _descriptor(column: str) -> dict[str, Any]:
     }
 
 
-def write_sidecars(plan: Plan, parts: Parts, sidecars: Sequence[Sidecar]) -> None:
-    """Streams the parts into all files, and puts each in its place when it is whole.
+def write_sidecars(labels: Any, sidecars: Sequence[Sidecar]) -> None:
+    """Writes these labels to all files, and puts each in its place when all are whole.
 
-    Raises DatasetError for a missing part, or one with other columns than the first, and OSError: then no file changes.
+    labels: of ``Parts.read_all``
+
+    Raises OSError: then no file changes.
     """
-    if not sidecars:
-        return
-    written = {sidecar.path.with_name(f".{sidecar.path.name}.{uuid.uuid4().hex}"): sidecar for sidecar in sidecars}
-    try:
-        for file in written:
-            file.parent.mkdir(parents=True, exist_ok=True)
-        _stream(plan, parts, written)
-        for file, sidecar in written.items():
-            file.replace(sidecar.path)
-    except OSError as error:
-        got = f"{error}: make room, or name another folder with --output and this one's --parts {parts.url}"
-        raise OSError(f"{sidecars[0].path.parent}: expected to write the labels, got {got}") from error
-    finally:
-        for file in written:
-            file.unlink(missing_ok=True)
-
-
-def _stream(plan: Plan, parts: Parts, sidecars: Mapping[Path, Sidecar]) -> None:
     import pyarrow as pa
     from pyarrow import parquet
 
-    writers: dict[Path, Any] = {}
-    try:
-        for table in _row_groups(plan, parts):
-            for file, sidecar in sidecars.items():
-                own = table.select([*IDENTITY, *sidecar.columns])
-                own = own.rename_columns([*IDENTITY, *sidecar.columns.values()])
-                if file not in writers:
-                    fields = [pa.field(field.name, field.type, nullable=False) for field in own.schema]
-                    writers[file] = parquet.ParquetWriter(file, pa.schema(fields, metadata=dict(sidecar.metadata)))
-                writers[file].write_table(own.cast(writers[file].schema), row_group_size=_ROWS_AT_A_TIME)
-    finally:
-        for writer in writers.values():
-            writer.close()
-
-
-def _row_groups(plan: Plan, parts: Parts) -> Iterator[Any]:
-    """The rows of all parts in order, about _ROWS_AT_A_TIME together."""
-    import pyarrow as pa
-
-    together: list[Any] = []
-    names: list[str] = []
-    following = -1
-    for item in plan.items:
-        table, name, first = parts.read(item), item.episode.name, item.episode.first_index
-        names = names or table.column_names
-        require(name, table.column_names == names, f"the columns {', '.join(names)}", ", ".join(table.column_names))
-        require(name, first > following, f"rows after {following}", first)
-        following = first + item.episode.num_frames - 1
-        together.append(table.replace_schema_metadata(None))
-        if sum(map(len, together)) >= _ROWS_AT_A_TIME:
-            yield pa.concat_tables(together)
-            together = []
-    if together:
-        yield pa.concat_tables(together)
+    with ExitStack() as whole:
+        for sidecar in sidecars:
+            own = labels.select([*IDENTITY, *sidecar.columns])
+            own = own.rename_columns([*IDENTITY, *sidecar.columns.values()])
+            fields = [pa.field(field.name, field.type, nullable=False) for field in own.schema]
+            schema = pa.schema(fields, metadata=dict(sidecar.metadata))
+            sidecar.path.parent.mkdir(parents=True, exist_ok=True)
+            file = whole.enter_context(whole_file(sidecar.path))
+            parquet.write_table(own.cast(schema), file, row_group_size=_ROWS_AT_A_TIME)
 
 
 def parquet_labels(path: Path, option: str = "--name") -> LabelFile | None:

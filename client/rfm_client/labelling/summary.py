@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,7 @@ import numpy.typing as npt
 from rfm_client.contract.results import SUCCESS_THRESHOLD
 from rfm_client.data.datasets.protocol import require
 from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS
-from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.label_files import read_label_table
-from rfm_client.labelling.plan import Plan
 
 _BACKWARDS_BY = 0.01  # the kappa of reward-aligned behaviour cloning: less is noise
 _MOST_LISTED = 12
@@ -69,39 +66,30 @@ def summarise(file: Path) -> Summary:
     """The summary of a progress file or a file of frame signals. Raises DatasetError for another file."""
     table = read_label_table(file)
     require(file, len(table) > 0, "labels", "none")
-    episodes = table["episode_index"].to_numpy()
+    return summary_of(table)
+
+
+def summary_of(labels: Any) -> Summary:
+    """The summary of a table of labels, whose columns of scores are named as those of parts."""
+    episodes = labels["episode_index"].to_numpy()
     starts = np.flatnonzero(np.diff(episodes, prepend=episodes[0] - 1)).tolist()
-    ends = [*starts[1:], len(table)]
-    return _of_episodes(
-        (int(episodes[start]), table.slice(start, end - start)) for start, end in zip(starts, ends, strict=True)
-    )
-
-
-def summary_of_parts(plan: Plan, parts: Parts) -> Summary:
-    """The summary of the parts of a plan."""
-    return _of_episodes((item.episode.index, parts.read(item)) for item in plan.items)
-
-
-def _of_episodes(tables: Iterable[tuple[int, Any]]) -> Summary:
-    """The summary of episodes by their numbers and their tables, whose columns are those of parts."""
     numbers, final, best, backwards, apart = [], [], [], [], []
-    num_frames = 0
-    for number, table in tables:
+    for start, end in zip(starts, [*starts[1:], len(labels)], strict=True):
+        table = labels.slice(start, end - start)
         progress = table[PROGRESS].to_numpy()
         cameras = [table[name].to_numpy() for name in table.column_names if name.startswith(f"{PROGRESS}.")]
-        numbers.append(number)
+        numbers.append(episodes[start])
         final.append(progress[-1])
         backwards.append(np.mean(np.diff(progress) < -_BACKWARDS_BY) if len(progress) > 1 else 0.0)
         if SUCCESS in table.column_names:
             best.append(table[SUCCESS].to_numpy().max())
         if cameras:
             apart.append(np.ptp(np.stack(cameras), axis=0).mean(dtype=np.float64))
-        num_frames += len(progress)
     return Summary(
         episodes=np.array(numbers, np.int64),
         final_progress=np.array(final, np.float32),
         best_success=np.array(best, np.float32) if best else None,
         backwards=np.array(backwards, np.float64),
         disagreement=np.array(apart, np.float64) if apart else None,
-        num_frames=num_frames,
+        num_frames=len(labels),
     )

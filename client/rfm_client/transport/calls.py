@@ -8,12 +8,12 @@ import io
 import logging
 import os
 from collections.abc import Awaitable, Callable, Collection, Mapping
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache, partial
+from functools import cached_property, partial
+from importlib import import_module
 from typing import Any, ClassVar, Protocol, TypeVar
 
-import numpy as np
 from tritonclient.utils import InferenceServerException, np_to_triton_dtype
 
 from rfm_client.contract import errors, triton
@@ -31,8 +31,6 @@ Answered = TypeVar("Answered")
 
 _US_PER_S = 1_000_000
 _AS_IT_IS = {"Accept-Encoding": "identity"}  # else aiohttp asks for gzip, which makes floats little smaller
-_SMALL_BYTES = 16  # what is asked about one sample, but for its embeddings
-_NUM_SMALL_INPUTS = 512  # that are kept
 _SERVED_TIMEOUT_S = 2.0  # of what an error adds
 
 logger = logging.getLogger("rfm_client")
@@ -84,7 +82,7 @@ class TritonTransport:
     A module of tritonclient is imported when it is first needed; a client belongs to the event loop that runs then.
     """
 
-    _triton: Any  # the module
+    _module: ClassVar[str]  # of tritonclient
     _as_json: ClassVar[dict[str, bool]] = {}  # by which its methods give dictionaries
     _proxy: str | None = None  # as an error tells it
 
@@ -95,10 +93,12 @@ class TritonTransport:
         if access.uses_tls and self._scheme not in SECURE_SCHEMES:
             raise ValueError(f"url: expected grpcs:// or https:// with certificates, got {url}")
         self._shared_memory = SharedMemory(url) if shared_memory else None
-        self._requested = cache(lambda name: self._triton.InferRequestedOutput(name))
-        self._small_input = lru_cache(_NUM_SMALL_INPUTS)(self._new_small_input)
         self._connection: Connection | None = None
         self._left: list[Connection] = []  # and perhaps not closed yet
+
+    @cached_property
+    def _triton(self) -> Any:
+        return import_module(self._module)
 
     async def infer(
         self, model: str, inputs: Tensors, outputs: Collection[str], timeout_s: float, *, request_id: str = ""
@@ -134,18 +134,16 @@ class TritonTransport:
     async def _infer(
         self, model: str, inputs: Tensors, outputs: Collection[str], request_id: str, timeout_s: float, client: Any
     ) -> Answer:
-        requested = [self._requested(name) for name in outputs]
+        requested = [self._triton.InferRequestedOutput(name) for name in outputs]
         # Triton drops a request that waits in its queue for longer, over HTTP too: no client waits for the answer.
         waits_us = max(int(timeout_s * _US_PER_S), 1)
-        ask = partial(client.infer, model, outputs=requested, request_id=request_id, timeout=waits_us)
         largest = max(inputs, key=lambda name: inputs[name].nbytes)
-        num_bytes = inputs[largest].nbytes
-        if self._shared_memory is None:
-            answer = await ask(await off_loop(num_bytes, self._inputs, inputs, {}))
-        else:
-            async with self._shared_memory.lend(client, inputs[largest]) as region:
-                regions = {largest: region} if region is not None else {}
-                answer = await ask(await off_loop(0 if regions else num_bytes, self._inputs, inputs, regions))
+        lent = nullcontext() if self._shared_memory is None else self._shared_memory.lend(client, inputs[largest])
+        async with lent as region:
+            regions = {largest: region} if region is not None else {}
+            num_bytes = 0 if regions else inputs[largest].nbytes
+            tensors = await off_loop(num_bytes, self._inputs, inputs, regions)
+            answer = await client.infer(model, tensors, outputs=requested, request_id=request_id, timeout=waits_us)
         response = answer.get_response()
         version = response["model_version"] if isinstance(response, dict) else response.model_version
         return Answer(_outputs(answer, outputs), str(version))
@@ -153,9 +151,6 @@ class TritonTransport:
     def _inputs(self, inputs: Tensors, regions: Mapping[str, Region]) -> list[Any]:
         tensors = []
         for name, array in inputs.items():
-            if array.nbytes <= _SMALL_BYTES and not array.dtype.hasobject:
-                tensors.append(self._small_input(name, array.shape, array.dtype.str, array.tobytes()))
-                continue
             tensor = self._triton.InferInput(name, array.shape, np_to_triton_dtype(array.dtype))
             if name in regions:
                 tensor.set_shared_memory(regions[name].name, array.nbytes)
@@ -163,13 +158,6 @@ class TritonTransport:
                 tensor.set_data_from_numpy(array)
             tensors.append(tensor)
         return tensors
-
-    def _new_small_input(self, name: str, shape: tuple[int, ...], dtype: str, content: bytes) -> Any:
-        """An input that requests share, since tensors so small are the same again and again."""
-        array = np.frombuffer(content, dtype).reshape(shape)
-        tensor = self._triton.InferInput(name, shape, np_to_triton_dtype(array.dtype))
-        tensor.set_data_from_numpy(array)
-        return tensor
 
     async def _call(
         self,
@@ -239,18 +227,13 @@ class GrpcTransport(TritonTransport):
     A host name may have several addresses, such as that of a headless Service: gRPC spreads the requests over them.
     """
 
+    _module = "tritonclient.grpc.aio"
     _as_json: ClassVar[dict[str, bool]] = {"as_json": True}
     _first_process: int | None = None  # that used gRPC
 
     def __init__(self, url: str, access: Access, *, shared_memory: bool) -> None:
         super().__init__(url, access, shared_memory=shared_memory)
         self._proxy = grpc_proxy(self._address)
-
-    @cached_property
-    def _triton(self) -> Any:
-        import tritonclient.grpc.aio
-
-        return tritonclient.grpc.aio
 
     def _open(self) -> Any:
         process = GrpcTransport._first_process = GrpcTransport._first_process or os.getpid()
@@ -267,11 +250,7 @@ class GrpcTransport(TritonTransport):
 class HttpTransport(TritonTransport):
     """HTTP: as many connections as there are calls at a time. Triton finishes a request that nobody waits for."""
 
-    @cached_property
-    def _triton(self) -> Any:
-        import tritonclient.http.aio
-
-        return tritonclient.http.aio
+    _module = "tritonclient.http.aio"
 
     def _open(self) -> Any:
         secure = {"ssl": True, "ssl_context": self._access.ssl_context} if self._scheme in SECURE_SCHEMES else {}

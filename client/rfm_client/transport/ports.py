@@ -4,11 +4,8 @@
 from __future__ import annotations
 
 import http.client
-import json
 import socket
 import ssl
-from enum import Enum
-from typing import Any
 
 from rfm_client.contract import errors
 from rfm_client.contract.addresses import host_of, split_url
@@ -19,16 +16,8 @@ _READ_BYTES = 4096
 _HTTP2_FRAME = "\x00\x00"  # how a gRPC server begins to answer a request that it does not understand
 
 
-class Port(Enum):
-    """What a port is, as a message names it."""
-
-    GRPC = "its gRPC port"
-    HTTP = "its HTTP port"
-    METRICS = "its metrics port"
-    GATEWAY = "a gateway's"
-
-
-_EXPECTED = {"grpc": (Port.GRPC, "Triton's gRPC port", 8001), "http": (Port.HTTP, "Triton's HTTP port", 8000)}
+_GRPC, _HTTP, _METRICS, _GATEWAY = "its gRPC port", "its HTTP port", "its metrics port", "a gateway's"
+_EXPECTED = {"grpc": (_GRPC, "Triton's gRPC port", 8001), "http": (_HTTP, "Triton's HTTP port", 8000)}
 OF_A_PORT = (  # errors of which a port may be the reason
     errors.ServerUnavailableError,
     errors.AccessDeniedError,
@@ -51,26 +40,26 @@ def wrong_port(url: str) -> str | None:
     if found is right and scheme == protocol:
         return None
     mend = {
-        Port.GRPC: f"use grpc://{address}",
-        Port.HTTP: f"use http://{address}",
-        Port.METRICS: f"use {scheme}://{in_url(host_of(address))}:{usual}, unless the server was given another",
-        Port.GATEWAY: f"use that of the Triton behind it, by default {usual}",
+        _GRPC: f"use grpc://{address}",
+        _HTTP: f"use http://{address}",
+        _METRICS: f"use {scheme}://{in_url(host_of(address))}:{usual}, unless the server was given another",
+        _GATEWAY: f"use that of the Triton behind it, by default {usual}",
     }[found]
     with_tls, without = ("", "") if scheme == protocol else (" with TLS", " without")
-    return f"{url}: expected {expected}{with_tls}, got {found.value}{without}: {mend}"
+    return f"{url}: expected {expected}{with_tls}, got {found}{without}: {mend}"
 
 
-def _port_at(address: str) -> Port | None:
-    """What listens there, if it is one that is known."""
+def _port_at(address: str) -> str | None:
+    """What listens there, as a message names it; None: nothing that is known."""
     try:
         if _read(address, "/v2").startswith(b"{"):
-            return Port.HTTP
+            return _HTTP
         metrics = _read(address, "/metrics")
-        if b"rfm_gateway_" in metrics or _is_health_of_gateway(_read(address, "/health")):
-            return Port.GATEWAY
-        return Port.METRICS if b"nv_" in metrics else None
+        if b"rfm_gateway_" in metrics or b'"available_gpus"' in _read(address, "/health"):
+            return _GATEWAY
+        return _METRICS if b"nv_" in metrics else None
     except http.client.BadStatusLine as error:
-        return Port.GRPC if str(error).startswith(_HTTP2_FRAME) else None
+        return _GRPC if str(error).startswith(_HTTP2_FRAME) else None
     except (OSError, http.client.HTTPException):
         return None
 
@@ -97,11 +86,3 @@ def _read(address: str, path: str) -> bytes:
         return answer.read(_READ_BYTES) if answer.status == http.client.OK else b""
     finally:
         connection.close()
-
-
-def _is_health_of_gateway(page: bytes) -> bool:
-    try:
-        health: Any = json.loads(page)
-    except ValueError:
-        return False
-    return isinstance(health, dict) and "available_gpus" in health

@@ -18,8 +18,8 @@ import itertools
 import logging
 import random
 import time
-from collections.abc import Awaitable, Callable, Collection, Coroutine, Sequence
-from typing import Any, TypeVar
+from collections.abc import Awaitable, Callable, Collection, Sequence
+from typing import TypeVar
 
 from rfm_client.contract.errors import (
     AccessDeniedError,
@@ -72,9 +72,14 @@ class KnownServer:
         """Whether the server gets no requests until it says that it is ready."""
         return self.comeback is not None and not self.comeback.done()
 
-    def leave_out(self, comeback: Coroutine[Any, Any, None]) -> None:
-        """Leave the server out until ``comeback`` returns."""
-        self.comeback = asyncio.create_task(comeback)
+    async def answer(self, request: Request[Answered], moment: int, left_s: float) -> Answered:
+        """What it answers to the request of this moment."""
+        self.outstanding += 1
+        self.last_request = moment
+        try:
+            return await request(self.transport, left_s)
+        finally:
+            self.outstanding -= 1
 
     async def rested(self, model: str) -> None:
         """Return when a server that failed says that it is ready, not at once."""
@@ -201,7 +206,7 @@ class Servers:
             server = self._least_busy(refusals)
             left_s = deadline.remaining_s()
             try:
-                answer = await self._ask(server, request, left_s)
+                answer = await server.answer(request, next(self._moments), left_s)
             except DeadlineExceededError as error:  # perhaps it hangs
                 self._leave_out(server, model, error)
                 failed = failures.get(server)
@@ -244,14 +249,6 @@ class Servers:
                 return answer
         raise min(refusals.values(), key=lambda error: isinstance(error, ModelNotFoundError))  # which says the least
 
-    async def _ask(self, server: KnownServer, request: Request[Answered], left_s: float) -> Answered:
-        server.outstanding += 1
-        server.last_request = next(self._moments)
-        try:
-            return await request(server.transport, left_s)
-        finally:
-            server.outstanding -= 1
-
     def _least_busy(self, avoided: Collection[KnownServer]) -> KnownServer:
         def rank(server: KnownServer) -> tuple[bool, bool, int, int]:
             return server in avoided, server.is_left_out, server.outstanding, server.last_request
@@ -264,9 +261,10 @@ class Servers:
             return  # it is the same failure
         server.failures += 1
         if error.may_have_ended_server:
-            server.leave_out(server.back(model, was_down=not isinstance(error, ProcessEndedError)))
+            was_down = not isinstance(error, ProcessEndedError)
+            server.comeback = asyncio.create_task(server.back(model, was_down=was_down))
         elif len(self._servers) > 1:
-            server.leave_out(server.rested(model))
+            server.comeback = asyncio.create_task(server.rested(model))
 
     async def _wrong_ports(self) -> list[str | None]:
         """What is wrong with the port of each server."""

@@ -179,22 +179,12 @@ def read_status(
     Raises ServerUnavailableError, AccessDeniedError, DeadlineExceededError, and InferenceFailedError for what is no
     Triton server.
     """
-    try:
-        return _read(url, metrics_url, timeout_s, access or Access())
-    except OF_A_PORT as error:
-        named = wrong_port(url)
-        if named is None:
-            raise
-        raise ServerUnavailableError(named) from error
-
-
-def _read(url: str, metrics_url: str | None, timeout_s: float, access: Access) -> ServerStatus:
     scheme, address = split_url(url)
+    metrics_url = metrics_url or f"http://{address.rpartition(':')[0]}:{METRICS_PORT}/metrics"
     try:
-        server = _read_server(scheme, address, timeout_s, access)
-        metrics_url = metrics_url or f"http://{address.rpartition(':')[0]}:{METRICS_PORT}/metrics"
+        version, is_ready, index, statistics = _read_server(scheme, address, timeout_s, access or Access())
         metrics = _read_metrics(metrics_url, timeout_s)
-        models = tuple(_models(server, metrics))
+        models = tuple(_models(index, statistics, metrics))
     except Exception as raised:
         proxy = grpc_proxy(address) if scheme.startswith("grpc") else None
         error = triton.error_from(raised, url, proxy=proxy)
@@ -204,42 +194,35 @@ def _read(url: str, metrics_url: str | None, timeout_s: float, access: Access) -
             error = DeadlineExceededError(
                 f"{url}{f' through {proxy}' if proxy else ''}: no answer within {timeout_s:g} s"
             )
+        elif isinstance(error, OF_A_PORT) and (named := wrong_port(url)):
+            error = ServerUnavailableError(named)
         raise error from raised
-    return ServerStatus(url, server.version, server.ready, models, metrics_url, metrics.error, metrics.devices)
+    return ServerStatus(url, version, is_ready, models, metrics_url, metrics.error, metrics.devices)
 
 
-@dataclass(frozen=True)
-class _Server:
-    """Answers of Triton's API, as its HTTP endpoints write them."""
+def _read_server(
+    scheme: str, address: str, timeout_s: float, access: Access
+) -> tuple[str, bool, list[dict[str, Any]], list[dict[str, Any]]]:
+    """Triton's version, whether it is ready, its index and statistics, as its HTTP endpoints write them."""
+    is_grpc = scheme.startswith("grpc")
+    limited = {"client_timeout": timeout_s} if is_grpc else {}
+    as_json = {"as_json": True, **limited} if is_grpc else {}
+    options: dict[str, Any]
+    if is_grpc:
+        from tritonclient.grpc import InferenceServerClient
 
-    version: str
-    ready: bool
-    index: list[dict[str, Any]]
-    statistics: list[dict[str, Any]]
-
-
-def _read_server(scheme: str, address: str, timeout_s: float, access: Access) -> _Server:
-    limited: dict[str, Any] = {}
-    as_json: dict[str, Any] = {}
-    client: Any
-    if scheme.startswith("grpc"):
-        import tritonclient.grpc
-
-        limited = {"client_timeout": timeout_s}
-        as_json = {"as_json": True, **limited}
-        options = access.grpc_options(scheme)
-        client = tritonclient.grpc.InferenceServerClient(address, channel_args=grpc_options(address), **options)
+        options = {"channel_args": grpc_options(address), **access.grpc_options(scheme)}
     else:
-        import tritonclient.http
+        from tritonclient.http import InferenceServerClient
 
         options = {"connection_timeout": timeout_s, "network_timeout": timeout_s, **access.http_options(scheme)}
-        client = tritonclient.http.InferenceServerClient(address, **options)
+    client = InferenceServerClient(address, **options)
     access.show_with_each_request(client)
     try:
         version = client.get_server_metadata(**as_json)["version"]
         statistics = client.get_inference_statistics(**as_json).get("model_stats", [])
         index = _index(client, statistics, as_json, limited)
-        return _Server(version, client.is_server_ready(**limited), index, statistics)
+        return version, client.is_server_ready(**limited), index, statistics
     finally:
         client.close()
 
@@ -262,12 +245,12 @@ def _index(
     ]
 
 
-def _models(server: _Server, metrics: _Metrics) -> list[ModelStatus]:
-    statistics = {(entry["name"], entry["version"]): entry for entry in server.statistics}
+def _models(index: list[dict[str, Any]], statistics: list[dict[str, Any]], metrics: _Metrics) -> list[ModelStatus]:
+    done_by = {(entry["name"], entry["version"]): entry for entry in statistics}
     models = []
-    for entry in server.index:
+    for entry in index:
         key = entry["name"], entry.get("version", "")
-        done = statistics.get(key, {})
+        done = done_by.get(key, {})
         times = done.get("inference_stats", {})
         models.append(
             ModelStatus(
@@ -357,11 +340,7 @@ def _devices(samples: list[Any]) -> tuple[Device, ...]:
                 models[model] = replace(done, compute_s=done.compute_s + sample.value / _US_PER_S)
     return tuple(
         Device(
-            name,
-            of_one.get("utilization"),
-            of_one.get("memory_used_bytes"),
-            of_one.get("memory_total_bytes"),
-            work.get(name, {}),
+            name, of.get("utilization"), of.get("memory_used_bytes"), of.get("memory_total_bytes"), work.get(name, {})
         )
-        for name, of_one in values.items()
+        for name, of in values.items()
     )

@@ -62,7 +62,9 @@ class Hdf5Dataset(Dataset):
             demos = _demos_in(file, opened)
             self._demos = {index: name for index, (name, _) in demos.items()}
             self.cameras, self.left_out = _cameras_in(file, dict(demos.values()))
-            is_libero, is_upright = _is_libero(opened["data"].attrs), _is_upright(opened["data"].attrs)
+            attributes = opened["data"].attrs
+            is_libero = _is_libero(attributes)
+            is_upright = "opencv" in str(attributes.get("macros_image_convention"))  # as robosuite then renders
         defaults: dict[str, Orientation] = dict.fromkeys(self.cameras, _LIBERO) if is_libero and not is_upright else {}
         self.orientations = orientations_of(orient, self.cameras, defaults)
         untold = [camera for camera in self.cameras if orient.default is None and camera not in orient.cameras]
@@ -148,7 +150,9 @@ def _cameras_in(file: Path, demos: Mapping[str, Any]) -> tuple[Sequence[str], Ma
     for of_demo in observations.values():
         for name, value in of_demo.items():
             if name not in faults and _is_picture(value):
-                faults[name] = next(filter(None, (_fault_in(*each, name) for each in observations.items())), "")
+                found = ((demo, stored.get(name)) for demo, stored in observations.items())
+                told = (f"missing in {demo}" if each is None else _fault(each) for demo, each in found)
+                faults[name] = next(filter(None, told), "")
     cameras = tuple(name for name, reason in faults.items() if not reason)
     first, stored = next(iter(observations.items()))
     forms = ", ".join(f"{name} {_form(value)}" for name, value in stored.items()) or "none"
@@ -156,11 +160,6 @@ def _cameras_in(file: Path, demos: Mapping[str, Any]) -> tuple[Sequence[str], Ma
     expected = "a camera as uint8 [T, H, W, 3] in every demonstration"
     require(f"{file}: data/{first}/obs", bool(cameras), expected, got)
     return cameras, {name: reason for name, reason in faults.items() if reason}
-
-
-def _fault_in(demo: str, observations: Mapping[str, Any], name: str) -> str:
-    value = observations.get(name)
-    return f"missing in {demo}" if value is None else _fault(value)
 
 
 def _fault(value: Any) -> str:
@@ -218,11 +217,6 @@ def _is_libero(attributes: Mapping[str, Any]) -> bool:
     has_problem = not {"problem_name", "language_instruction"}.isdisjoint(_document(attributes, "problem_info"))
     is_named = any("libero" in str(name).lower() for name in env_names)
     return has_problem or is_named or "bddl_file_name" in attributes
-
-
-def _is_upright(attributes: Mapping[str, Any]) -> bool:
-    """Whether the file says that robosuite rendered its pictures the right way up."""
-    return "opencv" in str(attributes.get("macros_image_convention"))
 
 
 def _document(attributes: Mapping[str, Any], name: str) -> Mapping[str, Any]:

@@ -118,11 +118,6 @@ class LeRobotDataset(Dataset):
         where, container = f"{episode.name}: {camera}", _CONTAINER.get(file.suffix.lower())
         return Span(file, packets.times_s[frames[episode.index]], 0.5 / self.info.fps, where, container)
 
-    def files(self) -> set[Path]:
-        """The tables and films that the episodes are in."""
-        entries = self._entries.values()
-        return {entry.data_file for entry in entries} | {film for entry in entries for film, _ in entry.films.values()}
-
     @cached_property
     def _in_film(self) -> Mapping[tuple[str, Path], Sequence[Entry]]:
         """The episodes in each film of each camera."""
