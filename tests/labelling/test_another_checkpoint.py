@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,9 +22,9 @@ ROOT = LEROBOT / "toy_v30_many"
 NUM_EPISODES = 10
 
 
-def labelled(output: Path, *shelves: Shelf) -> None:
+def labelled(output: Path, *shelves: Shelf, **options: Any) -> None:
     with RewardClient("", transports=shelves) as client:
-        label(open_dataset(ROOT), ClientScorer(client), LabelOptions(output=output, workers=1, **FEW))
+        label(open_dataset(ROOT), ClientScorer(client), LabelOptions(output=output, workers=1, **options))
 
 
 def assert_of_one_checkpoint(output: Path) -> None:
@@ -50,7 +51,7 @@ def test_a_run_stops_when_another_checkpoint_is_served(
     output: Path, other: Kept, parts: tuple[str, ...], has_encoder: bool
 ) -> None:
     with pytest.raises(InvalidSampleError, match=r"_digest: expected \w+-of-v1, got \w+-of-v2|settings_digest"):
-        labelled(output, Shelf(other=other, after=5, parts=parts, has_encoder=has_encoder))
+        labelled(output, Shelf(other=other, after=5, parts=parts, has_encoder=has_encoder), **FEW)
     assert list((output / ".rfm_parts").glob("*.parquet"))
     assert_of_one_checkpoint(output)
     assert not (output / "rfm_progress.parquet").exists()
@@ -60,7 +61,7 @@ def test_a_run_stops_when_another_checkpoint_is_served(
 def test_servers_that_are_replaced_one_after_the_other_mix_no_curve(output: Path, has_encoder: bool) -> None:
     shelves = [Shelf(has_encoder=has_encoder), Shelf(has_encoder=has_encoder, after=3, url="grpc://other:1")]
     with pytest.raises(InvalidSampleError, match="the same weights_digest, settings_digest at every server"):
-        labelled(output, *shelves)
+        labelled(output, *shelves, limit=4)
     assert_of_one_checkpoint(output)
 
 
