@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -84,17 +83,14 @@ def test_the_scorers_configuration_is_the_wire_contract(exported: Path) -> None:
     assert [warmup.name for warmup in config.model_warmup] == ["progress", "preference", "similarity"]
 
 
-def test_a_queue_is_bounded_by_triton_s_own_policy_if_it_is(tmp_path: Path) -> None:
-    """By default it is not: with a bound, Triton 2.51 at times notices a free instance half a second late."""
-    export(EMBEDDINGS, tmp_path, max_queue_size=7, queue_timeout_ms=250)
-    policy = read(tmp_path, "rfm").dynamic_batching.default_queue_policy
+def test_a_checkpoint_is_asked_for_what_it_has(tmp_path: Path) -> None:
+    export(goldens.config("legacy_keys_l2"), tmp_path / "continuous", max_queue_size=7, queue_timeout_ms=250)
+    config = read(tmp_path / "continuous", "rfm")
+    assert "progress_logits" not in dims(config.output)
+    # by default the queue is not bounded: with a bound, Triton 2.51 at times notices a free instance half a second late
+    policy = config.dynamic_batching.default_queue_policy
     assert (policy.max_queue_size, policy.default_timeout_microseconds) == (7, 250_000)
     assert policy.allow_timeout_override
-
-
-def test_a_checkpoint_is_asked_for_what_it_has(tmp_path: Path) -> None:
-    export(goldens.config("legacy_keys_l2"), tmp_path / "continuous")
-    assert "progress_logits" not in dims(read(tmp_path / "continuous", "rfm").output)
     export(goldens.config("robometer_c1_t1_disc10"), tmp_path / "no similarity")
     warmups = read(tmp_path / "no similarity", "rfm").model_warmup
     assert [warmup.name for warmup in warmups] == ["progress", "preference"]
@@ -124,14 +120,13 @@ def test_frames_go_through_the_encoder_into_the_scorer(exported: Path) -> None:
     assert dims(ensemble.output) == dims(read(exported, "film").output)
 
 
-def test_two_instances_a_gpu_or_one_on_the_cpu(tmp_path: Path) -> None:
+def test_two_instances_a_gpu_or_one_on_the_cpu(exported: Path, tmp_path: Path) -> None:
     """Of a network over embeddings: one scores while the other reads."""
-    export(EMBEDDINGS, tmp_path / "cpu", num_gpus=0)
-    (group,) = read(tmp_path / "cpu", "rfm").instance_group
+    (group,) = read(exported, "rfm").instance_group
     assert (group.kind, group.count, list(group.gpus)) == (pb.ModelInstanceGroup.KIND_CPU, 1, [])
-    serve = replace(serve_config(EMBEDDINGS), num_gpus=2)
-    rfm_export.export(EMBEDDINGS.checkpoint, tmp_path / "gpu", serve, other_machine=True)
-    (group,) = read(tmp_path / "gpu", "rfm").instance_group
+    settings = replace(serve_config(EMBEDDINGS), num_gpus=2)
+    rfm_export.export(EMBEDDINGS.checkpoint, tmp_path, settings, other_machine=True)
+    (group,) = read(tmp_path, "rfm").instance_group
     assert (group.kind, group.count, list(group.gpus)) == (pb.ModelInstanceGroup.KIND_GPU, 2, [0, 1])
 
 
@@ -201,10 +196,6 @@ def test_a_model_may_gain_an_optional_input_and_lose_none(tmp_path: Path) -> Non
     (tmp_path / "rfm_encoder" / "config.pbtxt").write_text(text_format.MessageToString(config))
     with pytest.raises(ExportError, match="rfm_encoder: expected a checkpoint with the same inputs"):
         export(FRAMES, tmp_path)
-
-
-def test_an_ensemble_does_not_lose_its_encoder(tmp_path: Path) -> None:
-    export(FRAMES, tmp_path)
     with pytest.raises(ExportError, match="expected a checkpoint that this model can serve too"):
         export(EMBEDDINGS, tmp_path)
 
@@ -217,13 +208,6 @@ def test_encoders_that_do_not_fit_or_cannot_be_had_are_named(tmp_path: Path) -> 
         export(FRAMES, tmp_path, image_encoder="/no/such/folder")
 
 
-def test_the_committed_repository_is_what_an_export_generates() -> None:
-    result = CliRunner().invoke(
-        app, ["export", "--check", "--repository", str(REPOSITORY), "--config", str(REPOSITORY / "serve.yaml")]
-    )
-    assert result.exit_code == 0, result.output
-
-
 def test_check_names_what_differs(tmp_path: Path) -> None:
     repository = shutil.copytree(REPOSITORY, tmp_path / "model_repository")
     (repository / "rfm" / "1" / "model.py").write_text("# changed\n")
@@ -232,12 +216,6 @@ def test_check_names_what_differs(tmp_path: Path) -> None:
         f"{repository}/rfm/1/model.py: differs from what `rfm export` generates",
         f"{repository}/rfm_frames/config.pbtxt: is missing",
     ]
-
-
-def test_the_commands_errors_are_one_line(tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["export", "--checkpoint", "nowhere", "--repository", str(tmp_path)])
-    assert result.exit_code == 1
-    assert re.fullmatch(r"rfm: checkpoint: expected .*, got 'nowhere'\n", result.stderr)
 
 
 # As upstream publishes it, comments aside.
@@ -252,50 +230,47 @@ server_port: 8000
 HEADS = ("progress", "preference", "success", "similarity")
 
 
-def untrained(head: str) -> str:
-    return (
-        f"config.yaml: model.train_{head}_head is false: the run did not train the head of {head}, so {head} means "
-        "something only if the run started from a checkpoint that did"
-    )
-
-
 def of_run(folder: Path) -> str:
     return f"{folder}/config.yaml: read as the settings of the training run"
 
 
-LAST_FRAME = (
-    "config.yaml: loss.predict_last_frame_progress is true: the run trained progress of the last frame alone, so "
-    "progress of the frames before it means something only if the run started from a checkpoint that trained it"
-)
-QUANTIZED = (
-    "config.yaml: model.quantization is true: the run scored with its base model rounded to a few bits; the scores here "
-    "are those of the weights as they stand, so they differ from the run's unless these are rounded alike"
-)
 ALL_TRAINED: dict[str, object] = {f"train_{head}_head": True for head in HEADS}
-RUNS: dict[str, tuple[str, dict[str, dict[str, object]], list[str]]] = {
-    "one head is not trained": ("c1_t1_disc10", {"model": ALL_TRAINED | {"train_success_head": False}}, [untrained("success")]),
-    "a head that the network lacks": ("robometer_c1_t1_disc10", {"model": ALL_TRAINED | {"train_similarity_head": False}}, []),
-    "only the last frame": ("c1_t1_disc10", {"model": ALL_TRAINED, "loss": {"predict_last_frame_progress": True}}, [LAST_FRAME]),
-    "a quantized base model": ("c1_t1_disc10", {"model": ALL_TRAINED | {"quantization": True}}, [QUANTIZED]),
-}  # fmt: skip
+RUNS: dict[str, tuple[dict[str, dict[str, object]], list[str]]] = {
+    "a head": (
+        {"model": ALL_TRAINED | {"train_success_head": False}},
+        [
+            "config.yaml: model.train_success_head is false: the run did not train the head of success, so success means "
+        ],
+    ),
+    "frames before the last": (
+        {"model": ALL_TRAINED, "loss": {"predict_last_frame_progress": True}},
+        [
+            "config.yaml: loss.predict_last_frame_progress is true: the run trained progress of the last frame alone, so "
+        ],
+    ),
+    "the weights as they stand": (
+        {"model": ALL_TRAINED | {"quantization": True}},
+        [
+            "config.yaml: model.quantization is true: the run scored with its base model rounded to a few bits; the scores "
+        ],
+    ),
+    "all": ({"model": ALL_TRAINED}, []),
+}
 
 
-@pytest.mark.parametrize(("name", "changes", "expected"), RUNS.values(), ids=RUNS)
+@pytest.mark.parametrize(("changes", "expected"), RUNS.values(), ids=RUNS)
 def test_an_export_says_what_the_run_did_not_train(
-    tmp_path: Path, name: str, changes: dict[str, dict[str, object]], expected: list[str]
+    tmp_path: Path, changes: dict[str, dict[str, object]], expected: list[str]
 ) -> None:
-    config = goldens.config(name)
-    checkpoint = shutil.copytree(config.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
-    file = next(
-        file for folder in (config.checkpoint, config.checkpoint.parent) if (file := folder / "config.yaml").exists()
-    )
-    run = read_run_config(file)
+    checkpoint = shutil.copytree(EMBEDDINGS.checkpoint, tmp_path / "checkpoint", copy_function=shutil.copyfile)
+    run = read_run_config(EMBEDDINGS.checkpoint.parent / "config.yaml")
     for section, values in changes.items():
         run[section] |= values
     (checkpoint / "config.yaml").write_text(yaml.safe_dump(run))
     said: list[str] = []
-    rfm_export.export(checkpoint, tmp_path / "repository", serve_config(config), say=said.append)
-    assert said == [of_run(checkpoint), *expected]
+    rfm_export.export(checkpoint, tmp_path / "repository", serve_config(EMBEDDINGS), say=said.append)
+    assert len(said) == 1 + len(expected)
+    assert all(map(str.startswith, said, [of_run(checkpoint), *expected]))
 
 
 def test_an_export_says_which_config_yaml_and_which_encoders_it_took(tmp_path: Path) -> None:
