@@ -68,12 +68,7 @@ def test_the_fastapi_servers_file_is_accepted(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("url", "host"),
-    [
-        ("http://0.0.0.0/", "0.0.0.0"),
-        ("localhost", "127.0.0.1"),
-        ("http://[::]/", "::"),
-        ("0:0:0:0:0:0:0:1", "::1"),
-    ],
+    [("http://0.0.0.0/", "0.0.0.0"), ("localhost", "127.0.0.1"), ("http://[::]/", "::"), ("0:0:0:0:0:0:0:1", "::1")],
 )
 def test_a_host_may_be_written_as_a_url(url: str, host: str) -> None:
     assert ServeConfig(host=url).host == host

@@ -22,6 +22,8 @@ import rfm_export
 from commands import REPOSITORY
 from engines import serve_config
 from reference_server import Served
+from rfm import families
+from rfm.checkpoint.content import CheckpointError
 from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
 from rfm_commands.cli import app
 from rfm_export import ExportError
@@ -49,6 +51,14 @@ def as_any_user(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.seteuid(user)
+
+
+def test_a_file_that_may_not_be_read_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = copied(SMALL, Path("checkpoint"))
+    (folder / "config.json").chmod(0)
+    with as_any_user(tmp_path), pytest.raises(CheckpointError, match=r"Permission ?[dD]enied|PermissionError"):
+        families.load(folder)
 
 
 def test_only_the_repository_must_be_writable(tmp_path: Path) -> None:

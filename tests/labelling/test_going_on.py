@@ -17,9 +17,9 @@ from typing import Any
 import pytest
 
 import labelling
-from labelling import FEW, LEROBOT, BrightnessScorer, PickyScorer
+from labelling import FEW, LEROBOT, BrightnessScorer, Notes, PickyScorer
 from rfm_client import ProgressResult, ServerUnavailableError
-from rfm_client.labelling import DatasetError, LabelOptions, Watch, label, open_dataset
+from rfm_client.labelling import DatasetError, LabelOptions, label, open_dataset
 
 ROOT = LEROBOT / "toy_v30_many"
 FILES = ("rfm_progress.parquet", "reward_signals/rfm.parquet")
@@ -88,21 +88,13 @@ def test_shards_are_put_together_by_a_run_without_one(output: Path, undisturbed:
     assert goes_on(output, undisturbed) == 0
 
 
-class Failures(Watch):
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def failed(self, episode: Any, error: Any) -> None:
-        self.lines.append(f"{episode.name}: {error}")
-
-
 def test_an_episode_that_fails_is_told_and_the_others_go_on(output: Path, undisturbed: list[bytes]) -> None:
-    failures, dataset = Failures(), open_dataset(ROOT)
+    notes, dataset = Notes(), open_dataset(ROOT)
     failing = [episode for episode in dataset.episodes if episode.task == PickyScorer.REFUSED]
     assert failing
-    report = label(dataset, PickyScorer(), LabelOptions(output=output, **FEW), failures)
+    report = label(dataset, PickyScorer(), LabelOptions(output=output, **FEW), notes)
     assert [failure.episode for failure in report.failures] == failing
-    assert sorted(failures.lines) == sorted(f"{e.name}: task: expected another one, got this" for e in failing)
+    assert sorted(notes.failures) == sorted(f"{e.name}: task: expected another one, got this" for e in failing)
     assert (report.files, (output / FILES[0]).exists()) == ([], False)
     assert goes_on(output, undisturbed) == sum(episode.num_frames for episode in failing)
 

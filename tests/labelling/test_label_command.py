@@ -213,7 +213,6 @@ def test_what_the_run_did_not_train_is_told(output: Path) -> None:
 
 
 WRONG = {
-    "episodes": (["--episodes", "5:2"], "episodes: expected numbers and ranges such as 0:100,205, got '5:2'"),
     "a format": (["--format", "csv"], "'--format': expected one of progress, signals, hdf5, got 'csv'"),
     "an option that contradicts": (["--shard", "3/3"], "'--shard': expected i/n with i from 0 to n - 1, got 3/3"),
     "an orientation": (["--orient", "up"], "orient: expected one of none, rotate180, "),

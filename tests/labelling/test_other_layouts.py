@@ -3,16 +3,12 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from PIL import Image
 
-from pictures import numbered
 from rfm_client.labelling import DatasetError, open_dataset
 
 
@@ -59,22 +55,3 @@ def test_a_layout_that_is_not_read_is_named_with_what_to_do(
     with pytest.raises(DatasetError) as refused:
         open_dataset(root / opened)
     assert message.replace("ROOT", str(root)) in str(refused.value)
-
-
-@pytest.mark.parametrize("below", ["", "walk/"])
-def test_the_command_for_pictures_makes_a_video_of_every_picture_in_the_order_of_their_numbers(
-    tmp_path: Path, below: str
-) -> None:
-    if shutil.which("ffmpeg") is None:
-        pytest.skip("ffmpeg is not installed")
-    (tmp_path / below).mkdir(exist_ok=True)
-    for number, frame in enumerate(numbered(12)):
-        Image.fromarray(frame).save(tmp_path / below / f"frame_{number}.png")
-    with pytest.raises(DatasetError) as refused:
-        open_dataset(tmp_path)
-    command = str(refused.value).split("of each episode (")[1].split(") and list the videos")[0]
-    subprocess.run(["bash", "-c", command], check=True, capture_output=True, cwd=tmp_path)
-    subprocess.run(["bash", "-c", "(echo video; ls *.mp4) > tasks.csv"], check=True, cwd=tmp_path)
-    dataset = open_dataset(tmp_path, task="walk")
-    (episode,) = dataset.episodes
-    np.testing.assert_array_equal(list(dataset.frames(episode, "video")), numbered(12))

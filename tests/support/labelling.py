@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, Trajectory
+from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, RewardError, Trajectory
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.labelling import CheckpointFacts, LabelOptions, Scorer, Watch, label, open_dataset
+from rfm_client.labelling import CheckpointFacts, DatasetEpisode, LabelOptions, Scorer, Watch, label, open_dataset
 
 LEROBOT = Path(__file__).parents[1] / "lerobot"
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
@@ -29,11 +29,7 @@ class BrightnessScorer:
     """Progress is how bright the slot's frame is, success how red: what is read can be recomputed by hand."""
 
     def __init__(
-        self,
-        seconds: float = 0.0,
-        digest: str = "brightness",
-        max_frames: int | None = 16,
-        settings: str = "settings",
+        self, seconds: float = 0.0, digest: str = "brightness", max_frames: int | None = 16, settings: str = "settings"
     ) -> None:
         self.seconds = seconds
         self.digest = digest
@@ -82,9 +78,13 @@ class Notes(Watch):
 
     def __init__(self) -> None:
         self.lines: list[str] = []
+        self.failures: list[str] = []
 
     def note(self, text: str) -> None:
         self.lines.append(text)
+
+    def failed(self, episode: DatasetEpisode, error: RewardError) -> None:
+        self.failures.append(f"{episode.name}: {error}")
 
 
 @contextmanager
