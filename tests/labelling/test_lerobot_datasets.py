@@ -75,11 +75,6 @@ def test_every_frame_is_that_of_the_film_in_order_and_every_episode_that_of_the_
         assert (episode.num_frames, episode.first_index) == (len(own), own[0]["index"])
 
 
-def rewrite(film: Path, change: Callable[[list[Any]], list[Any]], fps: Fraction = Fraction(10)) -> None:
-    """Encodes a film anew, of other frames, or of another rate."""
-    encode_here(film, change(whole_film(film)), "libx264", {"crf": "1"}, pixels="yuv444p", rate=fps)
-
-
 @pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
 def test_a_film_may_begin_later_than_its_rows(tmp_path: Path, suffix: str) -> None:
     """Also where time stamps are rounded to a millisecond, as in Matroska."""
@@ -264,7 +259,9 @@ def told(**more: Any) -> Break:
 
 
 def film(change: Callable[[list[Any]], list[Any]], file: str = V21_FILM, fps: Fraction = Fraction(10)) -> Break:
-    return lambda root: rewrite(root / file, change, fps)
+    """A film of other frames, or of another rate."""
+    coded: dict[str, Any] = {"options": {"crf": "1"}, "pixels": "yuv444p", "rate": fps}
+    return lambda root: encode_here(root / file, change(whole_film(root / file)), **coded)
 
 
 END = r"to_timestamp: expected 3\.9000 s for 39 frames, got 3\.7000 s"
