@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,10 +34,9 @@ def free_bytes(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return free
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_a_large_network_goes_where_most_room_is(
-    free_bytes: list[float], dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_large_network_goes_where_most_room_is(free_bytes: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+    dtype = torch.bfloat16
+
     def full() -> tuple[float, float]:
         raise RuntimeError("CUDA error: out of memory")
 
@@ -87,13 +85,12 @@ def test_the_command_says_where_it_compares(tmp_path: Path) -> None:
     assert (refused.exit_code, "device: expected one of cpu" in refused.output) == (1, True)
 
 
-@pytest.mark.parametrize("device", ["cuda", "cuda:x", "gpu", "0"])
-def test_label_refuses_a_device_that_is_not_there(tmp_path: Path, free_bytes: list[float], device: str) -> None:
+def test_label_refuses_a_device_that_is_not_there(free_bytes: list[float]) -> None:
     assert not free_bytes  # no GPU
-    dataset = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "dataset")
-    done = CliRunner().invoke(app, ["label", str(dataset), "--checkpoint", str(SMALL.checkpoint), "--device", device])
+    words = ["label", str(LEROBOT / "toy_v21"), "--checkpoint", str(SMALL.checkpoint), "--device", "0"]
+    done = CliRunner().invoke(app, words)
     assert done.exit_code == 1
-    assert f"rfm: device: expected one of cpu, got {device}: PyTorch " in done.stderr
+    assert "rfm: device: expected one of cpu, got 0: PyTorch " in done.stderr
 
 
 @pytest.mark.gpu

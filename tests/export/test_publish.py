@@ -4,42 +4,36 @@
 from __future__ import annotations
 
 import fcntl
-import json
 import os
 import re
+import resource
 import shutil
-import subprocess
-import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
 import goldens
 import rfm_export
 from commands import REPOSITORY
 from engines import serve_config
-from one_model import BriefServer
 from reference_server import Served
 from rfm import families
 from rfm.checkpoint.content import CheckpointError
-from rfm.launch.endpoints import Endpoints
-from rfm.launch.installation import find_installation
 from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
-from rfm_client import RewardClient
+from rfm_commands.cli import app
 from rfm_export import ExportError
 from rfm_export.publish import alone, read_config, staging
 from rfm_serve import model_processes, wait_for
 from spoilt import WEIGHTS, copied, files_in, weights
-from trajectories import random_trajectory
 
 PLAIN, SMALL = goldens.config("c1_t1_disc10"), goldens.config("legacy_keys_l2")
 FRAMES = goldens.config("enc_c1_t1_disc10")
 NOBODY = 65534
-PATIENCE_S = 60
 
 
 def export(repository: Path, name: str = "rfm", config: goldens.Config = SMALL, checkpoint: Path | None = None) -> int:
@@ -85,48 +79,27 @@ def test_only_the_repository_must_be_writable(tmp_path: Path) -> None:
     shutil.rmtree(folder)
 
 
-# One `rfm export` after the other, each under a limit of file sizes, in a process of their own.
-IN_LITTLE_ROOM = """
-import io, json, resource, sys
-from contextlib import redirect_stderr
-from rfm_commands.cli import main
-checkpoint, repository, *rooms = sys.argv[1:]
-for room in map(int, rooms):
-    resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
-    sys.argv = ["rfm", "export", "--checkpoint", checkpoint, "--repository", repository]
-    status, errors = 0, io.StringIO()
-    try:
-        with redirect_stderr(errors):
-            main()
-    except SystemExit as ended:
-        status = ended.code
-    print(json.dumps([status, errors.getvalue()]))
-"""
-
-
-def test_a_full_disk_is_told_and_changes_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("room", [0, 100, (SMALL.checkpoint / WEIGHTS).stat().st_size // 2])
+def test_a_full_disk_is_told_and_changes_nothing(tmp_path: Path, room: int) -> None:
     """Be it full at once, behind a small file, or in the middle of the weights."""
     repository = tmp_path / "model_repository"
     export(repository)
     before = files_in(tmp_path)
-    rooms = (0, 100, (SMALL.checkpoint / WEIGHTS).stat().st_size // 2)
-    ended = subprocess.run(
-        [sys.executable, "-c", IN_LITTLE_ROOM, *map(str, (SMALL.checkpoint, repository, *rooms))],
-        check=True,
-        stdout=subprocess.PIPE,
-        text=True,
-        timeout=PATIENCE_S,
-    )
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
+    try:
+        words = ["export", "--checkpoint", str(SMALL.checkpoint), "--repository", str(repository)]
+        result = CliRunner().invoke(app, words)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert files_in(tmp_path) == before
     assert not list(tmp_path.rglob(".*"))
-    told = [json.loads(line) for line in ended.stdout.splitlines()]
-    assert [status for status, _ in told] == [1] * len(rooms)
     expected = (
         r"rfm: .*/model_repository: expected room for the exported files, got: .*[Ff]ile too large.*; the versions that "
         r"are served stay as they are; make room there, or name another --repository"
     )
-    for _, errors in told:
-        assert re.fullmatch(expected, errors.splitlines()[-1]), errors
+    assert result.exit_code == 1
+    assert re.fullmatch(expected, result.stderr.splitlines()[-1]), result.stderr
 
 
 @pytest.mark.parametrize(
@@ -134,12 +107,9 @@ def test_a_full_disk_is_told_and_changes_nothing(tmp_path: Path) -> None:
     [
         (
             lambda folder: folder.mkdir(0o555),
-            "that this user may change, got: Permission denied; --repository names an",
+            "this user may change, got: Permission denied; --repository names another",
         ),
-        (
-            lambda folder: folder.write_text(""),
-            "that this user may change, got: File exists; --repository names another",
-        ),
+        (lambda folder: folder.write_text(""), "this user may change, got: File exists; --repository names another"),
         (lambda folder: shutil.copytree(REPOSITORY / "rfm", folder), "got a model of one: --repository ."),
     ],
     ids=["read-only", "a file", "a model"],
@@ -154,25 +124,23 @@ def test_an_export_into_what_takes_none_is_told(
         raise AssertionError("it may be changed")
 
 
-@pytest.mark.parametrize("place", [".", "rfm", "another"])
-def test_two_exports_at_a_time_are_one_too_many_and_the_next_removes_what_a_killed_one_left(
-    tmp_path: Path, place: str
-) -> None:
+def test_two_exports_at_a_time_are_one_too_many_and_the_next_removes_what_a_killed_one_left(tmp_path: Path) -> None:
     repository = tmp_path / "model_repository"
     for name in ("another", "rfm"):
         export(repository, name)
-    left = repository / place / ".export-killed"
-    (left / "rfm").mkdir(parents=True)
+    left = [repository / place / ".export-killed" for place in (".", "rfm", "another")]
+    for folder in left:
+        (folder / "rfm").mkdir(parents=True)
     descriptor = os.open(repository, os.O_RDONLY)
     fcntl.flock(descriptor, fcntl.LOCK_EX)
     try:
         with pytest.raises(ExportError, match="model_repository: expected no other export or rollout at work, got one"):
             export(repository)
-        assert left.exists()  # it may be the other's
+        assert all(folder.exists() for folder in left)  # they may be the other's
     finally:
         os.close(descriptor)
     assert export(repository) == 2
-    assert not left.exists()
+    assert not any(folder.exists() for folder in left)
 
 
 def check_loadable(repository: Path) -> None:
@@ -190,92 +158,65 @@ def check_loadable(repository: Path) -> None:
             assert step.model_version in served[step.model_name]
 
 
-class Killed(BaseException):
-    """In place of kill -9 between two operations on the file system."""
-
-
-@pytest.mark.parametrize("before", [0, 1], ids=["first export", "second export"])
+@pytest.mark.parametrize(("num_before", "fewest"), [(0, 3), (1, 8)], ids=["first export", "second export"])
 def test_an_export_that_dies_at_any_moment_leaves_a_repository_that_loads(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, num_before: int, fewest: int
 ) -> None:
-    died, survived = True, 0
-    exported = tmp_path / "exported"
-    exported.mkdir()
-    for _ in range(before):
-        export(exported, config=FRAMES)
-    while died:
-        repository = shutil.copytree(exported, tmp_path / str(survived) / "model_repository")
-        remaining = survived
+    """Between any two operations of the file system on the repository: what is there then, a kill would leave.
 
-        def counted(original: Any, repository: Path = repository) -> Any:
-            def move(self: Path, target: Path) -> Path:
-                nonlocal remaining
-                if repository in Path(target).parents:
-                    if remaining == 0:
-                        raise Killed
-                    remaining -= 1
-                return Path(original(self, target))
+    At first those move three folders; later three versions, warm-up files and five configurations.
+    """
+    repository = tmp_path / "model_repository"
+    for _ in range(num_before):
+        export(repository, config=FRAMES)
+    count = 0
 
-            return move
+    def checked(original: Any) -> Any:
+        def move(self: Path, target: Path) -> Path:
+            nonlocal count
+            if repository in Path(target).parents:
+                check_loadable(repository)
+                count += 1
+            return Path(original(self, target))
 
-        with monkeypatch.context() as patch:
-            patch.setattr(Path, "rename", counted(Path.rename))
-            patch.setattr(Path, "replace", counted(Path.replace))
-            try:
-                export(repository, config=FRAMES)
-                died = False
-            except Killed:
-                survived += 1
-        check_loadable(repository)
-    assert survived >= (3, 8)[before]  # three folders; and three versions, warm-up files, five configurations
+        return move
 
-
-class Polls(BriefServer):
-    """As an operator may run Triton without ``rfm serve``: each folder of the repository is a model, also later."""
-
-    def _arguments(self, models: Sequence[str]) -> list[str]:
-        told = [argument for argument in super()._arguments(models) if not argument.startswith("--load-model")]
-        return [*(argument.replace("explicit", "poll") for argument in told), "--repository-poll-secs=1"]
+    monkeypatch.setattr(Path, "rename", checked(Path.rename))
+    monkeypatch.setattr(Path, "replace", checked(Path.replace))
+    export(repository, config=FRAMES)
+    check_loadable(repository)
+    assert count >= fewest
 
 
 @pytest.mark.triton
-@pytest.mark.slow
-def test_triton_does_not_see_what_is_staged(tmp_path: Path) -> None:
+def test_triton_does_not_see_what_is_staged(served: Served) -> None:
     """Nor what an export left that was killed."""
-    repository = tmp_path / "repository"
-    export(repository, config=PLAIN)
-    with staging(repository, ["rfm"]) as scratch:
-        shutil.copytree(repository / "rfm", scratch / "rfm", ignore=shutil.ignore_patterns(scratch.name))
-        shutil.copy(repository / "rfm" / "config.pbtxt", scratch)
-        key = "a-key-that-only-tests-know"
-        with (
-            (tmp_path / "log").open("wb") as log,
-            Polls(repository, Endpoints.free(), find_installation(), log=log, admin_key=key) as server,
-            RepositoryApi(server.endpoints.grpc_url, key) as api,
-            RewardClient(server.endpoints.grpc_url) as client,
-        ):
-            assert [(entry.name, entry.version, entry.state) for entry in api.index()] == [("rfm", 1, "READY")]
-            client.progress(random_trajectory(0, 3))
+    with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
+        before = {entry.name for entry in api.index()}
+        with staging(served.repository, ["rfm"]) as scratch:
+            shutil.copytree(served.repository / "rfm", scratch / "rfm", ignore=shutil.ignore_patterns(scratch.name))
+            shutil.copy(served.repository / "rfm" / "config.pbtxt", scratch)
+            assert {entry.name for entry in api.index()} == before
+            shutil.copytree(served.repository / "rfm", served.repository / "seen")
+            assert {entry.name for entry in api.index()} == {*before, "seen"}  # or this test would see nothing
+            shutil.rmtree(served.repository / "seen")
 
 
 @pytest.mark.triton
 def test_an_export_changes_no_model_of_another_name(served: Served) -> None:
     """One that is loaded again has the processes that it had, since its files are what they were."""
 
-    def living() -> list[int]:
-        """As soon as those of one load alone are alive."""
-        wait_for(lambda: len(model_processes(served.server.pid, "kept")) == 1)
-        return model_processes(served.server.pid, "kept")
-
     export(served.repository, "kept")
     with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
-        for _ in range(2):  # the first load after the start is a new one anyway
+        processes = []
+        for name in ("kept", "kept", "added"):  # the first load after the start is a new one anyway
+            if name == "added":
+                export(served.repository, name)
             api.load("kept")
-        before = living()
-        export(served.repository, "added")
-        api.load("kept")
-        assert living() == before
+            wait_for(lambda: len(model_processes(served.server.pid, "kept")) == 1)
+            processes.append(model_processes(served.server.pid, "kept"))
         api.unload("kept")
+    assert processes[-1] == processes[-2]
 
 
 @pytest.mark.triton

@@ -10,22 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pyarrow import parquet
 
-from labelling import LEROBOT, BrightnessScorer, absent, picky, slow
-from rfm.launch.process import Endpoints
-from rfm_client import ProgressResult, RewardClient, RewardError
+from labelling import FEW, LEROBOT, BrightnessScorer, picky, slow
+from rfm_client import ProgressResult, RewardError
 from rfm_client.data.orientation import Orient
-from rfm_client.labelling import (
-    ClientScorer,
-    LabelOptions,
-    RayOptions,
-    Scorer,
-    Watch,
-    label,
-    label_with_ray,
-    open_dataset,
-)
+from rfm_client.labelling import LabelOptions, RayOptions, Scorer, Watch, label, label_with_ray, open_dataset
 from rfm_client.labelling.label import plan_labels
 from rfm_client.labelling.ray_engine import EpisodeActor, RayJob
 
@@ -34,12 +23,6 @@ pytestmark = pytest.mark.filterwarnings(
 )
 
 ROOT = LEROBOT / "toy_v30_many"
-FILES = ("rfm_progress.parquet", "reward_signals/rfm.parquet")
-SUPPORT = Path(__file__).parents[1] / "support"
-
-
-def contents(output: Path) -> list[bytes]:
-    return [(output / name).read_bytes() for name in FILES]
 
 
 class OpenScorer(BrightnessScorer):
@@ -66,7 +49,7 @@ def test_an_actor_opens_the_dataset_as_it_is_told_and_its_scorer_for_as_long_as_
         scorer.is_open = False
 
     dataset = open_dataset(ROOT, **told)  # type: ignore[arg-type]
-    plan = plan_labels(dataset, scorer, LabelOptions(output=output, limit=3, cameras=(dataset.cameras[0],)))
+    plan = plan_labels(dataset, scorer, LabelOptions(output=output, limit=3, **FEW))
     actor = EpisodeActor(RayJob(str(ROOT), told, connect, plan, str(output / "parts"), workers=1))
     assert actor({"places": [[0, 2]]}) == {"place": [0, 2], "reason": ["", ""]}
     assert actor({"places": [[1]]}) == {"place": [1], "reason": [""]}
@@ -74,41 +57,25 @@ def test_an_actor_opens_the_dataset_as_it_is_told_and_its_scorer_for_as_long_as_
     del actor
     assert not scorer.is_open
     assert scorer.tasks == {"juggle"}
-    stored = list(open_dataset(ROOT).frames(dataset.episodes[0], dataset.cameras[0]))
+    stored = list(open_dataset(ROOT).frames(dataset.episodes[0], plan.recipe.cameras[0]))
     assert any(np.array_equal(frame, np.rot90(stored[-1], -1)) for frame in scorer.seen)
 
 
-@pytest.fixture
-def undisturbed(tmp_path: Path) -> list[bytes]:
-    folder = tmp_path / "undisturbed"
-    folder.mkdir()
-    label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(output=folder))
-    return contents(folder)
-
-
-@pytest.fixture
-def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+@pytest.mark.slow
+def test_a_cluster_goes_on_without_a_node_that_is_killed_and_one_machine_with_what_it_has_left(
+    output: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import ray
     from ray.cluster_utils import Cluster
 
-    monkeypatch.setenv("PYTHONPATH", str(SUPPORT))  # where actors find the scorer
+    support = Path(__file__).parents[1] / "support"
+    monkeypatch.setenv("PYTHONPATH", str(support))  # where actors find the scorer
     monkeypatch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")  # its thread would outlive the test
-    cluster = Cluster(
-        initialize_head=True, head_node_args={"num_cpus": 2, "object_store_memory": 10**8, "include_dashboard": False}
-    )
-    cluster.add_node(num_cpus=2, object_store_memory=10**8)
+    node = {"num_cpus": 2, "object_store_memory": 10**8}
+    cluster = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
+    killed = cluster.add_node(**node)
     ray.init(address=cluster.address, log_to_driver=False)
-    yield cluster
-    ray.shutdown()
-    cluster.shutdown()
-
-
-@pytest.mark.slow
-def test_a_cluster_goes_on_without_a_node_that_is_killed_and_writes_what_one_process_writes(
-    cluster: Any, output: Path, undisturbed: list[bytes]
-) -> None:
-    node = cluster.add_node(num_cpus=2, object_store_memory=10**8)
 
     class Killing(Watch):
         count = 0
@@ -116,44 +83,22 @@ def test_a_cluster_goes_on_without_a_node_that_is_killed_and_writes_what_one_pro
         def scored(self, episode: Any) -> None:
             self.count += 1
             if self.count == 2:
-                cluster.remove_node(node, allow_graceful=False)
+                cluster.remove_node(killed, allow_graceful=False)
 
-    watch = Killing()
-    options = LabelOptions(output=output, workers=1)
-    report = label_with_ray(str(ROOT), slow, options, watch, ray=RayOptions(cluster.address, actors=3))
-    assert (report.failures, watch.count) == ([], 10)
-    assert contents(output) == undisturbed
-
-
-@pytest.mark.slow
-def test_one_machine_goes_on_with_what_a_cluster_has_left(cluster: Any, output: Path, undisturbed: list[bytes]) -> None:
-    options, on = LabelOptions(output=output), RayOptions(cluster.address, actors=2)
-    report = label_with_ray(str(ROOT), absent, options, ray=on)
-    assert [str(failure.error) for failure in report.failures] == ["no server"] * 10
-    report = label_with_ray(str(ROOT), picky, options, ray=on)
+    by_cluster, by_both, alone = ({**FEW, "output": output / name} for name in ("cluster", "both", "alone"))
+    try:
+        watch, on = Killing(), RayOptions(cluster.address, actors=2)
+        report = label_with_ray(str(ROOT), slow, LabelOptions(**by_cluster, workers=1), watch, ray=on)
+        assert (report.failures, watch.count) == ([], 10)
+        report = label_with_ray(str(ROOT), picky, LabelOptions(**by_both), ray=RayOptions(cluster.address))
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
     assert report.files == []
     assert {str(failure.error) for failure in report.failures} == {"task: expected another one, got this"}
     rest = BrightnessScorer()
-    label(open_dataset(ROOT), rest, options)
-    assert rest.num_samples == 2 * sum(failure.episode.num_frames for failure in report.failures)
-    assert contents(output) == undisturbed
-
-
-@pytest.mark.triton
-@pytest.mark.slow
-def test_actors_ask_a_server_for_all_of_their_episodes(cluster: Any, output: Path, demo_server: Endpoints) -> None:
-    url = demo_server.grpc_url
-
-    @contextmanager
-    def connect() -> Iterator[Scorer]:
-        with RewardClient(url) as client:
-            yield ClientScorer(client)
-
-    (output / "one").mkdir()
-    options = LabelOptions(output=output, limit=4, frames=4, workers=1)
-    report = label_with_ray(str(ROOT), connect, options, ray=RayOptions(cluster.address, actors=2))
-    assert report.failures == []
-    with connect() as scorer:
-        label(open_dataset(ROOT), scorer, LabelOptions(output=output / "one", limit=4, frames=4))
-    of_cluster, of_one = (parquet.read_table(folder / FILES[0]) for folder in (output, output / "one"))
-    np.testing.assert_allclose(of_cluster["progress_sparse"], of_one["progress_sparse"], rtol=0, atol=1e-5)
+    label(open_dataset(ROOT), rest, LabelOptions(**by_both))
+    assert rest.num_samples == sum(failure.episode.num_frames for failure in report.failures)
+    label(open_dataset(ROOT), BrightnessScorer(), LabelOptions(**alone))
+    for name in ("rfm_progress.parquet", "reward_signals/rfm.parquet"):
+        assert len({(output / folder / name).read_bytes() for folder in ("cluster", "both", "alone")}) == 1

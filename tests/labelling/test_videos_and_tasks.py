@@ -52,8 +52,7 @@ def test_a_folder_of_videos_is_read_in_the_order_of_its_table(videos: Path, name
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        ("tasks.csv", '\ufeffvideo,task\r\nb.mp4,"put the block in the bowl, then close the lid"\r\n'),
-        ("tasks.csv", 'video,task\nb.mp4," put the block in the bowl, then close the lid "\n'),
+        ("tasks.csv", '\ufeffvideo,task\r\nb.mp4," put the block in the bowl, then close the lid "\r\n'),
         ("tasks.json", '{"b.mp4": "put the block in the bowl, then close the lid\\n"}'),
     ],
 )
@@ -75,11 +74,6 @@ REFUSED = {
         "video,task\nday/a.mp4,a\nb.mp4,put the block in the bowl, then close the lid\n",
         "tasks.csv: line 3: expected 2 cells (text with a comma in quotes), got 3",
     ),
-    "a row that ends early": (
-        "tasks.csv",
-        "video,note,task\nb.mp4,blue\n",
-        "tasks.csv: line 2: expected 3 cells (text with a comma in quotes), got 2",
-    ),
     "a video that is missing": ("tasks.json", '{"c.mp4": "a"}', "c.mp4: expected a video file, got none"),
     "no JSON": ("tasks.json", "{", "tasks.json: expected JSON, got "),
 }
@@ -94,15 +88,14 @@ def test_a_table_of_videos_that_is_wrong_is_refused(videos: Path, name: str | No
     assert message in str(caught.value)
 
 
-def lerobot(folder: Path, *tasks: str) -> Path:
-    """A dataset whose first episodes have these tasks."""
+def lerobot(folder: Path, task: str) -> Path:
+    """A dataset whose tasks are this one."""
     root = shutil.copytree(LEROBOT / "toy_v21", folder / "toy")
-    lines = (root / "meta" / "tasks.jsonl").read_text().splitlines()
-    lines[: len(tasks)] = [json.dumps({"task_index": index, "task": task}) for index, task in enumerate(tasks)]
+    lines = [json.dumps({"task_index": index, "task": task}) for index in range(6)]
     (root / "meta" / "tasks.jsonl").write_text("\n".join(lines))
-    for file in (root / "meta").glob("episodes.jsonl"):
-        episodes = [json.loads(line) for line in file.read_text().splitlines()]
-        file.write_text("\n".join(json.dumps({**episode, "tasks": []}) for episode in episodes))
+    episodes = (root / "meta" / "episodes.jsonl").read_text().splitlines()
+    lines = [json.dumps({**json.loads(line), "tasks": []}) for line in episodes]
+    (root / "meta" / "episodes.jsonl").write_text("\n".join(lines))
     return root
 
 
@@ -113,46 +106,39 @@ def hdf5(folder: Path, task: str) -> Path:
     return folder / "demos.hdf5"
 
 
-def table(folder: Path, text: str) -> Path:
-    for name in ("a.mp4", "b.mp4"):
-        write_video(folder / name, numbered(3))
-    (folder / "tasks.csv").write_text(text)
+def table(folder: Path, task: str) -> Path:
+    write_video(folder / "a.mp4", numbered(3))
+    (folder / "tasks.csv").write_text(f"video,task\na.mp4,{task}\n")
     return folder
 
 
-WITH_TASKS: dict[str, Callable[[Path], Path]] = {
-    "LeRobot": lambda folder: lerobot(folder, "stack the cups"),
-    "HDF5": lambda folder: hdf5(folder, "stack the cups"),
-    "videos": lambda folder: table(folder, "video,task\na.mp4,stack the cups\nb.mp4,stack the cups\n"),
-}
-TOY_TASKS = [episode.task for episode in open_dataset(LEROBOT / "toy_v21").episodes]
-WITHOUT_TASKS: dict[str, tuple[Callable[[Path], Path], list[str]]] = {
-    "LeRobot": (
-        lambda folder: lerobot(folder, " "),
-        ["open the box" if task == TOY_TASKS[0] else task for task in TOY_TASKS],
-    ),
-    "HDF5": (lambda folder: hdf5(folder, ""), ["open the box"]),
-    "videos, an empty cell": (
-        lambda folder: table(folder, "video,task\na.mp4,\nb.mp4,stack the cups\n"),
-        ["open the box", "stack the cups"],
-    ),
-    "videos, no column": (lambda folder: table(folder, "video\na.mp4\nb.mp4\n"), ["open the box"] * 2),
-}
+KINDS: dict[str, Callable[[Path, str], Path]] = {"LeRobot": lerobot, "HDF5": hdf5, "videos": table}
 
 
-@pytest.mark.parametrize(("make", "expected"), WITHOUT_TASKS.values(), ids=WITHOUT_TASKS)
-def test_a_task_fills_in_where_episodes_have_none(
-    tmp_path: Path, make: Callable[[Path], Path], expected: list[str]
-) -> None:
-    source = make(tmp_path)
+@pytest.mark.parametrize("make", KINDS.values(), ids=KINDS)
+def test_a_task_fills_in_where_episodes_have_none(tmp_path: Path, make: Callable[[Path, str], Path]) -> None:
+    source = make(tmp_path, "")
     with pytest.raises(DatasetError, match="--task"):
         _ = open_dataset(source).episodes
-    assert [episode.task for episode in open_dataset(source, task="open the box").episodes] == expected
+    assert {episode.task for episode in open_dataset(source, task="open the box").episodes} == {"open the box"}
 
 
-@pytest.mark.parametrize("make", WITH_TASKS.values(), ids=WITH_TASKS)
-def test_a_task_replaces_those_of_episodes_only_on_request(tmp_path: Path, make: Callable[[Path], Path]) -> None:
-    source = make(tmp_path)
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("video,task\nb.mp4,\nday/a.mp4,stack the cups\n", ["open the box", "stack the cups"]),
+        ("video\nb.mp4\nday/a.mp4\n", ["open the box"] * 2),
+    ],
+    ids=["an empty cell", "no column"],
+)
+def test_a_task_fills_in_where_a_table_has_none(videos: Path, text: str, expected: list[str]) -> None:
+    (videos / "tasks.csv").write_text(text)
+    assert [episode.task for episode in open_dataset(videos, task="open the box").episodes] == expected
+
+
+@pytest.mark.parametrize("make", KINDS.values(), ids=KINDS)
+def test_a_task_replaces_those_of_episodes_only_on_request(tmp_path: Path, make: Callable[[Path, str], Path]) -> None:
+    source = make(tmp_path, "stack the cups")
     with pytest.raises(DatasetError) as refused:
         _ = open_dataset(source, task="open the box").episodes
     assert str(refused.value) == (
@@ -161,9 +147,5 @@ def test_a_task_replaces_those_of_episodes_only_on_request(tmp_path: Path, make:
     )
     told = {episode.task for episode in open_dataset(source, task="open the box", override_task=True).episodes}
     assert told == {"open the box"}
-
-
-@pytest.mark.parametrize(("task", "got"), [(None, "none"), ("", "''"), (" ", "' '")])
-def test_a_task_that_replaces_others_is_a_sentence(videos: Path, task: str | None, got: str) -> None:
-    with pytest.raises(DatasetError, match=f"^task: expected a sentence, got {got}$"):
-        open_dataset(videos, task=task, override_task=True)
+    with pytest.raises(DatasetError, match=r"^task: expected a sentence, got none$"):
+        open_dataset(source, override_task=True)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Labelling without a server: a scorer of a few lines, and a process that labels with it and may be killed.
 
-python tests/support/labelling.py DATASET OUTPUT [SECONDS_A_REQUEST [WORKERS [SHARD]]]
+python tests/support/labelling.py DATASET OUTPUT SECONDS_A_REQUEST
 """
 
 from __future__ import annotations
@@ -12,26 +12,24 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from rfm_client import InvalidSampleError, ProgressResult, ProgressSample, RewardError, Trajectory
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.labelling import CheckpointFacts, LabelOptions, Scorer, Watch, label, open_dataset
-from rfm_client.labelling.options import parse_shard
+from rfm_client.labelling import CheckpointFacts, DatasetEpisode, LabelOptions, Scorer, Watch, label, open_dataset
 
 LEROBOT = Path(__file__).parents[1] / "lerobot"
+FRONT, WRIST = "observation.images.front", "observation.images.wrist"
+FEW: dict[str, Any] = {"cameras": (WRIST,), "frames": 2}  # options with which a run takes a moment
 
 
 class BrightnessScorer:
     """Progress is how bright the slot's frame is, success how red: what is read can be recomputed by hand."""
 
     def __init__(
-        self,
-        seconds: float = 0.0,
-        digest: str = "brightness",
-        max_frames: int | None = 16,
-        settings: str = "settings",
+        self, seconds: float = 0.0, digest: str = "brightness", max_frames: int | None = 16, settings: str = "settings"
     ) -> None:
         self.seconds = seconds
         self.digest = digest
@@ -65,17 +63,14 @@ class PickyScorer(BrightnessScorer):
 
     REFUSED = "put the red block on the plate"
 
+    def __init__(self, refused: str = REFUSED) -> None:
+        super().__init__()
+        self.refused = refused
+
     def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
-        if samples[0].trajectory.task == self.REFUSED:
+        if samples[0].trajectory.task == self.refused:
             raise InvalidSampleError.at("task", "another one", "this")
         return super().evaluate(samples)
-
-
-class AbsentScorer(BrightnessScorer):
-    """Fails for every sample."""
-
-    def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
-        raise RewardError("no server")
 
 
 class Notes(Watch):
@@ -83,9 +78,13 @@ class Notes(Watch):
 
     def __init__(self) -> None:
         self.lines: list[str] = []
+        self.failures: list[str] = []
 
     def note(self, text: str) -> None:
         self.lines.append(text)
+
+    def failed(self, episode: DatasetEpisode, error: RewardError) -> None:
+        self.failures.append(f"{episode.name}: {error}")
 
 
 @contextmanager
@@ -98,11 +97,6 @@ def picky() -> Iterator[Scorer]:
     yield PickyScorer()
 
 
-@contextmanager
-def absent() -> Iterator[Scorer]:
-    yield AbsentScorer()
-
-
 def brightness(frames: UInt8Array) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
     return np.array([frame.mean() / 255 for frame in frames], np.float32)
 
@@ -112,7 +106,5 @@ def redness(frames: UInt8Array) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
 
 
 if __name__ == "__main__":
-    source, output, *more = sys.argv[1:]
-    seconds, workers, shard = [*more, "0", "2", ""][:1], [*more[1:], "2"][:1], more[2:3]
-    options = LabelOptions(output=Path(output), workers=int(workers[0]), shard=parse_shard(shard[0]) if shard else None)
-    label(open_dataset(source), BrightnessScorer(float(seconds[0])), options)
+    source, output, seconds = sys.argv[1:]
+    label(open_dataset(source), BrightnessScorer(float(seconds)), LabelOptions(output=Path(output), workers=2, **FEW))
