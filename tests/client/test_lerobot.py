@@ -38,7 +38,6 @@ INSTEAD = "label the dataset with rfm-client label, or name the part of the file
     [
         ("v3.0", V30_FILM, "10 episodes"),
         ("v3.1", "films/000.mp4", "some of the dataset's 10 episodes"),
-        ("v4.0", "films/000.mp4", "some of the dataset's 10 episodes"),
         (3, "films/000.mp4", "some of the dataset's 10 episodes"),
     ],
 )
@@ -53,13 +52,6 @@ def test_a_lerobot_file_that_may_hold_several_episodes_is_refused(
         assert str(caught.value).startswith(told)
         assert f"{held}: {INSTEAD}" in str(caught.value)
         assert str(caught.value).endswith(f"({film})")
-
-
-def test_of_several_lerobot_v3_files_none_is_told_to_hold_all_episodes(tmp_path: Path) -> None:
-    film = lerobot_dataset(tmp_path, "v3.0", V30_FILM, 10)
-    film.with_name("file-001.mp4").write_bytes(film.read_bytes())
-    with pytest.raises(InvalidSampleError, match=r"v3\.0 file that holds some of the dataset's 10 episodes: "):
-        read_video(film)
 
 
 def test_a_part_of_a_lerobot_v3_file_is_read(tmp_path: Path) -> None:

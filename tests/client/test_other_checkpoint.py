@@ -4,15 +4,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 
 from rfm_client import InvalidSampleError, RewardClient
 from rfm_client.contract import FrameSize
-from rfm_client.gym import RewardModelWrapper, RewardOptions
 from shelves import V1, V2, Shelf
 
 SHORT, LONG = replace(V1, max_frames=4), replace(V2, max_frames=8)
@@ -46,27 +43,3 @@ def test_frames_are_resized_as_the_checkpoint_reads_them_by_now() -> None:
         episode.add(FRAME)
     assert shelf.shapes[-1] == (1, 8, 16, 16, 3)
     assert {shape[2:4] for shape in shelf.shapes[:-1]} == {(8, 8)}
-
-
-class Still(gymnasium.Env[Any, Any]):
-    """One whose picture never changes."""
-
-    observation_space = gymnasium.spaces.Box(0, 255, FRAME.shape, np.uint8)
-    action_space = gymnasium.spaces.Discrete(1)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        return FRAME, {}
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        return FRAME, 0.0, False, False, {}
-
-
-def test_a_wrapper_shows_as_many_frames_as_the_checkpoint_was_trained_on_by_now() -> None:
-    shelf = Shelf(SHORT, LONG, after=2, has_encoder=False)
-    with RewardClient("", transports=[shelf]) as client:
-        env = RewardModelWrapper(Still(), client, TASK, RewardOptions(frames_from=lambda seen: seen))
-        env.reset()
-        for _ in range(3):
-            env.step(0)
-        assert shelf.shapes[0][1] == 4
-        assert shelf.shapes[-1][1] == 8

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,6 @@ import pytest
 import rerun
 from PIL import Image
 
-import clip
 from client_commands import TASK, invoke
 from rfm.launch.process import Endpoints
 from rfm_client import FrameScores
@@ -28,8 +28,7 @@ NS_PER_S = 1e9
 
 
 def entities(file: Path) -> set[str]:
-    schema = rerun.dataframe.load_recording(file).schema()
-    return {column.entity_path for column in schema.component_columns()}
+    return {column.entity_path for column in rerun.dataframe.load_recording(file).schema().component_columns()}
 
 
 def logged(file: Path, timeline: str, entity: str, component: str) -> tuple[list[Any], list[Any]]:
@@ -44,10 +43,8 @@ def logged(file: Path, timeline: str, entity: str, component: str) -> tuple[list
 @pytest.mark.triton
 def test_score_records_frames_and_curves_on_one_timeline(demo_server: Endpoints, video: Path, tmp_path: Path) -> None:
     other, seen = tmp_path / "other clip.mp4", tmp_path / "seen.npz"
-    clip.write(other)
-    random = np.random.default_rng(0)
-    embeddings = {"video_embeddings": random.random((5, 64)), "text_embedding": random.random(32)}
-    np.savez(seen, **{name: array.astype(np.float32) for name, array in embeddings.items()})
+    shutil.copy(video, other)
+    np.savez(seen, video_embeddings=np.ones((5, 64), np.float32), text_embedding=np.ones(32, np.float32))
     out, target = tmp_path / "out.rrd", tmp_path / "scores.json"
     result = invoke(
         *("score", video, other, "missing.mp4", seen, "--task", TASK, "--fps", 10, "--max-frames", 7),
@@ -103,7 +100,6 @@ def test_a_missing_package_is_told_with_the_command_that_installs_it(
     result = invoke(*words, "--rrd", tmp_path / "out.rrd")
     assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
     assert result.stderr == 'rfm-client: recordings need rerun-sdk: pip install "./client[rerun]"\n'
-    assert invoke(*words).exit_code == ExitCode.OK
 
 
 def test_a_recording_has_the_ending_that_the_viewer_opens(video: Path, tmp_path: Path) -> None:
