@@ -89,22 +89,23 @@ def calling(client: RewardClient, threads: int = 2) -> Iterator[Outcomes]:
 def test_calls_survive_restarts_and_kills_of_servers(tmp_path: Path, repository: Path) -> None:
     both = [Endpoints.free(), Endpoints.free()]
     repositories = [repository, shutil.copytree(repository, tmp_path / "other" / "model_repository")]
-    with ExitStack() as stack:
+    with ExitStack() as started, ExitStack() as callers:  # which end while there are servers
         first, second = (
-            stack.enter_context(OneModelServer(*server)) for server in zip(repositories, both, strict=True)
+            started.enter_context(OneModelServer(*server)) for server in zip(repositories, both, strict=True)
         )
-        outcomes, clients = [], []
+        outcomes: list[Outcomes] = []
+        clients: list[RewardClient] = []
         for protocol in ("grpc", "http"):
             urls = [url_of(endpoints, protocol) for endpoints in both]
             for servers in (urls[:1], urls):
-                client = stack.enter_context(RewardClient(servers, timeout_s=PATIENCE_S))
-                outcomes.append(stack.enter_context(calling(client)))
+                client = callers.enter_context(RewardClient(servers, timeout_s=PATIENCE_S))
+                outcomes.append(callers.enter_context(calling(client)))
                 clients.append(client)
-        sharing = stack.enter_context(RewardClient(both[0].grpc_url, timeout_s=PATIENCE_S, shared_memory=True))
+        sharing = callers.enter_context(RewardClient(both[0].grpc_url, timeout_s=PATIENCE_S, shared_memory=True))
         expected, shared = clients[0].progress(trajectory(0)), sharing.progress(heavy(), frame_steps=2)
         wait_for(lambda: all(answered(endpoints) for endpoints in both))  # the load is shared
         first.stop()
-        stack.enter_context(OneModelServer(repositories[0], both[0]))
+        started.enter_context(OneModelServer(repositories[0], both[0]))
         for each in outcomes:
             each.wait_for(ProgressResult)
         assert_same(sharing.progress(heavy(), frame_steps=2), shared)
@@ -112,7 +113,7 @@ def test_calls_survive_restarts_and_kills_of_servers(tmp_path: Path, repository:
         second.kill()
         for each in outcomes:
             each.wait_for(ProgressResult)
-        stack.enter_context(OneModelServer(repositories[1], both[1]))
+        started.enter_context(OneModelServer(repositories[1], both[1]))
         wait_for(lambda: answered(both[1]) > 0)  # it is asked again
         assert [each.errors for each in outcomes] == [[]] * len(outcomes)
         for client in clients:
@@ -190,7 +191,8 @@ def test_a_full_queue_is_waited_for(repository: Path) -> None:
 def nothing_shared_is_left(demo_server: Endpoints) -> Iterator[None]:
     before = ours_in_dev_shm(), regions(demo_server)
     yield
-    assert (ours_in_dev_shm(), regions(demo_server)) == before
+    assert ours_in_dev_shm() <= before[0]
+    assert regions(demo_server) <= before[1]
 
 
 @pytest.mark.usefixtures("nothing_shared_is_left")
@@ -225,7 +227,7 @@ def test_memory_of_cancelled_calls_never_mixes_with_that_of_others(demo_server: 
 def test_memory_of_a_call_at_work_is_given_back_when_the_client_closes(served: Served, protocol: str) -> None:
     """Triton refuses to unmap it while the request uses it, and does not do so later by itself."""
     with RewardClient(served.url(protocol), model=MODEL, shared_memory=True) as client:
-        scored = [client.submit(sample) for sample in plug()]
+        scored = [client.submit(sample) for sample in plug()[:4]]
         wait_until_at_work(MODEL)
         for future in scored:
             future.cancel()

@@ -14,16 +14,14 @@ import sys
 import sysconfig
 import venv
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from contextlib import closing
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cloudpickle
 import gymnasium
-import numpy as np
 import pytest
 
 from mixtures import MODEL, assert_same, plug
@@ -31,15 +29,11 @@ from paths import ROOT
 from reference_server import Served
 from rfm_client import (
     AsyncRewardClient,
-    InferenceFailedError,
     ProgressResult,
     ProgressSample,
     RewardClient,
 )
-from rfm_client.contract import wire
 from rfm_client.gym import RewardModelWrapper
-from rfm_client.transport.access import Access
-from rfm_client.transport.calls import Answer, GrpcTransport
 from trajectories import random_trajectory
 
 
@@ -125,31 +119,6 @@ def test_an_async_client_in_a_second_event_loop_says_so(served: Served) -> None:
         first.run_until_complete(client.close())
 
 
-def test_submitting_while_it_is_closed_leaves_no_future_open(served: Served) -> None:
-    """Over HTTP, where closing cancels nothing on the server: see ``Served.revive``."""
-    for _ in range(10):
-        client = served.client("http")
-        futures: list[Future[ProgressResult]] = []
-
-        def submit(client: RewardClient = client, futures: list[Future[ProgressResult]] = futures) -> None:
-            with pytest.raises(RuntimeError, match="is closed"):
-                while True:
-                    futures.append(client.submit(ProgressSample(random_trajectory(0, 1))))
-
-        with ThreadPoolExecutor(2) as pool:
-            submitting = [pool.submit(submit) for _ in range(2)]
-            client.close()
-            for thread in submitting:
-                thread.result()
-        assert all(future.done() for future in futures)
-
-
-def test_what_makes_the_samples_may_ask_the_client(served: Served) -> None:
-    with served.client("grpc") as client:
-        samples = (ProgressSample(random_trajectory(0, 2)) for _ in range(2) if client.is_ready())
-        assert len(client.evaluate(samples)) == 2
-
-
 def test_a_call_in_a_future_s_callback_is_refused_rather_than_waiting_for_itself(served: Served) -> None:
     told: Future[str] = Future()
     with served.client("grpc") as client:
@@ -172,25 +141,6 @@ def test_a_future_keeps_its_client_and_its_arrays(served: Served) -> None:
         trajectory.positions[:] = 0
         assert_same(future.result(), expected)
     assert served.client("grpc").submit(ProgressSample(random_trajectory(0, 2))).result().last_progress > 0
-
-
-def test_a_score_that_is_missing_fails_alone(served: Served) -> None:
-    class Losing(GrpcTransport):
-        """A real transport that loses the progress of one sample in answers to several."""
-
-        async def infer(self, model: str, inputs: wire.Tensors, *rest: Any, **options: Any) -> Answer:
-            answer = await super().infer(model, inputs, *rest, **options)
-            lost = inputs[wire.VIDEO_EMBEDDINGS].sum(axis=(1, 2)) == marked
-            progress = np.where(lost[:, None], np.nan, answer.tensors[wire.PROGRESS])
-            return replace(answer, tensors={**answer.tensors, wire.PROGRESS: progress})
-
-    url = served.url("grpc")
-    samples = [ProgressSample(random_trajectory(seed, 3)) for seed in range(4)]
-    marked = wire.encode_samples(samples[2:3])[wire.VIDEO_EMBEDDINGS].sum(axis=(1, 2))[0]
-    transport = Losing(url, Access(), shared_memory=False)
-    with RewardClient("", transports=[transport], model=MODEL) as client:
-        outcomes = client.evaluate(samples, return_errors=True)
-    assert [type(outcome) for outcome in outcomes] == [ProgressResult] * 2 + [InferenceFailedError, ProgressResult]
 
 
 def test_a_client_that_is_not_closed_does_not_keep_the_interpreter(served: Served) -> None:

@@ -68,19 +68,6 @@ def test_a_part_of_a_lerobot_v3_file_is_read(tmp_path: Path) -> None:
         read_video(film, start_s=0.3)
 
 
-def test_a_lerobot_v3_file_is_known_behind_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    film = lerobot_dataset(tmp_path / "data", "v3.0", V30_FILM, 10)
-    blob = tmp_path / "blob"
-    film.rename(blob)
-    film.symlink_to(blob)  # as a Hub download consists of links into a cache
-    outside = tmp_path / "film.mp4"
-    outside.symlink_to(lerobot_dataset(tmp_path / "other", "v3.0", V30_FILM, 10))
-    monkeypatch.chdir(film.parent)
-    for path in (film, Path(film.name), outside):
-        with pytest.raises(InvalidSampleError, match=r"a LeRobot v3\.0 file that holds 10 episodes"):
-            read_video(path)
-
-
 def test_a_lerobot_v3_file_without_its_dataset_is_known_by_its_path(tmp_path: Path) -> None:
     film = lerobot_dataset(tmp_path, "v3.0", V30_FILM, 10)
     (tmp_path / "meta" / "info.json").unlink()
@@ -118,3 +105,14 @@ def test_a_lerobot_dataset_that_cannot_be_read_is_an_error(tmp_path: Path) -> No
     (tmp_path / "meta" / "info.json").write_text('{"codebase_version": "v3')
     with pytest.raises(InvalidSampleError, match=r"^meta/info\.json: expected a readable JSON file, got Unterminated"):
         read_video(film)
+
+
+def test_a_lerobot_v3_file_is_known_behind_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    film, outside = lerobot_dataset(tmp_path / "data", "v3.0", V30_FILM, 10), tmp_path / "film.mp4"
+    film.rename(tmp_path / "blob")
+    film.symlink_to(tmp_path / "blob")  # as a Hub download consists of links into a cache
+    outside.symlink_to(lerobot_dataset(tmp_path / "other", "v3.0", V30_FILM, 10))
+    monkeypatch.chdir(film.parent)
+    for path in (Path(film.name), outside):
+        with pytest.raises(InvalidSampleError, match=r"a LeRobot v3\.0 file that holds 10 episodes"):
+            read_video(path)

@@ -10,10 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from rfm_client import RewardClient
-from rfm_client.cli.commands import app
 from rfm_client.contract.results import FrameScores
 from rfm_client.data.inputs import load_trajectory
 from rfm_client.data.sampling import Sampling
@@ -107,20 +105,3 @@ def test_percent_are_told_from_a_probability(give: Given) -> None:
 def test_a_part_of_a_video_has_times_that_can_be(tmp_path: Path, read: Any, name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=rf"^{name}: expected .*, got "):
         read(tmp_path / "film.mp4", **{name: value})
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["score", "film.mp4", "--task", "push", "--fps", "nan"],
-        ["score", "film.mp4", "--task", "push", "--fps", "inf"],
-        ["score", "film.mp4", "--task", "push", "--timeout", "nan"],
-        ["wait", "--timeout", "nan"],
-        ["label", "folder", "--num-gpus-per-actor", "nan"],
-    ],
-    ids=lambda words: " ".join(words[-2:]),
-)
-def test_a_command_refuses_nan(words: list[str]) -> None:
-    done = CliRunner().invoke(app, words)
-    assert done.exit_code == 2
-    assert f"Invalid value for '{words[-2]}'" in done.output

@@ -5,9 +5,12 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
+import grpc
 import pytest
 
 from rfm_client import (
@@ -19,6 +22,7 @@ from rfm_client import (
     ServerUnavailableError,
 )
 from rfm_client.contract.triton import error_of
+from rfm_client.transport.connection import grpc_options
 from trajectories import random_trajectory
 
 TIMEOUT_S = 1.0
@@ -119,6 +123,36 @@ def test_which_errors_a_request_may_have_caused(message: str, may_have_ended: bo
     error = error_of("StatusCode.UNAVAILABLE", message, InvalidSampleError)
     assert isinstance(error, ServerUnavailableError)
     assert error.may_have_ended_server is may_have_ended
+
+
+def test_requests_are_spread_over_the_addresses_of_a_name() -> None:
+    """A list of addresses stands for the name: none of several can be had without a DNS server."""
+    counts = [0, 0]
+
+    def serve(number: int) -> grpc.Server:
+        def answer(content: bytes, _context: grpc.ServicerContext) -> bytes:
+            counts[number] += 1
+            return content
+
+        handlers = {"Echo": grpc.unary_unary_rpc_method_handler(answer)}
+        server = grpc.server(ThreadPoolExecutor(1), (grpc.method_handlers_generic_handler("test", handlers),))
+        ports.append(server.add_insecure_port("127.0.0.1:0"))
+        server.start()
+        return server
+
+    ports: list[int] = []
+    servers = [serve(number) for number in range(2)]
+    target = f"ipv4:{','.join(f'127.0.0.1:{port}' for port in ports)}"
+    try:
+        with grpc.insecure_channel(target, grpc_options("name:8001")) as channel:
+            echo = channel.unary_unary("/test/Echo")
+            end_s = time.monotonic() + WITHIN_S
+            while not all(counts):
+                assert echo(b"once") == b"once"
+                assert time.monotonic() < end_s
+    finally:
+        for server in servers:
+            server.stop(None)
 
 
 def test_a_name_that_nobody_knows_is_told() -> None:
