@@ -37,8 +37,6 @@ from reference_server import Served
 from rfm_client import (
     FrameScores,
     ProgressResult,
-    RewardClient,
-    Sample,
 )
 from rfm_client.cli.command import EXIT_CODES, ExitCode
 from rfm_client.cli.commands import app
@@ -47,12 +45,9 @@ from rfm_client.cli.made_up import MadeUpSamples, parse_lengths
 from rfm_client.cli.scoring import unique_stems
 from rfm_client.cli.show import number
 from rfm_client.contract.wire import encode_samples
-from rfm_client.transport.status import read_status
 from rfm_serve import wait_for
 from trajectories import random_trajectory
 from vlm import PLAIN as VLM
-
-COMMANDS = get_command(app).commands  # type: ignore[attr-defined]
 
 
 @contextmanager
@@ -62,37 +57,29 @@ def silent_server() -> Iterator[tuple[str, socket.socket]]:
         yield f"http://127.0.0.1:{listening.getsockname()[1]}", listening
 
 
-@pytest.fixture
-def triton(served: Served) -> Iterator[Any]:
-    client = tritonclient.http.InferenceServerClient(served.url("http").removeprefix("http://"))
-    yield client
-    client.close()
-
-
-def test_status_tells_what_triton_counts(served: Served, protocol: str, triton: Any) -> None:
-    with served.client(protocol, MODEL) as client:
+def test_status_tells_what_triton_counts(served: Served) -> None:
+    with served.client("grpc", MODEL) as client:
         client.progress(random_trajectory(0, 3, *WIDTHS))
-    metrics = served.endpoints.metrics_url
-    wait_for(
-        lambda: any(
-            model.batches and model.batches.count
-            for model in read_status(served.url(protocol), metrics_url=metrics).models
-        )
-    )
-    result = run("status", "--url", served.url(protocol), "--metrics-url", metrics, "--json")
-    assert (result.returncode, result.stderr) == (0, "")
-    (server,) = json.loads(result.stdout)["servers"]
+    words = ("status", "--url", served.url("grpc"), "--metrics-url", served.endpoints.metrics_url, "--json", "-")
+
+    def shown() -> tuple[dict[str, Any], dict[str, Any]]:
+        result = invoke(*words)
+        assert (result.exit_code, result.stderr) == (0, "")
+        (server,) = json.loads(result.stdout)["servers"]
+        return server, {model["name"]: model for model in server["models"]}
+
+    wait_for(lambda: (shown()[1][MODEL]["batches"] or {"count": 0})["count"])  # the model tells once a second
+    server, models = shown()
     assert (server["ready"], server["version"], server["metrics_error"]) == (True, "2.51.0", None)
-    models = {model["name"]: model for model in server["models"]}
     assert models.keys() == {file.parent.name for file in served.repository.glob("*/config.pbtxt")}
-    (counted,) = triton.get_inference_statistics(MODEL)["model_stats"]
-    model = models[MODEL]
+    with tritonclient.http.InferenceServerClient(served.url("http").removeprefix("http://")) as triton:
+        (counted,) = triton.get_inference_statistics(MODEL)["model_stats"]
+    model, stats = models[MODEL], counted["inference_stats"]
     assert (model["state"], model["version"], model["reason"]) == ("READY", "1", "")
-    assert model["requests_succeeded"] == counted["inference_stats"]["success"]["count"] > 0
-    assert model["requests_failed"] == counted["inference_stats"]["fail"]["count"]
-    assert model["samples"] == counted["inference_count"]
-    assert model["executions"] == counted["execution_count"]
-    assert model["queue_ms"] == pytest.approx(counted["inference_stats"]["queue"]["ns"] / 1e6)
+    assert model["requests_succeeded"] == stats["success"]["count"] > 0
+    assert model["requests_failed"] == stats["fail"]["count"]
+    assert (model["samples"], model["executions"]) == (counted["inference_count"], counted["execution_count"])
+    assert model["queue_ms"] == pytest.approx(stats["queue"]["ns"] / 1e6)
     batches = model["batches"]
     assert model["samples_per_batch"] == batches["samples"] / batches["count"] >= 1
     assert model["queue_ms_per_request"] == pytest.approx(model["queue_ms"] / model["requests_succeeded"])
@@ -136,10 +123,6 @@ def test_status_shows_the_gpus_and_what_waits(served: Served, tmp_path: Path) ->
     assert requests[5:] == ["6", "12"]  # refused; pending
     assert batches[2:5] == ["40", "3.0", "250.00"]
     assert batches[6] == "start"
-    with web_server(tmp_path) as url:
-        (model,) = (m for m in read_status(served.url("grpc"), metrics_url=f"{url}/metrics").models if m.name == MODEL)
-    assert model.queue_ms_per_request == pytest.approx(model.queue_ms / model.requests_succeeded)
-    assert model.busy_ms == 10_000
     assert columns(result.stdout, "GPU-a") == ["GPU-a", "75%", "3.0 GiB", "80.0 GiB"]
     assert columns(result.stdout, "GPU-b") == ["GPU-b", "0%", "-", "-"]
 
@@ -155,33 +138,43 @@ def test_status_without_metrics_shows_the_rest_and_says_so(served: Served) -> No
     assert (requests[1:3], requests[5:]) == (["1", "READY"], ["-", "-"])
 
 
-def test_wait_returns_when_the_model_is_ready(served: Served) -> None:
-    result = ask(served, "wait")
-    assert (result.exit_code, result.output) == (0, "")
+SAMPLES = {"embeddings": ("progress", False), "pairs": ("similarity", False), "frames": ("preference", True)}
 
 
-def made_up(client: RewardClient, kind: str, lengths: str, *, use_frames: bool = False) -> list[Sample]:
-    return MadeUpSamples(kind, 3, parse_lengths(lengths), use_frames, seed=5).samples(client)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("use_frames", [False, True], ids=["embeddings", "frames"])
-@pytest.mark.parametrize("kind", ["progress", "preference", "similarity"])
-def test_sample_shows_what_the_client_gives(served: Served, kind: str, use_frames: bool) -> None:
+@pytest.mark.parametrize(("kind", "use_frames"), SAMPLES.values(), ids=SAMPLES)
+def test_sample_and_bench_input_ask_for_the_same_samples(
+    served: Served, tmp_path: Path, kind: Any, use_frames: bool
+) -> None:
     words = ["--sample-type", kind, "--num-samples", 3, "--num-frames", "2,5", "--seed", 5]
-    result = ask(served, "sample", *words, *(["--use-frames"] if use_frames else []), "--json", "-")
+    words += ["--use-frames"] if use_frames else []
+    result = ask(served, "sample", *words, "--json", "-")
     assert (result.exit_code, result.stderr) == (0, "")
     with served.client("grpc", MODEL) as client:
-        samples = made_up(client, kind, "2,5", use_frames=use_frames)
+        samples = MadeUpSamples(kind, 3, parse_lengths("2,5"), use_frames, seed=5).samples(client)
         expected = client.evaluate(samples)
-    answers = json.loads(result.stdout)["samples"]
-    assert len(answers) == len(expected)
-    for answer, scores in zip(answers, expected, strict=True):
+    for answer, scores in zip(json.loads(result.stdout)["samples"], expected, strict=True):
         if isinstance(scores, ProgressResult):
             assert_scores(answer, scores)
         else:
             assert answer[kind] == pytest.approx(getattr(scores, kind), abs=1e-4)
             for name in ("first", "second") if kind == "preference" else ("reference", "other"):
                 assert_scores(answer[name], getattr(scores, name))
+
+    target = tmp_path / "input.json"
+    result = ask(served, "bench-input", *words, "--output", target)
+    name = f"{MODEL}_frames" if use_frames else MODEL
+    command = f"perf_analyzer -m {name} -i grpc -u {served.url('grpc').removeprefix('grpc://')} --input-data {target}"
+    assert result.stdout == f"{command} --async --concurrency-range 1:16:5\n"
+    for request, sample in zip(json.loads(target.read_text())["data"], samples, strict=True):
+        tensors = encode_samples([sample])
+        assert request.keys() == tensors.keys()
+        for tensor, array in tensors.items():  # as perf_analyzer reads them, with the batch axis that it adds
+            content = request[tensor]["content"]
+            if isinstance(content, list):
+                flat = np.array([text.encode() for text in content], np.object_)
+            else:
+                flat = np.frombuffer(base64.b64decode(content["b64"], validate=True), array.dtype.newbyteorder("<"))
+            np.testing.assert_array_equal(flat.reshape(1, *request[tensor]["shape"]), array)
 
 
 def test_made_up_samples_are_frames_where_embeddings_are_not_read(served: Served, tmp_path: Path) -> None:
@@ -194,51 +187,13 @@ def test_made_up_samples_are_frames_where_embeddings_are_not_read(served: Served
 
 def test_sample_shows_a_table_and_tells_of_each_that_fails(served: Served) -> None:
     result = ask(served, "sample", "--sample-type", "preference", "--num-samples", 2, "--num-frames", "3,17")
-    assert result.exit_code == ExitCode.FAILED
-    assert [line.partition(": num_frames: expected at most 16")[0] for line in result.stderr.splitlines()] == [
-        "rfm-client: samples[0]",
-        "rfm-client: samples[1]",
-    ]
-    assert result.stdout == ""
+    assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
+    for index, line in enumerate(result.stderr.splitlines()):
+        assert line.startswith(f"rfm-client: samples[{index}]: num_frames: expected at most 16")
     good = ask(served, "sample", "--sample-type", "preference", "--num-samples", 1)
     with served.client("grpc", MODEL) as client:
         (expected,) = client.evaluate(MadeUpSamples("preference", 1).samples(client))
     assert f"P(first) = {expected.preference:.4f}" in good.stdout  # type: ignore[union-attr]
-
-
-def decoded(tensor: dict[str, Any], like: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """A tensor of the file, as perf_analyzer reads it, with the batch axis that it adds."""
-    content = tensor["content"]
-    if isinstance(content, list):
-        flat = np.array([text.encode() for text in content], np.object_)
-    else:
-        flat = np.frombuffer(base64.b64decode(content["b64"], validate=True), like.dtype.newbyteorder("<"))
-    return flat.reshape(1, *tensor["shape"])
-
-
-@pytest.mark.parametrize("use_frames", [False, True], ids=["embeddings", "frames"])
-@pytest.mark.parametrize("kind", ["progress", "preference", "similarity"])
-def test_bench_input_holds_the_tensors_of_the_contract(
-    served: Served, tmp_path: Path, kind: str, use_frames: bool
-) -> None:
-    target = tmp_path / "input.json"
-    words = ["--sample-type", kind, "--num-samples", 3, "--num-frames", "4-6", "--seed", 5, "--output", target]
-    result = ask(served, "bench-input", *words, *(["--use-frames"] if use_frames else []))
-    name = f"{MODEL}_frames" if use_frames else MODEL
-    address = served.url("grpc").removeprefix("grpc://")
-    expected = f"perf_analyzer -m {name} -i grpc -u {address} --input-data {target}"
-    assert (result.exit_code, result.stderr) == (0, "")
-    assert result.stdout == f"{expected} --async --concurrency-range 1:16:5\n"
-    with served.client("grpc", MODEL) as client:
-        samples = made_up(client, kind, "4-6", use_frames=use_frames)
-    requests = json.loads(target.read_text())["data"]
-    assert len(requests) == 3
-    for request, sample in zip(requests, samples, strict=True):
-        tensors = encode_samples([sample])
-        assert request.keys() == tensors.keys()
-        for tensor, array in tensors.items():
-            assert decoded(request[tensor], array).dtype == array.dtype
-            np.testing.assert_array_equal(decoded(request[tensor], array), array)
 
 
 def free_url() -> str:
@@ -264,7 +219,7 @@ def test_no_server_is_told_at_once(words: list[str]) -> None:
     assert result.stdout == ""
 
 
-@pytest.mark.parametrize("words", ASKING.values(), ids=ASKING)
+@pytest.mark.parametrize("words", [ASKING["sample"], ASKING["status"]], ids=["sample", "status"])
 def test_a_server_that_does_not_answer_is_out_of_time(words: list[str]) -> None:
     with silent_server() as (url, _):
         result = invoke(*words, "--url", url, "--timeout", 0.2)
@@ -272,44 +227,43 @@ def test_a_server_that_does_not_answer_is_out_of_time(words: list[str]) -> None:
     assert re.fullmatch(r"rfm-client: .*no answer within 0\.2 s\n", result.stderr), result.stderr
 
 
-@pytest.mark.parametrize("name", ["score", "compare", "sample", "bench-input"])
-def test_a_model_that_is_not_served_is_told(served: Served, protocol: str, name: str) -> None:
-    result = ask(served, *ASKING[name], model="unknown", protocol=protocol)
+def test_a_model_that_is_not_served_is_told(served: Served, protocol: str) -> None:
+    result = ask(served, "score", "film.mp4", model="unknown", protocol=protocol)
     assert result.exit_code == ExitCode.NO_MODEL
     assert re.fullmatch(r"rfm-client: .*unknown_frames.*\n", result.stderr), result.stderr
     (served_names,) = re.findall(r"; served: (.*): give the checkpoint's name with model \(--model\)$", result.stderr)
     assert {MODEL, f"{MODEL}_frames"} <= set(served_names.split(", "))
 
 
-def test_embeddings_alone_are_no_model_for_videos(served: Served, video: Path) -> None:
-    result = ask(served, "score", video, "--task", TASK, model="c1_t1_disc10")
-    assert result.exit_code == ExitCode.NO_MODEL
-    assert "c1_t1_disc10_frames" in result.stderr
-
-
 def test_one_server_that_is_down_does_not_matter(served: Served) -> None:
-    result = ask(served, "sample", "--url", free_url())
+    result = invoke("sample", "--url", free_url(), "--url", served.url("grpc"), "--model", MODEL)
     assert result.exit_code == 0, result.stderr
-    reordered = invoke("sample", "--url", free_url(), "--url", served.url("grpc"), "--model", MODEL)
-    assert reordered.exit_code == 0, reordered.stderr
 
 
-def test_waiting_ends_in_time() -> None:
+def test_wait_returns_when_the_model_is_ready_or_its_time_is_up(served: Served) -> None:
+    result = ask(served, "wait")
+    assert (result.exit_code, result.output) == (0, "")
     url = free_url()
     result = invoke("wait", "--url", url, "--timeout", 0.2)
     assert result.exit_code == ExitCode.DEADLINE
     assert result.stderr == f"rfm-client: {url}: rfm and rfm_frames: not ready within 0.2 s\n"
 
 
-@pytest.mark.parametrize("words", [["wait"], ["score", "film.mp4"]], ids=lambda words: str(words[0]))
-def test_an_interrupt_ends_it_without_a_traceback(words: list[str]) -> None:
+def test_an_interrupt_ends_it_without_a_traceback() -> None:
     with silent_server() as (url, listening):
-        process = subprocess.Popen([str(RFM_CLIENT), *words, "--url", url], stderr=subprocess.PIPE, text=True)
+        command = [str(RFM_CLIENT), "score", "film.mp4", "--url", url]
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         connection, _ = listening.accept()  # by now it is asking
         with connection:
             process.send_signal(signal.SIGINT)
             _, told = process.communicate(timeout=30)
     assert (process.returncode, told) == (ExitCode.INTERRUPTED, "rfm-client: interrupted\n")
+
+
+def test_embeddings_alone_are_no_model_for_videos(served: Served, video: Path) -> None:
+    result = ask(served, "score", video, "--task", TASK, model="c1_t1_disc10")
+    assert result.exit_code == ExitCode.NO_MODEL
+    assert "c1_t1_disc10_frames" in result.stderr
 
 
 URL = "expected grpc://host:port or http://host:port, or grpcs:// or https://, got"
@@ -358,12 +312,17 @@ def test_a_missing_package_costs_a_line(served: Served, monkeypatch: pytest.Monk
     assert re.fullmatch(r'rfm-client: .*prometheus_client.*: pip install "./client\[cli\]"\n', result.stderr)
 
 
-def test_every_command_and_option_has_help() -> None:
-    assert COMMANDS.keys() == {"score", "compare", "status", "wait", "sample", "bench-input", "gateway", "label"}
-    for name, command in COMMANDS.items():
+def test_every_command_and_option_has_help_and_exit_codes_are_documented() -> None:
+    general = " ".join(invoke("--help").stdout.split())
+    assert EXIT_CODES in general
+    for code in ExitCode:
+        assert re.search(rf"\b{code.value} ", EXIT_CODES), code
+    commands = get_command(app).commands  # type: ignore[attr-defined]
+    assert commands.keys() == {"score", "compare", "status", "wait", "sample", "bench-input", "gateway", "label"}
+    for name, command in commands.items():
+        assert name in general
         assert command.help, name
-        result = invoke(name, "--help")
-        shown = " ".join(result.stdout.split())
+        shown = " ".join(invoke(name, "--help").stdout.split())
         assert (EXIT_CODES in shown) == (name != "gateway")  # which runs until it is stopped
         for parameter in command.params:
             assert parameter.help, (name, parameter.name)
@@ -371,25 +330,11 @@ def test_every_command_and_option_has_help() -> None:
                 assert not option.startswith("--") or option in shown
 
 
-def test_exit_codes_are_documented() -> None:
-    result = run("--help")
-    assert (result.returncode, result.stderr) == (0, "")
-    shown = " ".join(result.stdout.split())
-    assert EXIT_CODES in shown
-    for code in ExitCode:
-        assert re.search(rf"\b{code.value} ", EXIT_CODES), code
-    for name in COMMANDS:
-        assert name in shown
-
-
-def test_the_shell_can_complete_commands_and_options() -> None:
-    script = run(_RFM_CLIENT_COMPLETE="source_bash").stdout
+def test_the_shell_can_complete_commands() -> None:
+    script = run("--show-completion", "bash", _TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION="1").stdout
     assert "_RFM_CLIENT_COMPLETE=complete_bash" in script
-    assert "rfm-client" in script
     asked = {"COMP_WORDS": "rfm-client st", "COMP_CWORD": "1", "_RFM_CLIENT_COMPLETE": "complete_bash"}
     assert run(**asked).stdout.split() == ["status"]
-    shown = run("--show-completion", "bash", _TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION="1")
-    assert (shown.returncode, shown.stdout.strip()) == (0, script.strip())
 
 
 def test_a_score_that_is_not_told_is_null_and_shown_as_a_dash() -> None:

@@ -21,7 +21,8 @@ from terminals import WIDTH, on_terminal
 
 pytestmark = pytest.mark.triton
 
-NAMES = ("episode_a.mp4", "episode_b.mp4", "episode_c.mp4")
+
+NAMES = ("episode_a.mp4", "episode_b.mp4")
 
 
 @pytest.fixture(scope="module")
@@ -33,70 +34,48 @@ def films(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return [folder / name for name in NAMES]
 
 
-def words(lines: list[str]) -> set[str]:
-    return {word for line in lines for word in line.split()}
-
-
-def assert_fits(lines: list[str]) -> None:
-    assert [line for line in lines if len(line) > WIDTH] == []
+def shown(endpoints: Endpoints, *asked: object, code: ExitCode = ExitCode.OK) -> tuple[set[str], list[str]]:
+    """The words and lines that a command about the demo's checkpoint shows, which fit the terminal."""
+    told, lines = on_terminal(*asked, "--url", endpoints.grpc_url)
+    assert told == code, lines
+    assert max(map(len, lines)) <= WIDTH
+    return {word for line in lines for word in line.split()}, lines
 
 
 def test_the_state_of_a_server_fits_a_terminal_and_says_what_its_words_mean(demo_server: Endpoints) -> None:
-    code, lines = on_terminal("status", "--url", demo_server.grpc_url, "--metrics-url", demo_server.metrics_url)
-    assert code == ExitCode.OK, lines
-    assert_fits(lines)
+    words, lines = shown(demo_server, "status", "--metrics-url", demo_server.metrics_url)
     heads = {"model", "v", "state", "requests", "failed", "refused", "pending", "batches", "samples", "queue", "ms"}
-    assert heads | {"rfm", "rfm_encoder", "rfm_frames"} <= words(lines)
+    assert heads | {"rfm", "rfm_encoder", "rfm_frames"} <= words
     told = " ".join(" ".join(lines).split())
     assert "failed: answered with an error, whoever is to blame" in told
     assert "refused: samples that cannot be scored, the caller's fault" in told
 
 
 def test_scores_and_comparisons_fit_a_terminal_and_name_each_file(demo_server: Endpoints, films: list[Path]) -> None:
-    code, lines = on_terminal("score", *films, "missing.mp4", "--task", TASK, "--url", demo_server.grpc_url)
-    assert code == ExitCode.FAILED, lines
-    assert_fits(lines)
-    assert {"video", "progress", "success", "frames", "version"} <= words(lines)
-    assert sorted(word.rpartition("/")[2] for word in words(lines) if word.endswith(NAMES)) == sorted(NAMES)
-    code, lines = on_terminal("compare", *films, "--task", TASK, "--url", demo_server.grpc_url)
-    assert code == ExitCode.OK, lines
-    assert_fits(lines)
-    assert {"rank", "P(wins)", "progress", "success", "frames", "second", "mean", "orders"} <= words(lines)
-    assert {word.rpartition("/")[2] for word in words(lines) if word.endswith(".mp4")} == set(NAMES)
-    code, lines = on_terminal(
-        "sample", "--sample-type", "preference", "--num-samples", 1, "--url", demo_server.grpc_url
-    )
-    assert code == ExitCode.OK, lines
-    assert_fits(lines)
-    (first, second) = (
-        [line for line in lines if line.strip().startswith(f"0: {name}")] for name in ("first", "second")
-    )
-    assert "P(first) =" in first[0]
-    assert len(second) == 1
+    words, _ = shown(demo_server, "score", *films, "missing.mp4", "--task", TASK, code=ExitCode.FAILED)
+    assert {"video", "progress", "success", "frames", "version"} <= words
+    assert {word.rpartition("/")[2] for word in words if word.endswith(NAMES)} == set(NAMES)
+    words, _ = shown(demo_server, "compare", *films, "--task", TASK)
+    assert {"rank", "P(wins)", "progress", "success", "frames", "second", "mean", "orders"} <= words
+    assert {word.rpartition("/")[2] for word in words if word.endswith(".mp4")} == set(NAMES)
 
 
-@pytest.mark.parametrize("width", [1, 3, 4, 12, 20, 29, 30, 39])
-def test_a_name_is_shortened_in_the_middle(width: int) -> None:
-    name = "/data/of/a/robot/episode_7.mp4"
-    short = shortened(name, width)
-    assert len(short) == min(width, len(name))
-    if width >= len(name):
-        assert short == name
-    elif width > 3:
-        start, end = short.split("...", 1) if short.count("...") == 1 else ("", "")
-        assert name.startswith(start)
-        assert name.endswith(end)
-        assert not width >= 20 or end.endswith("/episode_7.mp4")
+SHORTENED = {3: "/da", 4: "...4", 12: "/dat...7.mp4", 20: "/da.../episode_7.mp4", 30: "/data/of/a/robot/episode_7.mp4"}
+
+
+@pytest.mark.parametrize(("width", "short"), SHORTENED.items())
+def test_a_name_is_shortened_in_the_middle(width: int, short: str) -> None:
+    assert shortened("/data/of/a/robot/episode_7.mp4", width) == short
 
 
 def test_long_texts_wrap_and_figures_stay_whole() -> None:
     console = Console(file=io.StringIO(), width=60)
     row = ("path/" * 20, "0.1234", "why it is not ready, in so many words that they need lines of their own")
     console.print(table("", ("model", "progress", "reason"), [row]))
-    shown = console.file.getvalue()  # type: ignore[attr-defined]
-    assert max(map(len, shown.splitlines())) <= 60
-    assert "0.1234" in shown
-    assert " ".join(row[2].split()[:3]) in shown
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert max(map(len, text.splitlines())) <= 60
+    assert "0.1234" in text
+    assert " ".join(row[2].split()[:3]) in text
 
 
 def test_the_reason_of_a_model_that_is_not_ready_has_a_line_of_its_own() -> None:

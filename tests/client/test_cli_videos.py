@@ -20,7 +20,6 @@ from client_commands import (
     ask,
     assert_scores,
     columns,
-    invoke,
     rows,
     run,
     web_server,
@@ -28,13 +27,14 @@ from client_commands import (
 from reference_server import Served
 from rfm_client import (
     FrameScores,
+    InferenceFailedError,
     PreferenceResult,
     RewardClient,
     Trajectory,
 )
 from rfm_client.cli.command import ExitCode
-from rfm_client.cli.comparing import LEGEND, Comparison
-from rfm_client.cli.options import ServerOptions
+from rfm_client.cli.comparing import LEGEND, Comparison, compare
+from rfm_client.cli.options import VideoOptions
 from rfm_client.cli.pictures import Panel, plot
 from rfm_client.cli.scoring import Source
 from rfm_client.data.inputs import load_trajectory
@@ -42,6 +42,7 @@ from shelves import Shelf
 from trajectories import random_trajectory
 
 MAX_FRAMES = 16  # of that checkpoint
+FILE_OF_SEVERAL = "data/videos/observation.images.top/chunk-000/file-000.mp4"
 
 
 EVENLY = np.rint(np.linspace(0, clip.NUM_FRAMES - 1, MAX_FRAMES)).astype(int)
@@ -108,31 +109,17 @@ OPTIONS: dict[str, tuple[list[object], dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize(("words", "options"), OPTIONS.values(), ids=OPTIONS)
-def test_score_passes_its_options_on(served: Served, video: Path, words: list[object], options: dict[str, Any]) -> None:
-    result = ask(served, "score", video, "--task", TASK, *words, "--json")
+def test_score_passes_its_options_on(
+    served: Served, video: Path, tmp_path: Path, words: list[object], options: dict[str, Any]
+) -> None:
+    result = ask(served, "score", video, "--task", TASK, *words, "--json", "--npy", tmp_path / "scores.npy")
     assert (result.exit_code, result.stderr) == (0, "")
     (scored,) = json.loads(result.stdout)["videos"]  # and nothing but JSON
     with served.client("grpc", MODEL) as client:
         expected = client.progress(load_trajectory(video, task=TASK, fps=3.0), **options)
     assert_scores(scored, expected)
     np.testing.assert_allclose(scored["frame_times_s"], np.linspace(0, 31, 10).astype(int) / clip.FPS)
-
-
-def test_score_and_compare_turn_frames_as_they_are_told(served: Served, video: Path, tmp_path: Path) -> None:
-    upright, stored = load_trajectory(video, fps=3.0).frames, tmp_path / "upside_down.npy"
-    assert upright is not None
-    np.save(stored, upright[:, ::-1])
-    asked = ("--task", TASK, "--orient", "flip-vertical", "--json")
-    told = json.loads(ask(served, "score", stored, *asked).stdout)
-    compared = json.loads(ask(served, "compare", stored, video, *asked).stdout)
-    assert told["orient"] == compared["orient"] == "flip-vertical"
-    first, second = (Trajectory(frames=frames, task=TASK) for frames in (upright, upright[:, ::-1]))
-    with served.client("grpc", MODEL) as client:
-        expected = client.progress(first)
-        preference = client.preference(first, second).preference
-        assert not np.allclose(expected.progress, client.progress(second).progress, atol=100 * TOLERANCE)
-    assert_scores(told["videos"][0], expected)
-    assert compared["preference"] == pytest.approx(preference, abs=TOLERANCE)
+    np.testing.assert_array_equal(np.load(tmp_path / "scores.npy")[:, 0], np.float32(scored["progress"]))
 
 
 @pytest.mark.parametrize("limit", [4, 24])
@@ -143,18 +130,23 @@ def test_score_takes_at_most_as_many_frames_as_it_is_told_and_the_checkpoint_rea
     (scored,) = json.loads(result.stdout)["videos"]
     indices = np.rint(np.linspace(0, clip.NUM_FRAMES - 1, min(limit, MAX_FRAMES))).astype(int)
     assert scored["frame_indices"] == indices.tolist()
-    frames = load_trajectory(video, fps=10).frames
-    assert frames is not None
+    frames = load_trajectory(video, fps=10).positions[indices]
     with served.client("grpc", MODEL) as client:
-        assert_scores(scored, client.progress(Trajectory(frames=frames[indices], task=TASK)))
+        assert_scores(scored, client.progress(Trajectory(frames=frames, task=TASK)))
 
 
-def test_score_leaves_no_frame_out_if_told_so(served: Served, video: Path) -> None:
-    result = ask(served, "score", video, "--task", TASK, "--fps", 10, "--no-subsample")
-    assert result.exit_code == ExitCode.FAILED
-    assert result.stderr.startswith(f"rfm-client: {video}: num_frames: expected at most 16")
-    assert result.stderr.count("\n") == 1
-    assert result.stdout == ""
+def test_score_and_compare_turn_frames_as_they_are_told(served: Served, video: Path, tmp_path: Path) -> None:
+    upright, stored = load_trajectory(video, fps=3.0).positions, tmp_path / "upside_down.npy"
+    np.save(stored, upright[:, ::-1])
+    asked = ("--task", TASK, "--orient", "flip-vertical", "--json")
+    told = json.loads(ask(served, "score", stored, *asked).stdout)
+    compared = json.loads(ask(served, "compare", stored, video, *asked).stdout)
+    assert told["orient"] == compared["orient"] == "flip-vertical"
+    first, second = (Trajectory(frames=frames, task=TASK) for frames in (upright, upright[:, ::-1]))
+    with served.client("grpc", MODEL) as client:
+        assert_scores(told["videos"][0], client.progress(first))
+        preference = client.preference(first, second).preference
+    assert compared["preference"] == pytest.approx(preference, abs=TOLERANCE)
 
 
 def test_score_reads_videos_behind_urls(served: Served, video: Path) -> None:
@@ -165,100 +157,99 @@ def test_score_reads_videos_behind_urls(served: Served, video: Path) -> None:
     assert remote["frame_times_s"] is None
 
 
-def test_score_writes_one_video_to_a_file(served: Served, video: Path, tmp_path: Path) -> None:
-    result = ask(served, "score", video, "--task", TASK, "--npy", tmp_path / "rewards.npy")
-    assert result.exit_code == 0, result.stderr
-    assert np.load(tmp_path / "rewards.npy").shape == (10, 2)
+NO_TASK = 'task: expected a sentence with frames, got none: add --task "what is to be done"'
+SEVERAL = "video: expected a film of one episode, got a LeRobot v3.0 file that holds 10 episodes: label the dataset "
+REFUSED: dict[str, tuple[list[object], str]] = {
+    "no frame left out": (
+        ["score", "clip.mp4", "--fps", 10, "--no-subsample"],
+        "clip.mp4: num_frames: expected at most 16",
+    ),
+    "no task": (["score", "clip.mp4", "--task", ""], f"clip.mp4: {NO_TASK}"),
+    "no task to compare": (["compare", "clip.mp4", "clip.mp4", "--task", ""], NO_TASK.partition(": add ")[2]),
+    "frames and embeddings": (
+        ["compare", "clip.mp4", "seen.npy"],
+        "clip.mp4 and seen.npy: second: expected frames, as the first trajectory, got video_embeddings",
+    ),
+    "several episodes": (["score", FILE_OF_SEVERAL], f"{FILE_OF_SEVERAL}: {SEVERAL}"),
+    "several episodes to compare": (["compare", "clip.mp4", FILE_OF_SEVERAL], SEVERAL),
+}
 
 
-def test_a_task_that_is_missing_is_told(served: Served, video: Path) -> None:
-    result = ask(served, "score", video)
-    assert result.exit_code == ExitCode.FAILED
-    mend = 'add --task "what is to be done"'
-    assert result.stderr == f"rfm-client: {video}: task: expected a sentence with frames, got none: {mend}\n"
-    compared = ask(served, "compare", video, video)
-    assert compared.exit_code == ExitCode.FAILED
-    assert mend in compared.stderr
+@pytest.mark.parametrize(("words", "message"), REFUSED.values(), ids=REFUSED)
+def test_what_cannot_be_scored_or_compared_is_told(
+    served: Served, video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[object], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    several = Path(FILE_OF_SEVERAL)
+    several.parent.mkdir(parents=True)
+    for file in (Path("clip.mp4"), several):
+        file.write_bytes(video.read_bytes())
+    Path("data/meta").mkdir()
+    Path("data/meta/info.json").write_text('{"codebase_version": "v3.0", "total_episodes": 10}')
+    np.save("seen.npy", np.zeros((2, 8), np.float32))
+    result = ask(served, *words, *(() if "--task" in words else ("--task", TASK)))
+    assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
+    assert result.stderr.startswith("rfm-client: ")
+    assert message in result.stderr
+    assert result.stderr.count("\n") == 1
 
 
-def test_compare_asks_both_orders_of_two_videos_also_of_two_sizes(served: Served, video: Path, tmp_path: Path) -> None:
-    small = tmp_path / "small.npy"
-    np.save(small, np.random.default_rng(0).integers(0, 256, (20, 40, 30, 3), np.uint8))
-    target, picture = tmp_path / "scores.json", tmp_path / "both.pdf"
-    result = ask(served, "compare", video, small, "--task", TASK, "--json", target, "--plot", picture)
+def test_compare_asks_both_orders_of_every_two_videos_also_of_several_sizes(
+    served: Served, video: Path, tmp_path: Path
+) -> None:
+    random = np.random.default_rng(0)
+    small, still = tmp_path / "small.npy", tmp_path / "still.npy"
+    np.save(small, random.integers(0, 256, (20, 40, 30, 3), np.uint8))
+    np.save(still, np.zeros((3, 40, 30, 3), np.uint8))
+    files = [video, small, still]
+    target = tmp_path / "scores.json"
+    result = ask(served, "compare", *files, "--task", TASK, "--json", target, "--plot", tmp_path / "all.svg")
     told = f"rfm-client: note: {small}: 16 of 20 frames were scored, evenly spaced\n"
     assert (result.exit_code, result.stderr) == (0, told)
-    first, second = load_trajectory(video, task=TASK, fps=3), load_trajectory(small)
-    with served.client("grpc", MODEL) as client:
-        expected = client.preference(first, second, subsample=True)
-        swapped = client.preference(replace(second, task=TASK), first, subsample=True).preference
-    document = json.loads(target.read_text())
-    assert document["preference"] == pytest.approx(expected.preference, abs=TOLERANCE)
-    assert_scores(document["first"], expected.first)
-    assert_scores(document["second"], expected.second)
-    assert document["second"]["frame_indices"] == np.rint(np.linspace(0, 19, 16)).astype(int).tolist()
-    assert document["orders"] == [
-        {"first": str(video), "second": str(small), "preference": document["preference"]},
-        {"first": str(small), "second": str(video), "preference": pytest.approx(swapped, abs=TOLERANCE)},
-    ]
-    both = (document["preference"] + 1 - document["orders"][1]["preference"]) / 2
-    wins = {str(video): both, str(small): 1 - both}
-    agree = (document["preference"] > 0.5) == (swapped < 0.5)
-    verdict = ("first" if expected.preference > 0.5 else "second") if agree else None
-    assert (document["verdict"], document["orders_agree"]) == (verdict, agree)
-    assert (document["ranking"] is None) == (not agree)
-    for name, each in zip(wins, document["videos"], strict=True):
-        assert (each["source"], each["wins"]) == (name, pytest.approx(wins[name]))
-        row = rows(result.stdout, name)[0]
-        figures = (wins[name], each["progress"][-1], each["success"][-1])
-        assert row[2:] == [*(f"{figure:.4f}" for figure in figures), str(len(each["progress"]))]
-    assert picture.read_bytes().startswith(b"%PDF")
-
-
-def test_compare_ranks_several_videos_by_both_orders_of_every_two(served: Served, tmp_path: Path) -> None:
-    files = [tmp_path / f"{name}.npz" for name in "abc"]
-    trajectories = [random_trajectory(seed, 3 + seed, *WIDTHS) for seed in range(3)]
-    for file, seen in zip(files, trajectories, strict=True):
-        np.savez(file, video_embeddings=seen.video_embeddings, text_embedding=seen.text_embedding)
-    target = tmp_path / "scores.json"
-    result = ask(served, "compare", *files, "--json", target, "--plot", tmp_path / "all.svg")
-    assert (result.exit_code, result.stderr) == (0, "")
-    asked = [replace(seen, text_embedding=trajectories[0].text_embedding) for seen in trajectories]
+    trajectories = [load_trajectory(video, task=TASK, fps=3), *(load_trajectory(f, task=TASK) for f in files[1:])]
     orders = [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)]
     with served.client("grpc", MODEL) as client:
-        told = {order: client.preference(*(asked[index] for index in order)) for order in orders}
+        asked = {order: client.preference(*(trajectories[i] for i in order), subsample=True) for order in orders}
     document = json.loads(target.read_text())
-    assert document.keys() & {"first", "second", "preference"} == set()
-    assert document["orders"] == [
-        {
-            "first": str(files[first]),
-            "second": str(files[second]),
-            "preference": pytest.approx(told[first, second].preference, abs=TOLERANCE),
-        }
-        for first, second in orders
+    assert document.keys() & {"first", "second", "preference"} == set()  # which two videos have
+    assert [(Path(each["first"]), Path(each["second"])) for each in document["orders"]] == [
+        (files[first], files[second]) for first, second in orders
     ]
-    wins = [
-        np.mean([(told[a, b].preference + 1 - told[b, a].preference) / 2 for b in range(3) if b != a]) for a in range(3)
-    ]
-    assert [each["source"] for each in document["videos"]] == list(map(str, files))
+    told_preferences = [each["preference"] for each in document["orders"]]
+    np.testing.assert_allclose(told_preferences, [each.preference for each in asked.values()], rtol=0, atol=TOLERANCE)
+    shares = {(a, b): (asked[a, b].preference + 1 - asked[b, a].preference) / 2 for a, b in orders}
     for index, each in enumerate(document["videos"]):
-        assert each["wins"] == pytest.approx(wins[index], abs=TOLERANCE)
-        assert_scores(each, told[0, 1].first if index == 0 else told[0, index].second)
-    pairs = [line for line in result.stdout.splitlines() if line.rstrip().endswith((" agree", " no answer"))]
-    for line, (first, second), pair in zip(pairs, [(0, 1), (0, 2), (1, 2)], document["pairs"], strict=True):
-        answers = told[first, second].preference, 1 - told[second, first].preference
+        wins = np.mean([share for (a, _), share in shares.items() if a == index])
+        assert (each["source"], each["wins"]) == (str(files[index]), pytest.approx(wins, abs=TOLERANCE))
+        assert_scores(each, asked[0, 1].first if index == 0 else asked[0, index].second)
+        figures = [f"{figure:.4f}" for figure in (each["wins"], each["progress"][-1], each["success"][-1])]
+        assert rows(result.stdout, str(files[index]))[0][2:] == [*figures, str(len(each["progress"]))]
+    assert document["videos"][1]["frame_indices"] == np.rint(np.linspace(0, 19, 16)).astype(int).tolist()
+    for pair, (a, b) in zip(document["pairs"], [(0, 1), (0, 2), (1, 2)], strict=True):
+        answers = asked[a, b].preference, 1 - asked[b, a].preference
         agree = (answers[0] > 0.5) == (answers[1] > 0.5)
-        shown = [f"{share:.4f}" for share in (*answers, sum(answers) / 2)]
-        orders = "agree" if agree else "no answer"
-        assert columns(line, str(files[first])) == [str(files[first]), str(files[second]), *shown, orders]
         verdict = ("first" if answers[0] > 0.5 else "second") if agree else None
-        assert pair == {
-            "first": str(files[first]),
-            "second": str(files[second]),
-            "verdict": verdict,
-            "orders_agree": agree,
-        }
+        named = {"first": str(files[a]), "second": str(files[b])}
+        assert pair == {**named, "verdict": verdict, "orders_agree": agree}
     assert (tmp_path / "all.svg").read_text().startswith("<?xml")
+
+
+def test_compare_of_two_videos_has_their_preference_and_verdict(served: Served, tmp_path: Path) -> None:
+    files = [tmp_path / f"{name}.npz" for name in "ab"]
+    first, second = (random_trajectory(seed, 3 + seed, *WIDTHS) for seed in range(2))
+    for file, seen in zip(files, (first, second), strict=True):
+        np.savez(file, video_embeddings=seen.video_embeddings, text_embedding=seen.text_embedding)
+    result = ask(served, "compare", *files, "--json", "-", "--plot", tmp_path / "both.pdf")
+    document = json.loads(result.stdout)
+    with served.client("grpc", MODEL) as client:
+        expected = client.preference(first, replace(second, text_embedding=None), both_orders=True)
+        once = client.preference(first, second)
+    assert document["preference"] == pytest.approx(once.preference, abs=TOLERANCE)
+    assert_scores(document["first"], expected.first)
+    assert_scores(document["second"], expected.second)
+    assert (document["verdict"], document["orders_agree"]) == (expected.verdict, expected.orders_agree)
+    assert (document["ranking"] is None) == (not expected.orders_agree)
+    assert (tmp_path / "both.pdf").read_bytes().startswith(b"%PDF")
 
 
 ORDERS: dict[str, tuple[dict[tuple[int, int], float], list[int | None], list[int] | None, list[str]]] = {
@@ -305,41 +296,13 @@ def test_a_comparison_names_no_winner_where_the_orders_disagree(
     assert comparison.tables()[2:] == [LEGEND] * (ranking is None)
 
 
-def test_compare_refuses_the_answers_of_two_versions(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, video: Path
-) -> None:
+def test_compare_refuses_the_answers_of_two_versions(tmp_path: Path, video: Path) -> None:
     np.save(tmp_path / "small.npy", np.zeros((2, 40, 30, 3), np.uint8))  # of another size: a request of its own
-    client = RewardClient("", transports=[Shelf(after=1)])
-    monkeypatch.setattr(ServerOptions, "connected", lambda _server, _access: client)
-    result = invoke("compare", video, tmp_path / "small.npy", "--task", TASK, "--url", "grpc://127.0.0.1:1")
-    assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
-    assert result.stderr == "rfm-client: model_version: expected one for all videos, got 1, 2: ask again\n"
-
-
-def test_compare_tells_what_cannot_be_compared(served: Served, video: Path, tmp_path: Path) -> None:
-    np.save(tmp_path / "embeddings.npy", np.zeros((2, 8), np.float32))
-    result = ask(served, "compare", video, tmp_path / "embeddings.npy", "--task", TASK)
-    assert result.exit_code == ExitCode.FAILED
-    expected = "second: expected frames, as the first trajectory, got video_embeddings"
-    assert result.stderr == f"rfm-client: {video} and {tmp_path / 'embeddings.npy'}: {expected}\n"
-
-
-def test_a_lerobot_file_of_several_episodes_is_neither_scored_nor_compared(
-    served: Served, video: Path, tmp_path: Path
-) -> None:
-    film = tmp_path / "videos" / "observation.images.top" / "chunk-000" / "file-000.mp4"
-    film.parent.mkdir(parents=True)
-    film.write_bytes(video.read_bytes())
-    (tmp_path / "meta").mkdir()
-    (tmp_path / "meta" / "info.json").write_text('{"codebase_version": "v3.0", "total_episodes": 10}')
-    refused = (
-        "video: expected a film of one episode, got a LeRobot v3.0 file that holds 10 episodes: label the dataset "
-    )
-    for words in (("score", film), ("compare", video, film)):
-        result = ask(served, *words, "--task", TASK)
-        assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
-        assert refused in result.stderr
-        assert str(film) in result.stderr
+    with (
+        RewardClient("", transports=[Shelf(after=1)]) as client,
+        pytest.raises(InferenceFailedError, match=r"^model_version: expected one for all videos, got 1, 2: ask again$"),
+    ):
+        compare(client, [str(video), str(tmp_path / "small.npy")], VideoOptions(task=TASK))
 
 
 def test_a_plot_has_a_strip_for_each_video_and_is_drawn_without_scores_too(tmp_path: Path) -> None:

@@ -4,18 +4,14 @@
 from __future__ import annotations
 
 import asyncio
-import time
-import urllib.request
-from collections.abc import Callable
 from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from prometheus_client.parser import text_string_to_metric_families
 
 from engines import load_engine
-from mixtures import FRAMES_MODEL, MODEL, TOLERANCE, assert_same, counts, mixed_samples, plug
+from mixtures import FRAMES_MODEL, MODEL, TOLERANCE, assert_same, mixed_samples, plug
 from reference_server import Served
 from rfm_client import (
     AsyncRewardClient,
@@ -33,7 +29,6 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.data.resize import resize_frames
-from rfm_client.scoring.batching import MAX_REQUEST_BYTES
 from rfm_client.transport.access import Access
 from rfm_client.transport.calls import Answer, GrpcTransport
 from rfm_client.transport.deadline import Deadline
@@ -41,74 +36,42 @@ from rfm_client.transport.in_flight import MAX_BYTES, InFlight
 from trajectories import random_trajectory
 
 NOBODY = "grpc://127.0.0.1:1"  # a port where nothing listens
+KINDS: dict[type, str] = {
+    ProgressSample: "progress",
+    PreferenceSample: "preference",
+    SimilaritySample: "similarity",
+}
+WIDTHS = (48, 32)  # of the embeddings of FRAMES_MODEL
 
 
-def in_one_call(client: RewardClient, samples: list[Sample]) -> list[Result]:
-    return client.evaluate(samples)
-
-
-def in_calls(client: RewardClient, samples: list[Sample]) -> list[Result]:
-    calls: dict[type, Callable[..., Result]] = {
-        ProgressSample: client.progress,
-        PreferenceSample: client.preference,
-        SimilaritySample: client.similarity,
-    }
-    return [calls[type(sample)](*sample.trajectories) for sample in samples]
-
-
-def as_futures(client: RewardClient, samples: list[Sample]) -> list[Result]:
-    return [future.result() for future in [client.submit(sample) for sample in samples]]
-
-
-@pytest.mark.parametrize("style", [in_one_call, in_calls, as_futures], ids=lambda style: str(style.__name__))
-def test_every_style_of_call_gives_the_engine_s_answers(
-    served: Served, protocol: str, style: Callable[[RewardClient, list[Sample]], list[Result]]
-) -> None:
+def test_every_style_of_call_gives_the_engine_s_answers(served: Served, protocol: str) -> None:
     samples = mixed_samples(12)
-    with served.client(protocol) as client:
-        answers = style(client, samples)
-    for answer, expected in zip(answers, load_engine(MODEL).evaluate(samples), strict=True):
-        assert_same(answer, expected)
-        assert answer.model_version == "1"  # type: ignore[union-attr]
 
-
-def test_every_style_may_be_awaited(served: Served, protocol: str) -> None:
-    samples = mixed_samples(9)
-
-    async def ask() -> tuple[list[Result], list[Result]]:
+    async def awaited() -> list[Result]:
         async with AsyncRewardClient(served.url(protocol), model=MODEL) as client:
-            calls: dict[type, Callable[..., object]] = {
-                ProgressSample: client.progress,
-                PreferenceSample: client.preference,
-                SimilaritySample: client.similarity,
-            }
-            alone = asyncio.gather(*(calls[type(sample)](*sample.trajectories) for sample in samples))  # type: ignore[call-overload]
-            return await client.evaluate(iter(samples)), await alone
+            alone = [getattr(client, KINDS[type(sample)])(*sample.trajectories) for sample in samples]
+            return [*await client.evaluate(iter(samples)), *await asyncio.gather(*alone)]
 
-    for answers in asyncio.run(ask()):
-        for answer, expected in zip(answers, load_engine(MODEL).evaluate(samples), strict=True):
-            assert_same(answer, expected)
+    with served.client(protocol) as client:
+        answers = client.evaluate(samples)
+        answers += [getattr(client, KINDS[type(sample)])(*sample.trajectories) for sample in samples]
+        answers += [future.result() for future in [client.submit(sample) for sample in samples]]
+    answers += asyncio.run(awaited())
+    for answer, expected in zip(answers, 5 * load_engine(MODEL).evaluate(samples), strict=True):
+        assert_same(answer, expected)
+        assert answer.model_version == "1"
 
 
-def test_a_thousand_samples_of_any_kind_come_back_in_order(served: Served) -> None:
+def test_hundreds_of_samples_of_frames_and_embeddings_come_back_in_order(served: Served) -> None:
+    embedded = [random_trajectory(seed, 1 + seed % 16, *WIDTHS) for seed in range(300)]
+    samples: list[Sample] = [ProgressSample(trajectory) for trajectory in embedded]
+    frames = np.random.default_rng(0).integers(0, 256, (3, 24, 32, 3), np.uint8)
+    films = [Trajectory(frames=frames[:length], task="stack the cups") for length in (1, 3)]
+    samples[150:150] = [ProgressSample(films[0]), PreferenceSample(*films), SimilaritySample(*embedded[:2])]
     with served.client("grpc", FRAMES_MODEL) as client:
-        info = client.model_info()
-        samples: list[Sample] = [narrowed(sample, info.video_dim, info.text_dim) for sample in mixed_samples(997)]
-        frames = np.random.default_rng(0).integers(0, 256, (3, 24, 32, 3), np.uint8)
-        films = [Trajectory(frames=frames[:length], task="stack the cups") for length in (1, 3)]
-        samples[500:500] = [ProgressSample(films[0]), PreferenceSample(*films), ProgressSample(films[1])]
         answers = client.evaluate(samples)
     for answer, alone in zip(answers, load_engine(FRAMES_MODEL).evaluate(samples), strict=True):
         assert_same(answer, alone)
-
-
-def narrowed(sample: Sample, video_dim: int | None, text_dim: int | None) -> Sample:
-    """The sample with embeddings of other widths."""
-    trajectories = [
-        replace(t, video_embeddings=t.positions[:, :video_dim], text_embedding=t.text_embedding[:text_dim])  # type: ignore[index]
-        for t in sample.trajectories
-    ]
-    return ProgressSample(trajectories[0]) if isinstance(sample, ProgressSample) else type(sample)(*trajectories)
 
 
 def test_a_bad_sample_fails_alone_or_is_raised_with_its_place(served: Served, protocol: str) -> None:
@@ -128,53 +91,12 @@ def test_a_bad_sample_fails_alone_or_is_raised_with_its_place(served: Served, pr
     assert str(outcomes[6]) == "sample: expected ProgressSample, PreferenceSample or SimilaritySample, got str"
 
 
-def test_samples_of_a_model_that_is_not_served_fail_and_the_others_are_scored(served: Served, protocol: str) -> None:
-    film = ProgressSample(Trajectory(frames=np.zeros((1, 8, 8, 3), np.uint8), task="none"))
-    with served.client(protocol) as client:  # MODEL has no encoders
-        outcomes = client.evaluate([film, film, ProgressSample(random_trajectory(0, 2)), film], return_errors=True)
-    kinds = [type(outcome) for outcome in outcomes]
-    assert kinds == [ModelNotFoundError, ModelNotFoundError, ProgressResult, ModelNotFoundError]
-
-
 def test_embeddings_of_another_width_are_told_in_our_words(served: Served, protocol: str) -> None:
     with served.client(protocol) as client:
         with pytest.raises(InvalidSampleError, match=r"^video_embeddings: expected \[-1,768\], got \[2,5\] \(request "):
             client.progress(random_trajectory(0, 2, 5, 384))
         with pytest.raises(InvalidSampleError, match=r"^text_embedding: expected \[384\], got \[7\] \(request \S+\)$"):
             client.progress(random_trajectory(0, 2, 768, 7))
-
-
-@pytest.mark.slow
-def test_a_cancelled_call_is_cancelled_on_the_server(served: Served) -> None:
-    """Triton 2.51 does not hear every cancellation, so there are several rounds. In its queue it cancels them itself."""
-
-    def num_cancelled() -> float:
-        in_model = metric(served, "rfm_samples", outcome="cancelled")
-        return in_model + metric(served, "nv_inference_request_failure", reason="CANCELED")
-
-    long = [ProgressSample(random_trajectory(0, 2048), frame_steps=16) for _ in range(8)]
-    before = num_cancelled()
-    with served.client("grpc") as client, ThreadPoolExecutor(3) as pool:
-        for _ in range(10):
-            plugs = [pool.submit(client.evaluate, long) for _ in range(3)]
-            next(as_completed(plugs))  # so the next one runs, and what is asked now has to wait
-            late = [client.submit(ProgressSample(random_trajectory(0, 4)), timeout_s=0.1) for _ in range(5)]
-            assert {type(future.exception()) for future in late} <= {DeadlineExceededError, type(None)}
-            for each in plugs:
-                each.result()
-            time.sleep(1.0)  # for the model to tell Triton what it has counted
-            if num_cancelled() > before:
-                return
-    pytest.fail("no cancelled call was cancelled on the server")
-
-
-def metric(served: Served, name: str, **labels: str) -> float:
-    """What Triton's metrics say of MODEL."""
-    with urllib.request.urlopen(served.endpoints.metrics_url, timeout=10) as answer:
-        families = list(text_string_to_metric_families(answer.read().decode()))
-    wanted = {"model": MODEL, **labels}.items()
-    samples = (sample for family in families for sample in family.samples)
-    return sum(s.value for s in samples if s.name.removesuffix("_total") == name and wanted <= s.labels.items())
 
 
 def test_a_deadline_ends_a_call_and_no_other(served: Served, protocol: str) -> None:
@@ -200,24 +122,6 @@ def test_a_cancelled_future_disturbs_no_other(served: Served) -> None:
             future.result()
 
 
-def test_requests_in_flight_are_bounded(served: Served) -> None:
-    class Counting(GrpcTransport):
-        now = most = 0
-
-        async def infer(self, *arguments: object, **options: object) -> Answer:
-            self.now += 1
-            self.most = max(self.most, self.now)
-            try:
-                return await super().infer(*arguments, **options)  # type: ignore[arg-type]
-            finally:
-                self.now -= 1
-
-    transport = Counting(served.url("grpc"), Access(), shared_memory=False)
-    with RewardClient("", transports=[transport], model=MODEL, max_in_flight=3) as client:
-        as_futures(client, mixed_samples(30))
-    assert transport.most == 3
-
-
 def test_bytes_in_flight_are_bounded_and_more_than_the_bound_goes_alone() -> None:
     async def ask() -> None:
         room = InFlight(10).room
@@ -237,48 +141,39 @@ def test_bytes_in_flight_are_bounded_and_more_than_the_bound_goes_alone() -> Non
     asyncio.run(ask())
 
 
-def test_those_that_wait_for_room_are_let_in_as_they_came() -> None:
-    async def ask() -> None:
-        in_flight = InFlight(1)
-        entered: list[int] = []
-
-        async def enter(number: int) -> None:
-            async with in_flight.room(1, Deadline(30)):
-                entered.append(number)
-
-        async with in_flight.room(1, Deadline(30)):
-            waiting = []
-            for number in range(4):
-                waiting.append(asyncio.create_task(enter(number)))
-                await asyncio.sleep(0)
-            waiting[1].cancel()
-        await asyncio.gather(*waiting, return_exceptions=True)
-        assert entered == [0, 2, 3]
-
-    asyncio.run(ask())
+def test_samples_of_a_model_that_is_not_served_fail_and_the_others_are_scored(served: Served) -> None:
+    film = ProgressSample(Trajectory(frames=np.zeros((1, 8, 8, 3), np.uint8), task="none"))
+    with served.client("grpc") as client:  # MODEL has no encoders
+        outcomes = client.evaluate([film, ProgressSample(random_trajectory(0, 2)), film], return_errors=True)
+    assert [type(outcome) for outcome in outcomes] == [ModelNotFoundError, ProgressResult, ModelNotFoundError]
 
 
-def test_large_samples_are_sent_in_several_requests(served: Served) -> None:
-    frames = np.zeros((4, 700, 1000, 3), np.uint8)
-    samples = [ProgressSample(Trajectory(frames=frames, task="none")) for _ in range(3)]
-    assert frames.nbytes > MAX_REQUEST_BYTES // 2
-    with served.client("grpc", FRAMES_MODEL) as client:
-        before = counts(served, f"{FRAMES_MODEL}_frames")[0]
-        client.evaluate(samples)
-        assert counts(served, f"{FRAMES_MODEL}_frames")[0] == before + 3
+def test_requests_in_flight_are_bounded(served: Served) -> None:
+    class Counting(GrpcTransport):
+        now = most = 0
+
+        async def infer(self, *arguments: object, **options: object) -> Answer:
+            self.now += 1
+            self.most = max(self.most, self.now)
+            try:
+                return await super().infer(*arguments, **options)  # type: ignore[arg-type]
+            finally:
+                self.now -= 1
+
+    transport = Counting(served.url("grpc"), Access(), shared_memory=False)
+    with RewardClient("", transports=[transport], model=MODEL, max_in_flight=3) as client:
+        for future in [client.submit(sample) for sample in mixed_samples(30)]:
+            future.result()
+    assert transport.most == 3
 
 
 def test_model_info_tells_what_the_checkpoint_takes(served: Served, protocol: str) -> None:
     with served.client(protocol, FRAMES_MODEL) as client:
         info, frames = client.model_info(), client.model_info(frames=True)
     assert (info.name, info.versions, info.max_batch_size) == (FRAMES_MODEL, ("1",), 64)
-    assert (info.max_frames, info.frame_size) == (16, None)
-    config = load_engine(FRAMES_MODEL).predictor.network.config  # type: ignore[attr-defined]
-    assert (info.video_dim, info.text_dim) == (config.video_feature_dim, config.text_feature_dim)
-    assert info.progress_bins == frames.progress_bins == 10
-    assert frames.max_frames == 16
-    preprocessor = load_engine(FRAMES_MODEL).encoders.preprocessor  # type: ignore[attr-defined]
-    assert str(frames.frame_size) == f"shortest {preprocessor.resize_px}"
+    assert (info.max_frames, info.frame_size, info.progress_bins) == (16, None, 10)
+    assert (info.video_dim, info.text_dim) == WIDTHS
+    assert (frames.max_frames, str(frames.frame_size), frames.progress_bins) == (16, "shortest 64", 10)
     assert (frames.video_dim, frames.text_dim) == (None, None)
 
 
@@ -288,8 +183,6 @@ def test_what_is_not_served_is_told(served: Served, protocol: str) -> None:
             client.model_info()
         with pytest.raises(DeadlineExceededError, match=r"not_served and not_served_frames: not ready within 0\.3 s"):
             client.wait_ready(0.3)
-    with served.client(protocol) as client:
-        client.wait_ready(30)
 
 
 def test_a_long_trajectory_is_subsampled_when_asked(served: Served) -> None:
@@ -345,28 +238,17 @@ def test_each_trajectory_is_resized_by_its_own_size_when_asked(served: Served) -
         np.testing.assert_allclose(resized.progress, client.progress(wide).progress, rtol=0, atol=5e-4)
 
 
-def test_pairs_of_two_frame_sizes_are_scored(served: Served, protocol: str) -> None:
+def test_pairs_of_two_frame_sizes_are_scored(served: Served) -> None:
     random = np.random.default_rng(5)
     films = [
         Trajectory(frames=random.integers(0, 256, (num_frames, *size, 3), np.uint8), task="open the drawer")
         for num_frames, size in ((4, (48, 60)), (3, (90, 61)), (2, (48, 60)))
     ]
     samples = [PreferenceSample(a, b) if a is films[0] else SimilaritySample(a, b) for a in films for b in films]
-    with served.client(protocol, FRAMES_MODEL) as client:
+    with served.client("grpc", FRAMES_MODEL) as client:
         answers = client.evaluate(samples)
     for result, expected in zip(answers, load_engine(FRAMES_MODEL).evaluate(samples), strict=True):
         assert_same(result, expected)
-
-
-def test_timing_and_logits_come_when_asked(served: Served, protocol: str) -> None:
-    with served.client(protocol) as client:
-        plain = client.progress(random_trajectory(0, 3))
-        full = client.progress(random_trajectory(0, 3), logits=True, timing=True)
-    assert (plain.timing, plain.progress_logits) == (None, None)
-    assert full.progress_logits is not None
-    assert full.progress_logits.shape == (3, 10)
-    assert full.timing is not None
-    assert full.timing.forward_ms > 0
 
 
 @pytest.mark.parametrize("retry", [False, True])
@@ -379,3 +261,13 @@ def test_nobody_there_is_an_error_of_its_own_for_each_sample(caplog: pytest.LogC
         assert isinstance(outcome, ServerUnavailableError)
         assert "refused" in str(outcome)
     assert [record.message.partition(": trying again")[0] for record in caplog.records] == [NOBODY] * retry
+
+
+def test_timing_and_logits_come_when_asked(served: Served) -> None:
+    with served.client("grpc") as client:
+        plain = client.progress(random_trajectory(0, 3))
+        full = client.progress(random_trajectory(0, 3), logits=True, timing=True)
+    assert (plain.timing, plain.progress_logits) == (None, None)
+    assert full.progress_logits is not None and full.timing is not None
+    assert full.progress_logits.shape == (3, 10)
+    assert full.timing.forward_ms > 0

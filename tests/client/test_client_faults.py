@@ -1,24 +1,26 @@
 # SPDX-License-Identifier: MIT
-"""Servers that stop, hang and come back, and connections that die."""
+"""Servers that stop, hang and come back, connections that die, and memory that is shared with them."""
 
 from __future__ import annotations
 
 import shutil
 import signal
 import socket
+import subprocess
+import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
 
-from faulty_servers import heavy, ours_in_dev_shm, trajectory, url_of
-from mixtures import assert_same
+from faulty_servers import heavy, ours_in_dev_shm, regions, trajectory, url_of
+from mixtures import MODEL, assert_same, plug, wait_until_at_work
 from one_model import OneModelServer, answered
 from proxies import Proxy
+from reference_server import Served
 from repositories import bound_queue, configure
 from rfm.launch.process import Endpoints
 from rfm_client import (
@@ -29,6 +31,7 @@ from rfm_client import (
     RewardClient,
     ServerUnavailableError,
 )
+from rfm_serve import wait_for
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
@@ -61,7 +64,7 @@ class Outcomes:
 
 
 @contextmanager
-def calling(client: RewardClient, threads: int = 4) -> Iterator[Outcomes]:
+def calling(client: RewardClient, threads: int = 2) -> Iterator[Outcomes]:
     """Within it, threads ask without pause."""
     outcomes = Outcomes()
     stop = threading.Event()
@@ -83,47 +86,43 @@ def calling(client: RewardClient, threads: int = 4) -> Iterator[Outcomes]:
                 thread.result()
 
 
-def test_calls_survive_a_restart_of_the_server(repository: Path, protocol: str) -> None:
-    endpoints = Endpoints.free()
-    with ExitStack() as servers, RewardClient(url_of(endpoints, protocol), timeout_s=PATIENCE_S) as client:
-        server = servers.enter_context(OneModelServer(repository, endpoints))
-        expected = client.progress(trajectory(0))
-        with calling(client) as outcomes:
-            outcomes.wait_for(ProgressResult)
-            server.stop()
-            servers.enter_context(OneModelServer(repository, endpoints))
-            outcomes.wait_for(ProgressResult)
-        assert outcomes.errors == []
-        assert_same(expected, client.progress(trajectory(0)))
-
-
-def test_of_two_servers_one_may_be_killed_and_come_back(tmp_path: Path, repository: Path, protocol: str) -> None:
+def test_calls_survive_restarts_and_kills_of_servers(tmp_path: Path, repository: Path) -> None:
     both = [Endpoints.free(), Endpoints.free()]
-    other_repository = shutil.copytree(repository, tmp_path / "other" / "model_repository")
-    urls = [url_of(endpoints, protocol) for endpoints in both]
-    with ExitStack() as servers, RewardClient(urls, timeout_s=PATIENCE_S) as client:
-        first = servers.enter_context(OneModelServer(repository, both[0]))
-        servers.enter_context(OneModelServer(other_repository, both[1]))
-        with calling(client) as outcomes:
-            until(lambda: all(answered(endpoints) for endpoints in both))  # the load is shared
-            first.kill()
-            outcomes.wait_for(ProgressResult, 100)
-            servers.enter_context(OneModelServer(repository, both[0]))
-            until(lambda: answered(both[0]) > 0)  # it is asked again
-        assert outcomes.errors == []
+    repositories = [repository, shutil.copytree(repository, tmp_path / "other" / "model_repository")]
+    with ExitStack() as started, ExitStack() as callers:  # which end while there are servers
+        first, second = (
+            started.enter_context(OneModelServer(*server)) for server in zip(repositories, both, strict=True)
+        )
+        outcomes: list[Outcomes] = []
+        clients: list[RewardClient] = []
+        for protocol in ("grpc", "http"):
+            urls = [url_of(endpoints, protocol) for endpoints in both]
+            for servers in (urls[:1], urls):
+                client = callers.enter_context(RewardClient(servers, timeout_s=PATIENCE_S))
+                outcomes.append(callers.enter_context(calling(client)))
+                clients.append(client)
+        sharing = callers.enter_context(RewardClient(both[0].grpc_url, timeout_s=PATIENCE_S, shared_memory=True))
+        expected, shared = clients[0].progress(trajectory(0)), sharing.progress(heavy(), frame_steps=2)
+        wait_for(lambda: all(answered(endpoints) for endpoints in both))  # the load is shared
+        first.stop()
+        started.enter_context(OneModelServer(repositories[0], both[0]))
+        for each in outcomes:
+            each.wait_for(ProgressResult)
+        assert_same(sharing.progress(heavy(), frame_steps=2), shared)
+        assert len(regions(both[0])) == 1
+        second.kill()
+        for each in outcomes:
+            each.wait_for(ProgressResult)
+        started.enter_context(OneModelServer(repositories[1], both[1]))
+        wait_for(lambda: answered(both[1]) > 0)  # it is asked again
+        assert [each.errors for each in outcomes] == [[]] * len(outcomes)
+        for client in clients:
+            assert_same(client.progress(trajectory(0)), expected)
 
 
-def until(condition: Callable[[], bool]) -> None:
-    """Asks the servers again and again."""
-    end_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end_s
-
-
-def test_a_server_that_hangs_costs_one_call_and_is_left_out(repository: Path, protocol: str) -> None:
-    endpoints = Endpoints.free()
-    with OneModelServer(repository, endpoints), socket.create_server(("127.0.0.1", 0)) as hung:
-        urls = [f"{protocol}://127.0.0.1:{hung.getsockname()[1]}", url_of(endpoints, protocol)]
+def test_a_server_that_hangs_costs_one_call_and_is_left_out(demo_server: Endpoints, protocol: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as hung:
+        urls = [f"{protocol}://127.0.0.1:{hung.getsockname()[1]}", url_of(demo_server, protocol)]
         with RewardClient(urls, timeout_s=2) as client:
             client.wait_ready(30)  # the one that is ready is enough
             outcomes: list[Result | Exception] = []
@@ -132,14 +131,9 @@ def test_a_server_that_hangs_costs_one_call_and_is_left_out(repository: Path, pr
     assert [type(outcome) for outcome in outcomes if isinstance(outcome, Exception)] == [DeadlineExceededError]
 
 
-def test_a_connection_that_dies_in_silence_costs_one_deadline(repository: Path, protocol: str) -> None:
-    endpoints = Endpoints.free()
-    port = endpoints.grpc_port if protocol == "grpc" else endpoints.http_port
-    with (
-        OneModelServer(repository, endpoints),
-        Proxy(port) as proxy,
-        RewardClient(f"{protocol}://127.0.0.1:{proxy.port}", timeout_s=3) as client,
-    ):
+def test_a_connection_that_dies_in_silence_costs_one_deadline(demo_server: Endpoints, protocol: str) -> None:
+    port = demo_server.grpc_port if protocol == "grpc" else demo_server.http_port
+    with Proxy(port) as proxy, RewardClient(f"{protocol}://127.0.0.1:{proxy.port}", timeout_s=3) as client:
         expected = client.progress(trajectory(0), timeout_s=PATIENCE_S)
         proxy.go_silent()
         outcomes = [client.evaluate([ProgressSample(trajectory(0))], return_errors=True)[0] for _ in range(5)]
@@ -148,12 +142,12 @@ def test_a_connection_that_dies_in_silence_costs_one_deadline(repository: Path, 
         assert proxy.num_connections == 2
 
 
-def test_a_request_that_nobody_takes_goes_over_a_new_connection_within_its_time(repository: Path) -> None:
-    endpoints = Endpoints.free()
+def test_a_request_that_the_server_does_not_take_goes_over_a_new_connection_within_its_time(
+    demo_server: Endpoints,
+) -> None:
     large = trajectory(0, 40_000)  # 10 MB: more than the sockets' buffers take
     with (
-        OneModelServer(repository, endpoints),
-        Proxy(endpoints.grpc_port, reads=False) as proxy,
+        Proxy(demo_server.grpc_port, reads=False) as proxy,
         RewardClient(f"grpc://127.0.0.1:{proxy.port}", timeout_s=PATIENCE_S) as client,
     ):
         expected = client.progress(trajectory(0))
@@ -163,14 +157,9 @@ def test_a_request_that_nobody_takes_goes_over_a_new_connection_within_its_time(
         assert proxy.num_connections == 2
 
 
-def test_calls_that_share_a_connection_with_one_that_hits_its_deadline_go_on(repository: Path) -> None:
+def test_calls_that_share_a_connection_with_one_that_hits_its_deadline_go_on(demo_server: Endpoints) -> None:
     """Over a connection that is alive and slow: a call that has more time keeps it."""
-    endpoints = Endpoints.free()
-    with (
-        OneModelServer(repository, endpoints),
-        Proxy(endpoints.grpc_port) as proxy,
-        RewardClient(f"grpc://127.0.0.1:{proxy.port}") as client,
-    ):
+    with Proxy(demo_server.grpc_port) as proxy, RewardClient(f"grpc://127.0.0.1:{proxy.port}") as client:
         expected = client.progress(trajectory(0))
         with proxy.held():
             patient = client.submit(ProgressSample(trajectory(0)), timeout_s=PATIENCE_S)
@@ -180,39 +169,107 @@ def test_calls_that_share_a_connection_with_one_that_hits_its_deadline_go_on(rep
         assert proxy.num_connections == 1
 
 
-def test_a_server_that_hangs_does_not_hold_what_shares_memory_with_it(repository: Path) -> None:
-    endpoints = Endpoints.free()
-    before = ours_in_dev_shm()
-    with OneModelServer(repository, endpoints) as server:
-        client = RewardClient(endpoints.grpc_url, shared_memory=True)
-        client.progress(heavy(), frame_steps=2)
-        server.signal(signal.SIGSTOP)
-        try:
-            client.close()
-        finally:
-            server.signal(signal.SIGCONT)
-        assert ours_in_dev_shm() == before
+def test_a_full_queue_is_waited_for(repository: Path) -> None:
+    configure(repository / "rfm", batch_size=1)
+    bound_queue(repository / "rfm", max_queue_size=1)
+    samples = [ProgressSample(trajectory(seed, 32), frame_steps=16) for seed in range(40)]
+    with OneModelServer(repository, Endpoints.free()) as server:
+        for url in (server.endpoints.grpc_url, server.endpoints.http_url):
+            with RewardClient(url, retry=False) as client:
+                outcomes = client.evaluate(samples, return_errors=True)
+            with RewardClient(url, timeout_s=PATIENCE_S) as client:
+                answers = client.evaluate(samples)
+            refused = [outcome for outcome in outcomes if isinstance(outcome, Exception)]
+            assert {type(error) for error in refused} == {ServerUnavailableError}
+            assert "Exceeds maximum queue size" in str(refused[0])
+            for outcome, answer in zip(outcomes, answers, strict=True):
+                if not isinstance(outcome, Exception):
+                    assert_same(outcome, answer)
 
 
 @pytest.fixture
-def short_queue(repository: Path) -> Path:
-    configure(repository / "rfm", batch_size=1)
-    bound_queue(repository / "rfm", max_queue_size=1)
-    return repository
+def nothing_shared_is_left(demo_server: Endpoints) -> Iterator[None]:
+    before = ours_in_dev_shm(), regions(demo_server)
+    yield
+    assert ours_in_dev_shm() <= before[0]
+    assert regions(demo_server) <= before[1]
 
 
-def test_a_full_queue_is_waited_for(short_queue: Path, protocol: str) -> None:
-    samples = [ProgressSample(trajectory(seed, 32), frame_steps=16) for seed in range(40)]
-    endpoints = Endpoints.free()
-    with OneModelServer(short_queue, endpoints):
-        with RewardClient(url_of(endpoints, protocol), retry=False) as client:
-            outcomes = client.evaluate(samples, return_errors=True)
-        with RewardClient(url_of(endpoints, protocol), timeout_s=PATIENCE_S) as client:
-            answers = client.evaluate(samples)
-    refused = [outcome for outcome in outcomes if isinstance(outcome, Exception)]
-    assert {type(error) for error in refused} == {ServerUnavailableError}
-    assert "Exceeds maximum queue size" in str(refused[0])
-    assert len(answers) == len(samples)
-    for outcome, answer in zip(outcomes, answers, strict=True):
-        if not isinstance(outcome, Exception):
-            assert_same(outcome, answer)
+@pytest.mark.usefixtures("nothing_shared_is_left")
+def test_shared_memory_changes_no_answer(demo_server: Endpoints, protocol: str) -> None:
+    samples = [ProgressSample(heavy(), frame_steps=2), ProgressSample(trajectory(1))]
+    mapped, named = regions(demo_server), ours_in_dev_shm()
+    with RewardClient(url_of(demo_server, protocol)) as client:
+        expected = client.evaluate(samples)
+    with RewardClient(url_of(demo_server, protocol), shared_memory=True) as client:
+        for _ in range(3):
+            for answer, plain in zip(client.evaluate(samples), expected, strict=True):
+                assert_same(answer, plain)
+        assert len(regions(demo_server) - mapped) == 1  # one, used again and again
+        assert ours_in_dev_shm() == named  # its name is gone while it is in use
+
+
+@pytest.mark.usefixtures("nothing_shared_is_left")
+def test_memory_of_cancelled_calls_never_mixes_with_that_of_others(demo_server: Endpoints) -> None:
+    samples = [ProgressSample(trajectory(seed, 4200), frame_steps=2) for seed in range(4)]  # 1.1 MB: copied in a thread
+    with RewardClient(demo_server.grpc_url) as client:
+        expected = [client.evaluate([sample])[0] for sample in samples]
+    with RewardClient(demo_server.grpc_url, shared_memory=True) as client:
+        for round_number in range(10):
+            late = [client.submit(sample, timeout_s=0.001 * (1 + round_number)) for sample in samples]
+            futures = [client.submit(sample) for sample in samples]
+            for future, plain in zip(futures, expected, strict=True):
+                assert_same(future.result(), plain)
+            assert {type(future.exception()) for future in late} <= {DeadlineExceededError, type(None)}
+
+
+@pytest.mark.usefixtures("nothing_shared_is_left")
+def test_memory_of_a_call_at_work_is_given_back_when_the_client_closes(served: Served, protocol: str) -> None:
+    """Triton refuses to unmap it while the request uses it, and does not do so later by itself."""
+    with RewardClient(served.url(protocol), model=MODEL, shared_memory=True) as client:
+        scored = [client.submit(sample) for sample in plug()[:4]]
+        wait_until_at_work(MODEL)
+        for future in scored:
+            future.cancel()
+
+
+def test_a_server_that_hangs_does_not_hold_what_shares_memory_with_it(demo_server: Endpoints) -> None:
+    before = ours_in_dev_shm()
+    with Proxy(demo_server.grpc_port) as proxy:
+        client = RewardClient(f"grpc://127.0.0.1:{proxy.port}", shared_memory=True)
+        client.progress(heavy(), frame_steps=2)
+        with proxy.held():
+            client.close()
+            assert ours_in_dev_shm() == before
+
+
+ASKING = """
+import os, resource, signal, sys
+import numpy as np
+from rfm_client import RewardClient, Trajectory
+{before}
+with RewardClient(sys.argv[1], shared_memory=True) as client:
+    trajectory = Trajectory(video_embeddings=np.ones((2000, 64)), text_embedding=np.ones(32))
+    print(client.progress(trajectory, frame_steps=2).last_progress)
+    {after}
+"""
+FULL = "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16))"
+
+
+def ask_elsewhere(url: str, before: str = "", after: str = "") -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", ASKING.format(before=before, after=after), url]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60)
+
+
+def test_a_killed_client_leaves_no_data(demo_server: Endpoints) -> None:
+    before = ours_in_dev_shm()
+    killed = ask_elsewhere(demo_server.grpc_url, after="os.kill(os.getpid(), signal.SIGKILL)")
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    assert ours_in_dev_shm() == before
+
+
+def test_a_full_dev_shm_is_told_and_inputs_go_through_the_socket(demo_server: Endpoints) -> None:
+    done = ask_elsewhere(demo_server.grpc_url, before=FULL)  # as a full /dev/shm, for this process alone
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) > 0
+    assert "no shared memory, inputs go through the socket: [Errno 27] File too large" in done.stderr

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Regions of shared memory when a call fails, is cancelled, or the server starts anew: none is lost or mixed up.
+"""Regions of shared memory when a call fails or is cancelled: none is lost.
 
-A stand-in for tritonclient: a real server cannot be told when to answer. ``test_shared_memory_faults`` has real ones.
+A stand-in for tritonclient: a real server cannot be told when to answer. ``test_client_faults`` has real ones.
 """
 
 from __future__ import annotations
 
 import asyncio
-import threading
 from collections.abc import Callable, Coroutine
 from typing import Any
 
@@ -18,8 +17,7 @@ from tritonclient.utils import InferenceServerException
 
 from commands import in_shared_memory
 from rfm_client.contract import triton
-from rfm_client.transport.off_loop import MIN_BYTES
-from rfm_client.transport.shared_memory import FOLDER, MIN_REGION_BYTES, MIN_SHARED_BYTES, Region, SharedMemory
+from rfm_client.transport.shared_memory import FOLDER, MIN_REGION_BYTES, MIN_SHARED_BYTES, SharedMemory
 
 SMALL = np.ones(MIN_SHARED_BYTES, np.uint8)
 LARGE = np.ones(MIN_REGION_BYTES + 1, np.uint8)  # more than the region of a small one holds
@@ -79,8 +77,9 @@ async def lend(server: Triton, memory: SharedMemory, array: np.ndarray[Any, Any]
         return region.name
 
 
-@pytest.mark.parametrize("failure", [aiohttp.ServerDisconnectedError(), ConnectionResetError()], ids=repr)
-def test_what_could_not_be_registered_is_tried_again(failure: Exception) -> None:
+def test_what_could_not_be_registered_is_tried_again() -> None:
+    failure = aiohttp.ServerDisconnectedError()
+
     async def test(server: Triton, memory: SharedMemory) -> None:
         server.failure = failure
         with pytest.raises(type(failure)):
@@ -120,34 +119,6 @@ def test_what_a_cancelled_call_registered_is_given_back() -> None:
     run(test)
 
 
-def test_what_a_cancelled_call_still_writes_to_is_lent_to_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    begun, may_end = threading.Event(), threading.Event()
-    write = Region.write
-
-    def slow(self: Region, array: np.ndarray[Any, Any]) -> None:
-        if not begun.is_set():
-            begun.set()
-            assert may_end.wait(WITHIN_S)
-        write(self, array)
-
-    monkeypatch.setattr(Region, "write", slow)
-    array = np.ones(MIN_BYTES, np.uint8)  # written in a thread
-
-    async def test(server: Triton, memory: SharedMemory) -> None:
-        call = asyncio.create_task(lend(server, memory, array))
-        assert await asyncio.to_thread(begun.wait, WITHIN_S)
-        call.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await call
-        (written,) = server.mapped
-        try:
-            assert await lend(server, memory, array) != written
-        finally:
-            may_end.set()
-
-    run(test)
-
-
 def test_regions_that_are_too_small_make_room_unless_the_server_uses_them() -> None:
     async def test(server: Triton, memory: SharedMemory) -> None:
         await lend(server, memory)
@@ -160,26 +131,5 @@ def test_regions_that_are_too_small_make_room_unless_the_server_uses_them() -> N
         await lend(server, memory, np.ones(3 * MIN_REGION_BYTES, np.uint8))
         assert small in server.mapped
         server.in_use = set()
-
-    run(test)
-
-
-def test_a_server_that_starts_anew_has_lost_what_it_had_before() -> None:
-    async def test(server: Triton, memory: SharedMemory) -> None:
-        async def lose(times: int) -> None:
-            """Calls side by side, each of which is told that its region is lost."""
-            if times == 0:
-                return
-            with pytest.raises(InferenceServerException):
-                async with memory.lend(server, SMALL):
-                    await lose(times - 1)
-                    raise InferenceServerException(f"{triton.LOST_REGION}: 'a'", status="400")
-
-        old = {await lend(server, memory)}
-        await lose(3)
-        old |= set(server.mapped)
-        new = await lend(server, memory)
-        assert new not in old
-        assert await lend(server, memory) == new
 
     run(test)

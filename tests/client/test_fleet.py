@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from faulty_servers import url_of
 from patients import DEADLY, MARK, Callers, make_repository, references, trajectory
 from rfm_client import (
     ProgressSample,
@@ -42,9 +41,9 @@ def fleet(tmp_path: Path) -> Iterator[list[Serving]]:
 
 
 def test_a_request_that_ends_its_process_ends_two_of_a_fleet(
-    fleet: list[Serving], references: list[np.ndarray[Any, Any]], protocol: str
+    fleet: list[Serving], references: list[np.ndarray[Any, Any]]
 ) -> None:
-    urls = [url_of(server.endpoints, protocol) for server in fleet]
+    urls = [server.endpoints.grpc_url for server in fleet]
     with (
         RewardClient(urls, timeout_s=LONG_S) as client,
         RewardClient(urls, timeout_s=LONG_S) as other,

@@ -3,18 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-import clip
-from rfm.engine import Engine
 from rfm.rewind.encoders import ImagePreprocessor
 from rfm.vlm.images import Normalisation, QwenImages, SmolImages, fitted_size
-from rfm_client import ProgressResult, ProgressSample, Trajectory
 from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.resize import resize_frames
@@ -67,7 +62,7 @@ def test_frames_are_only_ever_made_smaller(text: str, size: tuple[int, int], fit
 
 
 NO_COLOURS = Normalisation((0.0,) * 3, (1 / 255,) * 3)  # so that the network reads grey levels
-SIZES = [(300, 401), (401, 300), *np.random.default_rng(0).integers(257, 700, (6, 2)).tolist()]
+SIZES = [(300, 401), (401, 300), (257, 699)]
 
 
 def large(height: int, width: int) -> UInt8Array:
@@ -101,15 +96,3 @@ def test_qwen_reads_the_very_pixels_that_it_would_have_read() -> None:
     frames, size = large(300, 401), FrameSize("exact", fitted_size(224, 320, 28))
     images = QwenImages(14, NO_COLOURS, (224, 320))
     assert torch.equal(images.images_to_size(frames), images.images_to_size(resize_frames(frames, size)))
-
-
-def test_scores_of_resized_frames_are_close(engine: Callable[[str], Engine]) -> None:
-    frames = clip.render()[::4]
-    small = resize_frames(frames, FrameSize.parse("shortest 64"))
-    assert small.shape == (8, 64, 64, 3)
-    samples = [ProgressSample(Trajectory(frames=film, task=clip.TASK)) for film in (frames, small)]
-    whole, resized = engine("enc_c1_t1_disc10").evaluate(samples)
-    assert isinstance(whole, ProgressResult)
-    assert isinstance(resized, ProgressResult)
-    np.testing.assert_allclose(resized.progress, whole.progress, rtol=0, atol=1e-4)
-    np.testing.assert_allclose(resized.success, whole.success, rtol=0, atol=1e-4)

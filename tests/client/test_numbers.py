@@ -10,10 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from rfm_client import RewardClient
-from rfm_client.cli.commands import app
 from rfm_client.contract.results import FrameScores
 from rfm_client.data.inputs import load_trajectory
 from rfm_client.data.sampling import Sampling
@@ -57,7 +55,7 @@ FINITES: dict[str, Given] = {
     "RewardOptions.scale": lambda value: RewardOptions(scale=value),
     "RayOptions.num_gpus_per_actor": lambda value: RayOptions(num_gpus_per_actor=value),
 }
-NO_NUMBERS = [math.nan, math.inf, True, "8", np.bool_(True), [1]]
+NO_NUMBERS = [math.nan, math.inf, True, "8"]
 
 
 def cases(kinds: dict[str, Given], values: list[Any]) -> list[Any]:
@@ -67,8 +65,8 @@ def cases(kinds: dict[str, Given], values: list[Any]) -> list[Any]:
 @pytest.mark.parametrize(
     ("give", "value"),
     [
-        *cases(SHARES, [*NO_NUMBERS, -1, -0.01, 1.01, 80, np.float32(80)]),
-        *cases(COUNTS, [*NO_NUMBERS, 0, -1, 2.5, 2.0, np.float64(2)]),
+        *cases(SHARES, [*NO_NUMBERS, -0.01, 1.01]),
+        *cases(COUNTS, [*NO_NUMBERS, 0, 2.5]),
         *cases(FROM_0, [*NO_NUMBERS, -1, 2.5]),
         *cases(POSITIVES, [*NO_NUMBERS, 0, -1]),
         *cases(FINITES, NO_NUMBERS),
@@ -82,11 +80,11 @@ def test_a_number_that_cannot_hold_is_refused(give: Given, value: Any) -> None:
 @pytest.mark.parametrize(
     ("give", "value"),
     [
-        *cases(SHARES, [0, 1, 0.5, np.float32(0.8), np.int64(1)]),
+        *cases(SHARES, [0, np.float32(0.8)]),
         *cases(FROM_0, [0, np.int64(8)]),
-        *cases(COUNTS, [1, 8, np.int64(8), np.uint8(8)]),
-        *cases(POSITIVES, [1, 0.5, np.float32(0.5), np.int64(8)]),
-        *cases(FINITES, [1, 0.5, np.float32(0.5), 0]),
+        *cases(COUNTS, [np.int64(8)]),
+        *cases(POSITIVES, [np.float32(0.5)]),
+        *cases(FINITES, [0, np.float32(0.5)]),
     ],
 )
 def test_a_number_may_be_numpy_s(give: Given, value: Any) -> None:
@@ -101,26 +99,9 @@ def test_percent_are_told_from_a_probability(give: Given) -> None:
         give(80)
 
 
-@pytest.mark.parametrize("value", [math.nan, -1.0, True, "1"])
+@pytest.mark.parametrize("value", [math.nan, -1.0, True])
 @pytest.mark.parametrize("read", [load_trajectory, read_video])
 @pytest.mark.parametrize("name", ["fps", "start_s", "end_s"])
 def test_a_part_of_a_video_has_times_that_can_be(tmp_path: Path, read: Any, name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=rf"^{name}: expected .*, got "):
         read(tmp_path / "film.mp4", **{name: value})
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["score", "film.mp4", "--task", "push", "--fps", "nan"],
-        ["score", "film.mp4", "--task", "push", "--fps", "inf"],
-        ["score", "film.mp4", "--task", "push", "--timeout", "nan"],
-        ["wait", "--timeout", "nan"],
-        ["label", "folder", "--num-gpus-per-actor", "nan"],
-    ],
-    ids=lambda words: " ".join(words[-2:]),
-)
-def test_a_command_refuses_nan(words: list[str]) -> None:
-    done = CliRunner().invoke(app, words)
-    assert done.exit_code == 2
-    assert f"Invalid value for '{words[-2]}'" in done.output

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,6 @@ import pytest
 import rerun
 from PIL import Image
 
-import clip
 from client_commands import TASK, invoke
 from rfm.launch.process import Endpoints
 from rfm_client import FrameScores
@@ -40,11 +40,11 @@ def logged(file: Path, timeline: str, entity: str, component: str) -> tuple[list
     return [time for time, _ in rows], [value for _, value in rows]
 
 
+@pytest.mark.triton
 def test_score_records_frames_and_curves_on_one_timeline(demo_server: Endpoints, video: Path, tmp_path: Path) -> None:
     other, seen = tmp_path / "other clip.mp4", tmp_path / "seen.npz"
-    clip.write(other)
-    random = np.random.default_rng(0)
-    np.savez(seen, video_embeddings=random.random((5, 64), np.float32), text_embedding=random.random(32, np.float32))
+    shutil.copy(video, other)
+    np.savez(seen, video_embeddings=np.ones((5, 64), np.float32), text_embedding=np.ones(32, np.float32))
     out, target = tmp_path / "out.rrd", tmp_path / "scores.json"
     result = invoke(
         *("score", video, other, "missing.mp4", seen, "--task", TASK, "--fps", 10, "--max-frames", 7),
@@ -93,10 +93,11 @@ def test_a_score_that_is_not_predicted_has_no_curve_and_nothing_makes_no_file(tm
 
 
 def test_a_missing_package_is_told_with_the_command_that_installs_it(
-    video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    demo_server: Endpoints, video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    result = invoke("score", video, "--task", TASK, "--rrd", tmp_path / "out.rrd")
+    words = ("score", video, "--task", TASK, "--url", demo_server.grpc_url)
+    result = invoke(*words, "--rrd", tmp_path / "out.rrd")
     assert (result.exit_code, result.stdout) == (ExitCode.FAILED, "")
     assert result.stderr == 'rfm-client: recordings need rerun-sdk: pip install "./client[rerun]"\n'
 

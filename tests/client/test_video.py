@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 
 import clip
-from paths import VIDEOS
 from pictures import numbered, numbers, write_video
 from rfm_client import InvalidSampleError
 from rfm_client.data.inputs import load_trajectory
@@ -34,12 +33,6 @@ def test_a_video_is_read_whole_or_at_a_frame_rate(film: Path) -> None:
     np.testing.assert_array_equal(sampled, whole.positions[indices])
 
 
-@pytest.mark.parametrize("fps", [0, -1, float("nan"), float("inf")])
-def test_a_frame_rate_is_a_number_above_0(film: Path, fps: float) -> None:
-    with pytest.raises(InvalidSampleError, match=rf"^fps: expected a number above 0, got {fps}$"):
-        read_video(film, fps)
-
-
 def test_memory_is_told_before_it_is_taken(film: Path) -> None:
     frame_bytes = clip.SIZE_PX**2 * 3
     told: list[int] = []
@@ -52,12 +45,6 @@ def test_memory_is_told_before_it_is_taken(film: Path) -> None:
 
     with pytest.raises(MemoryError, match=f"^{frame_bytes}$"):
         read_video(film, take=refuse)
-
-
-def test_a_file_is_read_as_the_format_that_is_named_alone(film: Path) -> None:
-    np.testing.assert_array_equal(read_video(film, 3, container="mov"), read_video(film, 3))
-    with pytest.raises(InvalidSampleError, match=r"^video: expected a file with a video stream, got "):
-        read_video(film, container="matroska")
 
 
 def test_frames_of_a_variable_rate_are_even_in_number(tmp_path: Path) -> None:
@@ -130,12 +117,6 @@ def test_a_url_is_downloaded_once_and_read_as_the_file_is(film: Path) -> None:
     np.testing.assert_array_equal(loaded.positions, read_video(film, 3))
 
 
-@pytest.mark.parametrize("file", sorted(VIDEOS.glob("*.mp4")), ids=lambda file: file.stem)
-def test_a_robot_video_is_the_same_behind_a_url(file: Path) -> None:
-    with serving(VIDEOS) as (url, _):
-        np.testing.assert_array_equal(read_video(f"{url}/{file.name}", 3), read_video(file, 3))
-
-
 BAD_URLS = {
     "not there": ("nothing.mp4", "HTTP Error 404: Not Found"),
     "broken off": ("short/clip.mp4", "[0-9]+ of [0-9]+ bytes came"),
@@ -161,7 +142,7 @@ def test_a_server_that_says_nothing_is_given_up() -> None:
         read_video(url, 3)
 
 
-@pytest.mark.parametrize("url", ["http://", "http://localhost:none/", "http://local host/", "https://lücke/\n"])
+@pytest.mark.parametrize("url", ["http://", "http://localhost:none/", "https://lücke/\n"])
 def test_a_url_that_is_none_is_refused(url: str) -> None:
     with pytest.raises(InvalidSampleError, match=r"^video: expected a file with a video stream, got "):
         read_video(url, 3)

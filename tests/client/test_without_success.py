@@ -35,58 +35,41 @@ def endpoints(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Endpoints]:
         yield server.endpoints
 
 
-@pytest.fixture
-def without_heads(endpoints: Endpoints, protocol: str) -> Iterator[RewardClient]:
-    with RewardClient(endpoints.grpc_url if protocol == "grpc" else endpoints.http_url, model=MODEL) as client:
-        yield client
-
-
 def film(seed: int, count: int) -> Trajectory:
     frames = np.random.default_rng(seed).integers(0, 256, (count, 40, 56, 3), np.uint8)
     return Trajectory(frames=frames, task=TASK)
 
 
 def test_progress_is_what_it_was_and_a_preference_fails_alone(
-    without_heads: RewardClient, served: Served, protocol: str
+    endpoints: Endpoints, served: Served, tmp_path: Path
 ) -> None:
-    good = ProgressSample(film(0, 3))
-    first, refused, last = without_heads.evaluate(
-        [good, PreferenceSample(film(1, 2), film(2, 3)), good], return_errors=True
-    )
+    good = film(0, 3)
+    samples = [ProgressSample(good), PreferenceSample(film(1, 2), film(2, 3))]
+    with RewardClient(endpoints.grpc_url, model=MODEL) as client, served.client("grpc", MODEL) as with_heads:
+        result, refused = client.evaluate(samples, return_errors=True)
+        expected = with_heads.progress(good)
     assert isinstance(refused, InvalidSampleError)
     assert "sample_type: expected progress or similarity (this checkpoint has no preference head)" in str(refused)
-    with served.client(protocol, MODEL) as client:
-        expected = client.progress(good.trajectory)
-    for result in (first, last):
-        assert isinstance(result, ProgressResult)
-        np.testing.assert_allclose(result.progress, expected.progress, rtol=0, atol=1e-5)
-        assert np.isnan(result.success).all()
-
-
-def test_an_episode_has_progress_and_never_succeeds(without_heads: RewardClient) -> None:
-    with without_heads.episode(TASK, success=SuccessRule(threshold=0)) as episode:
-        scores = [episode.add(frame) for frame in film(3, 3).positions]
-    assert all(np.isfinite(score.progress) and np.isnan(score.success) for score in scores)
-    assert not any(score.succeeded for score in scores)
-
-
-@pytest.mark.parametrize("blocking", [True, False])
-def test_an_environment_is_rewarded_but_not_ended_by_success(without_heads: RewardClient, blocking: bool) -> None:
-    options = RewardOptions(terminate_on_success=SuccessRule(), blocking=blocking)
-    env = RewardModelWrapper(cart_pole(), without_heads, TASK, options)
-    with pytest.raises(
-        ValueError, match=r"^terminate_on_success: expected None with a checkpoint that does not predict"
-    ):
-        env.reset(seed=0)
-    rewards, infos = play(RewardModelWrapper(cart_pole(), without_heads, TASK, RewardOptions(blocking=blocking)))
-    assert np.isfinite(rewards).all()
-    assert all(np.isnan(info["reward_model"]["success"]) for info in infos)
-
-
-def test_the_gateway_answers_progress_alone(endpoints: Endpoints, tmp_path: Path) -> None:
-    frames = film(4, 3).positions.tolist()
-    sample = {"sample_type": "progress", "trajectory": {"frames": frames, "task": TASK}}
+    assert isinstance(result, ProgressResult)
+    np.testing.assert_allclose(result.progress, expected.progress, rtol=0, atol=1e-5)
+    assert np.isnan(result.success).all()
+    sample = {"sample_type": "progress", "trajectory": {"frames": good.positions.tolist(), "task": TASK}}
     with running(endpoints, tmp_path, MODEL) as gateway:
         answer = requests.post(f"{gateway.url}/evaluate_batch", json={"samples": [sample]}).json()
-    assert len(answer["outputs_progress"]["progress_pred"][0]) == 3
+    np.testing.assert_allclose(answer["outputs_progress"]["progress_pred"][0], expected.progress, rtol=0, atol=1e-5)
     assert answer["outputs_success"] is None
+
+
+def test_nothing_succeeds_and_an_environment_is_not_ended_by_success(endpoints: Endpoints) -> None:
+    with RewardClient(endpoints.http_url, model=MODEL) as client:
+        with client.episode(TASK, success=SuccessRule(threshold=0)) as episode:
+            scores = [episode.add(frame) for frame in film(3, 3).positions]
+        assert all(np.isfinite(score.progress) and np.isnan(score.success) for score in scores)
+        assert not any(score.succeeded for score in scores)
+        env = RewardModelWrapper(cart_pole(), client, TASK, RewardOptions(terminate_on_success=SuccessRule()))
+        told = r"^terminate_on_success: expected None with a checkpoint that does not predict"
+        with pytest.raises(ValueError, match=told):
+            env.reset(seed=0)
+        rewards, infos = play(RewardModelWrapper(cart_pole(), client, TASK, RewardOptions()))
+    assert np.isfinite(rewards).all()
+    assert all(np.isnan(info["reward_model"]["success"]) for info in infos)

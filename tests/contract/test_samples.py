@@ -11,14 +11,13 @@ from rfm_client import (
     InvalidSampleError,
     PreferenceSample,
     ProgressSample,
-    RewardError,
     Sample,
     SimilaritySample,
     Trajectory,
     float_frames_to_uint8,
 )
 from rfm_client.contract import wire
-from rfm_client.scoring import batching as packing
+from rfm_client.scoring import batching
 
 FRAMES = np.zeros((3, 8, 6, 3), np.uint8)
 VIDEO = np.ones((3, 5), np.float32)
@@ -149,13 +148,6 @@ def test_what_cannot_be_scored_cannot_be_made(make: Callable[[], Any], message: 
     assert str(caught.value) == message
 
 
-def test_embeddings_become_float32() -> None:
-    trajectory = Trajectory(video_embeddings=[[1, 2]], text_embedding=np.ones(3, np.float64))  # type: ignore[arg-type]
-    assert trajectory.positions.dtype == np.float32
-    assert trajectory.text_embedding is not None
-    assert trajectory.text_embedding.dtype == np.float32
-
-
 def test_float_frames_are_clipped_and_truncated() -> None:
     frames = np.array([-3.0, 0.9, 1.0, 254.99, 300.0])
     assert float_frames_to_uint8(frames).tolist() == [0, 0, 1, 254, 255]
@@ -167,66 +159,43 @@ def test_float_frames_that_would_turn_black_are_refused(frames: np.ndarray) -> N
         float_frames_to_uint8(frames)
 
 
-SAMPLES: dict[str, list[Sample]] = {
-    "all types, all lengths": [
-        ProgressSample(embedded(1)),
-        PreferenceSample(embedded(2), embedded(5)),
-        SimilaritySample(embedded(3), embedded(1)),
-    ],
-    "frames": [ProgressSample(filmed(2), frame_steps=2), PreferenceSample(filmed(1), filmed(3))],
-    "pairs of two frame sizes": [
+def test_pairs_of_two_frame_sizes_arrive_as_they_were() -> None:
+    samples: list[Sample] = [
         PreferenceSample(filmed(4), filmed(1, height=9)),
         SimilaritySample(filmed(2), filmed(3, height=9)),
-    ],
-}
-
-
-def test_only_pairs_of_two_frame_sizes_take_a_second_array() -> None:
-    assert wire.SECOND_FRAMES not in wire.encode_samples(SAMPLES["frames"])
-    tensors = wire.encode_samples(SAMPLES["pairs of two frame sizes"])
+    ]
+    tensors = wire.encode_samples(samples)
     assert tensors[wire.FRAMES].shape == (2, 4, 8, 6, 3)
     assert tensors[wire.SECOND_FRAMES].shape == (2, 3, 9, 6, 3)
     assert wire.num_positions(tensors) == 4 + 3
-
-
-def test_pairs_of_two_frame_sizes_arrive_as_they_were() -> None:
-    samples = SAMPLES["pairs of two frame sizes"]
-    tensors = wire.encode_samples(samples)
     of_encoder = {spec.name: tensors[spec.name] for spec in wire.encoder_inputs()}
     for decoded in (wire.decode_samples(tensors), wire.decode_trajectories(of_encoder)):
         for sample, its_copy in zip(samples, decoded, strict=True):
             for trajectory, other in zip(sample.trajectories, its_copy.trajectories, strict=True):
                 np.testing.assert_array_equal(other.positions, trajectory.positions)  # type: ignore[union-attr]
-
-
-def test_requests_of_two_frame_sizes_are_bounded_by_what_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The longest first trajectory and the longest second one may be of two samples."""
-    counts = [(1, 9), (9, 1), (5, 5), (2, 8), (8, 2), (1, 1)]
-    samples = dict(enumerate(PreferenceSample(filmed(n), filmed(m, height=64)) for n, m in counts))
-    samples |= {index + len(counts): SimilaritySample(sample.first, sample.first) for index, sample in samples.items()}
-    bound = 60_000
-    monkeypatch.setattr(packing, "MAX_REQUEST_BYTES", bound)
-    asked: list[int] = []
-    for _, group in packing.groups(samples, "rfm"):
-        for part in packing.parts(samples, group, max_batch_size=64):
-            tensors = wire.encode_samples([samples[index] for index in part])
-            sent = sum(tensors[name].nbytes for name in (wire.FRAMES, wire.SECOND_FRAMES) if name in tensors)
-            assert sent == packing.padded_bytes([samples[index] for index in part])
-            assert sent <= bound
-            asked += part
-    assert sorted(asked) == sorted(samples)
+    assert wire.SECOND_FRAMES not in wire.encode_samples([PreferenceSample(filmed(1), filmed(3))])
 
 
 def test_a_sample_of_a_larger_request_is_named_in_its_error() -> None:
-    tensors = wire.encode_samples(SAMPLES["all types, all lengths"])
+    tensors = wire.encode_samples([ProgressSample(embedded(1)), PreferenceSample(embedded(2), embedded(5))])
     tensors[wire.SAMPLE_TYPE][1] = 9
     with pytest.raises(InvalidSampleError, match=r"^samples\[1\]\.sample_type: expected"):
         wire.decode_samples(tensors)
 
 
-def test_every_error_is_a_reward_error() -> None:
-    import rfm_client
-
-    errors = [getattr(rfm_client, name) for name in rfm_client.__all__ if name.endswith("Error")]
-    assert len(errors) == 9
-    assert all(issubclass(error, RewardError) for error in errors)
+def test_requests_of_two_frame_sizes_are_bounded_by_what_is_sent() -> None:
+    """The longest first trajectory and the longest second one may be of two samples."""
+    small, large = (np.zeros((9, height, 400, 3), np.uint8) for height in (100, 400))
+    counts = [(1, 9), (9, 1), (5, 5), (2, 8), (8, 2), (1, 1)]
+    pairs = [[Trajectory(frames=small[:n], task="lift"), Trajectory(frames=large[:m], task="lift")] for n, m in counts]
+    samples: dict[int, Sample] = dict(enumerate(PreferenceSample(*pair) for pair in pairs))
+    samples |= {len(counts) + index: SimilaritySample(first, first) for index, (first, _) in enumerate(pairs)}
+    asked: list[int] = []
+    for _, group in batching.groups(samples, "rfm"):
+        for part in batching.parts(samples, group, max_batch_size=64):
+            tensors = wire.encode_samples([samples[index] for index in part])
+            sent = sum(tensors[name].nbytes for name in (wire.FRAMES, wire.SECOND_FRAMES) if name in tensors)
+            assert sent == batching.padded_bytes([samples[index] for index in part])
+            assert sent <= batching.MAX_REQUEST_BYTES
+            asked += part
+    assert sorted(asked) == sorted(samples)

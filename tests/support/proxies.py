@@ -95,8 +95,10 @@ class Proxy:
         self._is_closed.set()
         self._listener.close()
         for near, far, _ in self._pairs:
-            near.close()
-            far.close()
+            for end in (near, far):
+                with suppress(OSError):  # the other side has ended it
+                    end.shutdown(socket.SHUT_RDWR)  # also under a thread that waits for it
+                end.close()
 
 
 class HttpProxy(Proxy):
