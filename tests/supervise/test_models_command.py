@@ -239,6 +239,33 @@ def test_rollouts_lose_no_request_mix_no_versions_and_outlive_restarts(
     assert running.served.said == []  # nothing was healed
 
 
+def test_what_was_served_is_served_again_and_not_what_was_exported_since(running: Running, other: Path) -> None:
+    """Models that were loaded since, too; those that were unloaded are not."""
+    served, samples = running.served, rollout.questions()
+    running.export_plain("since")
+    running.models("load", "since")
+    version = rollout.export(other, running.repository)
+    parts = dict.fromkeys(PARTS, NO_REASON)
+    wait_for(lambda: served.reasons() == parts | {"since": NO_REASON})
+    os.kill(served.model_processes("since")[0], signal.SIGKILL)
+    wait_for(lambda: served.restarts("since") == 1)
+    served.wait_ready()
+    assert served.reasons() == parts | {"since": NO_REASON}
+    assert [running.ready(part) for part in PARTS] == [["1"]] * 3
+    with served.client() as client:
+        expected = rollout.answers(WITH_ENCODERS.checkpoint, samples)
+        for got, wanted in zip(client.evaluate(samples), expected, strict=True):
+            assert difference(got, wanted) <= rollout.TOLERANCE
+    running.models("rollout", NAME, str(version))
+    running.models("unload", "since")
+    wait_for(lambda: served.reasons() == parts)
+    os.kill(served.triton, signal.SIGKILL)
+    wait_for(lambda: served.restarts("triton") == 1)
+    served.wait_ready()
+    assert served.reasons() == parts
+    assert [running.ready(part) for part in PARTS] == [[str(version)]] * 3
+
+
 def break_settings(checkpoint: Path) -> None:
     (checkpoint / "config.json").write_text("{")
 
@@ -271,33 +298,6 @@ def test_a_broken_version_is_never_asked_and_the_old_one_stays(running: Running,
     with running.client(NAME) as client:
         assert client.is_ready()  # what failed is no reason to ask nobody here
     running.models("unload", name)
-
-
-def test_what_was_served_is_served_again_and_not_what_was_exported_since(running: Running, other: Path) -> None:
-    """Models that were loaded since, too; those that were unloaded are not."""
-    served, samples = running.served, rollout.questions()
-    running.export_plain("since")
-    running.models("load", "since")
-    version = rollout.export(other, running.repository)
-    parts = dict.fromkeys(PARTS, NO_REASON)
-    wait_for(lambda: served.reasons() == parts | {"since": NO_REASON})
-    os.kill(served.model_processes("since")[0], signal.SIGKILL)
-    wait_for(lambda: served.restarts("since") == 1)
-    served.wait_ready()
-    assert served.reasons() == parts | {"since": NO_REASON}
-    assert [running.ready(part) for part in PARTS] == [["1"]] * 3
-    with served.client() as client:
-        expected = rollout.answers(WITH_ENCODERS.checkpoint, samples)
-        for got, wanted in zip(client.evaluate(samples), expected, strict=True):
-            assert difference(got, wanted) <= rollout.TOLERANCE
-    running.models("rollout", NAME, str(version))
-    running.models("unload", "since")
-    wait_for(lambda: served.reasons() == parts)
-    os.kill(served.triton, signal.SIGKILL)
-    wait_for(lambda: served.restarts("triton") == 1)
-    served.wait_ready()
-    assert served.reasons() == parts
-    assert [running.ready(part) for part in PARTS] == [[str(version)]] * 3
 
 
 @dataclass
