@@ -164,10 +164,9 @@ def test_callers_are_answered_while_another_model_loads(running: Running, tmp_pa
     [
         (("rollout", "nobody", "1"), ", got nobody"),
         (("rollout", NAME, "77"), "rfm version 77: expected an exported version, got [Errno 2]"),
-        (("load", "nobody"), ", got nobody"),
         (("rollback", NAME), "expected a version before 1, got none"),
     ],
-    ids=["name", "version", "load", "none before"],
+    ids=["name", "version", "none before"],
 )
 def test_what_is_not_there_is_told_and_nothing_changes(running: Running, words: tuple[str, ...], message: str) -> None:
     before = running.models("list")

@@ -191,6 +191,25 @@ def test_what_an_execution_took_is_told(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
+def test_a_model_without_its_metrics_serves_all_the_same_and_says_so_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Triton refuses a family whose name another kind of metric has."""
+
+    def refused(**_: Any) -> None:
+        raise ValueError("of another kind")
+
+    said: list[str] = []
+    monkeypatch.setattr("triton_python_backend_utils.MetricFamily", refused)
+    monkeypatch.setattr("triton_python_backend_utils.Logger.log_error", said.append)
+    model = Model(tmp_path)
+    for _ in range(3):
+        assert [response.error for response in model.respond(request(1), request(5))] == [None, None]
+    (line,) = said
+    assert line.startswith("metrics cannot be reported: ")
+    assert "of another kind" in line
+
+
 def test_metrics_know_the_checkpoint_and_what_can_be_asked(tmp_path: Path) -> None:
     Model(tmp_path, settings={"source": "org/name", "network": '{"class": "Rewind"}'})
     (told,) = (metric for metric in METRICS if metric.name == "rfm_checkpoint_info")
@@ -267,9 +286,8 @@ def test_requests_are_scored_in_the_thread_that_calls_execute_and_the_guard_know
     assert threads == [threading.current_thread()] * 2
 
 
-@pytest.mark.parametrize("parameter", ["max_queue_size", "queue_timeout_ms"])
-def test_an_older_export_s_bound_of_the_queue_is_ignored_with_a_note(tmp_path: Path, parameter: str) -> None:
-    model = Model(tmp_path, settings={parameter: "1"})
+def test_an_older_export_s_bound_of_the_queue_is_ignored_with_a_note(tmp_path: Path) -> None:
+    model = Model(tmp_path, settings={"queue_timeout_ms": "1"})
     assert "of an older export have no effect: export again" in LOGGED[0]["note"]
     assert [response.error for response in model.respond(request(1), request(5))] == [None, None]
 

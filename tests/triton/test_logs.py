@@ -9,7 +9,6 @@ import pickle
 import re
 import threading
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -182,33 +181,6 @@ def test_the_requests_of_a_call_begin_alike(running: Running) -> None:
         assert outcomes[1].request_id in [f"call-{number}" for number in (2, 3, 4)]
         with pytest.raises(InvalidSampleError, match=r"^samples\[1\]\.num_frames: .* \(request call-[234]\)$"):
             client.evaluate([GOOD, TOO_LONG, GOOD], request_id="call")
-
-
-@pytest.mark.triton
-def test_requests_that_fail_together_are_named_together(running: Running) -> None:
-    """Whoever shared the batch of a faulty request is scored alone."""
-
-    def ask(number: int) -> bool:
-        sample = FAILING if number == 0 else GOOD
-        try:
-            client.evaluate([sample], request_id=f"together-{number}")
-        except InferenceFailedError:
-            return False
-        return True
-
-    def batches() -> list[dict[str, Any]]:
-        return [said for _, said in running.lines() if said["event"] == "batch_failed"]
-
-    with running.client() as client, ThreadPoolExecutor(16) as pool:
-        rounds = 0
-        while not batches():
-            rounds += 1
-            assert rounds < 50
-            assert list(pool.map(ask, range(16))) == [False, *[True] * 15]
-    for said in batches():
-        assert "together-0-1" in said["request_ids"]
-        assert len(said["request_ids"]) > 1
-        assert said["error"] == 'ZeroDivisionError("a fault of the model\'s")'
 
 
 @pytest.mark.parametrize("name", ["", "two words", "new\nline", "] forged", "x" * 65, "\u00e4"])

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import httpx
 import numpy as np
@@ -43,7 +42,7 @@ pytestmark = pytest.mark.triton
 
 PLAIN = goldens.config("c1_t1_disc10")
 FILMED = "enc_c1_t1_disc10"
-MODEL, TWICE, MUTE = PLAIN.name, "twice", "mute"  # TWICE has two instances; MUTE cannot tell its metrics
+MODEL, TWICE = PLAIN.name, "twice"  # which has two instances
 TYPES = ("progress", "preference", "similarity")
 HISTOGRAMS = {
     "batch_samples": SAMPLES_BUCKETS,
@@ -61,13 +60,6 @@ class TritonPythonModel(TritonPythonModel):
         if any(getattr(question.sample, "frame_steps", 0) == {FAILING_STEPS} for question in questions):
             raise ZeroDivisionError("a fault of the model's")
         return super().answer(questions, execution)
-"""
-# What Triton refuses: another kind of metric has that name.
-BROKEN = """
-
-import rfm.triton_model.metrics as metrics
-
-metrics._TOTALS["feature_cache_bytes"] = "A counter."
 """
 
 
@@ -108,18 +100,14 @@ def counted(after: Scraped, before: Scraped, model: str) -> dict[str, float]:
 
 @pytest.fixture(scope="module")
 def served_too(served: Served) -> Iterator[Served]:
-    """The shared server with the models of this file."""
-    for name, code, instances in ((TWICE, FAILING, 2), (MUTE, BROKEN, 1)):
-        settings = replace(serve_config(PLAIN, name), instances=instances)
-        rfm_export.export(PLAIN.checkpoint, served.repository, settings)
-        file = served.repository / name / "1" / "model.py"
-        file.write_text(file.read_text() + code)
+    """The shared server with a model of this file."""
+    rfm_export.export(PLAIN.checkpoint, served.repository, replace(serve_config(PLAIN, TWICE), instances=2))
+    file = served.repository / TWICE / "1" / "model.py"
+    file.write_text(file.read_text() + FAILING)
     with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
-        for name in (TWICE, MUTE):
-            api.load(name)
+        api.load(TWICE)
         yield served
-        for name in (TWICE, MUTE):
-            api.unload(name)
+        api.unload(TWICE)
 
 
 def client(served: Served, model: str) -> RewardClient:
@@ -285,11 +273,3 @@ def test_a_model_that_is_loaded_again_counts_on(served_too: Served) -> None:
         asked.evaluate([sample])
         wait_for(shows(1))
         assert counted(scrape(served_too), before, TWICE) == {"progress scored": 3, "frames": 9}
-
-
-def test_a_model_without_its_metrics_serves_all_the_same_and_says_so_once(served_too: Served) -> None:
-    with client(served_too, MUTE) as asked:
-        for _ in range(3):
-            assert len(asked.evaluate(mixed_samples(3))) == 3
-    log = Path(served_too.repository.parent, "tritonserver.log").read_text()
-    assert log.count("metrics cannot be reported") == 1
