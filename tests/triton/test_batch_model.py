@@ -196,11 +196,11 @@ def test_a_model_without_its_metrics_serves_all_the_same_and_says_so_once(
 ) -> None:
     """Triton refuses a family whose name another kind of metric has."""
 
-    def refused(**_: Any) -> None:
+    def refused(*_: Any, **__: Any) -> None:
         raise ValueError("of another kind")
 
     said: list[str] = []
-    monkeypatch.setattr("triton_python_backend_utils.MetricFamily", refused)
+    monkeypatch.setattr("triton_python_backend_utils.MetricFamily.__init__", refused)
     monkeypatch.setattr("triton_python_backend_utils.Logger.log_error", said.append)
     model = Model(tmp_path)
     for _ in range(3):
