@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -15,13 +16,12 @@ import httpx
 import psutil
 
 import rfm_export
-import rollout
 from callers import Callers, Exam, direct, through_gateway
 from paths import ROOT
 from rfm.config import ExportConfig
 from rfm.launch.process import Endpoints
 from rfm_client import RewardClient
-from rfm_serve import MODEL, Serving, children, serving, wait_for
+from rfm_serve import MODEL, RFM, Serving, children, serving, wait_for
 
 CHECKPOINT = ROOT / "model_repository" / "rfm" / "1" / "checkpoint"
 TRITON, OTHER = "triton", f"{MODEL}_b"
@@ -130,14 +130,16 @@ class Site:
 
     def models(self, command: str, *words: str) -> None:
         """``rfm models COMMAND``. Raises RuntimeError if it fails."""
-        key, url = self.folder / "key", self.served.endpoints.grpc_url
-        done = rollout.models(command, self.folder / "model_repository", url, key, *words)
+        options = [f"--url={self.served.endpoints.grpc_url}", f"--admin-key-file={self.folder / 'key'}"]
+        options += [] if command == "list" else [f"--repository={self.folder / 'model_repository'}"]
+        line = [str(RFM), "models", command, *words, *options]
+        done = subprocess.run(line, capture_output=True, text=True, timeout=180, check=False)
         if done.returncode:
             raise RuntimeError(f"rfm models {command}: {done.stderr}")
 
     @property
     def gateway(self) -> psutil.Process:
-        (pid,) = [pid for pid in children(self.served.process.pid, ".") if pid != self.served.triton]
+        (pid,) = [pid for pid in children(self.served.process.pid) if pid != self.served.triton]
         return psutil.Process(pid)
 
     def wait_healthy(self) -> float:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import socket
 import ssl
@@ -12,54 +11,114 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import aiohttp
 import aiohttp.web
 import httpx
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from commands import EXIT_S
+import goldens
+from engines import load_engine
+from one_model import BriefServer
 from repositories import kill_model
-from rfm.launch.endpoints import Endpoints
+from rfm.launch.endpoints import Endpoints, GrpcTls
 from rfm.launch.triton_options import MAX_HTTP_BYTES
-from rfm_client import AccessDeniedError, ServerUnavailableError
+from rfm_client import AccessDeniedError, ProgressSample, RewardClient, ServerUnavailableError
+from rfm_client.cli.commands import app as client_app
 from rfm_client.transport.access import Access
 from rfm_client.transport.loop_thread import LoopThread
 from rfm_client.transport.status import read_status
 from rfm_commands.cli import app
-from secured import (
-    AT_ONCE_S,
-    KEY,
-    PUBLIC_HOST,
-    TRAJECTORY,
-    Papers,
-    client,
-    denied_at_once,
-    scores_right,
-)
+from rfm_serve import KEY, PATIENCE_S, Serving, serving, wait_for
+from secured import PUBLIC_HOST, Papers, other_program
+from trajectories import random_trajectory
+
+PLAIN = goldens.config("c1_t1_disc10")
+TRAJECTORY = random_trajectory(0, 5)
+TOLERANCE = 1e-5
+AT_ONCE_S = 20.0  # far less than the client would retry
+GATED = "inference,health,metadata,model-config,statistics"
+TRITON_GATE = "triton-grpc-protocol-gate"  # gRPC metadata that Triton was told to ask for
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
-TRITON_GATE = "triton-grpc-protocol-gate"  # gRPC metadata that Triton was told to ask for
+
+def client(url: str, **options: Any) -> RewardClient:
+    return RewardClient(url, **options)
+
+
+def scores_right(asked: RewardClient) -> None:
+    expected = load_engine(PLAIN.name).evaluate([ProgressSample(TRAJECTORY)])[0]
+    got = asked.progress(TRAJECTORY)
+    np.testing.assert_allclose(got.progress, expected.progress, atol=TOLERANCE)  # type: ignore[union-attr]
+
+
+@contextmanager
+def denied_at_once(match: str) -> Iterator[None]:
+    started_s = time.monotonic()
+    with pytest.raises(AccessDeniedError, match=match):
+        yield
+    assert time.monotonic() - started_s < AT_ONCE_S
+
+
+@pytest.fixture(scope="module")
+def secure(repository: Path, papers: Papers, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Endpoints]:
+    """TLS, without certificates of clients, and with a key."""
+    folder = tmp_path_factory.mktemp("secure")
+    endpoints = replace(Endpoints.free(), grpc_tls=GrpcTls(papers.certificate, papers.key))
+    program = other_program(folder, f"--grpc-restricted-protocol={GATED}:gate={KEY}")
+    with (folder / "log").open("wb") as log, BriefServer(repository, endpoints, program, log=log):
+        yield endpoints
+
+
+@pytest.fixture(scope="module")
+def gateway_port() -> int:
+    """Of the gateway beside ``mutual``."""
+    return Endpoints.free().http_port
+
+
+@pytest.fixture(scope="module")
+def key_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """With the admin key of ``mutual``."""
+    file = tmp_path_factory.mktemp("mutual") / "key"
+    file.touch(0o600)
+    file.write_text(f"{KEY}\n")
+    return file
+
+
+@pytest.fixture(scope="module")
+def running(repository: Path, papers: Papers, gateway_port: int, key_file: Path) -> Iterator[Serving]:
+    """``rfm serve`` with TLS and certificates of clients, and a gateway beside."""
+    words = ["--grpc-certificate", papers.certificate, "--grpc-key", papers.key, "--grpc-client-ca", papers.ca]
+    words += ["--host", PUBLIC_HOST, "--gateway-port", gateway_port, "--admin-key-file", key_file]
+    with serving(repository, *map(str, words)) as served:
+        with client(served.endpoints.http_url) as asked:
+            asked.wait_ready(PATIENCE_S)
+        yield served
+
+
+@pytest.fixture(scope="module")
+def mutual(running: Serving, papers: Papers) -> Endpoints:
+    tls = GrpcTls(papers.certificate, papers.key, papers.ca)
+    return replace(running.endpoints, host=PUBLIC_HOST, grpc_tls=tls)
 
 
 def test_grpc_is_encrypted_and_shows_the_key(secure: Endpoints, papers: Papers) -> None:
     assert secure.grpc_url.startswith("grpcs://127.0.0.1:")
     with client(secure.grpc_url, ca_file=papers.ca, headers={TRITON_GATE.title(): KEY}) as asked:
-        asked.wait_ready(AT_ONCE_S)
+        asked.wait_ready(PATIENCE_S)
         scores_right(asked)
-
-
-@pytest.mark.parametrize("headers", [{}, {TRITON_GATE: "another"}], ids=["none", "another"])
-def test_grpc_without_the_key_is_denied(secure: Endpoints, papers: Papers, headers: dict[str, str]) -> None:
-    with (
-        client(secure.grpc_url, ca_file=papers.ca, headers=headers) as asked,
-        denied_at_once("access denied: .*is restricted"),
-    ):
-        asked.progress(TRAJECTORY)
+    for headers in ({}, {TRITON_GATE: "another"}):
+        with (
+            client(secure.grpc_url, ca_file=papers.ca, headers=headers) as asked,
+            denied_at_once("access denied: .*is restricted"),
+        ):
+            asked.progress(TRAJECTORY)
 
 
 def test_a_server_of_a_stranger_or_of_another_name_is_not_trusted(secure: Endpoints, papers: Papers) -> None:
@@ -109,8 +168,8 @@ def test_the_gateway_beside_tls_listens_on_loopback_alone(mutual: Endpoints, gat
         socket.create_connection((PUBLIC_HOST, gateway_port), AT_ONCE_S)
 
 
-def test_rfm_models_shows_a_certificate(mutual: Endpoints, papers: Papers, mutual_folder: Path) -> None:
-    list_models = ["list", "--url", mutual.grpc_url, "--admin-key-file", str(mutual_folder / "key")]
+def test_rfm_models_shows_a_certificate(mutual: Endpoints, papers: Papers, key_file: Path) -> None:
+    list_models = ["list", "--url", mutual.grpc_url, "--admin-key-file", str(key_file)]
     own = ["--client-certificate", str(papers.client_certificate), "--client-key", str(papers.client_key)]
     trusted = ["--ca-file", str(papers.ca), *own]
     assert CliRunner().invoke(app, ["models", *trusted, *list_models]).stdout.split() == ["rfm", "1", "READY"]
@@ -120,19 +179,18 @@ def test_rfm_models_shows_a_certificate(mutual: Endpoints, papers: Papers, mutua
         assert refused.stderr.startswith(f"rfm: {mutual.grpc_url}: failed to connect")
 
 
-@contextmanager
-def proxy(endpoints: Endpoints, papers: Papers, *, client_ca: Path | None = None) -> Iterator[str]:
-    """What nginx or an ingress would be."""
+@pytest.fixture(scope="module")
+def proxied(mutual: Endpoints, papers: Papers) -> Iterator[str]:
+    """As behind nginx or an ingress, which asks for a certificate and a key."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(papers.certificate, papers.key)
-    if client_ca is not None:
-        context.verify_mode = ssl.CERT_REQUIRED
-        context.load_verify_locations(client_ca)
+    context.verify_mode = ssl.CERT_REQUIRED
+    context.load_verify_locations(papers.ca)
 
     async def forward(request: aiohttp.web.Request) -> aiohttp.web.Response:
         if request.headers.get("Authorization") != f"Bearer {KEY}":
             return aiohttp.web.json_response({"error": "no key"}, status=401)
-        url = f"{endpoints.http_url}{request.path_qs}"
+        url = f"{mutual.http_url}{request.path_qs}"
         headers = {name: value for name, value in request.headers.items() if name.startswith("Inference")}
         async with (
             aiohttp.ClientSession(auto_decompress=False) as session,
@@ -141,9 +199,9 @@ def proxy(endpoints: Endpoints, papers: Papers, *, client_ca: Path | None = None
             kept = {name: value for name, value in answer.headers.items() if name != "Content-Length"}
             return aiohttp.web.Response(status=answer.status, body=await answer.read(), headers=kept)
 
-    app = aiohttp.web.Application(client_max_size=MAX_HTTP_BYTES)
-    app.router.add_route("*", "/{tail:.*}", forward)
-    runner = aiohttp.web.AppRunner(app, access_log=None)
+    application = aiohttp.web.Application(client_max_size=MAX_HTTP_BYTES)
+    application.router.add_route("*", "/{tail:.*}", forward)
+    runner = aiohttp.web.AppRunner(application, access_log=None)
     bound = socket.create_server(("127.0.0.1", 0))
 
     async def start() -> None:
@@ -156,12 +214,6 @@ def proxy(endpoints: Endpoints, papers: Papers, *, client_ca: Path | None = None
         yield f"https://127.0.0.1:{bound.getsockname()[1]}"
     finally:
         loop.stop(runner.cleanup)
-
-
-@pytest.fixture(scope="module")
-def proxied(mutual: Endpoints, papers: Papers) -> Iterator[str]:
-    with proxy(mutual, papers, client_ca=papers.ca) as url:
-        yield url
 
 
 def test_http_through_a_proxy_with_tls_and_a_key(proxied: str, papers: Papers) -> None:
@@ -219,43 +271,19 @@ def test_what_cannot_be_used_is_refused(
     assert KEY not in str(refused.value)
 
 
-def rfm_client(*words: object, **environment: str) -> subprocess.CompletedProcess[str]:
-    program = Path(sys.executable).parent / "rfm-client"
-    return subprocess.run(
-        [str(program), *map(str, words)],
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        timeout=EXIT_S,
-        check=False,
-    )
-
-
 def test_the_command_has_the_same_options(mutual: Endpoints, proxied: str, papers: Papers, tmp_path: Path) -> None:
     key_file = tmp_path / "key"
     key_file.write_text(f"{KEY}\n")
-    words = [
-        "--ca-file",
-        papers.ca,
-        "--client-certificate",
-        papers.client_certificate,
-        "--client-key",
-        papers.client_key,
-    ]
-    done = rfm_client(*words, "sample", "--url", mutual.grpc_url)
-    assert done.returncode == 0, done.stderr
-    in_environment = {
-        "RFM_CA_FILE": str(papers.ca),
-        "RFM_CLIENT_CERTIFICATE": str(papers.client_certificate),
-        "RFM_CLIENT_KEY": str(papers.client_key),
-        "RFM_API_KEY_FILE": str(key_file),
-    }
+    names = {"ca_file": papers.ca, "client_certificate": papers.client_certificate, "client_key": papers.client_key}
+    words = [f"--{name.replace('_', '-')}={file}" for name, file in names.items()]
+    done = CliRunner().invoke(client_app, [*words, "sample", "--url", mutual.grpc_url])
+    assert done.exit_code == 0, done.output
+    in_environment = {f"RFM_{name.upper()}": str(file) for name, file in {**names, "api_key_file": key_file}.items()}
     for name in ("sample", "status", "wait"):
-        done = rfm_client(name, "--url", proxied, **in_environment)
-        assert done.returncode == 0, done.stderr
-    refused = rfm_client("--ca-file", papers.other_ca, "sample", "--url", mutual.grpc_url)
-    assert refused.returncode == 1
-    assert "access denied" in refused.stderr
+        done = CliRunner(env=in_environment).invoke(client_app, [name, "--url", proxied])
+        assert done.exit_code == 0, done.output
+    refused = CliRunner().invoke(client_app, [f"--ca-file={papers.other_ca}", "sample", "--url", mutual.grpc_url])
+    assert (refused.exit_code, "access denied" in refused.stderr) == (1, True)
 
 
 @contextmanager
@@ -265,18 +293,18 @@ def gateway(papers: Papers, endpoints: Endpoints, folder: Path, *words: object) 
     options += ["--certificate", str(papers.certificate), "--key", str(papers.key), *map(str, words)]
     with (folder / "gateway.log").open("w") as log:
         process = subprocess.Popen([sys.executable, "-m", "rfm_gateway", *options], stdout=log, stderr=log)
+
+    def listens() -> bool:
+        assert process.poll() is None, (folder / "gateway.log").read_text()
+        with socket.socket() as asking:
+            return asking.connect_ex(("127.0.0.1", port)) == 0
+
     try:
-        while True:
-            assert process.poll() is None, (folder / "gateway.log").read_text()
-            try:
-                socket.create_connection(("127.0.0.1", port), 1).close()
-                break
-            except ConnectionRefusedError:
-                time.sleep(0.1)
+        wait_for(listens)
         yield port
     finally:
         process.terminate()
-        process.wait(EXIT_S)
+        process.wait(PATIENCE_S)
 
 
 def test_the_gateway_serves_https_before_a_triton_with_mutual_tls(
@@ -305,15 +333,15 @@ def test_the_gateway_s_own_certificate_is_not_the_caller_s_fault(
 
 
 def test_half_a_certificate_of_the_gateway_is_refused(papers: Papers) -> None:
-    done = rfm_client("gateway", "--triton", "grpc://127.0.0.1:1", "--certificate", papers.certificate)
-    assert done.returncode == 2
+    words = ["gateway", "--triton", "grpc://127.0.0.1:1", "--certificate", str(papers.certificate)]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 2
     assert "'--certificate, --key': expected both or none, got one" in done.stderr
 
 
-def test_rfm_serve_heals_with_tls(mutual: Endpoints, papers: Papers, mutual_folder: Path, repository: Path) -> None:
+def test_rfm_serve_heals_with_tls(mutual: Endpoints, papers: Papers, running: Serving, repository: Path) -> None:
     """It is told of no certificate for itself."""
     kill_model(repository)
     with client(mutual.grpc_url, **papers.client) as asked:  # it asks again until the model is back
         scores_right(asked)
-    log = (mutual_folder / "log").read_text()
-    assert re.search("rfm: triton is started again: (rfm: )?a process of it is dead", log)
+    assert re.search("rfm: triton is started again: (rfm: )?a process of it is dead", running.log.read_text())

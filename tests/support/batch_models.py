@@ -107,28 +107,20 @@ class Model(BatchModel[Sample, Result]):
         self.batches: list[int] = []
         parameters = {name: {"string_value": value} for name, value in {"torch_threads": "1", **settings}.items()}
         config = CONFIG | {"parameters": parameters, "model_warmup": [{"count": 0}] * warmups}
-        self.initialize(
-            {
-                "model_config": json.dumps(config),
-                "model_repository": str(folder),
-                "model_version": "1",
-                "model_name": "rfm",
-                "model_instance_name": "rfm_0_0",
-                "model_instance_kind": "CPU",
-                "model_instance_device_id": "0",
-            }
-        )
+        instance = {"model_instance_name": "rfm_0_0", "model_instance_kind": "CPU", "model_instance_device_id": "0"}
+        model = {"model_repository": str(folder), "model_version": "1", "model_name": "rfm"}
+        self.initialize({"model_config": json.dumps(config), **model, **instance})
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
-        """There is nothing to load."""
+        pass
 
-    def respond(self, requests: Sequence[Request]) -> list[Response]:
+    def respond(self, *requests: Request) -> list[Response]:
         """What becomes of requests of which Triton hands over all at once."""
-        self.take(requests)
+        self.take(*requests)
         wait_for(lambda: all(request.responses for request in requests))
         return [response for request in requests for response in request.responses]
 
-    def take(self, requests: Sequence[Request]) -> None:
+    def take(self, *requests: Request) -> None:
         """Hands the requests over, as Triton does, and keeps the responses that come at once."""
         for request, response in zip(requests, self.execute(requests) or (), strict=False):
             request.responses.append(response)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""``rfm serve`` of the committed repository as a process."""
+"""``rfm serve`` of the committed repository as a process, and what such processes leave."""
 
 from __future__ import annotations
 
@@ -14,16 +14,12 @@ from typing import Any
 
 from paths import ROOT
 from rfm.launch.cleanup import REGION_PREFIX, SHARED_MEMORY
-from rfm.launch.proc import ZOMBIE, stat_of
+from rfm.launch.proc import ZOMBIE, all_pids, arguments_of, stat_of
 from rfm.launch.process import Endpoints
 from rfm_client import RewardClient
 
 REPOSITORY = ROOT / "model_repository"
-
-
 RFM = Path(sys.executable).parent / "rfm"
-
-
 EXIT_S = 60
 RUN = "RFM_TEST_RUN"
 OWNER = re.compile(rf"{REGION_PREFIX}_(\d+)_")
@@ -36,12 +32,13 @@ def is_alive(pid: int) -> bool:
 
 
 def command(repository: Path, endpoints: Endpoints) -> list[str]:
-    ports = {
-        "--http-port": endpoints.http_port,
-        "--grpc-port": endpoints.grpc_port,
-        "--metrics-port": endpoints.metrics_port,
-    }
-    return [str(RFM), "serve", "--repository", str(repository), *(str(word) for pair in ports.items() for word in pair)]
+    ports = [f"--{name}-port={getattr(endpoints, f'{name}_port')}" for name in ("http", "grpc", "metrics")]
+    return [str(RFM), "serve", "--repository", str(repository), *ports]
+
+
+def in_shared_memory() -> set[str]:
+    """Names in shared memory."""
+    return {path.name for path in SHARED_MEMORY.iterdir()}
 
 
 def regions() -> set[str]:
@@ -51,21 +48,9 @@ def regions() -> set[str]:
     return names - {name for name, pid in owners.items() if is_alive(pid) and not is_ours(pid)}
 
 
-def in_shared_memory() -> set[str]:
-    """Names in shared memory."""
-    return {path.name for path in SHARED_MEMORY.iterdir()}
-
-
 def tritons() -> set[int]:
     """Process ids of every tritonserver that this run of the tests has started."""
-    found = set()
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            if "tritonserver" in (folder / "cmdline").read_text().split("\0")[0] and is_ours(int(folder.name)):
-                found.add(int(folder.name))
-        except (FileNotFoundError, ProcessLookupError):  # it ended meanwhile
-            continue
-    return found
+    return {pid for pid in all_pids() if "tritonserver" in "".join(arguments_of(pid)[:1]) and is_ours(pid)}
 
 
 def is_ours(pid: int) -> bool:

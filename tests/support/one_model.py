@@ -20,9 +20,9 @@ class BriefServer(TritonServer):
     """A server that is killed when its test is over: Triton takes a second for each model process to end in order."""
 
     def __exit__(self, *raised: Any) -> None:
-        if self._process is not None and self.exit_status == -signal.SIGABRT:
+        if self.exit_status == -signal.SIGABRT:
             CRASHES.append(self.repository)
-        if self._process is not None and self.exit_status is None:
+        if self.exit_status is None:
             self.kill()
         super().__exit__(*raised)
 
@@ -36,8 +36,7 @@ class OneModelServer(BriefServer):
         self._own_log = log
 
     def signal(self, number: signal.Signals) -> None:
-        assert self._process is not None
-        os.killpg(self._process.pid, number)
+        os.killpg(self.pid, number)
 
     def kill(self) -> None:
         super().kill()

@@ -13,59 +13,41 @@ import pytest
 
 from paths import ROOT
 from repositories import configure
-from rfm_client import (
-    ProgressSample,
-    RewardClient,
-    Trajectory,
-)
+from rfm.engine import Engine
+from rfm_client import ProgressSample, RewardClient, Trajectory
 from rfm_serve import MODEL, wait_for
 
 CALLERS = 16
-
-
 TOLERANCE = 1e-5
-
-
 MARK = 7.0  # in the text embedding of a sample that a model of this test dies of
 
 
-DEADLY = f"""
+def answering(body: str) -> str:
+    """Code for a model.py that does something before it answers. ``marks``: of the questions"""
+    return f"""
 
-_answer = TritonPythonModel.answer
-
-
-def deadly(self, questions, execution):
-    import os
-
-    marked = [q for q in questions if q.sample.trajectories[0].text_embedding[0] == {MARK}]
-    if marked:
-        os._exit(1)
-    return _answer(self, questions, execution)
+_plain_answer = TritonPythonModel.answer
 
 
-TritonPythonModel.answer = deadly
+def answer(self, questions, execution):
+    import os, pathlib, time
+
+    marks = [q.sample.trajectories[0].text_embedding[0] for q in questions]
+    {body}
+    return _plain_answer(self, questions, execution)
+
+
+TritonPythonModel.answer = answer
 """
+
+
+DEADLY = answering(f"if {MARK} in marks: os._exit(1)")
 
 
 def answering_after(seconds: float, began: Path | None = None) -> str:
     """Code for a model.py whose answers take so much longer. began: a file that is there once it works on one"""
-    return f"""
-
-_prompt_answer = TritonPythonModel.answer
-
-
-def late(self, questions, execution):
-    import time
-    from pathlib import Path
-
-    if {str(began)!r} != "None":
-        Path({str(began)!r}).touch()
-    time.sleep({seconds})
-    return _prompt_answer(self, questions, execution)
-
-
-TritonPythonModel.answer = late
-"""
+    note = "" if began is None else f"pathlib.Path({str(began)!r}).touch(); "
+    return answering(f"{note}time.sleep({seconds})")
 
 
 def make_repository(
@@ -90,8 +72,6 @@ def trajectory(seed: int, num_frames: int = 8, mark: float = 0.0) -> Trajectory:
 @pytest.fixture(scope="module")
 def references() -> list[np.ndarray[Any, Any]]:
     """What the engine answers, without Triton."""
-    from rfm.engine import Engine
-
     engine = Engine.from_checkpoint(ROOT / "model_repository" / MODEL / "1" / "checkpoint")
     return [result.progress for result in engine.evaluate([ProgressSample(trajectory(n)) for n in range(CALLERS)])]  # type: ignore[union-attr]
 

@@ -15,13 +15,15 @@ from typing import Any
 import httpx
 from prometheus_client.parser import text_string_to_metric_families
 
+from commands import RFM
 from rfm.launch.cleanup import SHARED_MEMORY
-from rfm.launch.proc import ZOMBIE, arguments_of, stat_of
-from rfm.launch.process import Endpoints
+from rfm.launch.endpoints import Endpoints
+from rfm.launch.proc import arguments_of, children_of, stat_of
+from rfm.launch.repository_api import RepositoryApi
 from rfm_client import RewardClient
 
-RFM = Path(sys.executable).parent / "rfm"
 MODEL = "rfm"
+KEY = "a-key-that-only-tests-know"  # an admin key
 PATIENCE_S = 60.0
 TRUTH_S = 5.0  # within which readiness tells what is so
 
@@ -35,20 +37,15 @@ def wait_for(is_so: Callable[[], Any], within_s: float = PATIENCE_S) -> float:
     return time.monotonic() - started_s
 
 
-def children(pid: int, program: str) -> list[int]:
-    return [
-        int(word) for word in subprocess.run(["pgrep", "-P", str(pid), program], stdout=subprocess.PIPE).stdout.split()
-    ]
+def children(pid: int, program: str = "") -> list[int]:
+    """Processes that the process has started. program: part of their name"""
+    return [child for child in children_of(pid) if (stat := stat_of(child)) is not None and program in stat.name]
 
 
 def model_processes(triton: int, model: str = MODEL) -> list[int]:
-    """The processes of a model that live, of the tritonserver ``triton``."""
-    found = []
-    for pid in children(triton, "triton_python"):
-        stat, words = stat_of(pid), arguments_of(pid)
-        if stat is not None and stat.state != ZOMBIE and len(words) > 1 and f"/{model}/" in words[1]:
-            found.append(pid)
-    return sorted(found)
+    """The processes of a model that live, of the tritonserver ``triton``; a zombie has no arguments."""
+    found = children(triton, "triton_python")
+    return sorted(pid for pid in found if any(f"/{model}/" in word for word in arguments_of(pid)[1:2]))
 
 
 @dataclass
@@ -96,6 +93,13 @@ class Serving:
             sample.value for sample in samples if sample.name == name and labels.items() <= sample.labels.items()
         )
 
+    def restarts(self, *what: str) -> float:
+        return sum(self.metric("rfm_serve_restarts_total", what=name) for name in what)
+
+    def api(self) -> RepositoryApi:
+        """Of one that is ``administered``."""
+        return RepositoryApi(self.endpoints.grpc_url, KEY)
+
     @property
     def said(self) -> list[str]:
         """By ``rfm serve`` itself, but for that it is ready."""
@@ -125,3 +129,16 @@ def serving(repository: Path, *more: str) -> Iterator[Serving]:
             process.terminate()
         process.wait(PATIENCE_S)
     assert not list(SHARED_MEMORY.glob(f"*_rfm_{process.pid}_*"))
+
+
+@contextmanager
+def administered(repository: Path, *more: str, **settings: int) -> Iterator[Serving]:
+    """Within it, the repository is served, with these settings and an admin key, and was ready."""
+    key_file, config = repository.parent / "key", repository.parent / "serve.yaml"
+    key_file.touch(0o600)
+    key_file.write_text(KEY)
+    config.write_text("serve:\n" + "".join(f"  {name}: {value}\n" for name, value in settings.items()))
+    with serving(repository, f"--admin-key-file={key_file}", f"--config={config}", *more) as served:
+        served.wait_ready()
+        yield served
+    assert KEY not in served.log.read_text(errors="replace")

@@ -7,8 +7,6 @@ They send embeddings and raw frames, in turn, one request at a time and a few a 
 from __future__ import annotations
 
 import asyncio
-import subprocess
-import sys
 import threading
 import time
 from collections import Counter
@@ -42,7 +40,6 @@ NAME = "rfm"
 WITH_ENCODERS = goldens.config("enc_c1_t1_disc10")
 WIDTHS = (48, 32)
 FRAME_PX = 48
-RFM = Path(sys.executable).parent / "rfm"
 TOLERANCE = 1e-5
 CLEARLY = 1e-2  # versions differ by at least so much
 CALLERS = 32
@@ -172,12 +169,3 @@ def callers(
     finally:
         stop.set()
         thread.join()
-
-
-def models(command: str, repository: Path, url: str, key_file: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    """``rfm models COMMAND``."""
-    options = ["--url", url, "--admin-key-file", str(key_file)]
-    if command != "list":
-        options += ["--repository", str(repository)]
-    line = [str(RFM), "models", command, *words, *options]
-    return subprocess.run(line, capture_output=True, text=True, timeout=180, check=False)

@@ -41,7 +41,7 @@ REASON = "scoring failed; the server's log has the reason"
 
 def test_requests_are_answered_together_and_each_gets_its_own(tmp_path: Path) -> None:
     model = Model(tmp_path)
-    responses = model.respond([request(1), request(5, 1), request(6)])
+    responses = model.respond(request(1), request(5, 1), request(6))
     assert model.batches == [4]
     tensors = [response.output_tensors for response in responses]
     assert tensors[0] == [("progress", [[1]])]
@@ -59,7 +59,7 @@ def test_refused_and_failed_requests_fail_alone(tmp_path: Path) -> None:
     model = Model(tmp_path)
     unreadable = Request(request(1).tensors | {"num_frames": np.zeros((1, 2), np.int32)})
     responses = model.respond(
-        [request(REFUSED), request(1), request(FAILS), unreadable, request(1, REFUSED), Request({})]
+        request(REFUSED), request(1), request(FAILS), unreadable, request(1, REFUSED), Request({})
     )
     assert [response.error for response in responses] == [
         ("invalid", "num_frames: expected others, got these"),
@@ -87,7 +87,7 @@ def test_a_question_that_cannot_be_prepared_is_refused_with_its_place(tmp_path: 
             return super().prepare(question)
 
     model = Picky(tmp_path)
-    outcomes = [response.error for response in model.respond([request(7), request(1, 7), request(5)])]
+    outcomes = [response.error for response in model.respond(request(7), request(1, 7), request(5))]
     expected = ("num_frames: expected another, got 7", "samples[1].num_frames: expected another, got 7")
     assert outcomes == [("invalid", expected[0]), ("invalid", expected[1]), None]
     assert model.batches == [1]
@@ -95,7 +95,7 @@ def test_a_question_that_cannot_be_prepared_is_refused_with_its_place(tmp_path: 
 
 def test_a_request_that_breaks_a_batch_is_found(tmp_path: Path) -> None:
     model = Model(tmp_path)
-    responses = model.respond([request(1, id="a"), request(BREAKS, id="b"), request(5, id="c")])
+    responses = model.respond(request(1, id="a"), request(BREAKS, id="b"), request(5, id="c"))
     assert [response.error for response in responses] == [None, ("internal", REASON), None]
     assert model.batches == [3, 1, 1, 1]
     together, alone = LOGGED
@@ -113,7 +113,7 @@ def test_answers_that_cannot_be_written_fail_alone(tmp_path: Path) -> None:
             return super().encode(answers, tensors, outputs)
 
     model = Large(tmp_path)
-    good, bad = model.respond([request(1), request(5, 6)])
+    good, bad = model.respond(request(1), request(5, 6))
     assert (good.error, bad.error) == (None, ("internal", REASON))
     assert model.samples == {("progress", "scored"): 1, ("progress", "failed"): 2}
 
@@ -124,7 +124,7 @@ def test_a_log_that_cannot_be_written_costs_no_answer(tmp_path: Path, monkeypatc
 
     model = Model(tmp_path)
     monkeypatch.setattr("triton_python_backend_utils.Logger.log_error", full)
-    responses = model.respond([request(1), request(BREAKS)])
+    responses = model.respond(request(1), request(BREAKS))
     assert [response.error for response in responses] == [None, ("internal", REASON)]
     assert model.samples == {("progress", "scored"): 1, ("progress", "failed"): 1}
 
@@ -138,11 +138,11 @@ def test_behind_a_batch_that_took_long_a_cancelled_request_is_not_scored(tmp_pat
             return super().answer(questions, execution)
 
     model = Slow(tmp_path)
-    model.respond([request(1), request(BREAKS)])
-    cancelled, scored = model.respond([request(5, is_given_up=True), request(6)])
+    model.respond(request(1), request(BREAKS))
+    cancelled, scored = model.respond(request(5, is_given_up=True), request(6))
     assert cancelled.error == ("cancelled", "cancelled by the client")
     assert scored.error is None
-    (scored,) = model.respond([request(5, is_given_up=True)])  # nobody asks Triton behind a short batch
+    (scored,) = model.respond(request(5, is_given_up=True))  # nobody asks Triton behind a short batch
     assert scored.error is None
     assert model.samples[("progress", "cancelled")] == 1
 
@@ -150,9 +150,9 @@ def test_behind_a_batch_that_took_long_a_cancelled_request_is_not_scored(tmp_pat
 def test_warm_ups_and_probes_are_not_counted(tmp_path: Path) -> None:
     model = Model(tmp_path, warmups=2)
     blank = Request(blank_question(CONFIG), id=f"{PROBE_PREFIX}-rfm")
-    model.respond([request(1), request(5), blank, request(1, id="caller")])
+    model.respond(request(1), request(5), blank, request(1, id="caller"))
     assert model.samples == {("progress", "scored"): 1}
-    model.respond([request(1), request(1, id="caller")])
+    model.respond(request(1), request(1, id="caller"))
     assert model.samples == {("progress", "scored"): 3}
 
 
@@ -163,7 +163,7 @@ def test_pairs_are_counted_with_all_their_frames(tmp_path: Path) -> None:
 
     model = Pairs(tmp_path)
     pair = PreferenceSample(random_trajectory(0, 5, *WIDTHS), random_trajectory(1, 7, *WIDTHS))
-    model.respond([Request(wire.encode_samples([pair]))])
+    model.respond(Request(wire.encode_samples([pair])))
     assert model.samples == {("preference", "scored"): 1}
     assert model.told("frames_total") == {(): 12}
 
@@ -179,8 +179,8 @@ def test_what_an_execution_took_is_told(tmp_path: Path) -> None:
             return super().answer(questions, execution)
 
     model = Working(tmp_path)
-    model.respond([request(1), request(5, 6)])
-    model.respond([Request(blank_question(CONFIG), id=PROBE_PREFIX)])
+    model.respond(request(1), request(5, 6))
+    model.respond(Request(blank_question(CONFIG), id=PROBE_PREFIX))
     model.finalize()
     told = {metric.name: metric.value for metric in METRICS if metric.value and metric.name != "rfm_samples_total"}
     assert told == {
@@ -189,6 +189,25 @@ def test_what_an_execution_took_is_told(tmp_path: Path) -> None:
         "rfm_forward_passes_total": 4, "rfm_batch_samples": 3, "rfm_batch_padding_ratio": 0.25,
         "rfm_collate_seconds": 0.25, "rfm_forward_seconds": 0.5,
     }  # fmt: skip
+
+
+def test_a_model_without_its_metrics_serves_all_the_same_and_says_so_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Triton refuses a family whose name another kind of metric has."""
+
+    def refused(*_: Any, **__: Any) -> None:
+        raise ValueError("of another kind")
+
+    said: list[str] = []
+    monkeypatch.setattr("triton_python_backend_utils.MetricFamily.__init__", refused)
+    monkeypatch.setattr("triton_python_backend_utils.Logger.log_error", said.append)
+    model = Model(tmp_path)
+    for _ in range(3):
+        assert [response.error for response in model.respond(request(1), request(5))] == [None, None]
+    (line,) = said
+    assert line.startswith("metrics cannot be reported: ")
+    assert "of another kind" in line
 
 
 def test_metrics_know_the_checkpoint_and_what_can_be_asked(tmp_path: Path) -> None:
@@ -231,10 +250,10 @@ def test_an_instance_that_raises_at_the_blank_sample_after_failed_batches_ends(
             return [outcome or ProgressResult(progress=score, success=score)]
 
     model = Blank(tmp_path, warmups=1)
-    model.respond([request(1)])
+    model.respond(request(1))
     for _ in range(FAILED_BATCHES):
         assert ended == []
-        model.respond([request(BREAKS)])
+        model.respond(request(BREAKS))
     assert bool(ended) is is_broken
 
 
@@ -267,11 +286,10 @@ def test_requests_are_scored_in_the_thread_that_calls_execute_and_the_guard_know
     assert threads == [threading.current_thread()] * 2
 
 
-@pytest.mark.parametrize("parameter", ["max_queue_size", "queue_timeout_ms"])
-def test_an_older_export_s_bound_of_the_queue_is_ignored_with_a_note(tmp_path: Path, parameter: str) -> None:
-    model = Model(tmp_path, settings={parameter: "1"})
+def test_an_older_export_s_bound_of_the_queue_is_ignored_with_a_note(tmp_path: Path) -> None:
+    model = Model(tmp_path, settings={"queue_timeout_ms": "1"})
     assert "of an older export have no effect: export again" in LOGGED[0]["note"]
-    assert [response.error for response in model.respond([request(1), request(5)])] == [None, None]
+    assert [response.error for response in model.respond(request(1), request(5))] == [None, None]
 
 
 @pytest.mark.parametrize(("kind", "gpus"), [("CPU", []), ("GPU", [0, 1, 2, 3])])

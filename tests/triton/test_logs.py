@@ -9,7 +9,6 @@ import pickle
 import re
 import threading
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -24,10 +23,10 @@ from tritonclient.utils import np_to_triton_dtype
 import goldens
 import rfm_export
 from engines import serve_config
-from gateways import Gateway
-from gateways import running as running_gateway
+from gateways import answers, poll
 from paths import ROOT
 from rfm.launch.admin_key import VARIABLE
+from rfm.launch.endpoints import Endpoints
 from rfm_client import (
     DeadlineExceededError,
     InferenceFailedError,
@@ -35,7 +34,6 @@ from rfm_client import (
     ProgressSample,
     RewardClient,
     RewardError,
-    Sample,
     ServerUnavailableError,
 )
 from rfm_client.contract import wire
@@ -65,6 +63,7 @@ class TritonPythonModel(TritonPythonModel):
 class Running:
     served: Serving
     traces: list[bytes]
+    gateway: str  # its URL
 
     def client(self, protocol: str = "grpc") -> RewardClient:
         endpoints = self.served.endpoints
@@ -121,7 +120,7 @@ def documented_options(traces_url: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    """An ``rfm serve`` that has its admin key from the environment."""
+    """An ``rfm serve`` that has its admin key from the environment, and a gateway beside."""
     folder = tmp_path_factory.mktemp("logs")
     repository = folder / "repository"
     rfm_export.export(CONFIG.checkpoint, repository, serve_config(CONFIG))
@@ -131,52 +130,40 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
         threading.Thread(target=collector.serve_forever).start()
         environment.setitem(os.environ, VARIABLE, KEY)
         options = documented_options(f"http://127.0.0.1:{collector.server_address[1]}/v1/traces")
-        with serving(repository, "--", *options) as served:
+        port = Endpoints.free().http_port
+        with serving(repository, f"--gateway-port={port}", "--", *options) as served:
             served.wait_ready()
-            yield Running(served, collector.traces)
+            gateway = f"http://127.0.0.1:{port}"
+            poll(lambda: answers(gateway))
+            yield Running(served, collector.traces, gateway)
         collector.shutdown()
 
 
-def too_long() -> Sample:
-    return ProgressSample(random_trajectory(0, 17))
-
-
-def failing() -> Sample:
-    return ProgressSample(random_trajectory(0, 3), frame_steps=FAILING_STEPS)
-
-
-def good() -> Sample:
-    return ProgressSample(random_trajectory(0, 3))
-
-
-# The client
+GOOD = ProgressSample(random_trajectory(0, 3))
+TOO_LONG = ProgressSample(random_trajectory(0, 17))
+FAILING = ProgressSample(random_trajectory(0, 3), frame_steps=FAILING_STEPS)
 
 
 @pytest.mark.triton
 def test_what_is_refused_is_told_with_its_request_and_logged_as_verbose(running: Running, protocol: str) -> None:
     with running.client(protocol) as client, pytest.raises(InvalidSampleError, match="at most 16") as raised:
-        client.evaluate([too_long()])
-    request_id = raised.value.request_id
-    assert request_id is not None
+        client.evaluate([TOO_LONG])
+    request_id = str(raised.value.request_id)
     assert re.fullmatch(f"{RANDOM_ID.pattern}-1", request_id)
     assert str(raised.value) == f"{raised.value.message} (request {request_id})"
     severity, said = running.said_of(request_id)
     assert severity == "I"
     assert said == {
-        "event": "request_refused",
-        "model": "rfm",
-        "version": "1",
-        "request_id": request_id,
-        "sample_type": "progress",
+        "event": "request_refused", "model": "rfm", "version": "1", "request_id": request_id, "sample_type": "progress",
         "error": raised.value.message.partition(": score some")[0],  # the remedy is the client's
-    }
+    }  # fmt: skip
 
 
 @pytest.mark.triton
-def test_what_failed_is_logged_as_an_error_with_its_traceback(running: Running, protocol: str) -> None:
-    name = f"a.fault/of-{protocol}"
-    with running.client(protocol) as client, pytest.raises(InferenceFailedError) as raised:
-        client.evaluate([failing()], request_id=name)
+def test_what_failed_is_logged_as_an_error_with_its_traceback(running: Running) -> None:
+    name = "a.fault/of-the-model"
+    with running.client() as client, pytest.raises(InferenceFailedError) as raised:
+        client.evaluate([FAILING], request_id=name)
     assert str(raised.value) == f"scoring failed; the server's log has the reason (request {name}-1)"
     severity, said = running.said_of(f"{name}-1")
     assert severity == "E"
@@ -186,41 +173,14 @@ def test_what_failed_is_logged_as_an_error_with_its_traceback(running: Running, 
 
 
 @pytest.mark.triton
-def test_the_requests_of_a_call_begin_alike(running: Running, protocol: str) -> None:
+def test_the_requests_of_a_call_begin_alike(running: Running) -> None:
     """One of three samples, which is refused, then each sample alone."""
-    with running.client(protocol) as client:
-        outcomes = client.evaluate([good(), too_long(), good()], return_errors=True, request_id="call")
+    with running.client() as client:
+        outcomes = client.evaluate([GOOD, TOO_LONG, GOOD], return_errors=True, request_id="call")
         assert isinstance(outcomes[1], InvalidSampleError)
         assert outcomes[1].request_id in [f"call-{number}" for number in (2, 3, 4)]
         with pytest.raises(InvalidSampleError, match=r"^samples\[1\]\.num_frames: .* \(request call-[234]\)$"):
-            client.evaluate([good(), too_long(), good()], request_id="call")
-
-
-@pytest.mark.triton
-def test_requests_that_fail_together_are_named_together(running: Running) -> None:
-    """Whoever shared the batch of a faulty request is scored alone."""
-
-    def ask(number: int) -> bool:
-        sample = failing() if number == 0 else good()
-        try:
-            client.evaluate([sample], request_id=f"together-{number}")
-        except InferenceFailedError:
-            return False
-        return True
-
-    def batches() -> list[dict[str, Any]]:
-        return [said for _, said in running.lines() if said["event"] == "batch_failed"]
-
-    with running.client() as client, ThreadPoolExecutor(16) as pool:
-        rounds = 0
-        while not batches():
-            rounds += 1
-            assert rounds < 50
-            assert list(pool.map(ask, range(16))) == [False, *[True] * 15]
-    for said in batches():
-        assert "together-0-1" in said["request_ids"]
-        assert len(said["request_ids"]) > 1
-        assert said["error"] == 'ZeroDivisionError("a fault of the model\'s")'
+            client.evaluate([GOOD, TOO_LONG, GOOD], request_id="call")
 
 
 @pytest.mark.parametrize("name", ["", "two words", "new\nline", "] forged", "x" * 65, "\u00e4"])
@@ -248,14 +208,11 @@ def test_an_error_keeps_its_request_where_it_goes() -> None:
     assert str(RewardError("no request")) == "no request"
 
 
-# Options of tritonserver, as docs/logs.md has them
-
-
 @pytest.mark.triton
 def test_traces_name_the_request_and_continue_a_caller_s(running: Running) -> None:
     trace_id = "4bf92f3577b34da6a3ce929d0e0e4736"
     inputs = []
-    for name, array in wire.encode_samples([good()]).items():
+    for name, array in wire.encode_samples([GOOD]).items():
         inputs.append(tritonclient.http.InferInput(name, array.shape, np_to_triton_dtype(array.dtype)))
         inputs[-1].set_data_from_numpy(array)
     headers = {"traceparent": f"00-{trace_id}-00f067aa0ba902b7-01"}
@@ -275,44 +232,31 @@ def test_the_admin_key_is_among_triton_s_arguments_alone(running: Running) -> No
     assert KEY not in running.served.log.read_text()
 
 
-# The gateway
-
-
-@pytest.fixture(scope="module")
-def gateway(running: Running, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
-    with running_gateway(running.served.endpoints, tmp_path_factory.mktemp("gateway"), "rfm") as started:
-        yield started
-
-
-def body(num_frames: int) -> dict[str, Any]:
-    trajectory = random_trajectory(0, num_frames)
-    assert trajectory.text_embedding is not None
-    embeddings = {
-        "video_embeddings": trajectory.positions.tolist(),
-        "text_embedding": trajectory.text_embedding.tolist(),
-    }
-    return {"samples": [{"sample_type": "progress", "trajectory": embeddings}]}
-
-
-def asked(gateway: Gateway, request_id: str, **content: Any) -> requests.Response:
+def asked(running: Running, request_id: str, **content: Any) -> requests.Response:
     headers = {"X-Request-ID": request_id}
-    return requests.post(f"{gateway.url}/evaluate_batch", headers=headers, timeout=PATIENCE_S, **content)
+    return requests.post(f"{running.gateway}/evaluate_batch", headers=headers, timeout=PATIENCE_S, **content)
 
 
 @pytest.mark.triton
-def test_the_gateway_passes_the_caller_s_id_on_and_returns_it(running: Running, gateway: Gateway) -> None:
-    refused = asked(gateway, "of-the-caller", json=body(17))
+def test_the_gateway_passes_the_caller_s_id_on_and_returns_it(running: Running) -> None:
+    def body(sample: ProgressSample) -> dict[str, Any]:
+        embeddings = {
+            name: getattr(sample.trajectory, name).tolist() for name in ("video_embeddings", "text_embedding")
+        }
+        return {"samples": [{"sample_type": "progress", "trajectory": embeddings}]}
+
+    refused = asked(running, "of-the-caller", json=body(TOO_LONG))
     assert (refused.status_code, refused.headers["X-Request-ID"]) == (422, "of-the-caller")
     assert "(request" not in refused.text
     assert running.said_of("of-the-caller-1")[1]["error"].startswith("num_frames: expected at most 16")
-    scored = asked(gateway, "of-the-caller", json=body(3))
+    scored = asked(running, "of-the-caller", json=body(GOOD))
     assert (scored.status_code, scored.headers["X-Request-ID"]) == (200, "of-the-caller")
-    answer = asked(gateway, "odd", data=b"no JSON")  # which it refuses itself
+    answer = asked(running, "odd", data=b"no JSON")  # which it refuses itself
     assert (answer.status_code, answer.headers["X-Request-ID"]) == (422, "odd")
 
 
 @pytest.mark.triton
-@pytest.mark.parametrize("given", ["", "two words", "x" * 65, "a\tb", PROBE_PREFIX])
-def test_the_gateway_makes_an_id_where_there_is_none_to_pass_on(gateway: Gateway, given: str) -> None:
-    answer = requests.get(f"{gateway.url}/model_info", headers={"X-Request-ID": given}, timeout=PATIENCE_S)
-    assert RANDOM_ID.fullmatch(answer.headers["X-Request-ID"])
+def test_the_gateway_makes_an_id_where_there_is_none_to_pass_on(running: Running) -> None:
+    for given in ("", "two words", "x" * 65, "a\tb", PROBE_PREFIX):
+        answer = requests.get(f"{running.gateway}/model_info", headers={"X-Request-ID": given}, timeout=PATIENCE_S)
+        assert RANDOM_ID.fullmatch(answer.headers["X-Request-ID"]), given

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import httpx
 import numpy as np
@@ -43,7 +42,7 @@ pytestmark = pytest.mark.triton
 
 PLAIN = goldens.config("c1_t1_disc10")
 FILMED = "enc_c1_t1_disc10"
-MODEL, TWICE, MUTE = PLAIN.name, "twice", "mute"  # TWICE has two instances; MUTE cannot tell its metrics
+MODEL, TWICE = PLAIN.name, "twice"  # which has two instances
 TYPES = ("progress", "preference", "similarity")
 HISTOGRAMS = {
     "batch_samples": SAMPLES_BUCKETS,
@@ -62,13 +61,6 @@ class TritonPythonModel(TritonPythonModel):
             raise ZeroDivisionError("a fault of the model's")
         return super().answer(questions, execution)
 """
-# What Triton refuses: another kind of metric has that name.
-BROKEN = """
-
-import rfm.triton_model.metrics as metrics
-
-metrics._TOTALS["feature_cache_bytes"] = "A counter."
-"""
 
 
 @dataclass(frozen=True)
@@ -86,15 +78,14 @@ class Scraped:
         return next(family for family in self.families if family.name == f"rfm_{name}")
 
 
-def scrape(served: Served) -> Scraped:
-    """What Triton has been told so far, which is all but of requests that are under way."""
-    time.sleep(TOLD_S)
+def scrape(served: Served, told_s: float = TOLD_S) -> Scraped:
+    """What Triton has been told ``told_s`` from now, which is all but of requests that are under way."""
+    time.sleep(told_s)
     return Scraped(list(text_string_to_metric_families(httpx.get(served.endpoints.metrics_url).text)))
 
 
-def counted(served: Served, model: str, before: Scraped) -> dict[str, float]:
-    """How many samples there were since ``before``, as ``progress scored``; and ``frames``."""
-    after = scrape(served)
+def counted(after: Scraped, before: Scraped, model: str) -> dict[str, float]:
+    """How many samples there were in between, as ``progress scored``; and ``frames``."""
 
     def change(name: str, **labels: str) -> float:
         return after.value(name, model=model, **labels) - before.value(name, model=model, **labels)
@@ -109,18 +100,14 @@ def counted(served: Served, model: str, before: Scraped) -> dict[str, float]:
 
 @pytest.fixture(scope="module")
 def served_too(served: Served) -> Iterator[Served]:
-    """The shared server with the models of this file."""
-    for name, code, instances in ((TWICE, FAILING, 2), (MUTE, BROKEN, 1)):
-        settings = replace(serve_config(PLAIN, name), instances=instances)
-        rfm_export.export(PLAIN.checkpoint, served.repository, settings)
-        file = served.repository / name / "1" / "model.py"
-        file.write_text(file.read_text() + code)
+    """The shared server with a model of this file."""
+    rfm_export.export(PLAIN.checkpoint, served.repository, replace(serve_config(PLAIN, TWICE), instances=2))
+    file = served.repository / TWICE / "1" / "model.py"
+    file.write_text(file.read_text() + FAILING)
     with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
-        for name in (TWICE, MUTE):
-            api.load(name)
+        api.load(TWICE)
         yield served
-        for name in (TWICE, MUTE):
-            api.unload(name)
+        api.unload(TWICE)
 
 
 def client(served: Served, model: str) -> RewardClient:
@@ -145,7 +132,7 @@ def test_samples_are_counted_by_type_and_by_what_became_of_them(served: Served) 
         infer(served.url("grpc"), MODEL, foreign, [wire.PROGRESS])
     scored = dict.fromkeys((f"{kind} scored" for kind in TYPES), 4.0)
     expected = {**scored, "progress refused": 2, "unknown refused": 3, "frames": num_frames(good)}
-    assert counted(served, MODEL, before) == expected
+    assert counted(scrape(served), before, MODEL) == expected
 
 
 def test_two_instances_count_apart_and_add_up(served_too: Served) -> None:
@@ -157,8 +144,8 @@ def test_two_instances_count_apart_and_add_up(served_too: Served) -> None:
         with pytest.raises(InferenceFailedError, match="log has the reason"):
             asked.evaluate([ProgressSample(random_trajectory(0, 8), frame_steps=FAILING_STEPS)])
     scored = dict.fromkeys((f"{kind} scored" for kind in TYPES), 20.0)
-    assert counted(served_too, TWICE, before) == {**scored, "progress failed": 1, "frames": num_frames(samples)}
     after = scrape(served_too)
+    assert counted(after, before, TWICE) == {**scored, "progress failed": 1, "frames": num_frames(samples)}
     each = [after.value("samples_total", instance=f"{TWICE}_0_{number}") for number in range(2)]
     assert sum(each) == after.value("samples_total", model=TWICE) == 61
     assert after.value("batch_samples_sum", model=TWICE) == 60
@@ -195,7 +182,7 @@ def test_histograms_add_up_to_what_each_execution_took(served: Served) -> None:
 
 
 def test_metrics_have_their_kinds_buckets_and_labels(served_too: Served) -> None:
-    scraped = scrape(served_too)
+    scraped = scrape(served_too, 0)
     counters = ("samples", "frames", "out_of_memory_retries", "forward_passes")
     for name, kind in {**dict.fromkeys(counters, "counter"), **dict.fromkeys(HISTOGRAMS, "histogram")}.items():
         assert scraped.family(name).type == kind
@@ -221,8 +208,9 @@ def test_raw_frames_are_counted_where_they_are_encoded_and_where_they_are_scored
         asked.encode(film(3))
         asked.progress(film(4))
         asked.preference(film(2), film(5))
-    assert counted(served, f"{FILMED}_encoder", before) == {"encode scored": 3, "frames": 3 + 4 + 7}
-    assert counted(served, FILMED, before) == {"progress scored": 1, "preference scored": 1, "frames": 4 + 7}
+    after = scrape(served)
+    assert counted(after, before, f"{FILMED}_encoder") == {"encode scored": 3, "frames": 3 + 4 + 7}
+    assert counted(after, before, FILMED) == {"progress scored": 1, "preference scored": 1, "frames": 4 + 7}
 
 
 def test_the_client_s_status_and_prometheus_agree(served: Served) -> None:
@@ -250,7 +238,7 @@ def test_the_client_s_status_and_prometheus_agree(served: Served) -> None:
 def test_the_served_checkpoint_is_told(served: Served) -> None:
     with client(served, FILMED) as asked:
         info = asked.model_info()
-    told = [s for s in scrape(served).family("checkpoint_info").samples if s.labels["model"].startswith(FILMED)]
+    told = [s for s in scrape(served, 0).family("checkpoint_info").samples if s.labels["model"].startswith(FILMED)]
     of_both = {"version": "1", "source": info.source, "revision": ""}
     assert [sample.value for sample in told] == [1, 1]
     assert {**of_both, "model": FILMED, "weights_digest": info.weights_digest, "network": "RewindTransformer"} in [
@@ -265,14 +253,17 @@ def test_a_model_that_is_loaded_again_counts_on(served_too: Served) -> None:
     before = scrape(served_too)
 
     def shows(value: float) -> Callable[[], bool]:
-        return lambda: scrape(served_too).value("checkpoint_info", model=TWICE) == value
+        return lambda: scrape(served_too, 0).value("checkpoint_info", model=TWICE) == value
 
     with client(served_too, TWICE) as asked, RepositoryApi(served_too.url("grpc"), served_too.server.admin_key) as api:
         asked.evaluate([sample])
         api.unload(TWICE)
         api.wait_gone(TWICE)
         wait_for(shows(0))
-        assert counted(served_too, TWICE, before) == {"progress scored": 1, "frames": 3}  # told before it went
+        assert counted(scrape(served_too, 0), before, TWICE) == {
+            "progress scored": 1,
+            "frames": 3,
+        }  # told before it went
         api.load(TWICE)
         asked.evaluate([sample])
         config = served_too.repository / TWICE / "config.pbtxt"
@@ -281,12 +272,4 @@ def test_a_model_that_is_loaded_again_counts_on(served_too: Served) -> None:
         api.load(TWICE)  # the new instances come before the old ones go
         asked.evaluate([sample])
         wait_for(shows(1))
-        assert counted(served_too, TWICE, before) == {"progress scored": 3, "frames": 9}
-
-
-def test_a_model_without_its_metrics_serves_all_the_same_and_says_so_once(served_too: Served) -> None:
-    with client(served_too, MUTE) as asked:
-        for _ in range(3):
-            assert len(asked.evaluate(mixed_samples(3))) == 3
-    log = Path(served_too.repository.parent, "tritonserver.log").read_text()
-    assert log.count("metrics cannot be reported") == 1
+        assert counted(scrape(served_too), before, TWICE) == {"progress scored": 3, "frames": 9}

@@ -55,10 +55,10 @@ class Ahead(Model):
         super().finalize()
 
     def begin(self) -> list[Request]:
-        """Has it score one or two requests, which are not answered before ``open``."""
+        """Has it score one or two requests, which are prepared, and are not answered before ``open``."""
         first = [request(1), request(1)]
-        self.take(first)
-        wait_for(lambda: self.batches)
+        self.take(*first)
+        wait_for(lambda: self.batches and len(self.prepared) == 2)
         return first
 
     def open(self, *requests: Request) -> None:
@@ -70,7 +70,7 @@ def test_a_lone_request_on_an_idle_model_is_answered_by_execute(tmp_path: Path) 
     model = Ahead(tmp_path)
     model.may_answer.set()
     lone = request(5)
-    model.take([lone])
+    model.take(lone)
     assert [response.error for response in lone.responses] == [None]
     assert model.prepared == []  # what is not prepared ahead is prepared in its turn
 
@@ -80,7 +80,7 @@ def test_what_comes_while_a_batch_is_scored_is_prepared_and_makes_up_the_next(tm
     first = model.begin()
     later = [request(count) for count in (5, 6, 7)]
     for each in later:
-        model.take([each])
+        model.take(each)
     wait_for(lambda: sorted(model.prepared)[-3:] == [5, 6, 7])
     model.open(*first, *later)
     assert model.batches in ([2, 3], [1, 4])
@@ -93,7 +93,7 @@ def test_what_is_not_prepared_waits_for_another_batch(tmp_path: Path) -> None:
     first = model.begin()
     model.may_prepare.clear()
     late = [request(5), request(6)]
-    model.take(late)
+    model.take(*late)
     model.may_answer.set()
     wait_for(lambda: all(each.responses for each in first))
     assert not any(each.responses for each in late)
@@ -106,7 +106,7 @@ def test_execute_returns_when_less_than_a_batch_waits(tmp_path: Path) -> None:
     first = model.begin()
     full = [request(5) for _ in range(MAX_BATCH)]
     with ThreadPoolExecutor(1) as pool:
-        taken = pool.submit(model.take, full)
+        taken = pool.submit(model.take, *full)
         wait_for(lambda: len(model.prepared) >= MAX_BATCH)
         assert not taken.done()  # the rest waits in Triton, where another instance can take it
         model.open(*first, *full)
@@ -117,10 +117,10 @@ def test_a_batch_has_no_more_tokens_than_its_budget(tmp_path: Path) -> None:
     model = Ahead(tmp_path, settings={"token_budget": "12"})
     first = model.begin()
     later = [request(5), request(6)]  # two frames more are too many
-    model.take(later)
+    model.take(*later)
     more = request(7)
     with ThreadPoolExecutor(1) as pool:
-        pool.submit(model.take, [more])
+        pool.submit(model.take, more)
         wait_for(lambda: 6 in model.prepared)
         model.open(*first, *later, more)
     assert model.batches in ([2, 2, 1], [1, 3, 1])
@@ -132,7 +132,7 @@ def test_refused_failed_and_cancelled_requests_fail_alone(tmp_path: Path, monkey
     first = model.begin()
     unreadable = Request(request(1).tensors | {"num_frames": np.zeros((1, 2), np.int32)})
     requests = [request(REFUSED), request(BREAKS), unreadable, request(5, is_given_up=True), request(6)]
-    model.take(requests)
+    model.take(*requests)
     model.open(*first, *requests)
     assert [response.error and response.error[0] for each in requests for response in each.responses] == [
         "invalid", "internal", "invalid", "cancelled", None,
@@ -149,7 +149,7 @@ def test_a_request_for_which_there_is_no_memory_fails_alone(tmp_path: Path) -> N
 
     large = request(5)
     large.tensors["video_embeddings"] = large.tensors["video_embeddings"].view(Large)
-    failed, scored = model.respond([large, request(6)])
+    failed, scored = model.respond(large, request(6))
     assert failed.error == ("internal", "scoring failed; the server's log has the reason")
     assert scored.error is None
 
@@ -157,7 +157,7 @@ def test_a_request_for_which_there_is_no_memory_fails_alone(tmp_path: Path) -> N
 def test_a_model_is_unloaded_when_all_are_answered(tmp_path: Path) -> None:
     model = Ahead(tmp_path)
     requests = [*model.begin(), request(5)]
-    model.take(requests[-1:])
+    model.take(*requests[-1:])
     with ThreadPoolExecutor(1) as pool:
         unloaded = pool.submit(model.finalize)
         wait_for(lambda: 5 in model.prepared)

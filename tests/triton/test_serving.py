@@ -13,8 +13,9 @@ import goldens
 import rfm_export
 from engines import load_engine, serve_config
 from mixtures import FRAMES_MODEL, MODEL, assert_same, counts, mixed_samples, plug, wait_until_at_work
+from patients import answering_after
 from reference_server import Served
-from repositories import forget_input
+from repositories import bound_queue, configure, forget_input
 from rfm.launch.repository_api import RepositoryApi
 from rfm_client import (
     InvalidSampleError,
@@ -23,6 +24,7 @@ from rfm_client import (
     RewardClient,
     RewardError,
     Sample,
+    ServerUnavailableError,
     SimilaritySample,
     Trajectory,
 )
@@ -66,7 +68,15 @@ def filmed_samples(count: int) -> list[Sample]:
     return samples
 
 
-@pytest.mark.parametrize(("model", "samples"), [(MODEL, mixed_samples(100)), (FRAMES_MODEL, filmed_samples(24))])
+@pytest.mark.parametrize(
+    ("protocol", "model", "samples"),
+    [
+        ("grpc", MODEL, mixed_samples(100)),
+        ("http", MODEL, mixed_samples(30)),
+        ("http", FRAMES_MODEL, filmed_samples(24)),
+    ],
+    ids=["grpc", "http", "frames"],
+)
 def test_any_mixture_equals_its_samples_alone(served: Served, protocol: str, model: str, samples: list[Sample]) -> None:
     with served.client(protocol, model) as client:
         together = client.evaluate(samples, logits=True)
@@ -79,15 +89,13 @@ def test_any_mixture_equals_its_samples_alone(served: Served, protocol: str, mod
 BAD = 11  # the place of a sample that is refused
 
 
-@pytest.mark.parametrize("model", [MODEL, FRAMES_MODEL])
+@pytest.mark.parametrize(("protocol", "model"), [("grpc", MODEL), ("http", MODEL), ("http", FRAMES_MODEL)])
 def test_callers_share_batches_and_a_bad_sample_fails_alone(served: Served, protocol: str, model: str) -> None:
     samples = mixed_samples(100) if model == MODEL else filmed_samples(32)
     samples[BAD] = ProgressSample(random_trajectory(0, 17) if model == MODEL else film(0, 17, 8, 8))
     expected = [load_engine(model).evaluate([sample])[0] for sample in samples]
     works = model if model == MODEL else f"{FRAMES_MODEL}_encoder"
-    busy = (
-        plug() if model == MODEL else [ProgressSample(film(1000 + (protocol == "grpc"), 16, 2500, 2500))]
-    )  # not cached
+    busy = plug() if model == MODEL else [ProgressSample(film(1000, 16, 2500, 2500))]
     with (
         RewardClient(served.url(protocol), model=model, max_in_flight=len(samples)) as client,
         served.client("http", model) as other,  # a large request would hold up those behind it on one gRPC connection
@@ -110,12 +118,12 @@ def test_callers_share_batches_and_a_bad_sample_fails_alone(served: Served, prot
         assert_same(outcome, wanted)
 
 
-def test_a_bad_sample_of_a_call_is_located_and_costs_no_other(served: Served, protocol: str) -> None:
+def test_a_bad_sample_of_a_call_is_located_and_costs_no_other(served: Served) -> None:
     """Be it too long, or of a width that Triton itself refuses."""
     samples = mixed_samples(9)
     samples[4] = ProgressSample(random_trajectory(0, 17))
     samples[6] = ProgressSample(random_trajectory(1, 3, 768, 7))
-    with served.client(protocol) as client:
+    with served.client("http") as client:
         outcomes = client.evaluate(samples, return_errors=True)
         with pytest.raises(InvalidSampleError, match=r"^samples\[4\]\.num_frames: "):
             client.evaluate(samples[:6])
@@ -124,9 +132,9 @@ def test_a_bad_sample_of_a_call_is_located_and_costs_no_other(served: Served, pr
         assert_same(outcomes[index], load_engine(MODEL).evaluate([samples[index]])[0])
 
 
-def test_dense_mode_scores_each_frame_on_its_prefix(served: Served, protocol: str) -> None:
+def test_dense_mode_scores_each_frame_on_its_prefix(served: Served) -> None:
     trajectory = random_trajectory(5, 9)
-    with served.client(protocol) as client:
+    with served.client("http") as client:
         dense = client.progress(trajectory, frame_steps=4)
         for t in range(9):
             picked = trajectory.positions[np.linspace(0, t, 4).astype(int)]
@@ -154,6 +162,22 @@ def steps(number: int) -> wire.Tensors:
     return {wire.FRAME_STEPS: np.array([[number]], np.int32)}
 
 
+FRAMES = np.ones((1, 5, 8, 6, 3), np.uint8)
+QUESTION: wire.Tensors = {
+    wire.SAMPLE_TYPE: np.array([[1]], np.uint8),
+    **lengths(3, 2),
+    **steps(0),
+    wire.FRAMES: FRAMES,
+    wire.TASK: np.array([[b"lift"]], np.object_),
+}
+
+
+def second(**shape: int) -> wire.Tensors:
+    """The second trajectory's frames in an array of their own."""
+    frames = {"num": 2, "height": 8, "width": 6, "channels": 3, **shape}
+    return {wire.FRAMES: FRAMES[:, :3], wire.SECOND_FRAMES: np.ones((1, *frames.values()), np.uint8)}
+
+
 BAD_EMBEDDINGS: dict[str, tuple[wire.Tensors, str]] = {
     "NaN": (with_value(np.nan), r"^video_embeddings: expected finite values, got nan at \[1, 7\]$"),
     "Inf": (with_value(np.inf), r"^video_embeddings: expected finite values, got inf at \[1, 7\]$"),
@@ -175,22 +199,6 @@ BAD_EMBEDDINGS: dict[str, tuple[wire.Tensors, str]] = {
         r"^num_frames: expected at least one frame of each .*, got \[0, 0\]$",
     ),
 }
-
-FRAMES = np.ones((1, 5, 8, 6, 3), np.uint8)
-QUESTION: wire.Tensors = {
-    wire.SAMPLE_TYPE: np.array([[1]], np.uint8),
-    **lengths(3, 2),
-    **steps(0),
-    wire.FRAMES: FRAMES,
-    wire.TASK: np.array([[b"lift"]], np.object_),
-}
-
-
-def second(**shape: int) -> wire.Tensors:
-    """The second trajectory's frames in an array of their own."""
-    frames = {"num": 2, "height": 8, "width": 6, "channels": 3, **shape}
-    return {wire.FRAMES: FRAMES[:, :3], wire.SECOND_FRAMES: np.ones((1, *frames.values()), np.uint8)}
-
 
 BAD_FRAMES: dict[str, tuple[wire.Tensors, str]] = {
     "bytes that are no text": ({wire.TASK: np.array([[b"\xff\xfe"]], np.object_)}, "^task: expected UTF-8 text, got"),
@@ -223,44 +231,31 @@ BAD_FRAMES: dict[str, tuple[wire.Tensors, str]] = {
 }
 
 
-@pytest.mark.parametrize(("changes", "message"), BAD_EMBEDDINGS.values(), ids=BAD_EMBEDDINGS)
-def test_bad_embeddings_are_refused_with_what_was_expected(
-    served: Served, protocol: str, changes: wire.Tensors, message: str
-) -> None:
+@pytest.mark.parametrize("name", [*BAD_EMBEDDINGS, *BAD_FRAMES])
+def test_what_cannot_be_scored_is_refused_with_what_was_expected(served: Served, name: str) -> None:
+    is_film = name in BAD_FRAMES
+    changes, message = BAD_FRAMES[name] if is_film else BAD_EMBEDDINGS[name]
+    model, question = (f"{FRAMES_MODEL}_frames", QUESTION) if is_film else (MODEL, embedded())
     with pytest.raises(InvalidSampleError, match=message):
-        infer(served.url(protocol), MODEL, embedded() | changes, [wire.PROGRESS])
+        infer(served.url("grpc"), model, question | changes, [wire.PROGRESS])
 
 
-@pytest.mark.parametrize(("changes", "message"), BAD_FRAMES.values(), ids=BAD_FRAMES)
-def test_bad_frames_are_refused_with_what_was_expected(
-    served: Served, protocol: str, changes: wire.Tensors, message: str
-) -> None:
-    with pytest.raises(InvalidSampleError, match=message):
-        infer(served.url(protocol), f"{FRAMES_MODEL}_frames", QUESTION | changes, [wire.PROGRESS])
-
-
-def test_a_rewound_trajectory_is_scored(served: Served, protocol: str) -> None:
+def test_a_rewound_trajectory_is_scored(served: Served) -> None:
     """Its array has negative strides."""
     forwards = random_trajectory(1, 6)
     backwards = Trajectory(video_embeddings=forwards.positions[::-1], text_embedding=forwards.text_embedding)
     copied = Trajectory(video_embeddings=forwards.positions[::-1].copy(), text_embedding=forwards.text_embedding)
-    with served.client(protocol) as client:
+    with served.client("http") as client:
         assert_same(client.progress(backwards), client.progress(copied))
 
 
-def test_a_checkpoint_without_similarity_says_so(served: Served, protocol: str) -> None:
-    message = "sample_type: expected progress or preference .*no similarity head.*, got similarity"
-    with served.client(protocol, VLM) as client, pytest.raises(InvalidSampleError, match=message):
-        client.similarity(film(0, 2, 64, 64), film(1, 2, 64, 64))
-
-
-def test_what_was_not_asked_is_nan_on_the_wire(served: Served, protocol: str) -> None:
+def test_what_was_not_asked_is_nan_on_the_wire(served: Served) -> None:
     samples = [
         ProgressSample(random_trajectory(1, 2)),
         PreferenceSample(random_trajectory(2, 1), random_trajectory(3, 3)),
     ]
     outputs = [wire.PROGRESS, wire.SUCCESS, wire.PREFERENCE, wire.SIMILARITY, wire.PROGRESS_LOGITS, wire.TIMING_MS]
-    tensors = infer(served.url(protocol), MODEL, wire.encode_samples(samples), outputs)
+    tensors = infer(served.url("http"), MODEL, wire.encode_samples(samples), outputs)
     for name in (wire.PROGRESS, wire.SUCCESS):
         assert np.isnan(tensors[name]).tolist() == [[False, False, True, True], [False] * 4]
     assert np.isnan(tensors[wire.PROGRESS_LOGITS][0]).all(axis=-1).tolist() == [False, False, True, True]
@@ -280,7 +275,7 @@ def test_a_pair_of_two_frame_sizes_may_be_sent_through_shared_memory(served: Ser
 
 
 @pytest.mark.parametrize("model", [FRAMES_MODEL, VLM])
-def test_a_second_array_may_hold_frames_of_one_size(served: Served, protocol: str, model: str) -> None:
+def test_a_second_array_may_hold_frames_of_one_size(served: Served, model: str) -> None:
     """Whoever writes tensors may use the optional input for any pair, and for a sample without a second trajectory."""
     frames = [np.random.default_rng(seed).integers(0, 256, (2, 56, 56, 3), np.uint8) for seed in (1, 2)]
     films = [Trajectory(frames=each, task="lift") for each in frames]
@@ -290,7 +285,7 @@ def test_a_second_array_may_hold_frames_of_one_size(served: Served, protocol: st
         wire.SECOND_FRAMES: np.stack([frames[1], np.zeros_like(frames[1])]),
     }
     outputs = [wire.PROGRESS, wire.SUCCESS, wire.PREFERENCE]
-    url = served.url(protocol)
+    url = served.url("http")
     expected, got = (infer(url, f"{model}_frames", t, outputs) for t in (tensors, tensors | apart))
     for name in outputs:
         assert np.isfinite(got[name][0]).all()
@@ -305,33 +300,51 @@ def test_a_model_from_before_pairs_of_two_frame_sizes_says_so(served: Served) ->
     pairs = [PreferenceSample(wide, wide), PreferenceSample(wide, tall), PreferenceSample(tall, tall)]
     with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
         api.load("before_frames")
-        for protocol in ("grpc", "http"):
-            with served.client(protocol, "before") as client:
-                one_size, two_sizes, another_size = client.evaluate(pairs, return_errors=True)
-            assert isinstance(two_sizes, InvalidSampleError)
-            assert two_sizes.message == (
-                "second_frames: expected a model that takes pairs of two frame sizes, "
-                "got one that was exported before there was this input: export it again, or resize a trajectory"
-            )
-            assert not isinstance(one_size, RewardError)
-            assert not isinstance(another_size, RewardError)
+        with served.client("grpc", "before") as client:
+            one_size, two_sizes, another_size = client.evaluate(pairs, return_errors=True)
         api.unload("before_frames")
+    assert isinstance(two_sizes, InvalidSampleError)
+    assert two_sizes.message == (
+        "second_frames: expected a model that takes pairs of two frame sizes, "
+        "got one that was exported before there was this input: export it again, or resize a trajectory"
+    )
+    assert not isinstance(one_size, RewardError)
+    assert not isinstance(another_size, RewardError)
 
 
-def test_special_tokens_in_a_task_are_text(served: Served, protocol: str) -> None:
-    frames = np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), np.uint8)
-    with served.client(protocol, FRAMES_MODEL) as client:
-        plain, special = (
-            client.progress(Trajectory(frames=frames, task=task)).progress
-            for task in ("lift [ SEP ] it", "lift [SEP] it")
-        )
-    np.testing.assert_allclose(plain, special, rtol=0, atol=TOLERANCE)
-
-
-def test_one_model_missing_is_named_and_does_not_cost_the_others(served: Served, protocol: str) -> None:
+def test_one_model_missing_is_named_and_does_not_cost_the_others(served: Served) -> None:
     filmed = ProgressSample(Trajectory(frames=np.zeros((1, 8, 8, 3), np.uint8), task="lift"))
-    with served.client(protocol) as client:  # embeddings only
+    with served.client("http") as client:  # embeddings only
         outcomes = client.evaluate([filmed, ProgressSample(random_trajectory(0, 2)), filmed], return_errors=True)
     names = ["ModelNotFoundError", "ProgressResult", "ModelNotFoundError"]
     assert [type(outcome).__name__ for outcome in outcomes] == names
     assert f"{MODEL}_frames" in str(outcomes[0])
+
+
+@pytest.mark.slow
+def test_a_full_queue_refuses_at_once_and_patience_is_served(served: Served) -> None:
+    """By Triton's own policy; with one instance, Triton 2.51 notices a free one half a second late."""
+    config, name = goldens.config(MODEL), "queued"
+    rfm_export.export(config.checkpoint, served.repository, serve_config(config, name))
+    file = served.repository / name / "1" / "model.py"
+    file.write_text(file.read_text() + answering_after(0.5))
+    configure(served.repository / name, instances=2, batch_size=2)
+    bound_queue(served.repository / name, max_queue_size=4, timeout_ms=600)
+    with RepositoryApi(served.url("grpc"), served.server.admin_key) as api, ThreadPoolExecutor(24) as pool:
+
+        def ask(client: RewardClient) -> Exception | None:
+            try:
+                client.progress(random_trajectory(0, 3))
+            except ServerUnavailableError as error:
+                return error
+            return None
+
+        api.load(name)
+        for protocol in ("grpc", "http"):
+            with RewardClient(served.url(protocol), model=name, retry=False) as client:
+                outcomes = list(pool.map(ask, [client] * 24))
+            assert [error for error in outcomes if error is not None and "Exceeds maximum queue size" in str(error)]
+            assert outcomes.count(None) >= 2
+        with served.client("grpc", name) as patient:  # who asks again is served in the end
+            assert list(pool.map(ask, [patient] * 12)) == [None] * 12
+        api.unload(name)
