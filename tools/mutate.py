@@ -22,13 +22,15 @@ from cosmic_ray.work_item import WorkerOutcome, WorkItem, WorkResult
 ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
 CAUGHT = 0.95
-# What is changed, and the tests of which one must fail.
+# Changed files, and the tests of which one must fail.
 PARTS = {
-    "client/rfm_client/contract/wire/*.py": "tests/contract tests/families/test_properties.py",
-    "rfm/engine/layers.py": "tests/families/test_linear.py tests/families/test_precision.py tests/families/test_rewind.py",
-    "rfm/rewind/*.py": "tests/families/test_rewind.py tests/families/test_encoders.py tests/families/test_checkpoint.py",
-    "rfm/vlm/*.py": "tests/families -k vlm",
-    "rfm/triton_model/batch_model.py": "tests/triton/test_batch_model.py tests/triton/test_pipeline.py",
+    "client/rfm_client/contract/wire/*.py": "contract/test_*.py families/test_properties.py",
+    "rfm/engine/layers.py": "families/test_linear.py families/test_precision.py families/test_rewind.py",
+    "rfm/rewind/*.py": "families/test_rewind.py families/test_*encoders.py families/test_checkpoint.py"
+    " families/test_missing_heads.py families/test_forms.py export/test_provenance.py",
+    "rfm/vlm/*.py": "families/test_vlm*.py families/test_nf4.py families/test_forms.py families/test_shot_cache.py"
+    " export/test_provenance.py",
+    "rfm/triton_model/batch_model.py": "triton/test_batch_model.py triton/test_pipeline.py",
 }
 CONFIG = """
 [cosmic-ray]
@@ -52,7 +54,8 @@ def start(pattern: str, folder: Path) -> Path:
     if not modules:
         raise RuntimeError(f"{pattern}: expected files, got none")
     pytest = ROOT / ".venv" / "bin" / "pytest"
-    (folder / "mutate.toml").write_text(CONFIG.format(modules=modules, pytest=pytest, tests=PARTS[pattern]))
+    tests = (str(file) for name in PARTS[pattern].split() for file in sorted((folder / "tests").glob(name)))
+    (folder / "mutate.toml").write_text(CONFIG.format(modules=modules, pytest=pytest, tests=" ".join(tests)))
     run(folder, "cosmic-ray", "init", "mutate.toml", "mutants.sqlite")
     run(folder, "cr-filter-operators", "mutants.sqlite", "mutate.toml")
     return folder
