@@ -81,6 +81,7 @@ MIXED: list[Sample] = [
 
 
 @pytest.mark.parametrize("name", [PLAIN, "q25_video_avg_disc10", "smol_mean_disc10"])
+@pytest.mark.slow
 def test_batches_that_are_collated_while_others_are_scored_have_the_cpu_s_scores(seen: Seen, name: str) -> None:
     engine = engine_there(goldens.config(name), feature_cache_mb=1)
     engine.token_budget = 100

@@ -317,6 +317,7 @@ PICKLES: dict[str, tuple[Callable[[Path], None], str]] = {
 
 
 @pytest.mark.parametrize(("spoil", "named"), PICKLES.values(), ids=PICKLES)
+@pytest.mark.slow
 def test_the_conversion_that_the_refusal_of_a_pickle_names_works(
     folder: Path, spoil: Callable[[Path], None], named: str
 ) -> None:
@@ -332,6 +333,7 @@ def test_the_conversion_that_the_refusal_of_a_pickle_names_works(
     assert all(torch.equal(after.network[name], before.network[name]) for name in before.network)
 
 
+@pytest.mark.slow
 def test_the_conversion_of_a_pickled_adapter_works(tmp_path: Path) -> None:
     golden = goldens.config("q25_peft_adapter_disc10")
 
@@ -581,6 +583,7 @@ IN_CACHE = [f"offline {source}" for source in (f"{UNTAGGED}@{TAG}", TAGGED, IN_S
 
 
 @pytest.mark.parametrize("source", [UNTAGGED, TAGGED, IN_SUBFOLDER, LATE, LATE_ABOVE, *IN_CACHE])
+@pytest.mark.slow
 def test_config_yaml_is_found_on_main_of_the_hub_s_repository(from_hub: dict[str, str], source: str) -> None:
     expected = asdict(families.load(goldens.config(WITH_IMAGES).checkpoint).config)
     assert expected["multi_image"] and expected["per_frame_progress_token"]
@@ -625,6 +628,7 @@ REFUSED_HUB = {
 
 
 @pytest.mark.parametrize(("source", "message"), REFUSED_HUB.values(), ids=REFUSED_HUB)
+@pytest.mark.slow
 def test_what_a_hub_s_repository_lacks_is_told(from_hub: dict[str, str], source: str, message: str) -> None:
     assert re.search(message, from_hub[source]), from_hub[source]
 

@@ -383,6 +383,7 @@ except CheckpointError as error:
 """
 
 
+@pytest.mark.slow
 def test_a_full_folder_of_temporary_files_is_told() -> None:
     """Loading needs none."""
     config = goldens.config(NAME)

@@ -98,6 +98,7 @@ for outcome, other in zip(outcomes, expected, strict=True):
 """
 
 
+@pytest.mark.slow
 def test_a_cpu_out_of_memory_halves_the_batch_and_fails_a_lone_sample() -> None:
     """A process of its own, since the limit on its memory is real and lasts; what is freed there is free at once."""
     environment = {**os.environ, "MALLOC_MMAP_THRESHOLD_": str(2**16), "MALLOC_ARENA_MAX": "1"}

@@ -161,7 +161,7 @@ def mixture() -> list[Sample]:
         ("q25_peft_adapter_disc10", 4096),
         ("q25_peft_adapter_disc10", 65_536),
         ("q25_video_last_l2", 65_536),
-        (SMOL, 4096),
+        pytest.param(SMOL, 4096, marks=pytest.mark.slow),
     ],
 )
 def test_a_mixture_equals_its_samples_alone(name: str, token_budget: int) -> None:

@@ -117,9 +117,9 @@ def test_a_batch_has_no_more_tokens_than_its_budget(tmp_path: Path) -> None:
     model = Ahead(tmp_path, settings={"token_budget": "12"})
     first = model.begin()
     later = [request(5), request(6)]  # two frames more are too many
-    model.take(*later)
     more = request(7)
-    with ThreadPoolExecutor(1) as pool:
+    with ThreadPoolExecutor(1) as pool:  # the first call waits if its requests and one of the first fill a batch
+        pool.submit(model.take, *later)
         pool.submit(model.take, more)
         wait_for(lambda: 6 in model.prepared)
         model.open(*first, *later, more)
