@@ -44,6 +44,7 @@ WITH_SIMILARITY = "q25_peft_adapter_disc10"  # in the copied references too
 PIXEL_TOLERANCE = 1e-6  # relative, of a sum over all pixels
 
 
+SMOL = "smol_mean_disc10"
 MIXED_TOLERANCE = 5e-6  # seen: 1e-6
 
 
@@ -160,11 +161,11 @@ def mixture() -> list[Sample]:
         ("q25_peft_adapter_disc10", 4096),
         ("q25_peft_adapter_disc10", 65_536),
         ("q25_video_last_l2", 65_536),
-        ("smol_mean_disc10", 4096),
+        (SMOL, 4096),
     ],
 )
 def test_a_mixture_equals_its_samples_alone(name: str, token_budget: int) -> None:
-    samples = mixture()
+    samples = mixture()[:: 3 if name == SMOL else 1]  # its squares take long on a CPU
     engine = Engine(load_engine(name).predictor, token_budget=token_budget)
     order = np.random.default_rng(0).permutation(len(samples))
     together = engine.evaluate([samples[index] for index in order])
@@ -325,7 +326,7 @@ def test_the_task_is_not_a_template() -> None:
 
 
 ASKED_AGAIN = {
-    **{name: partial(predictor_of, name) for name in (PLAIN, "q25_video_last_l2", "smol_mean_disc10")},
+    **{name: partial(predictor_of, name) for name in (PLAIN, "q25_video_last_l2", SMOL)},
     f"{PLAIN} on videos": lambda: on_videos(PLAIN),
 }
 
