@@ -126,9 +126,7 @@ def test_videos_are_fitted(
 ) -> None:
     frames = np.random.default_rng(0).integers(0, 256, (1, *size, 3), np.uint8)
     image = Image.fromarray(frames[0])
-    for height, width in (
-        between if size != (540, 960) else [*between, expected]
-    ):  # all by Pillow but the last, by torch
+    for height, width in by_pillow:
         image = image.resize((width, height), Image.Resampling.BICUBIC)
     wanted = torch.from_numpy(np.array(image)).movedim(-1, 0)[None].float()
     if wanted.shape[2:] != expected:
