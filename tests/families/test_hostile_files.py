@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
 from typer.testing import CliRunner
 
 import goldens
@@ -29,11 +28,12 @@ from rfm.plain_yaml import MAX_YAML_BYTES
 from rfm_client.contract.settings import ConfigError
 from rfm_commands.cli import app
 from rfm_commands.config import Config
-from spoilt import WEIGHTS, Spoil, copied, files_in, settings, text_settings
+from spoilt import WEIGHTS, Spoil, copied, files_in, settings, text, text_settings, weights
 
 REWIND = goldens.config("legacy_keys_l2")
 VLM = goldens.config("q25_mean_l2")
-INDEX = "model.safetensors.index.json"
+ADAPTER = goldens.config("q25_peft_adapter_disc10")
+
 LONGEST_S = 30
 MOST_MEMORY_BYTES = 512 * 2**20  # beyond what the process had at its largest
 
@@ -52,40 +52,37 @@ def _soon() -> Iterator[None]:
     signal.signal(signal.SIGALRM, previous)
 
 
-def text(name: str, content: str) -> Spoil:
-    return lambda folder: (folder / name).write_text(content)
-
-
-def header(change: Callable[[dict[str, Any]], object]) -> Spoil:
+def raw_header(change: Callable[[bytes], bytes]) -> Spoil:
     """Another header before the same numbers."""
 
     def spoil(folder: Path) -> None:
         content = (folder / WEIGHTS).read_bytes()
         (length,) = struct.unpack_from("<Q", content)
-        told = json.loads(content[8 : 8 + length])
-        changed = change(told) or told
-        raw = changed if isinstance(changed, bytes) else json.dumps(changed).encode()
+        raw = change(content[8 : 8 + length])
         (folder / WEIGHTS).write_bytes(struct.pack("<Q", len(raw)) + raw + content[8 + length :])
 
     return spoil
 
 
+def header(**changes: object) -> Spoil:
+    """Other things about the first tensor."""
+
+    def change(raw: bytes) -> bytes:
+        told = json.loads(raw)
+        told[FIRST].update(changes)
+        return json.dumps(told).encode()
+
+    return raw_header(change)
+
+
 def instead(name: str, make: Callable[[Path], object]) -> Spoil:
     """Something else under the name of a file."""
-
-    def spoil(folder: Path) -> None:
-        (folder / name).unlink()
-        make(folder / name)
-
-    return spoil
+    return lambda folder: [(folder / name).unlink(), make(folder / name)]
 
 
 def shards(**weight_map: Any) -> Spoil:
-    def spoil(folder: Path) -> None:
-        (folder / WEIGHTS).unlink()
-        (folder / INDEX).write_text(json.dumps({"weight_map": weight_map}))
-
-    return spoil
+    index = json.dumps({"weight_map": weight_map})
+    return instead(WEIGHTS, lambda file: Path(f"{file}.index.json").write_text(index))
 
 
 def other_endian(folder: Path) -> None:
@@ -93,22 +90,6 @@ def other_endian(folder: Path) -> None:
     (length,) = struct.unpack_from("<Q", content)
     numbers = np.frombuffer(content[8 + length :], "<f4").byteswap()
     (folder / WEIGHTS).write_bytes(content[: 8 + length] + numbers.tobytes())
-
-
-def no_numbers_but_shapes(folder: Path) -> None:
-    """Shapes of which one axis is 0 need no bytes, whatever the others are."""
-    names = list(load_file(folder / WEIGHTS))
-    told = {name: {"dtype": "F32", "shape": [2**19, 0], "data_offsets": [0, 0]} for name in names}
-    raw = json.dumps(told).encode()
-    (folder / WEIGHTS).write_bytes(struct.pack("<Q", len(raw)) + raw)
-
-
-def sparse(folder: Path) -> None:
-    """A petabyte, of which nothing lies on the disk."""
-    raw = json.dumps({"a": {"dtype": "F32", "shape": [2**44], "data_offsets": [0, 2**46]}}).encode()
-    with (folder / WEIGHTS).open("wb") as file:
-        file.write(struct.pack("<Q", len(raw)) + raw)
-        file.truncate(2**43)
 
 
 FIRST = "first_embedding_A"
@@ -124,20 +105,18 @@ HOSTILE: dict[str, tuple[Spoil, str]] = {
         SAFETENSORS + f"one whose header would be {2**63} bytes long",
     ),
     "a header that fits but is huge": (
-        header(lambda _: b"{" + b" " * MAX_HEADER_BYTES + b"}"),
+        raw_header(lambda _: b"{" + b" " * MAX_HEADER_BYTES + b"}"),
         SAFETENSORS + "one whose header would be",
     ),
-    "a deep header": (header(lambda _: b"[" * 2**20), SAFETENSORS),
+    "a deep header": (raw_header(lambda _: b"[" * 2**20), SAFETENSORS),
     "a tensor twice": (
-        header(lambda h: json.dumps(h).replace("{", f'{{"{FIRST}": {json.dumps(h[FIRST])}, ', 1).encode()),
+        raw_header(lambda raw: raw.replace(b"{", f'{{"{FIRST}": {{}}, '.encode(), 1)),
         SAFETENSORS + f"the key '{FIRST}' twice",
     ),
-    "offsets beyond the end": (header(lambda h: h[FIRST].update(data_offsets=[0, 2**60])), SAFETENSORS),
-    "a shape that lies": (header(lambda h: h[FIRST].update(shape=[1, 1, 10**6])), SAFETENSORS),
-    "a type that is none": (header(lambda h: h[FIRST].update(dtype="PY")), SAFETENSORS + f"'{FIRST}' of type 'PY'"),
-    "whole numbers as weights": (header(lambda h: h[FIRST].update(dtype="I32")), rf"{FIRST}: expected numbers like"),
-    "huge shapes of no numbers": (no_numbers_but_shapes, r"expected|axes"),
-    "a petabyte that is not there": (sparse, SAFETENSORS),
+    "offsets beyond the end": (header(data_offsets=[0, 2**60]), SAFETENSORS),
+    "a shape that lies": (header(shape=[1, 1, 10**6]), SAFETENSORS),
+    "a type that is none": (header(dtype="PY"), SAFETENSORS + f"'{FIRST}' of type 'PY'"),
+    "whole numbers as weights": (header(dtype="I32"), rf"{FIRST}: expected numbers like"),
     "a tail": (lambda f: (f / WEIGHTS).write_bytes((f / WEIGHTS).read_bytes() + b"tail"), SAFETENSORS),
     "Git LFS": (
         text(WEIGHTS, "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n"),
@@ -227,39 +206,33 @@ def test_a_hostile_vision_language_checkpoint_is_refused(tmp_path: Path, spoil: 
     folder = copied(VLM, tmp_path / "checkpoint")
     spoil(folder)
     (tmp_path / "model_repository").mkdir()
-    refused(folder, tmp_path / "model_repository", message, "--base-model", str(VLM.base_model))
+    refused(folder, tmp_path / "model_repository", message, "--base-model", VLM.sources["base_model"])
 
 
 def test_lora_factors_whose_product_would_be_huge_are_refused(tmp_path: Path) -> None:
-    config = goldens.config("q25_peft_adapter_disc10")
-    folder = copied(config, tmp_path / "checkpoint")
-    adapter = load_file(folder / "adapter_model.safetensors")
-    name = next(name for name in adapter if ".lora_A." in name)
-    adapter[name] = torch.zeros(1, 2**20)
-    adapter[name.replace("lora_A", "lora_B")] = torch.zeros(2**20, 1)
-    save_file(adapter, folder / "adapter_model.safetensors")
+    folder = copied(ADAPTER, tmp_path / "checkpoint")
+
+    def widen(adapter: dict[str, torch.Tensor]) -> None:
+        name = next(name for name in adapter if ".lora_A." in name)
+        adapter |= {name: torch.zeros(1, 2**20), name.replace("lora_A", "lora_B"): torch.zeros(2**20, 1)}
+
+    weights(widen, "adapter_model.safetensors")(folder)
     (tmp_path / "model_repository").mkdir()
     message = r"expected LoRA factors of \[\d+, \d+\], got \[1048576, 1\] and \[1, 1048576\]"
-    refused(folder, tmp_path / "model_repository", message, "--base-model", str(config.base_model))
+    refused(folder, tmp_path / "model_repository", message, "--base-model", ADAPTER.sources["base_model"])
 
 
-def test_a_base_model_with_code_is_not_asked_about(tmp_path: Path) -> None:
-    config = goldens.config("q25_peft_adapter_disc10")
-    base = tmp_path / "base"
-    base.mkdir()
+def test_the_code_of_a_base_model_is_not_run(tmp_path: Path) -> None:
     mark = tmp_path / "was_here"
-    (base / "evil.py").write_text(f"open({str(mark)!r}, 'w')\n")
-    (base / "config.json").write_text(json.dumps({"model_type": "evil", "auto_map": {"AutoConfig": "evil.Config"}}))
+    (tmp_path / "evil.py").write_text(f"open({str(mark)!r}, 'w')\n")
+    (tmp_path / "config.json").write_text(json.dumps({"model_type": "evil", "auto_map": {"AutoConfig": "evil.Config"}}))
     with pytest.raises(CheckpointError, match=r"base model .*: model_type: expected one of .*, got 'evil'"):
-        families.load(config.checkpoint, base_model=str(base))
+        families.load(ADAPTER.checkpoint, base_model=str(tmp_path))
     assert not mark.exists()
 
 
 def test_the_links_of_the_hubs_cache_are_followed(tmp_path: Path) -> None:
-    blobs, snapshot = (
-        tmp_path / "models--org--name" / "blobs",
-        tmp_path / "models--org--name" / "snapshots" / ("0" * 40),
-    )
+    blobs, snapshot = (tmp_path / "models--org--name" / part for part in ("blobs", f"snapshots/{'0' * 40}"))
     blobs.mkdir(parents=True)
     snapshot.mkdir(parents=True)
     for number, file in enumerate(sorted(REWIND.checkpoint.iterdir())):
@@ -271,17 +244,11 @@ def test_the_links_of_the_hubs_cache_are_followed(tmp_path: Path) -> None:
 
 
 BAD_SETTINGS = {
-    "a path as name": (
-        "export: {name: ../../etc}",
-        r"serve\.yaml: export\.name: expected letters, digits, _ and -, got",
-    ),
+    "a path as name": ("export: {name: ../../etc}", r"serve\.yaml: export\.name: expected letters, digits, _ and -, got"),
     "an endless name": (f"export: {{name: {'a' * 300}}}", r"export\.name: expected at most 100 characters, got 300"),
-    "a batch beyond int32": (
-        "export: {max_batch_size: 9999999999}",
-        r"export\.max_batch_size: expected at most 2147483647",
-    ),
+    "a batch beyond int32": ("export: {max_batch_size: 9999999999}", r"max_batch_size: expected at most 2147483647"),
     "GPUs without end": ("num_gpus: 1000000000", r"serve\.yaml: num_gpus: expected at most 4096"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("content", "message"), BAD_SETTINGS.values(), ids=BAD_SETTINGS)

@@ -37,15 +37,18 @@ def engine(name: str, cache: FeatureCache[Any] | None = None) -> Engine:
     return Engine(checkpoint.predictor(torch.device("cpu"), None, cache))
 
 
-def frames_per_shot(served: Engine) -> int:
-    assert isinstance(served.predictor, VlmPredictor)
-    return served.predictor.collator.frames_per_shot
+def of_both(name: str, cache: FeatureCache[Any] | None = None) -> tuple[Engine, Engine]:
+    """An engine with a cache, by default one that holds all, and one without."""
+    return engine(name, FeatureCache(64 * BYTES_PER_MB) if cache is None else cache), engine(name)
+
+
+def predictor_of(cached: Engine) -> VlmPredictor:
+    assert isinstance(cached.predictor, VlmPredictor)
+    return cached.predictor
 
 
 def frames_of(seed: int, count: int, size: tuple[int, int] = (56, 84)) -> UInt8Array:
-    frames = film(seed, count, *size).frames
-    assert frames is not None
-    return frames
+    return film(seed, count, *size).positions
 
 
 def whole(frames: UInt8Array) -> ProgressSample:
@@ -63,18 +66,23 @@ def ask(served: Engine, sample: NamedProgressSample, execution: Execution | None
     return outcome
 
 
+def assert_scored(outcome: Any, plain: Engine, frames: UInt8Array, frame_steps: int = 0) -> None:
+    """As by an engine without a cache that is given the whole film."""
+    (expected,) = plain.evaluate([ProgressSample(Trajectory(frames=frames, task=TASK), frame_steps=frame_steps)])
+    assert_close(outcome, expected, TOLERANCE)
+
+
 @pytest.mark.parametrize(
     ("name", "rule"), [*((MODELS[0], rule) for rule in RULES), *((name, "rint_pad") for name in MODELS[1:])]
 )
 def test_an_episode_has_the_scores_of_the_whole_and_each_shot_is_encoded_once(name: str, rule: Rule) -> None:
-    cached, plain = engine(name, FeatureCache(64 * BYTES_PER_MB)), engine(name)
+    cached, plain = of_both(name)
     sampling = Sampling(rule, 4 if rule in TAKE_A_NUMBER else None)
-    frames, execution = frames_of(0, 16 if rule == "all" else 20), Execution()
-    per_shot, shown, num_shown = frames_per_shot(cached), set(), 0
+    frames, execution = frames_of(0, 18 if name == MODELS[0] else 12), Execution()  # pad16 takes 16 of more
+    per_shot, shown, num_shown = predictor_of(cached).collator.frames_per_shot, set(), 0
     for step in range(len(frames)):
         window = frames[sampling.prefix(step).indices]
-        (expected,) = plain.evaluate([whole(window)])
-        assert_close(ask(cached, named(window, frames[step : step + 1]), execution), expected, TOLERANCE)
+        assert_scored(ask(cached, named(window, frames[step : step + 1]), execution), plain, window)
         digests = [*map(frame_digest, window)]
         digests += digests[-1:] * (-len(digests) % per_shot)
         shots = {tuple(digests[i : i + per_shot]) for i in range(0, len(digests), per_shot)}
@@ -85,73 +93,60 @@ def test_an_episode_has_the_scores_of_the_whole_and_each_shot_is_encoded_once(na
 
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
 def test_a_cache_that_holds_nothing_changes_no_score(name: str) -> None:
-    cache = FeatureCache[Any](1)
-    cached, plain = engine(name, cache), engine(name)
-    frames = frames_of(1, 6)
-    for stop in range(1, 7):
-        (expected,) = plain.evaluate([whole(frames[:stop])])
-        assert_close(ask(cached, named(frames[:stop], frames[:stop])), expected, TOLERANCE)
+    cache, frames = FeatureCache[Any](1), frames_of(1, 4)
+    cached, plain = of_both(name, cache)
+    for stop in range(1, 5):
+        assert_scored(ask(cached, named(frames[:stop], frames[:stop])), plain, frames[:stop])
         assert len(cache) == 0
     assert str(ask(cached, named(frames[:2], frames[1:]))) == (
         "frame_digests: expected digests of frames that this model knows or has been sent, got 1 others"
     )
+    frames_of_two_sizes = [*frames_of(8, 1), *frames_of(9, 1, (84, 56))]
+    expected = "frame_digests: expected digests of frames of one size, got sizes [(56, 84), (84, 56)]"
+    assert str(ask(cached, named(frames_of_two_sizes, frames_of_two_sizes))) == expected
 
 
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
 def test_a_cache_that_evicts_at_every_step_changes_no_score(name: str) -> None:
     cache = FeatureCache[Any](3 * 56 * 84 * 3 + 2 * BYTES_PER_MB // 100)
-    cached, plain, frames, unknown = engine(name, cache), engine(name), frames_of(2, 12), 0
-    for stop in range(4, 13):
+    frames, unknown = frames_of(2, 10), 0
+    cached, plain = of_both(name, cache)
+    for stop in range(4, 11):
         window = frames[stop - 4 : stop]
-        (expected,) = plain.evaluate([whole(window)])
         outcome = ask(cached, named(window, window[-1:]))
         if isinstance(outcome, RewardError):
             unknown += 1
             outcome = ask(cached, named(window, window))
-        assert_close(outcome, expected, TOLERANCE)
+        assert_scored(outcome, plain, window)
         assert cache.num_bytes <= cache.limit_bytes
     assert unknown
 
 
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
 def test_whole_films_of_other_callers_fill_the_cache(name: str) -> None:
-    cached, plain = engine(name, FeatureCache(64 * BYTES_PER_MB)), engine(name)
-    first, second, execution = film(3, 4, 56, 84, TASK), film(4, 6, 84, 56, TASK), Execution()
+    cached, plain = of_both(name)
+    first, second = film(3, 4, 56, 84, TASK), film(4, 6, 84, 56, TASK)
     samples = [ProgressSample(first), PreferenceSample(first, second), PreferenceSample(second, first)]
-    for outcome, expected in zip(cached.evaluate(samples, execution), plain.evaluate(samples), strict=True):
-        assert_close(outcome, expected, TOLERANCE)
-    assert execution.num_encoded == 10  # each frame of the batch once, in three samples
-    again = Execution()
-    for outcome, expected in zip(cached.evaluate(samples[1:], again), plain.evaluate(samples[1:]), strict=True):
-        assert_close(outcome, expected, TOLERANCE)
-    assert (again.num_encoded, again.num_found) == (0, 10)
-    assert again.cache_bytes
-    assert first.frames is not None
-    (expected,) = plain.evaluate([whole(first.frames)])
-    assert_close(ask(cached, named(first.frames, ())), expected, TOLERANCE)
-
-
-def test_dense_mode_of_named_frames() -> None:
-    cached, plain, frames = engine(MODELS[0], FeatureCache(BYTES_PER_MB)), engine(MODELS[0]), frames_of(5, 5)
-    (expected,) = plain.evaluate([ProgressSample(Trajectory(frames=frames, task=TASK), frame_steps=4)])
-    assert_close(ask(cached, named(frames, frames, 4)), expected, TOLERANCE)
-    assert_close(ask(cached, named(frames, (), 4)), expected, TOLERANCE)
+    expected = plain.evaluate(samples)
+    for counts in ((10, 0), (0, 10)):  # each frame of the batch once, in three samples
+        execution = Execution()
+        for outcome, other in zip(cached.evaluate(samples, execution), expected, strict=True):
+            assert_close(outcome, other, TOLERANCE)
+        assert (execution.num_encoded, execution.num_found) == counts
+        assert execution.cache_bytes
+    assert_scored(ask(cached, named(first.positions, ())), plain, first.positions)
+    assert_scored(ask(cached, named(first.positions, (), 3)), plain, first.positions, 3)
 
 
 def test_the_size_that_frames_are_brought_to_is_part_of_what_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames of very long videos are made smaller than those of short ones."""
-    cached, plain, frames = (
-        engine(MODELS[3], FeatureCache(64 * BYTES_PER_MB)),
-        engine(MODELS[3]),
-        frames_of(6, 4, (448, 336)),
-    )
+    cached, plain = of_both(MODELS[3])
+    frames = frames_of(6, 4, (448, 336))
     monkeypatch.setattr("rfm.vlm.images.VIDEO_TOTAL_TOKENS", 300.0)
-    assert isinstance(cached.predictor, VlmPredictor)
-    grid = cached.predictor.collator.grid  # type: ignore[attr-defined]  # of the Qwen backbones
     for stop in (2, 4):
-        (expected,) = plain.evaluate([whole(frames[:stop])])
-        assert_close(ask(cached, named(frames[:stop], frames[:stop])), expected, TOLERANCE)
-    rows = [cached.predictor.rows(whole(frames[:stop]))[0] for stop in (2, 4)]
+        assert_scored(ask(cached, named(frames[:stop], frames[:stop])), plain, frames[:stop])
+    rows = [predictor_of(cached).rows(whole(frames[:stop]))[0] for stop in (2, 4)]
+    grid = predictor_of(cached).collator.grid  # type: ignore[attr-defined]  # of the Qwen backbones
     assert grid(rows[0].films[0]).tokens_per_group != grid(rows[1].films[0]).tokens_per_group
 
 
@@ -160,28 +155,26 @@ def test_what_is_not_finite_is_not_kept_even_if_no_score_shows_it(name: str) -> 
     """The last tokens of a video may stand behind all that is read."""
     cache, frames = FeatureCache[Any](BYTES_PER_MB), frames_of(12, 4)
     cached = engine(name, cache)
-    assert isinstance(cached.predictor, VlmPredictor)
 
     def spoil(_module: Any, _inputs: Any, output: torch.Tensor) -> torch.Tensor:
         return torch.cat([output[:-1], output[-1:] * torch.nan])
 
-    cached.predictor.network.model.visual.merger.register_forward_hook(spoil)
+    predictor_of(cached).network.model.visual.merger.register_forward_hook(spoil)
     ask(cached, named(frames, frames))
     assert len(cache) == 0
 
 
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
-def test_a_frame_that_comes_many_times_is_brought_to_size_once(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_that_comes_many_times_is_brought_to_size_once(name: str) -> None:
     """Or one large frame, named thousands of times, would take all memory."""
-    cached, frames = engine(name, FeatureCache(64 * BYTES_PER_MB)), frames_of(13, 2)
-    (expected,) = engine(name).evaluate([whole(frames[[0, 1, 1, 0, 1, 1]])])
-    collator = cached.predictor.collator  # type: ignore[attr-defined]
-    sized: list[int] = []
-    to_size = collator._to_size
-    monkeypatch.setattr(collator, "_to_size", lambda film, needed: sized.append(len(needed)) or to_size(film, needed))
-    outcome = ask(cached, named([frames[index] for index in (0, 1, 1, 0, 1, 1)], frames))
-    assert sized == [2]
-    assert_close(outcome, expected, TOLERANCE)
+    cached, plain = of_both(name)
+    frames = frames_of(13, 2)[[0, 1, 1, 0, 1, 1]]
+    sample = named(frames, frames[:2])
+    prepared = cached.prepare(sample)
+    cached.work_ahead(prepared)
+    (row,) = prepared.rows
+    assert len(row.films[0].ready.pixels) == 2
+    assert_scored(ask(cached, sample), plain, frames)
 
 
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
@@ -190,16 +183,15 @@ def test_black_frames_with_pixels_are_always_encoded(name: str) -> None:
     cached, black, execution = engine(name, FeatureCache(BYTES_PER_MB)), np.zeros((2, 56, 84, 3), np.uint8), Execution()
     for _ in range(2):
         (expected,) = cached.evaluate([whole(black)], execution)
-    assert execution.num_encoded == 2 * frames_per_shot(cached)
     assert_close(ask(cached, named(black, ()), execution), expected, TOLERANCE)
-    assert execution.num_encoded == 2 * frames_per_shot(cached)
+    assert execution.num_encoded == 2 * predictor_of(cached).collator.frames_per_shot
 
 
 def test_a_pass_without_memory_empties_the_cache_and_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
     cache, frames, execution = FeatureCache[Any](BYTES_PER_MB), frames_of(16, 4), Execution()
-    cached, plain = engine(MODELS[0], cache), engine(MODELS[0])
+    cached, plain = of_both(MODELS[0], cache)
     cached.evaluate([whole(frames[:2])])
-    network, sizes = cached.predictor.network, []  # type: ignore[attr-defined]
+    network, sizes = predictor_of(cached).network, list[int]()
     forward = network.forward
 
     def refusing(batch: Any) -> Any:
@@ -220,23 +212,16 @@ def test_a_pass_without_memory_empties_the_cache_and_is_tried_again(monkeypatch:
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
 def test_frames_that_were_evicted_are_kept_again_though_all_their_shots_are_kept(name: str) -> None:
     cache, frames, execution = FeatureCache[Any](BYTES_PER_MB), frames_of(17, 4), Execution()
-    cached = engine(name, cache)
-    (expected,) = cached.evaluate([whole(frames)])
-    (row,) = cached.predictor.rows(whole(frames))
-    shots = cache.found(cached.predictor.collator.shot_keys(row.films[0]).values())  # type: ignore[attr-defined]
+    cached, plain = of_both(name, cache)
+    cached.evaluate([whole(frames)])
+    (row,) = predictor_of(cached).rows(whole(frames))
+    shots = cache.found(predictor_of(cached).collator.shot_keys(row.films[0]).values())  # type: ignore[attr-defined]
     cache.clear()
     cache.keep(shots)
     for sample in (whole(frames), named(frames, ())):
         (outcome,) = cached.score([cached.prepare(sample)], execution)
-        assert_close(outcome, expected, TOLERANCE)
+        assert_scored(outcome, plain, frames)
     assert execution.num_encoded == 0
-
-
-def test_frames_of_two_sizes_are_no_film() -> None:
-    frames = [*frames_of(8, 1), *frames_of(9, 1, (84, 56))]
-    outcome = ask(engine(MODELS[0], FeatureCache(BYTES_PER_MB)), named(frames, frames))
-    expected = "frame_digests: expected digests of frames of one size, got sizes [(56, 84), (84, 56)]"
-    assert str(outcome) == expected
 
 
 def test_what_is_kept_holds_on_to_no_request() -> None:

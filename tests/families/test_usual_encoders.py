@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +13,11 @@ import goldens
 import rfm_export
 from rfm.config import ExportConfig
 from rfm.rewind import pretrained as usual
+from spoilt import Spoil, settings
 
 CHECKPOINT = goldens.config("c1_t1_disc10").checkpoint  # of upstream's widths, without encoders
-
-
-def rewritten(file: Path, change: Callable[[Any], object]) -> None:
-    """A JSON file, changed."""
-    content = json.loads(file.read_text())
-    change(content)
-    file.write_text(json.dumps(content))
+ENCODED = goldens.config("enc_c1_t1_disc10").sources
+PREPROCESSOR = "preprocessor_config.json"
 
 
 def published_image_encoder(folder: Path) -> None:
@@ -31,73 +25,54 @@ def published_image_encoder(folder: Path) -> None:
     from transformers import Dinov2Config
 
     Dinov2Config().save_pretrained(folder)
-    golden = goldens.config("enc_c1_t1_disc10").image_encoder
-    assert golden is not None
-    shutil.copyfile(golden / "preprocessor_config.json", folder / "preprocessor_config.json")
-    change = {"size": {"shortest_edge": 256}, "crop_size": {"height": 224, "width": 224}}
-    rewritten(folder / "preprocessor_config.json", lambda images: images.update(change))
+    shutil.copyfile(Path(ENCODED["image_encoder"], PREPROCESSOR), folder / PREPROCESSOR)
+    settings(PREPROCESSOR, size={"shortest_edge": 256}, crop_size={"height": 224, "width": 224})(folder)
 
 
 def published_text_encoder(folder: Path) -> None:
     from transformers import BertConfig
 
-    BertConfig(hidden_size=384, num_hidden_layers=12, num_attention_heads=12, intermediate_size=1536).save_pretrained(
-        folder
-    )
+    sizes = {"hidden_size": 384, "num_hidden_layers": 12, "num_attention_heads": 12, "intermediate_size": 1536}
+    BertConfig(**sizes).save_pretrained(folder)
 
 
-def change_config(**changes: object) -> Callable[[Path], None]:
-    return lambda folder: rewritten(folder / "config.json", lambda config: config.update(changes))
-
-
-def another_crop(folder: Path) -> None:
-    crop = {"crop_size": {"height": 256, "width": 256}}
-    rewritten(folder / "preprocessor_config.json", lambda images: images.update(crop))
-
-
-OTHER_ENCODERS: dict[str, tuple[Callable[[Path], None], list[str]]] = {
-    "as published": (lambda _folder: None, []),
-    "registers": (change_config(model_type="dinov2_with_registers"), ["model_type: expected dinov2, got dinov2_with_registers"]),
-    "another crop": (another_crop, ["crop_px: expected [224, 224], got [256, 256]"]),
-    "another width": (change_config(hidden_size=384, num_attention_heads=6), []),  # of which the weights tell
+OF_IMAGE, OF_TEXT = (published_image_encoder, usual.image_facts), (published_text_encoder, usual.text_facts)
+OTHER_ENCODERS: dict[str, tuple[Any, Spoil, list[str]]] = {
+    "images as published": (OF_IMAGE, lambda _folder: None, []),
+    "registers": (OF_IMAGE, settings("config.json", model_type="dinov2_with_registers"), ["model_type: expected dinov2, got dinov2_with_registers"]),
+    "another crop": (OF_IMAGE, settings("preprocessor_config.json", crop_size={"height": 256, "width": 256}), ["crop_px: expected [224, 224], got [256, 256]"]),
+    "another brightness": (OF_IMAGE, settings("preprocessor_config.json", image_mean=[0.5, 0.456, 0.406]), ["image_mean: expected [0.485, 0.456, 0.406], got [0.5, 0.456, 0.406]"]),
+    "another width": (OF_IMAGE, settings("config.json", hidden_size=384, num_attention_heads=6), []),  # of which the weights tell
+    "texts as published": (OF_TEXT, lambda _folder: None, []),
+    "fewer layers": (OF_TEXT, settings("config.json", num_hidden_layers=6), ["num_hidden_layers: expected 12, got 6"]),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("spoil", "expected"), OTHER_ENCODERS.values(), ids=OTHER_ENCODERS)
-def test_an_image_encoder_as_wide_as_upstream_s_is_compared(
-    tmp_path: Path, spoil: Callable[[Path], None], expected: list[str]
+@pytest.mark.parametrize(("encoder", "spoil", "expected"), OTHER_ENCODERS.values(), ids=OTHER_ENCODERS)
+def test_an_encoder_as_wide_as_upstream_s_is_compared(
+    tmp_path: Path, encoder: Any, spoil: Spoil, expected: list[str]
 ) -> None:
-    published_image_encoder(tmp_path)
+    publish, facts = encoder
+    publish(tmp_path)
     spoil(tmp_path)
-    assert usual.differences(usual.image_facts(str(tmp_path))) == expected
-
-
-def test_a_text_encoder_as_wide_as_upstream_s_is_compared(tmp_path: Path) -> None:
-    published_text_encoder(tmp_path)
-    assert usual.differences(usual.text_facts(str(tmp_path))) == []
-    change_config(num_hidden_layers=6)(tmp_path)
-    expected = ["num_hidden_layers: expected 12, got 6"]
-    assert usual.differences(usual.text_facts(str(tmp_path))) == expected
+    assert usual.differences(facts(str(tmp_path))) == expected
 
 
 def test_encoders_that_are_not_upstream_s_are_told(tmp_path: Path) -> None:
     from transformers import AutoModel, BertConfig, Dinov2Config
 
     image, text = tmp_path / "image", tmp_path / "text"
-    golden = goldens.config("enc_c1_t1_disc10")
-    assert golden.image_encoder is not None
-    assert golden.text_encoder is not None
-    shutil.copytree(golden.text_encoder, text, copy_function=shutil.copyfile)
+    shutil.copytree(ENCODED["text_encoder"], text, copy_function=shutil.copyfile)
     small = Dinov2Config(num_hidden_layers=1, image_size=28, mlp_ratio=1)
     AutoModel.from_config(small).save_pretrained(image)
-    shutil.copyfile(golden.image_encoder / "preprocessor_config.json", image / "preprocessor_config.json")
+    shutil.copyfile(Path(ENCODED["image_encoder"], PREPROCESSOR), image / PREPROCESSOR)
     config = BertConfig(
         hidden_size=384, num_hidden_layers=6, num_attention_heads=12, intermediate_size=8, vocab_size=180
     )
     AutoModel.from_config(config).save_pretrained(text)
     said: list[str] = []
-    settings = ExportConfig(num_gpus=0, image_encoder=str(image), text_encoder=str(text))
-    decisions = {each.name: each for each in rfm_export.explain(CHECKPOINT, settings, say=said.append)}
+    config = ExportConfig(num_gpus=0, image_encoder=str(image), text_encoder=str(text))
+    decisions = {each.name: each for each in rfm_export.explain(CHECKPOINT, config, say=said.append)}
     *_, of_image, of_text, assumed = said
     assert of_image.startswith(
         f"{image}: differs from upstream's facebook/dinov2-base in num_hidden_layers: expected 12, got 1; "

@@ -67,27 +67,30 @@ class Config:
         return next(files).parent
 
     @property
-    def image_encoder(self) -> Path | None:
-        folder = self.folder / "encoders" / "image_encoder"
-        return folder if folder.is_dir() else None
-
-    @property
-    def text_encoder(self) -> Path | None:
-        folder = self.folder / "encoders" / "text_encoder"
-        return folder if folder.is_dir() else None
-
-    @property
     def summary(self) -> dict[str, Any]:
         return dict(json.loads((self.folder / "config_summary.json").read_text()))
 
     @property
-    def base_model(self) -> Path | None:
-        base = self.summary.get("base")
-        return self.folder / base if base else None
+    def is_vlm(self) -> bool:
+        return "base" in self.summary
 
     @property
-    def is_vlm(self) -> bool:
-        return self.base_model is not None
+    def image_encoder(self) -> Path | None:
+        return self._encoder("image_encoder")
+
+    @property
+    def text_encoder(self) -> Path | None:
+        return self._encoder("text_encoder")
+
+    @property
+    def base_model(self) -> Path | None:
+        return self.folder / self.summary["base"] if self.is_vlm else None
+
+    @property
+    def sources(self) -> dict[str, str]:
+        """What the checkpoint is loaded with: its base model, or its encoders, if it has some."""
+        names = ("base_model", "image_encoder", "text_encoder")
+        return {name: str(source) for name in names if (source := getattr(self, name)) is not None}
 
     @property
     def is_discrete(self) -> bool:
@@ -108,6 +111,10 @@ class Config:
         if not self.is_vlm:
             return REWIND_TOLERANCES
         return LORA_TOLERANCES if self.summary["lora"] else VLM_TOLERANCES
+
+    def _encoder(self, name: str) -> Path | None:
+        folder = self.folder / "encoders" / name
+        return folder if folder.is_dir() else None
 
     def cases(self) -> list[Case]:
         return [Case(self, file) for file in sorted((self.folder / "cases").glob("*.json"))]
@@ -136,6 +143,11 @@ class Case:
     @property
     def content(self) -> dict[str, Any]:
         return dict(json.loads(self.file.read_text()))
+
+    @property
+    def arrays(self) -> dict[str, Array]:
+        """The raw arrays that the original computed."""
+        return dict(np.load(self.file.with_suffix("").with_suffix(".expected.npz")))
 
     @property
     def tolerances(self) -> tuple[float, float]:
@@ -173,7 +185,7 @@ class Case:
 
         bfloat16: of a checkpoint in bfloat16 its scores in that type; else those in float32
         """
-        arrays = dict(np.load(self.file.with_suffix("").with_suffix(".expected.npz")))
+        arrays = self.arrays
         if not bfloat16 and self.has_float32:
             arrays = {key.removeprefix("fp32."): array for key, array in arrays.items() if key.startswith("fp32.")}
         read = _Reader(arrays, self.config)

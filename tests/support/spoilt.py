@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 import json
-import os
 import re
+import shlex
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 from safetensors.torch import load_file, save_file
@@ -56,27 +56,36 @@ def settings(file: str, **changes: Any) -> Spoil:
     return in_json(file, lambda content: content.update(changes))
 
 
+def text(name: str, content: str) -> Spoil:
+    return lambda folder: (folder / name).write_text(content)
+
+
 def text_settings(**changes: Any) -> Spoil:
     """Of the language model in a vision-language one."""
     return in_json("config.json", lambda content: content["text_config"].update(changes))
 
 
-def run_the_command(load: Callable[[Path], object], folder: Path) -> None:
+def conversion(load: Callable[[Path], object], folder: Path) -> str:
     """What the refusal of ``load`` says to type."""
     with pytest.raises(CheckpointError) as refusal:
         load(folder)
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     (command,) = re.findall(r"python -c .*", str(refusal.value))
-    subprocess.run(["bash", "-c", command], check=True, env={**os.environ, "PATH": path})
+    return str(command)
+
+
+def convert(load: Callable[[Path], object], folder: Path) -> None:
+    """Runs, in this process, the code that the refusal of ``load`` says to type."""
+    _, _, code, *arguments = shlex.split(conversion(load, folder))
+    with mock.patch.object(sys, "argv", ["-c", *arguments]):
+        exec(code, {})
 
 
 def without(name: str, heads: Sequence[str], target: Path) -> Path:
     """A copy of a reference checkpoint whose heads are cut off."""
-    source = goldens.config(name).checkpoint
-    shutil.copytree(source, target, copy_function=shutil.copyfile)
+    copied(goldens.config(name), target)
     if not (target / "config.yaml").exists():
-        shutil.copyfile(source.parent / "config.yaml", target / "config.yaml")
-    weights = load_file(target / "model.safetensors")
-    cut = tuple(f"{head}_head." for head in heads)
-    save_file({key: w for key, w in weights.items() if not key.startswith(cut)}, target / "model.safetensors")
+        shutil.copyfile(goldens.config(name).checkpoint.parent / "config.yaml", target / "config.yaml")
+    weights(
+        lambda tensors: [tensors.pop(key) for key in [*tensors] if key.startswith(tuple(f"{h}_head." for h in heads))]
+    )(target)
     return target
