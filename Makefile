@@ -71,7 +71,7 @@ perf: $(INSTALLED)
 	$(BIN)/python benchmarks/perf_analyzer.py --size default
 
 # Cause faults while callers ask, ten minutes.
-# Processes killed, stopped and hung, a crash loop, rollouts, killed exports, malformed requests.
+# Processes killed, stopped and hung, a crash loop, rollouts, malformed requests.
 chaos: $(INSTALLED)
 	$(TOOL) tools/chaos.py
 

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
 """``make chaos``: cause faults while callers ask, compare every answer, and tell what became of each call.
 
-    chaos.py faults     processes killed, stopped and hung, a crash loop, slow connections
+    chaos.py faults     processes killed, stopped and hung, a crash loop
     chaos.py rollout    two versions take turns on one server
-    chaos.py exports    ``rfm export`` is killed at many moments
     chaos.py requests   malformed requests: schemathesis against the gateway, spoilt tensors against Triton
     chaos.py soak       no fault: at half of what can be served, memory and latency stay the same
 
@@ -27,7 +26,6 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-import killed_exports
 import odd_requests
 import rfm_export
 import rollout
@@ -72,12 +70,6 @@ def take_turns(folder: Path, arguments: argparse.Namespace) -> list[Row]:
         row.expect(not tally.unlike, f"answers of neither version, such as {tally.unlike[:1]}")
         rows.append(row)
     return rows
-
-
-def exports(folder: Path, arguments: argparse.Namespace) -> list[Row]:
-    for told in killed_exports.kill_exports(folder, arguments.kills):
-        print(told, flush=True)
-    return [Row(f"{arguments.kills} killed exports", told="the repository could be served after each")]
 
 
 def requests(folder: Path, arguments: argparse.Namespace) -> list[Row]:
@@ -136,7 +128,7 @@ def tried(name: str, rows: list[Row]) -> Iterator[None]:
         rows.append(Row(name, broken=[f"{type(error).__name__}: {error}"]))
 
 
-PARTS = {"faults": all_faults, "rollout": take_turns, "exports": exports, "requests": requests, "soak": soak}
+PARTS = {"faults": all_faults, "rollout": take_turns, "requests": requests, "soak": soak}
 
 
 def main() -> int:
@@ -144,7 +136,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", default="all", choices=["all", *PARTS], metavar="PART")
     parser.add_argument("--minutes", type=float, default=None, help="of a soak (30), of rollouts (1)")
-    parser.add_argument("--kills", type=int, default=10, help="of exports")
     parser.add_argument("--examples", type=int, default=300, help="of malformed requests, of each kind")
     parser.add_argument("--seed", type=int, default=0, help="of malformed requests")
     arguments = parser.parse_args()

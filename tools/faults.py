@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -14,7 +12,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import httpx
-import numpy as np
 import psutil
 
 import rfm_export
@@ -33,7 +30,6 @@ CALLERS = 16
 HANG_S = 10
 SILENT_S = 10.0  # as rfm serve has it by default
 LOOP_S = 120.0  # six starts of Triton and more, with back-off
-SLOW_CONNECTIONS = 100
 MODEL_FAULTS = """
 
 _answer = TritonPythonModel.answer
@@ -248,55 +244,6 @@ def stop_gateway(site: Site, seconds: float = 5.0) -> list[Row]:
     return [Row("SIGSTOP of the gateway", callers, healed_s, f"SIGCONT after {seconds:g} s")]
 
 
-def slow_connections(site: Site, seconds: float = 10.0) -> list[Row]:
-    """Callers of the same door are served beside many connections that send a byte a second."""
-    ends, rows = site.served.endpoints, []
-    gateway_port = int(site.gateway_url.rpartition(":")[2])
-    doors = {
-        "Triton's HTTP": (ends.http_port, f"/v2/models/{MODEL}/infer", site.callers(CALLERS // 2, url=ends.http_url)),
-        "the gateway": (gateway_port, "/evaluate_batch", site.gateway_callers()),
-    }
-    for name, (port, path, asking) in doors.items():
-        with dripping(ends.host, port, path), asking as callers:
-            time.sleep(seconds)
-        told = f"{SLOW_CONNECTIONS} connections; p99 {1e3 * np.percentile(callers.latencies_s, 99):.0f} ms"
-        rows.append(Row(f"slow connections to {name}", callers, told=told))
-    return rows
-
-
-@contextmanager
-def dripping(host: str, port: int, path: str) -> Iterator[None]:
-    """Within it, connections send a byte a second each: half of them of the head, half of the body.
-
-    A connection that the server resets is opened anew: of so many at once, Triton drops some now and then.
-    """
-    head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 99\r\n\r\n"
-    connections: dict[int, socket.socket] = {}
-    stop = threading.Event()
-
-    def drip() -> None:
-        while not stop.wait(1):
-            for number in range(SLOW_CONNECTIONS):
-                with suppress(OSError):
-                    if number not in connections:
-                        connections[number] = socket.create_connection((host, port), 1)
-                        connections[number].sendall(head.encode() if number % 2 else b"POST /")
-                    try:
-                        connections[number].sendall(b"x")
-                    except OSError:
-                        connections.pop(number).close()
-
-    thread = threading.Thread(target=drip)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
-        for connection in connections.values():
-            connection.close()
-
-
 def signalled(what: Callable[[Serving], int], number: signal.Signals) -> Callable[[Site], None]:
     return lambda site: os.kill(what(site.served), number)
 
@@ -319,6 +266,5 @@ FAULTS: tuple[Callable[[Site], list[Row]], ...] = (
     healed("a broken context (simulated)", lambda site: site.trigger("break"), MODEL, may_lose=2 * CALLERS),
     kill_gateway,
     stop_gateway,
-    slow_connections,
     crash_loop,
 )

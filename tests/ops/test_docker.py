@@ -12,7 +12,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import venv
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -245,24 +244,6 @@ def test_the_lock_names_all_that_the_image_needs_beside_torch() -> None:
 def test_the_lock_has_hashes_of_all_and_no_address() -> None:
     assert [entry for entry, options in entries(LOCK).items() if not HASHES.fullmatch(options)] == []
     assert "://" not in LOCK.read_text()
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [(f" --hash=sha256:{'0' * 64}", "DO NOT MATCH THE HASHES"), ("", "Hashes are required in --require-hashes mode")],
-    ids=["another", "none"],
-)
-def test_a_package_without_its_hash_is_not_installed(tmp_path: Path, options: str, message: str) -> None:
-    for name in ("constraints.txt", "docker/install.sh"):
-        copy(ROOT / name, (tmp_path / name).parent)
-    requirement = next(iter(entries(LOCK)))
-    (tmp_path / "docker" / LOCK.name).write_text(f"{requirement}{options}\n")
-    environment = tmp_path / "environment"
-    venv.create(environment)
-    done = install(tmp_path, "packages", environment, tmp_path)
-    assert done.returncode == 1
-    assert message in done.stderr
-    assert list(environment.glob("lib/python*/site-packages/*")) == []
 
 
 @pytest.mark.nightly

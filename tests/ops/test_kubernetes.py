@@ -7,16 +7,13 @@ Kubernetes' own schemas come with kubernetes-validate; those of PodMonitor and o
 
 from __future__ import annotations
 
-import copy
 import functools
 import importlib.metadata
 import json
-import os
 import re
 import shutil
 import subprocess
 import sys
-import textwrap
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -134,19 +131,6 @@ def test_every_manifest_fits_its_schema(folder: str, release: str) -> None:
         validate(manifest, release)
 
 
-@pytest.mark.parametrize("folder", SETS)
-def test_a_misspelt_field_is_found(folder: str) -> None:
-    for manifest in built(folder):
-        if "spec" in manifest:
-            manifest["spec"]["replica"] = 1
-            with pytest.raises(jsonschema.ValidationError, match="'replica' was unexpected"):
-                validate(manifest, RELEASES[-1])
-    for workload in built(folder, "Deployment", "ServingRuntime"):
-        container_of(workload)["livenessProbe"]["periodSecond"] = 1
-        with pytest.raises(jsonschema.ValidationError, match="'periodSecond' was unexpected"):
-            validate(workload, RELEASES[-1])
-
-
 def violations(pod: Object) -> Iterator[str]:
     """What the pod security standard "restricted" forbids, and a root file system that can be written."""
     around = pod.get("securityContext", {})
@@ -174,37 +158,6 @@ def violations(pod: Object) -> Iterator[str]:
 @pytest.mark.parametrize("workload", workloads(*SETS))
 def test_pods_are_restricted(workload: Object) -> None:
     assert list(violations(pod_of(workload))) == []
-
-
-@pytest.mark.parametrize(
-    ("loosen", "found"),
-    [
-        (lambda pod: pod.update(hostNetwork=True), "hostNetwork"),
-        (lambda pod: pod["volumes"].append({"name": "node", "hostPath": {"path": "/"}}), "hostPath"),
-        (lambda pod: pod["securityContext"].pop("runAsNonRoot"), "root"),
-        (lambda pod: pod["securityContext"].pop("seccompProfile"), "seccompProfile"),
-        (lambda pod: pod["containers"][0]["securityContext"].pop("capabilities"), "capabilities"),
-        (lambda pod: pod["containers"][0]["securityContext"].update(privileged=True), "privileged"),
-        (
-            lambda pod: pod["containers"][0]["securityContext"].pop("allowPrivilegeEscalation"),
-            "allowPrivilegeEscalation",
-        ),
-        (lambda pod: pod["containers"][0]["securityContext"].update(runAsUser=0), "root"),
-    ],
-)
-def test_a_loosened_pod_is_not(loosen: Callable[[Object], object], found: str) -> None:
-    pod = copy.deepcopy(pod_of(named("overlays/cpu", "Deployment", "rfm-triton")))
-    loosen(pod)
-    assert list(violations(pod)) == [found]
-
-
-def test_namespaces_say_that_pods_are_restricted() -> None:
-    for folder in SETS:
-        (namespace,) = built(folder, "Namespace")
-        modes = ("warn", "audit") if folder == "kserve" else ("enforce", "warn", "audit")
-        labels = namespace["metadata"]["labels"]
-        assert {labels[f"pod-security.kubernetes.io/{mode}"] for mode in modes} == {"restricted"}
-        assert {one["metadata"].get("namespace") for one in built(folder)} == {None, namespace["metadata"]["name"]}
 
 
 @pytest.mark.parametrize("workload", workloads(*SETS))
@@ -348,19 +301,6 @@ def test_the_gateway_reaches_triton(folder: str) -> None:
     assert wanted == {port["port"] for port in way_out["ports"]} == {port["port"] for port in way_in["ports"]}
 
 
-def test_the_readme_s_patch_lets_pods_ask_another_address_for_names(tmp_path: Path) -> None:
-    (patch,) = re.findall(r"\n    patches:\n(?:      .*\n)+", (KUBERNETES / "README.md").read_text())
-    overlay = KUBERNETES / "overlays" / "cpu"
-    base = os.path.relpath(overlay, tmp_path)
-    (tmp_path / "kustomization.yaml").write_text(f"resources: [{base}]\n{textwrap.dedent(patch)}")
-    command = [BIN / "kubectl", "kustomize", "--load-restrictor=LoadRestrictionsNone", tmp_path]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    policies = (one for one in yaml.safe_load_all(done.stdout) if one["kind"] == "NetworkPolicy")
-    (default,) = (one for one in policies if one["metadata"]["name"] == "default")
-    assert {"ipBlock": {"cidr": "10.96.0.10/32"}} in default["spec"]["egress"][0]["to"]
-    validate(default, RELEASES[-1])
-
-
 @pytest.mark.parametrize("folder", OVERLAYS)
 def test_kube_prometheus_stack_finds_monitors_and_rules(folder: str) -> None:
     """It selects both by the name of its Helm release, and nothing else is labelled so."""
@@ -398,16 +338,6 @@ def test_the_autoscaler_s_metric_is_recorded_and_handed_on(folder: str) -> None:
         one["record"]: one["expr"] for group in groups for part in group for one in part["rules"] if "record" in one
     }
     assert " by " not in recorded[series]  # that would drop the labels namespace and pod
-
-
-def test_kserve_s_objects_know_each_other() -> None:
-    (runtime,), (service,) = built("kserve", "ServingRuntime"), built("kserve", "InferenceService")
-    (claim,) = built("kserve", "PersistentVolumeClaim")
-    model = service["spec"]["predictor"]["model"]
-    assert model["runtime"] == runtime["metadata"]["name"]
-    assert model["modelFormat"]["name"] in [known["name"] for known in runtime["spec"]["supportedModelFormats"]]
-    assert model["protocolVersion"] in runtime["spec"]["protocolVersions"]
-    assert urlsplit(model["storageUri"]).netloc == claim["metadata"]["name"]
 
 
 def test_what_the_readme_applies_is_there() -> None:
