@@ -40,6 +40,8 @@ DOCKER = ROOT / "docker"
 DOCKERFILE = (DOCKER / "Dockerfile").read_text()
 COMPOSE = yaml.safe_load((DOCKER / "compose.yaml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
+OURS = [name for name, service in SERVICES.items() if service["image"].startswith("rfm-triton:")]
+ENTRYPOINT: list[str] = json.loads(re.findall(r"^ENTRYPOINT (\[.*\])$", DOCKERFILE, re.MULTILINE)[0])
 BIN = Path(sys.executable).parent
 LOCK = DOCKER / "requirements.txt"
 COPIED = re.compile(r"^COPY ([^-].*) (/source\S*)$", re.MULTILINE)
@@ -47,7 +49,7 @@ MOUNTED = re.compile(r"--mount=type=bind,source=([^,\s]+),target=(/source[^,\s]+
 HASHES = re.compile(r"( --hash=sha256:[0-9a-f]{64})+")
 STEP = re.compile(r"/source/docker/install\.sh ([a-z]+ /.*)$", re.MULTILINE)
 VARIABLE = re.compile(r"\$\{(\w+):-(.*?)\}")
-OURS = {"rfm-client", "rfm-gateway", "rfm-triton"}
+DISTRIBUTIONS = {"rfm-client", "rfm-gateway", "rfm-triton"}
 NOT_FOR_SERVING = {"pip", "pytest", "ruff", "mypy", "nvidia-pytriton", "matplotlib", "gymnasium", "hypothesis"}
 UNAVAILABLE = 3
 SYSTEM_PATH = "/usr/local/bin:/usr/bin:/bin"
@@ -60,31 +62,32 @@ class Image:
     root: Path
     environment: dict[str, str]
 
-    def run(self, *words: object, **variables: str) -> subprocess.CompletedProcess[str]:
+    def program(self, words: tuple[object, ...]) -> list[str]:
         program = shutil.which(str(words[0]), path=self.environment["PATH"])
         assert program is not None, words[0]
-        return subprocess.run(
-            [program, *map(str, words[1:])],
-            env={**self.environment, **variables},
-            capture_output=True,
-            text=True,
-            timeout=120,
-            check=False,
-        )
+        return [program, *map(str, words[1:])]
+
+    def run(self, *words: object, **variables: str) -> subprocess.CompletedProcess[str]:
+        environment = {**self.environment, **variables}
+        return subprocess.run(self.program(words), env=environment, capture_output=True, text=True, timeout=120)
+
+    def said(self, *words: object, **variables: str) -> str:
+        done = self.run(*words, **variables)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
 
     @contextmanager
     def started(self, *words: object) -> Iterator[subprocess.Popen[bytes]]:
         """A program that runs until it is told to stop, and then ends well."""
-        program = shutil.which(str(words[0]), path=self.environment["PATH"])
-        assert program is not None, words[0]
-        with (self.root / f"{words[0]}.log").open("ab") as log:
-            process = subprocess.Popen([program, *map(str, words[1:])], env=self.environment, stdout=log, stderr=log)
+        log = self.root / f"{words[0]}.log"
+        with log.open("ab") as lines:
+            process = subprocess.Popen(self.program(words), env=self.environment, stdout=lines, stderr=lines)
             try:
                 yield process
             finally:
                 process.terminate()
                 status = process.wait(60)
-        assert status in (0, -signal.SIGTERM), (self.root / f"{words[0]}.log").read_text()[-2000:]
+        assert status in (0, -signal.SIGTERM), log.read_text()[-2000:]
 
 
 @pytest.fixture(scope="module")
@@ -95,24 +98,17 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> Image:
             copy(ROOT / source, root / target.lstrip("/"))
     for source, target in MOUNTED.findall(DOCKERFILE):
         copy(ROOT / source, (root / target.lstrip("/")).parent)
-    steps = STEP.findall(DOCKERFILE)
-    assert [step.split()[0] for step in steps] == ["wheels", "torch", "packages"]
+    steps = [step.split() for step in STEP.findall(DOCKERFILE)]
+    assert [step[0] for step in steps] == ["wheels", "torch", "packages"]
+    of_pip = {name: value for name, value in os.environ.items() if name.startswith(("HOME", "PIP_", "SSL_", "XDG_"))}
     for step in steps:
-        words = [root / word.lstrip("/") if word.startswith("/") else word for word in step.split()]
-        done = install(root / "source", *words)
-        assert done.returncode == 0, done.stderr
+        subprocess.run(
+            ["sh", root / "source/docker/install.sh", step[0], *(root / folder.lstrip("/") for folder in step[1:])],
+            env={**of_pip, "PATH": f"{BIN}:{SYSTEM_PATH}"},
+            check=True,
+        )
     path = f"{root / 'opt/rfm/bin'}:{triton_in(root)}:{SYSTEM_PATH}"
     return Image(root, {"PATH": path, "HOME": str(root), "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1"})
-
-
-def install(source: Path, *words: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        ["sh", source / "docker" / "install.sh", *words],
-        env={**environment_of_pip(), "PATH": f"{BIN}:{SYSTEM_PATH}"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
 
 
 def copy(source: Path, target: Path) -> None:
@@ -124,19 +120,14 @@ def copy(source: Path, target: Path) -> None:
         shutil.copy(source, target)
 
 
-def environment_of_pip() -> dict[str, str]:
-    """What tells pip where its cache and its packages are."""
-    return {name: value for name, value in os.environ.items() if name.startswith(("HOME", "PIP_", "SSL_", "XDG_"))}
-
-
 def triton_in(root: Path) -> Path:
     """A folder with the wheel's tritonserver, which brings along its libraries and backends like NVIDIA's."""
     triton = find_installation()
     folder = root / "opt" / "tritonserver"
     arguments = triton.lay_out_backends(folder / "backends")
-    libraries = triton.environment["LD_LIBRARY_PATH"]
     program = folder / "bin" / "tritonserver"
     program.parent.mkdir()
+    libraries = triton.environment["LD_LIBRARY_PATH"]
     words = ["exec", "env", f"LD_LIBRARY_PATH={libraries}", str(triton.executable), *arguments]
     program.write_text(f'#!/bin/sh\n{shlex.join(words)} "$@"\n')
     program.chmod(0o755)
@@ -161,54 +152,17 @@ def pins(file: Path, python: str | None = None) -> dict[str, SpecifierSet]:
     }
 
 
-def needed(*roots: str, without: str) -> set[str]:
-    """The packages that what is installed here says it needs, their extras too, but what only ``without`` needs."""
-    found: set[tuple[str, str]] = set()
-    waiting = [Requirement(root) for root in roots]
-    while waiting:
-        requirement = waiting.pop()
-        name = canonicalize_name(requirement.name)
-        new = {(name, extra) for extra in {"", *requirement.extras}} - found
-        if name == without or not new:
-            continue
-        found |= new
-        further = [Requirement(text) for text in importlib.metadata.requires(name) or []]
-        waiting += [
-            need
-            for need in further
-            if need.marker is None or any(need.marker.evaluate({"extra": extra}) for _, extra in new)
-        ]
-    return {name for name, _ in found}
-
-
-def compose_words(profile: str) -> list[str]:
-    """A docker compose of either generation."""
-    docker = shutil.which("docker")
-    if docker and subprocess.run([docker, "compose", "version"], capture_output=True, check=False).returncode == 0:
-        program = [docker, "compose"]
-    else:
+def composed(profile: str, **variables: str) -> dict[str, Any]:
+    """What a docker compose of either generation makes of the file."""
+    program = ["docker", "compose"]
+    if not shutil.which("docker") or subprocess.run([*program, "version"], capture_output=True).returncode:
         assert shutil.which("docker-compose"), "docker-compose: expected in PATH, got nothing (make ops-tools)"
         program = ["docker-compose"]
-    return [*program, "--file", str(DOCKER / "compose.yaml"), "--profile", profile]
-
-
-def active(profile: str) -> dict[str, dict[str, Any]]:
-    """The services that run with a profile."""
-    return {name: service for name, service in SERVICES.items() if profile in service.get("profiles", [profile])}
-
-
-def names_of(services: dict[str, dict[str, Any]]) -> list[str]:
-    """Under which the services find each other."""
-    aliases = (alias for service in services.values() for alias in aliases_of(service))
-    return sorted([*services, *aliases])
-
-
-def aliases_of(service: dict[str, Any]) -> list[str]:
-    return list(service.get("networks", {}).get("default", {}).get("aliases", []))
-
-
-def is_ours(service: dict[str, Any]) -> bool:
-    return str(service["image"]).startswith("rfm-triton:")
+    command = [*program, "--file", str(DOCKER / "compose.yaml"), "--profile", profile, "config"]
+    done = subprocess.run(command, env={**os.environ, **variables}, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    config: dict[str, Any] = yaml.safe_load(done.stdout)
+    return config
 
 
 def test_the_example_configuration_lets_more_wait_than_a_batch() -> None:
@@ -218,7 +172,7 @@ def test_the_example_configuration_lets_more_wait_than_a_batch() -> None:
 
 
 def test_the_dockerfile_is_clean() -> None:
-    done = subprocess.run([BIN / "hadolint", DOCKER / "Dockerfile"], capture_output=True, text=True, check=False)
+    done = subprocess.run([BIN / "hadolint", DOCKER / "Dockerfile"], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, "")
 
 
@@ -236,45 +190,47 @@ def test_the_lock_has_the_versions_of_the_constraints(python: str) -> None:
     assert locked == {name: constrained.get(name) for name in locked}, "make lock"
 
 
-def test_the_lock_names_all_that_the_image_needs_beside_torch() -> None:
-    roots = ("rfm-triton[encoders,vlm]",)
-    assert set(pins(LOCK)) == needed(*roots, without="torch") - OURS, "make .venv/installed lock"
-
-
-def test_the_lock_has_hashes_of_all_and_no_address() -> None:
+def test_the_lock_names_what_the_packages_ask_for_with_hashes_and_without_addresses() -> None:
+    """What those need in turn, ``pip check`` finds as the image is built."""
+    asked = [Requirement(text) for name in DISTRIBUTIONS for text in importlib.metadata.requires(name) or []]
+    extras = ("", "encoders", "vlm")
+    needed = {
+        canonicalize_name(need.name)
+        for need in asked
+        if need.marker is None or any(need.marker.evaluate({"extra": extra}) for extra in extras)
+    }
+    assert needed - DISTRIBUTIONS - {"torch"} <= set(pins(LOCK)), "make .venv/installed lock"
     assert [entry for entry, options in entries(LOCK).items() if not HASHES.fullmatch(options)] == []
     assert "://" not in LOCK.read_text()
 
 
 @pytest.mark.nightly
 def test_the_image_holds_what_serving_needs_in_locked_versions_and_nothing_else(image: Image) -> None:
-    listed = image.run(
-        "python",
-        "-c",
-        "import importlib.metadata as m, json; print(json.dumps({d.name: d.version for d in m.distributions()}))",
-    )
-    installed = {canonicalize_name(name): version for name, version in json.loads(listed.stdout).items()}
+    code = "import importlib.metadata as m, json; print(json.dumps({d.name: d.version for d in m.distributions()}))"
+    installed = {
+        canonicalize_name(name): version for name, version in json.loads(image.said("python", "-c", code)).items()
+    }
     versions = pins(ROOT / "constraints.txt")
-    assert set(installed) >= OURS
+    assert set(installed) >= DISTRIBUTIONS
     assert not NOT_FOR_SERVING & set(installed)
     for name, version in installed.items():
-        assert name in OURS or versions[name].contains(version), (name, version)
+        assert name in DISTRIBUTIONS or versions[name].contains(version), (name, version)
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize(
     "words",
     [
-        ["python", "-c", "import rfm_export, rfm.vlm, rfm.rewind"],
-        ["python", "-c", "import rfm_gateway.app"],
-        ["rfm", "--help"],
+        ["python", "-c", "import rfm_export, rfm.vlm, rfm.rewind, rfm_gateway.app"],
         ["rfm-client", "--help"],
+        *([*SERVICES[name].get("entrypoint", ENTRYPOINT), *SERVICES[name]["command"], "--help"] for name in OURS),
     ],
     ids=" ".join,
 )
-def test_the_image_has_the_packages_and_commands(image: Image, words: list[str]) -> None:
-    done = image.run(*words)
-    assert done.returncode == 0, done.stderr
+def test_the_image_has_the_packages_and_the_commands_and_options_of_the_compose_file(
+    image: Image, words: list[str]
+) -> None:
+    image.said(*words)
 
 
 @pytest.mark.nightly
@@ -289,27 +245,17 @@ def test_the_image_serves_and_its_health_check_tells(
         repository = tmp_path / "model_repository"
         rfm_export.export(config.checkpoint, repository, serve_config(config))
     endpoints = Endpoints.free()
-    with image.started(*entrypoint(), *ports_of(endpoints), "--repository", repository):
-        ready = image.run("rfm-client", "wait", "--url", endpoints.grpc_url, "--timeout", "100")
-        assert ready.returncode == 0, ready.stderr
-        health = image.run("sh", DOCKER / "health.sh", RFM_URL=endpoints.grpc_url)
-        assert health.returncode == 0, health.stderr
-        (sample,) = json.loads(health.stdout)["samples"]
+    ports = {"http": endpoints.http_port, "grpc": endpoints.grpc_port, "metrics": endpoints.metrics_port}
+    options = [f"--{name}-port={port}" for name, port in ports.items()]
+    with image.started(*ENTRYPOINT, *options, "--repository", repository):
+        image.said("rfm-client", "wait", "--url", endpoints.grpc_url, "--timeout", "100")
+        health = image.said("sh", DOCKER / "health.sh", RFM_URL=endpoints.grpc_url)
+        (sample,) = json.loads(health)["samples"]
         assert np.isfinite(sample["progress"]).all()
         if config is None:
             check_gateway(image, endpoints)
     gone = image.run("sh", DOCKER / "health.sh", RFM_URL=endpoints.grpc_url)
     assert gone.returncode == UNAVAILABLE, gone.stderr
-
-
-def entrypoint() -> list[str]:
-    (words,) = re.findall(r"^ENTRYPOINT (\[.*\])$", DOCKERFILE, re.MULTILINE)
-    return list(json.loads(words))
-
-
-def ports_of(endpoints: Endpoints) -> list[object]:
-    ports = {"http": endpoints.http_port, "grpc": endpoints.grpc_port, "metrics": endpoints.metrics_port}
-    return [word for name, port in ports.items() for word in (f"--{name}-port", port)]
 
 
 def check_gateway(image: Image, endpoints: Endpoints) -> None:
@@ -327,21 +273,18 @@ def check_gateway(image: Image, endpoints: Endpoints) -> None:
 
 
 @pytest.mark.parametrize("profile", ["gpu", "cpu"])
-def test_the_compose_file_is_valid(profile: str) -> None:
-    done = subprocess.run([*compose_words(profile), "config", "--quiet"], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-
-
-@pytest.mark.parametrize("profile", ["gpu", "cpu"])
 def test_every_service_that_is_asked_for_runs(profile: str) -> None:
-    services = active(profile)
-    assert {"server", "gateway", "prometheus", "grafana"} <= set(names_of(services))
-    assert sum(name in ("server", "gateway") for name in names_of(services)) == 2
+    asked_for = composed(profile)["services"].items()  # docker-compose 1 has those of other profiles too
+    services = {name: service for name, service in asked_for if profile in service.get("profiles", [profile])}
+    names = [*services]
     for service in services.values():
         assert set(service.get("depends_on", {})) <= set(services)
+        names += ((service.get("networks") or {}).get("default") or {}).get("aliases", [])
+    assert {"server", "gateway", "prometheus", "grafana"} <= set(names)
+    assert sum(name in ("server", "gateway") for name in names) == 2
     scraped = yaml.safe_load((DOCKER / "prometheus" / "prometheus.yml").read_text())["scrape_configs"]
     for target in (target for job in scraped for static in job["static_configs"] for target in static["targets"]):
-        assert target.partition(":")[0] in names_of(services)
+        assert target.partition(":")[0] in names
 
 
 @pytest.mark.parametrize("name", SERVICES)
@@ -354,16 +297,11 @@ def test_every_service_is_confined(name: str) -> None:
     assert service["deploy"]["resources"]["limits"]["memory"]
     assert all(port.startswith("${RFM_BIND:-127.0.0.1}:") for port in service["ports"])
     assert re.fullmatch(r"[\w/-]+:v?\d+\.\d+\.\d+(-cpu)?", VARIABLE.sub(r"\2", service["image"]))
-    assert "healthcheck" in service or is_ours(service)  # the image has its own
+    assert "healthcheck" in service or name in OURS  # the image has its own
     assert "HEALTHCHECK" in DOCKERFILE
-
-
-def test_what_is_mounted_is_there() -> None:
-    for service in SERVICES.values():
-        for volume in service.get("volumes", []):
-            source = VARIABLE.sub(r"\2", volume).partition(":")[0]
-            assert source in COMPOSE["volumes"] or (DOCKER / source).exists(), source
-        assert set(service.get("secrets", [])) <= set(COMPOSE["secrets"])
+    for volume in service.get("volumes", []):
+        source = VARIABLE.sub(r"\2", volume).partition(":")[0]
+        assert source in COMPOSE["volumes"] or (DOCKER / source).exists(), source
 
 
 def test_prometheus_has_the_secrets_that_its_configuration_names() -> None:
@@ -375,31 +313,15 @@ def test_prometheus_has_the_secrets_that_its_configuration_names() -> None:
     with_key = yaml.safe_load(re.sub(r"# (authorization:)", r"\1", text))["scrape_configs"]
     (gateway,) = (job for job in with_key if job["job_name"] == "gateway")
     assert gateway["authorization"] == {"credentials_file": "/run/secrets/gateway_api_key"}
+    for variables, source in (({}, "/dev/null"), ({"RFM_GATEWAY_KEY_FILE": "./key"}, "docker/key")):
+        assert composed("cpu", **variables)["secrets"]["gateway_api_key"]["file"].endswith(source)
 
 
-@pytest.mark.parametrize(("options", "source"), [({}, "/dev/null"), ({"RFM_GATEWAY_KEY_FILE": "./key"}, "docker/key")])
-def test_the_gateway_s_key_is_mounted_where_there_is_one(options: dict[str, str], source: str) -> None:
-    command = [*compose_words("cpu"), "config"]
-    done = subprocess.run(command, env={**os.environ, **options}, check=True, capture_output=True, text=True)
-    assert yaml.safe_load(done.stdout)["secrets"]["gateway_api_key"]["file"].endswith(source)
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", [name for name, service in SERVICES.items() if is_ours(service)])
-def test_the_image_knows_the_options_that_the_compose_file_gives_it(image: Image, name: str) -> None:
-    words = [*SERVICES[name].get("entrypoint", entrypoint()), *SERVICES[name]["command"]]
-    done = image.run(*words, "--help")
-    assert done.returncode == 0, done.stderr
-
-
-def test_every_variable_is_explained_with_its_default() -> None:
+def test_every_variable_is_explained_with_its_default_and_no_secret_has_one() -> None:
     used = dict(VARIABLE.findall((DOCKER / "compose.yaml").read_text()))
     example = (DOCKER / ".env.example").read_text()
     told = dict(re.findall(r"^#([A-Z_]+)=(.*)$", example, re.MULTILINE))
     assert told == {**used, "RFM_GATEWAY_API_KEY": ""}
-
-
-def test_no_secret_has_a_default() -> None:
     environment = SERVICES["grafana"]["environment"]
     assert not [name for name in environment if "PASSWORD" in name and not name.endswith("__FILE")]
     assert environment["GF_AUTH_ANONYMOUS_ENABLED"] == "false"

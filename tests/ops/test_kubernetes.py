@@ -14,10 +14,7 @@ import re
 import shutil
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from http import HTTPStatus
+from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -38,6 +35,7 @@ from rfm.launch.ending import KILL_AFTER_S
 from rfm.launch.process import Endpoints
 from rfm_commands.cli import app
 from rfm_gateway.command import STOP_WITHIN_S
+from rfm_serve import wait_for
 
 pytestmark = pytest.mark.slow
 
@@ -57,8 +55,15 @@ PORT_OPTIONS = {
     "status": "status_port",
     "gateway": "port",
 }
-PATIENCE_S = 120.0
-POLL_S = 0.02
+PROBES = ("startupProbe", "readinessProbe", "livenessProbe")
+SECURITY = {
+    "allowPrivilegeEscalation": False,
+    "capabilities": {"drop": ["ALL"]},
+    "readOnlyRootFilesystem": True,
+    "runAsNonRoot": True,
+    "runAsUser": 10001,
+    "seccompProfile": {"type": "RuntimeDefault"},
+}
 
 Object = dict[str, Any]
 
@@ -98,10 +103,10 @@ def workloads(*folders: str) -> list[Any]:
     ]
 
 
-def parameters(command: Any, words: list[str]) -> dict[str, Any]:
-    """What the real command line reads ``words`` as; it runs nothing."""
+def parameters(words: list[str]) -> dict[str, Any]:
+    """What ``rfm`` reads its words as; it runs nothing."""
     name, *arguments = words
-    return command.commands[name].make_context(name, arguments).params
+    return get_command(app).commands[name].make_context(name, arguments).params  # type: ignore[attr-defined]
 
 
 def selected(selector: dict[str, str], folder: str) -> list[Object]:
@@ -131,33 +136,16 @@ def test_every_manifest_fits_its_schema(folder: str, release: str) -> None:
         validate(manifest, release)
 
 
-def violations(pod: Object) -> Iterator[str]:
-    """What the pod security standard "restricted" forbids, and a root file system that can be written."""
-    around = pod.get("securityContext", {})
-    yield from (key for key in ("hostNetwork", "hostPID", "hostIPC") if pod.get(key))
-    yield from (f"sysctls {one}" for one in around.get("sysctls", []))
-    yield from (kind for volume in pod.get("volumes", []) for kind in set(volume) - {"name"} - VOLUMES)
-    for container in [*pod["containers"], *pod.get("initContainers", [])]:
-        inside = container.get("securityContext", {})
-        context = {**around, **inside}
-        yield from (key for key in ("privileged", "procMount", "seLinuxOptions", "appArmorProfile") if context.get(key))
-        yield from ("hostPort" for port in container.get("ports", []) if port.get("hostPort"))
-        capabilities = inside.get("capabilities", {})
-        if capabilities.get("drop") != ["ALL"] or set(capabilities.get("add", [])) - {"NET_BIND_SERVICE"}:
-            yield "capabilities"
-        if inside.get("allowPrivilegeEscalation") is not False:
-            yield "allowPrivilegeEscalation"
-        if context.get("runAsNonRoot") is not True or context.get("runAsUser") == 0:
-            yield "root"
-        if context.get("seccompProfile", {}).get("type") not in ("RuntimeDefault", "Localhost"):
-            yield "seccompProfile"
-        if inside.get("readOnlyRootFilesystem") is not True:
-            yield "readOnlyRootFilesystem"
-
-
 @pytest.mark.parametrize("workload", workloads(*SETS))
 def test_pods_are_restricted(workload: Object) -> None:
-    assert list(violations(pod_of(workload))) == []
+    """As the pod security standard "restricted" has it, and with a root file system that cannot be written."""
+    pod, container = pod_of(workload), container_of(workload)
+    context = {**pod.get("securityContext", {}), **container["securityContext"]}
+    assert {name: context.pop(name) for name in SECURITY} == SECURITY
+    assert set(context) <= {"runAsGroup", "fsGroup", "fsGroupChangePolicy"}
+    assert not {"hostNetwork", "hostPID", "hostIPC", "initContainers", "ephemeralContainers"} & set(pod)
+    assert {kind for volume in pod["volumes"] for kind in volume} <= {"name", *VOLUMES}
+    assert not [port for port in container["ports"] if "hostPort" in port]
 
 
 @pytest.mark.parametrize("workload", workloads(*SETS))
@@ -169,7 +157,7 @@ def test_containers_have_limits_probes_and_the_release_s_image(workload: Object)
     assert container["image"] in [release + variant for variant in variants]
     resources = container["resources"]
     assert resources["requests"]["memory"] and resources["limits"]["memory"] and resources["requests"]["cpu"]
-    for kind in ("startupProbe", "readinessProbe", "livenessProbe"):
+    for kind in PROBES:
         assert container[kind]["periodSeconds"] and container[kind]["timeoutSeconds"]
     mounts = {mount["name"] for mount in container["volumeMounts"]}
     assert mounts == {volume["name"] for volume in pod_of(workload)["volumes"]}
@@ -188,12 +176,12 @@ def test_a_gpu_is_asked_for_where_there_is_one() -> None:
 def test_arguments_are_those_of_the_program(workload: Object) -> None:
     container = container_of(workload)
     assert container["command"] == ["rfm"]
-    given = parameters(get_command(app), container["args"])
+    given = parameters(container["args"])
     assert given["host"] == "0.0.0.0"
     ports = {port["name"]: port["containerPort"] for port in container["ports"]}
     assert ports == {name: given[PORT_OPTIONS[name]] for name in ports}
     is_gateway = container["args"][0] == "gateway"
-    for kind in ("startupProbe", "readinessProbe", "livenessProbe"):
+    for kind in PROBES:
         if "httpGet" in container[kind]:
             port = container[kind]["httpGet"]["port"]
             assert ports.get(port, port) == given["port" if is_gateway else "status_port"]
@@ -209,7 +197,7 @@ def test_keys_are_files_that_others_cannot_read(workload: Object) -> None:
     container, pod = container_of(workload), pod_of(workload)
     (secret,) = (volume for volume in pod["volumes"] if "secret" in volume)
     (mount,) = (mount for mount in container["volumeMounts"] if mount["name"] == secret["name"])
-    given = parameters(get_command(app), container["args"])
+    given = parameters(container["args"])
     file = given["api_key_file"] if container["args"][0] == "gateway" else given["admin_key_file"]
     assert file.parent == Path(mount["mountPath"])
     assert secret["secret"]["defaultMode"] == 0o400
@@ -219,7 +207,7 @@ def test_keys_are_files_that_others_cannot_read(workload: Object) -> None:
 
 def test_kserve_s_key_is_a_variable() -> None:
     container = container_of(named("kserve", "ServingRuntime", "rfm-triton"))
-    assert parameters(get_command(app), container["args"])["admin_key_file"] is None
+    assert parameters(container["args"])["admin_key_file"] is None
     (key,) = (one["valueFrom"]["secretKeyRef"] for one in container["env"] if one["name"] == admin_key.VARIABLE)
     assert_readme_creates(key["name"], key["key"])
 
@@ -284,7 +272,7 @@ def test_policies_open_the_ports_that_there_are(folder: str) -> None:
 
 @pytest.mark.parametrize("folder", OVERLAYS)
 def test_the_gateway_reaches_triton(folder: str) -> None:
-    gateway = parameters(get_command(app), container_of(named(folder, "Deployment", "rfm-gateway"))["args"])
+    gateway = parameters(container_of(named(folder, "Deployment", "rfm-gateway"))["args"])
     triton, metrics = urlsplit(gateway["triton"]), urlsplit(gateway["metrics_url"])
     pods = named(folder, "Service", triton.hostname)["spec"]
     assert triton.scheme == "grpc"
@@ -345,59 +333,17 @@ def test_what_the_readme_applies_is_there() -> None:
     assert set(applied) == set(SETS)
 
 
-def with_values(arguments: list[str], values: dict[str, Any]) -> list[str]:
-    """The same options, with other values."""
-    options = (word.partition("=") for word in arguments)
-    return [f"{name}={values[name]}" if has_value else name for name, has_value, _ in options]
-
-
-def eventually(is_so: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not is_so():
-        assert time.monotonic() < deadline_s
-        time.sleep(POLL_S)
-
-
-@dataclass(frozen=True)
-class Probed:
-    """What a pod's container runs, on ports of this machine."""
-
-    container: Object
-    process: subprocess.Popen[bytes]
-    status_port: int
-    log: Path
-
-    def passes(self, kind: str) -> bool:
-        """As the kubelet asks."""
-        assert self.process.poll() is None, self.log.read_text()
-        get = self.container[kind]["httpGet"]
-        assert get["port"] == "status"
-        try:
-            return httpx.get(f"http://127.0.0.1:{self.status_port}{get['path']}").status_code == HTTPStatus.OK
-        except httpx.TransportError:
-            return False
-
-    def run_kserve_s_liveness_probe(self) -> None:
-        """Raises CalledProcessError if it does not pass. Knative sends an httpGet to no port but that of requests."""
-        container = container_of(named("kserve", "ServingRuntime", "rfm-triton"))
-        program, *words, script = container["livenessProbe"]["exec"]["command"]
-        assert program == "python"
-        port = parameters(get_command(app), container["args"])["status_port"]
-        subprocess.run([sys.executable, *words, script.replace(f":{port}/", f":{self.status_port}/")], check=True)
-
-
-@pytest.fixture
-def probed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Probed]:
-    """The demo's ``rfm`` alone."""
+def test_the_probes_tell_a_living_model_from_a_dead_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a pod's container runs, on ports of this machine: the demo's ``rfm`` alone."""
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    shutil.copytree(ROOT / "model_repository" / "rfm", tmp_path / "model_repository" / "rfm")
-    key, log = tmp_path / "admin-key", tmp_path / "log"
+    repository, key, log = tmp_path / "model_repository", tmp_path / "admin-key", tmp_path / "log"
+    shutil.copytree(ROOT / "model_repository" / "rfm", repository / "rfm")
     key.write_text("0123456789abcdef" * 4)
     key.chmod(0o400)
     container = container_of(named("overlays/cpu", "Deployment", "rfm-triton"))
     endpoints, status_port = Endpoints.free(), Endpoints.free().http_port
     values = {
-        "--repository": tmp_path / "model_repository",
+        "--repository": repository,
         "--host": endpoints.host,
         "--http-port": endpoints.http_port,
         "--grpc-port": endpoints.grpc_port,
@@ -405,21 +351,39 @@ def probed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Probed]:
         "--status-port": status_port,
         "--admin-key-file": key,
     }
-    command = [BIN / container["command"][0], *with_values(container["args"], values)]
-    with log.open("wb") as lines, subprocess.Popen(command, stdout=lines, stderr=lines) as process:
+    options = (word.partition("=") for word in container["args"])
+    words = [f"{name}={values[name]}" if has_value else name for name, has_value, _ in options]
+    with (
+        log.open("wb") as lines,
+        subprocess.Popen([BIN / container["command"][0], *words], stdout=lines, stderr=lines) as process,
+    ):
+
+        def passes(kind: str) -> bool:
+            assert process.poll() is None, log.read_text()
+            get = container[kind]["httpGet"]
+            assert get["port"] == "status"
+            with suppress(httpx.TransportError):
+                return httpx.get(f"http://127.0.0.1:{status_port}{get['path']}").status_code == 200
+            return False
+
         try:
-            yield Probed(container, process, status_port, log)
+            wait_for(lambda: passes("livenessProbe"))
+            assert not passes("startupProbe")  # it loads
+            wait_for(lambda: passes("startupProbe") and passes("readinessProbe"))
+            kill_model(repository)
+            wait_for(lambda: not passes("readinessProbe"))
+            assert passes("livenessProbe")
+            run_kserve_s_liveness_probe(status_port)
+            wait_for(lambda: passes("readinessProbe"))  # rfm serve has healed it
         finally:
             process.terminate()
     assert process.returncode == 0, log.read_text()
 
 
-def test_the_probes_tell_a_living_model_from_a_dead_one(probed: Probed, tmp_path: Path) -> None:
-    eventually(lambda: probed.passes("livenessProbe"))
-    assert not probed.passes("startupProbe")  # it loads
-    eventually(lambda: probed.passes("startupProbe") and probed.passes("readinessProbe"))
-    kill_model(tmp_path / "model_repository")
-    eventually(lambda: not probed.passes("readinessProbe"))
-    assert probed.passes("livenessProbe")
-    probed.run_kserve_s_liveness_probe()
-    eventually(lambda: probed.passes("readinessProbe"))  # rfm serve has healed it
+def run_kserve_s_liveness_probe(status_port: int) -> None:
+    """Raises CalledProcessError if it does not pass. Knative sends an httpGet to no port but that of requests."""
+    container = container_of(named("kserve", "ServingRuntime", "rfm-triton"))
+    program, *words, script = container["livenessProbe"]["exec"]["command"]
+    assert program == "python"
+    port = parameters(container["args"])["status_port"]
+    subprocess.run([sys.executable, *words, script.replace(f":{port}/", f":{status_port}/")], check=True)

@@ -11,10 +11,9 @@ import shutil
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -29,6 +28,7 @@ from paths import ROOT
 from repositories import kill_model
 from rfm.launch.process import Endpoints
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, RewardClient, RewardError, Trajectory
+from rfm_serve import MODEL, serving, wait_for
 from trajectories import random_trajectory
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]
@@ -37,15 +37,12 @@ PROMETHEUS = ROOT / "docker" / "prometheus"
 GRAFANA = ROOT / "docker" / "grafana"
 RUNBOOKS = ROOT / "docs" / "operations.md"
 
-WITHIN_S = 60
-POLL_S = 0.2
 INTERVALS = {"15s": "1s", "1m": "10s"}  # of the files, and what they are here
 EMBEDDING_DIMS = (64, 32)  # D and Dt of the demo's checkpoint
 TOO_MANY_FRAMES = 100  # for it
 GATEWAY_CALLERS = 4
 METRIC = re.compile(r"\b(?:up|ALERTS|(?:nv|rfm)[_:][a-z0-9_:]+)\b")
 NEEDS_GPU = "nv_gpu_"
-MODEL = "rfm"  # whose process dies
 PROGRAMS = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
 
 Json: TypeAlias = dict[str, Any]
@@ -100,33 +97,32 @@ class Monitored:
 
 def eventually(ask: Callable[[], Any]) -> Any:
     """The first answer that is true."""
-    deadline_s = time.monotonic() + WITHIN_S
-    while time.monotonic() < deadline_s:
-        if answer := ask():
-            return answer
-        time.sleep(POLL_S)
-    return ask()
+    told: list[Any] = []
+    wait_for(lambda: told.append(ask()) or told[-1])
+    return told[-1]
+
+
+def answers(url: str) -> bool:
+    with suppress(httpx.TransportError):  # it does not listen yet
+        return httpx.get(url).is_success
+    return False
 
 
 @contextmanager
-def running(command: list[str], log: Path, *ready_urls: str) -> Iterator[None]:
-    """A process that answers at ``ready_urls``, and is ended."""
-    with log.open("wb") as lines:
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=lines, stderr=lines)
-
-    def is_ready() -> bool:
-        assert process.poll() is None, log.read_text()
+def prometheus(folder: Path, port: int, targets: dict[str, str]) -> Iterator[Monitored]:
+    command = [
+        program("prometheus"),
+        f"--config.file={write_configuration(folder, targets)}",
+        f"--storage.tsdb.path={folder / 'data'}",
+        f"--web.listen-address=127.0.0.1:{port}",
+    ]
+    url = f"http://127.0.0.1:{port}"
+    with (folder / "prometheus.log").open("wb") as log, subprocess.Popen(command, stdout=log, stderr=log) as process:
         try:
-            return all(httpx.get(url).is_success for url in ready_urls)
-        except httpx.TransportError:  # it does not listen yet
-            return False
-
-    try:
-        assert eventually(is_ready), log.read_text()
-        yield
-    finally:
-        process.terminate()
-        process.wait(WITHIN_S)
+            wait_for(lambda: answers(f"{url}/-/ready"))
+            yield Monitored(url)
+        finally:
+            process.terminate()
 
 
 def write_configuration(folder: Path, targets: dict[str, str]) -> Path:
@@ -172,7 +168,7 @@ def load_gateway(url: str, is_over: threading.Event) -> None:
     assert video is not None and text is not None
     trajectory = {"video_embeddings": video.tolist(), "text_embedding": text.tolist()}
     good = {"samples": [{"sample_type": "progress", "trajectory": trajectory}] * 20}
-    with httpx.Client(base_url=url, timeout=WITHIN_S) as client, ThreadPoolExecutor(GATEWAY_CALLERS) as callers:
+    with httpx.Client(base_url=url, timeout=60) as client, ThreadPoolExecutor(GATEWAY_CALLERS) as callers:
         while not is_over.wait(0.1):
             for body in (good, {"samples": "none"}):
                 list(callers.map(lambda body: client.post("/evaluate_batch", json=body), [body] * GATEWAY_CALLERS))
@@ -199,33 +195,16 @@ def monitored(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Monitored]:
     """Once all is scraped, a model's process dies: what was never started again is in no metric."""
     folder = tmp_path_factory.mktemp("monitored")
     repository = shutil.copytree(ROOT / "model_repository", folder / "model_repository")
-    triton, others = Endpoints.free(), Endpoints.free()
-    host, gateway_port, status_port, port = others.host, others.http_port, others.grpc_port, others.metrics_port
-    ports = {"http": triton.http_port, "grpc": triton.grpc_port, "metrics": triton.metrics_port}
-    ports |= {"gateway": gateway_port, "status": status_port}
-    options = [f"--{name}-port={number}" for name, number in ports.items()]
-    serve = [program("rfm"), "serve", f"--repository={repository}", *options]
-    targets = {
-        "triton": f"{host}:{triton.metrics_port}",
-        "gateway": f"{host}:{gateway_port}",
-        "rfm-serve": f"{host}:{status_port}",
-    }
-    prometheus = [
-        program("prometheus"),
-        f"--config.file={write_configuration(folder, targets)}",
-        f"--storage.tsdb.path={folder / 'data'}",
-        f"--web.listen-address={host}:{port}",
-    ]
-    served_urls = [f"http://{host}:{status_port}/ready", f"http://{host}:{gateway_port}/metrics"]
-    monitored = Monitored(f"http://{host}:{port}")
-    with (
-        running(serve, folder / "rfm.log", *served_urls),
-        running(prometheus, folder / "prometheus.log", f"{monitored.url}/-/ready"),
-        loaded(triton, f"http://{host}:{gateway_port}"),
-    ):
-        assert eventually(lambda: monitored.query(f'rfm_serve_ready{{model="{MODEL}"}} == 1'))
-        kill_model(repository)
-        yield monitored
+    free = Endpoints.free()
+    gateway = f"http://127.0.0.1:{free.http_port}"
+    with serving(repository, f"--gateway-port={free.http_port}") as served:
+        wait_for(lambda: served.is_ready() and answers(f"{gateway}/metrics"))
+        urls = {"triton": served.endpoints.metrics_url, "gateway": gateway, "rfm-serve": served.status_url}
+        targets = {job: httpx.URL(url).netloc.decode() for job, url in urls.items()}
+        with prometheus(folder, free.grpc_port, targets) as monitored, loaded(served.endpoints, gateway):
+            wait_for(lambda: monitored.query(f'rfm_serve_ready{{model="{MODEL}"}} == 1'))
+            kill_model(repository)
+            yield monitored
 
 
 def test_prometheus_takes_the_configuration_and_the_rules() -> None:
@@ -260,14 +239,12 @@ def test_triton_the_gateway_and_rfm_serve_are_scraped(monitored: Monitored) -> N
         told = {entry["metric"]["job"]: entry["value"][1] for entry in monitored.query("up")}
         return told == {"triton": "1", "gateway": "1", "rfm-serve": "1"}
 
-    assert eventually(up), monitored.get("targets")
+    wait_for(up)
 
 
 @pytest.mark.parametrize("name", RECORDED)
 def test_every_recording_rule_gives_data(monitored: Monitored, name: str) -> None:
-    entries = eventually(lambda: monitored.query(name))
-    assert entries
-    for entry in entries:
+    for entry in eventually(lambda: monitored.query(name)):
         assert {"job", "instance"} <= entry["metric"].keys() <= {"__name__", "job", "instance", "model", "version"}
         assert float(entry["value"][1]) >= 0
 
@@ -293,7 +270,7 @@ def test_every_query_of_the_dashboard_gives_data(monitored: Monitored, expressio
     if NEEDS_GPU in expression and not torch.cuda.is_available():
         assert monitored.query(expression) == []
     else:
-        assert eventually(lambda: monitored.query(expression))
+        wait_for(lambda: monitored.query(expression))
 
 
 @pytest.mark.parametrize("variable", DASHBOARD["templating"]["list"], ids=lambda variable: variable["name"])
@@ -301,7 +278,7 @@ def test_every_variable_of_the_dashboard_has_values(monitored: Monitored, variab
     series, label = re.fullmatch(r"label_values\((.*), (\w+)\)", variable["query"]["query"]).groups()  # type: ignore[union-attr]
     expected = {"model": {"rfm", "rfm_encoder", "rfm_frames"}, "version": {"1"}}[label]
     series = series.replace("$model", ".*")
-    assert eventually(lambda: set(monitored.get(f"label/{label}/values", **{"match[]": series})) == expected)
+    wait_for(lambda: set(monitored.get(f"label/{label}/values", **{"match[]": series})) == expected)
 
 
 @pytest.mark.parametrize("rule", ALERTS, ids=[rule["alert"] for rule in ALERTS])
@@ -311,14 +288,14 @@ def test_every_metric_of_an_alert_is_there(monitored: Monitored, rule: Json) -> 
     assert wanted
     if not torch.cuda.is_available():
         wanted = {name for name in wanted if NEEDS_GPU not in name}
-    assert eventually(lambda: wanted <= set(monitored.get("label/__name__/values")))
+    wait_for(lambda: wanted <= set(monitored.get("label/__name__/values")))
 
 
 def test_a_dead_model_process_is_noticed_and_healed(monitored: Monitored) -> None:
     """The fixture has killed it."""
     name = f'{{alertname="RfmModelNotReady", alertstate="pending", model="{MODEL}"}}'
-    assert eventually(lambda: monitored.query(f"last_over_time(ALERTS{name}[10m])"))
-    assert eventually(lambda: monitored.query(f'rfm_serve_restarts_total{{what="{MODEL}"}} == 1'))
-    assert eventually(lambda: monitored.query(f'rfm_serve_ready{{model="{MODEL}"}} == 1'))
-    assert eventually(lambda: not monitored.query(f"ALERTS{name}"))
+    wait_for(lambda: monitored.query(f"last_over_time(ALERTS{name}[10m])"))
+    wait_for(lambda: monitored.query(f'rfm_serve_restarts_total{{what="{MODEL}"}} == 1'))
+    wait_for(lambda: monitored.query(f'rfm_serve_ready{{model="{MODEL}"}} == 1'))
+    wait_for(lambda: not monitored.query(f"ALERTS{name}"))
     assert not monitored.query('{alertname="RfmModelNotReady", alertstate="firing"}')
