@@ -19,7 +19,7 @@ class Linear(nn.Linear):
     """An ``nn.Linear`` whose large float32 products on the CPU are computed by oneDNN.
 
     torch itself asks oneDNN only for bfloat16: MKL leaves processors that are not Intel's far below what they can do
-    (docs/performance.md). The operation is the one that torch.compile puts in. It is made for each shape, which takes a
+    (docs/explanation/performance.md). The operation is the one that torch.compile puts in. It is made for each shape, which takes a
     while the first time: ReWiND's tokens come in few shapes (``rfm.rewind.network.rounded_up``).
     """
 

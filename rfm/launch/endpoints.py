@@ -17,7 +17,7 @@ from rfm_client.contract.addresses import check_authorities, check_certificate, 
 from rfm_client.contract.listening import check_free, in_url
 
 PORTS = range(20_000, 32_000)  # Linux gives the higher ones to connections that go out, while a server still loads
-# NVIDIA's container 26.07. Earlier ones can be crashed, or taken over, by whoever reaches them: docs/security.md
+# NVIDIA's container 26.07. Earlier ones can be crashed, or taken over, by whoever reaches them: docs/guides/secure.md
 SECURITY_FLOOR = (2, 71)
 
 _given: deque[int] = deque(maxlen=256)  # ports of late: their servers may not listen yet

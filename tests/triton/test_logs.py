@@ -110,7 +110,7 @@ class Taker(BaseHTTPRequestHandler):
 
 
 def documented_options(traces_url: str) -> list[str]:
-    """What docs/logs.md tells to give tritonserver, but with this collector, and for every request."""
+    """What docs/reference/logs_and_metrics.md tells to give tritonserver, but with this collector, and for every request."""
     text = " ".join(re.findall(r"--(?:trace-config|log-verbose)=[^\s`]+", (ROOT / "docs" / "logs.md").read_text()))
     assert "--log-verbose" in text
     text, count = re.subn(r"=opentelemetry,url=\S+", f"=opentelemetry,url={traces_url}", text)
@@ -248,7 +248,7 @@ def test_an_error_keeps_its_request_where_it_goes() -> None:
     assert str(RewardError("no request")) == "no request"
 
 
-# Options of tritonserver, as docs/logs.md has them
+# Options of tritonserver, as docs/reference/logs_and_metrics.md has them
 
 
 @pytest.mark.triton
