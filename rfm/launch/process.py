@@ -53,8 +53,8 @@ Config = Mapping[str, Any]  # a model's configuration in Triton's JSON
 def short_spin(environment: Mapping[str, str]) -> dict[str, str]:
     """Environment variables that let OpenMP's threads spin for 0.1 ms; empty if the environment sets this itself.
 
-    libgomp's default of 3 ms makes a forward pass several times slower on a busy machine. Without spinning it takes half
-    as long again on a quiet one.
+    libgomp's default of 3 ms makes a forward pass several times slower on a busy machine; no spinning makes it 1.5
+    times slower on a quiet one.
     """
     return {} if {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & environment.keys() else {"GOMP_SPINCOUNT": "10000"}
 

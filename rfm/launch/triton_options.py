@@ -46,7 +46,7 @@ def check_arguments(more: Sequence[str], own: Sequence[str]) -> None:
 
 
 def size_limits(installation: Installation, given: Sequence[str]) -> list[str]:
-    """Arguments that limit a request's size, if this tritonserver has the option (2.51 lacks it) and it is not given."""
+    """Arguments that limit a request's size. Empty if they are given, or this tritonserver (such as 2.51) has none."""
     if any(argument.startswith(f"--{_SIZE_OPTION}=") for argument in given):
         return []
     return [f"--{_SIZE_OPTION}={MAX_HTTP_BYTES}"] if _knows(installation.executable, _SIZE_OPTION) else []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a model says in Triton's log of requests that have no answer: one JSON object a line (docs/reference/logs_and_metrics.md)."""
+"""Log of requests without scores: a JSON object a line in Triton's log (docs/reference/logs_and_metrics.md)."""
 
 from __future__ import annotations
 
