@@ -19,8 +19,8 @@ class Linear(nn.Linear):
     """An ``nn.Linear`` whose large float32 products on the CPU are computed by oneDNN.
 
     torch asks oneDNN only for bfloat16, but MKL is slow on processors other than Intel's
-    (docs/explanation/performance.md). The operation is that of torch.compile. oneDNN builds a kernel for each new shape, so
-    ReWiND's tokens come in few shapes (``rfm.rewind.network.rounded_up``).
+    (docs/explanation/performance.md). The operation is that of torch.compile. oneDNN builds a kernel for each new
+    shape, so ReWiND's tokens come in few shapes (``rfm.rewind.network.rounded_up``).
     """
 
     def forward(self, input: Tensor, *, relu: bool = False, plus: Tensor | None = None) -> Tensor:
