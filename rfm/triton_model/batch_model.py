@@ -44,8 +44,8 @@ class BatchModel(Generic[Question, Answer]):
     A subclass reads the tensors of a request (``decode``), checks and prepares each question (``prepare``), answers
     questions (``answer``), and writes the answers of a request (``encode``).
 
-    A subclass that ``works_ahead`` scores in a ``Pipeline``, which calls ``work_ahead`` before a question's turn. Others
-    score in ``execute``.
+    A subclass that ``works_ahead`` scores in a ``Pipeline``, which calls ``work_ahead`` before a question's turn.
+    Others score in ``execute``.
     """
 
     def initialize(self, args: Mapping[str, str]) -> None:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """A pipeline that prepares, scores and answers requests at the same time. Independent of Triton.
 
-For models whose samples take long to prepare: while the device scores, the next batch is prepared. Other models score in
-``execute``, which takes half of the CPU time for a request.
+For models whose samples take long to prepare: while the device scores, the next batch is prepared. Other models score
+in ``execute``, which takes half of the CPU time for a request.
 """
 
 from __future__ import annotations
