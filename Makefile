@@ -7,7 +7,7 @@ TOOL := PYTHONPATH=tests/support:tools $(BIN)/python
 
 # `make help` shows the first line of the comment above each target.
 .PHONY: help demo test test-all nightly test-newest check parity bench bench-full perf chaos soak format model_repository \
-  clean ops-check ops-tools audit lock mutate
+  clean ops-check ops-tools audit lock mutate docs prose
 
 # What can be made: this list.
 help:
@@ -23,7 +23,7 @@ test: check
 	$(BIN)/pytest $(WORKERS) -m "not gpu and not slow and not nightly"
 
 # All that CI runs: also the tests that kill, wait or restart, or need programs of Debian.
-test-all: check ops-tools
+test-all: check docs ops-tools
 	$(BIN)/pytest $(WORKERS) -m "not gpu and not alone and not nightly"
 	$(BIN)/pytest -m "alone and not nightly"
 
@@ -110,6 +110,17 @@ ops-tools: $(INSTALLED)
 	  { $(AS_ROOT) apt-get update -qq && \
 	  $(AS_ROOT) apt-get install --yes -qq --no-install-recommends chromium chromium-driver; } || \
 	  $(call MISSING,chromium and chromedriver,apt-get install chromium chromium-driver)
+
+# Build the documents as a site, build/site, with the Python API. A broken link is an error.
+docs:
+	$(PYTHON) -m venv $(VENV)/docs
+	$(VENV)/docs/bin/pip install --quiet --disable-pip-version-check "mkdocs-material>=9.8,<10" \
+	  "mkdocstrings[python]>=1,<2" ruff
+	NO_MKDOCS_2_WARNING=1 $(VENV)/docs/bin/mkdocs build --strict --quiet
+
+# Count the words that make docstrings, comments and documents hard to read. It fails nothing.
+prose:
+	$(PYTHON) tools/prose.py
 
 # Report known vulnerabilities of the pinned packages. Needs the network.
 audit: $(INSTALLED)

@@ -18,9 +18,9 @@ WORTH_ONEDNN = 1 << 21  # multiplications; of fewer, to begin costs more than is
 class Linear(nn.Linear):
     """An ``nn.Linear`` whose large float32 products on the CPU are computed by oneDNN.
 
-    torch itself asks oneDNN only for bfloat16: MKL leaves processors that are not Intel's far below what they can do
-    (docs/performance.md). The operation is the one that torch.compile puts in. It is made for each shape, which takes a
-    while the first time: ReWiND's tokens come in few shapes (``rfm.rewind.network.rounded_up``).
+    torch asks oneDNN only for bfloat16, but MKL is slow on processors other than Intel's
+    (docs/explanation/performance.md). The operation is that of torch.compile. oneDNN builds a kernel for each new
+    shape, so ReWiND's tokens come in few shapes (``rfm.rewind.network.rounded_up``).
     """
 
     def forward(self, input: Tensor, *, relu: bool = False, plus: Tensor | None = None) -> Tensor:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How this process is asked to end, and how those that it has started are ended."""
+"""Stop signals of this process, and the ending of its child processes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-EXIT_TIMEOUT_S = 10  # Triton waits this long for requests in flight, and for a model process that is dead
+EXIT_TIMEOUT_S = 10  # for requests in flight; Triton also waits this long for a dead model process
 KILL_AFTER_S = 2 * EXIT_TIMEOUT_S
 
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -22,7 +22,7 @@ _prctl = ctypes.CDLL(None).prctl
 
 @contextmanager
 def stop_signals_to(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-    """A context in which ``handler`` takes the signals that ask this process to stop. In the main thread."""
+    """Context manager in which ``handler`` takes SIGINT, SIGTERM and SIGHUP. For the main thread."""
     previous = {number: signal.signal(number, handler) for number in _STOP_SIGNALS}
     try:
         yield
@@ -32,7 +32,7 @@ def stop_signals_to(handler: Callable[[int, FrameType | None], object]) -> Itera
 
 
 def end(process: subprocess.Popen[bytes]) -> None:
-    """Ends a process that leads a session: gracefully, by force after KILL_AFTER_S."""
+    """End a process that leads a session: gracefully, by force after KILL_AFTER_S."""
     if process.poll() is None:
         process.terminate()
     try:
@@ -43,12 +43,12 @@ def end(process: subprocess.Popen[bytes]) -> None:
 
 
 def ending_with_parent() -> Callable[[], None]:
-    """A ``preexec_fn`` with which the kernel kills the new process as soon as the thread that started it ends."""
+    """``preexec_fn`` for Popen: the kernel kills the new process when the thread that started it ends."""
     parent = os.getpid()
 
     def bind() -> None:
         _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:  # it has ended already
+        if os.getppid() != parent:  # the parent has ended already
             os._exit(1)
 
     return bind

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where a Triton listens, with which certificates, and which Triton may where others can reach it."""
+"""Addresses and certificates of one Triton, and the lowest version that may listen beyond loopback."""
 
 from __future__ import annotations
 
@@ -16,23 +16,22 @@ from rfm.launch.installation import ServerStartError
 from rfm_client.contract.addresses import check_authorities, check_certificate, is_loopback
 from rfm_client.contract.listening import check_free, in_url
 
-PORTS = range(20_000, 32_000)  # Linux gives the higher ones to connections that go out, while a server still loads
-# NVIDIA's container 26.07. Earlier ones can be crashed, or taken over, by whoever reaches them: docs/security.md
-SECURITY_FLOOR = (2, 71)
+PORTS = range(20_000, 32_000)  # below the ports that Linux gives to outgoing connections
+SECURITY_FLOOR = (2, 71)  # NVIDIA's container 26.07; earlier ones have remote vulnerabilities: docs/guides/secure.md
 
-_given: deque[int] = deque(maxlen=256)  # ports of late: their servers may not listen yet
+_given: deque[int] = deque(maxlen=256)  # ports of servers that may not listen yet
 
 
 @dataclass(frozen=True)
 class GrpcTls:
-    """Files (PEM) that Triton serves gRPC with. client_ca: who may vouch for clients, which then need a certificate"""
+    """PEM files for gRPC with TLS. client_ca: authorities of client certificates, which clients then need"""
 
     certificate: Path
     key: Path
     client_ca: Path | None = None
 
     def check(self) -> None:
-        """Raises ServerStartError for files that Triton could not serve with."""
+        """Check the files. Raises ServerStartError."""
         try:
             check_certificate(self.certificate, self.key, "grpc_certificate, grpc_key")
             if self.client_ca is not None:
@@ -41,7 +40,7 @@ class GrpcTls:
             raise ServerStartError(str(error)) from None
 
     def arguments(self) -> list[str]:
-        """Arguments of tritonserver that encrypt its gRPC port."""
+        """Arguments of tritonserver for gRPC with TLS."""
         files = [f"--grpc-server-cert={self.certificate}", f"--grpc-server-key={self.key}"]
         if self.client_ca is None:
             return ["--grpc-use-ssl=true", *files]
@@ -50,7 +49,7 @@ class GrpcTls:
 
 @dataclass(frozen=True)
 class Endpoints:
-    """Addresses of one server. grpc_tls: gRPC is encrypted; HTTP cannot be, and then listens on 127.0.0.1 alone"""
+    """Addresses of one server. grpc_tls: gRPC uses TLS; HTTP, which cannot, then listens on 127.0.0.1 only"""
 
     host: str = DEFAULT_HOST
     http_port: int = 8000
@@ -60,7 +59,7 @@ class Endpoints:
 
     @classmethod
     def of(cls, config: ServeConfig) -> Endpoints:
-        """The endpoints that a configuration names."""
+        """Endpoints of a configuration."""
         tls = None
         if config.grpc_certificate is not None and config.grpc_key is not None:
             tls = GrpcTls(config.grpc_certificate, config.grpc_key, config.grpc_client_ca)
@@ -68,13 +67,13 @@ class Endpoints:
 
     @classmethod
     def free(cls) -> Endpoints:
-        """Loopback endpoints on ports that are free now."""
+        """Loopback endpoints on free ports."""
         http_port, grpc_port, metrics_port = free_ports(3)
         return cls(DEFAULT_HOST, http_port, grpc_port, metrics_port)
 
     @property
     def http_host(self) -> str:
-        """Listen address of the server's HTTP port."""
+        """Address of the HTTP port."""
         return self.host if self.grpc_tls is None else DEFAULT_HOST
 
     @property
@@ -93,7 +92,7 @@ class Endpoints:
         return f"http://{in_url(self.host)}:{self.metrics_port}/metrics"
 
     def arguments(self) -> list[str]:
-        """Arguments of tritonserver that make it listen there."""
+        """Arguments of tritonserver for these addresses."""
         return [
             f"--http-address={_of_http_server(self.http_host)}",
             f"--http-port={self.http_port}",
@@ -104,7 +103,7 @@ class Endpoints:
         ]
 
     def check(self) -> None:
-        """Raises ServerStartError for a taken port, another machine's address, and files that are no certificate."""
+        """Check ports, addresses and certificates. Raises ServerStartError."""
         if self.grpc_tls is not None:
             self.grpc_tls.check()
         listening = (
@@ -120,7 +119,7 @@ class Endpoints:
 
 
 def check_version(host: str, version: str, *, accepted: bool) -> None:
-    """Raises ServerStartError if others can reach a Triton with known vulnerabilities, unless that is ``accepted``."""
+    """Raises ServerStartError for a vulnerable Triton on an address beyond loopback, unless ``accepted``."""
     match = re.match(r"(\d+)\.(\d+)", version)
     is_safe = match is not None and (int(match[1]), int(match[2])) >= SECURITY_FLOOR
     if is_safe or accepted or is_loopback(host):
@@ -134,7 +133,7 @@ def check_version(host: str, version: str, *, accepted: bool) -> None:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports of the loopback address that are free now. Raises OSError if there are too few."""
+    """Free ports of the loopback address. Raises OSError if there are too few."""
     tried = random.SystemRandom().sample(PORTS, len(PORTS))
     ports = list(islice((port for port in tried if port not in _given and _is_free(port)), count))
     if len(ports) < count:
@@ -152,5 +151,5 @@ def _is_free(port: int) -> bool:
 
 
 def _of_http_server(host: str) -> str:
-    """An address as Triton's HTTP servers read it: without the prefix they take IPv6 for a name."""
+    """Address in the form of Triton's HTTP servers, which need a prefix before IPv6."""
     return f"ipv6:{host}" if ":" in host else host

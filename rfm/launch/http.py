@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Plain HTTP requests to a Triton on this machine, each on a connection of its own and within a time limit."""
+"""HTTP requests to a Triton on this machine, each with a connection and a time limit of its own."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-PROBE_TIMEOUT_S = 1.0  # of what Triton answers by itself
+PROBE_TIMEOUT_S = 1.0  # for answers that need no model
 
 
 class UnreadableAnswerError(Exception):
-    """An answer that is no JSON, or has another status than 200."""
+    """An answer that is not JSON, or has another status than 200."""
 
 
-NO_ANSWER = (OSError, http.client.HTTPException, UnreadableAnswerError)  # or none that can be read
+NO_ANSWER = (OSError, http.client.HTTPException, UnreadableAnswerError)
 
 
 class Http:
-    """The server at ``host:port``. Its methods raise one of NO_ANSWER.
+    """The server at ``host:port``. Its methods raise NO_ANSWER.
 
-    headers: of each request
+    headers: sent with each request
     """
 
     def __init__(self, host: str, port: int, headers: Mapping[str, str] | None = None) -> None:
         self._address, self._headers = (host, port), headers or {}
 
     def request(self, method: str, path: str, timeout_s: float, body: bytes | None = None) -> tuple[int, str]:
-        """Status and content of the answer."""
+        """Send a request. Return status and content of the answer."""
         connection = http.client.HTTPConnection(*self._address, timeout=timeout_s)
         try:
             connection.request(method, path, body, self._headers)
@@ -38,7 +38,7 @@ class Http:
             connection.close()
 
     def json(self, path: str, timeout_s: float = PROBE_TIMEOUT_S, method: str = "GET") -> Any:
-        """The content of an answer that is JSON."""
+        """Send a request. Return the JSON of the answer."""
         status, text = self.request(method, path, timeout_s)
         if status != http.client.OK:
             raise UnreadableAnswerError(f"{path}: {status} {text}")

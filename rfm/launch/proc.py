@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the kernel says of the processes of this machine."""
+"""Processes of this machine, from /proc."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ ZOMBIE, STOPPED = "Z", "T"  # states
 
 _PROC = Path("/proc")
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
-_STATE, _PARENT, _GROUP, _USER, _SYSTEM = 0, 1, 2, 11, 12  # places in /proc/PID/stat behind the process' name
+_STATE, _PARENT, _GROUP, _USER, _SYSTEM = 0, 1, 2, 11, 12  # fields of /proc/PID/stat behind the name
 
 
 @dataclass(frozen=True)
 class ProcessStat:
-    """Name, state, parent, group and CPU time of a process. The name, at most 15 characters, is a zombie's, too"""
+    """Name (at most 15 characters), state, parent, group and CPU time of a process. A zombie has them, too"""
 
     name: str
     state: str
@@ -27,15 +27,14 @@ class ProcessStat:
 
 
 def all_pids() -> list[int]:
-    """The ids of all processes."""
+    """Ids of all processes."""
     return [int(folder.name) for folder in _PROC.glob("[0-9]*")]
 
 
 def children_of(pid: int) -> list[int]:
-    """The processes that the process has started, zombies included.
+    """Child processes of a process, zombies included.
 
-    A machine may have thousands of processes, so the kernel's lists of each thread's children are read, where it has
-    such lists.
+    Reads the kernel's lists of children where they exist, since a machine may have thousands of processes.
     """
     threads = _PROC / str(pid) / "task"
     if not (threads / str(pid) / "children").exists():
@@ -48,7 +47,7 @@ def children_of(pid: int) -> list[int]:
 
 
 def arguments_of(pid: int) -> list[str]:
-    """The process' program and its arguments; none of a zombie, or where there is no process of this id."""
+    """Program and arguments of a process; empty for a zombie or an unknown id."""
     try:
         content = (_PROC / str(pid) / "cmdline").read_bytes()
     except (FileNotFoundError, ProcessLookupError):
@@ -57,7 +56,7 @@ def arguments_of(pid: int) -> list[str]:
 
 
 def stat_of(pid: int) -> ProcessStat | None:
-    """What there is to know of the process; None: there is none of this id."""
+    """State of a process; None for an unknown id."""
     try:
         head, _, tail = (_PROC / str(pid) / "stat").read_text().rpartition(")")
     except (FileNotFoundError, ProcessLookupError):
@@ -70,5 +69,5 @@ def stat_of(pid: int) -> ProcessStat | None:
 
 
 def cpu_s_of_group(group: int) -> float:
-    """CPU time of all processes of a group, in seconds."""
+    """CPU time of a process group, in seconds."""
     return sum(stat.cpu_s for pid in all_pids() if (stat := stat_of(pid)) is not None and stat.group == group)

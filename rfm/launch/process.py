@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One tritonserver process: started, ready, stopped, and nothing of it left behind."""
+"""One tritonserver process: starts it, waits until it is ready, stops it, and leaves nothing behind."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ from rfm.parameters import DEFAULT_HANG_S, HANG_VARIABLE
 from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
 
 POLL_S = 0.1
-STALLED_S, WORK_S = 60.0, 0.05  # a start that uses less of the CPU in so long has been spoilt by Triton
+STALLED_S, WORK_S = 60.0, 0.05  # a start that uses less CPU time than WORK_S in STALLED_S is stuck
 LOAD_S = 1800.0
-ANSWER_TIMEOUT_S = 10.0  # of one that starts
-NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # a `load` would load all versions anew: their folders have changed
-SECRETS = (VARIABLE, GATEWAY_KEY_VARIABLE)  # variables that neither Triton nor a model process needs
-_REMEDIES = {  # by what Triton, PyTorch or the system say of a model that is not loaded
+ANSWER_TIMEOUT_S = 10.0  # of a server that starts
+NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # else a version's folder changes, and a `load` reloads all versions
+SECRETS = (VARIABLE, GATEWAY_KEY_VARIABLE)  # variables that Triton and the model processes do not get
+_REMEDIES = {  # remedy by a pattern of the reason why a model is not loaded
     "unsupported gpu id|KIND_GPU|compiled with CUDA|no NVIDIA driver": (
         "the models were exported for GPUs that this machine lacks: rfm export again here (--num-gpus 0: for the CPU)"
     ),
@@ -47,36 +47,36 @@ _REMEDIES = {  # by what Triton, PyTorch or the system say of a model that is no
 }
 _REGIONS = "--backend-config=python,shm-region-prefix-name="
 
-Config = Mapping[str, Any]  # of a model, as Triton's JSON has it
+Config = Mapping[str, Any]  # a model's configuration in Triton's JSON
 
 
 def short_spin(environment: Mapping[str, str]) -> dict[str, str]:
-    """What to add to the environment of a process that computes, unless that says itself how OpenMP's threads wait.
+    """Environment variables that let OpenMP's threads spin for 0.1 ms; empty if the environment sets this itself.
 
-    For 0.1 ms threads of a forward pass on the CPU spin where they wait for each other; then they sleep. With libgomp's
-    own 3 ms a pass takes several times as long on a busy machine; without any, half as long again on a quiet one.
+    libgomp's default of 3 ms makes a forward pass several times slower on a busy machine; no spinning makes it 1.5
+    times slower on a quiet one.
     """
     return {} if {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & environment.keys() else {"GOMP_SPINCOUNT": "10000"}
 
 
 class SpoiltStartError(ServerStartError):
-    """Triton has lost a model process that loads, and has ended, or waits for ever.
+    """Triton lost a model process during loading, and ended or waits for ever.
 
-    Triton 2.51 does so where a machine stands still for a second.
+    Triton 2.51 does so when the machine stands still for a second.
     """
 
 
 class TritonServer:
-    """A tritonserver on ``repository`` with every model of it loaded. A context manager that stops it.
+    """A tritonserver on ``repository`` with all its models loaded. A context manager that stops it.
 
-    It is killed when the thread that starts it ends, however that ends.
+    The kernel kills it when the thread that started it ends.
 
     http_threads: threads that read HTTP requests; None: Triton's choice
-    hang_s: after how many seconds without progress of a batch a model process ends itself
-    log: where Triton's log goes; None: this process's standard output and error
-    admin_key: what requests to the restricted APIs must show (``admin_key``); None: a new one, known to this alone
-    accepts_known_vulnerabilities: it may be reached from elsewhere although its Triton has some
-    more_arguments: of tritonserver, such as ``--trace-config=...``; not those that this class sets
+    hang_s: seconds without progress of a batch after which a model process ends itself
+    log: file for Triton's log; None: this process's standard output and error
+    admin_key: key of the restricted APIs; None: a new random key
+    accepts_known_vulnerabilities: True: listen on any address, even with a vulnerable Triton
+    more_arguments: further arguments of tritonserver, such as ``--trace-config=...``
     """
 
     def __init__(
@@ -103,41 +103,41 @@ class TritonServer:
         self._more_arguments = tuple(more_arguments)
         self._http = Http(endpoints.http_host, endpoints.http_port, http_headers(self.admin_key))
         self._claim: Claim | None = None
-        self._signal: int | None = None  # that was sent last
+        self._signal: int | None = None  # the last signal that was sent
         self._process: subprocess.Popen[bytes] | None = None
 
     @property
     def models(self) -> list[str]:
-        """The names of the models in the repository."""
+        """Names of the models in the repository."""
         return models_in(self.repository)
 
     @property
     def pid(self) -> int:
-        """The id of the process that was started last."""
+        """Id of the newest process."""
         assert self._process is not None  # started
         return self._process.pid
 
     @property
     def exit_status(self) -> int | None:
-        """The process' exit status; None: it runs."""
+        """Exit status of the process; None: it runs."""
         assert self._process is not None  # started
         return self._process.poll()
 
     def signal(self, number: int) -> None:
-        """Sends a signal to the process, and to one that is being started."""
+        """Send a signal to the process, now or as soon as it starts."""
         self._signal = number
         if self._process is not None:
             self._process.send_signal(number)
 
     def kill(self) -> None:
-        """Ends the process and its children at once."""
+        """Kill the process and its children."""
         self._kill_group()
 
     def start_ready(self, served: Mapping[str, Config] | None = None) -> None:
-        """Starts the process, and returns when every model is ready. Repeats a start once that Triton has spoilt.
+        """Start the process and wait until every model is ready. Repeat a spoilt start once.
 
-        served: configurations of the models, which may name other versions than their files by now; None: all models,
-            as their files say
+        served: configurations of the models to serve, which may name other versions than their files; None: all models
+            as in their files
         Raises ServerStartError.
         """
         try:
@@ -147,7 +147,7 @@ class TritonServer:
             self._start_ready(served)
 
     def stop(self) -> int:
-        """Ends the server gracefully, by force after KILL_AFTER_S, and gives its exit status (0 if it never ran)."""
+        """End the server gracefully, by force after KILL_AFTER_S. Return its exit status, 0 if it never ran."""
         status = 0
         if self._process is not None:
             end(self._process)
@@ -172,7 +172,7 @@ class TritonServer:
         self.stop()
 
     def _start_ready(self, served: Mapping[str, Config] | None) -> None:
-        """As ``start_ready``. Triton loads by itself what its files name, and is asked to load the rest."""
+        """As ``start_ready``: Triton loads the models whose files are up to date, and is asked to load the others."""
         there = self.models
         if not there:
             raise ServerStartError(no_models(self.repository))
@@ -188,7 +188,7 @@ class TritonServer:
             self._load(name, others[name])
 
     def _start(self, models: Sequence[str]) -> None:
-        """Starts the process, which loads ``models``. Raises ServerStartError for what is known to be wrong before."""
+        """Start the process with ``models``. Raises ServerStartError for wrong arguments, addresses or files."""
         own = self._arguments(models)
         check_arguments(self._more_arguments, [*own, _REGIONS])
         if self._installation.wheel is not None:
@@ -219,7 +219,7 @@ class TritonServer:
             self._process.send_signal(self._signal)
 
     def _wait_ready(self, models: Collection[str]) -> None:
-        """Returns when ``models`` are ready. Raises ServerStartError with the reason of one that is not."""
+        """Wait until ``models`` are ready. Raises ServerStartError with the reason of a model that is not."""
         assert self._process is not None  # started
         started_s = worked_s = time.monotonic()
         cpu_s = 0.0
@@ -247,7 +247,7 @@ class TritonServer:
         raise kind(f"tritonserver: expected to run, got exit status {self._process.returncode}")
 
     def _load(self, name: str, config: Config) -> None:
-        """Has Triton load a model with this configuration, over HTTP: its gRPC port may ask for a certificate."""
+        """Ask Triton to load a model with this configuration, over HTTP: its gRPC port may ask for a certificate."""
         body = json.dumps({"parameters": {"config": json.dumps(config)}}).encode()
         path = f"/v2/repository/models/{quote(name, safe='')}/load"
         try:
@@ -267,8 +267,8 @@ class TritonServer:
             "--model-control-mode=explicit",
             *(f"--load-model={model}" for model in models),
             "--disable-auto-complete-config",
-            "--strict-readiness=false",  # else one version that cannot be loaded keeps all models from being ready
-            "--exit-on-error=false",  # so that the reason of each model that fails can be read
+            "--strict-readiness=false",  # else a version that fails to load keeps all models from being ready
+            "--exit-on-error=false",  # keeps the reason of each failed model readable
             f"--exit-timeout-secs={EXIT_TIMEOUT_S}",
             *self.endpoints.arguments(),
             *([f"--http-thread-count={self._http_threads}"] if self._http_threads else []),
@@ -286,11 +286,11 @@ def _remedy(reasons: str) -> str:
 
 
 def _names_the_same_versions(repository: Path, model: str, config: Config) -> bool:
-    """True if the model's file names the versions of ``config``, or none."""
+    """True if the model's file names the versions of ``config``, or no versions."""
     try:
         file = text_format.Parse((repository / model / CONFIG_FILE).read_text(), ModelConfig())
     except (OSError, UnicodeDecodeError, text_format.ParseError):
         return False
-    if not file.version_policy.HasField("specific"):  # of a model that is not ours
+    if not file.version_policy.HasField("specific"):  # a model of another program
         return True
     return bool(list(file.version_policy.specific.versions) == config["version_policy"]["specific"]["versions"])

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""A running server's model-repository API: what is loaded, load, unload; and a probe of one version.
+"""The model-repository API of a running server: index, load, unload, and a probe of one version.
 
-Over gRPC, where Triton works on a load in a thread of its own. Over HTTP a load holds the thread that took the request,
-and with it all connections of that thread, until the model is loaded.
+Over gRPC, since a load over HTTP blocks all connections of Triton's HTTP thread until the model is loaded.
 """
 
 from __future__ import annotations
@@ -26,26 +25,26 @@ from rfm_client.contract.wire import Tensors
 INDEX_PATH = "/v2/repository/index"  # over HTTP
 READY, LOADING, UNLOADING = "READY", "LOADING", "UNLOADING"
 POLL_S = 0.1
-ANSWER_S = 1800.0  # of one request: a load answers when the model is warmed up
-FINISH_S = 600.0  # requests in flight on a version that is taken out
+ANSWER_S = 1800.0  # for one request; a load answers after the warm-up
+FINISH_S = 600.0  # for requests in flight on an old version
 
 _CHANNEL = [
-    ("grpc.min_reconnect_backoff_ms", 10_000),  # how long it may take to connect, too
+    ("grpc.min_reconnect_backoff_ms", 10_000),  # also bounds the time to connect
     ("grpc.enable_http_proxy", 0),
 ]
 _OF_SERVER = (*triton.UNAVAILABLE, *triton.OUT_OF_TIME, *triton.CANCELLED)
 _GOING = (READY, UNLOADING)
-_NOT_LOADED = "not loaded"  # Triton gives no state
+_NOT_LOADED = "not loaded"  # our name where Triton gives no state
 _UNAVAILABLE, _UNLOADED = "UNAVAILABLE", "unloaded"
 
 
 class RepositoryApiError(Exception):
-    """A request that the server did not fulfil, and why."""
+    """A failed request of the repository API, with the reason."""
 
 
 @dataclass(frozen=True)
 class ModelVersion:
-    """A version as the server knows it; one that it does not know yet has no number. state: READY, UNAVAILABLE, ..."""
+    """One version in the server's index. version: None: not loaded yet; state: READY, UNAVAILABLE, ..."""
 
     name: str
     version: int | None
@@ -54,20 +53,20 @@ class ModelVersion:
 
     @property
     def is_ready(self) -> bool:
-        """True if it answers requests, as far as the server knows."""
+        """True if the server calls it ready."""
         return self.state == READY
 
     @property
     def is_unloaded(self) -> bool:
-        """True if it is not loaded because somebody unloaded it. A version that failed has another reason."""
+        """True if it was unloaded on request; a version that failed to load has another reason."""
         return self.state == _NOT_LOADED or (self.state, self.reason) == (_UNAVAILABLE, _UNLOADED)
 
 
 class RepositoryApi:
-    """The server at ``url`` (grpc://host:port, or grpcs:// with TLS). A context manager.
+    """The server at ``url``: grpc://host:port, or grpcs:// with TLS. A context manager.
 
-    options: of tritonclient's gRPC client, as Access has them
-    Its methods raise RepositoryApiError, and so does the constructor for another kind of URL.
+    options: options of tritonclient's gRPC client, such as those of Access
+    The constructor and the methods raise RepositoryApiError.
     """
 
     def __init__(self, url: str, admin_key: str | None, options: Mapping[str, Any] | None = None) -> None:
@@ -86,25 +85,25 @@ class RepositoryApi:
         self._client = tritonclient.grpc.InferenceServerClient(address, channel_args=channel, **given)
 
     def index(self) -> list[ModelVersion]:
-        """Everything in the repository, by name and version."""
+        """All versions in the repository, sorted by name and version."""
         answer = self._request(self._client.get_model_repository_index)
         return versions_of(MessageToDict(entry) for entry in answer.models)
 
     def ready_versions(self, model: str) -> list[int]:
-        """The versions of ``model`` that are served now."""
+        """Versions of ``model`` that are ready."""
         ready = (entry for entry in self.index() if entry.name == model and entry.is_ready)
         return [entry.version for entry in ready if entry.version is not None]
 
     def load(self, model: str) -> None:
-        """Has the server serve what the model's configuration says; what was served before stays if that fails."""
+        """Load the versions that the model's configuration names. If that fails, the served versions stay."""
         self._request(self._client.load_model, model)
 
     def unload(self, model: str) -> None:
-        """Has the server forget the model, after the requests that it is working on."""
+        """Unload the model after its requests in flight."""
         self._request(self._client.unload_model, model)
 
     def wait_gone(self, model: str, kept: Collection[int] = ()) -> None:
-        """Returns when no version of the model but ``kept`` works on a request."""
+        """Wait until no version of the model but ``kept`` has a request in flight."""
         deadline_s = time.monotonic() + FINISH_S
         while time.monotonic() < deadline_s:
             going = [entry for entry in self.index() if entry.name == model and entry.state in _GOING]
@@ -114,7 +113,7 @@ class RepositoryApi:
         raise RepositoryApiError(f"{model}: expected its old versions to finish within {FINISH_S:g} s, got no end")
 
     def infer(self, model: str, version: int, inputs: Tensors, outputs: Collection[str]) -> Tensors:
-        """What one version answers to a probe. The probe's request id sets it apart from callers' requests in logs."""
+        """Outputs of one version for a probe. Its request id tells it from callers' requests in logs."""
         tensors = []
         for name, array in inputs.items():
             tensors.append(tritonclient.grpc.InferInput(name, array.shape, np_to_triton_dtype(array.dtype)))
@@ -152,7 +151,7 @@ class RepositoryApi:
 
 
 def versions_of(index: Iterable[Mapping[str, str]]) -> list[ModelVersion]:
-    """The entries of a server's index, by name and version."""
+    """Entries of a server's index, sorted by name and version."""
     versions = [
         ModelVersion(
             entry["name"],
@@ -166,5 +165,5 @@ def versions_of(index: Iterable[Mapping[str, str]]) -> list[ModelVersion]:
 
 
 def one_line(reason: str) -> str:
-    """The first line of an error, which says what happened; the lines behind it say where."""
+    """First line of an error message; the others are its traceback."""
     return reason.strip().partition("\n")[0].strip()

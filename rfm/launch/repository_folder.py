@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The folder that a server is to read: which models are in it, or what it is instead."""
+"""Models in a repository folder; for a folder without models, the likely mistake and its remedy."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import os
 from pathlib import Path
 
 CONFIG_FILE = "config.pbtxt"
-_WEIGHTS = "model.safetensors*"  # or their index
+_WEIGHTS = "model.safetensors*"  # also matches the index of shards
 _EXPORT = "rfm export --checkpoint {checkpoint} --repository {repository}"
-_LEVELS_ABOVE = 4  # from a folder of weights, MODEL/VERSION/checkpoint, to its repository
+_LEVELS_ABOVE = 4  # from MODEL/VERSION/checkpoint up to the repository
 
 
 def models_in(repository: Path) -> list[str]:
-    """The names of the models in the repository, sorted. A model's folder, whose versions keep theirs, has none."""
+    """Sorted names of the models in a repository; empty for the folder of a model."""
     if (repository / CONFIG_FILE).exists():
         return []
     return sorted(file.parent.name for file in repository.glob(f"*/{CONFIG_FILE}"))
 
 
 def no_models(repository: Path) -> str:
-    """Why ``repository`` is no repository, which has no models, and what to do instead."""
+    """Error message for a folder without models, with the remedy."""
     got, remedy = _found(repository)
     return f"repository: expected a folder of models, got {repository}, {got}: {remedy}"
 

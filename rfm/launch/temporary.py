@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A server for just as long as this process needs one."""
+"""A server that runs as long as a context."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rfm.launch.process import TritonServer
 
 @contextmanager
 def stopped_by_signals() -> Iterator[None]:
-    """A context in which a signal to stop raises SystemExit, so that what was started is stopped."""
+    """Context manager in which a stop signal raises SystemExit, so that context managers clean up."""
 
     def leave(number: int, _frame: FrameType | None) -> NoReturn:
         raise SystemExit(128 + number)
@@ -28,7 +28,7 @@ def stopped_by_signals() -> Iterator[None]:
 
 @contextmanager
 def temporary_server(repository: Path, log: Path, tritonserver: Path | None = None) -> Iterator[Endpoints]:
-    """A server on free ports of this machine, with Triton's log in a file. Raises ServerStartError."""
+    """Context manager with a server on free ports and its log in a file. Raises ServerStartError."""
     log.parent.mkdir(parents=True, exist_ok=True)
     installation = find_installation(tritonserver)
     with (

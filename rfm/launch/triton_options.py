@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""tritonserver's options: those that may be given to ``rfm serve`` behind ``--``, and the limit of a request's size."""
+"""Options of tritonserver that users may give behind ``--``, and the largest HTTP request."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathlib import Path
 
 from rfm.launch.installation import Installation, ServerStartError
 
-MAX_HTTP_BYTES = 256 * 2**20  # of a request's body, as in the gateway; over gRPC Triton takes 2 GiB
+MAX_HTTP_BYTES = 256 * 2**20  # of a request's body; over gRPC Triton takes 2 GiB
 
-# Refused besides the options that are set here: their other names, and options that take away what a start waits for.
+# Refused besides the options that rfm serve sets: their other names, and options that break a start.
 _KEPT = {
     "--model-store",
     "--backend-directory",
@@ -28,14 +28,14 @@ _KEPT = {
     "--grpc-server-key",
     "--grpc-root-cert",
 }
-# May be given again, for other APIs: Triton refuses to start with two keys for one.
+# May be given again for other APIs. Triton refuses to start with two keys for one API.
 _REPEATED = {"--http-restricted-api", "--grpc-restricted-protocol"}
 _SIZE_OPTION = "http-max-input-size"
 _ARGUMENT = re.compile(r"(--[a-z][a-z0-9-]+)=.*")
 
 
 def check_arguments(more: Sequence[str], own: Sequence[str]) -> None:
-    """Raises ServerStartError for one that ``own`` has, also if it is abbreviated, or that is no ``--option=value``."""
+    """Raises ServerStartError for an option of ``own``, also abbreviated, and for anything but ``--option=value``."""
     kept = {argument.partition("=")[0] for argument in own} - _REPEATED | _KEPT
     for argument in more:
         match = _ARGUMENT.fullmatch(argument)
@@ -46,16 +46,16 @@ def check_arguments(more: Sequence[str], own: Sequence[str]) -> None:
 
 
 def size_limits(installation: Installation, given: Sequence[str]) -> list[str]:
-    """Arguments of tritonserver, as far as it has such options (2.51 has none) and they are not ``given``."""
+    """Arguments that limit a request's size. Empty if they are given, or this tritonserver (such as 2.51) has none."""
     if any(argument.startswith(f"--{_SIZE_OPTION}=") for argument in given):
         return []
     return [f"--{_SIZE_OPTION}={MAX_HTTP_BYTES}"] if _knows(installation.executable, _SIZE_OPTION) else []
 
 
 def _knows(program: Path, option: str) -> bool:
-    """True if the option's name stands in the program: asking by --help would start it."""
+    """True if the option's name stands in the program file. ``--help`` would start Triton."""
     try:
         with program.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             return content.find(option.encode()) >= 0
-    except (OSError, ValueError):  # it cannot be read, or is empty: starting it gives the reason
+    except (OSError, ValueError):  # unreadable or empty: the start gives the reason
         return False

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A health probe: one blank request to a model every few seconds."""
+"""Health probes: one synthetic request to a model every few seconds."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from rfm.probe import blank_question
 from rfm_client.contract import wire
 from rfm_client.contract.names import PROBE_PREFIX
 
-BROKEN_COUNT, BROKEN_S = 3, 30.0  # failures in a row, and their time, of a model that could answer the probe before
-SHARE = 0.1  # of a model's time at most
+BROKEN_COUNT, BROKEN_S = 3, 30.0  # failed probes in a row, over this time, make a model broken
+SHARE = 0.1  # largest share of a model's time
 
 _OUTPUTS = (wire.PROGRESS, wire.VIDEO_EMBEDDINGS)
 
 
 class Probe:
-    """Probes a model every ``interval_s`` in a thread of its own, or less often if an answer takes long.
+    """Probes a model in a thread of its own, every ``interval_s`` or less often if answers take long.
 
-    hang_s: how long the model may answer nothing before it counts as hung
-    observe: takes how long each answer took, in seconds
+    hang_s: seconds without an answer after which the model counts as hung
+    observe: called with the seconds that each answer took
     """
 
     def __init__(
@@ -36,21 +36,21 @@ class Probe:
         self._http, self._model, self._interval_s, self._hang_s = http, model, interval_s, hang_s
         self._observe = observe
         self._waiting_since_s = time.monotonic()
-        self._num_failures: int | None = None  # in a row; None: it has never succeeded
-        self._succeeded_s = 0.0  # when it last did
+        self._num_failures: int | None = None  # in a row; None: no probe has succeeded yet
+        self._succeeded_s = 0.0  # time of the last success
         self.has_answered = False
         self._closed = threading.Event()
         threading.Thread(target=self._run, name=f"rfm-probe-{model}", daemon=True).start()
 
     def close(self) -> None:
-        """Send no more probes."""
+        """Stop probing."""
         self._closed.set()
 
     def fault(self, progress_s: float) -> str | None:
-        """Why the model has to be started again; None: it need not.
+        """Reason to restart the model; None: it is healthy.
 
-        progress_s: when Triton last counted an answer or a forward pass of the model, by time.monotonic. A busy model
-            answers a probe late
+        progress_s: time (monotonic) of the last answer or forward pass that Triton counted. A busy model answers probes
+            late
         """
         fails_s = time.monotonic() - self._succeeded_s
         if self._num_failures is not None and self._num_failures >= BROKEN_COUNT and fails_s >= BROKEN_S:
@@ -70,7 +70,7 @@ class Probe:
             except NO_ANSWER:
                 pass  # the probe stays open
             else:
-                if status != HTTPStatus.SERVICE_UNAVAILABLE:  # it waited in a queue that is full
+                if status != HTTPStatus.SERVICE_UNAVAILABLE:  # a full queue rejects probes, too
                     took_s = time.monotonic() - started_s
                     self._take(status, took_s)
             self._closed.wait(max(self._interval_s, min(took_s / SHARE, self._hang_s)))
@@ -83,7 +83,7 @@ class Probe:
         self._observe(took_s)
         if status < HTTPStatus.INTERNAL_SERVER_ERROR:
             self._num_failures, self._succeeded_s = 0, time.monotonic()
-        elif self._num_failures is not None:  # else it answers; blank frames need not give a readable answer
+        elif self._num_failures is not None:  # a model may refuse every blank sample
             self._num_failures += 1
 
     def _request(self) -> bytes:
@@ -102,6 +102,6 @@ class Probe:
 
 
 def can_be_probed(config: Mapping[str, Any]) -> bool:
-    """True if a model with this configuration is one of ours and has processes of its own."""
+    """True for a Python model of this project."""
     names = {tensor["name"] for tensor in config["input"]}
     return config.get("backend") == "python" and wire.NUM_FRAMES in names

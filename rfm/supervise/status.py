@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The status port of ``rfm serve``: whether it lives, whether it is ready, and what it had to heal."""
+"""The status port of ``rfm serve``: live, ready, and metrics of its restarts."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, G
 from rfm.launch.installation import ServerStartError
 from rfm_client.contract.listening import check_free
 
-NO_REASON = ""  # the reason why a model is not ready, of one that is
-REQUEST_S = 5.0  # that a connection may be silent
+NO_REASON = ""  # of a ready model
+REQUEST_S = 5.0  # longest silence of a connection
 
 _BUCKETS_S = tuple(digit * 10.0**power for power in range(-3, 2) for digit in (1, 2, 5))
 
 
 class Status:
-    """Which models are ready, and why others are not."""
+    """Ready models, and the reasons why others are not."""
 
     def __init__(self) -> None:
         self._reasons: Mapping[str, str] = {}
@@ -41,7 +41,7 @@ class Status:
         self.restarts = Counter("rfm_serve_restarts", told, ["what"], registry=self._registry)
 
     def record(self, reasons: Mapping[str, str]) -> None:
-        """Records by model why it is not ready; NO_REASON for one that is. There are no other models."""
+        """Record the state of all models: the reason why a model is not ready, or NO_REASON."""
         gone, before, self._reasons = self._reasons.keys() - reasons.keys(), self._reasons, dict(reasons)
         for model, reason in before.items():
             if reason not in (NO_REASON, reasons.get(model)):
@@ -54,24 +54,24 @@ class Status:
             self._ready.remove(model)
 
     def record_down(self, reason: str) -> None:
-        """Records why no model is ready."""
+        """Record a reason why no model is ready."""
         self.record(dict.fromkeys(self._reasons, reason))
 
     @property
     def ready(self) -> tuple[bool, dict[str, Any]]:
-        """True if all models are ready; and the body of ``/ready``."""
+        """Whether all models are ready, and the body of ``/ready``."""
         reasons = self._reasons
         is_ready = bool(reasons) and all(reason == NO_REASON for reason in reasons.values())
         models = {model: {"ready": reason == NO_REASON, "reason": reason} for model, reason in reasons.items()}
         return is_ready, {"ready": is_ready, "models": models}
 
     def metrics(self) -> bytes:
-        """The metrics in the text format of Prometheus."""
+        """Metrics in the text format of Prometheus."""
         return generate_latest(self._registry)
 
 
 class StatusServer(ThreadingHTTPServer):
-    """Serves a Status over HTTP: ``/live``, ``/ready`` and ``/metrics``. Raises ServerStartError for a taken port."""
+    """HTTP server of a Status: ``/live``, ``/ready``, ``/metrics``. Raises ServerStartError for a taken port."""
 
     daemon_threads = True
 
@@ -86,12 +86,12 @@ class StatusServer(ThreadingHTTPServer):
         threading.Thread(target=self.serve_forever, name="rfm-status", daemon=True).start()
 
     def close(self) -> None:
-        """Ends the HTTP server and its thread."""
+        """Stop the HTTP server and its thread."""
         self.shutdown()
         self.server_close()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Logs nothing: a caller that leaves without an answer is no fault."""
+        """Log nothing for callers that leave without an answer."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(request, client_address)
 
@@ -117,4 +117,4 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, *_: Any) -> None:
-        """Logs nothing: probes come every few seconds."""
+        """Log nothing: probes come every few seconds."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Triton and what belongs to it, kept answering until a signal stops it."""
+"""Supervisor: runs Triton and the gateway, and restarts them after a fault, until a signal stops it."""
 
 from __future__ import annotations
 
@@ -20,35 +20,32 @@ from rfm.supervise.status import Status, StatusServer
 from rfm.supervise.watch import TRITON, TritonWatch, parts_of
 
 GATEWAY = "gateway"
-STEADY_S = 60.0  # whatever has run for so long is no part of a crash loop
+STEADY_S = 60.0  # a process that ran longer is not in a crash loop
 MOST = 5  # restarts in a row
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
 
 
 class CrashLoopError(ServerStartError):
-    """A process ended so often that it is not started again."""
+    """A process ended too often to start it again."""
 
 
 class BackOff:
-    """The pauses before one thing is started again: none at first, longer ones where the starts follow closely."""
+    """Growing pauses between the restarts of one process; none before the first."""
 
     def __init__(self, what: str, steady_s: float = STEADY_S) -> None:
         self._what, self._steady_s = what, steady_s
         self._row = 0
-        self._running_since_s: float | None = None  # None: it has ended
+        self._running_since_s: float | None = None  # None: not running
 
     def started(self) -> None:
-        """Records a start, from which the next pause is computed."""
+        """Record a successful start."""
         self._running_since_s = time.monotonic()
 
     def pause_s(self, reason: str) -> float:
-        """Seconds to wait before the next start, after an exit or a failed start.
-
-        Raises CrashLoopError when it is one.
-        """
+        """Record an exit or a failed start. Return the seconds to wait before the next start. Raises CrashLoopError."""
         if self._running_since_s is not None and time.monotonic() - self._running_since_s >= self._steady_s:
             self._row = 0
-        self._running_since_s = None  # a start that failed does not count as running, however long it took
+        self._running_since_s = None  # a failed start does not count as running
         self._row += 1
         if self._row > MOST:
             got = f"{self._row} ends, each within {self._steady_s:g} s of a start; the last: {reason}"
@@ -57,7 +54,7 @@ class BackOff:
 
 
 class GatewayProcess:
-    """Runs the command line from ``start`` to ``stop``; ``look``, called often, starts it again when it has ended."""
+    """The gateway as a child process. ``look`` must be called often; it restarts an ended gateway."""
 
     def __init__(self, command: Sequence[str]) -> None:
         self._command = command
@@ -66,14 +63,14 @@ class GatewayProcess:
         self._due_s: float | None = None
 
     def start(self) -> None:
-        """Starts the gateway as a child process."""
+        """Start the process."""
         self._process = subprocess.Popen(
             self._command, stdin=subprocess.DEVNULL, preexec_fn=ending_with_parent(), start_new_session=True
         )
         self._back_off.started()
 
     def look(self) -> str | None:
-        """Starts the gateway again if it has ended, and gives why; None: it was not started. Raises CrashLoopError."""
+        """Restart an ended gateway. Return why it had ended; None: no restart. Raises CrashLoopError."""
         if self._process is None or self._process.poll() is None:
             return None
         why = f"exit status {self._process.returncode}"
@@ -86,18 +83,18 @@ class GatewayProcess:
         return why
 
     def stop(self) -> None:
-        """Lets the gateway answer the requests in flight, and ends it; by force after KILL_AFTER_S."""
+        """End the gateway after its requests in flight, by force after KILL_AFTER_S."""
         if self._process is not None:
             end(self._process)
 
 
 class Supervisor:
-    """Serves until a signal to stop comes. Run it in the main thread.
+    """Serves until a stop signal. For the main thread.
 
-    gateway: command line of a gateway that runs beside the server; None: there is none
-    status_port: of the status (``status``), on the server's host; None: there is none
-    canary_s, hang_s, triton_silent_s: as TritonWatch has them
-    say: takes what happened, a line each
+    gateway: command line of a gateway to run beside the server; None: no gateway
+    status_port: port of the status server, on Triton's host; None: no status server
+    canary_s, hang_s, triton_silent_s: see TritonWatch
+    say: prints a line about an event
     """
 
     def __init__(
@@ -122,17 +119,17 @@ class Supervisor:
         self._is_to_stop = threading.Event()
         self._new_back_off = partial(BackOff, "tritonserver", STEADY_S + hang_s)
         self._back_off = self._new_back_off()
-        self._watch: TritonWatch | None = None  # None: Triton is started, or has ended
-        self._served: dict[str, Config] | None = None  # last; None: nothing yet
-        self._left_out: dict[str, str] = {}  # models that kept ending Triton, and how
+        self._watch: TritonWatch | None = None  # None: Triton is starting, or has ended
+        self._served: dict[str, Config] | None = None  # configurations before the restart; None: first start
+        self._left_out: dict[str, str] = {}  # reasons by model that kept ending Triton
 
     def run(self) -> int:
-        """Gives Triton's exit status. Raises ServerStartError for what does not start, or ends again and again."""
+        """Serve. Return Triton's exit status. Raises ServerStartError for a failed start or a crash loop."""
         for path in cleanup.clear():
             self._say(f"removed {path}, which a server left that was killed")
         self._status.record(dict.fromkeys(self._server.models, "it is loaded"))
         for what in (TRITON, *self._server.models, *(() if self._gateway is None else (GATEWAY,))):
-            self._status.restarts.labels(what)  # 0, so that already the first is an increase
+            self._status.restarts.labels(what)  # begins at 0, so that the first restart is an increase
         port, host = self._status_port, self._server.endpoints.host
         with (
             stop_signals_to(self._stop),
@@ -142,7 +139,7 @@ class Supervisor:
 
     def _stop(self, number: int, _frame: FrameType | None) -> None:
         self._is_to_stop.set()
-        if self._watch is None:  # it loads, and would not look
+        if self._watch is None:  # Triton is loading
             self._server.signal(signal.SIGTERM if number == signal.SIGHUP else number)
 
     def _serve(self) -> int:
@@ -153,21 +150,18 @@ class Supervisor:
             while not self._is_to_stop.wait(POLL_S):
                 self._look()
         except ServerStartError:
-            if not self._is_to_stop.is_set():  # else it ended as it should
+            if not self._is_to_stop.is_set():
                 raise
         finally:
             self._status.record_down("it is stopping")
-            if self._gateway is not None:  # the gateway answers its requests in flight before the server stops
+            if self._gateway is not None:  # before the server stops, so that its requests in flight are answered
                 self._gateway.stop()
             self._close_watch()
             status = self._server.stop()
         return status
 
     def _start(self) -> None:
-        """Starts Triton, and looks after it from now on. Raises ServerStartError.
-
-        What was served before is served again, whatever was exported since.
-        """
+        """Start Triton with the versions that it served before, and watch it. Raises ServerStartError."""
         self._server.start_ready(self._served)
         if self._is_to_stop.is_set():
             return
@@ -179,7 +173,7 @@ class Supervisor:
         self._watch = self._new_watch(served=self._served or {})
 
     def _look(self) -> None:
-        """Starts again what has ended. Raises CrashLoopError."""
+        """Restart Triton or the gateway if it ended or has a fault. Raises CrashLoopError."""
         if self._watch is None:
             return
         if self._server.exit_status is not None:
@@ -194,16 +188,16 @@ class Supervisor:
             self._status.record({**self._left_out, **reasons})
 
     def _start_again(self, what: str, why: str) -> None:
-        """Returns when Triton is ready, or a signal has come. Raises CrashLoopError.
+        """Restart Triton; return when it is ready, or after a stop signal. Raises CrashLoopError.
 
-        what: the model that is to blame, or TRITON
+        what: the model with the fault, or TRITON
         """
         while not self._is_to_stop.is_set():
             self._count(what, why)
             self._close_watch()
             self._status.record_down(f"tritonserver is started again: {what}: {why}")
             self._server.kill()
-            self._server.stop()  # what is left of it
+            self._server.stop()
             try:
                 pause_s = self._back_off.pause_s(f"{what}: {why}")
             except CrashLoopError:
@@ -216,10 +210,10 @@ class Supervisor:
                 self._start()
                 return
             except ServerStartError as error:
-                what, why = error.model or what, str(error)  # Triton 2.51 itself ends with a process that loads
+                what, why = error.model or what, str(error)
 
     def _leaves_out(self, what: str, why: str) -> bool:
-        """True if others are served from now on, without the model ``what`` and what is made of it."""
+        """Leave out the model ``what`` and its ensembles. False if no other model is left."""
         served = self._served or {}
         left_out = [what, *(name for name, config in served.items() if what in parts_of(config))]
         others = {name: config for name, config in served.items() if name not in left_out}

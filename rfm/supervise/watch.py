@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Looks at a Triton that runs: what does it serve, which models are ready, and has something died or hung?
+"""Watch a running Triton: which models it serves, which are ready, and which fault it has.
 
 | fault | seen by |
 |---|---|
@@ -31,18 +31,18 @@ from rfm.supervise.probe import Probe, can_be_probed
 from rfm.supervise.status import NO_REASON, Status
 
 LOOK_S = 0.5
-LOOKS = 3  # without any answer, at least, before Triton is started again
+LOOKS = 3  # least number of looks without an answer before a restart
 
 _TIMEOUT_S = 1.5
 _INDEX_TIMEOUT_S = 5.0
-_PROGRESS = re.compile(  # counts that grow while a model gets on
+_PROGRESS = re.compile(  # counts that grow while a model makes progress
     r'^(?:nv_inference_request_success|rfm_forward_passes_total)\{[^}]*\bmodel="(?P<model>[^"]+)".*\} (?P<count>\S+)$',
     re.MULTILINE,
 )
 
 _PROGRAM = "triton_python_backend_stub"
 _PROGRAM_IN_KERNEL = _PROGRAM[:15]
-_STATES = {ZOMBIE: "a process of it is dead", STOPPED: "a process of it is stopped"}  # of a fault
+_STATES = {ZOMBIE: "a process of it is dead", STOPPED: "a process of it is stopped"}
 
 TRITON = "triton"
 UNKNOWN = ""  # the model of a process that died before the first look
@@ -51,18 +51,18 @@ logger = logging.getLogger(__name__)
 
 
 class ModelProcesses:
-    """The processes that Triton, ``triton_pid``, has started, one for each instance of a model, as /proc shows them.
+    """Model processes of one Triton, one for each instance, from /proc.
 
-    Triton does not notice that one is dead until it has a request for it, and keeps it as a zombie until then.
+    Triton notices a dead process only at its next request, and keeps it as a zombie until then.
     """
 
     def __init__(self, triton_pid: int) -> None:
         self._triton_pid = triton_pid
-        self._models: dict[int, str] = {}  # by process; of a zombie nothing can be read
+        self._models: dict[int, str] = {}  # by process; a zombie's command line is empty
         self._suspects: set[int] = set()
 
     def fault(self, settled: Collection[str]) -> tuple[str, str] | None:
-        """A model of ``settled`` with a process that is dead or stopped now and was so at the last look, and which."""
+        """A model of ``settled`` and the fault of its process: dead or stopped at this look and the last one."""
         states = self._states()
         suspects = {pid for pid, state in states.items() if state in _STATES and self._models[pid] in settled}
         confirmed = suspects & self._suspects
@@ -70,7 +70,7 @@ class ModelProcesses:
         return next(((self._models[pid], _STATES[states[pid]]) for pid in sorted(confirmed)), None)
 
     def _states(self) -> dict[int, str]:
-        """The states of the model processes; notes which model each runs."""
+        """State of each model process. Notes which model each runs."""
         states = {}
         for pid in children_of(self._triton_pid):
             stat = stat_of(pid)
@@ -88,12 +88,12 @@ class ModelProcesses:
 
 
 class TritonWatch:
-    """Looks every LOOK_S in a thread of its own, until it is closed.
+    """Looks at Triton every LOOK_S in a thread of its own, until it is closed.
 
-    canary_s: how often each model is probed
-    hang_s: how long a model may answer nothing before it counts as hung
-    silent_s: how long Triton may answer nothing to LOOKS looks in a row
-    served: configurations of what the server is to serve; more is found
+    canary_s: seconds between the probes of a model
+    hang_s: seconds without an answer after which a model counts as hung
+    silent_s: seconds without an answer after which Triton counts as silent
+    served: configurations of the models that the server should serve; others are found
     """
 
     def __init__(
@@ -115,18 +115,18 @@ class TritonWatch:
         self._processes = ModelProcesses(server.pid)
         self._probes: dict[str, Probe] = {}
         self._counts: dict[str, float] = {}
-        self._progress_s: dict[str, float] = {}  # when a model's count last grew
-        self._ready: dict[str, list[int]] = {}  # versions by model, as Triton last told
-        self._going: set[str] = set()  # that somebody loads or unloads
+        self._progress_s: dict[str, float] = {}  # time of a model's last progress
+        self._ready: dict[str, list[int]] = {}  # ready versions by model
+        self._going: set[str] = set()  # models that are loading or unloading
         self._leaving: set[str] = set()
         self.served = dict(served)
         self.reasons: dict[str, str] = dict.fromkeys(served, "it is loaded")
-        self.fault: tuple[str, str] | None = None  # of what, and which
+        self.fault: tuple[str, str] | None = None  # the model, or TRITON, and the reason
         self._closed = threading.Event()
         threading.Thread(target=self._run, name="rfm-watch", daemon=True).start()
 
     def close(self) -> None:
-        """End the looks and the probes."""
+        """Stop looking and probing."""
         self._closed.set()
 
     def _run(self) -> None:
@@ -150,10 +150,10 @@ class TritonWatch:
             num_failed, answered_s = 0, time.monotonic()
             try:
                 self._note_progress(text)
-                with suppress(*NO_ANSWER):  # while the threads of HTTP wait for models that are loaded
+                with suppress(*NO_ANSWER):  # Triton's HTTP threads may wait for a load
                     self._keep_up()
                 self.fault = self._dead() or self._probed()
-            except Exception:  # the next look may do better; without looks nothing would be healed
+            except Exception:  # the next look may succeed; without looks no fault is healed
                 logger.exception("an unexpected error")
 
     def _note_progress(self, metrics: str) -> None:
@@ -174,7 +174,7 @@ class TritonWatch:
         return next(((name, why) for name, why in probed.items() if why is not None), None)
 
     def _keep_up(self) -> None:
-        """Reads what Triton serves now. Raises one of NO_ANSWER."""
+        """Read Triton's index. Raises NO_ANSWER."""
         versions = versions_of(self._http.json(INDEX_PATH, _INDEX_TIMEOUT_S, "POST"))
         for model in {entry.name for entry in versions}:
             self._keep_up_with(model, [entry for entry in versions if entry.name == model])
@@ -187,7 +187,7 @@ class TritonWatch:
         if is_settled and ready != self._ready.get(model):
             path = f"/v2/models/{quote(model, safe='')}/versions/{max(ready)}/config"
             self.served[model] = serving_just(self._http.json(path), ready)
-            self._status.restarts.labels(model)  # 0, so that already the first is an increase
+            self._status.restarts.labels(model)  # begins at 0, so that the first restart is an increase
             before = self._probes.get(model)
             self._forget(model)
             if can_be_probed(self.served[model]):
@@ -205,13 +205,13 @@ class TritonWatch:
         self._leaving = self._leaving | {model} if is_unloaded else self._leaving - {model}
 
     def _forget(self, model: str) -> None:
-        """Ends the probes of a model whose processes are others now."""
+        """Stop probing a model that was reloaded or unloaded."""
         self._ready.pop(model, None)
         if model in self._probes:
             self._probes.pop(model).close()
 
     def _reason(self, model: str, versions: Collection[ModelVersion]) -> str:
-        """Why the model is not ready; NO_REASON if it is."""
+        """Reason why the model is not ready; NO_REASON if it is."""
         if model not in self._ready:
             told = [entry.reason for entry in versions if entry.name == model and entry.reason]
             return next(iter(told), "it is not loaded")
@@ -223,10 +223,10 @@ class TritonWatch:
 
 
 def parts_of(config: Config) -> list[str]:
-    """The models that an ensemble is made of; none of another model."""
+    """Models of an ensemble; empty for other models."""
     return [step["model_name"] for step in config.get("ensemble_scheduling", {}).get("step", [])]
 
 
 def serving_just(config: Config, versions: Sequence[int]) -> Config:
-    """A model's configuration, for these versions alone: a file may name others by now."""
+    """A model's configuration for these versions only."""
     return {**config, "version_policy": {"specific": {"versions": list(versions)}}}

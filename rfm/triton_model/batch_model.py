@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What every model.py has in common: the requests that Triton hands over are read, scored together and answered."""
+"""BatchModel, the base of every model.py: reads Triton's requests, scores them together, and answers each."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ from rfm_client.contract.named_frames import NamedFootage
 from rfm_client.contract.samples import Footage
 from rfm_client.contract.wire import Tensors
 
-GIVEN_UP_S = 0.1  # clients may have given up behind a batch that took longer; Triton 2.51 hands their requests over
+GIVEN_UP_S = 0.1  # after a longer batch, ask whether clients cancelled; Triton 2.51 still hands over their requests
 
 Question = TypeVar("Question")
 Answer = TypeVar("Answer")
-Scored: TypeAlias = list[tuple[Sequence[Request[Question]], Execution]]  # requests, and what was spent on them
+Scored: TypeAlias = list[tuple[Sequence[Request[Question]], Execution]]  # requests, and the cost of scoring them
 
 
 class BatchModel(Generic[Question, Answer]):
-    """Triton <-> a function from questions to answers. A request holds one or more questions.
+    """Adapter between Triton and a function from questions to answers. A request holds one or more questions.
 
-    A subclass says how a request's tensors are read (``decode``), what is done with a question when it comes
-    (``prepare``), how questions are answered (``answer``) and how the answers of one request are written (``encode``).
+    A subclass reads the tensors of a request (``decode``), checks and prepares each question (``prepare``), answers
+    questions (``answer``), and writes the answers of a request (``encode``).
 
-    A subclass that ``works_ahead`` has a ``Pipeline``, and says what it can do before a question's turn
-    (``work_ahead``). Any other scores in ``execute``.
+    A subclass that ``works_ahead`` scores in a ``Pipeline``, which calls ``work_ahead`` before a question's turn.
+    Others score in ``execute``.
     """
 
     def initialize(self, args: Mapping[str, str]) -> None:
@@ -56,7 +56,7 @@ class BatchModel(Generic[Question, Answer]):
         version = Path(args["model_repository"], args["model_version"])
         self._pipeline: Pipeline | None = None
         self._is_executing = False
-        self._batch_s = 0.0  # what the last batch took
+        self._batch_s = 0.0  # duration of the last batch
         self._guard = Guard(float(os.environ.get(HANG_VARIABLE) or DEFAULT_HANG_S), self._is_working)
         check_digest(version, settings.get(DIGEST_PARAMETER, ""))
         placement.run(lambda: self.load(version, placement.device, settings))
@@ -85,43 +85,43 @@ class BatchModel(Generic[Question, Answer]):
         self._guard.close()
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
-        """Loads the weights in the folder ``version`` onto ``device``."""
+        """Load the weights in the folder ``version`` onto ``device``."""
         raise NotImplementedError
 
     @property
     def works_ahead(self) -> bool:
-        """True if ``work_ahead`` is worth a thread; asked when the weights are loaded."""
+        """True if ``work_ahead`` is worth a thread. Read once, after ``load``."""
         return False
 
     def decode(self, tensors: Tensors) -> list[Question]:
-        """The questions of one request. Raises InvalidSampleError."""
+        """Questions of one request. Raises InvalidSampleError."""
         raise NotImplementedError
 
     def prepare(self, question: Question) -> tuple[Any, int]:
-        """What ``answer`` wants of a question, and its tokens, of which a batch has at most ``token_budget``. Cheap.
+        """The input of ``answer`` for a question, and its number of tokens, which ``token_budget`` bounds. Cheap.
 
         Raises RewardError for a question that cannot be answered.
         """
         return question, 0
 
     def work_ahead(self, prepared: Any) -> None:
-        """Does what takes long and can be done with a prepared question before its turn, in any thread, or never."""
+        """Do the slow part of a prepared question before its turn. Called in any thread, or never."""
 
     def answer(self, questions: Sequence[Any], execution: Execution) -> Sequence[Answer | RewardError]:
-        """One answer, or error, for each of the prepared questions. ``execution`` records what they took."""
+        """One answer or error for each prepared question. ``execution`` records their cost."""
         raise NotImplementedError
 
     def encode(self, answers: Sequence[Answer], tensors: Tensors, outputs: Collection[str]) -> Tensors:
-        """The requested outputs of one request whose inputs were ``tensors``."""
+        """Output tensors of one request. tensors: its inputs; outputs: names of the outputs to return"""
         raise NotImplementedError
 
     def execute(self, requests: Sequence[Any]) -> list[Any] | None:
-        """Called by Triton with requests. Gives their responses; None: they are sent when they are scored."""
+        """Called by Triton with requests. Return their responses; None: the pipeline sends them later."""
         batch: list[Request[Question]] = [Request.of(inference) for inference in requests]
         pipeline = self._pipeline
         if pipeline is None:
             return self._responses(batch, self._score)
-        if len(batch) == 1 and pipeline.is_idle:  # Triton hands the next request to another instance meanwhile
+        if len(batch) == 1 and pipeline.is_idle:  # cheaper than the pipeline
             return self._responses(batch, pipeline.run)
         for request, inference in zip(batch, requests, strict=True):
             request.outlive(inference)
@@ -147,8 +147,8 @@ class BatchModel(Generic[Question, Answer]):
         return responses
 
     def _read(self, request: Request[Question]) -> None:
-        """Decodes and prepares the questions of a request, or notes why it has none."""
-        if self._num_warmups and not request.request_id:  # Triton warms the instance up before it lets callers in
+        """Decode and prepare the questions of a request, or note its error."""
+        if self._num_warmups and not request.request_id:  # Triton warms up before it admits callers
             self._num_warmups -= 1
             request.is_counted = False
         if request.error is not None:
@@ -165,17 +165,17 @@ class BatchModel(Generic[Question, Answer]):
             request.num_tokens = sum(num_tokens)
         except RewardError as error:
             request.error = error
-        except Exception as error:  # noqa: BLE001  whatever went wrong with it costs no other its answer
+        except Exception as error:  # noqa: BLE001  fails this request alone
             request.fail(error)
 
     def _work_ahead(self, request: Request[Question]) -> None:
-        """Beside the scoring of others: what takes long of a request. What fails here fails again in its turn."""
+        """Do the slow part of a request while others are scored. An error comes again in its turn."""
         with suppress(Exception):
             for prepared in request.prepared:
                 self.work_ahead(prepared)
 
     def _score(self, batch: list[Request[Question]]) -> Scored[Question]:
-        """Gives each request its answers or its error, and tells what was spent on them."""
+        """Set the answers or the error of each request. Return the cost of scoring them."""
         may_have_given_up = self._batch_s > GIVEN_UP_S
         for request in batch:
             if may_have_given_up and request.error is None and request.is_cancelled():
@@ -191,7 +191,7 @@ class BatchModel(Generic[Question, Answer]):
         return scored
 
     def _scored(self, batch: list[Request[Question]]) -> Scored[Question]:
-        """Scores the requests together or, if that fails, each alone: what breaks one costs no other its answer."""
+        """Score the requests together or, if that fails, each alone, so that only the cause fails."""
         self._guard.step()
         execution = Execution(on_forward=self._guard.step)
         try:
@@ -199,7 +199,7 @@ class BatchModel(Generic[Question, Answer]):
             for request in batch:
                 request.answers = [next(answers) for _ in request.prepared]
                 request.error = _first_error(request.answers)
-        except Exception as error:  # noqa: BLE001  the request boundary: whatever happened, every request is answered
+        except Exception as error:  # noqa: BLE001  every request gets an answer or an error
             if len(batch) > 1:
                 _tell(self._log.report_batch, batch, error)
                 return [scored for request in batch for scored in self._scored([request])]
@@ -216,7 +216,7 @@ class BatchModel(Generic[Question, Answer]):
         if request.error is None:
             try:
                 return request.response(self.encode(request.answers, request.tensors, request.outputs))
-            except Exception as error:  # noqa: BLE001  whatever went wrong with it costs no other its answer
+            except Exception as error:  # noqa: BLE001  fails this request alone
                 request.fail(error)
         return request.error_response()
 
@@ -228,9 +228,7 @@ class BatchModel(Generic[Question, Answer]):
             _tell(self._metrics.add, part, execution)
 
     def _score_blank(self) -> None:
-        """Raises what an instance whose device is broken raises. A sample that is refused, or for which there is no
-        memory now, is an answer.
-        """
+        """Score the blank sample. Raises the errors of a broken device, not those of a refused sample."""
         try:
             questions = [self.prepare(question)[0] for question in self.decode(self._blank_tensors)]
         except InvalidSampleError:  # a checkpoint may refuse blank frames
@@ -239,32 +237,32 @@ class BatchModel(Generic[Question, Answer]):
 
 
 def _tell(tell: Callable[..., None], *what: Any) -> None:
-    """Logs or counts; a fault in that costs nobody an answer."""
+    """Call a function that logs or counts; print its errors, since requests must be answered all the same."""
     try:
         tell(*what)
-    except Exception:  # noqa: BLE001  whatever it is
+    except Exception:  # noqa: BLE001
         traceback.print_exc()
 
 
 def _first_error(answers: Sequence[Any]) -> RewardError | None:
-    """The first error of a request, located in it if it holds several questions."""
+    """First error of a request, with the index of its question if there are several."""
     errors = ((answer, index) for index, answer in enumerate(answers) if isinstance(answer, RewardError))
     return next((_located(*error, len(answers)) for error in errors), None)
 
 
 def _located(error: RewardError, index: int, count: int) -> RewardError:
-    """The error of the question ``index`` of a request of ``count`` questions."""
+    """An error with the index of its question, if the request has several."""
     return error.inside(f"samples[{index}]") if isinstance(error, InvalidSampleError) and count > 1 else error
 
 
 def _sample_types(input_names: Sequence[str]) -> list[str]:
-    """The types of samples that a model with these inputs scores."""
+    """Sample types that a model with these inputs scores."""
     of_samples = wire.SAMPLE_TYPE in input_names
     kinds = {name: not issubclass(kind, (Footage, NamedFootage)) for kind, name in SAMPLE_TYPES.items()}
     return [name for name, is_sample in kinds.items() if is_sample == of_samples]
 
 
 def _checkpoint(settings: Mapping[str, str]) -> dict[str, str]:
-    """Which checkpoint a model serves, as rfm_export wrote it down; of its network the class."""
+    """Labels of the served checkpoint: source, revision, digest, and the class of its network."""
     origin = {name: settings.get(name, "") for name in (SOURCE_PARAMETER, REVISION_PARAMETER, DIGEST_PARAMETER)}
     return {**origin, "network": json.loads(settings.get(NETWORK_PARAMETER) or "{}").get("class", "")}

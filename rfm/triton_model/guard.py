@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""A model process ends by itself when Triton has ended, when a batch hangs, and when its device is broken.
+"""The watchdog of a model process: ends it when Triton ended, a batch hangs, or the device is broken.
 
-``rfm serve`` sees that a model process has ended, and starts Triton again.
+``rfm serve`` notices the end and restarts Triton.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from typing import Any
 
 from rfm.triton_model.request import FAILED, SCORED, Request
 
-FAILED_BATCHES = 3  # in a row, before the blank sample is scored
+FAILED_BATCHES = 3  # failures in a row before the blank sample is scored
 _LOOK_S = 1.0
 _STDERR = 2
 
 
 class Guard:
-    """Ends the process. Starts a thread.
+    """Watches the process in a thread of its own, and ends it after a fault.
 
-    hang_s: seconds in which a batch may make no progress; a forward pass is progress
-    is_working: tells whether there is a batch
+    hang_s: longest time of a batch without progress; a forward pass is progress
+    is_working: returns True while there is a batch
     """
 
     def __init__(self, hang_s: float, is_working: Callable[[], bool]) -> None:
@@ -34,22 +34,22 @@ class Guard:
         self._is_working = is_working
         self.num_steps = 0  # forward passes and batches so far
         self._num_failed = 0
-        self._has_scored_blank = False  # else a failure of it says nothing
+        self._has_scored_blank = False  # only then a failure of the blank sample means a broken device
         self._closed = threading.Event()
         self._triton = os.getppid()
         self._thread = threading.Thread(target=self._watch, name="rfm-guard", daemon=True)
         self._thread.start()
 
     def step(self) -> None:
-        """Note progress: a batch has begun, or got one forward pass further."""
+        """Note progress: the start of a batch, or a forward pass."""
         self.num_steps += 1
 
     def look_at(self, batch: Iterable[Request[Any]], score_blank: Callable[[], None]) -> None:
-        """End the process if FAILED_BATCHES batches failed in a row and the blank sample fails, too.
+        """End the process if FAILED_BATCHES batches in a row failed and the blank sample fails, too.
 
-        Inputs may be the cause of failures, so the blank sample decides. The callers of the last batch ask again.
+        The blank sample decides, because inputs may cause failures. Callers of the last batch ask again.
 
-        score_blank: raises whatever goes wrong
+        score_blank: scores the blank sample; raises its errors
         """
         outcomes = {request.outcome for request in batch}
         if SCORED in outcomes:
@@ -62,17 +62,17 @@ class Guard:
         self._num_failed = 0
         try:
             score_blank()
-        except Exception:  # noqa: BLE001  whatever it is: the instance scored this before
+        except Exception:  # noqa: BLE001  any error: the instance scored this sample before
             end(f"instance is broken: the blank sample fails after {FAILED_BATCHES} failed batches")
 
     def close(self) -> None:
-        """End the thread that looks."""
+        """Stop the watchdog."""
         self._closed.set()
         self._thread.join()
         faulthandler.cancel_dump_traceback_later()
 
     def _watch(self) -> None:
-        """Arm Python's own timer again and again. It needs no lock of Python's, so any hang lets it run out."""
+        """Re-arm faulthandler's timer while there is progress. The timer needs no GIL, so it ends any hang."""
         seen, armed_s = -1, 0.0
         while not self._closed.is_set():
             is_getting_on = not self._is_working() or self.num_steps != seen
@@ -85,7 +85,7 @@ class Guard:
 
 
 def end(why: str) -> None:
-    """End the process at once, with the error that is being handled in the log."""
+    """Print the current exception and the reason, and end the process at once."""
     traceback.print_exc()
     print(f"rfm: the model process ends: {why}", file=sys.stderr, flush=True)
     os._exit(1)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The ``rfm_*`` metrics of a model instance, on Triton's metrics endpoint.
 
-To change one is a call to Triton's process, of some 20 us. So a thread makes these calls, every FLUSH_INTERVAL_S and
-with sums; what answers requests only adds up.
+An update is a call to Triton's process, of some 20 us. So requests only add up, and a thread reports the sums every
+FLUSH_INTERVAL_S.
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ FRAMES, RETRIES = "frames_total", "out_of_memory_retries_total"
 BATCH_SAMPLES, BATCH_PADDING = "batch_samples", "batch_padding_ratio"
 COLLATE_SECONDS, FORWARD_SECONDS = "collate_seconds", "forward_seconds"
 ENCODED, FOUND, MISSED = "frames_encoded_total", "feature_cache_hits_total", "feature_cache_misses_total"
-PASSES = "forward_passes_total"  # by which ``rfm serve`` knows that a batch does not hang
+PASSES = "forward_passes_total"  # progress, by which ``rfm serve`` tells a long batch from a hang
 
 _TOTALS = {
     FRAMES: "Frames scored.",
-    RETRIES: "Forward passes that ran out of memory and were tried again in halves.",
+    RETRIES: "Forward passes that ran out of memory and were repeated in halves.",
     ENCODED: "Frames that went through an encoder or a vision tower.",
-    FOUND: "Frames of a batch, each once, whose features were kept.",
+    FOUND: "Distinct frames of a batch whose features were in the cache.",
     PASSES: "Forward passes, and batches begun.",
-    MISSED: "Frames of a batch, each once, whose features were not kept, and had to be made.",
+    MISSED: "Distinct frames of a batch whose features were not in the cache.",
 }
 _HISTOGRAMS = {
     BATCH_SAMPLES: ("Samples of one execution.", SAMPLES_BUCKETS),
     BATCH_PADDING: ("Share of the token slots of an execution's forward passes that were padding.", PADDING_BUCKETS),
-    COLLATE_SECONDS: ("Of one execution, in which batches were made and no forward pass ran.", BUCKETS_S),
-    FORWARD_SECONDS: ("Of one execution's forward passes.", BUCKETS_S),
+    COLLATE_SECONDS: ("Time of one execution outside of its forward passes.", BUCKETS_S),
+    FORWARD_SECONDS: ("Time of one execution's forward passes.", BUCKETS_S),
 }
 
 
 class InstanceMetrics:
-    """The metrics of one instance; to be closed. Whatever goes wrong with them is logged once, and fails no request.
+    """Metrics of one instance. Must be closed. Errors of metrics are logged once and fail no request.
 
-    labels: the labels that name the instance
+    labels: labels of the instance
     checkpoint: labels of rfm_checkpoint_info
-    sample_types: the types of samples that the model scores
-    num_steps: gives how many forward passes were made so far
+    sample_types: sample types that the model scores
+    num_steps: returns the number of forward passes so far
     """
 
     def __init__(
@@ -61,12 +61,12 @@ class InstanceMetrics:
         num_steps: Callable[[], int],
     ) -> None:
         self._num_steps, self._num_told_steps = num_steps, num_steps()
-        self._lock = threading.Lock()  # of what was added, and is not told yet
+        self._lock = threading.Lock()  # of the sums below
         self._samples: Counter[tuple[str, str]] = Counter()
         self._totals: Counter[str] = Counter()
         self._observed: list[tuple[str, float]] = []
         self._kept_bytes = 0
-        self._families: list[Any] = []  # a metric dies with its family
+        self._families: list[Any] = []  # keeps their metrics alive
         self._has_failed = False
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
@@ -79,7 +79,7 @@ class InstanceMetrics:
         self._thread.start()
 
     def add(self, batch: Iterable[Request[Any]], execution: Execution) -> None:
-        """Counts a batch that ``execution`` was spent on, as far as it is callers'."""
+        """Count a batch and its cost, without warm-ups and probes."""
         if self._thread is None:
             return
         counted = [request for request in batch if request.is_counted]
@@ -95,7 +95,7 @@ class InstanceMetrics:
                 self._totals[MISSED] += execution.num_encoded
                 self._kept_bytes = execution.cache_bytes or self._kept_bytes
             num_executed = sum(len(request.answers) for request in counted)
-            if num_executed and execution.num_slots:  # a forward pass was spent on a caller
+            if num_executed and execution.num_slots:  # a forward pass for a caller
                 self._observed += [
                     (BATCH_SAMPLES, num_executed),
                     (BATCH_PADDING, execution.padding_ratio),
@@ -104,16 +104,16 @@ class InstanceMetrics:
                 ]
 
     def close(self) -> None:
-        """Returns when Triton knows all that was added, and that the checkpoint is served no more."""
+        """Report the last sums, and that the checkpoint is no longer served."""
         if self._thread is not None:
             self._closing.set()
             self._thread.join()
             self._flush(is_served=False)
 
     def _make_all(self, labels: dict[str, str], checkpoint: Mapping[str, str], sample_types: Collection[str]) -> None:
-        """Makes the metrics in Triton's process. They outlive this one, and go on where a model is loaded again."""
-        samples = self._family("samples_total", "COUNTER", "Samples, by what became of the request that they were in.")
-        self._sample_metrics = {  # all at once, so that already the first failure is an increase
+        """Create the metrics in Triton's process. They outlive this process and continue after a reload."""
+        samples = self._family("samples_total", "COUNTER", "Samples, by the outcome of their request.")
+        self._sample_metrics = {  # all at once, so that the first failure is an increase
             (sample_type, outcome): samples.Metric(labels={**labels, "sample_type": sample_type, "outcome": outcome})
             for sample_type in (*sample_types, UNKNOWN_TYPE)
             for outcome in OUTCOMES
@@ -125,7 +125,7 @@ class InstanceMetrics:
             name: self._family(name, "HISTOGRAM", told).Metric(labels=labels, buckets=list(buckets))
             for name, (told, buckets) in _HISTOGRAMS.items()
         }
-        kept = self._family("feature_cache_bytes", "GAUGE", "Bytes of the features that are kept.")
+        kept = self._family("feature_cache_bytes", "GAUGE", "Bytes of cached features.")
         self._kept_metric = kept.Metric(labels=labels)
         info = self._family("checkpoint_info", "GAUGE", "1: the checkpoint is served.")
         model = {name: labels[name] for name in ("model", "version")}
@@ -144,7 +144,7 @@ class InstanceMetrics:
             self._flush(is_served=True)
 
     def _flush(self, *, is_served: bool) -> None:
-        """Tells Triton what was added since."""
+        """Report the sums since the last call."""
         with self._lock:
             samples, self._samples = self._samples, Counter()
             totals, self._totals = self._totals, Counter()
@@ -165,7 +165,7 @@ class InstanceMetrics:
 
     def _show(self, *, is_served: bool) -> None:
         self._kept_metric.set(self._kept_bytes)
-        # Every time: where a model is reloaded, the instance that goes says 0 when the one that comes has said 1.
+        # Every time: after a reload the old instance sets 0 after the new one has set 1.
         self._checkpoint_metric.set(float(is_served))
 
     def _log_once(self) -> None:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Requests are prepared, scored and replied to, each beside the others. No Triton in it.
+"""A pipeline that prepares, scores and answers requests at the same time. Independent of Triton.
 
-For models whose samples take long to prepare: a device that scores has the next batch ready. Other models score in
-``execute``, which takes half as much CPU time for a request.
+For models whose samples take long to prepare: while the device scores, the next batch is prepared. Other models score
+in ``execute``, which takes half of the CPU time for a request.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from rfm.triton_model.request import Request
 
 
 class Pipeline:
-    """Scores what is prepared the moment it can, in the order in which it came. To be closed.
+    """Scores prepared requests in their order, as soon as they are ready. Must be closed.
 
-    prepare: what takes long of one request, in any of the placement's threads; what it raises is ignored
-    score: of a batch, always in the same thread: libgomp has a team of threads for each thread that computes
-    reply: with what ``score`` gave
-    max_samples, max_tokens: of one batch; a larger request is a batch of its own
+    prepare: does the slow part of one request, in one of the placement's threads; its errors are ignored
+    score: scores a batch, always in the same thread, since libgomp keeps a team of threads for each computing thread
+    reply: sends the results of ``score``
+    max_samples, max_tokens: bounds of a batch; a larger request is a batch of its own
     An exception of ``score`` or ``reply`` ends the process.
     """
 
@@ -43,10 +43,9 @@ class Pipeline:
         self._max_samples, self._max_tokens = max_samples, max_tokens
         self._changed = threading.Condition()
         self._waiting: deque[tuple[Request[Any], Future[None]]] = deque()
-        self._call: Callable[[], None] | None = None  # that ``run`` waits for
+        self._call: Callable[[], None] | None = None  # work of ``run`` for the scoring thread
         self._is_scoring = self._is_closed = False
-        self._scored: SimpleQueue[Any] = SimpleQueue()  # None: there will be no more
-        # On a GPU there is a thread for each core of the instance.
+        self._scored: SimpleQueue[Any] = SimpleQueue()  # None ends it
         self._preparing = ThreadPoolExecutor(placement.num_preparing, "rfm-prepare", partial(use_threads, 1))
         self._threads = [
             threading.Thread(target=_to_the_end, args=(stage,), name=f"rfm-{name}", daemon=True)
@@ -57,19 +56,19 @@ class Pipeline:
 
     @property
     def is_idle(self) -> bool:
-        """True if no request waits and none is scored."""
+        """True if no request waits or is scored."""
         with self._changed:
             return not (self._is_scoring or self._waiting)
 
     def put(self, requests: Iterable[Request[Any]]) -> None:
-        """Take requests in. Returns when no more than one batch waits behind the one that is scored."""
+        """Add requests. Returns when less than one batch waits."""
         with self._changed:
             self._waiting += [(request, self._preparing.submit(self._prepare, request)) for request in requests]
             self._changed.notify_all()
             self._changed.wait_for(self._has_room)
 
     def run(self, requests: list[Request[Any]]) -> Any:
-        """Score requests that are not prepared in the scoring thread, which is idle, and give what ``score`` gave."""
+        """Score requests in the idle scoring thread, without preparing them first. Return the result of ``score``."""
         future: Future[Any] = Future()
         with self._changed:
             self._call = lambda: future.set_result(self._score(requests))
@@ -78,7 +77,7 @@ class Pipeline:
         return future.result()
 
     def close(self) -> None:
-        """Return when all requests have been replied to."""
+        """Answer all requests, then stop the threads."""
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()
@@ -87,7 +86,7 @@ class Pipeline:
         self._preparing.shutdown()
 
     def _has_room(self) -> bool:
-        """True if what waits is less than a batch."""
+        """True if less than a batch waits."""
         num_samples = sum(request.num_samples for request, _ in self._waiting)
         num_tokens = sum(request.num_tokens for request, _ in self._waiting)
         return not self._waiting or (num_samples < self._max_samples and num_tokens < self._max_tokens)
@@ -110,8 +109,8 @@ class Pipeline:
         self._scored.put(None)
 
     def _next_batch(self) -> list[Request[Any]]:
-        """The first request, once it is prepared, and those behind it that are prepared and fit into its batch."""
-        self._waiting[0][1].exception()  # waits; what is wrong with a request shows in its turn
+        """Wait for the first request; return it with the next ones that are prepared and fit into its batch."""
+        self._waiting[0][1].exception()  # waits; an error of preparing comes again in its turn
         with self._changed:
             batch = [self._waiting.popleft()[0]]
             num_samples, num_tokens = batch[0].num_samples, batch[0].num_tokens
@@ -132,5 +131,5 @@ class Pipeline:
 def _to_the_end(stage: Callable[[], None]) -> None:
     try:
         stage()
-    except BaseException:  # noqa: BLE001  whatever it is: nothing would be answered any more
+    except BaseException:  # noqa: BLE001  without this stage no request is answered
         end("its pipeline has failed")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""On which device, and with how many CPU threads, an instance of a model computes."""
+"""Device and CPU threads of a model instance."""
 
 from __future__ import annotations
 
@@ -17,44 +17,44 @@ from rfm.parameters import THREADS_PARAMETER
 
 @dataclass(frozen=True)
 class Placement:
-    """device: of the network; num_threads: of PyTorch on the CPU"""
+    """Device of the network, and number of PyTorch's CPU threads."""
 
     device: torch.device
     num_threads: int
 
     @property
     def num_preparing(self) -> int:
-        """Threads that prepare samples beside the scoring, which needs the CPU itself unless it is on a GPU."""
+        """Threads that prepare samples beside the scoring: all of them on a GPU, else one."""
         return self.num_threads if self.device.type == "cuda" else 1
 
     @classmethod
     def of(cls, args: Mapping[str, str], config: Mapping[str, Any], settings: Mapping[str, str]) -> Placement:
-        """Where Triton places an instance; ``args`` of ``initialize``. All instances share the machine's cores."""
+        """Placement of an instance, from the arguments of ``initialize``. Instances share the machine's cores."""
         on_gpu = args["model_instance_kind"] == "GPU"
         num_threads = int(settings[THREADS_PARAMETER]) or max(torch.get_num_threads() // num_instances(config), 1)
         device = torch.device("cuda", int(args["model_instance_device_id"])) if on_gpu else torch.device("cpu")
         return cls(device, num_threads)
 
     def apply(self) -> None:
-        """To be called in each thread that computes: both settings are a thread's own."""
+        """Apply the settings to the calling thread. Every thread that computes must call it."""
         use_threads(self.num_threads)
         keep_float32()
         use(self.device)
 
     def run(self, work: Callable[[], None]) -> None:
-        """Does the work in a thread of its own. When that ends, its OpenMP threads end, too."""
-        use_threads(1)  # in the thread that calls
+        """Do the work in a temporary thread, whose OpenMP threads end with it."""
+        use_threads(1)  # for the calling thread
         with ThreadPoolExecutor(1, "rfm-load") as thread:
             thread.submit(self.apply).result()
             thread.submit(work).result()
 
 
 def use_threads(number: int) -> None:
-    """Has PyTorch compute with so many threads in the calling thread."""
-    torch.get_num_threads()  # at first it takes over what any thread has set last, even after ``set_num_threads``
+    """Set the number of PyTorch's threads for the calling thread."""
+    torch.get_num_threads()  # else the first use takes over the number of another thread
     torch.set_num_threads(number)
 
 
 def num_instances(config: Mapping[str, Any]) -> int:
-    """Instances of a model, on all its devices; ``config``: its configuration as Triton gives it."""
+    """Number of instances of a model on all its devices. config: the model's configuration from Triton"""
     return sum(group["count"] * max(len(group.get("gpus", [])), 1) for group in config["instance_group"])

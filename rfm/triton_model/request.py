@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One request: what it asks and what became of it."""
+"""One request of Triton: its questions, and their answers or its error."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ SAMPLE_TYPES = {
     Footage: "encode",
     NamedFootage: "encode",
 }
-UNKNOWN_TYPE = "unknown"  # of the samples of a request that could not be decoded
+UNKNOWN_TYPE = "unknown"  # sample type of a request that could not be decoded
 
 
 class CancelledError(RewardError):
-    """The client has cancelled the request: nothing waits for its answer."""
+    """The client cancelled the request."""
 
 
 @dataclass(eq=False)
 class Request(Generic[Question]):
-    """A request of Triton's, and what came of it so far.
+    """A request of Triton, and its state.
 
-    request_id: the id that the client chose; empty if it chose none
-    outputs: names of the outputs that the client wants
-    is_cancelled: asks Triton whether the client has cancelled, which takes 0.1 ms
-    is_counted: whether metrics count it: a caller sent it, no warm-up and no health probe
-    sender: Triton's, which takes the response; None: ``execute`` returns the response
-    num_tokens: of all its samples, known when they are prepared
-    questions, prepared, answers: as many each, or none yet
-    error: why it has no answer; None: it has one, or may get one
+    request_id: the client's id of the request; may be empty
+    outputs: names of the requested outputs
+    is_cancelled: asks Triton whether the client cancelled, in 0.1 ms
+    is_counted: False for warm-ups and probes, which metrics leave out
+    sender: Triton's response sender; None: ``execute`` returns the response
+    num_tokens: tokens of all samples; 0 before they are prepared
+    questions, prepared, answers: equally long, or still empty
+    error: reason why there is no answer; None: answered, or not yet scored
     """
 
     request_id: str
@@ -69,19 +69,19 @@ class Request(Generic[Question]):
 
     @classmethod
     def of(cls, inference: Any) -> Request[Question]:
-        """The request that Triton hands over as ``inference``. Its tensors are views of Triton's memory."""
+        """The request of Triton's ``inference``. Its tensors are views of Triton's memory."""
         request_id = inference.request_id()
         is_counted = not request_id.startswith(PROBE_PREFIX)
         request = cls(request_id, inference.requested_output_names(), inference.is_cancelled, is_counted)
         try:
             request.tensors = {tensor.name(): tensor.as_numpy() for tensor in inference.inputs()}
             request.num_samples = len(request.tensors[wire.NUM_FRAMES])
-        except Exception as error:  # noqa: BLE001  whatever went wrong with it costs no other its answer
+        except Exception as error:  # noqa: BLE001  fails this request alone
             request.fail(error)
         return request
 
     def outlive(self, inference: Any) -> None:
-        """Prepare for an answer after ``execute``, when Triton's memory of the tensors may be gone."""
+        """Copy the tensors and take a response sender, for an answer after ``execute`` returned."""
         self.sender = inference.get_response_sender()
         self.is_cancelled = self.sender.is_cancelled
         try:
@@ -90,18 +90,18 @@ class Request(Generic[Question]):
             self.fail(error)
 
     def fail(self, cause: Exception) -> None:
-        """Note that something went wrong of which clients need not know more."""
+        """Set a neutral error; the cause goes to the log."""
         self.error = InferenceFailedError("scoring failed; the server's log has the reason")
         self.error.__cause__ = cause
 
     def response(self, outputs: wire.Tensors) -> Any:
-        """Triton's response of these tensors."""
+        """Triton's response with these tensors."""
         import triton_python_backend_utils as pb_utils
 
         return pb_utils.InferenceResponse([pb_utils.Tensor(name, array) for name, array in outputs.items()])
 
     def error_response(self) -> Any:
-        """Triton's response of the error, of which the log knows more than the client."""
+        """Triton's response with the error."""
         import triton_python_backend_utils as pb_utils
 
         kinds = pb_utils.TritonError
@@ -109,26 +109,26 @@ class Request(Generic[Question]):
         return pb_utils.InferenceResponse(error=kinds(str(self.error), codes[self.outcome]))
 
     def send(self, response: Any) -> None:
-        """Send the response, which is the only one to this request."""
+        """Send the only response to this request."""
         import triton_python_backend_utils as pb_utils
 
         self.sender.send(response, flags=pb_utils.TRITONSERVER_RESPONSE_COMPLETE_FINAL)
 
     @property
     def sample_types(self) -> Counter[str]:
-        """How many samples of each type it asks about."""
+        """Number of samples by type."""
         if not self.questions:
             return Counter({UNKNOWN_TYPE: self.num_samples})
         return Counter(SAMPLE_TYPES[type(question)] for question in self.questions)
 
     @property
     def num_frames(self) -> int:
-        """Frames of all trajectories that it asks about."""
-        return sum(trajectory.num_frames for question in self.questions for trajectory in question.trajectories)  # type: ignore[attr-defined]  # all questions have some
+        """Frames of all trajectories."""
+        return sum(trajectory.num_frames for question in self.questions for trajectory in question.trajectories)  # type: ignore[attr-defined]
 
     @property
     def outcome(self) -> str:
-        """How the request ended: one of OUTCOMES."""
+        """One of OUTCOMES."""
         if self.error is None:
             return SCORED
         if isinstance(self.error, CancelledError):

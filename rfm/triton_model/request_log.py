@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a model says in Triton's log of requests that have no answer: one JSON object a line (docs/logs.md)."""
+"""Log of requests without scores: a JSON object a line in Triton's log (docs/reference/logs_and_metrics.md)."""
 
 from __future__ import annotations
 
@@ -12,29 +12,28 @@ from rfm.triton_model.request import FAILED, Request
 
 
 class RequestLog:
-    """Writes with ``labels``, which name the model.
+    """Writes entries with ``labels``, which name the model.
 
-    What failed is an error. What was refused or cancelled is only written where Triton's verbose log is on, so that
-    no client can fill the log.
+    Failures are errors. Refused and cancelled requests need Triton's verbose log, so that no client can fill the log.
     """
 
     def __init__(self, labels: Mapping[str, str]) -> None:
         self._labels = dict(labels)
 
     def report(self, request: Request[Any]) -> None:
-        """Writes down what became of a request that has an error."""
+        """Log a request that has an error."""
         assert request.error is not None
         sample_types = ",".join(sorted(request.sample_types))
         fields = {"request_id": request.request_id, "sample_type": sample_types, "error": str(request.error)}
         self._write(f"request_{request.outcome}", fields, request.error.__cause__, is_error=request.outcome == FAILED)
 
     def report_batch(self, batch: Sequence[Request[Any]], error: Exception) -> None:
-        """Writes down that requests failed together. Each is served alone then."""
+        """Log requests that failed together; each is scored alone afterwards."""
         fields = {"request_ids": [request.request_id for request in batch], "error": repr(error)}
         self._write("batch_failed", fields, error, is_error=True)
 
     def note(self, text: str) -> None:
-        """Writes down what the one who serves the model may want to know."""
+        """Log a remark for the operator."""
         import triton_python_backend_utils as pb_utils
 
         pb_utils.Logger.log_info(json.dumps({"event": "note", **self._labels, "note": text}))

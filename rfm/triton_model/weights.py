@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Are a served version's weights those that were exported?"""
+"""Check that a version's weights are those of its export."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from rfm_client.contract.model_info import DIGEST_PARAMETER
 
 
 def check_digest(version: Path, expected: str) -> None:
-    """Raises CheckpointError if the weights in the folder ``version`` are not those that were exported.
+    """Raises CheckpointError if the weights in the folder ``version`` changed after the export.
 
-    expected: the digest in the model's configuration, which may be that of a newer version. Each version folder keeps
-    the configuration of its own export. Empty: the export named none
+    expected: digest in the model's configuration; may be empty. The configuration in the version folder wins, since the
+    model's may be of a newer version
     """
     kept = version / "config.pbtxt"
     if is_there(kept):
@@ -29,7 +29,7 @@ def check_digest(version: Path, expected: str) -> None:
 
 
 def _digest_in(file: Path) -> str:
-    """The digest that an exported configuration names; empty if it names none."""
+    """Digest of the weights in an exported configuration; may be empty."""
     try:
         config = text_format.Parse(file.read_text(), pb.ModelConfig())
     except (OSError, ValueError, text_format.ParseError) as error:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """config.yaml of a vision-language training run: the settings that weights do not hold.
 
-docs/checkpoints.md lists every setting, and what decides it where the file lacks its key.
+docs/reference/checkpoints.md lists every setting, and what decides it where the file lacks its key.
 """
 
 from __future__ import annotations

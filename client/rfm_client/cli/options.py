@@ -119,7 +119,7 @@ class VideoOptions(Settings):
     subsample: bool = setting(True, "Score no more frames than the checkpoint was trained on, evenly spaced; else all.")
     resize: bool = setting(False, "Make frames as small as the checkpoint reads them, then send.")
     orient: Orientation = setting(
-        "none", "Turn frames upright before they are scored (see docs/guides/label-a-dataset.md)."
+        "none", "Turn frames upright before they are scored (see docs/guides/label_a_dataset.md)."
     )
 
 
@@ -136,7 +136,7 @@ class PrefixOptions(Settings):
         most=MAX_FRAME_STEPS,
     )
     sampling: Rule | None = setting(
-        None, "Rule by which each frame is scored on its prefix (see docs/guides/sampling.md)."
+        None, "Rule by which each frame is scored on its prefix (see docs/guides/choose_frames.md)."
     )
     frames: int | None = setting(None, "Frames that the rule shows the model; else as many as in training.", least=1)
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Which frames of an episode a model is shown when the newest is frame t: the rules in use, by name.
 
-``docs/guides/sampling.md`` has them in a table, with who uses which. No rule shows a frame after t.
+``docs/guides/choose_frames.md`` has them in a table, with who uses which. No rule shows a frame after t.
 
 Shapes: K frames that the rule shows, S slots of the sample that is sent, T frames of the episode.
 """
