@@ -23,7 +23,7 @@ _SHORTEST_S, _LONGEST_S = 0.001, 86_400.0  # a day
 
 @dataclass(frozen=True)
 class GatewayConfig(Settings):
-    """Where a gateway listens, whom it asks and lets in, and what it takes on; docs/reference/gateway.md has the reasons.
+    """Where a gateway listens, whom it asks and lets in, and what it takes on; see docs/reference/gateway.md.
 
     Where it listens and whom it asks may be None: ``rfm serve`` and ``rfm gateway`` have different defaults for that.
     """

@@ -43,7 +43,7 @@ class Probe:
         threading.Thread(target=self._run, name=f"rfm-probe-{model}", daemon=True).start()
 
     def close(self) -> None:
-        """Stop probing."""
+        """End the probes and their thread."""
         self._closed.set()
 
     def fault(self, progress_s: float) -> str | None:

@@ -63,7 +63,7 @@ class GatewayProcess:
         self._due_s: float | None = None
 
     def start(self) -> None:
-        """Start the process."""
+        """Start the gateway as a child process."""
         self._process = subprocess.Popen(
             self._command, stdin=subprocess.DEVNULL, preexec_fn=ending_with_parent(), start_new_session=True
         )

@@ -126,7 +126,7 @@ class TritonWatch:
         threading.Thread(target=self._run, name="rfm-watch", daemon=True).start()
 
     def close(self) -> None:
-        """Stop looking and probing."""
+        """End the looks and the probes."""
         self._closed.set()
 
     def _run(self) -> None:

@@ -66,7 +66,7 @@ class Guard:
             end(f"instance is broken: the blank sample fails after {FAILED_BATCHES} failed batches")
 
     def close(self) -> None:
-        """Stop the watchdog."""
+        """End the watchdog and its thread."""
         self._closed.set()
         self._thread.join()
         faulthandler.cancel_dump_traceback_later()

@@ -116,7 +116,7 @@ class Request(Generic[Question]):
 
     @property
     def sample_types(self) -> Counter[str]:
-        """Number of samples by type."""
+        """Number of samples of each type."""
         if not self.questions:
             return Counter({UNKNOWN_TYPE: self.num_samples})
         return Counter(SAMPLE_TYPES[type(question)] for question in self.questions)
@@ -124,11 +124,11 @@ class Request(Generic[Question]):
     @property
     def num_frames(self) -> int:
         """Frames of all trajectories."""
-        return sum(trajectory.num_frames for question in self.questions for trajectory in question.trajectories)  # type: ignore[attr-defined]
+        return sum(trajectory.num_frames for question in self.questions for trajectory in question.trajectories)  # type: ignore[attr-defined]  # all questions have trajectories
 
     @property
     def outcome(self) -> str:
-        """One of OUTCOMES."""
+        """Outcome of the request, one of OUTCOMES."""
         if self.error is None:
             return SCORED
         if isinstance(self.error, CancelledError):

@@ -35,7 +35,7 @@ pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
 PROMETHEUS = ROOT / "docker" / "prometheus"
 GRAFANA = ROOT / "docker" / "grafana"
-RUNBOOKS = ROOT / "docs" / "operations.md"
+RUNBOOKS = ROOT / "docs" / "guides" / "operate.md"
 
 INTERVALS = {"15s": "1s", "1m": "10s"}  # of the files, and what they are here
 EMBEDDING_DIMS = (64, 32)  # D and Dt of the demo's checkpoint
