@@ -74,15 +74,17 @@ MIXED: list[Sample] = [
 ]
 
 
-@pytest.mark.parametrize("name", [PLAIN, "q25_video_avg_disc10"])
+@pytest.mark.parametrize("name", [PLAIN, "q25_video_avg_disc10", "smol_mean_disc10"])
+@pytest.mark.slow
 def test_batches_that_are_collated_while_others_are_scored_have_the_cpu_s_scores(seen: Seen, name: str) -> None:
     engine = engine_there(name, feature_cache_mb=1)
     engine.token_budget = 100
     for _ in range(2):  # the second time, what was made of frames is kept on the device
         for result, expected in zip(engine.evaluate(MIXED), load_engine(name).evaluate(MIXED), strict=True):
             assert_close(result, expected, 1e-5)
-    assert seen.calls.count("Stream") == 1
-    assert {"pin_memory", "stream", "wait_stream", "record_stream"} <= {*seen.calls}
+    if not name.startswith("smol"):
+        assert seen.calls.count("Stream") == 1
+        assert {"pin_memory", "stream", "wait_stream", "record_stream"} <= {*seen.calls}
 
 
 def test_a_lack_of_memory_frees_what_pytorch_keeps(seen: Seen, monkeypatch: pytest.MonkeyPatch) -> None:
