@@ -55,8 +55,7 @@ def test_a_device_gives_the_reference_answers_and_waits_no_more_often_than_it_mu
         pytest.skip("SmolVLM is refused with transformers 5")
     engine = engine_there(config.name)
     cases = [case for case in config.cases() if not case.is_refused]
-    of_each_kind = {case.content["kind"]: case for case in cases}.values()
-    for case in of_each_kind:
+    for case in [*cases[:1], *(case for case in cases if "mixed" in case.file.stem)]:
         for result, expected in zip(engine.evaluate(case.samples()), case.expected(), strict=True):
             goldens.check(result, expected, case.tolerances)
     assert seen.num_operators > 100

@@ -95,7 +95,7 @@ def test_config_yaml_of_another_run_above_the_checkpoint_is_refused(
 
 @pytest.mark.parametrize("config", [VlmConfig, RewindConfig])
 def test_what_decides_each_setting_is_documented(config: type[VlmConfig | RewindConfig]) -> None:
-    documented = (ROOT / "docs" / "checkpoints.md").read_text()
+    documented = next((ROOT / "docs").rglob("checkpoints.md")).read_text()
     assert [field.name for field in fields(config) if f"`{field.name}`" not in documented] == []
 
 
@@ -232,10 +232,6 @@ SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
         lambda folder: ((folder / "config.json").unlink(), (folder / "config.yaml").unlink())[0],
         r"max_len: expected it in config.json or model.rewind of config.yaml, got it in neither",
     ),
-    "pickle": (
-        lambda folder: torch.save(take_weights(folder), folder / "pytorch_model.bin"),
-        r"expected model.safetensors, got pytorch_model.bin: .*refused\. .*weights_only=True lets .*: python -c \"import",
-    ),
     "no weights": (
         lambda folder: (folder / "model.safetensors").unlink(),
         r"expected model.safetensors or .*, got config.*: a checkpoint's folder has it, beside config.json",
@@ -344,7 +340,8 @@ def test_the_conversion_that_the_refusal_of_a_pickle_names_works(folder: Path, s
     spoil(folder)
     for state in STATES:
         torch.save({"state": {}}, folder / state)
-    with pytest.raises(CheckpointError, match=re.escape(f"expected model.safetensors, got {named}: pickles may run")):
+    expected = rf"expected model\.safetensors, got {re.escape(named)}: pickles may run .* weights_only=True lets "
+    with pytest.raises(CheckpointError, match=expected):
         families.load(folder)
     convert(families.load, folder)
     assert_same(families.load(folder), before)
@@ -439,11 +436,9 @@ def test_yaml_constructs_nothing(folder: Path, tmp_path: Path) -> None:
 
 TAGS = {
     "the highest score": (["best-x-0.5-step-10", "best-x-0.75-step-5", "main"], "best-x-0.75-step-5"),
-    "negative scores": (["best-loss--0.9-step-1", "best-loss--0.2-step-2"], "best-loss--0.2-step-2"),
-    "the first of equals": (["best-a-0.5-step-1", "best-b-0.5-step-2"], "best-a-0.5-step-1"),
+    "the first of equals, below 0": (["best-a--0.2-step-9", "best-b--0.2-step-2", "best-c--0.9-step-2"], "best-a--0.2-step-9"),
     "none": (["v1", "best-0.5", "best-a-1-step-2"], None),
-    "no tags": ([], None),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("tags", "expected"), TAGS.values(), ids=TAGS)

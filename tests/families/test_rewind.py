@@ -17,7 +17,7 @@ from rfm.config import DEFAULT_TOKEN_BUDGET
 from rfm.engine import Engine, Outcome
 from rfm.engine.layers import progress_from_logits
 from rfm.engine.predictor import prefix_indices
-from rfm.rewind.network import RewindBatch, RewindConfig, RewindTransformer, rounded_up
+from rfm.rewind.network import Packing, RewindBatch, RewindConfig, RewindTransformer, rounded_up
 from rfm.rewind.predictor import MAX_EMBEDDING, RewindCollator, RewindPredictor
 from rfm_client import (
     InferenceFailedError,
@@ -259,6 +259,10 @@ def test_frames_that_many_rows_show_are_in_a_batch_once() -> None:
     samples = (ProgressSample(trajectory(0, 5), frame_steps=4), PreferenceSample(same, same))
     batch = collator.collate([row for sample in samples for row in collator.rows(sample)])
     assert len(batch.video) == rounded_up(5 + 3)
+
+
+def test_rows_of_one_length_need_no_mask() -> None:
+    assert Packing.of(np.array([4, 4])).mask is None
 
 
 def test_counts_are_rounded_up_to_one_of_few() -> None:

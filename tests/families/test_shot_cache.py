@@ -78,7 +78,7 @@ def assert_scored(outcome: Any, plain: Engine, frames: UInt8Array, frame_steps: 
 def test_an_episode_has_the_scores_of_the_whole_and_each_shot_is_encoded_once(name: str, rule: Rule) -> None:
     cached, plain = of_both(name)
     sampling = Sampling(rule, 4 if rule in TAKE_A_NUMBER else None)
-    frames, execution = frames_of(0, 18 if name == MODELS[0] else 12), Execution()  # pad16 takes 16 of more
+    frames, execution = frames_of(0, 18 if "16" in rule else 8), Execution()  # pad16 takes 16 of more
     per_shot, shown, num_shown = predictor_of(cached).collator.frames_per_shot, set(), 0
     for step in range(len(frames)):
         window = frames[sampling.prefix(step).indices]
@@ -109,9 +109,9 @@ def test_a_cache_that_holds_nothing_changes_no_score(name: str) -> None:
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
 def test_a_cache_that_evicts_at_every_step_changes_no_score(name: str) -> None:
     cache = FeatureCache[Any](3 * 56 * 84 * 3 + 2 * BYTES_PER_MB // 100)
-    frames, unknown = frames_of(2, 10), 0
+    frames, unknown = frames_of(2, 8), 0
     cached, plain = of_both(name, cache)
-    for stop in range(4, 11):
+    for stop in range(4, 9):
         window = frames[stop - 4 : stop]
         outcome = ask(cached, named(window, window[-1:]))
         if isinstance(outcome, RewardError):

@@ -37,7 +37,7 @@ from vlm import BFLOAT16, PLAIN, assert_close, film, load, predictor_of, upstrea
 PIXEL_TOLERANCE = 1e-6  # relative, of a sum over all pixels
 
 
-SMOL = "smol_mean_disc10"
+SMOL, ON_VIDEOS = "smol_mean_disc10", f"{PLAIN} on videos"
 MIXED_TOLERANCE = 5e-6  # seen: 1e-6
 
 
@@ -171,16 +171,16 @@ def test_a_mixture_over_the_wire_equals_its_samples_alone(served: Served) -> Non
             assert_close(result, load_engine(model).evaluate([sample])[0], MIXED_TOLERANCE)
 
 
-def on_videos(name: str) -> VlmPredictor:
-    """A checkpoint that reads images, as if it had been trained on videos."""
+def changed(name: str, **settings: Any) -> VlmPredictor:
+    """A checkpoint as if it had been trained with other settings."""
     checkpoint = load(name)
-    config = replace(checkpoint.config, multi_image=False, per_frame_progress_token=False)
-    return replace(checkpoint, config=config).predictor(torch.device("cpu"))
+    return replace(checkpoint, config=replace(checkpoint.config, **settings)).predictor(torch.device("cpu"))
 
 
 TWO_SIZES: dict[str, Callable[[], VlmPredictor]] = {
     **{config.name: partial(predictor_of, config.name) for config in goldens.VLM if not config.is_bfloat16},
-    f"{PLAIN} on videos": lambda: on_videos(PLAIN),
+    ON_VIDEOS: lambda: changed(PLAIN, multi_image=False, per_frame_progress_token=False),
+    "attention of one token": lambda: changed("q25_attention_disc10", pooling_temperature=1e-5),
 }
 
 
@@ -259,7 +259,7 @@ def test_the_task_is_not_a_template() -> None:
     assert "'put {task} there'" in tokens.tokenizer.decode(row.input_ids)
 
 
-ASKED_AGAIN = {name: TWO_SIZES[name] for name in (PLAIN, "q25_video_last_l2", SMOL, f"{PLAIN} on videos")}
+ASKED_AGAIN = {name: TWO_SIZES[name] for name in (PLAIN, "q25_video_last_l2", SMOL, ON_VIDEOS)}
 
 
 @pytest.mark.parametrize("make", ASKED_AGAIN.values(), ids=ASKED_AGAIN)

@@ -32,13 +32,12 @@ class Seen:
     """What was done on the device.
 
     asked: by operator, how often the host waited for a value or a size
-    awaited: copies to the device for which the host waited; sent: those for which it did not
+    awaited: copies to the device for which the host waited
     calls: of CUDA's own functions, in order
     """
 
     asked: Counter[str] = field(default_factory=Counter)
     awaited: int = 0
-    sent: int = 0
     num_operators: int = 0
     calls: list[str] = field(default_factory=list)
 
@@ -117,8 +116,7 @@ def computed(func: Any, args: Any, kwargs: dict[str, Any], seen: Seen) -> Any:
         raise RuntimeError(f"{name}: expected all tensors to be on the same device, got cuda and cpu")
     crosses = is_copy and (bool(here) if target == "cuda" else bool(there))
     if crosses and target == "cuda":
-        waits = not named.get("non_blocking") or not all(hasattr(each, "pinned_here") for each in here)
-        seen.awaited, seen.sent = seen.awaited + waits, seen.sent + (not waits)
+        seen.awaited += not named.get("non_blocking") or not all(hasattr(each, "pinned_here") for each in here)
     masks = any(each.dtype is torch.bool for each in tree_flatten(named.get("indices", ()))[0] if each is not None)
     grows = name == "repeat_interleave" and named.get("output_size") is None
     if (crosses and target == "cpu") or name in _ASKS or masks or grows:
