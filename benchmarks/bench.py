@@ -13,20 +13,22 @@ within a round are what is compared. Callers run on the same cores.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
+import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
-from typing import Any
 
 import report
 import torch
 from contestants import DEMO, PEERS, VLM_BASE, VLM_CHECKPOINT, BareEngine, Contestant, checkpoint, peer, running
 from load import SHARED_MEMORY, Load
+from report import Row
 
 import rfm_export
 from rfm.config import ExportConfig
@@ -92,8 +94,7 @@ TritonPythonModel.load = load
 
 def servers(arguments: argparse.Namespace, folder: Path) -> None:
     """This server's ways, the bare engine and the peers, for both sizes of a checkpoint."""
-    rows: list[dict[str, Any]] = []
-    scenarios = {**SCENARIOS, **(FULL if arguments.full else {})}
+    rows: list[Row] = []
     for size in arguments.sizes:
         measured = checkpoint(size, folder)
         bare = BareEngine(measured)
@@ -104,55 +105,52 @@ def servers(arguments: argparse.Namespace, folder: Path) -> None:
             stack.enter_context(running(command, port, folder / f"gateway_{size}.log"))
             urls = dict.fromkeys(OURS, ends.grpc_url) | {"HTTP": ends.http_url, "gateway": f"http://127.0.0.1:{port}"}
             options = {"checkpoint": measured.folder, "threads": measured.threads}
-            addresses = {way: _given(url) for way, url in urls.items()}
+            addresses = {way: nullcontext(url) for way, url in urls.items()}
             addresses |= {name: peer(name, options, folder / f"{name}_{size}.log") for name in PEERS}
             made = {way: Contestant(way, server, measured.widths) for way, server in addresses.items()}
             for contestant in made.values():
                 stack.enter_context(contestant)
-            for name, (load, ways, with_peers) in scenarios.items():
+            for name, (load, ways, with_peers) in (SCENARIOS | (FULL if arguments.full else {})).items():
                 if load.frame_px and size != "small":
                     continue
-                chosen = {way: one for way, one in made.items() if way in ways or (with_peers and way in PEERS)}
+                asked = [way for way in made if way in ways or (with_peers and way in PEERS)]
+                batches = (
+                    () if load.frame_px else (1,) if load.callers == 1 else (1, 8, 32)
+                )  # it takes embeddings alone
+                alone = replace(load, rate_per_s=0, seconds=arguments.seconds)
                 for number in range(arguments.rounds):
-                    of_round = {
-                        f"bare engine, batch {batch}": bare.measure(
-                            replace(load, rate_per_s=0, seconds=arguments.seconds), batch
-                        )
-                        for batch in ((1,) if load.callers == 1 else (1, 8, 32))
-                    }
-                    best = max(of_batch["samples_per_s"] for of_batch in of_round.values())
+                    of_bare = {f"bare engine, batch {batch}": bare.measure(alone, batch) for batch in batches}
+                    best = max((told["samples_per_s"] for told in of_bare.values()), default=0.0)
                     now = replace(load, seconds=arguments.seconds, rate_per_s=load.rate_per_s * best)
-                    ahead = {way: one.measure(now) for way, one in chosen.items()}
-                    rows += _rows({"checkpoint": size, "load": name}, number, ahead | of_round)
-    told = "This server beside the bare engine and its alternatives\nRatio: of samples/s, to this server over gRPC."
-    report.write("results", told, rows, ("checkpoint", "load", "way"), "samples_per_s", arguments.output)
+                    told = {way: made[way].measure(now) for way in asked}
+                    rows += _rows({"checkpoint": size, "load": name}, number, told | of_bare)
+    about = "This server beside the bare engine and its alternatives\nRatio: of samples/s, to this server over gRPC."
+    report.write("results", about, rows, ("checkpoint", "load", "way"), "samples_per_s", arguments.output)
 
 
 def commits(arguments: argparse.Namespace, folder: Path) -> None:
     """This server at several commits, and mosec."""
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     for size in arguments.sizes:
         measured = checkpoint(size, folder)
         base = str(VLM_BASE) if size == "vlm" else ""
+        made = {}
+        for name, python in (word.split("=", 1) for word in arguments.server):
+            (place := folder / f"{size}_{name}").mkdir()
+            words = [python, "-c", COMMIT, str(measured.folder), base, str(measured.threads), str(place)]
+            made[name] = Contestant("gRPC", _commit(words), measured.widths)
+        if not base:
+            options = {"checkpoint": measured.folder, "threads": measured.threads}
+            made["mosec"] = Contestant("mosec", peer("mosec", options, folder / "mosec.log"), measured.widths)
+        load = Load(1, arguments.seconds, (8, 8) if base else UNIFORM, frame_px=256 if base else 0)
         with ExitStack() as stack:
-            made = {}
-            for name, python in (word.split("=", 1) for word in arguments.server):
-                place = folder / f"{size}_{name}"
-                place.mkdir()
-                words = [python, "-c", COMMIT, str(measured.folder), base, str(measured.threads), str(place)]
-                made[name] = Contestant("gRPC", _commit(words), measured.widths)
-            if size != "vlm":
-                options = {"checkpoint": measured.folder, "threads": measured.threads}
-                made["mosec"] = Contestant("mosec", peer("mosec", options, folder / "mosec.log"), measured.widths)
             for contestant in made.values():
                 stack.enter_context(contestant)
-            load = Load(1, arguments.seconds, (8, 8) if base else UNIFORM, frame_px=256 if base else 0)
-            for number in range(arguments.rounds):
-                for callers in arguments.callers:
-                    of_round = {way: one.measure(replace(load, callers=callers)) for way, one in made.items()}
-                    rows += _rows({"checkpoint": size, "callers": callers}, number, of_round)
-    told = "Before and after\nRatio: of samples/s, to the first server's."
-    report.write("before_after", told, rows, ("checkpoint", "callers", "way"), "samples_per_s", arguments.output)
+            for number, callers in itertools.product(range(arguments.rounds), arguments.callers):
+                told = {way: one.measure(replace(load, callers=callers)) for way, one in made.items()}
+                rows += _rows({"checkpoint": size, "callers": callers}, number, told)
+    about = "Before and after\nRatio: of samples/s, to the first server's."
+    report.write("before_after", about, rows, ("checkpoint", "callers", "way"), "samples_per_s", arguments.output)
 
 
 def accelerator(arguments: argparse.Namespace, folder: Path) -> None:
@@ -165,49 +163,41 @@ def accelerator(arguments: argparse.Namespace, folder: Path) -> None:
         "this server, one instance": (source, config, BATCH_S, ROW_S),
         "this server, frames": (VLM_CHECKPOINT, of_vlm, 0.0, VLM_ROW_S),
     }
-    rows: list[dict[str, Any]] = []
+    made, ledgers = {}, {}
+    for name, (of, settings, batch_s, row_s) in ours.items():
+        place = folder / _path(name)
+        rfm_export.export(of, place / "repository", settings)
+        (model,) = (place / "repository").glob("*/1/model.py")
+        told = {"peers": sys.path[0], "file": str(place / "ledger"), "batch_s": batch_s, "row_s": row_s}
+        model.write_text(model.read_text() + SIMULATED.format(**told))
+        made[name] = Contestant("gRPC", _ours(place), (64, 32))
+    for name in ("LitServe", "mosec"):
+        copied = shutil.copytree(source, folder / name / "checkpoint")
+        (copied / SIMULATION).write_text(json.dumps([str(folder / name / "ledger"), BATCH_S, ROW_S]))
+        made[name] = Contestant(name, peer(name, {"checkpoint": copied}, folder / f"{name}.log"), (64, 32))
+    loads = [("embeddings", Load(callers, arguments.seconds, UNIFORM)) for callers in arguments.callers]
+    for callers, px in ((16, 256), (4, 256), (16, 480)):
+        loads.append((f"frames of {px} x {px}", Load(callers, 2 * arguments.seconds, (8, 8), frame_px=px)))
+    rows: list[Row] = []
     with ExitStack() as stack:
-        made, ledgers = {}, {}
-        for name, (of, settings, batch_s, row_s) in ours.items():
-            place = folder / name
-            rfm_export.export(of, place / "repository", settings)
-            (model,) = (place / "repository").glob("*/1/model.py")
-            told = {"peers": sys.path[0], "file": str(place / "ledger"), "batch_s": batch_s, "row_s": row_s}
-            model.write_text(model.read_text() + SIMULATED.format(**told))
-            ledgers[name] = Ledger(place / "ledger")
-            made[name] = Contestant("gRPC", _ours(place), (64, 32))
-        for name in ("LitServe", "mosec"):
-            copied = folder / name / "checkpoint"
-            copied.mkdir(parents=True)
-            for file in source.iterdir():
-                (copied / file.name).symlink_to(file)
-            (copied / SIMULATION).write_text(json.dumps([str(folder / name / "ledger"), BATCH_S, ROW_S]))
-            ledgers[name] = Ledger(folder / name / "ledger")
-            server = peer(name, {"checkpoint": copied, "threads": 1}, folder / f"{name}.log")
-            made[name] = Contestant(name, server, (64, 32))
-        for contestant in made.values():
+        for name, contestant in made.items():
+            ledgers[name] = Ledger(folder / _path(name) / "ledger")
             stack.enter_context(contestant)
-        loads = [("embeddings", Load(callers, arguments.seconds, UNIFORM)) for callers in arguments.callers]
-        for callers, px in ((16, 256), (4, 256), (16, 480)):
-            loads.append((f"frames of {px} x {px}", Load(callers, 2 * arguments.seconds, (8, 8), frame_px=px)))
-        for number in range(arguments.rounds):
-            for name, load in loads:
-                of_round = {}
-                for way, contestant in made.items():
-                    if ("frames" in way) == bool(load.frame_px):
-                        busy_s, _ = ledgers[way].read()
-                        measured = contestant.measure(load)
-                        busy = (ledgers[way].read()[0] - busy_s) / measured["took_s"]
-                        of_round[way] = {"busy": busy, **measured}
-                rows += _rows({"load": name, "callers": load.callers}, number, of_round)
-    told = (
+        for number, (name, load) in itertools.product(range(arguments.rounds), loads):
+            of_round = {}
+            for way in (way for way in made if ("frames" in way) == bool(load.frame_px)):
+                before_s = ledgers[way].busy_s()
+                told = made[way].measure(load)
+                of_round[way] = {"busy": (ledgers[way].busy_s() - before_s) / told["took_s"], **told}
+            rows += _rows({"load": name, "callers": load.callers}, number, of_round)
+    about = (
         f"A simulated accelerator: {1e3 * BATCH_S:g} ms a batch and {1e3 * ROW_S:g} ms a sample, asleep\n"
         f"busy: share of the time. Frames: 8 a sample, a tiny checkpoint on Qwen3-VL, {1e3 * VLM_ROW_S:g} ms a sample."
     )
-    report.write("accelerator", told, rows, ("load", "callers", "way"), folder=arguments.output)
+    report.write("accelerator", about, rows, ("load", "callers", "way"), folder=arguments.output)
 
 
-def _rows(of: dict[str, Any], number: int, measured: dict[str, dict[str, float]]) -> list[dict[str, Any]]:
+def _rows(of: Row, number: int, measured: Mapping[str, Row]) -> list[Row]:
     """A row a way, shown as it comes."""
     rows = [{**of, "way": way, "round": number, **figures} for way, figures in measured.items()]
     rates = ", ".join(f"{row['way']} {row['samples_per_s']:.0f}" for row in rows)
@@ -215,9 +205,9 @@ def _rows(of: dict[str, Any], number: int, measured: dict[str, dict[str, float]]
     return rows
 
 
-@contextmanager
-def _given(url: str) -> Iterator[str]:
-    yield url
+def _path(way: str) -> str:
+    """Triton takes none with spaces."""
+    return way.replace(" ", "_")
 
 
 @contextmanager
@@ -242,7 +232,8 @@ def _commit(words: list[str]) -> Iterator[str]:
 def main() -> None:
     """Measures, writes and shows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["servers", "accelerator", "commits"], nargs="?", default="servers")
+    programs = {each.__name__: each for each in (servers, accelerator, commits)}
+    parser.add_argument("what", choices=programs, nargs="?", default="servers")
     parser.add_argument("--full", action="store_true", help="servers: all loads, half an hour instead of eight minutes")
     parser.add_argument("--server", action="append", default=[], metavar="NAME=PYTHON", help="commits: one of them")
     parser.add_argument("--rounds", type=int, default=5)
@@ -252,9 +243,8 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=report.RESULTS, help="folder for the results")
     arguments = parser.parse_args()
     torch.set_num_threads(torch.get_num_threads())
-    measure = {"servers": servers, "accelerator": accelerator, "commits": commits}[arguments.what]
     with TemporaryDirectory(prefix="rfm-bench-") as folder:
-        measure(arguments, Path(folder))
+        programs[arguments.what](arguments, Path(folder))
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ from rfm_commands.config import Config
 
 HERE = Path(__file__).parent
 DEMO = HERE.parent / "model_repository"
+DEMO_ENCODERS = {f"{kind}_encoder": str(DEMO / "rfm_encoder" / "1" / f"{kind}_encoder") for kind in ("image", "text")}
 VLM = HERE.parent / "tests" / "golden" / "vlm"
 VLM_CHECKPOINT, VLM_BASE = VLM / "q3_tok_disc10" / "checkpoint", VLM / "bases" / "q3"
 PEERS = {"FastAPI": "fastapi_server.py", "LitServe": "litserve_server.py", "mosec": "mosec_server.py"}
@@ -57,14 +58,13 @@ class Checkpoint:
     widths: tuple[int, int]
 
 
-def checkpoint(size: str, folder: Path, threads: int = 0) -> Checkpoint:
+def checkpoint(size: str, folder: Path) -> Checkpoint:
     """``small``: the demo's, as it is served there; ``default``: random weights; ``vlm``: a tiny one on Qwen3-VL."""
-    repository, threads = folder / f"repository_{size}", threads or torch.get_num_threads()
+    repository, threads = folder / f"repository_{size}", torch.get_num_threads()
     settings = ExportConfig(num_gpus=0, torch_threads=threads)
     if size == "small":
-        source, encoders = DEMO / "rfm" / "1" / "checkpoint", DEMO / "rfm_encoder" / "1"
-        folders = {f"{kind}_encoder": str(encoders / f"{kind}_encoder") for kind in ("image", "text")}
-        settings, widths = replace(Config.from_yaml(DEMO / "serve.yaml").export, **folders), (64, 32)
+        source, widths = DEMO / "rfm" / "1" / "checkpoint", (64, 32)
+        settings = replace(Config.from_yaml(DEMO / "serve.yaml").export, **DEMO_ENCODERS)
     elif size == "vlm":
         source, widths, settings = VLM_CHECKPOINT, (0, 0), replace(settings, base_model=str(VLM_BASE))
     else:

@@ -219,6 +219,11 @@ def _peak_bytes(what: str, checkpoint: Path) -> int:
     return int(peak_kib) * 1024
 
 
+def checkpoint(arguments: argparse.Namespace) -> None:
+    """Writes one of 4B parameters."""
+    write_checkpoint(arguments.folder, arguments.base_model)
+
+
 def write_checkpoint(folder: Path, base_model: str, layers: int = ALL_LAYERS) -> None:
     """Writes model.safetensors, config.json and config.yaml. base_model: folder or id whose tokenizer is used"""
     from safetensors.torch import save_file
@@ -250,19 +255,17 @@ def write_checkpoint(folder: Path, base_model: str, layers: int = ALL_LAYERS) ->
 def main() -> None:
     """Measures, writes and shows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["forward", "preparation", "loading", "checkpoint"])
+    programs = {each.__name__: each for each in (forward, preparation, loading, checkpoint)}
+    parser.add_argument("what", choices=programs)
     parser.add_argument("folder", type=Path, nargs="?", help="checkpoint: where it is written")
     parser.add_argument("--base-model", help="checkpoint: folder or id whose tokenizer is used")
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--output", type=Path, default=report.RESULTS, help="folder for the results")
     parser.add_argument("--one", help=argparse.SUPPRESS)  # of loading: prints the peak
     arguments = parser.parse_args()
-    if arguments.what == "checkpoint":
-        if arguments.folder is None or arguments.base_model is None:
-            parser.error("checkpoint: expected FOLDER and --base-model")
-        write_checkpoint(arguments.folder, arguments.base_model)
-        return
-    {"forward": forward, "preparation": preparation, "loading": loading}[arguments.what](arguments)
+    if arguments.what == "checkpoint" and None in (arguments.folder, arguments.base_model):
+        parser.error("checkpoint: expected FOLDER and --base-model")
+    programs[arguments.what](arguments)
 
 
 if __name__ == "__main__":

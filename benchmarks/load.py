@@ -14,6 +14,7 @@ import json
 import sys
 import time
 from collections.abc import AsyncIterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import asdict, dataclass
 
@@ -29,6 +30,7 @@ from rfm_client import (
     ProgressResult,
     ProgressSample,
     Result,
+    RewardClient,
     Sample,
     SimilaritySample,
     Trajectory,
@@ -45,7 +47,7 @@ PEERS = {
     "LitServe": lambda session, url: clients.by_msgpack(session, f"{url}/predict"),
     "mosec": lambda session, url: clients.by_msgpack(session, f"{url}/inference"),
 }
-SHARED_MEMORY = "shared memory"
+SHARED_MEMORY, THREADS = "shared memory", "threads"  # ways; of threads each has one call at a time
 
 
 @dataclass(frozen=True)
@@ -111,9 +113,16 @@ async def connected(way: str, url: str) -> AsyncIterator[Ask]:
         ) as session:
             yield PEERS[way](session, url)
         return
-    async with AsyncRewardClient(
-        url, shared_memory=way == SHARED_MEMORY, max_in_flight=IN_FLIGHT, retry=False
-    ) as client:
+    if way == THREADS:
+        with RewardClient(url, max_in_flight=IN_FLIGHT, retry=False) as blocking:
+
+            async def ask_blocking(samples: Sequence[Sample]) -> list[float]:
+                return [_score(result) for result in blocking.evaluate(samples)]
+
+            yield ask_blocking
+        return
+    memory = way == SHARED_MEMORY
+    async with AsyncRewardClient(url, shared_memory=memory, max_in_flight=IN_FLIGHT, retry=False) as client:
 
         async def ask(samples: Sequence[Sample]) -> list[float]:
             return [_score(result) for result in await client.evaluate(samples)]
@@ -127,8 +136,8 @@ def _score(result: Result) -> float:
     return result.preference if isinstance(result, PreferenceResult) else result.similarity
 
 
-async def measure(ask: Ask, load: Load, asked: Sequence[Sample]) -> Measured:
-    """Asks for ``load.seconds``."""
+async def measure(ask: Ask, load: Load, asked: Sequence[Sample], *, threads: bool = False) -> Measured:
+    """Asks for ``load.seconds``; each caller in a task, or in a thread of its own."""
     latencies_s: list[float] = []
     failed = 0
     started_s = time.perf_counter()
@@ -155,6 +164,9 @@ async def measure(ask: Ask, load: Load, asked: Sequence[Sample]) -> Measured:
             await asyncio.sleep(max(moment_s - time.perf_counter(), 0))
             calls.append(asyncio.create_task(answered(index, moment_s)))
         await asyncio.gather(*calls)
+    elif threads:
+        with ThreadPoolExecutor(load.callers) as pool:
+            list(pool.map(lambda index: asyncio.run(call(index)), range(load.callers)))
     else:
         await asyncio.gather(*map(call, range(load.callers)))
     took_s = time.perf_counter() - started_s
@@ -170,7 +182,7 @@ async def main(way: str, url: str, video_dim: int, text_dim: int) -> None:
             asked = samples(load, video_dim, text_dim)
             for sample in asked[:3]:  # connections are made, and each type has been answered once
                 await ask([sample])
-            print(json.dumps(asdict(await measure(ask, load, asked))), flush=True)
+            print(json.dumps(asdict(await measure(ask, load, asked, threads=way == THREADS))), flush=True)
 
 
 if __name__ == "__main__":

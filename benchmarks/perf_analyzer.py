@@ -16,7 +16,7 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -57,7 +57,7 @@ def main() -> None:
         bare = BareEngine(measured)
         with (
             temporary_server(measured.repository, folder / "triton.log") as endpoints,
-            Contestant("gRPC", _given(endpoints.grpc_url), measured.widths) as callers,
+            Contestant("gRPC", nullcontext(endpoints.grpc_url), measured.widths) as callers,
         ):
             for kind, load in KINDS.items():
                 write_perf_analyzer_input(folder / "requests.json", samples(load, *measured.widths))
@@ -103,11 +103,6 @@ def _figures(told: Mapping[str, str], best: float, ours: float) -> dict[str, flo
     times_ms = {name: float(told[column]) / 1e3 for name, column in names.items()}
     rates = {"samples_per_s": rate, "of_the_bare_engine": rate / best, "of_our_generator": rate / ours}
     return {**rates, **times_ms, "compute_ms": compute_us / 1e3}
-
-
-@contextmanager
-def _given(url: str) -> Iterator[str]:
-    yield url
 
 
 def _program(given: Path | None, folder: Path) -> tuple[Path, dict[str, str]]:

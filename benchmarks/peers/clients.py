@@ -11,17 +11,27 @@ from __future__ import annotations
 import asyncio
 import io
 import json
-from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import aiohttp
 import msgpack
 import numpy as np
 
-from rfm_client import PreferenceSample, ProgressSample, Sample, Trajectory
+from rfm_client import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 
 Ask: TypeAlias = Callable[[Sequence[Sample]], Awaitable[list[float]]]
 
+KINDS: dict[type, str] = {
+    ProgressSample: "progress",
+    PreferenceSample: "preference",
+    SimilaritySample: "similarity",
+}
+NAMES: dict[type, tuple[str, ...]] = {  # of their trajectories, as the evaluation server has them
+    ProgressSample: ("trajectory",),
+    PreferenceSample: ("chosen_trajectory", "rejected_trajectory"),
+    SimilaritySample: ("ref_trajectory", "sim_trajectory"),
+}
 _MSGPACK = {"Content-Type": "application/msgpack"}
 
 
@@ -42,7 +52,7 @@ def by_msgpack(session: aiohttp.ClientSession, url: str) -> Ask:
     async def ask_one(sample: Sample) -> float:
         videos = [_video(trajectory) for trajectory in sample.trajectories]
         message = {
-            "type": _kind(sample),
+            "type": KINDS[type(sample)],
             "shapes": [video.shape for video in videos],
             "video": b"".join(video.tobytes() for video in videos),
             "text": _text(sample.trajectories[0]).tobytes(),
@@ -62,21 +72,6 @@ def by_msgpack(session: aiohttp.ClientSession, url: str) -> Ask:
     return ask
 
 
-def _kind(sample: Sample) -> str:
-    if isinstance(sample, ProgressSample):
-        return "progress"
-    return "preference" if isinstance(sample, PreferenceSample) else "similarity"
-
-
-def _named(sample: Sample) -> dict[str, Trajectory]:
-    """The trajectories under the evaluation server's names."""
-    if isinstance(sample, ProgressSample):
-        return {"trajectory": sample.trajectory}
-    if isinstance(sample, PreferenceSample):
-        return {"chosen_trajectory": sample.first, "rejected_trajectory": sample.second}
-    return {"ref_trajectory": sample.reference, "sim_trajectory": sample.other}
-
-
 def _video(trajectory: Trajectory) -> np.ndarray:
     assert trajectory.video_embeddings is not None
     return trajectory.video_embeddings
@@ -87,24 +82,19 @@ def _text(trajectory: Trajectory) -> np.ndarray:
     return trajectory.text_embedding
 
 
-def _arrays(sample: Sample) -> Iterator[tuple[str, str, np.ndarray]]:
-    """Each array, with the names of its trajectory and of its own."""
-    for name, trajectory in _named(sample).items():
-        yield name, "video_embeddings", _video(trajectory)
-        yield name, "text_embedding", _text(trajectory)
-
-
 def _form(samples: Sequence[Sample]) -> aiohttp.FormData:
     """A request of the multipart endpoint."""
     form = aiohttp.FormData()
     for index, sample in enumerate(samples):
-        described: dict[str, Any] = {"sample_type": _kind(sample)}
-        for name, kind, array in _arrays(sample):
-            key = f"sample_{index}_{name}_{kind}"
-            file = io.BytesIO()
-            np.save(file, array)
-            form.add_field(key, file.getvalue(), filename=f"{key}.npy", content_type="application/octet-stream")
-            described.setdefault(name, {})[kind] = {"__numpy_file__": key}
+        described: dict[str, Any] = {"sample_type": KINDS[type(sample)]}
+        for name, trajectory in zip(NAMES[type(sample)], sample.trajectories, strict=True):
+            arrays = {"video_embeddings": _video(trajectory), "text_embedding": _text(trajectory)}
+            keys = {kind: f"sample_{index}_{name}_{kind}" for kind in arrays}
+            for kind, key in keys.items():
+                file = io.BytesIO()
+                np.save(file, arrays[kind])
+                form.add_field(key, file.getvalue(), filename=f"{key}.npy", content_type="application/octet-stream")
+            described[name] = {kind: {"__numpy_file__": key} for kind, key in keys.items()}
         form.add_field(f"sample_{index}", json.dumps(described))
     return form
 
@@ -116,4 +106,4 @@ def _scores(samples: Sequence[Sample], outputs: Mapping[str, Any]) -> list[float
         "preference": iter((outputs["outputs_preference"] or {}).get("prediction_probs", ())),
         "similarity": iter((outputs["outputs_similarity"] or {}).get("sim_score_ref_sim", ())),
     }
-    return [float(next(told[_kind(sample)])) for sample in samples]
+    return [float(next(told[KINDS[type(sample)]])) for sample in samples]

@@ -10,6 +10,7 @@ no lock.
 
 from __future__ import annotations
 
+import argparse
 import fcntl
 import json
 import mmap
@@ -37,10 +38,17 @@ from rfm_client import (
 )
 
 SIMULATION = "simulated.json"
-_LEDGER = struct.Struct("<dQ")  # seconds in forward passes, rows in them
-
-
+_LEDGER = struct.Struct("<d")  # seconds in forward passes
 _PAIRS = {"preference": PreferenceSample, "similarity": SimilaritySample}
+
+
+def options(told: str | None) -> argparse.Namespace:
+    """Of a peer's command line."""
+    parser = argparse.ArgumentParser(description=told, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--checkpoint", required=True, help="checkpoint folder")
+    parser.add_argument("--port", type=int, required=True)
+    parser.add_argument("--threads", type=int, default=1, help="of torch")
+    return parser.parse_args()
 
 
 def sample_of(message: Mapping[str, Any]) -> Sample:
@@ -75,26 +83,24 @@ def _frames(*scores: FrameScores) -> dict[str, Any]:
 
 
 class Ledger:
-    """What a simulated accelerator has done, in ``file``."""
+    """How long a simulated accelerator has worked, in ``file``."""
 
     def __init__(self, file: Path) -> None:
         if not file.exists():
-            file.write_bytes(_LEDGER.pack(0.0, 0))
+            file.write_bytes(_LEDGER.pack(0.0))
         self._file = file.open("r+b")
         self._memory = mmap.mmap(self._file.fileno(), 0)
 
-    def read(self) -> tuple[float, int]:
-        """Seconds in forward passes, and rows in them, since the beginning."""
-        busy_s, num_rows = _LEDGER.unpack_from(self._memory)
-        return float(busy_s), int(num_rows)
+    def busy_s(self) -> float:
+        """Seconds in forward passes since the beginning."""
+        return float(_LEDGER.unpack_from(self._memory)[0])
 
-    def run(self, duration_s: float, num_rows: int) -> None:
+    def run(self, duration_s: float) -> None:
         """Sleeps, as one forward pass; several instances take turns."""
         fcntl.flock(self._file, fcntl.LOCK_EX)
         started_s = time.perf_counter()
         time.sleep(duration_s)
-        before = self.read()
-        _LEDGER.pack_into(self._memory, 0, before[0] + time.perf_counter() - started_s, before[1] + num_rows)
+        _LEDGER.pack_into(self._memory, 0, self.busy_s() + time.perf_counter() - started_s)
         fcntl.flock(self._file, fcntl.LOCK_UN)
 
 
@@ -103,7 +109,7 @@ def simulate(engine: Engine, file: Path, batch_s: float, row_s: float) -> Engine
     ledger, num_bins = Ledger(file), engine.predictor.network.config.progress_bins
 
     def score(rows: Sequence[Any], batch: Any) -> list[RowScores]:
-        ledger.run(batch_s + row_s * len(rows), len(rows))
+        ledger.run(batch_s + row_s * len(rows))
         return [_half(row, num_bins) for row in rows]
 
     engine.predictor.score = score  # type: ignore[method-assign]  # only the forward pass is replaced

@@ -9,11 +9,10 @@ endpoint is here, which is the faster one.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from queue import Queue
 from typing import Any
@@ -25,6 +24,8 @@ from fastapi import FastAPI, Request
 from starlette.datastructures import UploadFile
 from torch import Tensor
 from upstream_forward import Scores, UpstreamRewind, load, progress_of
+
+from engines import options
 
 UPLOAD_KEY = "__numpy_file__"
 TRAJECTORIES = {  # of each type, in the order in which the network reads them
@@ -89,9 +90,8 @@ def _merged(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
 @torch.inference_mode()
 def _score(network: UpstreamRewind, samples: Sequence[Json]) -> Json:
     """The answer to the samples of one request: a forward for each kind of sample in it."""
-    answer: dict[str, Any] = dict.fromkeys(
-        ("outputs_preference", "outputs_progress", "outputs_success", "outputs_similarity"), None
-    )
+    outputs = ("outputs_preference", "outputs_progress", "outputs_success", "outputs_similarity")
+    answer: dict[str, Any] = dict.fromkeys(outputs)
     for kind in TRAJECTORIES:
         of_kind = [sample for sample in samples if sample["sample_type"] == kind]
         if not of_kind:
@@ -100,9 +100,7 @@ def _score(network: UpstreamRewind, samples: Sequence[Json]) -> Json:
         if kind == "progress":
             answer["outputs_progress"] = {"progress_pred": progress_of(scores.progress).tolist()}
             answer["outputs_success"] = {"success_probs": scores.success.sigmoid().tolist()}
-            continue
-        assert scores.query is not None  # pairs have it
-        if kind == "preference":
+        elif kind == "preference":
             answer["outputs_preference"] = {"prediction_probs": scores.query.sigmoid().tolist()}
         else:
             answer["outputs_similarity"] = {"sim_score_ref_sim": scores.query.tolist()}
@@ -110,24 +108,20 @@ def _score(network: UpstreamRewind, samples: Sequence[Json]) -> Json:
 
 
 def _forward(network: UpstreamRewind, samples: Sequence[Json], kind: Any) -> Scores:
+    """Raises RuntimeError for trajectories of unequal lengths."""
     sides = [[sample[name] for sample in samples] for name in TRAJECTORIES[kind]]
-    text = _stacked([trajectory["text_embedding"] for trajectory in sides[0]])
-    videos = [_stacked([trajectory["video_embeddings"] for trajectory in side]) for side in sides]
+    text = _stacked(trajectory["text_embedding"] for trajectory in sides[0])
+    videos = [_stacked(trajectory["video_embeddings"] for trajectory in side) for side in sides]
     return network(text, *videos, sample_type=kind)
 
 
-def _stacked(arrays: Sequence[Any]) -> Tensor:
-    """float32 [B, ...]. Raises RuntimeError for arrays of unequal shapes."""
+def _stacked(arrays: Iterable[Any]) -> Tensor:
     return torch.stack([torch.as_tensor(array, dtype=torch.float32) for array in arrays])
 
 
 def main() -> None:
     """Serves until SIGTERM."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--checkpoint", required=True, help="folder of a ReWiND checkpoint")
-    parser.add_argument("--port", type=int, default=8200)
-    parser.add_argument("--threads", type=int, default=1, help="of torch")
-    arguments = parser.parse_args()
+    arguments = options(__doc__)
     torch.set_num_threads(arguments.threads)
     torch.set_num_interop_threads(1)
     pool = ReplicaPool([load(arguments.checkpoint)], max_workers=1)  # more than replicas starve

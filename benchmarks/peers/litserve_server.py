@@ -6,7 +6,6 @@ score is answered with 400; one that cannot be read fails its batch, as LitServe
 """
 
 # No "from __future__ import annotations": LitServe gives FastAPI the annotations as they are.
-import argparse
 import multiprocessing
 import signal
 from typing import Annotated, Any
@@ -16,7 +15,7 @@ import msgpack
 import torch
 from fastapi import Body, Response
 
-from engines import answer_of, engine_of, sample_of
+from engines import answer_of, engine_of, options, sample_of
 from rfm.engine import Outcome
 from rfm_client import Sample
 
@@ -64,16 +63,11 @@ class RewardAPI(litserve.LitAPI):
 
 def main() -> None:
     """Serves until SIGTERM."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--checkpoint", required=True, help="checkpoint folder")
-    parser.add_argument("--port", type=int, default=8201)
-    parser.add_argument("--threads", type=int, default=1, help="of torch, in each worker")
-    parser.add_argument("--workers", type=int, default=1, help="inference processes")
-    arguments = parser.parse_args()
+    arguments = options(__doc__)
     batching = {"max_batch_size": MAX_BATCH_SIZE, "batch_timeout": BATCH_TIMEOUT_S}
     api = RewardAPI(arguments.checkpoint, arguments.threads, **batching)
     # Its fast_queue is not asked for: 0.2.19 ignores it.
-    server = litserve.LitServer(api, accelerator="cpu", workers_per_device=arguments.workers, timeout=REQUEST_TIMEOUT_S)
+    server = litserve.LitServer(api, accelerator="cpu", timeout=REQUEST_TIMEOUT_S)
     signal.signal(signal.SIGTERM, _interrupt)
     try:
         server.run(

@@ -7,7 +7,6 @@ request that cannot be read fails its batch, as mosec has it.
 
 from __future__ import annotations
 
-import argparse
 import logging
 import os
 import warnings
@@ -18,7 +17,7 @@ import mosec
 import torch
 from mosec.mixin import MsgpackMixin
 
-from engines import answer_of, engine_of, sample_of
+from engines import answer_of, engine_of, options, sample_of
 
 MAX_BATCH_SIZE = 64
 MAX_WAIT_MS = 1  # the least that it takes
@@ -42,12 +41,7 @@ class RewardWorker(MsgpackMixin, mosec.Worker):
 
 def main() -> None:
     """Serves until SIGTERM."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--checkpoint", required=True, help="checkpoint folder")
-    parser.add_argument("--port", type=int, default=8202)
-    parser.add_argument("--threads", type=int, default=1, help="of torch, in each worker")
-    parser.add_argument("--workers", type=int, default=1, help="inference processes")
-    arguments = parser.parse_args()
+    arguments = options(__doc__)
     os.environ |= {  # mosec reads its own settings from here
         "MOSEC_ADDRESS": "127.0.0.1",
         "MOSEC_PORT": str(arguments.port),
@@ -59,10 +53,9 @@ def main() -> None:
     settings = {"PEER_CHECKPOINT": arguments.checkpoint, "PEER_THREADS": str(arguments.threads)}
     server.append_worker(
         RewardWorker,
-        num=arguments.workers,
         max_batch_size=MAX_BATCH_SIZE,
         max_wait_time=MAX_WAIT_MS,
-        env=[settings] * arguments.workers,
+        env=[settings],
     )
     server.run()
 

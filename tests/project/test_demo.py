@@ -96,10 +96,17 @@ def test_a_checkpoint_of_one_s_own_scores_a_video(tmp_path: Path, monkeypatch: p
     for shown in (clip.TASK, "clip.mp4", "32 frames", "batches"):
         assert shown in result.output
     assert (tmp_path / "rewards.png").read_bytes().startswith(PNG)
-    arguments = ["demo", "--video", str(tmp_path / "clip.mp4"), "--task", "x", "--repository", str(tmp_path / "none")]
-    result = CliRunner().invoke(app, [*arguments, "--output", str(tmp_path)])
-    assert result.exit_code == 1
-    assert result.stderr.startswith("rfm: ")
+
+
+def test_a_repository_that_cannot_be_served_is_told(tmp_path: Path) -> None:
+    clip.write(tmp_path / "clip.mp4")
+    spaced = tmp_path / "my models"
+    spaced.symlink_to(REPOSITORY)
+    for repository, told in ((tmp_path / "none", "a folder of models"), (spaced, "a path without spaces")):
+        options = {"--video": tmp_path / "clip.mp4", "--task": "x", "--repository": repository, "--output": tmp_path}
+        result = CliRunner().invoke(app, ["demo", *(str(word) for pair in options.items() for word in pair)])
+        assert result.exit_code == 1
+        assert result.stderr.startswith(f"rfm: repository: expected {told}, got {repository}")
 
 
 @pytest.mark.nightly
