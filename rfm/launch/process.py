@@ -177,7 +177,8 @@ class TritonServer:
         if not there:
             raise ServerStartError(no_models(self.repository))
         if len(str(self.repository).split()) > 1:  # Triton's Python backend gives its path to a shell as it is
-            raise ServerStartError(f"repository: expected a path without spaces, got {self.repository}; a link will do (ln -s)")
+            where = "repository: expected a path without spaces, such as a link (ln -s)"
+            raise ServerStartError(f"{where}, got {self.repository}")
         as_in_file = there
         if served is not None:
             as_in_file = [name for name in served if _names_the_same_versions(self.repository, name, served[name])]

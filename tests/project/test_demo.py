@@ -102,7 +102,10 @@ def test_a_repository_that_cannot_be_served_is_told(tmp_path: Path) -> None:
     clip.write(tmp_path / "clip.mp4")
     spaced = tmp_path / "my models"
     spaced.symlink_to(REPOSITORY)
-    for repository, told in ((tmp_path / "none", "a folder of models"), (spaced, "a path without spaces")):
+    for repository, told in (
+        (tmp_path / "none", "a folder of models"),
+        (spaced, "a path without spaces, such as a link (ln -s)"),
+    ):
         options = {"--video": tmp_path / "clip.mp4", "--task": "x", "--repository": repository, "--output": tmp_path}
         result = CliRunner().invoke(app, ["demo", *(str(word) for pair in options.items() for word in pair)])
         assert result.exit_code == 1

@@ -110,7 +110,11 @@ class Taker(BaseHTTPRequestHandler):
 
 def documented_options(traces_url: str) -> list[str]:
     """What docs/reference/logs_and_metrics.md tells to give tritonserver, but with this collector, and for every request."""
-    text = " ".join(re.findall(r"--(?:trace-config|log-verbose)=[^\s`]+", (ROOT / "docs" / "reference" / "logs_and_metrics.md").read_text()))
+    text = " ".join(
+        re.findall(
+            r"--(?:trace-config|log-verbose)=[^\s`]+", (ROOT / "docs" / "reference" / "logs_and_metrics.md").read_text()
+        )
+    )
     assert "--log-verbose" in text
     text, count = re.subn(r"=opentelemetry,url=\S+", f"=opentelemetry,url={traces_url}", text)
     text, others = re.subn(r"=rate=\S+", "=rate=1", text)
