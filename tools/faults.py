@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -232,41 +231,21 @@ def kill_gateway(site: Site) -> list[Row]:
     return [row, Row("  callers beside it, over gRPC", beside)]
 
 
-def stop_gateway(site: Site, seconds: float = 5.0) -> list[Row]:
-    """Its callers wait until it goes on, which `rfm serve` leaves to others."""
-    process = site.gateway
-    with site.gateway_callers() as callers:
-        process.suspend()
-        try:
-            time.sleep(seconds)
-        finally:
-            process.resume()
-        healed_s = seconds + site.wait_healthy()
-        callers.wait_for_all()
-    return [Row("SIGSTOP of the gateway", callers, healed_s, f"SIGCONT after {seconds:g} s")]
+def signalled(what: str, number: signal.Signals) -> Callable[[Site], None]:
+    def send(site: Site) -> None:
+        os.kill(site.served.triton if what == TRITON else site.served.model_processes()[0], number)
 
-
-def signalled(what: Callable[[Serving], int], number: signal.Signals) -> Callable[[Site], None]:
-    return lambda site: os.kill(what(site.served), number)
-
-
-def a_model_process(served: Serving) -> int:
-    return served.model_processes()[0]
-
-
-def triton_of(served: Serving) -> int:
-    return served.triton
+    return send
 
 
 FAULTS: tuple[Callable[[Site], list[Row]], ...] = (
-    healed("kill -9 of a model process", signalled(a_model_process, signal.SIGKILL), MODEL),
-    healed("SIGSTOP of a model process", signalled(a_model_process, signal.SIGSTOP), MODEL),
-    healed("kill -9 of Triton", signalled(triton_of, signal.SIGKILL), TRITON),
-    healed("SIGSTOP of Triton", signalled(triton_of, signal.SIGSTOP), TRITON, noticed_s=SILENT_S),
+    healed("kill -9 of a model process", signalled(MODEL, signal.SIGKILL), MODEL),
+    healed("SIGSTOP of a model process", signalled(MODEL, signal.SIGSTOP), MODEL),
+    healed("kill -9 of Triton", signalled(TRITON, signal.SIGKILL), TRITON),
+    healed("SIGSTOP of Triton", signalled(TRITON, signal.SIGSTOP), TRITON, noticed_s=SILENT_S),
     healed(f"a batch hangs (hang_s: {HANG_S})", lambda site: site.trigger("hang"), MODEL, noticed_s=1.1 * HANG_S),
     # The callers of its first two batches are told that they failed.
     healed("a broken context (simulated)", lambda site: site.trigger("break"), MODEL, may_lose=2 * CALLERS),
     kill_gateway,
-    stop_gateway,
     crash_loop,
 )
