@@ -72,6 +72,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 @pytest.fixture
 def quiet_browser(browser: Browser) -> Iterator[Browser]:
     """The browser, which asks nothing outside this machine in the test and whose console shows no error."""
+    browser.driver.get("about:blank")  # the page of the test before asks its gateway no more
     browser.complaints()
     yield browser
     asked = browser.asked()
