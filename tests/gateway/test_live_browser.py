@@ -273,3 +273,4 @@ def test_a_picture_of_the_page(
         poll(lambda: len(page.cards("policy 7")) == 5 and page.cards("policy 7")[1]["Step"] == "8")
         poll(lambda: len(quiet_browser.run(PICTURES, "policy 7")) == 5)
         quiet_browser.picture("page_live.png")
+        quiet_browser.driver.get("about:blank")  # before its gateway ends

@@ -16,6 +16,7 @@ import httpx
 from prometheus_client.parser import text_string_to_metric_families
 
 from commands import RFM
+from one_model import CRASHES
 from rfm.launch.cleanup import SHARED_MEMORY
 from rfm.launch.endpoints import Endpoints
 from rfm.launch.proc import arguments_of, children_of, stat_of
@@ -123,6 +124,8 @@ def serving(repository: Path, *more: str) -> Iterator[Serving]:
         yield served
     except BaseException:
         print("\n".join(served.said), file=sys.stderr)  # shown with the failed test
+        if any("exit status -6" in line for line in served.said):
+            CRASHES.append(repository)
         raise
     finally:
         if process.poll() is None:
