@@ -528,6 +528,17 @@ def test_config_yaml_is_found_on_main_of_the_hub_s_repository(from_hub: dict[str
     assert json.loads(from_hub[source]) == json.loads(json.dumps(expected))
 
 
+@pytest.mark.parametrize(("main", "is_found"), [("a" * 40, True), ("a" * 41, False), ("../other", False)])
+def test_main_of_the_hub_s_cache_is_a_commit(tmp_path: Path, main: str, is_found: bool) -> None:
+    snapshots = tmp_path / "snapshots"
+    for folder in (snapshots / "of-the-tag", snapshots / ("a" * 40), tmp_path / "refs"):
+        folder.mkdir(parents=True)
+    (snapshots / ("a" * 40) / "config.yaml").write_text("{}")
+    (tmp_path / "refs" / "main").write_text(main)
+    found = find_run_config(snapshots / "of-the-tag")
+    assert found == ((snapshots / ("a" * 40) / "config.yaml").resolve() if is_found else None)
+
+
 REFUSED_HUB = {
     "pickles alone": (
         PICKLED,

@@ -279,7 +279,7 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
             in_json("config.json", lambda backbone, method=method: backbone.update(quantization_config={"quant_method": method})),
             rf"config\.json: quantization_config: expected none, got '{method}'; export the checkpoint that was quantized",
         )
-        for method in ("bitsandbytes", "gptq")
+        for method in ("bitsandbytes", "gptq", "awq", "fp8", "compressed-tensors")
     },
     **{
         f"weights with {part}": (
@@ -303,6 +303,10 @@ SPOILED: dict[str, tuple[str, Callable[[Path], None], str]] = {
     ),
     "LoRA with a field of the future": (ADAPTER, settings("adapter_config.json", use_newlora=True), r"expected plain LoRA, got use_newlora"),
     "an adapter that is no LoRA": (ADAPTER, settings("adapter_config.json", peft_type="IA3", r=None), r"peft_type: expected LORA, got 'IA3'"),
+    **{
+        f"LoRA that begins by {init}": (ADAPTER, settings("adapter_config.json", init_lora_weights=init), rf"init_lora_weights: expected true, got '{init}', .* merge it")
+        for init in ("pissa", "pissa_niter_16", "olora", "corda", "eva", "loftq", "lora_ga")
+    },
     "a run of another rank": (LORA_INSIDE, run("peft", r=32), r"config\.yaml: r: expected 4, the rows of .*lora_A, got 32; put in r"),
     "a module of another rank": (
         LORA_INSIDE,

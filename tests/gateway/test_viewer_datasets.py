@@ -25,7 +25,9 @@ from labelling import LEROBOT, BrightnessScorer
 from pictures import TURNS, turn
 from rfm_client.contract.settings import ConfigError
 from rfm_client.data.datasets.lerobot import LeRobotDataset
+from rfm_client.data.orientation import Orient
 from rfm_client.labelling import LabelOptions, label, open_dataset, summarise
+from rfm_client.labelling.options import Format
 from rfm_gateway.config import GatewayConfig
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew
 
@@ -83,6 +85,16 @@ def test_the_table_tells_what_the_labels_say_of_each_episode(get: Get, folders: 
     counts, edges = np.histogram(summary.final_progress, bins=20, range=(0, 1))
     assert told["bins"] == {"edges": edges.tolist(), "counts": counts.tolist()}
     assert (told["labels"], told["cameras"], told["threshold"]) == ("rfm_progress.parquet", list(CAMERAS), 0.5)
+
+
+@pytest.mark.parametrize("form", ["progress", "signals"])
+def test_the_table_tells_how_pictures_were_turned_for_the_labels(tmp_path: Path, form: Format) -> None:
+    root = copied("toy_v21", tmp_path)
+    label(
+        open_dataset(root, orient=Orient.parse(["wrist=rotate180"])), BrightnessScorer(), LabelOptions(formats=(form,))
+    )
+    with serving(root) as get:
+        assert get("/0").json()["orientations"] == ["none", "rotate180"]
 
 
 @pytest.mark.parametrize(("number", "episode"), [(V21, 7), (V30, 9)])
