@@ -87,7 +87,7 @@ mutate: $(INSTALLED)
 	$(VENV)/mutate/bin/python tools/mutate.py
 
 # Test what docker/ holds: alerts, dashboard, image, compose file, Kubernetes.
-# No container engine and no cluster are needed. Rules run on made-up series, then on a live Prometheus and Triton.
+# No container engine and no cluster are needed. Rules run on synthetic series, then on a live Prometheus and Triton.
 ops-check: ops-tools
 	$(BIN)/pytest tests/ops
 

@@ -32,8 +32,8 @@ from report import Row
 
 import rfm_export
 from rfm.config import ExportConfig
-from rfm.launch.process import Endpoints
 from rfm.launch.temporary import temporary_server
+from rfm.launch.triton_server import Endpoints
 from rfm_gateway.command import gateway_command
 from rfm_gateway.config import GatewayConfig
 

@@ -76,8 +76,8 @@ def episodes(arguments: argparse.Namespace) -> None:
             for way, (client, growing, _) in ways.items():
                 before, began_s = _loopback_bytes(), time.perf_counter()
                 if way == "windows":
-                    films = [np.stack([kept[step][env] for step in shown]) for env in range(arguments.envs)]
-                    client.evaluate([ProgressSample(Trajectory(frames=film, task=TASK)) for film in films])
+                    videos = [np.stack([kept[step][env] for step in shown]) for env in range(arguments.envs)]
+                    client.evaluate([ProgressSample(Trajectory(frames=video, task=TASK)) for video in videos])
                 else:
                     growing.add(frames)
                 took_ms, sent = (time.perf_counter() - began_s) * 1e3, _loopback_bytes() - before

@@ -21,7 +21,7 @@ from load import Load, Measured, samples
 import rfm_export
 from rfm.config import ExportConfig
 from rfm.engine import Engine
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindConfig, RewindTransformer
 from rfm_commands.config import Config

@@ -27,7 +27,7 @@ from load import Load, samples
 
 from rfm.launch.installation import find_installation
 from rfm.launch.temporary import temporary_server
-from rfm_client.cli.made_up import write_perf_analyzer_input
+from rfm_client.cli.synthetic import write_perf_analyzer_input
 
 WHEEL = "tritonclient==2.51.0"
 LIBRARIES = ("libcudart.so.12", "libb64.so.0d")  # the wheel of tritonserver has them under other names

@@ -1,6 +1,6 @@
 #!/bin/sh
 # SPDX-License-Identifier: MIT
-# Ends with 0 if the server scores a made-up sample: embeddings, or raw frames of a checkpoint that takes nothing else.
+# Ends with 0 if the server scores a synthetic sample: embeddings, or raw frames of a checkpoint that takes nothing else.
 # RFM_URL names a server that is not on this host's default port, RFM_MODEL a checkpoint not exported as rfm.
 set -u
 

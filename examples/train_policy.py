@@ -47,15 +47,15 @@ def rewards(
     client: RewardClient, live: LiveView | None, policies: Policies, seeds: range
 ) -> tuple[np.ndarray, np.ndarray]:
     """float64 [P] each: the progress that a step is paid, on average, and the share of episodes that succeed."""
-    films, successes = [], []
+    videos, successes = [], []
     for seed in seeds:
         scene = random_scene(TASK, np.random.default_rng(seed))
         for grasp_x, release_x in places(policies, render(resting(scene))[0]):
             episode = forward(pick_and_place(scene, grasp_x, release_x, np.random.default_rng(seed)), FRAMES)
-            films.append(render(episode))
+            videos.append(render(episode))
             successes.append(episode.success(TASK)[-1])
-    steps = np.stack(films, axis=1)  # [T, N, H, W, 3]
-    with client.episodes(len(films), TASK.sentence(), frames=FRAMES, live=live) as episodes:
+    steps = np.stack(videos, axis=1)  # [T, N, H, W, 3]
+    with client.episodes(len(videos), TASK.sentence(), frames=FRAMES, live=live) as episodes:
         progress = np.mean([episodes.add(frames).progress for frames in steps], axis=0)
     shape = len(seeds), len(policies)
     return progress.reshape(shape).mean(axis=0), np.reshape(successes, shape).mean(axis=0)

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from rfm.checkpoint.provenance import Decision
 from rfm_client.contract import FrameSize, RewardError
-from rfm_client.contract.named_frames import NamedFootage
-from rfm_client.contract.samples import Float32Array, Footage
+from rfm_client.contract.frame_refs import EncoderSampleRefs
+from rfm_client.contract.samples import EncoderSample, Float32Array
 
 if TYPE_CHECKING:
     import torch
@@ -117,8 +117,11 @@ class FrameEncoders(Protocol):
         """Moves the encoders to ``device``, and returns them."""
 
     def encode(
-        self, samples: Sequence[Footage | NamedFootage], execution: Execution, cache: FeatureCache[Float32Array] | None
-    ) -> list[Footage | RewardError]:
+        self,
+        samples: Sequence[EncoderSample | EncoderSampleRefs],
+        execution: Execution,
+        cache: FeatureCache[Float32Array] | None,
+    ) -> list[EncoderSample | RewardError]:
         """Each sample with embeddings of its trajectories' frames and of its task, or why it has none.
 
         execution: what it took is added to it

@@ -20,7 +20,7 @@ from patients import references  # noqa: F401  a fixture
 from reference_server import Served
 from rfm.engine import Engine
 from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 
 torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that tests start, which share the cores with other tests

@@ -18,7 +18,7 @@ import rfm_export
 from callers import Callers, Exam, direct, through_gateway
 from paths import ROOT
 from rfm.config import ExportConfig
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient
 from rfm_serve import MODEL, RFM, Serving, children, serving, wait_for
 

@@ -14,7 +14,7 @@ import goldens
 import rfm_export
 from engines import serve_config
 from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.triton_server import Endpoints, TritonServer
 from rfm_client import RewardClient
 
 

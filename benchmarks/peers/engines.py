@@ -118,7 +118,7 @@ def simulate(engine: Engine, file: Path, batch_s: float, row_s: float) -> Engine
 
 def _half(row: Any, num_bins: int) -> RowScores:
     """Scores of a row of either family."""
-    counts = [film.num_shown for film in row.films] if hasattr(row, "films") else [len(video) for video in row.videos]
+    counts = [getattr(video, "num_shown", None) or len(video) for video in row.videos]
     frames = []
     for count in counts:
         half = np.full(count, 0.5, np.float32)

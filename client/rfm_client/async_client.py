@@ -19,10 +19,10 @@ from rfm_client.episodes.steps import EpisodeOptions, EpisodeSettings
 from rfm_client.episodes.windows import Window, WindowScorer
 from rfm_client.scoring.call import Call, CallOptions
 from rfm_client.scoring.samples import SampleScorer
-from rfm_client.transport.access import Access
 from rfm_client.transport.calls import Transport, connect
+from rfm_client.transport.concurrency import ConcurrencyLimiter
+from rfm_client.transport.credentials import Credentials
 from rfm_client.transport.deadline import Deadline, check_timeout
-from rfm_client.transport.in_flight import InFlight
 from rfm_client.transport.lifetime import AsyncClosing, OneProcess
 from rfm_client.transport.servers import PROBE_TIMEOUT_S, Servers
 
@@ -47,7 +47,7 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
     retry: send again what failed because a server was down, restarting or full, until the time is up
     max_in_flight: requests under way at a time; more wait their turn
     shared_memory: large inputs go through memory that client and server map, if both are on one host
-    ca_file, client_certificate, client_key, headers, api_key: as Access has them
+    ca_file, client_certificate, client_key, headers, api_key: as Credentials has them
     transports: instead of connections to ``urls``, for tests and unusual networks
     """
 
@@ -68,14 +68,14 @@ class AsyncRewardClient(AsyncClosing, OneProcess):
         transports: Sequence[Transport] | None = None,
     ) -> None:
         check_timeout(timeout_s)
-        access = Access(ca_file, client_certificate, client_key, headers or {}, api_key)
+        credentials = Credentials(ca_file, client_certificate, client_key, headers or {}, api_key)
         if not transports:
             urls = [urls] if isinstance(urls, str) else urls
-            transports = [connect(url, shared_memory=shared_memory, access=access) for url in urls]
+            transports = [connect(url, shared_memory=shared_memory, credentials=credentials) for url in urls]
         self._model = model
         self._timeout_s = timeout_s
         self._servers = Servers(transports, retry=retry)
-        self._scorer = SampleScorer(model, self._servers, InFlight(max_in_flight))
+        self._scorer = SampleScorer(model, self._servers, ConcurrencyLimiter(max_in_flight))
         self._windows = WindowScorer(model, self._scorer)
         self._is_closed = False
         self._loop: asyncio.AbstractEventLoop | None = None  # that it was first used in

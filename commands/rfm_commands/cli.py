@@ -17,7 +17,7 @@ from rfm.config import ExportConfig, ServeConfig
 from rfm.launch.admin_key import take_key
 from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import find_installation
-from rfm.launch.process import TritonServer, short_spin
+from rfm.launch.triton_server import TritonServer, short_spin
 from rfm.supervise.supervisor import Supervisor
 from rfm_client.cli.command import Given, OptionsOf, with_options
 from rfm_client.contract.listening import from_here
@@ -165,7 +165,7 @@ def serve(
         server,
         gateway=None if config.gateway.port is None else gateway_command(_beside(server, config)),
         status_port=config.serve.status_port,
-        canary_s=config.serve.canary_s,
+        probe_s=config.serve.probe_s,
         hang_s=config.serve.hang_s,
         triton_silent_s=config.serve.triton_silent_s,
         say=say,

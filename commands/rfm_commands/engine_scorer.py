@@ -20,7 +20,7 @@ from rfm.engine import Engine
 from rfm.engine.execution import Execution
 from rfm.family import Checkpoint, FrameEncoders, config_fields
 from rfm_client import ProgressResult, ProgressSample, RewardError, Trajectory
-from rfm_client.contract.samples import Footage, UInt8Array
+from rfm_client.contract.samples import EncoderSample, UInt8Array
 from rfm_client.labelling import CheckpointFacts
 from rfm_export.verify import device_named
 
@@ -57,9 +57,9 @@ class EngineScorer:
         with self._lock:
             encoders = self._engine.encoders
             assert encoders is not None  # or the facts would not say that it encodes
-            footage = Footage((Trajectory(frames=frames, task=task),))
-            (outcome,) = encoders.encode([footage], Execution(), None)
-        return cast(Footage, _result(outcome)).trajectories[0]
+            encoder_sample = EncoderSample((Trajectory(frames=frames, task=task),))
+            (outcome,) = encoders.encode([encoder_sample], Execution(), None)
+        return cast(EncoderSample, _result(outcome)).trajectories[0]
 
     def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
         """The result of each sample. Raises RewardError for the first that fails."""

@@ -11,7 +11,7 @@ import typer
 
 from rfm.config import ExportConfig
 from rfm_client.cli.command import Given, OptionsOf, with_options
-from rfm_client.cli.label import DatasetArgument, EpisodeTexts, Labelling, RunOptions
+from rfm_client.cli.label import DatasetArgument, EpisodeTexts, LabelCommand, RunOptions
 from rfm_client.labelling import LabelOptions, RayOptions, Scorer
 from rfm_commands.command import OF_A_CHECKPOINT, say
 
@@ -38,4 +38,4 @@ def label(
             say(note)
         yield scorer
 
-    raise typer.Exit(Labelling(dataset, texts, labels, run, ray, connect, say).run())
+    raise typer.Exit(LabelCommand(dataset, texts, labels, run, ray, connect, say).run())

@@ -19,9 +19,9 @@ import typer
 from rfm.launch.admin_key import take_key
 from rfm.launch.repository_api import ModelVersion, RepositoryApi, RepositoryApiError
 from rfm_client.cli.command import OptionsOf, with_options
-from rfm_client.cli.options import AccessFiles
+from rfm_client.cli.options import CredentialFiles
 from rfm_client.contract.settings import Settings, setting
-from rfm_client.transport.access import Access
+from rfm_client.transport.credentials import Credentials
 from rfm_commands.command import RfmCommand, fail
 from rfm_commands.rollout import Rollout, models_of, previous_version
 
@@ -43,10 +43,10 @@ class AdministeredServer(Settings):
     @contextmanager
     def connected(self, context: typer.Context) -> Iterator[RepositoryApi]:
         """Its API. Raises AdminKeyError, RepositoryApiError."""
-        access: Access = context.obj
-        if access.uses_tls and not self.url.startswith(SECURE):
+        credentials: Credentials = context.obj
+        if credentials.uses_tls and not self.url.startswith(SECURE):
             raise RepositoryApiError(f"url: expected {SECURE}host:port with certificates, got {self.url}")
-        options = access.grpc_options(self.url.partition(":")[0])
+        options = credentials.grpc_options(self.url.partition(":")[0])
         with RepositoryApi(self.url, take_key(self.admin_key_file, os.environ), options) as api:
             yield api
 
@@ -59,7 +59,7 @@ Administered: TypeAlias = Annotated[AdministeredServer, OptionsOf(AdministeredSe
 @with_options
 def models(
     context: typer.Context,
-    files: Annotated[AccessFiles, OptionsOf(AccessFiles, only=("ca_file", "client_certificate", "client_key"))],
+    files: Annotated[CredentialFiles, OptionsOf(CredentialFiles, only=("ca_file", "client_certificate", "client_key"))],
 ) -> None:
     """List, load, unload and replace the models of a running server."""
     try:

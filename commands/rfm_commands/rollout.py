@@ -34,8 +34,8 @@ from rfm.launch.repository_api import RepositoryApi, RepositoryApiError
 from rfm.launch.repository_folder import CONFIG_FILE, models_in, no_models
 from rfm_client import PreferenceSample, ProgressSample, RewardError
 from rfm_client.contract import wire
-from rfm_client.contract.made_up import random_trajectory
 from rfm_client.contract.names import encoder_name, frames_name
+from rfm_client.contract.synthetic import random_trajectory
 from rfm_export.errors import ExportError
 from rfm_export.pbtxt import serving_versions
 from rfm_export.publish import alone, config_of, read_config, replace_config, staging

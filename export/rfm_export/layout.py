@@ -19,7 +19,6 @@ from rfm.family import Description, EncodersDescription
 from rfm.launch.repository_folder import CONFIG_FILE
 from rfm.parameters import FAMILY_PARAMETER, FEATURE_CACHE_PARAMETER
 from rfm_client.contract import FrameSize, PreferenceSample, ProgressSample, Sample, SimilaritySample, wire
-from rfm_client.contract.made_up import blank_trajectory
 from rfm_client.contract.model_info import (
     FRAME_SIZE_PARAMETER,
     FRAMES_PER_VALUE_PARAMETER,
@@ -27,6 +26,7 @@ from rfm_client.contract.model_info import (
     TRAINED_PADDING_PARAMETER,
 )
 from rfm_client.contract.names import encoder_name, frames_name
+from rfm_client.contract.synthetic import blank_trajectory
 from rfm_export.about import about_encoders
 from rfm_export.pbtxt import Interface, Warmup, ensemble_config, python_config, render
 

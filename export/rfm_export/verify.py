@@ -23,7 +23,7 @@ from rfm_client.contract import (
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.contract.made_up import Widths, random_trajectory
+from rfm_client.contract.synthetic import Widths, random_trajectory
 from rfm_export.errors import ExportDiffersError, ExportError
 
 TOLERANCE = 1e-6  # same weights, same machine, same code: the numbers are the same but for rounding

@@ -30,7 +30,7 @@ from rfm_gateway.observe import (
     RETRY_AFTER,
     CallerLeftError,
     GatewayMetrics,
-    Observed,
+    RequestMiddleware,
     while_connected,
 )
 from rfm_gateway.scoring import Evaluator
@@ -64,14 +64,14 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
     Raises OSError for a folder that is not there, ValueError for a malformed URL or files that cannot be used.
     """
     folder = None if config.allow_folder is None else config.allow_folder.resolve(strict=True)
-    model, access, metrics = config.model or DEFAULT_MODEL, config.access, GatewayMetrics()
+    model, credentials, metrics = config.model or DEFAULT_MODEL, config.credentials, GatewayMetrics()
     new_client = partial(
         AsyncRewardClient,
         config.triton_url,
         timeout_s=config.timeout,
         retry=False,  # the caller gets the error at once, and decides
         max_in_flight=config.max_in_flight,
-        **access.options,
+        **credentials.options,
     )
     client = new_client(model=model)
 
@@ -84,7 +84,7 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
     app = FastAPI(
         title=title, summary=summary, lifespan=lifespan, docs_url=None, redoc_url=None, exception_handlers=_handlers()
     )
-    app.add_middleware(Observed, metrics=metrics, config=config)
+    app.add_middleware(RequestMiddleware, metrics=metrics, config=config)
     if config.cors_origin:
         app.add_middleware(
             CORSMiddleware,
@@ -95,7 +95,7 @@ def create_app(config: GatewayConfig, api_key: str | None = None) -> FastAPI:
         )
     limits = BodyLimits(config.max_body_mib * MIB, config.timeout)
     max_decoded_bytes = DECODED_PER_BODY * limits.max_bytes
-    state = TritonState(client, config.triton_url, config.metrics_url, model, access)
+    state = TritonState(client, config.triton_url, config.metrics_url, model, credentials)
     guards = [] if api_key is None else [Depends(_key_check(api_key))]
     guarded = APIRouter(dependencies=guards, responses=_failures(401) if guards else {})
     _add_evaluations(guarded, limits, Evaluator(client, config.timeout, folder, max_decoded_bytes), metrics)

@@ -12,7 +12,7 @@ from rfm_client.contract.addresses import MAX_PORT, check_certificate, split_url
 from rfm_client.contract.listening import check_free
 from rfm_client.contract.names import GATEWAY_KEY_VARIABLE
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
-from rfm_client.transport.access import Access
+from rfm_client.transport.credentials import Credentials
 
 if TYPE_CHECKING:
     from rfm_gateway.viewer.datasets import ShownDataset
@@ -74,9 +74,9 @@ class GatewayConfig(Settings):
         return self.triton
 
     @property
-    def access(self) -> Access:
+    def credentials(self) -> Credentials:
         """What Triton is shown. Raises ValueError for files that cannot be used."""
-        return Access(self.triton_ca_file, self.triton_certificate, self.triton_key)
+        return Credentials(self.triton_ca_file, self.triton_certificate, self.triton_key)
 
     @property
     def tls(self) -> dict[str, Any]:
@@ -112,4 +112,4 @@ class GatewayConfig(Settings):
             check_free(self.host, self.port, "port", **options)
         if self.allow_folder is not None:
             self.allow_folder.resolve(strict=True)
-        _ = self.access, self.tls, self.api_key(environment), self.shown_datasets()
+        _ = self.credentials, self.tls, self.api_key(environment), self.shown_datasets()

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class NamedFiles:
+class RequestFiles:
     """The files that one request names. They are counted before they are read.
 
     folder: where they are, without links on the way to it; None: requests may name none

@@ -80,7 +80,7 @@ class GatewayMetrics:
         return generate_latest(self._registry)
 
 
-class Observed:
+class RequestMiddleware:
     """ASGI middleware: names, times and counts every request, and lets in as many evaluations as ``config`` says."""
 
     def __init__(self, app: ASGIApp, metrics: GatewayMetrics, config: GatewayConfig) -> None:

@@ -94,7 +94,7 @@ def _uploaded(value: Mapping[str, Any], uploads: Mapping[str, Callable[[], Any]]
     return uploads[name]()
 
 
-class Trajectory(BaseModel):
+class TrajectoryInput(BaseModel):
     """Frames, or their embeddings, of one episode, and its task."""
 
     model_config = ConfigDict(extra="ignore")
@@ -126,36 +126,36 @@ class _Sample(BaseModel):
     model_config = ConfigDict(extra="ignore")
 
     @property
-    def named_trajectories(self) -> dict[str, Trajectory]:
+    def named_trajectories(self) -> dict[str, TrajectoryInput]:
         """The trajectories by field name, in the order in which they are scored."""
-        return {name: value for name, value in self if isinstance(value, Trajectory)}
+        return {name: value for name, value in self if isinstance(value, TrajectoryInput)}
 
 
-class ProgressSample(_Sample):
+class ProgressInput(_Sample):
     """How far has the trajectory come at each frame?"""
 
     sample_type: Literal["progress"]
-    trajectory: Trajectory
+    trajectory: TrajectoryInput
 
 
-class PreferenceSample(_Sample):
+class PreferenceInput(_Sample):
     """Which trajectory does the chosen one's task better?"""
 
     sample_type: Literal["preference"]
-    chosen_trajectory: Trajectory
-    rejected_trajectory: Trajectory
+    chosen_trajectory: TrajectoryInput
+    rejected_trajectory: TrajectoryInput
 
 
-class SimilaritySample(_Sample):
+class SimilarityInput(_Sample):
     """How similar is ``sim_trajectory`` to ``ref_trajectory``? ``diff_trajectory`` is ignored, as it was."""
 
     sample_type: Literal["similarity"]
-    ref_trajectory: Trajectory = Field(validation_alias=AliasChoices("ref_trajectory", "reference_trajectory"))
-    sim_trajectory: Trajectory = Field(validation_alias=AliasChoices("sim_trajectory", "traj_sim_trajectory"))
+    ref_trajectory: TrajectoryInput = Field(validation_alias=AliasChoices("ref_trajectory", "reference_trajectory"))
+    sim_trajectory: TrajectoryInput = Field(validation_alias=AliasChoices("sim_trajectory", "traj_sim_trajectory"))
     data_gen_strategy: Any = None
 
 
-Sample: TypeAlias = ProgressSample | PreferenceSample | SimilaritySample
+Sample: TypeAlias = ProgressInput | PreferenceInput | SimilarityInput
 _ByType: TypeAlias = Annotated[Sample, Discriminator("sample_type")]
 SAMPLES: TypeAdapter[list[Sample]] = TypeAdapter(list[_ByType])
 

@@ -37,7 +37,7 @@ from rfm_client.transport.deadline import Deadline
 from rfm_client.transport.off_loop import MIN_BYTES, off_loop
 from rfm_gateway import schema
 from rfm_gateway.body import Batch, Decoded, invalid
-from rfm_gateway.folder import NamedFiles
+from rfm_gateway.folder import RequestFiles
 
 FRAME_STEPS = 4  # frames to which the evaluation server samples each prefix
 PREFERRED = 0.5
@@ -84,7 +84,7 @@ class Evaluator:
     async def _evaluate(self, batch: Batch, deadline: Deadline, request_id: str) -> schema.EvaluateBatchAnswer:
         served = await self._served(batch.samples, deadline)
         texts = await self._texts(batch.samples, served, deadline, request_id)
-        files = NamedFiles(self._folder, Decoded(self._max_decoded_bytes))
+        files = RequestFiles(self._folder, Decoded(self._max_decoded_bytes))
         conversion = _Conversion(served, texts, files, FRAME_STEPS if batch.use_frame_steps else 0)
         num_bytes = batch.num_bytes if self._folder is None else MIN_BYTES  # files may be large
         samples = await off_loop(num_bytes, conversion.samples, batch.samples)
@@ -179,13 +179,13 @@ class _Conversion:
 
     served: _Served
     texts: Texts
-    files: NamedFiles
+    files: RequestFiles
     frame_steps: int
 
     def samples(self, samples: Sequence[schema.Sample]) -> list[Sample]:
         """The samples as the client takes them.
 
-        Raises RequestValidationError that lists all that cannot be scored, and HTTPException as NamedFiles does.
+        Raises RequestValidationError that lists all that cannot be scored, and HTTPException as RequestFiles does.
         """
         converted: list[Sample] = []
         errors: dict[int, InvalidSampleError] = {}
@@ -210,13 +210,13 @@ class _Conversion:
                     trajectories.append(self._of_frames(trajectory))
             except InvalidSampleError as error:
                 raise error.inside(name) from None
-        if isinstance(sample, schema.ProgressSample):
+        if isinstance(sample, schema.ProgressInput):
             return ProgressSample(trajectories[0], frame_steps=self.frame_steps)
-        if isinstance(sample, schema.PreferenceSample):
+        if isinstance(sample, schema.PreferenceInput):
             return PreferenceSample(*trajectories)
         return SimilaritySample(*trajectories)
 
-    def _of_embeddings(self, given: schema.Trajectory, *, needs_text: bool) -> Trajectory:
+    def _of_embeddings(self, given: schema.TrajectoryInput, *, needs_text: bool) -> Trajectory:
         video, text = given.video_embeddings, given.text_embedding
         if video is None:
             in_file = self.files.embeddings(given.embeddings_path or "")
@@ -236,7 +236,7 @@ class _Conversion:
             raise InvalidSampleError.at("text_embedding", "an embedding, or a task to encode", got)
         return trajectory
 
-    def _of_frames(self, given: schema.Trajectory) -> Trajectory:
+    def _of_frames(self, given: schema.TrajectoryInput) -> Trajectory:
         if given.frames is None:
             what = "video_embeddings" if _has_embeddings(given) else "neither frames nor video_embeddings"
             if _has_embeddings(given) and self.served.embeddings is not None:
@@ -251,7 +251,7 @@ class _Conversion:
         return Trajectory(frames=_uint8(given.frames), task=given.task or "")
 
 
-def _has_embeddings(trajectory: schema.Trajectory) -> bool:
+def _has_embeddings(trajectory: schema.TrajectoryInput) -> bool:
     """Whether the trajectory has embeddings: its own, or those of a file where it has no frames."""
     in_file = trajectory.embeddings_path is not None and trajectory.frames is None
     return trajectory.video_embeddings is not None or in_file
@@ -260,7 +260,7 @@ def _has_embeddings(trajectory: schema.Trajectory) -> bool:
 def _uint8(frames: Any) -> UInt8Array:
     """uint8 [T, H, W, C], as the evaluation server made images.
 
-    Whole numbers stay as they are, floats are clipped and truncated. One frame is a film of one. Of RGBA the colours
+    Whole numbers stay as they are, floats are clipped and truncated. One frame is a video of one. Of RGBA the colours
     count.
     """
     array = as_array(frames)
@@ -318,7 +318,7 @@ def _answer(samples: Sequence[schema.Sample], results: Sequence[Result], group: 
             preference_labels=[CHOSEN_IS_FIRST] * len(preferences),
         )
     if similar:
-        references = [sample.ref_trajectory for sample, _ in similar if isinstance(sample, schema.SimilaritySample)]
+        references = [sample.ref_trajectory for sample, _ in similar if isinstance(sample, schema.SimilarityInput)]
         answer.outputs_similarity = schema.SimilarityOutputs.model_construct(
             sim_score_ref_sim=[result.similarity for _, result in similar],
             task=[reference.task for reference in references],

@@ -17,10 +17,10 @@ from rfm_client.contract.errors import (
     ServerError,
     ServerUnavailableError,
 )
-from rfm_client.contract.made_up import blank_trajectory
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.names import PROBE_PREFIX, encoder_name, frames_name
-from rfm_client.transport.access import Access
+from rfm_client.contract.synthetic import blank_trajectory
+from rfm_client.transport.credentials import Credentials
 from rfm_client.transport.deadline import Deadline
 from rfm_client.transport.status import Device, ServerStatus, read_status
 from rfm_gateway import schema
@@ -45,14 +45,14 @@ class TritonState:
         url: str,
         metrics_url: str | None,
         model: str,
-        access: Access | None = None,
+        credentials: Credentials | None = None,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._client = client
         self._url = url
         self._metrics_url = metrics_url
         self._model = model
-        self._access = access
+        self._credentials = credentials
         self._clock_s = clock_s
         self._refreshing = asyncio.Lock()
         self._refreshed_s = float("-inf")
@@ -100,7 +100,7 @@ class TritonState:
 
     async def _status(self, timeout_s: float) -> ServerStatus:
         return await asyncio.to_thread(
-            read_status, self._url, metrics_url=self._metrics_url, timeout_s=timeout_s, access=self._access
+            read_status, self._url, metrics_url=self._metrics_url, timeout_s=timeout_s, credentials=self._credentials
         )
 
     async def _devices(self, deadline: Deadline) -> schema.GpuStatus | None:

@@ -22,7 +22,7 @@ from rfm_client.contract import (
     Sample,
     SimilaritySample,
 )
-from rfm_client.contract.named_frames import NamedProgressSample
+from rfm_client.contract.frame_refs import ProgressSampleRefs
 from rfm_client.contract.samples import Float32Array
 
 Row = TypeVar("Row")
@@ -36,7 +36,7 @@ class Predictor(Protocol[Row, Batch]):
     def works_ahead(self) -> bool:
         """Whether ``work_ahead`` is worth a thread."""
 
-    def rows(self, sample: Sample | NamedProgressSample) -> list[Row]:
+    def rows(self, sample: Sample | ProgressSampleRefs) -> list[Row]:
         """The sample's rows, in dense mode one a frame; takes no forward pass.
 
         sample: has named frames only where the checkpoint's description says that it keeps features
@@ -87,7 +87,7 @@ def checked(rows: Iterable[RowScores], *, has_success: bool = True) -> list[RowS
     return [row if is_good(row) else failed for row in rows]
 
 
-def check_type(sample: Sample | NamedProgressSample, config: Any) -> None:
+def check_type(sample: Sample | ProgressSampleRefs, config: Any) -> None:
     """Raises InvalidSampleError for a question about two trajectories that the network has no head for.
 
     config: its configuration

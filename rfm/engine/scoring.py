@@ -35,8 +35,8 @@ from rfm_client.contract import (
     Sample,
     SimilarityResult,
 )
-from rfm_client.contract.named_frames import NamedProgressSample
-from rfm_client.contract.samples import Footage, with_trajectories
+from rfm_client.contract.frame_refs import ProgressSampleRefs
+from rfm_client.contract.samples import EncoderSample, with_trajectories
 
 Outcome: TypeAlias = Result | RewardError
 
@@ -49,7 +49,7 @@ class Prepared:
     num_tokens: of all rows
     """
 
-    sample: Sample | NamedProgressSample
+    sample: Sample | ProgressSampleRefs
     rows: Sequence[Any] | RewardError
     num_tokens: int = 0
 
@@ -143,7 +143,7 @@ class Engine:
             prepared = [self._prepared(sample, of) for sample, of in zip(samples, embedded_samples, strict=True)]
         return self._results(prepared, execution, before)
 
-    def prepare(self, sample: Sample | NamedProgressSample) -> Prepared:
+    def prepare(self, sample: Sample | ProgressSampleRefs) -> Prepared:
         """The first half of ``evaluate``. Takes no forward pass, and may run in one thread while another scores.
 
         sample: of what the network reads; no encoders are asked
@@ -169,18 +169,18 @@ class Engine:
     def _embedded(self, samples: Sequence[Sample], execution: Execution) -> Sequence[Sample | RewardError]:
         """The samples with embeddings in place of raw frames, which are encoded together; or why a sample has none."""
         outcomes: list[Sample | RewardError] = list(samples)
-        raw = {i: Footage(s.trajectories) for i, s in enumerate(samples) if s.trajectories[0].frames is not None}
+        raw = {i: EncoderSample(s.trajectories) for i, s in enumerate(samples) if s.trajectories[0].frames is not None}
         if self.encoders is None or not raw:
             return outcomes
         for index, outcome in zip(raw, self.encoders.encode(list(raw.values()), execution, None), strict=True):
-            if isinstance(outcome, Footage):
+            if isinstance(outcome, EncoderSample):
                 outcomes[index] = with_trajectories(samples[index], outcome.trajectories)
             else:
                 outcomes[index] = outcome
         return outcomes
 
     def _prepared(
-        self, sample: Sample | NamedProgressSample, embedded_sample: Sample | NamedProgressSample | RewardError
+        self, sample: Sample | ProgressSampleRefs, embedded_sample: Sample | ProgressSampleRefs | RewardError
     ) -> Prepared:
         if isinstance(embedded_sample, RewardError):
             return Prepared(sample, embedded_sample)
@@ -269,12 +269,12 @@ class Engine:
 
 
 def _outcome(
-    sample: Sample | NamedProgressSample, scores: Sequence[RowScores | RewardError], timing: BatchTiming
+    sample: Sample | ProgressSampleRefs, scores: Sequence[RowScores | RewardError], timing: BatchTiming
 ) -> Outcome:
     rows = [row for row in scores if isinstance(row, RowScores)]
     if len(rows) < len(scores):
         return next(row for row in scores if isinstance(row, RewardError))
-    if isinstance(sample, (ProgressSample, NamedProgressSample)):
+    if isinstance(sample, (ProgressSample, ProgressSampleRefs)):
         frames = _last_of_each(rows) if sample.frame_steps else rows[0].frames[0]
         logits = frames.progress_logits
         return ProgressResult(progress=frames.progress, success=frames.success, progress_logits=logits, timing=timing)

@@ -65,7 +65,7 @@ class ModelVersion:
 class RepositoryApi:
     """The server at ``url``: grpc://host:port, or grpcs:// with TLS. A context manager.
 
-    options: options of tritonclient's gRPC client, such as those of Access
+    options: options of tritonclient's gRPC client, such as those of Credentials
     The constructor and the methods raise RepositoryApiError.
     """
 

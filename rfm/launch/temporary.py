@@ -12,7 +12,7 @@ from typing import NoReturn
 from rfm.launch.ending import stop_signals_to
 from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import find_installation
-from rfm.launch.process import TritonServer
+from rfm.launch.triton_server import TritonServer
 
 
 @contextmanager

@@ -33,8 +33,8 @@ from rfm.rewind.pretrained import (
     load_tokenizer,
 )
 from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError, Trajectory, wire
-from rfm_client.contract.named_frames import NamedFootage, NamedTrajectory
-from rfm_client.contract.samples import Float32Array, Footage, UInt8Array
+from rfm_client.contract.frame_refs import EncoderSampleRefs, TrajectoryRefs
+from rfm_client.contract.samples import EncoderSample, Float32Array, UInt8Array
 
 IMAGE_ENCODER_FOLDER = "image_encoder"  # in an exported version of a model that encodes
 TEXT_ENCODER_FOLDER = "text_encoder"
@@ -122,10 +122,10 @@ class Encoders:
 
     def encode(
         self,
-        samples: Sequence[Footage | NamedFootage],
+        samples: Sequence[EncoderSample | EncoderSampleRefs],
         execution: Execution | None = None,
         cache: FeatureCache[Float32Array] | None = None,
-    ) -> list[Footage | RewardError]:
+    ) -> list[EncoderSample | RewardError]:
         """Each sample with embeddings of its trajectories' frames and of its task, or why it has none.
 
         execution: what it took is added to it; its tokens are those of images, which have no padding, and of tasks
@@ -137,13 +137,16 @@ class Encoders:
             return self._encoded(samples, execution, cache)
 
     def _encoded(
-        self, samples: Sequence[Footage | NamedFootage], execution: Execution, cache: FeatureCache[Float32Array] | None
-    ) -> list[Footage | RewardError]:
-        outcomes: dict[int, Footage | RewardError] = {}
-        for index, footage in enumerate(samples):
+        self,
+        samples: Sequence[EncoderSample | EncoderSampleRefs],
+        execution: Execution,
+        cache: FeatureCache[Float32Array] | None,
+    ) -> list[EncoderSample | RewardError]:
+        outcomes: dict[int, EncoderSample | RewardError] = {}
+        for index, encoder_sample in enumerate(samples):
             try:
-                self._check_task(footage.trajectories[0].task)
-                for trajectory in footage.trajectories:
+                self._check_task(encoder_sample.trajectories[0].task)
+                for trajectory in encoder_sample.trajectories:
                     _check_shapes(trajectory)
             except InvalidSampleError as error:
                 outcomes[index] = error
@@ -159,7 +162,7 @@ class Encoders:
 
     def _all_of(
         self,
-        trajectories: Sequence[Trajectory | NamedTrajectory],
+        trajectories: Sequence[Trajectory | TrajectoryRefs],
         tasks: Sequence[str],
         execution: Execution,
         cache: FeatureCache[Float32Array] | None,
@@ -172,7 +175,7 @@ class Encoders:
             return self.encode_frames(whole, execution), self.encode_tasks(tasks, execution)
         with execution.collating():
             named = [
-                each if isinstance(each, NamedTrajectory) else NamedTrajectory.of(each.positions, each.task)
+                each if isinstance(each, TrajectoryRefs) else TrajectoryRefs.of(each.positions, each.task)
                 for each in trajectories
             ]
             pixels = dict(pair for each in named for pair in each.pixels.items())
@@ -280,7 +283,7 @@ def task_digest(task: str) -> bytes:
 
 
 def _of_named(
-    trajectory: NamedTrajectory, images: Mapping[bytes, Float32Array | RewardError]
+    trajectory: TrajectoryRefs, images: Mapping[bytes, Float32Array | RewardError]
 ) -> Float32Array | RewardError:
     """float32 [T, Dv], or why there is none."""
     frames = []
@@ -303,7 +306,9 @@ def _of_video(images: Sequence[Tensor | InferenceFailedError]) -> Float32Array |
     return torch.stack(images).float().cpu().numpy()  # type: ignore[arg-type]  # all are tensors
 
 
-def _embedded(videos: Sequence[Float32Array | RewardError], text: Float32Array | RewardError) -> Footage | RewardError:
+def _embedded(
+    videos: Sequence[Float32Array | RewardError], text: Float32Array | RewardError
+) -> EncoderSample | RewardError:
     embeddings = []
     for outcome in (*videos, text):
         if isinstance(outcome, RewardError):
@@ -312,12 +317,12 @@ def _embedded(videos: Sequence[Float32Array | RewardError], text: Float32Array |
             return InferenceFailedError("an encoder gave an embedding that is not finite")
         embeddings.append(outcome)
     *of_videos, of_text = embeddings
-    return Footage(tuple(Trajectory(video_embeddings=video, text_embedding=of_text) for video in of_videos))
+    return EncoderSample(tuple(Trajectory(video_embeddings=video, text_embedding=of_text) for video in of_videos))
 
 
-def _check_shapes(trajectory: Trajectory | NamedTrajectory) -> None:
+def _check_shapes(trajectory: Trajectory | TrajectoryRefs) -> None:
     """The shorter side is brought to size; a sliver of an image would become a huge one."""
-    if isinstance(trajectory, NamedTrajectory):  # all that came with it: another may name them
+    if isinstance(trajectory, TrajectoryRefs):  # all that came with it: another may name them
         sizes = {frame.shape[:2] for frame in trajectory.pixels.values()}
     else:
         sizes = {trajectory.positions.shape[1:3]}

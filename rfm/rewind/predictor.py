@@ -18,7 +18,7 @@ from rfm.engine.layers import as_tensor
 from rfm.engine.predictor import RowScores, are_finite, check_type, checked, frame_scores, part_of, prefix_indices
 from rfm.rewind.network import RewindBatch, RewindConfig, RewindTransformer, rounded_up
 from rfm_client.contract import InvalidSampleError, ProgressSample, RewardError, Sample, SimilaritySample, Trajectory
-from rfm_client.contract.named_frames import NamedProgressSample
+from rfm_client.contract.frame_refs import ProgressSampleRefs
 from rfm_client.contract.samples import Float32Array
 
 MAX_EMBEDDING = 1e6  # thousands of times what an encoder gives
@@ -149,9 +149,9 @@ class RewindPredictor:
         self.dtype = dtype
         self.collator = RewindCollator(network.config)
 
-    def rows(self, sample: Sample | NamedProgressSample) -> list[RewindRow]:
+    def rows(self, sample: Sample | ProgressSampleRefs) -> list[RewindRow]:
         """The rows of a sample of embeddings. Raises InvalidSampleError."""
-        if isinstance(sample, NamedProgressSample):
+        if isinstance(sample, ProgressSampleRefs):
             raise InvalidSampleError.at("frames", "video_embeddings (this checkpoint reads embeddings)", "named frames")
         return self.collator.rows(sample)
 

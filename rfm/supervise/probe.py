@@ -13,7 +13,7 @@ from typing import Any
 from tritonclient.utils import np_to_triton_dtype
 
 from rfm.launch.http import NO_ANSWER, Http
-from rfm.probe import blank_question
+from rfm.probe_request import probe_request
 from rfm_client.contract import wire
 from rfm_client.contract.names import PROBE_PREFIX
 
@@ -96,7 +96,7 @@ class Probe:
                 "datatype": np_to_triton_dtype(array.dtype),
                 "data": [item.decode() if isinstance(item, bytes) else item for item in array.ravel().tolist()],
             }
-            for name, array in blank_question(config).items()
+            for name, array in probe_request(config).items()
         ]
         return json.dumps({"id": f"{PROBE_PREFIX}-{self._model}", "inputs": inputs, "outputs": outputs}).encode()
 

@@ -35,7 +35,7 @@ class Status:
         self._reason = gauge("rfm_serve_not_ready", "1: the model is not ready, and why.", ["model", "reason"])
         told = "From a health probe to its answer."
         self.probe_seconds = Histogram(
-            "rfm_serve_canary_seconds", told, ["model"], registry=self._registry, buckets=_BUCKETS_S
+            "rfm_serve_probe_seconds", told, ["model"], registry=self._registry, buckets=_BUCKETS_S
         )
         told = "Why Triton was started again: a model by name, or triton itself; gateway: the gateway was."
         self.restarts = Counter("rfm_serve_restarts", told, ["what"], registry=self._registry)

@@ -15,7 +15,7 @@ from types import FrameType
 from rfm.launch import cleanup
 from rfm.launch.ending import end, ending_with_parent, stop_signals_to
 from rfm.launch.installation import ServerStartError
-from rfm.launch.process import POLL_S, Config, TritonServer
+from rfm.launch.triton_server import POLL_S, Config, TritonServer
 from rfm.supervise.status import Status, StatusServer
 from rfm.supervise.watch import TRITON, TritonWatch, parts_of
 
@@ -93,7 +93,7 @@ class Supervisor:
 
     gateway: command line of a gateway to run beside the server; None: no gateway
     status_port: port of the status server, on Triton's host; None: no status server
-    canary_s, hang_s, triton_silent_s: see TritonWatch
+    probe_s, hang_s, triton_silent_s: see TritonWatch
     say: prints a line about an event
     """
 
@@ -103,7 +103,7 @@ class Supervisor:
         *,
         gateway: Sequence[str] | None = None,
         status_port: int | None = None,
-        canary_s: float,
+        probe_s: float,
         hang_s: float,
         triton_silent_s: float,
         say: Callable[[str], None],
@@ -114,7 +114,7 @@ class Supervisor:
         self._say = say
         self._status = Status()
         self._new_watch = partial(
-            TritonWatch, server, self._status, canary_s=canary_s, hang_s=hang_s, silent_s=triton_silent_s
+            TritonWatch, server, self._status, probe_s=probe_s, hang_s=hang_s, silent_s=triton_silent_s
         )
         self._is_to_stop = threading.Event()
         self._new_back_off = partial(BackOff, "tritonserver", STEADY_S + hang_s)

@@ -7,7 +7,7 @@
 | a model process is dead or stopped | ``ModelProcesses`` |
 | a model hangs outside of a batch, or its requests fail before they reach model.py | its ``probe`` |
 
-A process that hangs in a batch, or whose device is broken, ends itself (``rfm.triton_model.guard``).
+A process that hangs in a batch, or whose device is broken, ends itself (``rfm.triton_model.watchdog``).
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from urllib.parse import quote
 
 from rfm.launch.admin_key import http_headers
 from rfm.launch.http import NO_ANSWER, Http
-from rfm.launch.proc import STOPPED, ZOMBIE, arguments_of, children_of, stat_of
-from rfm.launch.process import Config, TritonServer
+from rfm.launch.process_table import STOPPED, ZOMBIE, arguments_of, children_of, stat_of
 from rfm.launch.repository_api import INDEX_PATH, LOADING, READY, UNLOADING, ModelVersion, versions_of
+from rfm.launch.triton_server import Config, TritonServer
 from rfm.supervise.probe import Probe, can_be_probed
 from rfm.supervise.status import NO_REASON, Status
 
@@ -90,7 +90,7 @@ class ModelProcesses:
 class TritonWatch:
     """Looks at Triton every LOOK_S in a thread of its own, until it is closed.
 
-    canary_s: seconds between the probes of a model
+    probe_s: seconds between the probes of a model
     hang_s: seconds without an answer after which a model counts as hung
     silent_s: seconds without an answer after which Triton counts as silent
     served: configurations of the models that the server should serve; others are found
@@ -101,7 +101,7 @@ class TritonWatch:
         server: TritonServer,
         status: Status,
         *,
-        canary_s: float,
+        probe_s: float,
         hang_s: float,
         silent_s: float,
         served: Mapping[str, Config],
@@ -109,7 +109,7 @@ class TritonWatch:
         endpoints = server.endpoints
         self._http = Http(endpoints.http_host, endpoints.http_port, http_headers(server.admin_key))
         self._metrics = Http(endpoints.host, endpoints.metrics_port)
-        self._new_probe = partial(Probe, self._http, interval_s=canary_s, hang_s=hang_s)
+        self._new_probe = partial(Probe, self._http, interval_s=probe_s, hang_s=hang_s)
         self._silent_s = silent_s
         self._status = status
         self._processes = ModelProcesses(server.pid)

@@ -17,18 +17,18 @@ import torch
 
 from rfm.engine.execution import Execution
 from rfm.parameters import BUDGET_PARAMETER, DEFAULT_HANG_S, HANG_VARIABLE, OLD_QUEUE_PARAMETERS
-from rfm.probe import blank_question
-from rfm.triton_model.guard import Guard
+from rfm.probe_request import probe_request
 from rfm.triton_model.metrics import InstanceMetrics
 from rfm.triton_model.pipeline import Pipeline
 from rfm.triton_model.placement import Placement
 from rfm.triton_model.request import SAMPLE_TYPES, CancelledError, Request
 from rfm.triton_model.request_log import RequestLog
+from rfm.triton_model.watchdog import Watchdog
 from rfm.triton_model.weights import check_digest
 from rfm_client.contract import InvalidSampleError, RewardError, wire
+from rfm_client.contract.frame_refs import EncoderSampleRefs
 from rfm_client.contract.model_info import DIGEST_PARAMETER, NETWORK_PARAMETER, REVISION_PARAMETER, SOURCE_PARAMETER
-from rfm_client.contract.named_frames import NamedFootage
-from rfm_client.contract.samples import Footage
+from rfm_client.contract.samples import EncoderSample
 from rfm_client.contract.wire import Tensors
 
 GIVEN_UP_S = 0.1  # after a longer batch, ask whether clients cancelled; Triton 2.51 still hands over their requests
@@ -57,15 +57,15 @@ class BatchModel(Generic[Question, Answer]):
         self._pipeline: Pipeline | None = None
         self._is_executing = False
         self._batch_s = 0.0  # duration of the last batch
-        self._guard = Guard(float(os.environ.get(HANG_VARIABLE) or DEFAULT_HANG_S), self._is_working)
+        self._watchdog = Watchdog(float(os.environ.get(HANG_VARIABLE) or DEFAULT_HANG_S), self._is_working)
         check_digest(version, settings.get(DIGEST_PARAMETER, ""))
         placement.run(lambda: self.load(version, placement.device, settings))
         model = {"model": args["model_name"], "version": args["model_version"]}
         labels = {**model, "device": str(placement.device), "instance": args["model_instance_name"]}
         sample_types = _sample_types([spec["name"] for spec in config["input"]])
         self._log = RequestLog(model)
-        self._metrics = InstanceMetrics(labels, _checkpoint(settings), sample_types, lambda: self._guard.num_steps)
-        self._blank_tensors = blank_question(config)
+        self._metrics = InstanceMetrics(labels, _checkpoint(settings), sample_types, lambda: self._watchdog.num_steps)
+        self._blank_tensors = probe_request(config)
         self._num_warmups = sum(warmup.get("count") or 1 for warmup in config.get("model_warmup", []))
         if any(settings.get(name) for name in OLD_QUEUE_PARAMETERS):
             self._log.note(f"{', '.join(OLD_QUEUE_PARAMETERS)} of an older export have no effect: export again")
@@ -82,7 +82,7 @@ class BatchModel(Generic[Question, Answer]):
         if self._pipeline is not None:
             self._pipeline.close()
         self._metrics.close()
-        self._guard.close()
+        self._watchdog.close()
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
         """Load the weights in the folder ``version`` onto ``device``."""
@@ -187,13 +187,13 @@ class BatchModel(Generic[Question, Answer]):
             started_s = time.monotonic()
             scored += self._scored(good)
             self._batch_s = time.monotonic() - started_s
-            self._guard.look_at(good, self._score_blank)
+            self._watchdog.look_at(good, self._score_blank)
         return scored
 
     def _scored(self, batch: list[Request[Question]]) -> Scored[Question]:
         """Score the requests together or, if that fails, each alone, so that only the cause fails."""
-        self._guard.step()
-        execution = Execution(on_forward=self._guard.step)
+        self._watchdog.step()
+        execution = Execution(on_forward=self._watchdog.step)
         try:
             answers = iter(self.answer([each for request in batch for each in request.prepared], execution))
             for request in batch:
@@ -233,7 +233,7 @@ class BatchModel(Generic[Question, Answer]):
             questions = [self.prepare(question)[0] for question in self.decode(self._blank_tensors)]
         except InvalidSampleError:  # a checkpoint may refuse blank frames
             return
-        self.answer(questions, Execution(on_forward=self._guard.step))
+        self.answer(questions, Execution(on_forward=self._watchdog.step))
 
 
 def _tell(tell: Callable[..., None], *what: Any) -> None:
@@ -258,7 +258,7 @@ def _located(error: RewardError, index: int, count: int) -> RewardError:
 def _sample_types(input_names: Sequence[str]) -> list[str]:
     """Sample types that a model with these inputs scores."""
     of_samples = wire.SAMPLE_TYPE in input_names
-    kinds = {name: not issubclass(kind, (Footage, NamedFootage)) for kind, name in SAMPLE_TYPES.items()}
+    kinds = {name: not issubclass(kind, (EncoderSample, EncoderSampleRefs)) for kind, name in SAMPLE_TYPES.items()}
     return [name for name, is_sample in kinds.items() if is_sample == of_samples]
 
 

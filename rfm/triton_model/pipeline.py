@@ -15,9 +15,9 @@ from functools import partial
 from queue import SimpleQueue
 from typing import Any
 
-from rfm.triton_model.guard import end
 from rfm.triton_model.placement import Placement, use_threads
 from rfm.triton_model.request import Request
+from rfm.triton_model.watchdog import end
 
 
 class Pipeline:

@@ -17,9 +17,9 @@ from rfm_client.contract import (
     SimilaritySample,
     wire,
 )
-from rfm_client.contract.named_frames import NamedFootage, NamedProgressSample
+from rfm_client.contract.frame_refs import EncoderSampleRefs, ProgressSampleRefs
 from rfm_client.contract.names import PROBE_PREFIX
-from rfm_client.contract.samples import Footage
+from rfm_client.contract.samples import EncoderSample
 
 Question = TypeVar("Question")
 
@@ -27,11 +27,11 @@ OUTCOMES = SCORED, REFUSED, FAILED, CANCELLED = "scored", "refused", "failed", "
 
 SAMPLE_TYPES = {
     ProgressSample: "progress",
-    NamedProgressSample: "progress",
+    ProgressSampleRefs: "progress",
     PreferenceSample: "preference",
     SimilaritySample: "similarity",
-    Footage: "encode",
-    NamedFootage: "encode",
+    EncoderSample: "encode",
+    EncoderSampleRefs: "encode",
 }
 UNKNOWN_TYPE = "unknown"  # sample type of a request that could not be decoded
 

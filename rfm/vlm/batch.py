@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A batch of conversations on its way to the device: tokens and uint8 pixels on the host, float pixels on the device.
 
-B conversations of L tokens. Each shot is there once, whichever films and conversations it stands in. Frames of one
+B conversations of L tokens. Each shot is there once, whichever videos and conversations it stands in. Frames of one
 size, H' x W' pixels, go together.
 """
 
@@ -15,39 +15,39 @@ import torch
 from torch import Tensor
 
 from rfm.engine.device import pinned
-from rfm.vlm.film import Indices, Shot, SizedFrames, VlmFilm, shots_of
 from rfm.vlm.images import QwenImages, SmolImages
 from rfm.vlm.qwen import VisionPlan
+from rfm.vlm.video import Indices, Shot, SizedFrames, VlmVideo, shots_of
 
 
 @dataclass(eq=False)
 class SizedShots:
     """Shots of one size that the vision tower is to read.
 
-    films: uint8 [N, H', W', 3] each
-    firsts: of each film, by the id of its sized frames, the first among those of all films
-    shots: by key, its frames among those of all films
+    videos: uint8 [N, H', W', 3] each
+    firsts: of each video, by the id of its sized frames, the first among those of all videos
+    shots: by key, its frames among those of all videos
     """
 
-    films: list[Tensor] = field(default_factory=list)
+    videos: list[Tensor] = field(default_factory=list)
     firsts: dict[int, int] = field(default_factory=dict)
     shots: dict[Hashable, Shot] = field(default_factory=dict)
 
     def add(self, sized: SizedFrames, key: Hashable, shot: Shot) -> None:
-        """Adds a shot of a film."""
+        """Adds a shot of a video."""
         if id(sized) not in self.firsts:
-            self.firsts[id(sized)] = sum(map(len, self.films))
-            self.films.append(sized.pixels)
+            self.firsts[id(sized)] = sum(map(len, self.videos))
+            self.videos.append(sized.pixels)
         first = self.firsts[id(sized)]
         places = [int(sized.places[frame]) for frame in shot]
         assert min(places) >= 0  # it is not kept
         self.shots[key] = tuple(first + place for place in places)
 
     def frames(self) -> FramesOfOneSize:
-        """The films, and which of their frames each shot is made of."""
+        """The videos, and which of their frames each shot is made of."""
         shots = torch.tensor(list(self.shots.values()))
-        is_each = torch.equal(shots, torch.arange(sum(map(len, self.films)))[:, None])
-        return FramesOfOneSize(self.films, None if is_each else shots)
+        is_each = torch.equal(shots, torch.arange(sum(map(len, self.videos)))[:, None])
+        return FramesOfOneSize(self.videos, None if is_each else shots)
 
 
 class Shots:
@@ -68,9 +68,9 @@ class Shots:
         """The shots of each size that are to be read, in the order in which they first came."""
         return list(self._of_size.values())
 
-    def add(self, film: VlmFilm, shown: Indices) -> list[Hashable]:
-        """The keys of the shots of a conversation that shows these frames of a film."""
-        sized, keys = film.ready, []
+    def add(self, video: VlmVideo, shown: Indices) -> list[Hashable]:
+        """The keys of the shots of a conversation that shows these frames of a video."""
+        sized, keys = video.ready, []
         self._sized.append(sized)
         for shot in shots_of(shown, are_images=self._are_images):
             key = sized.keys[shot]
@@ -99,23 +99,23 @@ class Shots:
 
 @dataclass(frozen=True)
 class FramesOfOneSize:
-    """Frames that share a size, film by film, and the shots that are read of them.
+    """Frames that share a size, video by video, and the shots that are read of them.
 
-    films: uint8 [T, H', W', 3] each
+    videos: uint8 [T, H', W', 3] each
     shots: int64 [S, 1], which frames are images, or [S, 2], which pairs are temporal groups; None: each frame an image
     """
 
-    films: Sequence[Tensor]
+    videos: Sequence[Tensor]
     shots: Tensor | None
 
     @property
     def num_shown(self) -> int:
         """Frames in the shots; of a group that is filled up with a frame, that frame twice."""
-        return sum(map(len, self.films)) if self.shots is None else self.shots.numel()
+        return sum(map(len, self.videos)) if self.shots is None else self.shots.numel()
 
     def frames(self, device: torch.device) -> Tensor:
-        """uint8 [T of all films, H', W', 3] on ``device``."""
-        return torch.cat([film.to(device, non_blocking=True) for film in self.films])
+        """uint8 [T of all videos, H', W', 3] on ``device``."""
+        return torch.cat([video.to(device, non_blocking=True) for video in self.videos])
 
 
 @dataclass(frozen=True)
@@ -126,9 +126,9 @@ class QwenPixels:
     sizes: Sequence[FramesOfOneSize]
 
     @property
-    def films(self) -> list[Tensor]:
+    def videos(self) -> list[Tensor]:
         """uint8 [T, H', W', 3] each."""
-        return [film for size in self.sizes for film in size.films]
+        return [video for size in self.sizes for video in size.videos]
 
     @property
     def num_shown(self) -> int:
@@ -151,7 +151,7 @@ class QwenPixels:
 class SmolPixels:
     """Pixels as SmolVLM reads them: of each conversation as many squares as of the one with the most.
 
-    squares: uint8 [T, side, side, 3] of all films
+    squares: uint8 [T, side, side, 3] of all videos
     rows, places, frames: int64 [I], in which conversation each square stands, at which place, and which frame it is
     shape: conversations, and squares of each
     """
@@ -164,9 +164,9 @@ class SmolPixels:
     shape: tuple[int, int]
 
     @property
-    def films(self) -> list[Tensor]:
+    def videos(self) -> list[Tensor]:
         """uint8 [T, side, side, 3] each."""
-        return list(self.squares.films)
+        return list(self.squares.videos)
 
     @property
     def num_shown(self) -> int:

@@ -20,13 +20,13 @@ from torch import Tensor
 from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.predictor import check_type
 from rfm.vlm.batch import FramesOfOneSize, QwenPixels, Shots, SmolPixels, VlmBatch
-from rfm.vlm.film import Indices, Shot, SizedFrames, VlmFilm, named_frames
 from rfm.vlm.images import FRAMES_PER_GROUP, MERGE, Grid, QwenImages, SmolImages
 from rfm.vlm.network import VlmConfig
 from rfm.vlm.prompts import PREFERENCE_TOKEN, PROGRESS_TOKEN, SIMILARITY_TOKEN, Chat, TrajectoryPart, Visual, question
 from rfm.vlm.qwen import Box, plan, positions
+from rfm.vlm.video import Indices, Shot, SizedFrames, VlmVideo, named_frames
 from rfm_client.contract import InvalidSampleError, ProgressSample, Sample, SimilaritySample, Trajectory
-from rfm_client.contract.named_frames import NamedProgressSample, NamedTrajectory
+from rfm_client.contract.frame_refs import ProgressSampleRefs, TrajectoryRefs
 from rfm_client.contract.samples import UInt8Array
 
 SECONDS_PER_GROUP = 1  # the original gives it to Qwen2.5-VL with its videos
@@ -45,7 +45,7 @@ class VlmRow:
     """One conversation.
 
     input_ids: int64 [L]
-    films: of each trajectory
+    videos: of each trajectory
     spans: for each trajectory, the tokens (first, behind the last) over which each frame's state is read
     query: token whose state answers the question about two trajectories
     picked: in dense mode int64 [K], the frames that the conversation shows; None: all
@@ -53,7 +53,7 @@ class VlmRow:
     """
 
     input_ids: Indices
-    films: tuple[VlmFilm, ...]
+    videos: tuple[VlmVideo, ...]
     spans: tuple[Spans, ...]
     query: int | None
     is_similarity: bool
@@ -63,12 +63,12 @@ class VlmRow:
     @property
     def frames(self) -> tuple[Sequence[UInt8Array] | UInt8Array, ...]:
         """uint8 [H, W, 3] of each frame of each trajectory, as they came."""
-        return tuple(film.frames for film in self.films)
+        return tuple(video.frames for video in self.videos)
 
     @property
-    def shown(self) -> Iterator[tuple[VlmFilm, Indices]]:
+    def shown(self) -> Iterator[tuple[VlmVideo, Indices]]:
         """Each trajectory, and which of its frames the conversation shows."""
-        return ((film, np.arange(film.num_shown) if self.picked is None else self.picked) for film in self.films)
+        return ((video, np.arange(video.num_shown) if self.picked is None else self.picked) for video in self.videos)
 
     @property
     def num_tokens(self) -> int:
@@ -95,36 +95,36 @@ class VlmCollator:
         """Frames that the vision tower reads as one."""
         return 1 if self.config.multi_image else FRAMES_PER_GROUP
 
-    def rows(self, sample: Sample | NamedProgressSample) -> list[VlmRow]:
+    def rows(self, sample: Sample | ProgressSampleRefs) -> list[VlmRow]:
         """The conversations about a sample, all of whose frames are at hand.
 
         Raises InvalidSampleError if the checkpoint cannot score it.
         """
         check_type(sample, self.config)
-        frame_steps = sample.frame_steps if isinstance(sample, (ProgressSample, NamedProgressSample)) else 0
-        films = tuple(_film(trajectory, frame_steps) for trajectory in sample.trajectories)
+        frame_steps = sample.frame_steps if isinstance(sample, (ProgressSample, ProgressSampleRefs)) else 0
+        videos = tuple(_video(trajectory, frame_steps) for trajectory in sample.trajectories)
         self._check_task(sample.trajectories[0].task)
-        row = self._row(sample, films)
+        row = self._row(sample, videos)
         if frame_steps:
             # Every prefix is as long and its frames are as large, so all conversations have the same tokens.
-            return [replace(row, picked=picked) for picked in films[0].conversations]
+            return [replace(row, picked=picked) for picked in videos[0].conversations]
         return [row]
 
-    def to_size(self, film: VlmFilm, cache: FeatureCache[Any] | None = None) -> SizedFrames:
-        """A film's frames as large as the backbone reads them.
+    def to_size(self, video: VlmVideo, cache: FeatureCache[Any] | None = None) -> SizedFrames:
+        """A video's frames as large as the backbone reads them.
 
         cache: of shots whose frames need not be brought to size; None: there is none
         """
-        frames = np.arange(len(film.frames))
-        keys = {shot: (id(film), shot) for shot in film.shots(are_images=self.config.multi_image)}
-        return SizedFrames(self._to_size(film, frames.tolist()), frames, keys)
+        frames = np.arange(len(video.frames))
+        keys = {shot: (id(video), shot) for shot in video.shots(are_images=self.config.multi_image)}
+        return SizedFrames(self._to_size(video, frames.tolist()), frames, keys)
 
-    def _to_size(self, film: VlmFilm, needed: Sequence[int]) -> Tensor:
-        """uint8 [N, H', W', 3] of some of a film's frames."""
+    def _to_size(self, video: VlmVideo, needed: Sequence[int]) -> Tensor:
+        """uint8 [N, H', W', 3] of some of a video's frames."""
         raise NotImplementedError
 
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
-        """A batch of conversations of any kind and length, whose films have been brought to size."""
+        """A batch of conversations of any kind and length, whose videos have been brought to size."""
         length = max(row.num_tokens for row in rows)
         pad = self.tokenizer.pad_token_id
         ids = torch.full((len(rows), length), pad, dtype=torch.int64)
@@ -151,20 +151,20 @@ class VlmCollator:
         )
         return self._with_pixels(batch, rows)
 
-    def _row(self, sample: Sample | NamedProgressSample, films: tuple[VlmFilm, ...]) -> VlmRow:
+    def _row(self, sample: Sample | ProgressSampleRefs, videos: tuple[VlmVideo, ...]) -> VlmRow:
         parts: list[str | Visual] = []
         for part in question(sample, progress_in_preference=self.config.progress_in_preference):
-            parts += self._frame_parts(films[part.index].num_shown) if isinstance(part, TrajectoryPart) else [part]
+            parts += self._frame_parts(videos[part.index].num_shown) if isinstance(part, TrajectoryPart) else [part]
         try:
-            text, pad, lengths = self._placed(self._chat.text(tuple(parts)), films)
+            text, pad, lengths = self._placed(self._chat.text(tuple(parts)), videos)
         except ValueError as error:  # an image of a shape that cannot be brought to size
             raise InvalidSampleError.at("frames", *str(error).split(", got ")) from error
         ids = _expanded(self._chat.tokens(text), self.tokenizer.convert_tokens_to_ids(pad), lengths)
         is_similarity = isinstance(sample, SimilaritySample)
         query_token = SIMILARITY_TOKEN if is_similarity else PREFERENCE_TOKEN
-        query = int(self._positions(ids, query_token)[-1]) if len(films) > 1 else None
+        query = int(self._positions(ids, query_token)[-1]) if len(videos) > 1 else None
         return VlmRow(
-            ids, films, self._spans(ids, films), query, is_similarity, position_ids=self._position_ids(ids, films)
+            ids, videos, self._spans(ids, videos), query, is_similarity, position_ids=self._position_ids(ids, videos)
         )
 
     def _frame_parts(self, num_frames: int) -> list[str | Visual]:
@@ -176,17 +176,17 @@ class VlmCollator:
             each.append(PROGRESS_TOKEN)
         return each * num_frames
 
-    def _placed(self, text: str, films: tuple[VlmFilm, ...]) -> tuple[str, str, list[int]]:
+    def _placed(self, text: str, videos: tuple[VlmVideo, ...]) -> tuple[str, str, list[int]]:
         """The text with one pad token for each image or video or group of it, which token, and of how many it stands
         for.
         """
         raise NotImplementedError
 
-    def _spans(self, ids: Indices, films: tuple[VlmFilm, ...]) -> tuple[Spans, ...]:
+    def _spans(self, ids: Indices, videos: tuple[VlmVideo, ...]) -> tuple[Spans, ...]:
         """Where each frame's state is read."""
         raise NotImplementedError
 
-    def _position_ids(self, ids: Indices, films: tuple[VlmFilm, ...]) -> Indices | None:
+    def _position_ids(self, ids: Indices, videos: tuple[VlmVideo, ...]) -> Indices | None:
         """int64 [3, L], if the backbone wants them."""
         return None
 
@@ -194,7 +194,7 @@ class VlmCollator:
         """The batch with what its backbone wants besides tokens."""
         raise NotImplementedError
 
-    def _image_spans(self, ids: Indices, films: tuple[VlmFilm, ...], ends: Spans) -> tuple[Spans, ...]:
+    def _image_spans(self, ids: Indices, videos: tuple[VlmVideo, ...], ends: Spans) -> tuple[Spans, ...]:
         """Spans of frames that are images of their own; ``ends``: the tokens around each one's."""
         if self.config.per_frame_progress_token:
             spans = [(int(token), int(token) + 1) for token in self._positions(ids, PROGRESS_TOKEN)]
@@ -202,8 +202,8 @@ class VlmCollator:
             spans = [(end - 1, end) for _, end in ends]
         else:
             spans = [(start + 1, end) for start, end in ends]
-        bounds = np.cumsum([0, *(film.num_shown for film in films)])
-        return tuple(spans[bounds[i] : bounds[i + 1]] for i in range(len(films)))
+        bounds = np.cumsum([0, *(video.num_shown for video in videos)])
+        return tuple(spans[bounds[i] : bounds[i + 1]] for i in range(len(videos)))
 
     def _positions(self, ids: Indices, token: str) -> Indices:
         return np.flatnonzero(ids == self.tokenizer.convert_tokens_to_ids(token))
@@ -222,44 +222,44 @@ class QwenCollator(VlmCollator):
 
     images: QwenImages
 
-    def to_size(self, film: VlmFilm, cache: FeatureCache[Any] | None = None) -> SizedFrames:
+    def to_size(self, video: VlmVideo, cache: FeatureCache[Any] | None = None) -> SizedFrames:
         """The frames of the shots that are not kept."""
         if cache is None:
-            return super().to_size(film)
-        keys = self.shot_keys(film)
+            return super().to_size(video)
+        keys = self.shot_keys(video)
         found = cache.found(keys.values())
-        kept = {key: found[key] for shot, key in keys.items() if key in found and not film.is_blank(shot)}
-        alike = film.alike
+        kept = {key: found[key] for shot, key in keys.items() if key in found and not video.is_blank(shot)}
+        alike = video.alike
         needed = sorted({int(alike[frame]) for shot, key in keys.items() if key not in kept for frame in shot})
-        places = np.full(len(film.frames), -1)
+        places = np.full(len(video.frames), -1)
         places[needed] = np.arange(len(needed))
-        return SizedFrames(self._to_size(film, needed), places[alike], keys, kept)
+        return SizedFrames(self._to_size(video, needed), places[alike], keys, kept)
 
-    def shot_keys(self, film: VlmFilm) -> dict[Shot, Hashable]:
-        """What is shown of each of a film's shots, in which size: all that the vision tower's answer depends on."""
-        grid, digests = self.grid(film), film.digests
-        shots = film.shots(are_images=self.config.multi_image)
+    def shot_keys(self, video: VlmVideo) -> dict[Shot, Hashable]:
+        """What is shown of each of a video's shots, in which size: all that the vision tower's answer depends on."""
+        grid, digests = self.grid(video), video.digests
+        shots = video.shots(are_images=self.config.multi_image)
         return {shot: (grid.rows, grid.columns, *(digests[frame] for frame in shot)) for shot in shots}
 
-    def _to_size(self, film: VlmFilm, needed: Sequence[int]) -> Tensor:
+    def _to_size(self, video: VlmVideo, needed: Sequence[int]) -> Tensor:
         """uint8 [N, H', W', 3] of images, or of a video's frames."""
-        frames = film.stack(needed)
+        frames = video.stack(needed)
         if self.config.multi_image:
             return self.images.images_to_size(frames)
-        return self.images.video_to_size(frames, film.num_shown)
+        return self.images.video_to_size(frames, video.num_shown)
 
     @property
     def _pad(self) -> str:
         return IMAGE_PAD if self.config.multi_image else VIDEO_PAD
 
-    def grid(self, film: VlmFilm) -> Grid:
-        """The grid of all that is shown of a film: images, or temporal groups."""
+    def grid(self, video: VlmVideo) -> Grid:
+        """The grid of all that is shown of a video: images, or temporal groups."""
         if self.config.multi_image:
-            return replace(self.images.image_grid(*film.size), groups=film.num_shown)
-        return self.images.video_grid(*film.size, film.num_shown)
+            return replace(self.images.image_grid(*video.size), groups=video.num_shown)
+        return self.images.video_grid(*video.size, video.num_shown)
 
-    def _placed(self, text: str, films: tuple[VlmFilm, ...]) -> tuple[str, str, list[int]]:
-        grids = [self.grid(film) for film in films]
+    def _placed(self, text: str, videos: tuple[VlmVideo, ...]) -> tuple[str, str, list[int]]:
+        grids = [self.grid(video) for video in videos]
         of_shots = [grid.tokens_per_group for grid in grids for _ in range(grid.groups)]
         if self.config.multi_image:
             return text, IMAGE_PAD, of_shots
@@ -268,14 +268,14 @@ class QwenCollator(VlmCollator):
         timed = [_timed_groups(grid) for grid in grids]
         return _replaced(text, VISION_START + VIDEO_PAD + VISION_END, timed), VIDEO_PAD, of_shots
 
-    def _spans(self, ids: Indices, films: tuple[VlmFilm, ...]) -> tuple[Spans, ...]:
+    def _spans(self, ids: Indices, videos: tuple[VlmVideo, ...]) -> tuple[Spans, ...]:
         starts = self._positions(ids, VISION_START)
         if self.config.multi_image:
             ends = list(zip(starts.tolist(), self._positions(ids, VISION_END).tolist(), strict=True))
-            return self._image_spans(ids, films, ends)
+            return self._image_spans(ids, videos, ends)
         # In strides from the n-th vision start of the row, for the n-th trajectory. Qwen3-VL writes times and a
         # start of its own before each group, which upstream does not heed, in training as in inference.
-        grids = map(self.grid, films)
+        grids = map(self.grid, videos)
         return tuple(self._video_spans(int(start), grid) for start, grid in zip(starts, grids, strict=False))
 
     def _video_spans(self, start: int, grid: Grid) -> Spans:
@@ -284,12 +284,12 @@ class QwenCollator(VlmCollator):
             return list(pairwise(bounds))
         return [(bound, bound + 1) for bound in bounds[1:]]
 
-    def _position_ids(self, ids: Indices, films: tuple[VlmFilm, ...]) -> Indices:
+    def _position_ids(self, ids: Indices, videos: tuple[VlmVideo, ...]) -> Indices:
         """Of images, and of Qwen3-VL's groups, each is a box of its own; else a video is one."""
         is_whole = not self.config.multi_image and self.config.family != QWEN3
         step = SECONDS_PER_GROUP * self.config.backbone["vision_config"].get("tokens_per_second", TOKENS_PER_SECOND)
         boxes, read, starts = [], 0, self._positions(ids, self._pad)
-        for grid in map(self.grid, films):
+        for grid in map(self.grid, videos):
             groups = grid.groups if is_whole else 1
             for _ in range(grid.groups // groups):
                 boxes.append(Box(int(starts[read]), groups, grid.rows // MERGE, grid.columns // MERGE, step))
@@ -298,8 +298,8 @@ class QwenCollator(VlmCollator):
 
     def _with_pixels(self, batch: VlmBatch, rows: Sequence[VlmRow]) -> VlmBatch:
         shots = Shots(are_images=self.config.multi_image)
-        read = [shots.add(film, shown) for row in rows for film, shown in row.shown]
-        grids = [self.images.grid(len(each.shots), *each.films[0].shape[1:3]) for each in shots.sizes]
+        read = [shots.add(video, shown) for row in rows for video, shown in row.shown]
+        grids = [self.images.grid(len(each.shots), *each.videos[0].shape[1:3]) for each in shots.sizes]
         layout = shots.layout([grid.tokens_per_group for grid in grids])
         ids = batch.inputs["input_ids"]
         position_ids = torch.zeros(3, *ids.shape, dtype=torch.int64)
@@ -324,29 +324,29 @@ class SmolCollator(VlmCollator):
 
     images: SmolImages
 
-    def _to_size(self, film: VlmFilm, needed: Sequence[int]) -> Tensor:
+    def _to_size(self, video: VlmVideo, needed: Sequence[int]) -> Tensor:
         """uint8 [N, side, side, 3]."""
-        return self.images.images_to_size(film.stack(needed))
+        return self.images.images_to_size(video.stack(needed))
 
-    def _placed(self, text: str, films: tuple[VlmFilm, ...]) -> tuple[str, str, list[int]]:
+    def _placed(self, text: str, videos: tuple[VlmVideo, ...]) -> tuple[str, str, list[int]]:
         text = text.replace(SMOL_IMAGE, FAKE + GLOBAL_IMAGE + SMOL_IMAGE + FAKE)
-        return text, SMOL_IMAGE, [self.images.tokens] * sum(film.num_shown for film in films)
+        return text, SMOL_IMAGE, [self.images.tokens] * sum(video.num_shown for video in videos)
 
-    def _spans(self, ids: Indices, films: tuple[VlmFilm, ...]) -> tuple[Spans, ...]:
+    def _spans(self, ids: Indices, videos: tuple[VlmVideo, ...]) -> tuple[Spans, ...]:
         around = self._positions(ids, FAKE).tolist()
-        return self._image_spans(ids, films, list(zip(around[::2], around[1::2], strict=True)))
+        return self._image_spans(ids, videos, list(zip(around[::2], around[1::2], strict=True)))
 
     def _with_pixels(self, batch: VlmBatch, rows: Sequence[VlmRow]) -> VlmBatch:
-        """Each conversation's squares side by side; a film that several show is there once."""
-        firsts: dict[VlmFilm, int] = {}
-        for film in (film for row in rows for film, _ in row.shown):
-            if film not in firsts:
-                firsts[film] = sum(len(each.frames) for each in firsts)
-        frames = [np.concatenate([firsts[film] + shown for film, shown in row.shown]) for row in rows]
+        """Each conversation's squares side by side; a video that several show is there once."""
+        firsts: dict[VlmVideo, int] = {}
+        for video in (video for row in rows for video, _ in row.shown):
+            if video not in firsts:
+                firsts[video] = sum(len(each.frames) for each in firsts)
+        frames = [np.concatenate([firsts[video] + shown for video, shown in row.shown]) for row in rows]
         counts = torch.tensor([len(each) for each in frames])
         pixels = SmolPixels(
             self.images,
-            FramesOfOneSize([film.ready.pixels for film in firsts], None),
+            FramesOfOneSize([video.ready.pixels for video in firsts], None),
             rows=torch.arange(len(rows)).repeat_interleave(counts),
             places=torch.cat([torch.arange(count) for count in counts.tolist()]),
             frames=torch.from_numpy(np.concatenate(frames)),
@@ -355,12 +355,12 @@ class SmolCollator(VlmCollator):
         return replace(batch, pixels=pixels)
 
 
-def _film(trajectory: Trajectory | NamedTrajectory, frame_steps: int) -> VlmFilm:
-    if isinstance(trajectory, NamedTrajectory):
-        return VlmFilm.of(named_frames(trajectory), frame_steps, trajectory.digests)
+def _video(trajectory: Trajectory | TrajectoryRefs, frame_steps: int) -> VlmVideo:
+    if isinstance(trajectory, TrajectoryRefs):
+        return VlmVideo.of(named_frames(trajectory), frame_steps, trajectory.digests)
     if trajectory.frames is None:
         raise InvalidSampleError.at("video_embeddings", "frames (this checkpoint reads raw frames)", "embeddings")
-    return VlmFilm.of(trajectory.frames, frame_steps)
+    return VlmVideo.of(trajectory.frames, frame_steps)
 
 
 def _replaced(text: str, placeholder: str, replacements: Sequence[str]) -> str:

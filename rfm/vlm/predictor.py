@@ -21,7 +21,7 @@ from rfm.vlm.collator import VlmCollator, VlmRow
 from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm.vlm.network import VlmOutput
 from rfm_client.contract import FrameScores, InvalidSampleError, RewardError, Sample
-from rfm_client.contract.named_frames import NamedProgressSample
+from rfm_client.contract.frame_refs import ProgressSampleRefs
 
 
 class VlmPredictor:
@@ -45,9 +45,9 @@ class VlmPredictor:
         self._dtype = next(network.parameters()).dtype
         self._max_tokens = int(network.model.config.get_text_config().max_position_embeddings)
 
-    def rows(self, sample: Sample | NamedProgressSample) -> list[VlmRow]:
+    def rows(self, sample: Sample | ProgressSampleRefs) -> list[VlmRow]:
         """The conversations about a sample. Raises InvalidSampleError, too for named frames that are not known."""
-        rows = self.collator.rows(self._completed(sample) if isinstance(sample, NamedProgressSample) else sample)
+        rows = self.collator.rows(self._completed(sample) if isinstance(sample, ProgressSampleRefs) else sample)
         # The backbone has learned no positions beyond its own; its scores of those would mean nothing.
         longest = max(row.num_tokens for row in rows)
         if longest > self._max_tokens:
@@ -61,10 +61,10 @@ class VlmPredictor:
 
     def work_ahead(self, rows: Sequence[VlmRow]) -> None:
         """Brings each frame to size once, and sends it on its way to the device."""
-        for film in (film for row in rows for film in row.films):
-            if film.sized is None:
-                sized = self.collator.to_size(film, self.cache)
-                film.sized = replace(sized, pixels=self._copies.send(sized.pixels))
+        for video in (video for row in rows for video in row.videos):
+            if video.sized is None:
+                sized = self.collator.to_size(video, self.cache)
+                video.sized = replace(sized, pixels=self._copies.send(sized.pixels))
 
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
         """Conversations of any kind."""
@@ -84,14 +84,14 @@ class VlmPredictor:
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch) -> list[RowScores | RewardError]:
         """The scores of each row of the batch, or why it has none, from one forward pass."""
-        self._copies.wait_for([] if batch.pixels is None else batch.pixels.films)
+        self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
         output = self._output(batch)
         scores, preference, similarity, may_keep = _read(output)
         of_rows, read, num_queries = [], 0, 0
         for row in rows:
             frames = []
-            for spans, film in zip(row.spans, row.films, strict=True):
-                frames.append(self._per_frame(part_of(scores, slice(read, read + len(spans))), film.num_shown))
+            for spans, video in zip(row.spans, row.videos, strict=True):
+                frames.append(self._per_frame(part_of(scores, slice(read, read + len(spans))), video.num_shown))
                 read += len(spans)
             query = None
             if row.query is not None:
@@ -114,7 +114,7 @@ class VlmPredictor:
                 self.cache.clear()
             raise
 
-    def _completed(self, sample: NamedProgressSample) -> NamedProgressSample:
+    def _completed(self, sample: ProgressSampleRefs) -> ProgressSampleRefs:
         """The sample with the pixels of frames that were kept."""
         named = sample.trajectory
         kept = {} if self.cache is None else self.cache.found(named.digests)
@@ -123,17 +123,17 @@ class VlmPredictor:
         return replace(sample, trajectory=replace(named, pixels=pixels))
 
     def _keep(self, rows: Sequence[VlmRow], layout: Layout, made: torch.Tensor | None) -> None:
-        """Keeps the frames of the rows, and what was made of their shots; nothing of a film that alone is too large."""
+        """Keep the rows' frames and the features of their shots, but nothing of a video that alone is too large."""
         if self.cache is None:
             return
-        for film in dict.fromkeys(film for row in rows for film in row.films):
-            frames = dict(zip(film.digests, film.frames, strict=True))
+        for video in dict.fromkeys(video for row in rows for video in row.videos):
+            frames = dict(zip(video.digests, video.frames, strict=True))
             if sum(frame.nbytes for frame in frames.values()) > self.cache.limit_bytes:
                 continue
             known = self.cache.found(frames)
             for digest in frames.keys() - known.keys():
                 self.cache.keep({digest: frames[digest].copy()})
-            for key in film.ready.keys.values():
+            for key in video.ready.keys.values():
                 if made is not None and key in layout.made:
                     self.cache.keep({key: made[layout.made[key]].clone()})
 

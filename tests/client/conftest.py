@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Films, clients and a repository for the tests of the client."""
+"""Videos, clients and a repository for the tests of the client."""
 
 from __future__ import annotations
 
@@ -14,13 +14,6 @@ from environments import MODEL, LateClient
 from paths import ROOT
 from reference_server import Served
 from rfm_client import RewardClient
-
-
-@pytest.fixture(scope="module")
-def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    file = tmp_path_factory.mktemp("film") / "clip.mp4"
-    clip.write(file)
-    return file
 
 
 @pytest.fixture(scope="session")

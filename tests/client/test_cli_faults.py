@@ -16,7 +16,7 @@ import pytest
 from client_commands import RFM_CLIENT, invoke, rows, web_server
 from gateways import Gateway, running
 from proxies import Proxy
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient, ServerUnavailableError
 from rfm_client.cli.command import ExitCode
 from rfm_client.cli.scoring import WORKERS

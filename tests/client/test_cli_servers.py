@@ -41,9 +41,9 @@ from rfm_client import (
 from rfm_client.cli.command import EXIT_CODES, ExitCode
 from rfm_client.cli.commands import app
 from rfm_client.cli.documents import frame_document
-from rfm_client.cli.made_up import MadeUpSamples, parse_lengths
 from rfm_client.cli.scoring import unique_stems
 from rfm_client.cli.show import number
+from rfm_client.cli.synthetic import SyntheticSamples, parse_lengths
 from rfm_client.contract.wire import encode_samples
 from rfm_serve import wait_for
 from trajectories import random_trajectory
@@ -150,7 +150,7 @@ def test_sample_and_bench_input_ask_for_the_same_samples(
     result = ask(served, "sample", *words, "--json", "-")
     assert (result.exit_code, result.stderr) == (0, "")
     with served.client("grpc", MODEL) as client:
-        samples = MadeUpSamples(kind, 3, parse_lengths("2,5"), use_frames, seed=5).samples(client)
+        samples = SyntheticSamples(kind, 3, parse_lengths("2,5"), use_frames, seed=5).samples(client)
         expected = client.evaluate(samples)
     for answer, scores in zip(json.loads(result.stdout)["samples"], expected, strict=True):
         if isinstance(scores, ProgressResult):
@@ -177,7 +177,7 @@ def test_sample_and_bench_input_ask_for_the_same_samples(
             np.testing.assert_array_equal(flat.reshape(1, *request[tensor]["shape"]), array)
 
 
-def test_made_up_samples_are_frames_where_embeddings_are_not_read(served: Served, tmp_path: Path) -> None:
+def test_synthetic_samples_are_frames_where_embeddings_are_not_read(served: Served, tmp_path: Path) -> None:
     result = ask(served, "sample", "--num-samples", 2, model=VLM)
     assert (result.exit_code, result.stderr) == (0, "")
     assert "progress of random frames" in result.stdout
@@ -192,7 +192,7 @@ def test_sample_shows_a_table_and_tells_of_each_that_fails(served: Served) -> No
         assert line.startswith(f"rfm-client: samples[{index}]: num_frames: expected at most 16")
     good = ask(served, "sample", "--sample-type", "preference", "--num-samples", 1)
     with served.client("grpc", MODEL) as client:
-        (expected,) = client.evaluate(MadeUpSamples("preference", 1).samples(client))
+        (expected,) = client.evaluate(SyntheticSamples("preference", 1).samples(client))
     assert f"P(first) = {expected.preference:.4f}" in good.stdout  # type: ignore[union-attr]
 
 
@@ -202,7 +202,7 @@ def free_url() -> str:
 
 
 ASKING = {
-    "score": ["score", "film.mp4"],
+    "score": ["score", "video.mp4"],
     "compare": ["compare", "a.mp4", "b.mp4"],
     "sample": ["sample"],
     "bench-input": ["bench-input", "--output", "input.json"],
@@ -228,7 +228,7 @@ def test_a_server_that_does_not_answer_is_out_of_time(words: list[str]) -> None:
 
 
 def test_a_model_that_is_not_served_is_told(served: Served, protocol: str) -> None:
-    result = ask(served, "score", "film.mp4", model="unknown", protocol=protocol)
+    result = ask(served, "score", "video.mp4", model="unknown", protocol=protocol)
     assert result.exit_code == ExitCode.NO_MODEL
     assert re.fullmatch(r"rfm-client: .*unknown_frames.*\n", result.stderr), result.stderr
     (served_names,) = re.findall(r"; served: (.*): give the checkpoint's name with model \(--model\)$", result.stderr)
@@ -251,7 +251,7 @@ def test_wait_returns_when_the_model_is_ready_or_its_time_is_up(served: Served) 
 
 def test_an_interrupt_ends_it_without_a_traceback() -> None:
     with silent_server() as (url, listening):
-        command = [str(RFM_CLIENT), "score", "film.mp4", "--url", url]
+        command = [str(RFM_CLIENT), "score", "video.mp4", "--url", url]
         process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         connection, _ = listening.accept()  # by now it is asking
         with connection:

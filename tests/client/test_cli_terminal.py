@@ -13,7 +13,7 @@ from rich.console import Console
 
 import clip
 from client_commands import RFM_CLIENT, TASK
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_client.cli.command import ExitCode
 from rfm_client.cli.show import shortened, status_tables, table
 from rfm_client.transport.status import ModelStatus, ServerStatus
@@ -26,7 +26,7 @@ NAMES = ("episode_a.mp4", "episode_b.mp4")
 
 
 @pytest.fixture(scope="module")
-def films(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def videos(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("a_folder_of_which_the_name_is_long") / "observation.images.front" / "chunk-000"
     folder.mkdir(parents=True)
     for name in NAMES:
@@ -51,11 +51,11 @@ def test_the_state_of_a_server_fits_a_terminal_and_says_what_its_words_mean(demo
     assert "refused: samples that cannot be scored, the caller's fault" in told
 
 
-def test_scores_and_comparisons_fit_a_terminal_and_name_each_file(demo_server: Endpoints, films: list[Path]) -> None:
-    words, _ = shown(demo_server, "score", *films, "missing.mp4", "--task", TASK, code=ExitCode.FAILED)
+def test_scores_and_comparisons_fit_a_terminal_and_name_each_file(demo_server: Endpoints, videos: list[Path]) -> None:
+    words, _ = shown(demo_server, "score", *videos, "missing.mp4", "--task", TASK, code=ExitCode.FAILED)
     assert {"video", "progress", "success", "frames", "version"} <= words
     assert {word.rpartition("/")[2] for word in words if word.endswith(NAMES)} == set(NAMES)
-    words, _ = shown(demo_server, "compare", *films, "--task", TASK)
+    words, _ = shown(demo_server, "compare", *videos, "--task", TASK)
     assert {"rank", "P(wins)", "progress", "success", "frames", "second", "mean", "orders"} <= words
     assert {word.rpartition("/")[2] for word in words if word.endswith(".mp4")} == set(NAMES)
 

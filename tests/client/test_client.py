@@ -29,10 +29,10 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.data.resize import resize_frames
-from rfm_client.transport.access import Access
 from rfm_client.transport.calls import Answer, GrpcTransport
+from rfm_client.transport.concurrency import MAX_BYTES, ConcurrencyLimiter
+from rfm_client.transport.credentials import Credentials
 from rfm_client.transport.deadline import Deadline
-from rfm_client.transport.in_flight import MAX_BYTES, InFlight
 from trajectories import random_trajectory
 
 NOBODY = "grpc://127.0.0.1:1"  # a port where nothing listens
@@ -66,8 +66,8 @@ def test_hundreds_of_samples_of_frames_and_embeddings_come_back_in_order(served:
     embedded = [random_trajectory(seed, 1 + seed % 16, *WIDTHS) for seed in range(300)]
     samples: list[Sample] = [ProgressSample(trajectory) for trajectory in embedded]
     frames = np.random.default_rng(0).integers(0, 256, (3, 24, 32, 3), np.uint8)
-    films = [Trajectory(frames=frames[:length], task="stack the cups") for length in (1, 3)]
-    samples[150:150] = [ProgressSample(films[0]), PreferenceSample(*films), SimilaritySample(*embedded[:2])]
+    videos = [Trajectory(frames=frames[:length], task="stack the cups") for length in (1, 3)]
+    samples[150:150] = [ProgressSample(videos[0]), PreferenceSample(*videos), SimilaritySample(*embedded[:2])]
     with served.client("grpc", FRAMES_MODEL) as client:
         answers = client.evaluate(samples)
     for answer, alone in zip(answers, load_engine(FRAMES_MODEL).evaluate(samples), strict=True):
@@ -124,7 +124,7 @@ def test_a_cancelled_future_disturbs_no_other(served: Served) -> None:
 
 def test_bytes_in_flight_are_bounded_and_more_than_the_bound_goes_alone() -> None:
     async def ask() -> None:
-        room = InFlight(10).room
+        room = ConcurrencyLimiter(10).room
         async with room(MAX_BYTES // 2, Deadline(1)), room(MAX_BYTES // 2 - 1, Deadline(1)):
             with pytest.raises(DeadlineExceededError):
                 async with room(2, Deadline(0.05)):
@@ -142,9 +142,9 @@ def test_bytes_in_flight_are_bounded_and_more_than_the_bound_goes_alone() -> Non
 
 
 def test_samples_of_a_model_that_is_not_served_fail_and_the_others_are_scored(served: Served) -> None:
-    film = ProgressSample(Trajectory(frames=np.zeros((1, 8, 8, 3), np.uint8), task="none"))
+    video = ProgressSample(Trajectory(frames=np.zeros((1, 8, 8, 3), np.uint8), task="none"))
     with served.client("grpc") as client:  # MODEL has no encoders
-        outcomes = client.evaluate([film, ProgressSample(random_trajectory(0, 2)), film], return_errors=True)
+        outcomes = client.evaluate([video, ProgressSample(random_trajectory(0, 2)), video], return_errors=True)
     assert [type(outcome) for outcome in outcomes] == [ModelNotFoundError, ProgressResult, ModelNotFoundError]
 
 
@@ -160,7 +160,7 @@ def test_requests_in_flight_are_bounded(served: Served) -> None:
             finally:
                 self.now -= 1
 
-    transport = Counting(served.url("grpc"), Access(), shared_memory=False)
+    transport = Counting(served.url("grpc"), Credentials(), shared_memory=False)
     with RewardClient("", transports=[transport], model=MODEL, max_in_flight=3) as client:
         for future in [client.submit(sample) for sample in mixed_samples(30)]:
             future.result()
@@ -240,11 +240,11 @@ def test_each_trajectory_is_resized_by_its_own_size_when_asked(served: Served) -
 
 def test_pairs_of_two_frame_sizes_are_scored(served: Served) -> None:
     random = np.random.default_rng(5)
-    films = [
+    videos = [
         Trajectory(frames=random.integers(0, 256, (num_frames, *size, 3), np.uint8), task="open the drawer")
         for num_frames, size in ((4, (48, 60)), (3, (90, 61)), (2, (48, 60)))
     ]
-    samples = [PreferenceSample(a, b) if a is films[0] else SimilaritySample(a, b) for a in films for b in films]
+    samples = [PreferenceSample(a, b) if a is videos[0] else SimilaritySample(a, b) for a in videos for b in videos]
     with served.client("grpc", FRAMES_MODEL) as client:
         answers = client.evaluate(samples)
     for result, expected in zip(answers, load_engine(FRAMES_MODEL).evaluate(samples), strict=True):

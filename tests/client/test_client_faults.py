@@ -22,7 +22,7 @@ from one_model import OneModelServer, answered
 from proxies import Proxy
 from reference_server import Served
 from repositories import bound_queue, configure
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_client import (
     DeadlineExceededError,
     ProgressResult,

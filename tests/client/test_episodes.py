@@ -37,8 +37,8 @@ from rfm_client.contract import wire
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.sampling import RULES, Rule, Sampling, of_prefixes, prefix_samples
 from rfm_client.episodes import Episode
-from rfm_client.transport.access import Access
 from rfm_client.transport.calls import Answer, GrpcTransport
+from rfm_client.transport.credentials import Credentials
 from rfm_serve import Serving, serving
 
 MODEL = "enc_c1_t1_disc10"
@@ -48,7 +48,7 @@ FOUR = Sampling("rint_pad", 4)
 TOLERANCE, VLM_TOLERANCE = 1e-5, 1e-4
 
 
-def film(seed: int, count: int, size: tuple[int, int] = (40, 56)) -> UInt8Array:
+def video(seed: int, count: int, size: tuple[int, int] = (40, 56)) -> UInt8Array:
     return np.random.default_rng(seed).integers(0, 256, (count, *size, 3), np.uint8)
 
 
@@ -74,7 +74,7 @@ class Recording(GrpcTransport):
     """To the real server; notes the inputs of each request."""
 
     def __init__(self, url: str) -> None:
-        super().__init__(url, Access(), shared_memory=False)
+        super().__init__(url, Credentials(), shared_memory=False)
         self.requests: list[wire.Tensors] = []
 
     async def infer(self, model: str, inputs: wire.Tensors, outputs: Any, timeout_s: float, **more: str) -> Answer:
@@ -107,7 +107,7 @@ STEPPED = [
 @pytest.mark.parametrize(("model", "rule", "protocol"), STEPPED)
 def test_steps_have_the_scores_of_the_whole(served: Served, model: str, rule: Rule, protocol: str) -> None:
     number = None if rule == "all" or rule.startswith("rewind") else 7 if model == MODEL else 4
-    frames = film(RULES.index(rule), 16 if rule == "all" else 40, (40, 56) if model == MODEL else (56, 84))
+    frames = video(RULES.index(rule), 16 if rule == "all" else 40, (40, 56) if model == MODEL else (56, 84))
     with served.client(protocol, model) as client, client.episode(TASK, sampling=rule, frames=number) as episode:
         assert client.model_info(frames=True).by_digest
         tolerance = TOLERANCE if model == MODEL else VLM_TOLERANCE
@@ -117,7 +117,7 @@ def test_steps_have_the_scores_of_the_whole(served: Served, model: str, rule: Ru
 def test_a_step_sends_its_new_frame_alone_and_nothing_is_encoded_twice(served: Served) -> None:
     """Of a model that reads videos, each new pair of frames is encoded, as a model that reads frames reads each."""
     encoders = {MODEL: f"{MODEL}_encoder", IMAGES: f"{IMAGES}_frames", VIDEO: f"{VIDEO}_frames"}
-    frames = film(100, 12, (56, 84))
+    frames = video(100, 12, (56, 84))
 
     def encoded() -> dict[str, float]:
         """Frames so far, by model. Each has told Triton of all by now."""
@@ -153,19 +153,19 @@ def test_a_step_sends_its_new_frame_alone_and_nothing_is_encoded_twice(served: S
 
 
 def test_episodes_side_by_side_are_one_request_and_score_alike(transport: Recording, client: RewardClient) -> None:
-    films = np.stack([film(seed, 7) for seed in (200, 201, 202)], axis=1)  # [T, N, H, W, 3]
+    videos = np.stack([video(seed, 7) for seed in (200, 201, 202)], axis=1)  # [T, N, H, W, 3]
     tasks = ["stack the cups", "open the drawer", "stack the cups"]
     episodes = client.episodes(3, tasks, frames=4)
-    added = [episodes.add(frames) for frames in films]
-    assert len(transport.requests) == len(films)
+    added = [episodes.add(frames) for frames in videos]
+    assert len(transport.requests) == len(videos)
     for index, task in enumerate(tasks):
         scores = [float(step.progress[index]) for step in added], [float(step.success[index]) for step in added]
-        assert_same(scores, offline(client, films[:, index], task=task))
+        assert_same(scores, offline(client, videos[:, index], task=task))
     assert added[-1].step.tolist() == [6, 6, 6]
 
 
 def test_a_mask_leaves_episodes_out_and_a_reset_begins_some_anew(client: RewardClient) -> None:
-    frames = film(103, 4)
+    frames = video(103, 4)
     episodes = client.episodes(2, TASK, frames=4)
     episodes.add(frames[[0, 1]])
     scores = episodes.add([None, frames[2]], mask=[False, True])
@@ -184,7 +184,7 @@ def test_a_mask_leaves_episodes_out_and_a_reset_begins_some_anew(client: RewardC
 
 
 def test_cameras_are_scored_apart_and_fused(client: RewardClient) -> None:
-    front, wrist = film(104, 5), film(105, 5, (48, 48))  # of two sizes
+    front, wrist = video(104, 5), video(105, 5, (48, 48))  # of two sizes
     apart = [offline(client, frames).progress[-1] for frames in (front, wrist)]
     for fuse, expected in {"mean": np.mean(apart), "min": min(apart), "max": max(apart)}.items():
         episode = client.episode(TASK, frames=4, cameras=("front", "wrist"), fuse=fuse)  # type: ignore[arg-type]
@@ -206,7 +206,7 @@ def test_cameras_are_scored_apart_and_fused(client: RewardClient) -> None:
     ids=["all cameras", "one of them", "each its own", "the other one"],
 )
 def test_frames_are_scored_as_they_are_turned(client: RewardClient, orient: Any, front_as: Any, wrist_as: Any) -> None:
-    front, wrist = film(104, 3), film(105, 3, (48, 44))
+    front, wrist = video(104, 3), video(105, 3, (48, 44))
     upright = client.episode(TASK, sampling="all", cameras=("front", "wrist"))
     turned = client.episode(TASK, sampling="all", cameras=("front", "wrist"), orient=orient)
     for a, b in zip(front, wrist, strict=True):
@@ -215,13 +215,13 @@ def test_frames_are_scored_as_they_are_turned(client: RewardClient, orient: Any,
 
 
 def test_a_frame_that_is_wrong_leaves_the_episode_as_it_was(client: RewardClient) -> None:
-    frames = film(107, 3)
+    frames = video(107, 3)
     episode = client.episode(TASK, frames=4)
     episode.add(frames[0])
     with pytest.raises(InvalidSampleError, match=r"^frame: expected uint8 \[H, W, 3\], got float64 \[2, 2, 3\]"):
         episode.add(np.zeros((2, 2, 3)))
     with pytest.raises(InvalidSampleError, match=r"expected uint8 \[40, 56, 3\], as the episode's first, got"):
-        episode.add(film(0, 1, (8, 8))[0])
+        episode.add(video(0, 1, (8, 8))[0])
     scores = [episode.add(frame) for frame in frames[1:]]
     assert [score.step for score in scores] == [1, 2]
     expected = offline(client, frames).progress[1:]
@@ -233,7 +233,7 @@ def test_a_frame_that_is_wrong_leaves_the_episode_as_it_was(client: RewardClient
 
 
 def test_the_newest_frame_takes_the_place_of_one_that_waits(client: RewardClient) -> None:
-    frames, episode = film(108, 30), client.episode(TASK, frames=4)
+    frames, episode = video(108, 30), client.episode(TASK, frames=4)
     answers = [episode.add_nowait(frame) for frame in frames]
     score = answers[-1].result()
     taken = [index for index, answer in enumerate(answers) if not answer.cancelled()]
@@ -250,7 +250,7 @@ def test_the_newest_frame_takes_the_place_of_one_that_waits(client: RewardClient
 
 def test_frames_stay_in_the_order_in_which_they_were_added(served: Served, client: RewardClient) -> None:
     """Whether they are waited for or not, with a reset between them, and where somebody stops to wait for one."""
-    frames = film(113, 5)
+    frames = video(113, 5)
 
     async def play() -> tuple[list[float], list[int]]:
         async with AsyncRewardClient(served.url("grpc"), model=MODEL) as client:
@@ -281,18 +281,18 @@ def test_frames_stay_in_the_order_in_which_they_were_added(served: Served, clien
 def test_an_episode_keeps_its_client(served: Served) -> None:
     episode = RewardClient(served.url("grpc"), model=MODEL).episode(TASK, frames=4)
     gc.collect()
-    assert [episode.add(frame).step for frame in film(115, 2)] == [0, 1]
+    assert [episode.add(frame).step for frame in video(115, 2)] == [0, 1]
 
 
 def test_large_frames_go_in_several_requests(transport: Recording, client: RewardClient) -> None:
-    large = film(116, 5, (700, 700))  # 1.5 MB each
+    large = video(116, 5, (700, 700))  # 1.5 MB each
     episodes = client.episodes(5, TASK, frames=2)
     scores = episodes.add(large)
     assert sorted(len(inputs[wire.NUM_FRAMES]) for inputs in transport.requests) == [1, 2, 2]
     expected = [offline(client, large[[index]], Sampling("rint_pad", 2)).progress[0] for index in range(5)]
     np.testing.assert_allclose(scores.progress, expected, atol=TOLERANCE)
     alike = client.episodes(5, TASK, frames=2)
-    alike.add(np.repeat(film(117, 1, (700, 700)), 5, axis=0))  # each row of a request is as long as its longest
+    alike.add(np.repeat(video(117, 1, (700, 700)), 5, axis=0))  # each row of a request is as long as its longest
     assert transport.most_bytes < 4 * 2**20
 
 
@@ -318,7 +318,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "no task": ({"task": " "}, "task: expected a task"),
     "not UTF-8": ({"task": "\ud800"}, "task: expected text that UTF-8 can encode"),
     "a camera": ({"cameras": "front"}, "^cameras: expected a sequence of names, got 'front'$"),
-    "a camera's frame": ({"frame": {"a": film(0, 1)[0]}}, r"^frames: .* of one camera .*, got frames of \['a'\]"),
+    "a camera's frame": ({"frame": {"a": video(0, 1)[0]}}, r"^frames: .* of one camera .*, got frames of \['a'\]"),
     "orient": (
         {"cameras": ["front"], "orient": {"wrist": "rotate180"}},
         r"^orient: expected some of the cameras \['front'\], got 'wrist'$",
@@ -328,7 +328,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 
 @pytest.mark.parametrize(("given", "message"), REFUSED.values(), ids=REFUSED)
 def test_what_cannot_be_right_is_refused(client: RewardClient, given: dict[str, Any], message: str) -> None:
-    given = {"task": TASK, "frame": film(0, 1)[0], "frames": 4, **given}
+    given = {"task": TASK, "frame": video(0, 1)[0], "frames": 4, **given}
     frame = given.pop("frame")
     with pytest.raises(ValueError, match=message):
         client.episode(**given).add(frame)
@@ -337,7 +337,7 @@ def test_what_cannot_be_right_is_refused(client: RewardClient, given: dict[str, 
 def test_a_model_that_is_not_served_and_tasks_that_are_too_few_are_told(served: Served) -> None:
     with served.client("grpc", "not_served") as client:
         with pytest.raises(ModelNotFoundError):
-            client.episode(TASK, frames=4).add(film(0, 1)[0])
+            client.episode(TASK, frames=4).add(video(0, 1)[0])
         with pytest.raises(ValueError, match="expected one for each of 3 episodes"):
             client.episodes(3, ["a", "b"])
 
@@ -357,7 +357,7 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
 @pytest.mark.slow
 @pytest.mark.triton
 def test_an_episode_goes_on_when_the_process_that_knew_its_frames_was_killed(own: Serving) -> None:
-    frames = film(118, 9)
+    frames = video(118, 9)
     with own.client(model=IMAGES) as client, client.episode(TASK, frames=4) as episode:
         scores = [episode.add(frame) for frame in frames[:5]]
         (pid,) = own.model_processes(f"{IMAGES}_frames")
@@ -372,7 +372,7 @@ def test_an_episode_goes_on_when_the_process_that_knew_its_frames_was_killed(own
 
 @pytest.mark.slow
 def test_a_server_that_knows_some_frames_and_one_that_keeps_none_score_alike(served: Served, own: Serving) -> None:
-    frames = film(112, 12)
+    frames = video(112, 12)
     with RewardClient([served.url("grpc"), own.endpoints.grpc_url], model=MODEL) as client:
         expected = offline(client, frames)
         for _ in range(3):

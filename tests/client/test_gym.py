@@ -52,11 +52,11 @@ def test_each_step_is_paid_by_the_scores_of_its_episode(client: RewardClient, op
     every, max_frames = options.get("every", 1), options.get("max_frames", MAX_FRAMES)
     for seed in range(2):
         rewards, infos = play(env, seed)
-        film, last = camera.films[seed], len(rewards)
+        video, last = camera.videos[seed], len(rewards)
         assert last >= 8
         assert every == 1 or seed or last % every != 0  # the last step is scored nevertheless
         newest = [step if step == last else step - step % every for step in range(last + 1)]
-        answers = {step: scores(client, film, step, max_frames) for step in newest}
+        answers = {step: scores(client, video, step, max_frames) for step in newest}
         values = np.array([answers[step].progress[-1] for step in newest])
         expected = np.diff(values) if options.get("mode") == "delta" else values[1:]
         assert_close(rewards, options.get("scale", 1) * expected + options.get("add_to_env_reward", False))
@@ -70,14 +70,14 @@ def test_each_step_is_paid_by_the_scores_of_its_episode(client: RewardClient, op
 def test_an_episode_ends_where_most_of_the_last_frames_succeed(client: RewardClient) -> None:
     camera = Camera(cart_pole())
     play(RewardModelWrapper(camera, client, TASK))
-    film = camera.films[0]
-    successes = [scores(client, film, step).success for step in range(len(film))]
+    video = camera.videos[0]
+    successes = [scores(client, video, step).success for step in range(len(video))]
     threshold = float(np.median([np.median(success[-3:]) for success in successes[1:]]))
     votes = [np.mean(success[-3:] >= threshold) > 0.5 for success in successes]
     expected = votes.index(True, 1)
     env = RewardModelWrapper(cart_pole(), client, TASK, RewardOptions(terminate_on_success=SuccessRule(threshold, 3)))
     rewards, _ = play(env)
-    assert len(rewards) == expected < len(film) - 1
+    assert len(rewards) == expected < len(video) - 1
 
 
 @pytest.mark.parametrize(("threshold", "every", "steps"), [(0.0, 1, 1), (0.0, 4, 4), (1.0, 1, 8)])
@@ -117,13 +117,13 @@ def test_several_cameras_are_scored_apart_and_fused(client: RewardClient, fuse: 
     options = RewardOptions(frames_from=two_cameras, cameras=["wrist", "front"], fuse=fuse, blocking=blocking)
     env = RewardModelWrapper(cart_pole_with_pixels(), client, TASK, options)
     observation, info = env.reset(seed=0)
-    film, ended, rewards = [two_cameras(observation)], False, []
+    video, ended, rewards = [two_cameras(observation)], False, []
     while not ended:
         observation, reward, ended, _, info = env.step(PUSH_RIGHT)
-        film.append(two_cameras(observation))
+        video.append(two_cameras(observation))
         rewards.append(reward)
-    steps = list(range(1, len(film)))
-    of_cameras = [progress(client, [shown[name] for shown in film], steps) for name in ("front", "wrist")]
+    steps = list(range(1, len(video)))
+    of_cameras = [progress(client, [shown[name] for shown in video], steps) for name in ("front", "wrist")]
     expected = getattr(np, fuse)(of_cameras, axis=0)
     assert info["reward_model"]["step"] == steps[-1]  # the last is waited for
     assert_close(rewards if blocking else rewards[-1], expected if blocking else expected[-1])
@@ -199,7 +199,7 @@ def test_a_step_goes_on_with_the_newest_answer_that_has_come(client: RewardClien
         rewards.append(reward)
         told.append(info["reward_model"])
     newest = [step for _, step in COMING]
-    values = progress(client, camera.films[0], [0, *newest], None)
+    values = progress(client, camera.videos[0], [0, *newest], None)
     assert_close(rewards, values[1:] if mode == "absolute" else np.diff(values))
     expected = [(known, step - known, 0) for step, known in enumerate(newest, 1)]
     assert [(each["step"], each["lag"], each["skipped"]) for each in told] == expected
@@ -222,7 +222,7 @@ def test_with_too_many_questions_open_a_step_is_skipped_and_counted_until_a_rese
     late.hold(1)
     _, reward, _, _, info = env.step(PUSH_RIGHT)
     assert (info["reward_model"]["step"], info["reward_model"]["skipped"]) == (0, 0)
-    assert_close(reward, progress(client, camera.films[1], [0], None))
+    assert_close(reward, progress(client, camera.videos[1], [0], None))
     env.close()
 
 
@@ -237,7 +237,7 @@ def test_the_last_step_waits_so_that_late_rewards_add_up_unless_it_shall_not(
     rewards, infos = play_on(env)
     last = 1 + len(rewards)
     known = last if await_last else 1
-    first, second, newest = progress(client, camera.films[0], [0, 1, known], None)
+    first, second, newest = progress(client, camera.videos[0], [0, 1, known], None)
     assert_close(rewards, [second - first, *[0] * (last - 3), newest - second])
     told = infos[-1]["reward_model"]
     assert (told["step"], told["lag"], told["skipped"]) == (known, last - known, last - 4)
@@ -250,7 +250,7 @@ def test_an_episode_ends_at_the_step_at_which_success_is_known_and_stays_a_succe
     """The answer about that step, which is waited for, may say otherwise."""
     camera = Camera(cart_pole())
     play(RewardModelWrapper(camera, client, TASK))
-    success = [float(scores(client, camera.films[0], step, None).success[-1]) for step in range(6)]
+    success = [float(scores(client, camera.videos[0], step, None).success[-1]) for step in range(6)]
     early, later = next((a, b) for b in range(2, 6) for a in range(1, b) if success[a] > success[b])
     rule = SuccessRule(threshold=(success[early] + success[later]) / 2)
     env, camera = not_blocking(late, max_pending=6, terminate_on_success=rule)
@@ -261,7 +261,7 @@ def test_an_episode_ends_at_the_step_at_which_success_is_known_and_stays_a_succe
     told = info["reward_model"]
     assert (terminated, truncated, told["succeeded"], told["step"]) == (True, False, True, later)
     assert_close(told["success"], success[later])
-    assert_close(reward, progress(client, camera.films[0], [later], None))
+    assert_close(reward, progress(client, camera.videos[0], [later], None))
 
 
 def test_after_an_error_delta_pays_what_was_missed(client: RewardClient, late: LateClient) -> None:
@@ -273,7 +273,7 @@ def test_after_an_error_delta_pays_what_was_missed(client: RewardClient, late: L
     with pytest.raises(ServerUnavailableError, match=r"^the server is restarting \(request \w+-\d+\)$"):
         env.step(PUSH_RIGHT)
     reward = env.step(PUSH_RIGHT)[1]
-    first, _, newest = progress(client, camera.films[0], range(3), None)
+    first, _, newest = progress(client, camera.videos[0], range(3), None)
     assert_close(reward, newest - first)
 
 

@@ -149,10 +149,10 @@ def test_wrapped_environments_work_in_processes_of_their_own(served: Served, cli
 
     env = AsyncVectorEnv([env_fn] * 2, context="spawn")
     env.reset(seed=[5, 6])
-    films = [[frame] for frame in env.render()]
+    videos = [[frame] for frame in env.render()]
     for _ in range(2):
         rewards = env.step(np.array([0, 1]))[1]
-        for film, frame in zip(films, env.render(), strict=True):
-            film.append(frame)
+        for video, frame in zip(videos, env.render(), strict=True):
+            video.append(frame)
     env.close()
-    assert_close(rewards, [progress(client, film, [2], max_frames=4)[0] for film in films])
+    assert_close(rewards, [progress(client, video, [2], max_frames=4)[0] for video in videos])

@@ -237,10 +237,10 @@ def test_npy_files_hold_frames_or_embeddings(tmp_path: Path) -> None:
 
 
 def test_frames_of_files_are_turned_as_the_caller_says_and_embeddings_are_refused(tmp_path: Path) -> None:
-    np.save(tmp_path / "film.npy", FRAMES)
-    np.savez(tmp_path / "film.npz", frames=FRAMES, task="lift")
+    np.save(tmp_path / "video.npy", FRAMES)
+    np.savez(tmp_path / "video.npz", frames=FRAMES, task="lift")
     np.save(tmp_path / "seen.npy", np.zeros((2, 3), np.float32))
-    for name in ("film.npy", "film.npz"):
+    for name in ("video.npy", "video.npz"):
         assert load_trajectory(tmp_path / name, orient="rotate180").positions.tolist() == FRAMES[:, ::-1, ::-1].tolist()
     with pytest.raises(InvalidSampleError, match=r"^orient: expected none for embeddings, .*, got rotate180"):
         load_trajectory(tmp_path / "seen.npy", orient="rotate180")
@@ -248,12 +248,12 @@ def test_frames_of_files_are_turned_as_the_caller_says_and_embeddings_are_refuse
 
 def test_npz_files_hold_a_whole_trajectory(tmp_path: Path) -> None:
     embeddings, text = np.arange(6, dtype=np.float32).reshape(2, 3), np.arange(4, dtype=np.float32)
-    np.savez(tmp_path / "film.npz", frames=FRAMES, task="lift the cup")
+    np.savez(tmp_path / "video.npz", frames=FRAMES, task="lift the cup")
     np.savez_compressed(tmp_path / "seen.NPZ", video_embeddings=embeddings, text_embedding=text)
     (tmp_path / "seen.NPZ.npz").rename(tmp_path / "seen.NPZ")
-    film, seen = load_trajectory(tmp_path / "film.npz"), load_trajectory(tmp_path / "seen.NPZ")
-    np.testing.assert_array_equal(film.positions, FRAMES)
-    assert film.task == "lift the cup"
+    video, seen = load_trajectory(tmp_path / "video.npz"), load_trajectory(tmp_path / "seen.NPZ")
+    np.testing.assert_array_equal(video.positions, FRAMES)
+    assert video.task == "lift the cup"
     np.testing.assert_array_equal(seen.video_embeddings, embeddings)
     np.testing.assert_array_equal(seen.text_embedding, text)
 

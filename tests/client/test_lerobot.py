@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A film of several LeRobot episodes is not one trajectory."""
+"""A video of several LeRobot episodes is not one trajectory."""
 
 from __future__ import annotations
 
@@ -17,64 +17,64 @@ from rfm_client.data.video import read_video
 
 
 def lerobot_dataset(root: Path, version: str, video: str, episodes: int) -> Path:
-    """A dataset's folder, as far as a video's reader looks: ``meta/info.json`` and one film. Gives the film."""
-    film = root / video
-    film.parent.mkdir(parents=True)
-    write_video(film, numbered(10))
+    """A dataset's folder, as far as a video's reader looks: ``meta/info.json`` and one file. Gives the file."""
+    file = root / video
+    file.parent.mkdir(parents=True)
+    write_video(file, numbered(10))
     (root / "meta").mkdir()
     info = {"codebase_version": version, "total_episodes": episodes}
     (root / "meta" / "info.json").write_text(json.dumps(info))
-    return film
+    return file
 
 
-V30_FILM = f"videos/{TOP}/chunk-000/file-000.mp4"
-V21_FILM = f"videos/chunk-000/{TOP}/episode_000000.mp4"
-ONE_EPISODE = "video: expected a film of one episode, got "
+V30_VIDEO = f"videos/{TOP}/chunk-000/file-000.mp4"
+V21_VIDEO = f"videos/chunk-000/{TOP}/episode_000000.mp4"
+ONE_EPISODE = "video: expected a video of one episode, got "
 INSTEAD = "label the dataset with rfm-client label, or name the part of the file"
 
 
 @pytest.mark.parametrize(
     ("version", "video", "held"),
     [
-        ("v3.0", V30_FILM, "10 episodes"),
-        ("v3.1", "films/000.mp4", "some of the dataset's 10 episodes"),
-        (3, "films/000.mp4", "some of the dataset's 10 episodes"),
+        ("v3.0", V30_VIDEO, "10 episodes"),
+        ("v3.1", "videos/000.mp4", "some of the dataset's 10 episodes"),
+        (3, "videos/000.mp4", "some of the dataset's 10 episodes"),
     ],
 )
 def test_a_lerobot_file_that_may_hold_several_episodes_is_refused(
     tmp_path: Path, version: Any, video: str, held: str
 ) -> None:
-    film = lerobot_dataset(tmp_path, version, video, 10)
+    file = lerobot_dataset(tmp_path, version, video, 10)
     for read in (read_video, load_trajectory):
         with pytest.raises(InvalidSampleError) as caught:
-            read(film)
+            read(file)
         told = f"{ONE_EPISODE}a LeRobot {version} file that holds "
         assert str(caught.value).startswith(told)
         assert f"{held}: {INSTEAD}" in str(caught.value)
-        assert str(caught.value).endswith(f"({film})")
+        assert str(caught.value).endswith(f"({file})")
 
 
 def test_a_part_of_a_lerobot_v3_file_is_read(tmp_path: Path) -> None:
-    film = lerobot_dataset(tmp_path, "v3.0", V30_FILM, 10)
-    part = load_trajectory(film, start_s=0.30000001, end_s=0.7, task="stack the cups")
+    file = lerobot_dataset(tmp_path, "v3.0", V30_VIDEO, 10)
+    part = load_trajectory(file, start_s=0.30000001, end_s=0.7, task="stack the cups")
     assert numbers(part.positions, 10) == [3, 4, 5, 6]
-    assert numbers(read_video(film, 5, start_s=0.0, end_s=0.8), 10) == [0, 2, 4, 7]
+    assert numbers(read_video(file, 5, start_s=0.0, end_s=0.8), 10) == [0, 2, 4, 7]
     for start_s, end_s in ((0.3, 0.3), (5.0, 6.0)):
         with pytest.raises(
             InvalidSampleError, match=r"^start_s to end_s: expected a part with frames, got .* of 0\.9 s"
         ):
-            read_video(film, start_s=start_s, end_s=end_s)
+            read_video(file, start_s=start_s, end_s=end_s)
     with pytest.raises(InvalidSampleError, match=ONE_EPISODE):
-        read_video(film, start_s=0.3)
+        read_video(file, start_s=0.3)
 
 
 def test_a_lerobot_v3_file_without_its_dataset_is_known_by_its_path(tmp_path: Path) -> None:
-    film = lerobot_dataset(tmp_path, "v3.0", V30_FILM, 10)
+    file = lerobot_dataset(tmp_path, "v3.0", V30_VIDEO, 10)
     (tmp_path / "meta" / "info.json").unlink()
     with pytest.raises(
         InvalidSampleError, match=f"{ONE_EPISODE}a file in the layout of LeRobot v3.0, which holds many"
     ):
-        read_video(film)
+        read_video(file)
 
 
 @pytest.mark.parametrize("camera", [TOP, TOP.replace(".", "%2E")])
@@ -90,29 +90,29 @@ def test_a_lerobot_v3_file_behind_a_url_is_refused_and_not_downloaded(camera: st
 
 @pytest.mark.parametrize(
     ("version", "video", "episodes"),
-    [("v2.1", V21_FILM, 10), ("v2.0", V21_FILM, 10), ("v3.0", V30_FILM, 1), (None, "films/file-000.mp4", 10)],
+    [("v2.1", V21_VIDEO, 10), ("v2.0", V21_VIDEO, 10), ("v3.0", V30_VIDEO, 1), (None, "videos/file-000.mp4", 10)],
     ids=["v2.1", "v2.0", "v3.0 with one episode in all", "another project's info.json"],
 )
-def test_a_film_of_one_episode_is_read(tmp_path: Path, version: str | None, video: str, episodes: int) -> None:
-    film = lerobot_dataset(tmp_path, version or "", video, episodes)
+def test_a_video_of_one_episode_is_read(tmp_path: Path, version: str | None, video: str, episodes: int) -> None:
+    file = lerobot_dataset(tmp_path, version or "", video, episodes)
     if version is None:
         (tmp_path / "meta" / "info.json").write_text('{"about": "another project"}')
-    assert numbers(read_video(film), 10) == list(range(10))
+    assert numbers(read_video(file), 10) == list(range(10))
 
 
 def test_a_lerobot_dataset_that_cannot_be_read_is_an_error(tmp_path: Path) -> None:
-    film = lerobot_dataset(tmp_path, "v3.0", V30_FILM, 10)
+    file = lerobot_dataset(tmp_path, "v3.0", V30_VIDEO, 10)
     (tmp_path / "meta" / "info.json").write_text('{"codebase_version": "v3')
     with pytest.raises(InvalidSampleError, match=r"^meta/info\.json: expected a readable JSON file, got Unterminated"):
-        read_video(film)
+        read_video(file)
 
 
 def test_a_lerobot_v3_file_is_known_behind_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    film, outside = lerobot_dataset(tmp_path / "data", "v3.0", V30_FILM, 10), tmp_path / "film.mp4"
-    film.rename(tmp_path / "blob")
-    film.symlink_to(tmp_path / "blob")  # as a Hub download consists of links into a cache
-    outside.symlink_to(lerobot_dataset(tmp_path / "other", "v3.0", V30_FILM, 10))
-    monkeypatch.chdir(film.parent)
-    for path in (Path(film.name), outside):
+    file, outside = lerobot_dataset(tmp_path / "data", "v3.0", V30_VIDEO, 10), tmp_path / "video.mp4"
+    file.rename(tmp_path / "blob")
+    file.symlink_to(tmp_path / "blob")  # as a Hub download consists of links into a cache
+    outside.symlink_to(lerobot_dataset(tmp_path / "other", "v3.0", V30_VIDEO, 10))
+    monkeypatch.chdir(file.parent)
+    for path in (Path(file.name), outside):
         with pytest.raises(InvalidSampleError, match=r"a LeRobot v3\.0 file that holds 10 episodes"):
             read_video(path)

@@ -239,17 +239,17 @@ def test_without_pillow_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_the_scores_that_add_returns_are_reported(served: Served, taker: Taker) -> None:
-    film = [picture(seed) for seed in range(9)]
+    video = [picture(seed) for seed in range(9)]
     rule = SuccessRule(threshold=0.0)
     with RewardClient(served.url("grpc"), model=MODEL) as client, LiveView(taker.url) as view:
         with client.episode("stack the cups", live=view, success=rule) as episode:
-            alone = [episode.add(frame) for frame in film[:4]]
+            alone = [episode.add(frame) for frame in video[:4]]
             episode.reset(task="open the drawer")
-            again = [episode.add_nowait(frame).result() for frame in film[:3]]
+            again = [episode.add_nowait(frame).result() for frame in video[:3]]
         with client.episodes(2, ["first", "second"], live=view, success=rule) as episodes:
-            together = [episodes.add([film[step], film[step + 4]]) for step in range(3)]
+            together = [episodes.add([video[step], video[step + 4]]) for step in range(3)]
             episodes.reset([True, False])
-            together.append(episodes.add(film[:2], [True, False]))
+            together.append(episodes.add(video[:2], [True, False]))
     beside = [[step.of(index) for step in together[:3]] for index in range(2)]
     expected = {("stack the cups", 0): alone, ("open the drawer", 0): again, ("first", 0): beside[0]}
     expected |= {("second", 1): beside[1]}

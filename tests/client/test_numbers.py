@@ -104,4 +104,4 @@ def test_percent_are_told_from_a_probability(give: Given) -> None:
 @pytest.mark.parametrize("name", ["fps", "start_s", "end_s"])
 def test_a_part_of_a_video_has_times_that_can_be(tmp_path: Path, read: Any, name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=rf"^{name}: expected .*, got "):
-        read(tmp_path / "film.mp4", **{name: value})
+        read(tmp_path / "video.mp4", **{name: value})

@@ -11,7 +11,7 @@ import pytest
 from pyarrow import parquet
 
 from client_commands import invoke
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient, load_trajectory
 from rfm_client.data.sampling import Sampling
 from rfm_client.labelling import ClientScorer, LabelOptions, label, open_dataset
@@ -25,15 +25,15 @@ TOLERANCE = 1e-5
 
 
 @pytest.fixture(scope="module")
-def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("films")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("videos")
     write_video(folder / "success.mp4", make_clip("success", Task("red", "bowl"), 2_000_000).frames)
     (folder / "tasks.json").write_text(json.dumps({"success.mp4": TASK}))
     return folder / "success.mp4"
 
 
-def test_demo_score_episode_and_labels_agree_on_a_clip_of_the_demo(demo_server: Endpoints, film: Path) -> None:
-    trajectory = load_trajectory(film, task=TASK)
+def test_demo_score_episode_and_labels_agree_on_a_clip_of_the_demo(demo_server: Endpoints, video: Path) -> None:
+    trajectory = load_trajectory(video, task=TASK)
     assert trajectory.frames is not None
     with RewardClient(demo_server.grpc_url) as client:
         info = client.model_info(frames=True)
@@ -41,9 +41,9 @@ def test_demo_score_episode_and_labels_agree_on_a_clip_of_the_demo(demo_server: 
         expected = client.progress(trajectory).progress  # as the demo asks
         with client.episode(TASK) as episode:
             stepped = [episode.add(frame).progress for frame in trajectory.frames]
-        report = label(open_dataset(film.parent), ClientScorer(client), LabelOptions())
+        report = label(open_dataset(video.parent), ClientScorer(client), LabelOptions())
     labelled = parquet.read_table(report.files[0])["progress_sparse"].to_numpy()
-    shown = invoke("score", film, "--task", TASK, "--url", demo_server.http_url, "--json")
+    shown = invoke("score", video, "--task", TASK, "--url", demo_server.http_url, "--json")
     (scored,) = json.loads(shown.stdout)["videos"]
     assert expected[-1] > 0.95
     for curve in (stepped, labelled, scored["progress"]):

@@ -12,7 +12,7 @@ import pytest
 from client_commands import invoke
 from gateways import running
 from proxies import HttpProxy, Proxy
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_client import DeadlineExceededError, RewardClient
 from rfm_client.contract.proxies import grpc_proxy, open_url
 from rfm_client.transport.status import read_status

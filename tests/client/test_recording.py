@@ -16,7 +16,7 @@ import rerun
 from PIL import Image
 
 from client_commands import TASK, invoke
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_client import FrameScores
 from rfm_client.cli.command import ExitCode
 from rfm_client.data.inputs import load_trajectory
@@ -51,8 +51,8 @@ def test_score_records_frames_and_curves_on_one_timeline(demo_server: Endpoints,
         *("--rrd", out, "--json", target, "--url", demo_server.grpc_url),
     )
     assert result.exit_code == ExitCode.FAILED  # of the missing one alone
-    of_film, of_seen = {"image", "progress", "success"}, {"progress", "success"}
-    stems = {"clip": of_film, r"other\ clip": of_film, "seen": of_seen}
+    of_video, of_seen = {"image", "progress", "success"}, {"progress", "success"}
+    stems = {"clip": of_video, r"other\ clip": of_video, "seen": of_seen}
     assert {f"/{stem}/{name}" for stem, names in stems.items() for name in names} <= entities(out)
     assert not any("missing" in entity for entity in entities(out))
     scores = {Path(each["source"]).stem: each for each in json.loads(target.read_text())["videos"]}
@@ -68,7 +68,7 @@ def test_score_records_frames_and_curves_on_one_timeline(demo_server: Endpoints,
     assert len(indices) == 7
     for name in ("progress", "success"):
         curve_times, values = logged(out, TIME, f"/clip/{name}", "Scalar")
-        assert curve_times == [times[index] for index in indices]  # the film and its curves meet
+        assert curve_times == [times[index] for index in indices]  # the video and its curves meet
         np.testing.assert_array_equal(values, scores["clip"][name])
         steps, values = logged(out, FRAME, f"/seen/{name}", "Scalar")
         assert steps == scores["seen"]["frame_indices"]

@@ -125,16 +125,16 @@ def test_score_scores_each_frame_on_its_prefix(served: Served, video: Path, rule
     result = ask(served, "score", video, "--task", TASK, "--sampling", rule, *words, "--json")
     assert (result.exit_code, result.stderr) == (0, "")
     (scored,) = json.loads(result.stdout)["videos"]
-    film = load_trajectory(video, task=TASK, fps=3.0)
-    assert film.frames is not None
+    trajectory = load_trajectory(video, task=TASK, fps=3.0)
+    assert trajectory.frames is not None
     sampling = Sampling.of(rule, 4 if words else None, None)
     with served.client("grpc", MODEL) as client:
-        shown = [sampling.prefix(t) for t in range(film.num_frames)]
+        shown = [sampling.prefix(t) for t in range(trajectory.num_frames)]
         results = client.evaluate(
-            ProgressSample(Trajectory(frames=film.frames[prefix.indices], task=TASK)) for prefix in shown
+            ProgressSample(Trajectory(frames=trajectory.frames[prefix.indices], task=TASK)) for prefix in shown
         )
         if rule == "linspace_trunc":
-            assert_scores(scored, client.progress(film, frame_steps=4))
+            assert_scores(scored, client.progress(trajectory, frame_steps=4))
     for name in ("progress", "success"):
         expected = [getattr(each, name)[prefix.read] for each, prefix in zip(results, shown, strict=True)]
         np.testing.assert_allclose(scored[name], expected, rtol=0, atol=1e-5)

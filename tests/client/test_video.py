@@ -24,19 +24,19 @@ from rfm_client.data.inputs import load_trajectory
 from rfm_client.data.video import read_video
 
 
-def test_a_video_is_read_whole_or_at_a_frame_rate(film: Path) -> None:
-    whole = load_trajectory(film, task=clip.TASK)
+def test_a_video_is_read_whole_or_at_a_frame_rate(video: Path) -> None:
+    whole = load_trajectory(video, task=clip.TASK)
     assert whole.task == clip.TASK
     assert np.abs(whole.positions.astype(int) - clip.render()).mean() < 8  # lossy, but the same picture
-    sampled = load_trajectory(str(film), fps=3).positions
+    sampled = load_trajectory(str(video), fps=3).positions
     indices = np.linspace(0, clip.NUM_FRAMES - 1, round(clip.NUM_FRAMES * 3 / clip.FPS)).astype(int)
     np.testing.assert_array_equal(sampled, whole.positions[indices])
 
 
-def test_memory_is_told_before_it_is_taken(film: Path) -> None:
+def test_memory_is_told_before_it_is_taken(video: Path) -> None:
     frame_bytes = clip.SIZE_PX**2 * 3
     told: list[int] = []
-    frames = read_video(film, 1, take=told.append)
+    frames = read_video(video, 1, take=told.append)
     assert len(told) > len(frames) + 1  # at each frame that is decoded, so that what it raises ends the reading soon
     assert [size for size in told if size] == [*[frame_bytes] * len(frames), frames.nbytes]
 
@@ -44,21 +44,21 @@ def test_memory_is_told_before_it_is_taken(film: Path) -> None:
         raise MemoryError(num_bytes)
 
     with pytest.raises(MemoryError, match=f"^{frame_bytes}$"):
-        read_video(film, take=refuse)
+        read_video(video, take=refuse)
 
 
 def test_frames_of_a_variable_rate_are_even_in_number(tmp_path: Path) -> None:
-    write_video(tmp_path / "film.mp4", numbered(10), [0, 1, 2, 3, 4, 5, 6, 20, 40, 60])  # 1.6 fps on average
-    assert numbers(read_video(tmp_path / "film.mp4"), 10) == list(range(10))
-    assert numbers(read_video(tmp_path / "film.mp4", 0.82), 10) == [0, 2, 4, 6, 9]
+    write_video(tmp_path / "video.mp4", numbered(10), [0, 1, 2, 3, 4, 5, 6, 20, 40, 60])  # 1.6 fps on average
+    assert numbers(read_video(tmp_path / "video.mp4"), 10) == list(range(10))
+    assert numbers(read_video(tmp_path / "video.mp4", 0.82), 10) == [0, 2, 4, 6, 9]
 
 
 def test_only_the_picked_frames_of_a_long_video_are_held(tmp_path: Path) -> None:
     frames = numbered(200)
-    write_video(tmp_path / "film.mp4", frames)
-    read_video(tmp_path / "film.mp4", 0.1)  # imports done
+    write_video(tmp_path / "video.mp4", frames)
+    read_video(tmp_path / "video.mp4", 0.1)  # imports done
     tracemalloc.start()
-    picked = read_video(tmp_path / "film.mp4", 0.2)
+    picked = read_video(tmp_path / "video.mp4", 0.2)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert numbers(picked, 200) == [0, 66, 132, 199]
@@ -110,11 +110,11 @@ def serving(folder: Path) -> Iterator[tuple[str, list[str]]]:
             thread.join()
 
 
-def test_a_url_is_downloaded_once_and_read_as_the_file_is(film: Path) -> None:
-    with serving(film.parent) as (url, asked):
+def test_a_url_is_downloaded_once_and_read_as_the_file_is(video: Path) -> None:
+    with serving(video.parent) as (url, asked):
         loaded = load_trajectory(f"{url}/clip.mp4?token=3", task=clip.TASK, fps=3)
         assert asked == ["/clip.mp4?token=3"]
-    np.testing.assert_array_equal(loaded.positions, read_video(film, 3))
+    np.testing.assert_array_equal(loaded.positions, read_video(video, 3))
 
 
 BAD_URLS = {
@@ -125,9 +125,9 @@ BAD_URLS = {
 
 
 @pytest.mark.parametrize(("path", "reason"), BAD_URLS.values(), ids=BAD_URLS)
-def test_a_url_that_fails_is_told_with_its_reason(film: Path, path: str, reason: str) -> None:
-    (film.parent / "text.mp4").write_text("no video")
-    with serving(film.parent) as (url, _), pytest.raises(InvalidSampleError) as refused:
+def test_a_url_that_fails_is_told_with_its_reason(video: Path, path: str, reason: str) -> None:
+    (video.parent / "text.mp4").write_text("no video")
+    with serving(video.parent) as (url, _), pytest.raises(InvalidSampleError) as refused:
         load_trajectory(f"{url}/{path}")
     expected = f"video: expected a file with a video stream, got {reason} "
     assert re.fullmatch(expected + re.escape(f"({url}/{path})"), str(refused.value))

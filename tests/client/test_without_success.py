@@ -18,7 +18,7 @@ from gateways import running
 from one_model import BriefServer
 from reference_server import Served
 from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressResult, ProgressSample, RewardClient, Trajectory
 from rfm_client.gym import RewardModelWrapper, RewardOptions, SuccessRule
 from spoilt import without
@@ -35,7 +35,7 @@ def endpoints(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Endpoints]:
         yield server.endpoints
 
 
-def film(seed: int, count: int) -> Trajectory:
+def video(seed: int, count: int) -> Trajectory:
     frames = np.random.default_rng(seed).integers(0, 256, (count, 40, 56, 3), np.uint8)
     return Trajectory(frames=frames, task=TASK)
 
@@ -43,8 +43,8 @@ def film(seed: int, count: int) -> Trajectory:
 def test_progress_is_what_it_was_and_a_preference_fails_alone(
     endpoints: Endpoints, served: Served, tmp_path: Path
 ) -> None:
-    good = film(0, 3)
-    samples = [ProgressSample(good), PreferenceSample(film(1, 2), film(2, 3))]
+    good = video(0, 3)
+    samples = [ProgressSample(good), PreferenceSample(video(1, 2), video(2, 3))]
     with RewardClient(endpoints.grpc_url, model=MODEL) as client, served.client("grpc", MODEL) as with_heads:
         result, refused = client.evaluate(samples, return_errors=True)
         expected = with_heads.progress(good)
@@ -63,7 +63,7 @@ def test_progress_is_what_it_was_and_a_preference_fails_alone(
 def test_nothing_succeeds_and_an_environment_is_not_ended_by_success(endpoints: Endpoints) -> None:
     with RewardClient(endpoints.http_url, model=MODEL) as client:
         with client.episode(TASK, success=SuccessRule(threshold=0)) as episode:
-            scores = [episode.add(frame) for frame in film(3, 3).positions]
+            scores = [episode.add(frame) for frame in video(3, 3).positions]
         assert all(np.isfinite(score.progress) and np.isnan(score.success) for score in scores)
         assert not any(score.succeeded for score in scores)
         env = RewardModelWrapper(cart_pole(), client, TASK, RewardOptions(terminate_on_success=SuccessRule()))

@@ -25,8 +25,8 @@ from rfm_client import (
     Trajectory,
 )
 from rfm_client.contract import wire
-from rfm_client.contract.named_frames import NamedFootage, NamedProgressSample, NamedTrajectory, frame_digest
-from rfm_client.contract.samples import Footage
+from rfm_client.contract.frame_refs import EncoderSampleRefs, ProgressSampleRefs, TrajectoryRefs, frame_digest
+from rfm_client.contract.samples import EncoderSample
 
 OUTPUTS = [spec.name for spec in wire.score_outputs(4)]
 TIMING = BatchTiming(1.5, 2.5)
@@ -169,25 +169,25 @@ def test_an_answer_of_fewer_rows_positions_or_axes_is_an_error(shape: tuple[int,
 
 
 def test_the_encoder_s_requests_and_answers_arrive_as_they_were() -> None:
-    film = filmed(0, 3)
-    tensors = wire.encode_frames(film)
+    video = filmed(0, 3)
+    tensors = wire.encode_frames(video)
     needed = [spec.name for spec in wire.encoder_inputs() if not spec.optional]
     assert list(tensors) == needed == ["num_frames", "frames", "task"]
     (footage,) = wire.decode_trajectories(tensors)
     (got,) = footage.trajectories
-    np.testing.assert_array_equal(got.positions, film.positions)
-    assert got.task == film.task
+    np.testing.assert_array_equal(got.positions, video.positions)
+    assert got.task == video.task
     answer = embedded(1, 3)
     outputs = [spec.name for spec in wire.encoder_outputs(5, 3)]
     assert outputs == ["video_embeddings", "text_embedding"]
-    told = wire.encode_trajectories([Footage((answer,))], 4, outputs)
+    told = wire.encode_trajectories([EncoderSample((answer,))], 4, outputs)
     assert told["video_embeddings"].shape == (1, 4, 5)
     assert not told["video_embeddings"][0, 3:].any()
     told["video_embeddings"] = told["video_embeddings"][:, :3]
-    decoded = wire.decode_embeddings(told, film)
+    decoded = wire.decode_embeddings(told, video)
     np.testing.assert_array_equal(decoded.positions, answer.positions)
     np.testing.assert_array_equal(decoded.text_embedding, answer.text_embedding)
-    assert decoded.task == film.task
+    assert decoded.task == video.task
 
 
 @pytest.mark.parametrize(
@@ -206,17 +206,17 @@ def test_embeddings_of_another_shape_are_an_error(video: tuple[int, ...], text: 
     ids=["all are known", "one is new", "one of each is new", "one of them has no place beside the others"],
 )
 def test_named_frames_arrive_with_those_that_are_sent(num_sent: int, shape: tuple[int, ...]) -> None:
-    films = filmed(0, 2), filmed(1, 3)
-    named = [NamedTrajectory.of(film.positions, film.task) for film in films]
-    sent = [*films[0].positions, *films[1].positions][:num_sent]
-    tensors = wire.encode_named(named, sent)
+    videos = filmed(0, 2), filmed(1, 3)
+    named = [TrajectoryRefs.of(video.positions, video.task) for video in videos]
+    sent = [*videos[0].positions, *videos[1].positions][:num_sent]
+    tensors = wire.encode_refs(named, sent)
     assert tensors[wire.FRAMES].shape == shape
     assert wire.num_positions(tensors) == 3
     samples, footage = wire.decode_samples(tensors), wire.decode_trajectories(tensors)
-    for sample, film, wanted in zip(samples, footage, named, strict=True):
-        assert isinstance(sample, NamedProgressSample)
-        assert isinstance(film, NamedFootage)
-        for trajectory in (*sample.trajectories, *film.trajectories):
+    for sample, video, wanted in zip(samples, footage, named, strict=True):
+        assert isinstance(sample, ProgressSampleRefs)
+        assert isinstance(video, EncoderSampleRefs)
+        for trajectory in (*sample.trajectories, *video.trajectories):
             assert (trajectory.digests, trajectory.task) == (wanted.digests, wanted.task)
             for frame in sent:
                 np.testing.assert_array_equal(trajectory.pixels[frame_digest(frame)], frame)
@@ -271,8 +271,8 @@ def test_the_encoder_reads_what_has_frames(lengths: tuple[int, int], is_refused:
 
 def test_specs_are_those_of_the_contract() -> None:
     question = [("sample_type", "UINT8", (1,), False), ("num_frames", "INT32", (2,), False), ("frame_steps", "INT32", (1,), False)]  # fmt: skip
-    films = [(name, "UINT8", (-1, -1, -1, 3), True) for name in ("frames", "second_frames")]
-    frames = [*films, ("task", "BYTES", (1,), False)]
+    videos = [(name, "UINT8", (-1, -1, -1, 3), True) for name in ("frames", "second_frames")]
+    frames = [*videos, ("task", "BYTES", (1,), False)]
     scored = [("progress", (-1,)), ("success", (-1,)), ("preference", (1,)), ("similarity", (1,)), ("timing_ms", (2,))]
     embeddings = [("video_embeddings", "FP32", (-1, 5), True), ("text_embedding", "FP32", (3,), False)]
 

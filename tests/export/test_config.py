@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 from labelling import LEROBOT
 from paths import ROOT
 from rfm.config import ExportConfig, ServeConfig
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm.supervise.supervisor import Supervisor
 from rfm_client.contract.settings import ConfigError, settings_of
 from rfm_commands import cli

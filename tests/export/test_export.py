@@ -51,7 +51,7 @@ def dims(tensors: Any) -> dict[str, tuple[str, list[int]]]:
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     repository = tmp_path_factory.mktemp("exported") / "model_repository"
     export(EMBEDDINGS, repository)
-    export(FRAMES, repository, name="film")
+    export(FRAMES, repository, name="video")
     return repository
 
 
@@ -96,7 +96,7 @@ def test_a_checkpoint_is_asked_for_what_it_has(tmp_path: Path) -> None:
 
 
 def test_frames_go_through_the_encoder_into_the_scorer(exported: Path) -> None:
-    encoder, ensemble = read(exported, "film_encoder"), read(exported, "film_frames")
+    encoder, ensemble = read(exported, "video_encoder"), read(exported, "video_frames")
     assert dims(encoder.output) == {"video_embeddings": ("FP32", [-1, 48]), "text_embedding": ("FP32", [32])}
     assert [tensor.name for tensor in encoder.input if tensor.allow_ragged_batch] == [
         "frames",
@@ -115,8 +115,8 @@ def test_frames_go_through_the_encoder_into_the_scorer(exported: Path) -> None:
         "task": ("STRING", [1]),
     }
     steps = [(step.model_name, step.model_version) for step in ensemble.ensemble_scheduling.step]
-    assert steps == [("film_encoder", 1), ("film", 1)]
-    assert dims(ensemble.output) == dims(read(exported, "film").output)
+    assert steps == [("video_encoder", 1), ("video", 1)]
+    assert dims(ensemble.output) == dims(read(exported, "video").output)
 
 
 def test_two_instances_a_gpu_or_one_on_the_cpu(exported: Path, tmp_path: Path) -> None:
@@ -132,7 +132,7 @@ def test_two_instances_a_gpu_or_one_on_the_cpu(exported: Path, tmp_path: Path) -
 def test_an_export_holds_what_serving_needs_and_nothing_of_the_training_run(exported: Path) -> None:
     files = {str(file.relative_to(exported)) for file in exported.rglob("*") if file.is_file()}
     assert {"rfm/1/model.py", "rfm/1/checkpoint/model.safetensors", "rfm/1/checkpoint/config.json"} <= files
-    assert {"film_encoder/1/image_encoder/model.safetensors", "film_encoder/1/text_encoder/tokenizer.json"} <= files
+    assert {"video_encoder/1/image_encoder/model.safetensors", "video_encoder/1/text_encoder/tokenizer.json"} <= files
     assert not [file for file in files if file.endswith((".yaml", ".bin"))]
 
 
@@ -311,8 +311,8 @@ def test_models_tell_their_weights_by_the_files_digest(exported: Path) -> None:
         files = (file for folder in folders for file in sorted((exported / folder).rglob("*.safetensors")))
         return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
 
-    expected = {"rfm": digest("rfm"), "film": digest("film"), "film_encoder": digest("film_encoder")}
-    expected["film_frames"] = digest("film_encoder", "film")
+    expected = {"rfm": digest("rfm"), "video": digest("video"), "video_encoder": digest("video_encoder")}
+    expected["video_frames"] = digest("video_encoder", "video")
     assert len(set(expected.values())) == len(expected)
     assert {name: parameter(exported, name, "weights_digest") for name in expected} == expected
 
@@ -320,22 +320,22 @@ def test_models_tell_their_weights_by_the_files_digest(exported: Path) -> None:
 @pytest.mark.parametrize("file", ["text_encoder/model.safetensors", "image_encoder/preprocessor_config.json"])
 def test_check_names_what_differs_also_by_other_weights_and_settings(exported: Path, tmp_path: Path, file: str) -> None:
     repository = shutil.copytree(exported, tmp_path / "repository")
-    changed = repository / "film_encoder" / "1" / file
+    changed = repository / "video_encoder" / "1" / file
     changed.write_bytes(changed.read_bytes() + b"\n")
-    (repository / "film" / "1" / "model.py").write_text("# changed\n")
-    (repository / "film_frames" / "config.pbtxt").unlink()
-    assert sorted(rfm_export.check(repository, serve_config(FRAMES, "film"))) == [
-        f"{repository}/film/1/model.py: differs from what `rfm export` generates",
-        f"{repository}/film_encoder/config.pbtxt: differs from what `rfm export` generates",
-        f"{repository}/film_frames/config.pbtxt: is missing",
+    (repository / "video" / "1" / "model.py").write_text("# changed\n")
+    (repository / "video_frames" / "config.pbtxt").unlink()
+    assert sorted(rfm_export.check(repository, serve_config(FRAMES, "video"))) == [
+        f"{repository}/video/1/model.py: differs from what `rfm export` generates",
+        f"{repository}/video_encoder/config.pbtxt: differs from what `rfm export` generates",
+        f"{repository}/video_frames/config.pbtxt: is missing",
     ]
 
 
 def test_the_digest_of_settings_is_of_the_dtype_too(exported: Path, tmp_path: Path) -> None:
-    export(FRAMES, tmp_path, name="film", dtype="bfloat16")
+    export(FRAMES, tmp_path, name="video", dtype="bfloat16")
     repositories = (exported, tmp_path)
-    assert len({parameter(repository, "film", "weights_digest") for repository in repositories}) == 1
-    assert len({parameter(repository, "film", "settings_digest") for repository in repositories}) == 2
+    assert len({parameter(repository, "video", "weights_digest") for repository in repositories}) == 1
+    assert len({parameter(repository, "video", "settings_digest") for repository in repositories}) == 2
 
 
 def test_a_checkpoint_of_the_hub_tells_its_commit(tmp_path: Path) -> None:

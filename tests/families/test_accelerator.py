@@ -17,7 +17,7 @@ from rfm.engine import Engine
 from rfm.engine.execution import Execution
 from rfm.triton_model.placement import Placement
 from rfm_client import PreferenceSample, ProgressSample, Sample
-from vlm import PLAIN, assert_close, film
+from vlm import PLAIN, assert_close, video
 
 
 @pytest.fixture
@@ -68,9 +68,9 @@ def test_a_device_gives_the_reference_answers_and_waits_no_more_often_than_it_mu
 
 
 MIXED: list[Sample] = [
-    ProgressSample(film(0, 3, 64, 64)),
-    PreferenceSample(film(1, 2, 64, 96), film(2, 3, 64, 64)),
-    ProgressSample(film(3, 4, 140, 56), frame_steps=3),
+    ProgressSample(video(0, 3, 64, 64)),
+    PreferenceSample(video(1, 2, 64, 96), video(2, 3, 64, 64)),
+    ProgressSample(video(3, 4, 140, 56), frame_steps=3),
 ]
 
 

@@ -28,9 +28,9 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
-from rfm_client.contract.samples import Footage
+from rfm_client.contract.samples import EncoderSample
 from spoilt import in_json
-from vlm import assert_close, film
+from vlm import assert_close, video
 
 NAME = "enc_c1_t1_disc10"
 # The original's embeddings, of images and of texts.
@@ -52,21 +52,21 @@ def encoders_of(name: str) -> Encoders:
     return encoders
 
 
-def encoded(outcome: Footage | RewardError) -> tuple[np.ndarray, np.ndarray]:
+def encoded(outcome: EncoderSample | RewardError) -> tuple[np.ndarray, np.ndarray]:
     """The embeddings of all frames, one trajectory after the other, and of the task."""
-    assert isinstance(outcome, Footage), outcome
+    assert isinstance(outcome, EncoderSample), outcome
     task = outcome.trajectories[0].text_embedding
     assert task is not None
     return np.concatenate([trajectory.positions for trajectory in outcome.trajectories]), task
 
 
-def assert_encoded(outcome: Footage | RewardError, expected: Sequence[Any]) -> None:
+def assert_encoded(outcome: EncoderSample | RewardError, expected: Sequence[Any]) -> None:
     for got, wanted in zip(encoded(outcome), expected, strict=True):
         np.testing.assert_allclose(got, wanted, rtol=0, atol=EMBEDDING_TOLERANCE)
 
 
-def footage(seed: int, num_frames: int, height: int = 40, width: int = 40, task: str = "lift the cup") -> Footage:
-    return Footage((film(seed, num_frames, height, width, task),))
+def footage(seed: int, num_frames: int, height: int = 40, width: int = 40, task: str = "lift the cup") -> EncoderSample:
+    return EncoderSample((video(seed, num_frames, height, width, task),))
 
 
 @pytest.mark.reference
@@ -84,24 +84,24 @@ def test_embeddings_are_those_of_the_original(case: goldens.Case) -> None:
     samples, arrays = case.samples(), case.arrays
     kind = goldens.sample_type(samples[0])
     expected = [arrays[f"{kind}.encoder.{name}_embeddings"] for name in ("video", "text")]
-    outcomes = encoders_of(case.config.name).encode([Footage(sample.trajectories) for sample in samples])
+    outcomes = encoders_of(case.config.name).encode([EncoderSample(sample.trajectories) for sample in samples])
     for row, outcome in enumerate(outcomes):
         assert_encoded(outcome, [array[row] for array in expected])
 
 
 def test_a_trajectory_is_encoded_as_alone(encoders: Encoders) -> None:
     shapes = ((1, 64, 64), (70, 48, 100), (3, 1, 1), (130, 20, 31))
-    films = [footage(index, *shape, f"lift {'the cup ' * index}") for index, shape in enumerate(shapes)]
-    for alone, together in zip(films, encoders.encode(films), strict=True):
+    videos = [footage(index, *shape, f"lift {'the cup ' * index}") for index, shape in enumerate(shapes)]
+    for alone, together in zip(videos, encoders.encode(videos), strict=True):
         assert_encoded(together, encoded(encoders.encode([alone])[0]))
 
 
 def test_a_task_that_is_too_long_fails_alone(encoders: Encoders) -> None:
-    films = [footage(0, 2, task=task) for task in ("lift", "lift " * 100, "drop")]
-    first, failed, last = encoders.encode(films)
+    videos = [footage(0, 2, task=task) for task in ("lift", "lift " * 100, "drop")]
+    first, failed, last = encoders.encode(videos)
     assert isinstance(failed, InvalidSampleError)
     assert str(failed).startswith("task: expected at most 32 tokens (limit of the text encoder), got ")
-    for outcome, alone in ((first, films[0]), (last, films[2])):
+    for outcome, alone in ((first, videos[0]), (last, videos[2])):
         assert_encoded(outcome, encoded(encoders.encode([alone])[0]))
 
 
@@ -109,19 +109,19 @@ def test_a_task_that_is_too_long_fails_alone(encoders: Encoders) -> None:
 def test_a_pair_of_two_frame_sizes_is_scored_from_the_embeddings_of_each_trajectory(
     encoders: Encoders, kind: type[PreferenceSample] | type[SimilaritySample]
 ) -> None:
-    first, second = film(1, 5, 48, 100), film(2, 3, 90, 61)
-    apart = encoders.encode([Footage((first,)), Footage((second,))])
-    embedded = [outcome.trajectories[0] for outcome in apart if isinstance(outcome, Footage)]
+    first, second = video(1, 5, 48, 100), video(2, 3, 90, 61)
+    apart = encoders.encode([EncoderSample((first,)), EncoderSample((second,))])
+    embedded = [outcome.trajectories[0] for outcome in apart if isinstance(outcome, EncoderSample)]
     expected, pair = load_engine(NAME).evaluate([kind(*embedded), kind(first, second)])
     assert_close(pair, expected, 1e-5)
 
 
-def test_a_pair_of_one_frame_size_is_encoded_as_one_film(encoders: Encoders) -> None:
+def test_a_pair_of_one_frame_size_is_encoded_as_one_video(encoders: Encoders) -> None:
     """To the bit, also where its frames are those of two forward passes."""
-    first, second = film(1, 40, 48, 100), film(2, 40, 48, 100)
-    (pair,) = encoders.encode([Footage((first, second))])
+    first, second = video(1, 40, 48, 100), video(2, 40, 48, 100)
+    (pair,) = encoders.encode([EncoderSample((first, second))])
     (as_one,) = encoders.encode_frames([np.concatenate([first.positions, second.positions])])
-    assert isinstance(pair, Footage)
+    assert isinstance(pair, EncoderSample)
     assert [trajectory.num_frames for trajectory in pair.trajectories] == [40, 40]
     np.testing.assert_array_equal(encoded(pair)[0], as_one)
     for trajectory in pair.trajectories:
@@ -143,20 +143,20 @@ def refuse(model: torch.nn.Module, is_too_large: Callable[[Tensor], bool], monke
 def test_out_of_memory_halves_images_and_tasks_and_is_counted(
     encoders: Encoders, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    films = [footage(0, 3), footage(1, 2, task="push the red button"), footage(2, 70)]
-    expected = encoders.encode(films)
+    videos = [footage(0, 3), footage(1, 2, task="push the red button"), footage(2, 70)]
+    expected = encoders.encode(videos)
     refuse(encoders.image_model, lambda images: len(images) > 20, monkeypatch)
     refuse(encoders.text_model, lambda tokens: len(tokens) > 1, monkeypatch)
     execution, passes = Execution(), []
     execution.on_forward = lambda: passes.append(None)
-    for outcome, other in zip(encoders.encode(films, execution), expected, strict=True):
+    for outcome, other in zip(encoders.encode(videos, execution), expected, strict=True):
         assert_encoded(outcome, encoded(other))
     assert execution.out_of_memory_count == 3 + 2  # images: 64 and its halves; tasks: all three and the last two
     assert len(passes) == 3 + 2 + (4 + 1) + 3  # ... and what fitted: four times 16 and 11 images; each task
 
 
-def test_a_film_that_does_not_fit_in_memory_fails_alone(encoders: Encoders, monkeypatch: pytest.MonkeyPatch) -> None:
-    white = Footage((Trajectory(frames=np.full((3, 40, 40, 3), 255, np.uint8), task="lift the cup"),))
+def test_a_video_that_does_not_fit_in_memory_fails_alone(encoders: Encoders, monkeypatch: pytest.MonkeyPatch) -> None:
+    white = EncoderSample((Trajectory(frames=np.full((3, 40, 40, 3), 255, np.uint8), task="lift the cup"),))
     white_pixel = encoders.preprocessor(torch.full((1, 40, 40, 3), 255, dtype=torch.uint8))[0, 0].max()
     refuse(encoders.image_model, lambda images: bool((images[:, 0].amin(dim=(1, 2)) == white_pixel).any()), monkeypatch)
     first, failed, last = encoders.encode([footage(0, 3), white, footage(0, 3)])
@@ -175,7 +175,7 @@ def test_what_the_encoders_take_is_forward_time(encoders: Encoders, monkeypatch:
 
     models = (encoders.image_model, encoders.text_model)
     with models[0].register_forward_hook(pass_an_hour), models[1].register_forward_hook(pass_an_hour):
-        (result,) = load_engine(NAME).evaluate([ProgressSample(film(0, 3, 40, 40))], execution)
+        (result,) = load_engine(NAME).evaluate([ProgressSample(video(0, 3, 40, 40))], execution)
     assert isinstance(result, ProgressResult)
     assert hours == [2]
     assert execution.forward_s == pytest.approx(2 * 3600, abs=60)
@@ -203,7 +203,7 @@ def test_a_checkpoints_own_encoder_weights_win_and_must_fit(encoders: Encoders) 
 
 @pytest.mark.gpu
 def test_the_gpu_gives_the_embeddings_of_the_cpu(encoders: Encoders) -> None:
-    frames = [film(0, 5, 50, 70).positions]
+    frames = [video(0, 5, 50, 70).positions]
     on_cpu = encoders.encode_frames(frames)[0]
     try:
         on_gpu = encoders.to(torch.device("cuda")).encode_frames(frames)[0]
@@ -261,7 +261,7 @@ def test_what_is_saved_is_the_same_also_with_sizes_as_transformers_once_wrote_th
     copy = Encoders.load(saved(encoders, tmp_path, IMAGES, lambda content: content.update(size=64, crop_size=56)))
     assert copy.preprocessor == encoders.preprocessor
     assert (copy.preprocessor.resize_px, copy.preprocessor.crop_px) == (64, (56, 56))
-    frames = [film(0, 2, 50, 70).positions]
+    frames = [video(0, 2, 50, 70).positions]
     np.testing.assert_array_equal(copy.encode_frames(frames)[0], encoders.encode_frames(frames)[0])
     np.testing.assert_array_equal(copy.encode_tasks(["lift the cup"]), encoders.encode_tasks(["lift the cup"]))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The engine with a made-up predictor, where the order of things is known."""
+"""The engine with a synthetic predictor, where the order of things is known."""
 
 from __future__ import annotations
 

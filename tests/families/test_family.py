@@ -25,7 +25,7 @@ from rfm.checkpoint.content import CheckpointError
 from rfm.config import ExportConfig
 from rfm.engine import Engine
 from rfm.launch.installation import Installation, find_installation
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm.parameters import FAMILY_PARAMETER
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, RewardClient, SimilaritySample, Trajectory
 from rfm_export.layout import CONFIG_FILE
@@ -37,7 +37,7 @@ TOY = ExportConfig(name="toy", num_gpus=0, torch_threads=1)
 SLOPE = torch.tensor([[4.0, 0.0, -1.0]])  # of red, green and blue
 
 
-def film(red: list[float]) -> Trajectory:
+def video(red: list[float]) -> Trajectory:
     """Frames that are red to these degrees 0..1, and else black."""
     frames = np.zeros((len(red), 6, 8, 3), np.uint8)
     frames[..., 0] = np.round(255 * np.array(red))[:, None, None]
@@ -45,7 +45,7 @@ def film(red: list[float]) -> Trajectory:
 
 
 def progress(red: list[float]) -> np.ndarray:
-    """What the toy checkpoint says of ``film(red)``."""
+    """What the toy checkpoint says of ``video(red)``."""
     return 1 / (1 + np.exp(2 - 4 * np.round(255 * np.array(red)) / 255))
 
 
@@ -97,9 +97,9 @@ def running(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Itera
 def test_a_family_from_elsewhere_is_served_on_raw_frames(running: Running) -> None:
     first, second = [0.1, 0.5, 0.9], [0.8, 0.2]
     samples = [
-        ProgressSample(film(first)),
-        ProgressSample(film(first), frame_steps=2),
-        PreferenceSample(film(first), film(second)),
+        ProgressSample(video(first)),
+        ProgressSample(video(first), frame_steps=2),
+        PreferenceSample(video(first), video(second)),
     ]
     with RewardClient(running.url, model="toy") as client:
         whole, dense, pair = client.evaluate(samples)
@@ -109,7 +109,7 @@ def test_a_family_from_elsewhere_is_served_on_raw_frames(running: Running) -> No
         logits = 4 * np.round(255 * np.array([0.9, 0.2])) / 255
         assert pair.preference == pytest.approx(1 / (1 + np.exp(logits[1] - logits[0])), abs=1e-6)
         with pytest.raises(InvalidSampleError, match="sample_type: expected progress or preference, got similarity"):
-            client.evaluate([SimilaritySample(film(first), film(second))])
+            client.evaluate([SimilaritySample(video(first), video(second))])
     assert rfm_export.check(running.repository, TOY) == []
     config = parse((running.repository / "toy" / CONFIG_FILE).read_text())
     network = json.loads(config.parameters["network"].string_value)
@@ -120,7 +120,7 @@ def test_a_family_from_elsewhere_is_served_on_raw_frames(running: Running) -> No
 def test_a_configuration_that_names_no_family_serves_what_its_folder_holds(running: Running) -> None:
     demo = running.repository / "rfm" / "1" / "checkpoint"
     encoders = families.encoders_of(None).load(running.repository / "rfm_encoder" / "1")
-    sample = ProgressSample(film([0.1, 0.5, 0.9]))
+    sample = ProgressSample(video([0.1, 0.5, 0.9]))
     (expected,) = Engine.from_checkpoint(demo, encoders=encoders).evaluate([sample])
     with RewardClient(running.url) as client:
         (result,) = client.evaluate([sample])

@@ -13,9 +13,9 @@ from rfm.engine.execution import Execution
 from rfm.engine.feature_cache import FeatureCache, get_or_make
 from rfm.family import FrameEncoders
 from rfm_client.contract import InferenceFailedError, InvalidSampleError, RewardError, Trajectory
-from rfm_client.contract.named_frames import NamedFootage, NamedTrajectory, frame_digest
-from rfm_client.contract.samples import Footage, UInt8Array
-from vlm import film
+from rfm_client.contract.frame_refs import EncoderSampleRefs, TrajectoryRefs, frame_digest
+from rfm_client.contract.samples import EncoderSample, UInt8Array
+from vlm import video
 
 TASK = "stack the cups"
 
@@ -28,21 +28,21 @@ def encoders() -> FrameEncoders:
 
 
 def frames_of(seed: int, count: int) -> UInt8Array:
-    return film(seed, count, 40, 56).positions
+    return video(seed, count, 40, 56).positions
 
 
-def footage(frames: UInt8Array, task: str = TASK) -> Footage:
-    return Footage((Trajectory(frames=frames, task=task),))
+def footage(frames: UInt8Array, task: str = TASK) -> EncoderSample:
+    return EncoderSample((Trajectory(frames=frames, task=task),))
 
 
-def named(frames: UInt8Array, sent: UInt8Array, task: str = TASK) -> NamedFootage:
+def named(frames: UInt8Array, sent: UInt8Array, task: str = TASK) -> EncoderSampleRefs:
     """A question about frames of which only some are sent."""
     pixels = {frame_digest(frame): frame for frame in sent}
-    return NamedFootage((NamedTrajectory(tuple(map(frame_digest, frames)), pixels, task),))
+    return EncoderSampleRefs((TrajectoryRefs(tuple(map(frame_digest, frames)), pixels, task),))
 
 
-def embeddings(outcome: Footage | RewardError) -> tuple[np.ndarray, np.ndarray]:
-    assert isinstance(outcome, Footage), outcome
+def embeddings(outcome: EncoderSample | RewardError) -> tuple[np.ndarray, np.ndarray]:
+    assert isinstance(outcome, EncoderSample), outcome
     (trajectory,) = outcome.trajectories
     assert trajectory.video_embeddings is not None
     assert trajectory.text_embedding is not None
@@ -81,17 +81,17 @@ def test_a_digest_that_is_not_known_fails_its_sample_alone(encoders: FrameEncode
     assert str(failed) == (
         "frame_digests: expected digests of frames that this model knows or has been sent, got 3 others"
     )
-    assert isinstance(scored, Footage)
+    assert isinstance(scored, EncoderSample)
     (healed,) = encoders.encode([named(frames, frames)], Execution(), cache)
-    assert isinstance(healed, Footage)
+    assert isinstance(healed, EncoderSample)
 
 
 def test_nobody_can_say_what_a_digest_shows(encoders: FrameEncoders) -> None:
     """Pixels are named by who reads them: a digest that a caller gives them counts for nothing."""
     frames, cache = frames_of(4, 2), FeatureCache(2**20)
     honest = frame_digest(frames[0])
-    question = NamedTrajectory((honest,), {frame_digest(frames[1]): frames[1]}, TASK)
-    (outcome,) = encoders.encode([NamedFootage((question,))], Execution(), cache)
+    question = TrajectoryRefs((honest,), {frame_digest(frames[1]): frames[1]}, TASK)
+    (outcome,) = encoders.encode([EncoderSampleRefs((question,))], Execution(), cache)
     assert isinstance(outcome, InvalidSampleError)
     (expected,) = encoders.encode([footage(frames[:1])], Execution(), None)
     (outcome,) = encoders.encode([footage(frames[:1])], Execution(), cache)
@@ -148,8 +148,8 @@ def test_a_sliver_is_refused_though_only_another_request_names_it(encoders: Fram
     """In one batch the second would bring what the first has sent to size."""
     sliver, cache, frames = np.zeros((1, 3000, 3), np.uint8), FeatureCache(2**20), frames_of(5, 1)
     encoders.encode([footage(frames)], Execution(), cache)
-    sends = NamedTrajectory((frame_digest(frames[0]),), {frame_digest(sliver): sliver}, TASK)
-    names = NamedTrajectory((frame_digest(sliver),), {}, TASK)
-    refused, unknown = encoders.encode([NamedFootage((sends,)), NamedFootage((names,))], Execution(), cache)
+    sends = TrajectoryRefs((frame_digest(frames[0]),), {frame_digest(sliver): sliver}, TASK)
+    names = TrajectoryRefs((frame_digest(sliver),), {}, TASK)
+    refused, unknown = encoders.encode([EncoderSampleRefs((sends,)), EncoderSampleRefs((names,))], Execution(), cache)
     assert str(refused) == "frames: expected frames at most 50 times as long as wide, got 1 x 3000"
     assert "frame_digests: expected digests of frames that this model knows" in str(unknown)

@@ -22,7 +22,7 @@ from rfm.engine import Engine
 from rfm.vlm import nf4
 from rfm_client import ProgressSample
 from spoilt import copied, settings
-from vlm import PLAIN, assert_close, film, load
+from vlm import PLAIN, assert_close, load, video
 
 WEIGHTS = GOLDEN / "nf4" / "weights.safetensors"
 CASES = ("nested", "plain", "float32", "blocks_across_rows", "odd")
@@ -173,7 +173,9 @@ def test_an_export_scores_as_the_values_of_its_weights(tmp_path: Path, name: str
 
     base_model = str(goldens.config(name).base_model)
     engines = [Engine.from_checkpoint(exported), Engine.from_checkpoint(full, base_model=base_model), load_engine(name)]
-    (result,), (expected,), (unrounded,) = (engine.evaluate([ProgressSample(film(0, 3, 60, 84))]) for engine in engines)
+    (result,), (expected,), (unrounded,) = (
+        engine.evaluate([ProgressSample(video(0, 3, 60, 84))]) for engine in engines
+    )
     assert_close(result, expected, 1e-6)
     with pytest.raises(AssertionError):
         assert_close(result, unrounded, 1e-2)

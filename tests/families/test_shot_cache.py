@@ -16,10 +16,10 @@ from rfm.engine.execution import Execution
 from rfm.engine.feature_cache import BYTES_PER_MB, FeatureCache
 from rfm.vlm.predictor import VlmPredictor
 from rfm_client import PreferenceSample, ProgressSample, RewardError, Trajectory
-from rfm_client.contract.named_frames import NamedProgressSample, NamedTrajectory, frame_digest
+from rfm_client.contract.frame_refs import ProgressSampleRefs, TrajectoryRefs, frame_digest
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.sampling import RULES, Rule, Sampling
-from vlm import assert_close, film, load
+from vlm import assert_close, load, video
 
 TASK = "stack the blocks"
 TOLERANCE = 1e-5
@@ -48,26 +48,26 @@ def predictor_of(cached: Engine) -> VlmPredictor:
 
 
 def frames_of(seed: int, count: int, size: tuple[int, int] = (56, 84)) -> UInt8Array:
-    return film(seed, count, *size).positions
+    return video(seed, count, *size).positions
 
 
 def whole(frames: UInt8Array) -> ProgressSample:
     return ProgressSample(Trajectory(frames=frames, task=TASK))
 
 
-def named(frames: Sequence[UInt8Array], sent: Sequence[UInt8Array], frame_steps: int = 0) -> NamedProgressSample:
+def named(frames: Sequence[UInt8Array], sent: Sequence[UInt8Array], frame_steps: int = 0) -> ProgressSampleRefs:
     """A question about frames of which only some are sent."""
     pixels = {frame_digest(frame): frame for frame in sent}
-    return NamedProgressSample(NamedTrajectory(tuple(map(frame_digest, frames)), pixels, TASK), frame_steps)
+    return ProgressSampleRefs(TrajectoryRefs(tuple(map(frame_digest, frames)), pixels, TASK), frame_steps)
 
 
-def ask(served: Engine, sample: NamedProgressSample, execution: Execution | None = None) -> Any:
+def ask(served: Engine, sample: ProgressSampleRefs, execution: Execution | None = None) -> Any:
     (outcome,) = served.score([served.prepare(sample)], execution or Execution())
     return outcome
 
 
 def assert_scored(outcome: Any, plain: Engine, frames: UInt8Array, frame_steps: int = 0) -> None:
-    """As by an engine without a cache that is given the whole film."""
+    """As by an engine without a cache that is given the whole video."""
     (expected,) = plain.evaluate([ProgressSample(Trajectory(frames=frames, task=TASK), frame_steps=frame_steps)])
     assert_close(outcome, expected, TOLERANCE)
 
@@ -123,9 +123,9 @@ def test_a_cache_that_evicts_at_every_step_changes_no_score(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
-def test_whole_films_of_other_callers_fill_the_cache(name: str) -> None:
+def test_whole_videos_of_other_callers_fill_the_cache(name: str) -> None:
     cached, plain = of_both(name)
-    first, second = film(3, 4, 56, 84, TASK), film(4, 6, 84, 56, TASK)
+    first, second = video(3, 4, 56, 84, TASK), video(4, 6, 84, 56, TASK)
     samples = [ProgressSample(first), PreferenceSample(first, second), PreferenceSample(second, first)]
     expected = plain.evaluate(samples)
     for counts in ((10, 0), (0, 10)):  # each frame of the batch once, in three samples
@@ -147,7 +147,7 @@ def test_the_size_that_frames_are_brought_to_is_part_of_what_is_kept(monkeypatch
         assert_scored(ask(cached, named(frames[:stop], frames[:stop])), plain, frames[:stop])
     rows = [predictor_of(cached).rows(whole(frames[:stop]))[0] for stop in (2, 4)]
     grid = predictor_of(cached).collator.grid  # type: ignore[attr-defined]  # of the Qwen backbones
-    assert grid(rows[0].films[0]).tokens_per_group != grid(rows[1].films[0]).tokens_per_group
+    assert grid(rows[0].videos[0]).tokens_per_group != grid(rows[1].videos[0]).tokens_per_group
 
 
 @pytest.mark.parametrize("name", IMAGES_AND_VIDEO)
@@ -173,7 +173,7 @@ def test_a_frame_that_comes_many_times_is_brought_to_size_once(name: str) -> Non
     prepared = cached.prepare(sample)
     cached.work_ahead(prepared)
     (row,) = prepared.rows
-    assert len(row.films[0].ready.pixels) == 2
+    assert len(row.videos[0].ready.pixels) == 2
     assert_scored(ask(cached, sample), plain, frames)
 
 
@@ -215,7 +215,7 @@ def test_frames_that_were_evicted_are_kept_again_though_all_their_shots_are_kept
     cached, plain = of_both(name, cache)
     cached.evaluate([whole(frames)])
     (row,) = predictor_of(cached).rows(whole(frames))
-    shots = cache.found(predictor_of(cached).collator.shot_keys(row.films[0]).values())  # type: ignore[attr-defined]
+    shots = cache.found(predictor_of(cached).collator.shot_keys(row.videos[0]).values())  # type: ignore[attr-defined]
     cache.clear()
     cache.keep(shots)
     for sample in (whole(frames), named(frames, ())):

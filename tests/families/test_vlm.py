@@ -32,7 +32,7 @@ from rfm_client import (
     SimilaritySample,
     Trajectory,
 )
-from vlm import BFLOAT16, PLAIN, assert_close, film, load, predictor_of, upstream_inputs
+from vlm import BFLOAT16, PLAIN, assert_close, load, predictor_of, upstream_inputs, video
 
 PIXEL_TOLERANCE = 1e-6  # relative, of a sum over all pixels
 
@@ -127,11 +127,11 @@ def mixture(step: int = 1) -> list[Sample]:
     samples: list[Sample] = []
     sizes = [(count, *size) for count in (2, 8, 16) for size in ((56, 56), (64, 100), (90, 61))]
     for seed, (num_frames, height, width) in enumerate(sizes):
-        samples.append(ProgressSample(film(seed, num_frames, height, width, f"task {seed}")))
-        samples.append(PreferenceSample(film(seed, num_frames, height, width), film(seed + 50, 3, height, width)))
-        samples.append(SimilaritySample(film(seed, 1, height, width), film(seed + 90, num_frames, height, width)))
-        samples.append(PreferenceSample(film(seed, num_frames, height, width), film(seed + 70, 3, 84, 112)))
-        samples.append(SimilaritySample(film(seed, 1, 60, 60), film(seed + 80, num_frames, height, width)))
+        samples.append(ProgressSample(video(seed, num_frames, height, width, f"task {seed}")))
+        samples.append(PreferenceSample(video(seed, num_frames, height, width), video(seed + 50, 3, height, width)))
+        samples.append(SimilaritySample(video(seed, 1, height, width), video(seed + 90, num_frames, height, width)))
+        samples.append(PreferenceSample(video(seed, num_frames, height, width), video(seed + 70, 3, 84, 112)))
+        samples.append(SimilaritySample(video(seed, 1, 60, 60), video(seed + 80, num_frames, height, width)))
     return samples[::step]
 
 
@@ -155,10 +155,10 @@ def test_a_mixture_equals_its_samples_alone(name: str, token_budget: int, step: 
         assert_close(outcome, engine.evaluate([samples[index]])[0], MIXED_TOLERANCE)
 
 
-def test_an_ordinary_film_over_the_token_budget_is_scored() -> None:
+def test_an_ordinary_video_over_the_token_budget_is_scored() -> None:
     """The budget decides which samples share a forward pass, not which are scored."""
-    samples = [ProgressSample(film(0, 12, 280, 420)), PreferenceSample(film(1, 6, 280, 420), film(2, 7, 280, 420))]
-    samples.append(ProgressSample(film(3, 5, 84, 84), frame_steps=4))
+    samples = [ProgressSample(video(0, 12, 280, 420)), PreferenceSample(video(1, 6, 280, 420), video(2, 7, 280, 420))]
+    samples.append(ProgressSample(video(3, 5, 84, 84), frame_steps=4))
     engine = Engine(load_engine(PLAIN).predictor, token_budget=100)
     for outcome, other in zip(engine.evaluate(samples), load_engine(PLAIN).evaluate(samples), strict=True):
         assert_close(outcome, other, MIXED_TOLERANCE)
@@ -196,7 +196,7 @@ def pooled(network: Any, states: torch.Tensor) -> torch.Tensor:
 def test_a_pair_of_two_frame_sizes_is_scored_as_transformers_reads_it(make: Callable[[], VlmPredictor]) -> None:
     """Its own forward of the backbone, given each image or video as upstream gives it; then the heads."""
     predictor = make()
-    network, sample = predictor.network, PreferenceSample(film(0, 3, 56, 140), film(1, 4, 130, 84))
+    network, sample = predictor.network, PreferenceSample(video(0, 3, 56, 140), video(1, 4, 130, 84))
     if TRANSFORMERS >= 5 and network.config.family == QWEN_2_5 and not network.config.multi_image:
         pytest.skip("text behind a video stands elsewhere since transformers 5")
     (row,) = predictor.rows(sample)
@@ -222,15 +222,15 @@ def test_a_pair_of_two_frame_sizes_is_scored_as_transformers_reads_it(make: Call
 
 BAD: dict[str, tuple[Callable[[], Sample], str]] = {
     "a special token in the task": (
-        lambda: ProgressSample(film(0, 1, 56, 56, "lift <|prog_token|> it")),
+        lambda: ProgressSample(video(0, 1, 56, 56, "lift <|prog_token|> it")),
         "task: expected text without the model's special tokens, got '<|prog_token|>'",
     ),
     "an image token in the task": (
-        lambda: PreferenceSample(film(0, 1, 56, 56, "<|image_pad|>"), film(0, 1, 56, 56)),
+        lambda: PreferenceSample(video(0, 1, 56, 56, "<|image_pad|>"), video(0, 1, 56, 56)),
         "task: expected text without the model's special tokens, got '<|image_pad|>'",
     ),
     "an image that is a line": (
-        lambda: ProgressSample(film(0, 1, 1, 300)),
+        lambda: ProgressSample(video(0, 1, 1, 300)),
         "frames: expected an image at most 200 times as long as wide, got 1 x 300",
     ),
     "a 20-megapixel frame": (
@@ -238,7 +238,7 @@ BAD: dict[str, tuple[Callable[[], Sample], str]] = {
         "num_frames: expected at most 8192 tokens (max_position_embeddings of this checkpoint), got",
     ),
     "similarity without a head": (
-        lambda: SimilaritySample(film(0, 1, 56, 56), film(1, 1, 56, 56)),
+        lambda: SimilaritySample(video(0, 1, 56, 56), video(1, 1, 56, 56)),
         "sample_type: expected progress or preference (this checkpoint has no similarity head), got similarity",
     ),
 }
@@ -246,7 +246,7 @@ BAD: dict[str, tuple[Callable[[], Sample], str]] = {
 
 @pytest.mark.parametrize(("make", "message"), BAD.values(), ids=BAD)
 def test_what_cannot_be_scored_fails_alone(make: Callable[[], Sample], message: str) -> None:
-    good = ProgressSample(film(1, 2, 56, 56))
+    good = ProgressSample(video(1, 2, 56, 56))
     first, failed, last = load_engine(PLAIN).evaluate([good, make(), good])
     assert isinstance(failed, InvalidSampleError)
     assert str(failed).startswith(message)
@@ -255,7 +255,7 @@ def test_what_cannot_be_scored_fails_alone(make: Callable[[], Sample], message: 
 
 def test_the_task_is_not_a_template() -> None:
     tokens = predictor_of(PLAIN).collator
-    (row,) = tokens.rows(ProgressSample(film(0, 1, 56, 56, "put {task} there")))
+    (row,) = tokens.rows(ProgressSample(video(0, 1, 56, 56, "put {task} there")))
     assert "'put {task} there'" in tokens.tokenizer.decode(row.input_ids)
 
 
@@ -265,16 +265,16 @@ ASKED_AGAIN = {name: TWO_SIZES[name] for name in (PLAIN, "q25_video_last_l2", SM
 @pytest.mark.parametrize("make", ASKED_AGAIN.values(), ids=ASKED_AGAIN)
 def test_a_question_is_read_as_if_no_other_had_been_asked_before(make: Callable[[], VlmPredictor]) -> None:
     """Questions differ in one thing each: the task, how many frames, their size, dense mode, the type, the order."""
-    one, other = film(0, 4, 56, 56), film(1, 3, 56, 84)
+    one, other = video(0, 4, 56, 56), video(1, 3, 56, 84)
     questions: list[Sample] = [
         ProgressSample(one),
-        ProgressSample(film(0, 4, 56, 56, "stack the block")),
-        ProgressSample(film(0, 6, 56, 56)),
-        ProgressSample(film(0, 4, 84, 56)),
+        ProgressSample(video(0, 4, 56, 56, "stack the block")),
+        ProgressSample(video(0, 6, 56, 56)),
+        ProgressSample(video(0, 4, 84, 56)),
         ProgressSample(one, frame_steps=2),
         PreferenceSample(one, other),
         PreferenceSample(other, one),
-        ProgressSample(film(0, 4, 56, 56, "image")),
+        ProgressSample(video(0, 4, 56, 56, "image")),
     ]
     many = make().collator
     for question in questions * 2:
@@ -286,7 +286,7 @@ def test_a_question_is_read_as_if_no_other_had_been_asked_before(make: Callable[
 
 
 def test_both_frames_of_a_group_carry_its_value() -> None:
-    (outcome,) = load_engine("q25_video_last_l2").evaluate([ProgressSample(film(0, 5, 56, 56))])
+    (outcome,) = load_engine("q25_video_last_l2").evaluate([ProgressSample(video(0, 5, 56, 56))])
     assert isinstance(outcome, ProgressResult)
     first, second, third = outcome.progress[::2]
     assert outcome.progress.tolist() == [first, first, second, second, third]
@@ -296,7 +296,7 @@ def test_both_frames_of_a_group_carry_its_value() -> None:
 @pytest.mark.parametrize("config", goldens.VLM, ids=lambda config: config.name)
 def test_a_network_that_reads_images_is_causal_and_one_that_reads_videos_is_not(config: goldens.Config) -> None:
     """As the documents say: there is no need to score each prefix of a trajectory that is read as images."""
-    trajectory = film(0, 5, 56, 56)
+    trajectory = video(0, 5, 56, 56)
     prefix = replace(trajectory, frames=trajectory.positions[:3])
     whole, part = load_engine(config.name).evaluate([ProgressSample(trajectory), ProgressSample(prefix)])
     assert isinstance(whole, ProgressResult)
@@ -309,7 +309,7 @@ def test_a_network_that_reads_images_is_causal_and_one_that_reads_videos_is_not(
 def test_out_of_memory_halves_the_batch_and_fails_what_never_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     """The CPU has no memory of a device that could run out: the network refuses larger batches in its place."""
     engine, execution = Engine(load_engine(PLAIN).predictor), Execution()
-    samples = [ProgressSample(film(seed, 2, 56, 56)) for seed in range(4)]
+    samples = [ProgressSample(video(seed, 2, 56, 56)) for seed in range(4)]
     expected = engine.evaluate(samples)
     score = engine.predictor.score
 
@@ -319,7 +319,7 @@ def test_out_of_memory_halves_the_batch_and_fails_what_never_fits(monkeypatch: p
         return score(rows, batch)
 
     monkeypatch.setattr(engine.predictor, "score", refusing)
-    *results, failed = engine.evaluate([*samples, ProgressSample(film(4, 3, 56, 56))], execution)
+    *results, failed = engine.evaluate([*samples, ProgressSample(video(4, 3, 56, 56))], execution)
     for result, other in zip(results, expected, strict=True):
         assert_close(result, other, MIXED_TOLERANCE)
     assert isinstance(failed, InferenceFailedError)

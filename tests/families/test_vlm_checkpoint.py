@@ -29,11 +29,11 @@ from rfm.vlm.checkpoint import VlmCheckpoint
 from rfm_client import ProgressSample, Result, RewardError
 from rfm_client.contract.model_info import FRAME_SIZE_PARAMETER
 from spoilt import Spoil, in_json, settings, text, text_settings, weights
-from vlm import PLAIN, assert_close, film, load
+from vlm import PLAIN, assert_close, load, video
 
 ADAPTER = "q25_peft_adapter_disc10"
 LORA_INSIDE = "q3_lora_full_disc10"
-SAMPLE = ProgressSample(film(0, 3, 60, 84))
+SAMPLE = ProgressSample(video(0, 3, 60, 84))
 TWICE = ("use_multi_image", "use_per_frame_progress_token")
 
 

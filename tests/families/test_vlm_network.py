@@ -25,7 +25,7 @@ from rfm.vlm.backbone import QWEN_2_5
 from rfm.vlm.collator import QwenCollator
 from rfm.vlm.images import Normalisation, QwenImages, fitted_size
 from rfm_client import PreferenceSample, ProgressSample, Sample
-from vlm import BFLOAT16, PLAIN, assert_close, film, predictor_of, upstream_inputs
+from vlm import BFLOAT16, PLAIN, assert_close, predictor_of, upstream_inputs, video
 
 SIZES = {
     "rounded": ((60, 90), (56, 84)),
@@ -50,7 +50,7 @@ HALVES = Normalisation((0.5,) * 3, (0.5,) * 3)
 def test_shots_of_one_size_are_one_call_of_attention(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     predictor = predictor_of(name)
     config = predictor.network.config.backbone
-    rows = [row for seed in range(4) for row in predictor.rows(ProgressSample(film(seed, 6, 84, 112)))]
+    rows = [row for seed in range(4) for row in predictor.rows(ProgressSample(video(seed, 6, 84, 112)))]
     batch = predictor.collate(rows).to(torch.device("cpu"), torch.float32)
     attention, calls = F.scaled_dot_product_attention, list[torch.Size]()
 
@@ -83,8 +83,8 @@ def test_bfloat16_on_a_gpu_is_near_float32_on_the_cpu() -> None:
 @pytest.mark.parametrize("name", [PLAIN, "q25_video_last_l2", "smol_mean_disc10"])
 def test_a_gpu_gives_the_cpu_s_numbers_in_float32(name: str) -> None:
     config = goldens.config(name)
-    samples: list[Sample] = [ProgressSample(film(seed, 5, 84, 112)) for seed in range(3)]
-    samples += [PreferenceSample(film(4, 2, 64, 96), film(5, 3, 64, 64)), ProgressSample(film(6, 4, 60, 60), 3)]
+    samples: list[Sample] = [ProgressSample(video(seed, 5, 84, 112)) for seed in range(3)]
+    samples += [PreferenceSample(video(4, 2, 64, 96), video(5, 3, 64, 64)), ProgressSample(video(6, 4, 60, 60), 3)]
     engine = Engine.from_checkpoint(config.checkpoint, **config.sources, device="cuda", dtype=torch.float32)
     for left, right in zip(load_engine(name).evaluate(samples), engine.evaluate(samples), strict=True):
         assert_close(left, right, 1e-5)
@@ -95,7 +95,7 @@ def test_the_host_waits_for_a_gpu_once_a_batch() -> None:
     """PyTorch itself tells of each time that the host waits; to read the scores, it must."""
     config = goldens.config(BFLOAT16)
     engine = Engine.from_checkpoint(config.checkpoint, **config.sources, device="cuda")
-    samples: list[Sample] = [ProgressSample(film(seed, 5, 84, 112)) for seed in range(3)]
+    samples: list[Sample] = [ProgressSample(video(seed, 5, 84, 112)) for seed in range(3)]
     engine.evaluate(samples)
     prepared = [engine.prepare(sample) for sample in samples]
     for each in prepared:
@@ -111,7 +111,7 @@ def test_the_host_waits_for_a_gpu_once_a_batch() -> None:
 # Worked out by hand from qwen-vl-utils' rules: longest side 480 px, multiples of 56 px, then multiples of 28 px within
 # 128 to 768 tokens a frame, of which all pairs of frames together have 115,200; at least 1.05 times 128 stay allowed.
 VIDEO_SIZES = {
-    "a short film keeps its size": (2, (448, 336), [], (448, 336)),
+    "a short video keeps its size": (2, (448, 336), [], (448, 336)),
     "a long side is scaled down first": (2, (540, 960), [(270, 480), (280, 504)], (280, 504)),
     "a small one is enlarged": (2, (64, 64), [(112, 112)], (336, 336)),
     "1024 frames have 225 tokens, 15 times 15, each": (1024, (448, 448), [], (420, 420)),
@@ -143,7 +143,7 @@ def test_black_stays_black_when_a_video_is_enlarged() -> None:
 
 def test_a_row_of_fewer_images_has_no_mask_behind_its_last() -> None:
     predictor = predictor_of("smol_mean_disc10")
-    rows = [row for count in (1, 3) for row in predictor.rows(ProgressSample(film(0, count, 64, 64)))]
+    rows = [row for count in (1, 3) for row in predictor.rows(ProgressSample(video(0, count, 64, 64)))]
     mask = upstream_inputs(predictor, rows)["pixel_attention_mask"]
     assert mask.flatten(2).any(-1).sum(-1).tolist() == [1, 3]
 
@@ -155,9 +155,9 @@ def test_tokens_stand_where_transformers_puts_them(name: str) -> None:
     if TRANSFORMERS >= 5 and config.family == QWEN_2_5 and not config.multi_image:
         pytest.skip("text behind a video stands elsewhere since transformers 5")
     samples = [
-        ProgressSample(film(0, 5, 64, 64)),
-        PreferenceSample(film(1, 3, 56, 140), film(2, 4, 130, 84)),
-        ProgressSample(film(3, 4, 140, 56, "lift the red cup"), frame_steps=3),
+        ProgressSample(video(0, 5, 64, 64)),
+        PreferenceSample(video(1, 3, 56, 140), video(2, 4, 130, 84)),
+        ProgressSample(video(3, 4, 140, 56, "lift the red cup"), frame_steps=3),
     ]
     rows = [row for sample in samples for row in predictor.rows(sample)]
     inputs = upstream_inputs(predictor, rows)
@@ -185,7 +185,7 @@ def test_a_configuration_without_the_tokens_of_a_second_has_those_of_transformer
         )
         for vision in (silent | {"tokens_per_second": usual}, silent)
     )
-    sample = ProgressSample(film(0, 7, 64, 64))
+    sample = ProgressSample(video(0, 7, 64, 64))
     np.testing.assert_array_equal(untold.rows(sample)[0].position_ids, told.rows(sample)[0].position_ids)
     assert usual != backbone["vision_config"]["tokens_per_second"]
 
@@ -193,7 +193,7 @@ def test_a_configuration_without_the_tokens_of_a_second_has_those_of_transformer
 @pytest.mark.parametrize("name", [PLAIN, "smol_mean_disc10"])
 def test_a_tokenizer_adds_nothing_to_what_the_chat_template_says(name: str) -> None:
     """It writes all there is to be; the tokenizers of the references have nothing to add."""
-    collator, sample = predictor_of(name).collator, ProgressSample(film(0, 2, 64, 64))
+    collator, sample = predictor_of(name).collator, ProgressSample(video(0, 2, 64, 64))
     (expected,) = collator.rows(sample)
     tokenizer = deepcopy(collator.tokenizer)
     end = tokenizer.eos_token

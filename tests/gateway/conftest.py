@@ -14,10 +14,10 @@ import rfm_export
 from browsers import Browser, chromium
 from engines import serve_config
 from gateway_requests import (
-    FILM,
+    ENCODERS,
     TINY,
     TINY_CONFIG,
-    VIDEO,
+    VLM,
     Ask,
     Triton,
     ask_json,
@@ -29,7 +29,7 @@ from proxies import Proxy
 from rfm.config import ExportConfig
 from rfm.launch.cleanup import REGION_PREFIX, SHARED_MEMORY
 from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer
 
@@ -46,7 +46,7 @@ def triton(tmp_path_factory: pytest.TempPathFactory, tiny_network: RewindTransfo
     repository, checkpoint = folder / "model_repository", folder / "two_wide"
     RewindCheckpoint(TINY_CONFIG, tiny_network.state_dict()).save(checkpoint)
     rfm_export.export(checkpoint, repository, ExportConfig(name=TINY, num_gpus=0, torch_threads=1))
-    for config, name in ((goldens.config("enc_c1_t1_disc10"), FILM), (goldens.config("q25_video_last_l2"), VIDEO)):
+    for config, name in ((goldens.config("enc_c1_t1_disc10"), ENCODERS), (goldens.config("q25_video_last_l2"), VLM)):
         rfm_export.export(config.checkpoint, repository, serve_config(config, name))
     ours = f"{REGION_PREFIX}_{os.getpid()}_*"  # others test beside us
     regions = set(SHARED_MEMORY.glob(ours))
@@ -81,7 +81,7 @@ def quiet_browser(browser: Browser) -> Iterator[Browser]:
     assert [line for line in browser.complaints() if "viewer/score" not in line] == []  # of the files it refuses
 
 
-tiny, film, video = fixture_of(TINY), fixture_of(FILM), fixture_of(VIDEO)
+tiny, encoders, video = fixture_of(TINY), fixture_of(ENCODERS), fixture_of(VLM)
 
 
 strict = fixture_of(TINY, "--timeout", "1", "--max-in-flight", "1", "--max-waiting", "0", "--max-body-mib", "1")

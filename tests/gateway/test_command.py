@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from gateways import running
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_commands.cli import app
 from rfm_gateway.command import page_link
 from rfm_gateway.config import GatewayConfig

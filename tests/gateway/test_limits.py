@@ -37,7 +37,7 @@ from gateways import Gateway, metric_at, poll, running
 from one_model import BriefServer
 from rfm.config import ExportConfig
 from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm.rewind.checkpoint import RewindCheckpoint
 from rfm.rewind.network import RewindTransformer
 from rfm_client import AsyncRewardClient, ServerUnavailableError

@@ -17,7 +17,7 @@ from PIL import Image
 from gateway_requests import failure
 from gateways import TestClient, inside, running
 from live_reports import Json, episode, identity, jpeg, picture, report, step
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_client import LiveView
 from rfm_client.episodes import StepScore, live
 from rfm_gateway.viewer.live import (

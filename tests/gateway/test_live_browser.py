@@ -13,7 +13,7 @@ import pytest
 
 from browsers import Browser
 from gateways import Gateway, free_port, poll, running
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_client import LiveView, RewardClient
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.episodes import StepScore
@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.triton, pytest.mark.slow]
 
 TASK = Task("red", "bowl")
 SENTENCE = TASK.sentence()
-FILM = make_clip("success", TASK, 2_000_000).frames
+FRAMES = make_clip("success", TASK, 2_000_000).frames
 DROPPED = make_clip("dropped", TASK, 2_000_001).frames
 SCORE = StepScore(0.5, 0.25, False, 0, 3.0)
 ATTACK = "</p><img src=x onerror=\"document.title='attacked'\"><script>document.title='attacked'</script>"
@@ -129,7 +129,7 @@ def test_without_episodes_the_page_tells_how_to_report_them(page: Page, client: 
     assert f'LiveView("{page.url}")' in code
     names: dict[str, Any] = {"client": client}
     exec(code, names)
-    score = names["episode"].add(FILM[0])
+    score = names["episode"].add(FRAMES[0])
     page.shows("Episode", {"Step": "0", "Progress": number(score.progress), "task": "stack the cups"})
     assert not page.browser["no-live"].is_displayed()
     names["live"].close()
@@ -139,10 +139,10 @@ def test_without_episodes_the_page_tells_how_to_report_them(page: Page, client: 
 def test_a_curve_has_the_numbers_that_add_returned(page: Page, client: RewardClient) -> None:
     with LiveView(page.url, name="exact") as view, client.episode(SENTENCE, live=view) as episode:
         scores: list[StepScore] = []
-        for frame in FILM:
+        for frame in FRAMES:
             newest = episode.add(frame)
             scores.append(newest)
-            if len(scores) in (1, len(FILM)):
+            if len(scores) in (1, len(FRAMES)):
                 told = {
                     "state": "running, succeeded" if newest.succeeded else "running",
                     "task": SENTENCE,
@@ -159,20 +159,20 @@ def test_a_curve_has_the_numbers_that_add_returned(page: Page, client: RewardCli
                 poll(lambda newest_frame=frame: page.has_pictures("exact", newest_frame))  # type: ignore[misc]
     (card,) = page.cards("exact")
     last = f"last progress {number(scores[-1].progress)}, last success {number(scores[-1].success)}"
-    assert card["chart"] == f"{len(FILM)} steps: {last}"
+    assert card["chart"] == f"{len(FRAMES)} steps: {last}"
 
 
 def test_two_environments_and_a_reset(page: Page, client: RewardClient) -> None:
     tasks = [SENTENCE, "open the drawer"]
     titles = [{"title": f"pair, environment {env}"} for env in range(2)]
-    last = {"Step": f"{len(FILM) - 1}"}
+    last = {"Step": f"{len(FRAMES) - 1}"}
     with LiveView(page.url, name="pair") as view:
         episodes = client.episodes(2, tasks, live=view)
-        for frames in zip(FILM, DROPPED, strict=True):
+        for frames in zip(FRAMES, DROPPED, strict=True):
             scores = episodes.add(list(frames))
         ends = [{**last, "Progress": number(progress)} for progress in scores.progress]
         page.shows("pair", *[{**titles[env], "task": tasks[env], **ends[env]} for env in range(2)])
-        poll(lambda: page.has_pictures("pair", FILM[-1], DROPPED[-1]))
+        poll(lambda: page.has_pictures("pair", FRAMES[-1], DROPPED[-1]))
         episodes.reset([True, False])
         again = {"Step": "0", "Progress": number(episodes.add([DROPPED[0]] * 2, [True, False]).progress[0])}
         ended = {**titles[0], "state": "ended, succeeded", **ends[0]}
@@ -183,7 +183,7 @@ def test_two_environments_and_a_reset(page: Page, client: RewardClient) -> None:
 
 def test_the_time_since_the_last_step_goes_on(page: Page) -> None:
     with LiveView(page.url, name="silent") as view:
-        view.episode("wait").add(FILM[0], StepScore(0.5, float("nan"), False, 0, 3.0))
+        view.episode("wait").add(FRAMES[0], StepScore(0.5, float("nan"), False, 0, 3.0))
         page.shows("silent", {"Success": "-", "Last step": "0 s ago"})
         page.shows("silent", {"Last step": "2 s ago", "state": "running"})
 
@@ -192,7 +192,7 @@ def test_a_page_that_is_loaded_later_shows_the_same(page: Page) -> None:
     with LiveView(page.url, name="before") as view:
         episode = view.episode("wait")
         for step in range(1300):
-            episode.add(FILM[0], StepScore(step / 1300, 0.25, False, step, 3.0))
+            episode.add(FRAMES[0], StepScore(step / 1300, 0.25, False, step, 3.0))
         page.shows("before", {"Step": "1299"})
         first = page.drawn("before")
         page.open()
@@ -205,14 +205,14 @@ def test_a_page_that_is_loaded_later_shows_the_same(page: Page) -> None:
 def test_an_episode_that_is_first_heard_of_late_is_shown(page: Page, first: int) -> None:
     """Its one point leaves the axis of the chart no length of its own."""
     with LiveView(page.url, name=f"late {first}") as view:
-        view.episode("wait").add(FILM[0], StepScore(0.5, 0.25, False, first, 3.0))
+        view.episode("wait").add(FRAMES[0], StepScore(0.5, 0.25, False, first, 3.0))
         page.shows(f"late {first}", {"Step": f"{first}", "state": "running"})
         assert page.drawn(f"late {first}")["times"] == [first]
 
 
 def test_text_of_others_is_text(page: Page) -> None:
     with LiveView(page.url, name=ATTACK) as view:
-        view.episode(ATTACK).add(FILM[0], SCORE)
+        view.episode(ATTACK).add(FRAMES[0], SCORE)
         page.shows(ATTACK, {"task": ATTACK, "Step": "0"})
     assert page.browser.all("#live-episodes script") == []
     assert page.browser.run("return document.title") == "Rewards of robot videos"
@@ -222,10 +222,10 @@ def test_axe_finds_nothing_in_either_theme(page: Page) -> None:
     with LiveView(page.url, name="axe") as view:
         episodes = [view.episode("go on", 0), view.episode("end", 1)]
         for episode in episodes:
-            episode.add(FILM[0], StepScore(0.5, 0.25, True, 0, 3.0))
+            episode.add(FRAMES[0], StepScore(0.5, 0.25, True, 0, 3.0))
         episodes[1].end()
         page.shows("axe", {"state": "running, succeeded"}, {"state": "ended, succeeded"})
-        poll(lambda: page.has_pictures("axe", FILM[0], FILM[0]))
+        poll(lambda: page.has_pictures("axe", FRAMES[0], FRAMES[0]))
         for theme in ("light", "dark"):
             with page.browser.theme(theme):
                 assert page.browser.violations() == []
@@ -241,7 +241,7 @@ def test_a_page_without_key_asks_for_it_and_goes_on_with_a_gateway_that_comes_ba
             running(demo_server, tmp_path, port=port, RFM_GATEWAY_API_KEY=key),
             LiveView(page.url, name=name, api_key=key) as view,
         ):
-            view.episode("wait").add(FILM[0], SCORE)
+            view.episode("wait").add(FRAMES[0], SCORE)
             if name == "before":
                 browser.driver.get(page.url)
                 browser["live-tab"].click()
@@ -250,7 +250,7 @@ def test_a_page_without_key_asks_for_it_and_goes_on_with_a_gateway_that_comes_ba
                 browser.write("key", key)
                 browser.all("#key-form button")[0].click()
             page.shows(name, {"Step": "0"})
-            poll(lambda name=name: page.has_pictures(name, FILM[0]))  # type: ignore[misc]
+            poll(lambda name=name: page.has_pictures(name, FRAMES[0]))  # type: ignore[misc]
             browser.until_text("errors", "")
             assert "api_key=" in browser.run("return document.getElementById('live-code').textContent")
         told = browser.until("document.getElementById('errors').textContent")
@@ -260,16 +260,21 @@ def test_a_page_without_key_asks_for_it_and_goes_on_with_a_gateway_that_comes_ba
 def test_a_picture_of_the_page(
     demo_server: Endpoints, client: RewardClient, quiet_browser: Browser, tmp_path: Path
 ) -> None:
-    films = [FILM, DROPPED, make_clip("rewound", TASK, 2_000_002).frames, make_clip("success", TASK, 2_000_003).frames]
+    videos = [
+        FRAMES,
+        DROPPED,
+        make_clip("rewound", TASK, 2_000_002).frames,
+        make_clip("success", TASK, 2_000_003).frames,
+    ]
     with running(demo_server, tmp_path) as gateway, LiveView(gateway.url, name="policy 7") as view:
         page = Page(gateway.url, quiet_browser)
         page.open()
-        episodes = client.episodes(len(films), SENTENCE, live=view)
-        for frames in zip(*films, strict=True):
+        episodes = client.episodes(len(videos), SENTENCE, live=view)
+        for frames in zip(*videos, strict=True):
             episodes.add(list(frames))
         episodes.reset([False, True, False, True])
-        for frame in FILM[:9]:
-            episodes.add([films[3][0], frame, frame, films[2][0]], [False, True, False, False])
+        for frame in FRAMES[:9]:
+            episodes.add([videos[3][0], frame, frame, videos[2][0]], [False, True, False, False])
         poll(lambda: len(page.cards("policy 7")) == 5 and page.cards("policy 7")[1]["Step"] == "8")
         poll(lambda: len(quiet_browser.run(PICTURES, "policy 7")) == 5)
         quiet_browser.picture("page_live.png")

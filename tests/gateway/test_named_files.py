@@ -14,8 +14,8 @@ from PIL import Image
 
 from gateway_requests import (
     BLACK,
-    FILM,
-    FILM_DIMS,
+    ENCODER_DIMS,
+    ENCODERS,
     Triton,
     answered,
     ask_json,
@@ -43,7 +43,7 @@ def shelf(triton: Triton, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
     for index, frame in enumerate(filmed(1, 3)["frames"]):
         Image.fromarray(frame).save(folder / "episode" / f"{index}.png")
     Image.fromarray(filmed(1, 1, size_px=40)["frames"][0]).save(folder / "larger.png")
-    given = embedded(1, 3, FILM_DIMS)
+    given = embedded(1, 3, ENCODER_DIMS)
     arrays = {name: given[name] for name in ("video_embeddings", "text_embedding")}
     for file in (folder / "episode.npz", outside / "outside.npz"):
         np.savez(file, **arrays)
@@ -59,7 +59,7 @@ def shelf(triton: Triton, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
         (folder / f"link_to_{name}").symlink_to(outside / name)
     (folder / "folder_outside").symlink_to(outside)
     (folder / "circle").symlink_to("circle")
-    with running(triton.endpoints, outside, FILM, "--allow-folder", str(folder)) as started:
+    with running(triton.endpoints, outside, ENCODERS, "--allow-folder", str(folder)) as started:
         yield started, folder
 
 
@@ -68,7 +68,7 @@ def test_images_and_arrays_in_the_allowed_folder_are_read(shelf: tuple[Gateway, 
     frames = filmed(1, 3)["frames"]
     names = ["link.png", "episode/1.png", str(folder / "episode" / "2.png")]
     assert answered(ask_json(gateway, [of_frames(names)])) == expected(gateway, [of_frames(frames)])
-    given = embedded(1, 3, FILM_DIMS)
+    given = embedded(1, 3, ENCODER_DIMS)
     whole = progress({"embeddings_path": "episode.npz"})
     parts = progress({"embeddings_path": "episode.npy", "text_embedding": given["text_embedding"]})
     answer = answered(ask_json(gateway, [whole, preference(parts["trajectory"], whole["trajectory"])]))
@@ -118,7 +118,7 @@ def test_files_are_refused_before_they_fill_the_memory(triton: Triton, tmp_path:
     message = "body: expected files of at most 2097152 bytes in one request, when they are decoded, got more"
     image = of_frames(["black.png"])
     plain, packed = (progress({"embeddings_path": name, "task": "lift"}) for name in ("plain.npy", "packed.npz"))
-    with running(triton.endpoints, tmp_path, FILM, "--allow-folder", str(folder), "--max-body-mib", "1") as gateway:
+    with running(triton.endpoints, tmp_path, ENCODERS, "--allow-folder", str(folder), "--max-body-mib", "1") as gateway:
         answered(ask_json(gateway, [image, image]))
         assert ask_json(gateway, [plain, packed]).status_code == 422  # the widths are others
         for too_many in (

@@ -10,7 +10,7 @@ import pytest
 
 from gateway_requests import (
     BLACK,
-    FILM_DIMS,
+    ENCODER_DIMS,
     FIRST,
     SECOND,
     Ask,
@@ -27,12 +27,12 @@ from gateway_requests import (
 from gateways import Gateway
 
 pytestmark = pytest.mark.triton
-ROW = [1.0] * FILM_DIMS[0]
-GOOD = progress(embedded(1, 2, FILM_DIMS))
+ROW = [1.0] * ENCODER_DIMS[0]
+GOOD = progress(embedded(1, 2, ENCODER_DIMS))
 
 
 def but(**fields: Any) -> Json:
-    return progress({**embedded(1, 3, FILM_DIMS), **fields})
+    return progress({**embedded(1, 3, ENCODER_DIMS), **fields})
 
 
 NUMBERS, EQUAL_ROWS = "expected numbers, got something else", "expected rows of equal length, got unequal ones"
@@ -74,7 +74,7 @@ BAD_ARRAYS: dict[str, dict[str, tuple[Any, str]]] = {
         "null": (None, "expected frames, got neither frames nor video_embeddings"),
     },
 }
-TWO_WIDE = preference(embedded(1, 2, FILM_DIMS), embedded(1, 2, (7, 32)))
+TWO_WIDE = preference(embedded(1, 2, ENCODER_DIMS), embedded(1, 2, (7, 32)))
 BAD_SAMPLES: dict[str, tuple[Any, str, str]] = {
     f"{field}, {name}": (
         of_frames(value) if field == "frames" else but(**{field: value}),
@@ -102,7 +102,7 @@ BAD_SAMPLES: dict[str, tuple[Any, str, str]] = {
     "a list of types": ({"sample_type": ["progress"]}, "sample_type", rf"{NO_TYPE}\['progress'\]"),
     "no sample": (5, "", "expected an object, got 5"),
     "embeddings beside frames": (
-        preference(embedded(1, 2, FILM_DIMS), filmed(1, 2)),
+        preference(embedded(1, 2, ENCODER_DIMS), filmed(1, 2)),
         "chosen_trajectory video_embeddings",
         "expected them in both trajectories or neither, got one of two",
     ),
@@ -111,19 +111,19 @@ BAD_SAMPLES: dict[str, tuple[Any, str, str]] = {
 
 
 @pytest.mark.parametrize(("sample", "path", "message"), BAD_SAMPLES.values(), ids=BAD_SAMPLES)
-def test_a_bad_sample_is_refused_at_its_field(film: Gateway, sample: Any, path: str, message: str) -> None:
+def test_a_bad_sample_is_refused_at_its_field(encoders: Gateway, sample: Any, path: str, message: str) -> None:
     at = [int(part) if part.isdecimal() else part for part in path.split()]
-    check_refused(ask_json(film, [GOOD, sample, GOOD]), (["samples", 1, *at], message))
+    check_refused(ask_json(encoders, [GOOD, sample, GOOD]), (["samples", 1, *at], message))
 
 
-def test_all_bad_samples_are_told_at_once(film: Gateway, ask: Ask) -> None:
-    response = ask(film, [but(video_embeddings=np.ones((3, 7))), GOOD, TWO_WIDE])
+def test_all_bad_samples_are_told_at_once(encoders: Gateway, ask: Ask) -> None:
+    response = ask(encoders, [but(video_embeddings=np.ones((3, 7))), GOOD, TWO_WIDE])
     first, second = (["samples", 0, "trajectory"], ["samples", 2, "rejected_trajectory"])
     check_refused(
         response, ([*first, "video_embeddings"], r".*\[3, 7\]"), ([*second, "video_embeddings"], r".*\[2, 7\]")
     )
     task = but(text_embedding=None, task="lift " * 200)
-    response = ask(film, [task, but(text_embedding=None), task])
+    response = ask(encoders, [task, but(text_embedding=None), task])
     at = [["samples", index, "trajectory", "task"] for index in (0, 2)]
     check_refused(response, *((path, r"expected at most \d+ tokens.*, got .*") for path in at))
 

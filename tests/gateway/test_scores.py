@@ -17,7 +17,7 @@ import pytest
 import requests
 
 from gateway_requests import (
-    FILM_DIMS,
+    ENCODER_DIMS,
     FIRST,
     FRAME_STEPS,
     SECOND,
@@ -76,20 +76,20 @@ def test_the_documented_payload_is_answered_to_curl_and_to_requests(tiny: Gatewa
     assert kinds == {"predictions": int, "prediction_probs": float, "preference_labels": float}
 
 
-def test_every_type_in_one_request_gets_the_numbers_of_the_client(film: Gateway, ask: Ask) -> None:
-    samples = mixed(embedded, FILM_DIMS)
-    assert answered(ask(film, samples)) == expected(film, samples)
+def test_every_type_in_one_request_gets_the_numbers_of_the_client(encoders: Gateway, ask: Ask) -> None:
+    samples = mixed(embedded, ENCODER_DIMS)
+    assert answered(ask(encoders, samples)) == expected(encoders, samples)
     for sample in samples:
-        assert answered(ask(film, [sample])) == expected(film, [sample])
+        assert answered(ask(encoders, [sample])) == expected(encoders, [sample])
 
 
-def test_frames_and_embeddings_may_be_mixed(film: Gateway, ask: Ask) -> None:
-    samples = [*mixed(filmed), *mixed(embedded, FILM_DIMS), progress(filmed(3, 2, size_px=40))]
-    assert answered(ask(film, samples)) == numbers(expected(film, samples))
-    assert answered(ask(film, samples[:1])) == expected(film, samples[:1])
+def test_frames_and_embeddings_may_be_mixed(encoders: Gateway, ask: Ask) -> None:
+    samples = [*mixed(filmed), *mixed(embedded, ENCODER_DIMS), progress(filmed(3, 2, size_px=40))]
+    assert answered(ask(encoders, samples)) == numbers(expected(encoders, samples))
+    assert answered(ask(encoders, samples[:1])) == expected(encoders, samples[:1])
 
 
-def test_pairs_of_two_frame_sizes_are_scored(film: Gateway, video: Gateway) -> None:
+def test_pairs_of_two_frame_sizes_are_scored(encoders: Gateway, video: Gateway) -> None:
     samples = [
         preference(filmed(1, 3), filmed(2, 2, size_px=40)),
         progress(filmed(3, 2, size_px=40)),
@@ -98,17 +98,17 @@ def test_pairs_of_two_frame_sizes_are_scored(film: Gateway, video: Gateway) -> N
     assert answered(ask_json(video, samples)) == numbers(expected(video, samples, group=2))
     samples.append(similarity(filmed(4, 2, size_px=40), filmed(5, 5)))
     samples.append(progress(filmed(7, 2, size_px=440)))  # more than a megabyte: read in a thread, from disk
-    assert answered(ask_npy(film, samples)) == numbers(expected(film, samples))
+    assert answered(ask_npy(encoders, samples)) == numbers(expected(encoders, samples))
 
 
 def test_frame_steps_score_each_frame_on_its_prefix_and_leave_the_other_types_as_they_are(
-    film: Gateway, ask: Ask
+    encoders: Gateway, ask: Ask
 ) -> None:
-    for samples in (mixed(embedded, FILM_DIMS), mixed(filmed)):
-        steps = answered(ask(film, samples, use_frame_steps=True))
-        assert steps == numbers(expected(film, samples, frame_steps=FRAME_STEPS))
+    for samples in (mixed(embedded, ENCODER_DIMS), mixed(filmed)):
+        steps = answered(ask(encoders, samples, use_frame_steps=True))
+        assert steps == numbers(expected(encoders, samples, frame_steps=FRAME_STEPS))
         assert [len(values) for values in steps["outputs_progress"]["progress_pred"]] == [7, 1]
-        assert steps != numbers(answered(ask(film, samples, use_frame_steps=False)))
+        assert steps != numbers(answered(ask(encoders, samples, use_frame_steps=False)))
 
 
 FORMS: dict[str, tuple[Any, int]] = {
@@ -156,15 +156,15 @@ UPSTREAM_KINDS: dict[str, Callable[[int, int], Json]] = {
         text_embedding=None,
         embeddings_path="episode_7/embeddings.pt",
     ),
-    "embeddings": lambda seed, t: embedded(seed, t, FILM_DIMS, **UPSTREAM_FIELDS, frames=None, embeddings_path=None),
-    "both": lambda seed, t: embedded(seed, t, FILM_DIMS, **UPSTREAM_FIELDS, frames=filmed(seed, t)["frames"]),
-    "paths and embeddings": lambda seed, t: embedded(seed, t, FILM_DIMS, **UPSTREAM_FIELDS, frames=["0.png"] * t),
+    "embeddings": lambda seed, t: embedded(seed, t, ENCODER_DIMS, **UPSTREAM_FIELDS, frames=None, embeddings_path=None),
+    "both": lambda seed, t: embedded(seed, t, ENCODER_DIMS, **UPSTREAM_FIELDS, frames=filmed(seed, t)["frames"]),
+    "paths and embeddings": lambda seed, t: embedded(seed, t, ENCODER_DIMS, **UPSTREAM_FIELDS, frames=["0.png"] * t),
 }
 
 
 @pytest.mark.parametrize("make", UPSTREAM_KINDS.values(), ids=UPSTREAM_KINDS)
 def test_a_client_of_the_fastapi_server_changes_nothing_but_the_url(
-    film: Gateway, ask: Ask, make: Callable[[int, int], Json]
+    encoders: Gateway, ask: Ask, make: Callable[[int, int], Json]
 ) -> None:
     samples = [
         {**progress(make(1, 3)), "data_gen_strategy": "rewound", "resample_attempts": 1},
@@ -176,8 +176,8 @@ def test_a_client_of_the_fastapi_server_changes_nothing_but_the_url(
         for side in SIDES[sample["sample_type"]]:
             has_embeddings = sample[side].get("video_embeddings") is not None
             sample[side] = {**sample[side], "frames": None if has_embeddings else sample[side]["frames"]}
-    answer = answered(ask(film, samples))
-    assert answer == numbers(expected(film, plain))
+    answer = answered(ask(encoders, samples))
+    assert answer == numbers(expected(encoders, plain))
     assert answer["outputs_similarity"]["metadata"] == [UPSTREAM_FIELDS["metadata"]]
     assert answer["outputs_similarity"]["data_gen_strategy"] == ["paired"]
 
@@ -186,14 +186,14 @@ FLOATS = np.random.default_rng(0).uniform(-20, 280, (3, 32, 32, 3)).astype(np.fl
 PIXELS: Array = filmed(1, 3)["frames"]
 FRAMES: dict[str, tuple[Array, Array]] = {  # as they are sent, and as they are scored
     "floats are clipped and truncated": (FLOATS, np.clip(FLOATS, 0, 255).astype(np.uint8)),
-    "one frame is a film of one": (PIXELS[0], PIXELS[:1]),
+    "one frame is a video of one": (PIXELS[0], PIXELS[:1]),
     "of RGBA the colours count": (np.concatenate([PIXELS, PIXELS[..., :1]], axis=-1), PIXELS),
 }
 
 
 @pytest.mark.parametrize(("sent", "scored"), FRAMES.values(), ids=FRAMES)
-def test_frames_of_other_kinds_are_read(film: Gateway, ask: Ask, sent: Array, scored: Array) -> None:
-    assert answered(ask(film, [of_frames(sent)])) == expected(film, [of_frames(scored)])
+def test_frames_of_other_kinds_are_read(encoders: Gateway, ask: Ask, sent: Array, scored: Array) -> None:
+    assert answered(ask(encoders, [of_frames(sent)])) == expected(encoders, [of_frames(scored)])
 
 
 ARRAYS: dict[str, Callable[[Array], bytes]] = {
@@ -214,15 +214,15 @@ def test_any_npy_file_of_numbers_is_read(tiny: Gateway, written: Callable[[Array
     assert answered(response) == expected(tiny, [progress({**FIRST, "video_embeddings": video})])
 
 
-def test_a_task_without_embedding_is_encoded(film: Gateway) -> None:
-    given = embedded(1, 3, FILM_DIMS, task="open the drawer")
-    with film.client() as client:
+def test_a_task_without_embedding_is_encoded(encoders: Gateway) -> None:
+    given = embedded(1, 3, ENCODER_DIMS, task="open the drawer")
+    with encoders.client() as client:
         encoded = client.encode(Trajectory(frames=filmed(1, 2)["frames"], task="open the drawer"))
     samples = [progress({**given, "text_embedding": None}), preference({**given, "text_embedding": None}, given)]
     with_text = {**given, "text_embedding": encoded.text_embedding}
-    answer = answered(ask_json(film, samples))
-    assert answer == numbers(expected(film, [progress(with_text), preference(with_text, given)]))
-    other = answered(ask_json(film, [progress({**given, "text_embedding": None, "task": "close the drawer"})]))
+    answer = answered(ask_json(encoders, samples))
+    assert answer == numbers(expected(encoders, [progress(with_text), preference(with_text, given)]))
+    other = answered(ask_json(encoders, [progress({**given, "text_embedding": None, "task": "close the drawer"})]))
     assert other["outputs_progress"] != numbers({"progress_pred": answer["outputs_progress"]["progress_pred"][:1]})
 
 
@@ -237,16 +237,16 @@ def test_a_model_that_sees_a_video_gives_a_value_for_two_frames(video: Gateway) 
     assert len(steps["outputs_progress"]["progress_pred"][0]) == 5
 
 
-def test_concurrent_callers_each_get_their_own_answer(film: Gateway) -> None:
-    asked = [[mixed(embedded, FILM_DIMS)[k % 6], progress(embedded(k, 1 + k % 9, FILM_DIMS))] for k in range(32)]
-    alone = [expected(film, samples) for samples in asked]
+def test_concurrent_callers_each_get_their_own_answer(encoders: Gateway) -> None:
+    asked = [[mixed(embedded, ENCODER_DIMS)[k % 6], progress(embedded(k, 1 + k % 9, ENCODER_DIMS))] for k in range(32)]
+    alone = [expected(encoders, samples) for samples in asked]
     for index in range(0, len(asked), 8):  # what is wrong with some is not the others' concern
-        asked[index][1] = progress(embedded(index, 17, FILM_DIMS))
+        asked[index][1] = progress(embedded(index, 17, ENCODER_DIMS))
     start = threading.Barrier(len(asked))
 
     def call(index: int) -> requests.Response:
         start.wait()
-        return (ask_json if index % 2 else ask_npy)(film, asked[index])
+        return (ask_json if index % 2 else ask_npy)(encoders, asked[index])
 
     with ThreadPoolExecutor(len(asked)) as pool:
         for index, response in enumerate(pool.map(call, range(len(asked)))):

@@ -19,8 +19,8 @@ from hypothesis import HealthCheck, given, settings
 
 import goldens
 from gateway_requests import (
-    FILM,
-    FILM_DIMS,
+    ENCODER_DIMS,
+    ENCODERS,
     FIRST,
     SECOND,
     TINY,
@@ -39,7 +39,7 @@ from gateway_requests import (
 from gateways import WITHIN_S, Gateway, answers, free_port, poll, running
 from rfm.checkpoint.content import read_run_config
 from rfm.launch.cleanup import SHARED_MEMORY
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm.rewind.network import RewindTransformer
 from rfm_client import InvalidSampleError, ModelNotFoundError, Trajectory
 from rfm_client.transport.status import read_status
@@ -52,18 +52,18 @@ def work_done(gateway: Gateway) -> tuple[int, float]:
     return stats["total_requests"], stats["total_processing_time"]
 
 
-def test_gpu_status_counts_each_request_once(film: Gateway, tiny: Gateway, triton: Triton) -> None:
-    assert requests.get(f"{film.url}/health").json() == {"status": "healthy", "available_gpus": 1, "total_gpus": 1}
-    (count, busy_s), of_other = work_done(film), work_done(tiny)
+def test_gpu_status_counts_each_request_once(encoders: Gateway, tiny: Gateway, triton: Triton) -> None:
+    assert requests.get(f"{encoders.url}/health").json() == {"status": "healthy", "available_gpus": 1, "total_gpus": 1}
+    (count, busy_s), of_other = work_done(encoders), work_done(tiny)
     began_s = time.time()
     for _ in range(3):
-        answered(ask_json(film, [progress(filmed(1, 2))]))
-    assert work_done(film)[0] == count + 3
-    models = read_status(film.triton_url, metrics_url=triton.endpoints.metrics_url).models
-    computed_s = sum(model.busy_ms for model in models if model.name in (FILM, f"{FILM}_encoder")) / 1e3
-    assert busy_s < work_done(film)[1] == pytest.approx(computed_s, rel=0.01)
+        answered(ask_json(encoders, [progress(filmed(1, 2))]))
+    assert work_done(encoders)[0] == count + 3
+    models = read_status(encoders.triton_url, metrics_url=triton.endpoints.metrics_url).models
+    computed_s = sum(model.busy_ms for model in models if model.name in (ENCODERS, f"{ENCODERS}_encoder")) / 1e3
+    assert busy_s < work_done(encoders)[1] == pytest.approx(computed_s, rel=0.01)
     assert work_done(tiny) == of_other
-    status = requests.get(f"{film.url}/gpu_status").json()
+    status = requests.get(f"{encoders.url}/gpu_status").json()
     (stats,) = status.pop("gpu_stats").values()
     assert status == {"total_gpus": 1, "available_gpus": 1, "max_workers": 1, "pool_size": 1}
     assert (stats["device"], stats["status"]) == ("CPU", "ready")
@@ -109,9 +109,9 @@ def test_model_info_tells_the_checkpoint(tiny: Gateway, tiny_network: RewindTran
     assert info == {"model_version": "1", "num_gpus": 1}
 
 
-def test_model_info_has_the_whole_configuration_of_the_training_run(film: Gateway) -> None:
+def test_model_info_has_the_whole_configuration_of_the_training_run(encoders: Gateway) -> None:
     run = read_run_config(goldens.config("enc_c1_t1_disc10").checkpoint / "config.yaml")
-    assert requests.get(f"{film.url}/model_info").json()["experiment_config"] == json.loads(json.dumps(run))
+    assert requests.get(f"{encoders.url}/model_info").json()["experiment_config"] == json.loads(json.dumps(run))
 
 
 def test_metrics_count_what_was_asked(tiny: Gateway) -> None:
@@ -135,8 +135,8 @@ def test_metrics_count_what_was_asked(tiny: Gateway) -> None:
 
 
 @pytest.mark.parametrize("path", ["/evaluate_batch", "/evaluate_batch_npy"])
-def test_no_request_that_the_schemas_allow_breaks_the_gateway(film: Gateway, path: str) -> None:
-    ((_, operation),) = schemathesis.openapi.from_url(f"{film.url}/openapi.json")[path].items()
+def test_no_request_that_the_schemas_allow_breaks_the_gateway(encoders: Gateway, path: str) -> None:
+    ((_, operation),) = schemathesis.openapi.from_url(f"{encoders.url}/openapi.json")[path].items()
 
     @settings(max_examples=25, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck), database=None)
     @given(case=operation.as_strategy())
@@ -186,14 +186,14 @@ def test_rfm_serve_runs_a_gateway_until_a_signal_and_again_if_it_is_killed(trito
     assert not list(SHARED_MEMORY.glob(f"*_rfm_{process.pid}_*"))
 
 
-def test_the_client_encodes_a_trajectory_once_for_many_questions(film: Gateway, tiny: Gateway) -> None:
+def test_the_client_encodes_a_trajectory_once_for_many_questions(encoders: Gateway, tiny: Gateway) -> None:
     given = filmed(1, 4)
     frames = Trajectory(frames=given["frames"], task=given["task"])
-    with film.client() as client:
+    with encoders.client() as client:
         encoded = client.encode(frames)
-        assert (encoded.positions.shape, encoded.frames, encoded.task) == ((4, FILM_DIMS[0]), None, given["task"])
+        assert (encoded.positions.shape, encoded.frames, encoded.task) == ((4, ENCODER_DIMS[0]), None, given["task"])
         assert encoded.text_embedding is not None
-        assert encoded.text_embedding.shape == (FILM_DIMS[1],)
+        assert encoded.text_embedding.shape == (ENCODER_DIMS[1],)
         first, second = client.progress(frames), client.progress(encoded)
         np.testing.assert_allclose(first.progress, second.progress, rtol=0, atol=TOLERANCE)
         np.testing.assert_allclose(first.success, second.success, rtol=0, atol=TOLERANCE)

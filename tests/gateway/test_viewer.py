@@ -12,14 +12,14 @@ import pytest
 import requests
 
 import clip
-from gateway_requests import FILM, TINY, TOLERANCE, VIDEO, Triton, check_refused, failure
+from gateway_requests import ENCODERS, TINY, TOLERANCE, VLM, Triton, check_refused, failure
 from gateways import Gateway, poll, running
 from rfm_client.data.sampling import RULES
 from viewer_requests import COMPARE, SCORE, SERVED, by_command_line, curve_of, events, post
 
 pytestmark = pytest.mark.triton
 
-QUESTION = {"task": clip.TASK, "model": FILM}
+QUESTION = {"task": clip.TASK, "model": ENCODERS}
 
 
 @pytest.fixture(scope="module")
@@ -31,10 +31,10 @@ def videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_models_that_score_frames_are_offered(tiny: Gateway, film: Gateway) -> None:
-    served = requests.get(f"{film.url}/{SERVED}").json()
-    assert [model["name"] for model in served["models"]] == [FILM, VIDEO]
-    assert (served["model"], served["url"], served["fps"]) == (FILM, film.triton_url, 3.0)
+def test_the_models_that_score_frames_are_offered(tiny: Gateway, encoders: Gateway) -> None:
+    served = requests.get(f"{encoders.url}/{SERVED}").json()
+    assert [model["name"] for model in served["models"]] == [ENCODERS, VLM]
+    assert (served["model"], served["url"], served["fps"]) == (ENCODERS, encoders.triton_url, 3.0)
     frames = {rule["name"]: rule["frames"] for rule in served["rules"]}
     assert frames == {rule: 16 if rule.startswith("rewind") else None if rule == "all" else "any" for rule in RULES}
     assert requests.get(f"{tiny.url}/{SERVED}").json()["model"] == TINY
@@ -42,12 +42,12 @@ def test_the_models_that_score_frames_are_offered(tiny: Gateway, film: Gateway) 
 
 RULES_ASKED = {
     "default": {},
-    "vision-language": {"model": VIDEO, "sampling": "rint_pad", "frames": "4", "fps": "5"},
+    "vision-language": {"model": VLM, "sampling": "rint_pad", "frames": "4", "fps": "5"},
     "linspace_trunc": {"sampling": "linspace_trunc", "frames": "3"},
     "rewind_pad16_offline": {"sampling": "rewind_pad16_offline", "fps": "8"},
     "all": {"sampling": "all"},
     "resized": {"sampling": "linspace_round", "frames": "4", "resize": "true"},
-    "turned": {"model": VIDEO, "orient": "rotate90", "frames": "4"},
+    "turned": {"model": VLM, "orient": "rotate90", "frames": "4"},
 }
 
 
@@ -65,19 +65,19 @@ def test_the_curve_is_that_of_the_command_line(tiny: Gateway, videos: Path, fiel
         np.testing.assert_allclose(curve[name], video[name], rtol=0, atol=TOLERANCE, err_msg=name)
 
 
-def test_points_come_before_the_last_one_is_scored(film: Gateway, videos: Path) -> None:
-    told = events(post(film.url, SCORE, {"video": videos / "clip.mp4"}, fps="10", frames="4", **QUESTION))
+def test_points_come_before_the_last_one_is_scored(encoders: Gateway, videos: Path) -> None:
+    told = events(post(encoders.url, SCORE, {"video": videos / "clip.mp4"}, fps="10", frames="4", **QUESTION))
     counts = [len(points["progress"]) for name, points in told if name == "scores"]
     assert len(curve_of(told)["progress"]) == clip.NUM_FRAMES
     assert counts == [1, 2, 4, 8, 16, 1]
 
 
-def test_a_caller_who_leaves_frees_what_the_curve_holds(film: Gateway, videos: Path) -> None:
-    answered = film.metric("samples_total", sample_type="progress")
-    with post(film.url, SCORE, {"video": videos / "clip.mp4"}, fps="10", frames="16", **QUESTION) as response:
+def test_a_caller_who_leaves_frees_what_the_curve_holds(encoders: Gateway, videos: Path) -> None:
+    answered = encoders.metric("samples_total", sample_type="progress")
+    with post(encoders.url, SCORE, {"video": videos / "clip.mp4"}, fps="10", frames="16", **QUESTION) as response:
         assert next(response.iter_lines()) == b"event: video"
-    poll(lambda: film.metric("requests_in_flight") == 0)
-    assert film.metric("samples_total", sample_type="progress") < answered + clip.NUM_FRAMES
+    poll(lambda: encoders.metric("requests_in_flight") == 0)
+    assert encoders.metric("samples_total", sample_type="progress") < answered + clip.NUM_FRAMES
 
 
 NO_KIND = r"expected a file of the kind MP4, MOV, WebM, Matroska, Ogg or AVI, got another kind \(video\.mp4\)"
@@ -100,26 +100,26 @@ BROKEN: dict[str, tuple[bytes | None, dict[str, str], str, str]] = {
 
 @pytest.mark.parametrize(("content", "fields", "at", "message"), BROKEN.values(), ids=BROKEN)
 def test_a_wrong_question_says_why(
-    film: Gateway, videos: Path, content: bytes | None, fields: dict[str, str], at: str, message: str
+    encoders: Gateway, videos: Path, content: bytes | None, fields: dict[str, str], at: str, message: str
 ) -> None:
     file = videos / "clip.mp4" if content is None else content
-    check_refused(post(film.url, SCORE, {"video": file}, **{**QUESTION, **fields}), ([at], message))
+    check_refused(post(encoders.url, SCORE, {"video": file}, **{**QUESTION, **fields}), ([at], message))
 
 
-def test_a_missing_video_a_missing_model_and_a_refused_task_are_named(film: Gateway, videos: Path) -> None:
+def test_a_missing_video_a_missing_model_and_a_refused_task_are_named(encoders: Gateway, videos: Path) -> None:
     video = videos / "clip.mp4"
-    response = post(film.url, COMPARE, {"first": video}, **QUESTION)
+    response = post(encoders.url, COMPARE, {"first": video}, **QUESTION)
     check_refused(response, (["second"], "expected a video file, got none"))
-    response = post(film.url, SCORE, {"video": video}, **{**QUESTION, "model": "missing"})
+    response = post(encoders.url, SCORE, {"video": video}, **{**QUESTION, "model": "missing"})
     assert "missing_frames" in failure(response, 503)
-    response = post(film.url, SCORE, {"video": video}, model=VIDEO, task="<|im_end|>")
+    response = post(encoders.url, SCORE, {"video": video}, model=VLM, task="<|im_end|>")
     names, documents = zip(*events(response), strict=True)
     assert names == ("video", "failed")
     assert re.fullmatch(r"[\w.]+: expected .*, got .*", documents[-1]["detail"]), documents[-1]
 
 
 def test_a_video_that_needs_too_much_memory_is_refused(triton: Triton, videos: Path, tmp_path: Path) -> None:
-    with running(triton.endpoints, tmp_path, FILM, "--max-body-mib", "1") as gateway:
+    with running(triton.endpoints, tmp_path, ENCODERS, "--max-body-mib", "1") as gateway:
         response = post(gateway.url, SCORE, {"video": videos / "long.mp4"}, **QUESTION)
         assert "expected files of at most 2097152 bytes" in failure(response, 413)
         video = {"video": videos / "clip.mp4"}

@@ -21,7 +21,7 @@ import clip
 from browsers import Browser
 from gateway_requests import TOLERANCE
 from gateways import Gateway, poll, running
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_client.data.orientation import ORIENTATIONS, Orientation, turned
 from toy_world import Task, make_clip
 from viewer_requests import by_command_line

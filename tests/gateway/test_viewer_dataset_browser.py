@@ -16,7 +16,7 @@ from selenium.webdriver.support.select import Select
 from browsers import Browser
 from gateways import poll, running
 from labelling import BrightnessScorer
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient
 from rfm_client.data.datasets.lerobot import LeRobotDataset
 from rfm_client.data.orientation import Orient
@@ -117,8 +117,8 @@ def folders(demo_server: Endpoints, tmp_path_factory: pytest.TempPathFactory) ->
     coded = []
     for coding, (codec, options) in CODINGS.items():
         coded.append(copied("toy_v30_many", folder / coding))
-        for film in coded[-1].rglob("file-001.mp4"):
-            encoded_anew(film, codec, options)
+        for video in coded[-1].rglob("file-001.mp4"):
+            encoded_anew(video, codec, options)
     return demo, bright, copied("toy_v21", folder / "plain"), *coded
 
 
@@ -234,10 +234,10 @@ def test_dragging_in_the_chart_moves_the_videos_and_the_numbers(page: Page) -> N
 def test_a_video_shows_the_frame_of_the_time(page: Page, number: int) -> None:
     dataset = page.choose(number)
     page.at_rest(5)
-    films = [np.stack(list(dataset.frames(dataset.episodes[5], each))).astype(np.float32) for each in CAMERAS]
-    for t in (0, 7, len(films[0]) // 2, len(films[0]) - 1):
+    videos = [np.stack(list(dataset.frames(dataset.episodes[5], each))).astype(np.float32) for each in CAMERAS]
+    for t in (0, 7, len(videos[0]) // 2, len(videos[0]) - 1):
         page.move_to(t / 10)
-        for frames, shown in zip(films, page.browser.pixels(page.browser.all(VIDEOS)), strict=True):
+        for frames, shown in zip(videos, page.browser.pixels(page.browser.all(VIDEOS)), strict=True):
             off = np.abs(frames - shown).mean(axis=(1, 2, 3))
             assert off[t] == off.min() < 3, (t, off)
 

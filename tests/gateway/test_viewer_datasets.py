@@ -32,8 +32,8 @@ from rfm_gateway.config import GatewayConfig
 from shown_datasets import CAMERAS, CODINGS, columns_of, copied, encoded_anew
 
 V21, V30 = range(2)  # numbers of the datasets with labels; one without follows
-FILM = "videos/observation.images.front/chunk-000/file-000.mp4"  # of the episodes below
-OF_FILM = range(4)
+VIDEO = "videos/observation.images.front/chunk-000/file-000.mp4"  # of the episodes below
+OF_VIDEO = range(4)
 NEEDS_LATER = {"g": "60", "keyint_min": "60", "sc_threshold": "0", "bf": "3", "b_strategy": "0"}
 Get = Callable[[str], Any]
 
@@ -129,33 +129,33 @@ def test_a_video_has_the_frames_of_its_episode(get: Get, folders: list[Path], nu
 
 
 @pytest.mark.parametrize("coding", CODINGS.values(), ids=CODINGS)
-def test_a_cut_is_exact_however_the_film_is_coded(tmp_path: Path, coding: tuple[str, dict[str, str]]) -> None:
+def test_a_cut_is_exact_however_the_video_is_coded(tmp_path: Path, coding: tuple[str, dict[str, str]]) -> None:
     root = copied("toy_v30_many", tmp_path)
-    encoded_anew(root / FILM, *coding)
+    encoded_anew(root / VIDEO, *coding)
     with serving(root) as get:
-        for episode in OF_FILM:
+        for episode in OF_VIDEO:
             check_frames(get, root, episode)
 
 
 def test_an_episode_that_needs_frames_behind_its_end_is_refused(tmp_path: Path) -> None:
     root = copied("toy_v30_many", tmp_path)
-    encoded_anew(root / FILM, "libx264", NEEDS_LATER)
+    encoded_anew(root / VIDEO, "libx264", NEEDS_LATER)
     with serving(root) as get:
-        responses = [get(f"/0/episodes/{episode}/videos/0") for episode in OF_FILM]
+        responses = [get(f"/0/episodes/{episode}/videos/0") for episode in OF_VIDEO]
     refused = [response for response in responses if response.status_code != 200]
     assert refused
     for response in refused:
         assert "-bf 0" in failure(response, 500)
 
 
-def test_a_cut_of_a_turned_film_is_turned_alike(tmp_path: Path) -> None:
+def test_a_cut_of_a_turned_video_is_turned_alike(tmp_path: Path) -> None:
     root = copied("toy_v21", tmp_path)
-    film = next(root.rglob("*front/episode_000002.mp4"))
-    turn(film, TURNS["clockwise"][0])
+    video = next(root.rglob("*front/episode_000002.mp4"))
+    turn(video, TURNS["clockwise"][0])
     with serving(root) as get:
         cut = get("/0/episodes/2/videos/0").content
     turns = []
-    for content in (film.read_bytes(), cut):
+    for content in (video.read_bytes(), cut):
         with av.open(io.BytesIO(content)) as container:
             turns.append({frame.rotation for frame in container.decode(video=0)})
     assert turns[0] == turns[1] != {0}
@@ -166,8 +166,8 @@ UNKNOWN = {
     "/-1": "dataset: expected one of 3, got -1",
     "/0/episodes/8": "episode: expected one from 0 to 7, got 8",
     "/0/episodes/-1": "episode: expected one from 0 to 7, got -1",
-    "/0/episodes/0/videos/2": "camera: expected one of 2 with films, got 2",
-    "/0/episodes/0/videos/-1": "camera: expected one of 2 with films, got -1",
+    "/0/episodes/0/videos/2": "camera: expected one of 2 with videos, got 2",
+    "/0/episodes/0/videos/-1": "camera: expected one of 2 with videos, got -1",
     "/0?labels=../toy_v30_many/rfm_progress.parquet": "labels: expected one of rfm_progress.parquet, got another",
     "/0/episodes/0?labels=meta/info.json": "labels: expected one of rfm_progress.parquet, got another",
     "/0/meta/info.json": "Not Found",
@@ -180,7 +180,7 @@ def test_what_is_not_there_is_not_found(get: Get, path: str, message: str) -> No
     assert failure(get(path), 404) == message
 
 
-@pytest.mark.parametrize("name", [FILM, "rfm_progress.parquet", "README.md", "videos"])
+@pytest.mark.parametrize("name", [VIDEO, "rfm_progress.parquet", "README.md", "videos"])
 def test_a_dataset_with_links_that_leave_it_is_refused(folders: list[Path], tmp_path: Path, name: str) -> None:
     root = copied("toy_v30_many", tmp_path)
     if (root / name).exists():
@@ -193,23 +193,23 @@ def test_a_dataset_with_links_that_leave_it_is_refused(folders: list[Path], tmp_
 
 def test_links_inside_a_dataset_are_followed(tmp_path: Path) -> None:
     root = copied("toy_v30_many", tmp_path)
-    (root / "videos").rename(root / "films")
-    (root / "videos").symlink_to(root / "films")
+    (root / "videos").rename(root / "videos")
+    (root / "videos").symlink_to(root / "videos")
     with serving(root) as get:
         check_frames(get, root, 1)
 
 
 BROKEN: dict[str, tuple[str, bytes | None, str, str]] = {  # a file, its content, the path that is asked, what is told
-    "no film": (FILM, None, "/0/episodes/0/videos/0", "file-000.mp4: expected a video file, got none"),
+    "no video": (VIDEO, None, "/0/episodes/0/videos/0", "file-000.mp4: expected a video file, got none"),
     "a play list": (
-        FILM,
+        VIDEO,
         b"#EXTM3U\n/etc/passwd\n",
         "/0/episodes/0/videos/0",
         "file-000.mp4: expected a whole video file, got Invalid data",
     ),
-    "another film": (
-        FILM,
-        (LEROBOT / "toy_v30_many" / FILM.replace("000.mp4", "002.mp4")).read_bytes(),
+    "another video": (
+        VIDEO,
+        (LEROBOT / "toy_v30_many" / VIDEO.replace("000.mp4", "002.mp4")).read_bytes(),
         "/0/episodes/2/videos/0",
         "episode 0 to episode 3: .*: expected 177 frames, one for each row, got 96",
     ),
@@ -277,10 +277,10 @@ def test_labels_of_others_may_lack_success_and_rows(tmp_path: Path) -> None:
 
 def test_a_video_that_needs_too_much_memory_is_refused(tmp_path: Path) -> None:
     root = copied("toy_v30_many", tmp_path)
-    encoded_anew(root / FILM, "libx264", {"g": "2", "qp": "0"}, noise=np.random.default_rng(0))
+    encoded_anew(root / VIDEO, "libx264", {"g": "2", "qp": "0"}, noise=np.random.default_rng(0))
     message = "body: expected files of at most 2097152 bytes in one request, when they are decoded, got more"
     with serving(root, max_body_mib=1) as get:
-        responses = [get(f"/0/episodes/{episode}/videos/0") for episode in OF_FILM]
+        responses = [get(f"/0/episodes/{episode}/videos/0") for episode in OF_VIDEO]
         too_large = [response for response in responses if response.status_code != 200]
         assert {failure(response, 413) for response in too_large} == {message}
 

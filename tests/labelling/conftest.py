@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient
 
 

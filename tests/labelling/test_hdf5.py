@@ -186,7 +186,7 @@ def test_pictures_are_turned_as_the_file_says_or_as_the_caller_says(
         np.testing.assert_array_equal(read, turned(pictures()[camera], orientation))
 
 
-def test_films_are_turned_as_the_caller_says() -> None:
+def test_videos_are_turned_as_the_caller_says() -> None:
     root, turn = LEROBOT / "toy_v21", Orient.parse(["wrist=rotate90"])
     stored, dataset = open_dataset(root), open_dataset(root, orient=turn)
     assert (stored.orientations, dataset.orientations) == ({}, {WRIST: "rotate90"})

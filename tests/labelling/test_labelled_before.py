@@ -175,25 +175,25 @@ def test_labels_of_other_or_lost_episodes_are_dropped_only_when_asked(tmp_path: 
 
 
 @pytest.mark.parametrize("verify", [False, True])
-def test_labels_of_a_film_hold_until_its_time_changes_or_where_they_are_verified_its_content(
+def test_labels_of_a_video_hold_until_its_time_changes_or_where_they_are_verified_its_content(
     tmp_path: Path, output: Path, verify: bool
 ) -> None:
     root = shutil.copytree(TOY, tmp_path / TOY.name)
-    film = root / "videos" / FRONT / "chunk-000" / "file-001.mp4"  # of episodes 4 to 7
+    video = root / "videos" / FRONT / "chunk-000" / "file-001.mp4"  # of episodes 4 to 7
     assert labelled(root, output, verify=verify)[0] == sum(EPISODE_FRAMES)
     for file in root.rglob("*.mp4"):
         os.utime(file, (1, 1))
     if verify:
         assert labelled(root, output, verify=True)[0] == 0
-        film.write_bytes(film.read_bytes() + bytes(8))
-        os.utime(film, (1, 1))
+        video.write_bytes(video.read_bytes() + bytes(8))
+        os.utime(video, (1, 1))
     else:
         with pytest.raises(
-            DatasetError, match=r"labels of this dataset's episodes, got those of others, or of films that"
+            DatasetError, match=r"labels of this dataset's episodes, got those of others, or of videos that"
         ):
             labelled(root, output)
         assert labelled(root, output, overwrite=True)[0] == sum(EPISODE_FRAMES)
-        os.utime(film, (2, 2))
+        os.utime(video, (2, 2))
     assert labelled(root, output, verify=verify)[0] == sum(EPISODE_FRAMES[4:8])
 
 

@@ -98,10 +98,10 @@ def test_triton_and_the_engine_score_each_frame_on_its_prefix_and_tell_successes
     sampling = Sampling("rint", client.model_info(frames=True).max_frames)
     episode, trajectories = next(iter_episodes(dataset))
     by_hand = {}
-    for camera, film in trajectories.items():
-        assert film.frames is not None
+    for camera, video in trajectories.items():
+        assert video.frames is not None
         shown = [sampling.prefix(t) for t in range(episode.num_frames)]
-        samples = [ProgressSample(Trajectory(frames=film.frames[p.indices], task=episode.task)) for p in shown]
+        samples = [ProgressSample(Trajectory(frames=video.frames[p.indices], task=episode.task)) for p in shown]
         results = client.evaluate(samples)
         by_hand[camera] = [(r.progress[p.read], r.success[p.read]) for r, p in zip(results, shown, strict=True)]
         for name, number in (("progress", 0), ("success", 1)):
@@ -121,9 +121,9 @@ def test_all_of_a_causal_network_in_one_pass_is_what_its_prefixes_give(client: R
     told = progress_of(label(dataset, ClientScorer(client), options))
     assert "progress." + FRONT not in told  # of one camera there is nothing to be fused
     start = 0
-    for episode, films in iter_episodes(dataset, [FRONT]):
+    for episode, videos in iter_episodes(dataset, [FRONT]):
         if episode.index in short:
-            frames = films[FRONT].frames
+            frames = videos[FRONT].frames
             assert frames is not None
             results = client.evaluate(
                 ProgressSample(Trajectory(frames=frames[: t + 1], task=episode.task)) for t in range(len(frames))

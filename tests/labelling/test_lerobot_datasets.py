@@ -43,24 +43,24 @@ DATASETS = [
 ]
 
 
-def whole_film(file: Path) -> list[np.ndarray[Any, Any]]:
+def whole_video(file: Path) -> list[np.ndarray[Any, Any]]:
     with av.open(str(file)) as container:
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
 
-def films(root: Path, camera: str) -> list[Path]:
+def videos(root: Path, camera: str) -> list[Path]:
     found = [file for file in root.rglob("*.mp4") if camera in file.parts]
     return sorted(found, key=lambda file: (file.parent.name if "chunk" in file.parent.name else "", file.name))
 
 
 @pytest.mark.parametrize("root", DATASETS)
-def test_every_frame_is_that_of_the_film_in_order_and_every_episode_that_of_the_rows(root: Path) -> None:
-    """LeRobot writes episodes one behind the other: all films of a camera, decoded whole, are all frames."""
+def test_every_frame_is_that_of_the_video_in_order_and_every_episode_that_of_the_rows(root: Path) -> None:
+    """LeRobot writes episodes one behind the other: all videos of a camera, decoded whole, are all frames."""
     dataset = open_dataset(root)
     assert list(dataset.cameras) == [FRONT, WRIST]
     info = json.loads((root / "meta" / "info.json").read_text())
     for camera, size in ((FRONT, 256), (WRIST, 128)):
-        expected = (frame for file in films(root, camera) for frame in whole_film(file))
+        expected = (frame for file in videos(root, camera) for frame in whole_video(file))
         read = (frame for episode in dataset.episodes for frame in dataset.frames(episode, camera))
         pairs = zip(read, expected, strict=True)
         same = [one.shape == (size, size, 3) and np.array_equal(one, other) for one, other in pairs]
@@ -76,25 +76,25 @@ def test_every_frame_is_that_of_the_film_in_order_and_every_episode_that_of_the_
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
-def test_a_film_may_begin_later_than_its_rows(tmp_path: Path, suffix: str) -> None:
+def test_a_video_may_begin_later_than_its_rows(tmp_path: Path, suffix: str) -> None:
     """Also where time stamps are rounded to a millisecond, as in Matroska."""
     root = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "later")
-    film = root / "videos" / "chunk-000" / FRONT / "episode_000000.mp4"
-    frames = np.stack(whole_film(film))
+    video = root / "videos" / "chunk-000" / FRONT / "episode_000000.mp4"
+    frames = np.stack(whole_video(video))
     change_info(root, lambda info: info.update(video_path=info["video_path"].replace(".mp4", suffix)))
-    write_video(film.with_suffix(suffix), frames, [7 + t for t in range(len(frames))])
-    with av.open(str(film.with_suffix(suffix))) as container:
+    write_video(video.with_suffix(suffix), frames, [7 + t for t in range(len(frames))])
+    with av.open(str(video.with_suffix(suffix))) as container:
         assert [frame.time for frame in container.decode(video=0)][:2] == [0.7, 0.8]
     dataset = open_dataset(root)
     read = list(dataset.frames(dataset.episodes[0], FRONT))
-    np.testing.assert_array_equal(np.stack(read), np.stack(whole_film(film.with_suffix(suffix))))
+    np.testing.assert_array_equal(np.stack(read), np.stack(whole_video(video.with_suffix(suffix))))
 
 
 def test_av1_and_images_in_tables_are_read(tmp_path: Path) -> None:
     root = shutil.copytree(LEROBOT / "toy_v21", tmp_path / "mixed")
-    film = root / "videos" / "chunk-000" / FRONT / "episode_000000.mp4"
-    frames = whole_film(film)
-    encode(film, frames, "libsvtav1", {"crf": "20", "g": "2", "svtav1-params": "lp=1"})
+    video = root / "videos" / "chunk-000" / FRONT / "episode_000000.mp4"
+    frames = whole_video(video)
+    encode(video, frames, "libsvtav1", {"crf": "20", "g": "2", "svtav1-params": "lp=1"})
     stored = store_as_images(root, WRIST, saved())
     dataset = open_dataset(root)
     assert list(dataset.cameras) == [FRONT, WRIST]
@@ -190,8 +190,8 @@ def test_pictures_in_tables_are_of_8_bit_colours(
 
 
 def store_as_images(root: Path, camera: str, save: Callable[[Any], bytes]) -> list[np.ndarray[Any, Any]]:
-    """Episode 0's film of a camera goes into its table, as images in the rows and as files; gives its frames."""
-    frames = whole_film(root / "videos" / "chunk-000" / camera / "episode_000000.mp4")
+    """Episode 0's video of a camera goes into its table, as images in the rows and as files; gives its frames."""
+    frames = whole_video(root / "videos" / "chunk-000" / camera / "episode_000000.mp4")
     images = []
     (root / "images").mkdir()
     for t, frame in enumerate(frames):
@@ -227,9 +227,9 @@ def truncate(file: Path) -> None:
 
 V30_EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 V30_ROWS = "data/chunk-000/file-000.parquet"
-V30_FILM = f"videos/{FRONT}/chunk-000/file-001.mp4"
+V30_VIDEO = f"videos/{FRONT}/chunk-000/file-001.mp4"
 V21_ROWS = "data/chunk-000/episode_000003.parquet"
-V21_FILM = f"videos/chunk-000/{WRIST}/episode_000005.mp4"
+V21_VIDEO = f"videos/chunk-000/{WRIST}/episode_000005.mp4"
 
 Break = Callable[[Path], object]
 
@@ -240,7 +240,7 @@ def cells(file: str, column: str, change: Callable[[list[Any]], list[Any]]) -> B
 
 
 def spans(change: Callable[[list[Any]], list[Any]]) -> Break:
-    """Other times at which episodes lie in the films of the front camera."""
+    """Other times at which episodes lie in the videos of the front camera."""
 
     def apply(root: Path) -> None:
         for name in ("from_timestamp", "to_timestamp"):
@@ -258,30 +258,33 @@ def told(**more: Any) -> Break:
     return lambda root: change_info(root, lambda info: info.update(more))
 
 
-def film(change: Callable[[list[Any]], list[Any]], file: str = V21_FILM, fps: Fraction = Fraction(10)) -> Break:
-    """A film of other frames, or of another rate."""
+def video(change: Callable[[list[Any]], list[Any]], file: str = V21_VIDEO, fps: Fraction = Fraction(10)) -> Break:
+    """A video of other frames, or of another rate."""
     coded: dict[str, Any] = {"options": {"crf": "1"}, "pixels": "yuv444p", "rate": fps}
-    return lambda root: encode_here(root / file, change(whole_film(root / file)), **coded)
+    return lambda root: encode_here(root / file, change(whole_video(root / file)), **coded)
 
 
 END = r"to_timestamp: expected 3\.9000 s for 39 frames, got 3\.7000 s"
-NO_ROW = r"expected \d+ frames, one for each row, got \d+; write the dataset again, or leave this film's episodes out"
+NO_ROW = r"expected \d+ frames, one for each row, got \d+; write the dataset again, or leave this video's episodes out"
 CONTRADICTIONS: dict[str, dict[str, tuple[Break, str]]] = {
     "toy_v30_many": {
-        "a truncated film": (
-            lambda root: truncate(root / V30_FILM),
+        "a truncated video": (
+            lambda root: truncate(root / V30_VIDEO),
             r"file-001\.mp4: expected a whole video file, got ",
         ),
-        "a missing film": (lambda root: (root / V30_FILM).unlink(), r"file-001\.mp4: expected a video file, got none"),
+        "a missing video": (
+            lambda root: (root / V30_VIDEO).unlink(),
+            r"file-001\.mp4: expected a video file, got none",
+        ),
         "a length that the rows do not have": (
             cells(V30_EPISODES, "length", at(2, lambda length: length + 1)),
             r"episode 2: .*file-000\.parquet: length: expected 59, from 97 to 156, got 60",
         ),
-        "a film that is too short for its episode": (
+        "a video that is too short for its episode": (
             cells(V30_EPISODES, f"videos/{FRONT}/to_timestamp", at(1, lambda time_s: time_s - 0.2)),
             rf"episode 1: .*{END}",
         ),
-        "an episode that begins behind its film's end": (
+        "an episode that begins behind its video's end": (
             spans(at(9, lambda time_s: time_s + 100)),
             r"episode 9, row 0: .*front: .*mp4: expected its frame at 105\.5000 s, got one at 5\.5000 s; write the data",
         ),
@@ -321,8 +324,8 @@ CONTRADICTIONS: dict[str, dict[str, tuple[Break, str]]] = {
             told(total_frames=430),
             r"meta: expected 430 frames, as info\.json says, got 428",
         ),
-        "a film with frames of no episode": (
-            film(lambda frames: frames + frames[-2:], V30_FILM),
+        "a video with frames of no episode": (
+            video(lambda frames: frames + frames[-2:], V30_VIDEO),
             rf"episode \d to episode \d: .*front: .*file-001\.mp4: {NO_ROW}",
         ),
     },
@@ -335,17 +338,17 @@ CONTRADICTIONS: dict[str, dict[str, tuple[Break, str]]] = {
             lambda root: truncate(root / V21_ROWS),
             r"episode_000003\.parquet: expected a readable Parquet file, got ",
         ),
-        "a film of another episode": (
-            lambda root: shutil.copy(root / V21_FILM.replace("005", "007"), root / V21_FILM),
+        "a video of another episode": (
+            lambda root: shutil.copy(root / V21_VIDEO.replace("005", "007"), root / V21_VIDEO),
             rf"episode 5: .*wrist: .*mp4: {NO_ROW}",
         ),
-        "a film of twice the rate": (
-            film(lambda frames: [image for image in frames for _ in "12"], fps=Fraction(20)),
-            r"expected 49 frames, .* got 98 \(the film has 20\.00 frames a second, meta/info\.json says 10\)",
+        "a video of twice the rate": (
+            video(lambda frames: [image for image in frames for _ in "12"], fps=Fraction(20)),
+            r"expected 49 frames, .* got 98 \(the video has 20\.00 frames a second, meta/info\.json says 10\)",
         ),
-        "a film whose rate is nearly that of the rows": (
-            film(lambda frames: frames, fps=Fraction(10_000, 1001)),
-            r"episode 5, row 2: .*mp4: expected its frame at 0\.2000 s, got one at 0\.2002 s \(the film has 9\.99 frames "
+        "a video whose rate is nearly that of the rows": (
+            video(lambda frames: frames, fps=Fraction(10_000, 1001)),
+            r"episode 5, row 2: .*mp4: expected its frame at 0\.2000 s, got one at 0\.2002 s \(the video has 9\.99 frames "
             r"a second, meta/info\.json says 10\); ffmpeg -r 10 -i IN OUT gives it that rate$",
         ),
         "a row whose time is another's": (

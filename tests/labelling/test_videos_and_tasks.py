@@ -43,8 +43,8 @@ def test_a_folder_of_videos_is_read_in_the_order_of_its_table(videos: Path, name
         ("day/a.mp4", "open the box", 4, 6),
     ]
     for episode in dataset.episodes:
-        film = np.stack(list(dataset.frames(episode, "video")))
-        assert numbers(film, episode.num_frames) == list(range(episode.num_frames))
+        video = np.stack(list(dataset.frames(episode, "video")))
+        assert numbers(video, episode.num_frames) == list(range(episode.num_frames))
     report = label(dataset, BrightnessScorer(), LabelOptions(output=output))
     assert parquet.read_table(report.files[0])["episode_index"].to_pylist() == [0] * 6 + [1] * 4
 

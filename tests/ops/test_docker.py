@@ -31,7 +31,7 @@ import rfm_export
 from engines import serve_config
 from paths import ROOT
 from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_commands.config import Config
 
 pytestmark = [pytest.mark.triton, pytest.mark.slow]

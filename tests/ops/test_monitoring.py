@@ -26,7 +26,7 @@ import yaml
 
 from paths import ROOT
 from repositories import kill_model
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_client import InvalidSampleError, PreferenceSample, ProgressSample, RewardClient, RewardError, Trajectory
 from rfm_serve import MODEL, serving, wait_for
 from trajectories import random_trajectory

@@ -26,7 +26,7 @@ from typer.main import get_command
 import clip
 from labelling import LEROBOT
 from paths import ROOT
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_client.cli.commands import app
 from rfm_client.contract import wire

@@ -40,9 +40,9 @@ MAY_IMPORT = {
     "rfm.checkpoint": {"rfm.plain_yaml"},
     "rfm.rewind": SHARED,
     "rfm.vlm": SHARED,
-    "rfm.triton_model": {*SHARED, "rfm.parameters", "rfm.probe"},
+    "rfm.triton_model": {*SHARED, "rfm.parameters", "rfm.probe_request"},
     "rfm.launch": {"rfm.config", "rfm.parameters", "rfm_client.contract"},
-    "rfm.supervise": {"rfm.launch", "rfm.probe", "rfm_client.contract"},
+    "rfm.supervise": {"rfm.launch", "rfm.probe_request", "rfm_client.contract"},
     "rfm.engine": {"rfm", "!rfm.launch", "!rfm.supervise", "!rfm.triton_model", "rfm_client.contract"},
     "rfm": {"rfm_client.contract"},
     "rfm_export": {"rfm", "rfm_client.contract"},
@@ -71,7 +71,7 @@ FEWEST_WORDS = 4  # of a docstring
 LIGHT = {"numpy", "tritonclient", "aiohttp", "typing_extensions"}  # the last for type checkers only
 # What only an extra brings, and which files need it.
 EXTRAS = {
-    "av": {"film_files.py"},
+    "av": {"video_decoding.py"},
     "async_timeout": {"deadline.py"},  # Python 3.10 only
     "PIL": {"resize.py", "lerobot.py"},
     "gymnasium": {"gym.py", "gym_vector.py"},

@@ -19,8 +19,8 @@ from reference_server import Served
 from rfm.launch.admin_key import VARIABLE, AdminKeyError, take_key
 from rfm.launch.endpoints import Endpoints
 from rfm.launch.installation import Installation, ServerStartError, find_installation
-from rfm.launch.process import TritonServer
 from rfm.launch.triton_options import MAX_HTTP_BYTES, size_limits
+from rfm.launch.triton_server import TritonServer
 from rfm_commands.cli import app
 from rfm_serve import KEY
 

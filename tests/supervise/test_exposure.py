@@ -20,7 +20,7 @@ from rfm.config import ConfigError, ServeConfig
 from rfm.launch import endpoints, proc
 from rfm.launch.endpoints import PORTS, Endpoints, GrpcTls, check_version, free_ports
 from rfm.launch.installation import ServerStartError
-from rfm.launch.process import TritonServer
+from rfm.launch.triton_server import TritonServer
 from rfm.supervise.status import NO_REASON, Status, StatusServer
 from rfm_commands.cli import app
 from rfm_serve import wait_for

@@ -24,7 +24,7 @@ from rfm.launch.endpoints import Endpoints
 from rfm.launch.repository_api import RepositoryApiError
 from rfm.supervise.status import NO_REASON
 from rfm.supervise.supervisor import MOST, STEADY_S, BackOff, CrashLoopError
-from rfm.triton_model.guard import FAILED_BATCHES
+from rfm.triton_model.watchdog import FAILED_BATCHES
 from rfm_client import InferenceFailedError, ServerUnavailableError
 from rfm_serve import MODEL, PATIENCE_S, RFM, TRUTH_S, Serving, administered, children, serving, wait_for
 
@@ -83,7 +83,7 @@ def test_what_dies_stops_hangs_or_is_silent_is_healed_and_no_call_is_lost_until_
                 callers.wait_for_all()
                 assert served.restarts(what) == before + 1
         assert (callers.lost, callers.wrong) == ([], [])
-        assert served.metric("rfm_serve_canary_seconds_count", model=MODEL) > 3
+        assert served.metric("rfm_serve_probe_seconds_count", model=MODEL) > 3
         assert len(served.said) == len(faults), served.said
         assert served.said[-1] == "rfm: triton is started again: no answer for 3 s"
         assert "Timeout (0:00:03)!" in served.log.read_text()

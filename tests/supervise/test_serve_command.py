@@ -28,7 +28,7 @@ from rfm.config import ExportConfig
 from rfm.launch import installation
 from rfm.launch.endpoints import free_ports
 from rfm.launch.installation import ServerStartError, find_installation
-from rfm.launch.process import Endpoints, TritonServer, short_spin
+from rfm.launch.triton_server import Endpoints, TritonServer, short_spin
 from rfm_client import PreferenceSample, ProgressSample, RewardClient, Trajectory
 from rfm_commands.cli import app
 from rfm_serve import children, model_processes, wait_for
@@ -66,8 +66,8 @@ def test_the_committed_repository_is_served_with_a_gateway_until_a_signal(monkey
     endpoints = Endpoints("::1", http, grpc, metrics)
     words = [*command(REPOSITORY, endpoints), "--host=::1", f"--status-port={status}", f"--gateway-port={gateway}"]
     page = f"http://[::1]:{gateway}/"
-    film = Trajectory(frames=clip.render()[::8], task=clip.TASK)
-    samples = [ProgressSample(film), PreferenceSample(film, film)]
+    video = Trajectory(frames=clip.render()[::8], task=clip.TASK)
+    samples = [ProgressSample(video), PreferenceSample(video, video)]
     with nothing_left_behind(), subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
         try:
             wait_for(lambda: answer_of(f"http://[::1]:{status}/ready") or process.poll() is not None)

@@ -30,7 +30,7 @@ from rfm.launch.endpoints import Endpoints, GrpcTls
 from rfm.launch.triton_options import MAX_HTTP_BYTES
 from rfm_client import AccessDeniedError, ProgressSample, RewardClient, ServerUnavailableError
 from rfm_client.cli.commands import app as client_app
-from rfm_client.transport.access import Access
+from rfm_client.transport.credentials import Credentials
 from rfm_client.transport.loop_thread import LoopThread
 from rfm_client.transport.status import read_status
 from rfm_commands.cli import app
@@ -144,7 +144,7 @@ def test_a_client_without_tls_is_told(secure: Endpoints, scheme: str) -> None:
 def test_a_client_is_known_by_its_certificate(mutual: Endpoints, papers: Papers) -> None:
     with client(mutual.grpc_url, **papers.client) as asked:
         scores_right(asked)
-    assert read_status(mutual.grpc_url, access=Access(**papers.client)).ready
+    assert read_status(mutual.grpc_url, credentials=Credentials(**papers.client)).ready
     with client(mutual.grpc_url, ca_file=papers.ca, retry=False) as asked:  # Triton hangs up and does not say why
         with pytest.raises(ServerUnavailableError, match="Socket closed"):
             asked.progress(TRAJECTORY)
@@ -173,8 +173,8 @@ def test_rfm_models_shows_a_certificate(mutual: Endpoints, papers: Papers, key_f
     own = ["--client-certificate", str(papers.client_certificate), "--client-key", str(papers.client_key)]
     trusted = ["--ca-file", str(papers.ca), *own]
     assert CliRunner().invoke(app, ["models", *trusted, *list_models]).stdout.split() == ["rfm", "1", "READY"]
-    for access in (["--ca-file", str(papers.other_ca), *own], trusted[:2]):
-        refused = CliRunner().invoke(app, ["models", *access, *list_models])
+    for credentials in (["--ca-file", str(papers.other_ca), *own], trusted[:2]):
+        refused = CliRunner().invoke(app, ["models", *credentials, *list_models])
         assert (refused.exit_code, refused.stdout) == (1, "")
         assert refused.stderr.startswith(f"rfm: {mutual.grpc_url}: failed to connect")
 
@@ -219,7 +219,7 @@ def proxied(mutual: Endpoints, papers: Papers) -> Iterator[str]:
 def test_http_through_a_proxy_with_tls_and_a_key(proxied: str, papers: Papers) -> None:
     with client(proxied, api_key=KEY, **papers.client) as asked:
         scores_right(asked)
-    status = read_status(proxied, access=Access(**papers.client, api_key=KEY))
+    status = read_status(proxied, credentials=Credentials(**papers.client, api_key=KEY))
     assert [model.name for model in status.models] == ["rfm"]
 
 
@@ -235,7 +235,7 @@ def test_a_proxy_denies_who_shows_no_key_or_certificate_and_is_not_trusted_by_st
         with client(proxied, **options) as asked, denied_at_once(f"access denied: {told}"):
             asked.progress(TRAJECTORY)
         with pytest.raises(AccessDeniedError, match=f"access denied: {told}"):
-            read_status(proxied, access=Access(**options))
+            read_status(proxied, credentials=Credentials(**options))
     with (
         client(proxied, api_key=KEY, ca_file=papers.ca, retry=False) as asked,
         pytest.raises((AccessDeniedError, ServerUnavailableError)),  # by the moment at which the proxy hangs up
@@ -265,7 +265,7 @@ def test_what_cannot_be_used_is_refused(
     papers: Papers, options: Callable[[Papers], dict[str, Any]], message: str
 ) -> None:
     """No description has a key."""
-    assert KEY not in repr(Access(api_key=KEY, headers={"x-api-key": KEY}))
+    assert KEY not in repr(Credentials(api_key=KEY, headers={"x-api-key": KEY}))
     with pytest.raises(ValueError, match=message) as refused:
         client(**{"url": "grpcs://127.0.0.1:1", **options(papers)})
     assert KEY not in str(refused.value)

@@ -14,8 +14,8 @@ from typing import Any
 
 from paths import ROOT
 from rfm.launch.cleanup import REGION_PREFIX, SHARED_MEMORY
-from rfm.launch.proc import ZOMBIE, all_pids, arguments_of, stat_of
-from rfm.launch.process import Endpoints
+from rfm.launch.process_table import ZOMBIE, all_pids, arguments_of, stat_of
+from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient
 
 REPOSITORY = ROOT / "model_repository"

@@ -17,8 +17,8 @@ from rfm_client import ProgressResult, RewardClient, Trajectory
 from rfm_client.contract import wire
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.episodes.windows import Window
-from rfm_client.transport.access import Access
 from rfm_client.transport.calls import Answer, GrpcTransport
+from rfm_client.transport.credentials import Credentials
 
 MODEL = "enc_c1_t1_disc10"
 MAX_FRAMES = 16  # of that checkpoint
@@ -27,24 +27,24 @@ PUSH_RIGHT = 1  # the pole falls within ten steps
 SIZE = 240, 160  # pixels; fewer would not show the cart
 TOLERANCE = 1e-5
 
-Film = list[UInt8Array]
+Video = list[UInt8Array]
 
 
 class Camera(gym.Wrapper[Any, Any, Any, Any]):
-    """Films each episode for the test: ``films[-1][t]`` is what was to be seen after step t."""
+    """Videos each episode for the test: ``videos[-1][t]`` is what was to be seen after step t."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
-        self.films: list[Film] = []
+        self.videos: list[Video] = []
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
         answer = self.env.reset(**options)
-        self.films.append([np.array(self.env.render())])
+        self.videos.append([np.array(self.env.render())])
         return answer
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         answer = self.env.step(action)
-        self.films[-1].append(np.array(self.env.render()))
+        self.videos[-1].append(np.array(self.env.render()))
         return answer
 
 
@@ -64,7 +64,7 @@ def two_cameras(observation: dict[str, Any]) -> dict[str, UInt8Array]:
     return {"front": front, "wrist": 255 - front[::2, ::2], "state": np.zeros(1, np.uint8)}
 
 
-def scores(client: RewardClient, film: Film, step: int, max_frames: int | None = MAX_FRAMES) -> ProgressResult:
+def scores(client: RewardClient, video: Video, step: int, max_frames: int | None = MAX_FRAMES) -> ProgressResult:
     """Of the frames up to a step as upstream's RL loop sends them, cut or padded to ``max_frames``; None: all frames.
 
     Without the padded slots but the last, which is the newest frame's.
@@ -73,15 +73,15 @@ def scores(client: RewardClient, film: Film, step: int, max_frames: int | None =
     count = min(step + 1, slots)
     picked = np.rint(np.linspace(0, step, count)).astype(int)
     padded = [*picked, *[step] * (slots - count)]
-    result = client.progress(Trajectory(frames=np.stack([film[index] for index in padded]), task=TASK))
+    result = client.progress(Trajectory(frames=np.stack([video[index] for index in padded]), task=TASK))
     shown = [*range(count - 1), slots - 1]
     return replace(result, progress=result.progress[shown], success=result.success[shown])
 
 
 def progress(
-    client: RewardClient, film: Film, steps: Sequence[int], max_frames: int | None = MAX_FRAMES
+    client: RewardClient, video: Video, steps: Sequence[int], max_frames: int | None = MAX_FRAMES
 ) -> list[float]:
-    return [float(scores(client, film, step, max_frames).progress[-1]) for step in steps]
+    return [float(scores(client, video, step, max_frames).progress[-1]) for step in steps]
 
 
 def play(env: gym.Env[Any, Any], seed: int = 0) -> tuple[list[float], list[dict[str, Any]]]:
@@ -112,7 +112,7 @@ class SlowConnection(GrpcTransport):
     """To the real server; a question whose longest trajectory has a length that is held waits until it is let go."""
 
     def __init__(self, url: str) -> None:
-        super().__init__(url, Access(), shared_memory=False)
+        super().__init__(url, Credentials(), shared_memory=False)
         self.held: dict[int, Future[None]] = {}
 
     async def infer(self, model: str, inputs: wire.Tensors, outputs: Any, timeout_s: float, **_id: str) -> Answer:

@@ -7,7 +7,7 @@ import numpy as np
 import tritonclient.grpc
 
 from commands import in_shared_memory
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_client import (
     Trajectory,
 )

@@ -19,19 +19,19 @@ import requests
 
 from gateways import Gateway, running
 from proxies import Proxy
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_client import PreferenceSample, ProgressSample, Sample, SimilaritySample, Trajectory
 from small_network import SMALL
 
 Json: TypeAlias = dict[str, Any]
 Array: TypeAlias = npt.NDArray[Any]
 Ask: TypeAlias = Callable[..., requests.Response]
-TINY, FILM, VIDEO = "rfm", "film", "film_video"  # models: two numbers a frame; encoders; vision-language in video mode
+TINY, ENCODERS, VLM = "rfm", "encoders", "vlm"  # models: two numbers a frame; encoders; vision-language in video mode
 TINY_CONFIG = replace(
     SMALL, video_feature_dim=2, text_feature_dim=2, hidden_dim=8, num_layers=1, num_attention_heads=2, max_len=16,
     progress_bins=10,
 )  # fmt: skip
-FILM_DIMS = (48, 32)  # widths D and Dt of FILM's encoders
+ENCODER_DIMS = (48, 32)  # widths D and Dt of ENCODERS's encoders
 FRAME_STEPS = 4
 TOLERANCE = 1e-5  # where requests may share batches in different ways
 SIDES = {

@@ -19,7 +19,7 @@ import requests
 from prometheus_client.parser import text_string_to_metric_families
 
 from rfm.launch.endpoints import free_ports
-from rfm.launch.process import Endpoints
+from rfm.launch.triton_server import Endpoints
 from rfm_client import RewardClient
 from rfm_gateway.app import create_app
 from rfm_gateway.config import GatewayConfig

@@ -13,7 +13,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 import goldens
 from reference_server import Served
-from rfm.launch.proc import all_pids, arguments_of, stat_of
+from rfm.launch.process_table import all_pids, arguments_of, stat_of
 from rfm_client import (
     PreferenceSample,
     ProgressSample,

@@ -11,7 +11,7 @@ from typing import Any
 import tritonclient.grpc
 
 from rfm.launch.installation import find_installation
-from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.triton_server import Endpoints, TritonServer
 
 CRASHES: list[Path] = []  # repositories whose Triton has ended with SIGABRT, by itself
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Frames of made-up films."""
+"""Frames of synthetic videos."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from rfm.launch.process import Endpoints, TritonServer
+from rfm.launch.triton_server import Endpoints, TritonServer
 from rfm_client import RewardClient
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tritonclient.grpc.model_config_pb2 import ModelConfig
 
-from rfm.launch.proc import all_pids, arguments_of
+from rfm.launch.process_table import all_pids, arguments_of
 from rfm_export.layout import CONFIG_FILE
 from rfm_export.pbtxt import parse, render
 

@@ -19,7 +19,7 @@ from commands import RFM
 from one_model import CRASHES
 from rfm.launch.cleanup import SHARED_MEMORY
 from rfm.launch.endpoints import Endpoints
-from rfm.launch.proc import arguments_of, children_of, stat_of
+from rfm.launch.process_table import arguments_of, children_of, stat_of
 from rfm.launch.repository_api import RepositoryApi
 from rfm_client import RewardClient
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Datasets for the page: copies of the toy datasets, films coded otherwise, and what labels say."""
+"""Datasets for the page: copies of the toy datasets, videos coded otherwise, and what labels say."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ def columns_of(root: Path, episode: int, name: str = "rfm_progress.parquet") -> 
     return {column: table[column].to_numpy()[own] for column in table.column_names}
 
 
-def encoded_anew(film: Path, codec: str, options: dict[str, str], noise: np.random.Generator | None = None) -> None:
-    """Codes a film in another way, or noise in its place."""
-    with av.open(str(film)) as container:
+def encoded_anew(video: Path, codec: str, options: dict[str, str], noise: np.random.Generator | None = None) -> None:
+    """Codes a video in another way, or noise in its place."""
+    with av.open(str(video)) as container:
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     if noise is not None:
         frames = [noise.integers(0, 256, frame.shape, np.uint8) for frame in frames]
-    encode(film, frames, codec, options)
+    encode(video, frames, codec, options)

@@ -24,8 +24,8 @@ from rfm.engine.feature_cache import FeatureCache
 from rfm.engine.predictor import RowScores, frame_scores, prefix_indices
 from rfm.family import NETWORK, Description, EncodersDescription, Family, Options
 from rfm_client.contract import InvalidSampleError, ProgressSample, RewardError, Sample, SimilaritySample, Trajectory
-from rfm_client.contract.named_frames import NamedFootage, NamedTrajectory
-from rfm_client.contract.samples import Footage
+from rfm_client.contract.frame_refs import EncoderSampleRefs, TrajectoryRefs
+from rfm_client.contract.samples import EncoderSample
 
 MODEL_TYPE = "redness"
 PALETTE = "palette.safetensors"
@@ -73,19 +73,22 @@ class Palette:
         return Palette(self.scale.to(device))
 
     def encode(
-        self, samples: Sequence[Footage | NamedFootage], execution: Execution, cache: FeatureCache | None = None
-    ) -> list[Footage | RewardError]:
+        self,
+        samples: Sequence[EncoderSample | EncoderSampleRefs],
+        execution: Execution,
+        cache: FeatureCache | None = None,
+    ) -> list[EncoderSample | RewardError]:
         return [self._encoded(sample) for sample in samples]
 
-    def _encoded(self, sample: Footage | NamedFootage) -> Footage:
+    def _encoded(self, sample: EncoderSample | EncoderSampleRefs) -> EncoderSample:
         letters = np.full(1, len(sample.trajectories[0].task), np.float32)
         colours = [_frames(each).mean(axis=(1, 2)).astype(np.float32) for each in sample.trajectories]
         videos = [self.scale.cpu().numpy() * colour for colour in colours]
-        return Footage(tuple(Trajectory(video_embeddings=video, text_embedding=letters) for video in videos))
+        return EncoderSample(tuple(Trajectory(video_embeddings=video, text_embedding=letters) for video in videos))
 
 
-def _frames(trajectory: Trajectory | NamedTrajectory) -> np.ndarray:
-    if isinstance(trajectory, NamedTrajectory):
+def _frames(trajectory: Trajectory | TrajectoryRefs) -> np.ndarray:
+    if isinstance(trajectory, TrajectoryRefs):
         return np.stack([trajectory.pixels[digest] for digest in trajectory.digests])
     return trajectory.positions
 

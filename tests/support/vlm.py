@@ -32,7 +32,7 @@ def predictor_of(name: str) -> VlmPredictor:
     return predictor
 
 
-def film(seed: int, num_frames: int, height: int, width: int, task: str = "stack the blocks") -> Trajectory:
+def video(seed: int, num_frames: int, height: int, width: int, task: str = "stack the blocks") -> Trajectory:
     frames = np.random.default_rng(seed).integers(0, 256, (num_frames, height, width, 3), np.uint8)
     return Trajectory(frames=frames, task=task)
 
@@ -66,7 +66,7 @@ def upstream_inputs(predictor: VlmPredictor, rows: Sequence[VlmRow]) -> dict[str
     merged = batch.inputs["pixel_values"].unflatten(0, (-1, UNIT))
     pixels = merged[batch.inputs["visual_features"]].flatten(0, 1)
     inputs = {"input_ids": batch.inputs["input_ids"], "attention_mask": mask}
-    grids = [predictor.collator.grid(film) for row in rows for film in row.films]
+    grids = [predictor.collator.grid(video) for row in rows for video in row.videos]
     if not predictor.network.config.multi_image:
         grid = torch.tensor([[each.groups, each.rows, each.columns] for each in grids])
         return inputs | {"pixel_values_videos": pixels, "video_grid_thw": grid}

@@ -16,11 +16,11 @@ import torch
 
 from batch_models import BREAKS, CONFIG, FAILS, LOGGED, METRICS, REFUSED, WIDTHS, Model, Request, backend, request  # noqa: F401  a fixture
 from rfm.engine.execution import Execution
-from rfm.probe import blank_question
+from rfm.probe_request import probe_request
 from rfm.triton_model import batch_model
 from rfm.triton_model.batch_model import GIVEN_UP_S
-from rfm.triton_model.guard import FAILED_BATCHES, Guard
 from rfm.triton_model.placement import Placement, use_threads
+from rfm.triton_model.watchdog import FAILED_BATCHES, Watchdog
 from rfm_client import (
     FrameScores,
     InferenceFailedError,
@@ -149,7 +149,7 @@ def test_behind_a_batch_that_took_long_a_cancelled_request_is_not_scored(tmp_pat
 
 def test_warm_ups_and_probes_are_not_counted(tmp_path: Path) -> None:
     model = Model(tmp_path, warmups=2)
-    blank = Request(blank_question(CONFIG), id=f"{PROBE_PREFIX}-rfm")
+    blank = Request(probe_request(CONFIG), id=f"{PROBE_PREFIX}-rfm")
     model.respond(request(1), request(5), blank, request(1, id="caller"))
     assert model.samples == {("progress", "scored"): 1}
     model.respond(request(1), request(1, id="caller"))
@@ -180,7 +180,7 @@ def test_what_an_execution_took_is_told(tmp_path: Path) -> None:
 
     model = Working(tmp_path)
     model.respond(request(1), request(5, 6))
-    model.respond(Request(blank_question(CONFIG), id=PROBE_PREFIX))
+    model.respond(Request(probe_request(CONFIG), id=PROBE_PREFIX))
     model.finalize()
     told = {metric.name: metric.value for metric in METRICS if metric.value and metric.name != "rfm_samples_total"}
     assert told == {
@@ -235,7 +235,7 @@ def test_an_instance_that_raises_at_the_blank_sample_after_failed_batches_ends(
 ) -> None:
     """A checkpoint may refuse blank frames, and memory may be short for a moment; a lost device raises."""
     ended: list[str] = []
-    monkeypatch.setattr("rfm.triton_model.guard.end", ended.append)
+    monkeypatch.setattr("rfm.triton_model.watchdog.end", ended.append)
 
     class Blank(Model):
         has_warmed_up = False
@@ -257,7 +257,7 @@ def test_an_instance_that_raises_at_the_blank_sample_after_failed_batches_ends(
     assert bool(ended) is is_broken
 
 
-def test_requests_are_scored_in_the_thread_that_calls_execute_and_the_guard_knows(
+def test_requests_are_scored_in_the_thread_that_calls_execute_and_the_watchdog_knows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Warm-ups, too: else OpenMP has two teams of threads."""
@@ -269,16 +269,16 @@ def test_requests_are_scored_in_the_thread_that_calls_execute_and_the_guard_know
             assert is_working()
             return super().answer(questions, execution)
 
-    guards: list[Callable[[], bool]] = []
+    watchdogs: list[Callable[[], bool]] = []
 
-    class WatchedGuard(Guard):
+    class SeenWatchdog(Watchdog):
         def __init__(self, hang_s: float, is_working: Callable[[], bool]) -> None:
-            guards.append(is_working)
+            watchdogs.append(is_working)
             super().__init__(hang_s, is_working)
 
-    monkeypatch.setattr(batch_model, "Guard", WatchedGuard)
+    monkeypatch.setattr(batch_model, "Watchdog", SeenWatchdog)
     model = Watched(tmp_path, warmups=1)
-    (is_working,) = guards
+    (is_working,) = watchdogs
     for requests in ([request(1)], [request(5), request(6)]):
         assert not is_working()
         model.execute(requests)

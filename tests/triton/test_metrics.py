@@ -199,15 +199,15 @@ def test_metrics_have_their_kinds_buckets_and_labels(served_too: Served) -> None
 
 
 def test_raw_frames_are_counted_where_they_are_encoded_and_where_they_are_scored(served: Served) -> None:
-    def film(count: int) -> Trajectory:
+    def video(count: int) -> Trajectory:
         random = np.random.default_rng(count)
         return Trajectory(frames=random.integers(0, 256, (count, 40, 40, 3), np.uint8), task="lift the cup")
 
     before = scrape(served)
     with client(served, FILMED) as asked:
-        asked.encode(film(3))
-        asked.progress(film(4))
-        asked.preference(film(2), film(5))
+        asked.encode(video(3))
+        asked.progress(video(4))
+        asked.preference(video(2), video(5))
     after = scrape(served)
     assert counted(after, before, f"{FILMED}_encoder") == {"encode scored": 3, "frames": 3 + 4 + 7}
     assert counted(after, before, FILMED) == {"progress scored": 1, "preference scored": 1, "frames": 4 + 7}

@@ -49,18 +49,18 @@ def test_a_reference_answer_of_each_kind_of_checkpoint_comes_back(
     case.check_response(results)
 
 
-def film(seed: int, num_frames: int, height: int, width: int) -> Trajectory:
+def video(seed: int, num_frames: int, height: int, width: int) -> Trajectory:
     frames = np.random.default_rng(seed).integers(0, 256, (num_frames, height, width, 3), np.uint8)
     return Trajectory(frames=frames, task=f"task {seed}")
 
 
 def filmed_samples(count: int) -> list[Sample]:
-    """Pairs of both types, of one and of two sizes, and single films; lengths and sizes differ from one to the next."""
+    """Pairs of both types, of one and of two sizes, and single videos; lengths and sizes differ from one to the next."""
     samples: list[Sample] = []
     for index in range(count):
         size = (48, 100) if index % 2 else (90, 61)
-        first = film(2 * index, 1 + index % 5, *size)
-        second = film(2 * index + 1, 1 + index % 3, *(size[::-1] if index % 4 > 1 else size))
+        first = video(2 * index, 1 + index % 5, *size)
+        second = video(2 * index + 1, 1 + index % 3, *(size[::-1] if index % 4 > 1 else size))
         kind = index % 3
         samples.append(
             ProgressSample(first) if kind == 0 else (PreferenceSample, SimilaritySample)[kind - 1](first, second)
@@ -92,10 +92,10 @@ BAD = 11  # the place of a sample that is refused
 @pytest.mark.parametrize(("protocol", "model"), [("grpc", MODEL), ("http", MODEL), ("http", FRAMES_MODEL)])
 def test_callers_share_batches_and_a_bad_sample_fails_alone(served: Served, protocol: str, model: str) -> None:
     samples = mixed_samples(100) if model == MODEL else filmed_samples(32)
-    samples[BAD] = ProgressSample(random_trajectory(0, 17) if model == MODEL else film(0, 17, 8, 8))
+    samples[BAD] = ProgressSample(random_trajectory(0, 17) if model == MODEL else video(0, 17, 8, 8))
     expected = [load_engine(model).evaluate([sample])[0] for sample in samples]
     works = model if model == MODEL else f"{FRAMES_MODEL}_encoder"
-    busy = plug() if model == MODEL else [ProgressSample(film(1000, 16, 2500, 2500))]
+    busy = plug() if model == MODEL else [ProgressSample(video(1000, 16, 2500, 2500))]
     with (
         RewardClient(served.url(protocol), model=model, max_in_flight=len(samples)) as client,
         served.client("http", model) as other,  # a large request would hold up those behind it on one gRPC connection
@@ -233,9 +233,9 @@ BAD_FRAMES: dict[str, tuple[wire.Tensors, str]] = {
 
 @pytest.mark.parametrize("name", [*BAD_EMBEDDINGS, *BAD_FRAMES])
 def test_what_cannot_be_scored_is_refused_with_what_was_expected(served: Served, name: str) -> None:
-    is_film = name in BAD_FRAMES
-    changes, message = BAD_FRAMES[name] if is_film else BAD_EMBEDDINGS[name]
-    model, question = (f"{FRAMES_MODEL}_frames", QUESTION) if is_film else (MODEL, embedded())
+    is_video = name in BAD_FRAMES
+    changes, message = BAD_FRAMES[name] if is_video else BAD_EMBEDDINGS[name]
+    model, question = (f"{FRAMES_MODEL}_frames", QUESTION) if is_video else (MODEL, embedded())
     with pytest.raises(InvalidSampleError, match=message):
         infer(served.url("grpc"), model, question | changes, [wire.PROGRESS])
 
@@ -266,7 +266,7 @@ def test_what_was_not_asked_is_nan_on_the_wire(served: Served) -> None:
 
 
 def test_a_pair_of_two_frame_sizes_may_be_sent_through_shared_memory(served: Served, protocol: str) -> None:
-    pair = PreferenceSample(film(0, 4, 200, 300), film(1, 3, 120, 90))
+    pair = PreferenceSample(video(0, 4, 200, 300), video(1, 3, 120, 90))
     with RewardClient(served.url(protocol), model=FRAMES_MODEL, shared_memory=True) as client:
         (result,) = client.evaluate([pair])
         with tritonclient.grpc.InferenceServerClient(served.url("grpc").removeprefix("grpc://")) as triton:
@@ -278,8 +278,8 @@ def test_a_pair_of_two_frame_sizes_may_be_sent_through_shared_memory(served: Ser
 def test_a_second_array_may_hold_frames_of_one_size(served: Served, model: str) -> None:
     """Whoever writes tensors may use the optional input for any pair, and for a sample without a second trajectory."""
     frames = [np.random.default_rng(seed).integers(0, 256, (2, 56, 56, 3), np.uint8) for seed in (1, 2)]
-    films = [Trajectory(frames=each, task="lift") for each in frames]
-    tensors = wire.encode_samples([PreferenceSample(films[0], films[1]), ProgressSample(films[0])])
+    videos = [Trajectory(frames=each, task="lift") for each in frames]
+    tensors = wire.encode_samples([PreferenceSample(videos[0], videos[1]), ProgressSample(videos[0])])
     apart = {
         wire.FRAMES: np.stack([frames[0], frames[0]]),
         wire.SECOND_FRAMES: np.stack([frames[1], np.zeros_like(frames[1])]),
@@ -296,7 +296,7 @@ def test_a_model_from_before_pairs_of_two_frame_sizes_says_so(served: Served) ->
     config = goldens.config(VLM)
     rfm_export.export(config.checkpoint, served.repository, serve_config(config, "before"))
     forget_input(served.repository, "before_frames", wire.SECOND_FRAMES)
-    wide, tall = film(0, 2, 56, 84), film(1, 2, 84, 56)
+    wide, tall = video(0, 2, 56, 84), video(1, 2, 84, 56)
     pairs = [PreferenceSample(wide, wide), PreferenceSample(wide, tall), PreferenceSample(tall, tall)]
     with RepositoryApi(served.url("grpc"), served.server.admin_key) as api:
         api.load("before_frames")

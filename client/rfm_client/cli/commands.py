@@ -25,9 +25,9 @@ from rfm_client.cli.command import (
     with_options,
 )
 from rfm_client.cli.label import label
-from rfm_client.cli.made_up import MadeUpSamples, are_frames, write_perf_analyzer_input
-from rfm_client.cli.options import AccessFiles, OutputOptions, PrefixOptions, ServerOptions, VideoOptions
-from rfm_client.cli.show import RowByRow, print_tables, scores_table, status_tables
+from rfm_client.cli.options import CredentialFiles, OutputOptions, PrefixOptions, ServerOptions, VideoOptions
+from rfm_client.cli.show import StreamedTable, print_tables, scores_table, status_tables
+from rfm_client.cli.synthetic import SyntheticSamples, are_frames, write_perf_analyzer_input
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import RewardError
 from rfm_client.contract.names import frames_name
@@ -58,7 +58,7 @@ def _print_version(is_wanted: bool) -> None:
 @with_options
 def main(
     context: typer.Context,
-    files: AccessFiles,
+    files: CredentialFiles,
     version: Annotated[
         bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version and exit.")
     ] = False,
@@ -83,7 +83,7 @@ def score(
     output.check(videos)
     if prefix.sampling is not None and video.max_frames is not None:
         raise ConfigError("sampling", f"expected no --max-frames with it, got {video.max_frames}")
-    rows = RowByRow(scoring.COLUMNS, videos)
+    rows = StreamedTable(scoring.COLUMNS, videos)
     arrays = output.array_files(scoring.unique_stems(videos))
 
     def tell(number: int, outcome: scoring.Outcome) -> None:
@@ -98,7 +98,7 @@ def score(
             rows.write(outcome.row)
 
     with scoring.recorder(output.rrd, videos) as record, server.connected(context.obj) as client:
-        outcomes = scoring.Asking(client, video, prefix, record).score_all(videos, tell)
+        outcomes = scoring.SourceScorer(client, video, prefix, record).score_all(videos, tell)
     rows.end(prefix.rule)
     output.write_json(documents.score_document(server, video, prefix, outcomes))
     panels = [outcome.panel for outcome in outcomes if isinstance(outcome, scoring.Scored)]
@@ -158,7 +158,7 @@ def status(
         raise typer.BadParameter("expected one --url with it, got several", param_hint="'--metrics-url'")
     with usage_errors("'--url'"):
         statuses = [
-            read_status(url, metrics_url=metrics_url, timeout_s=server.timeout_s, access=context.obj)
+            read_status(url, metrics_url=metrics_url, timeout_s=server.timeout_s, credentials=context.obj)
             for url in server.urls
         ]
     if output.prints_tables:
@@ -181,12 +181,12 @@ def wait(
 def sample(
     context: typer.Context,
     server: ServerOptions,
-    made_up: MadeUpSamples,
+    synthetic: SyntheticSamples,
     output: Annotated[OutputOptions, OptionsOf(OutputOptions, only=("json",))],
 ) -> None:
-    """Score made-up samples, to see that the server answers. Their scores mean nothing."""
+    """Score synthetic samples, to see that the server answers. Their scores mean nothing."""
     with server.connected(context.obj) as client:
-        samples = made_up.samples(client)
+        samples = synthetic.samples(client)
         outcomes = client.evaluate(samples, return_errors=True)
     failures = [outcome for outcome in outcomes if isinstance(outcome, RewardError)]
     for index, outcome in enumerate(outcomes):
@@ -195,8 +195,8 @@ def sample(
     rows = [(f"{index}", outcome) for index, outcome in enumerate(outcomes) if not isinstance(outcome, RewardError)]
     if output.prints_tables and rows:
         of = "frames" if are_frames(samples) else "embeddings"
-        print_tables(scores_table(f"{made_up.sample_type} of random {of}", rows))
-    output.write_json(documents.samples_document(server, made_up.sample_type, outcomes))
+        print_tables(scores_table(f"{synthetic.sample_type} of random {of}", rows))
+    output.write_json(documents.samples_document(server, synthetic.sample_type, outcomes))
     raise typer.Exit(exit_code_of(failures, some_succeeded=len(failures) < len(outcomes)))
 
 
@@ -206,14 +206,14 @@ def bench_input(
     context: typer.Context,
     output: Annotated[Path, typer.Option(help="JSON file to write.")],
     server: ServerOptions,
-    made_up: Annotated[MadeUpSamples, OptionsOf(MadeUpSamples, defaults={"num_samples": 64})],
+    synthetic: Annotated[SyntheticSamples, OptionsOf(SyntheticSamples, defaults={"num_samples": 64})],
 ) -> None:
-    """Write made-up samples as input of Triton's perf_analyzer.
+    """Write synthetic samples as input of Triton's perf_analyzer.
 
     It prints the command that measures with them.
     """
     with server.connected(context.obj) as client:
-        samples = made_up.samples(client)
+        samples = synthetic.samples(client)
     write_perf_analyzer_input(output, samples)
     protocol, address = split_url(server.urls[0])
     name = frames_name(server.model) if are_frames(samples) else server.model

@@ -32,7 +32,7 @@ from rfm_client.labelling.ray_engine import Connect
 from rfm_client.labelling.run import Watch
 from rfm_client.labelling.scorer import ClientScorer, Scorer
 from rfm_client.labelling.summary import Summary, summarise
-from rfm_client.transport.access import Access
+from rfm_client.transport.credentials import Credentials
 
 SPEED_OVER_S = 600.0  # an episode may take minutes
 
@@ -107,18 +107,18 @@ def label(
 
     The same command goes on with what is missing.
     """
-    access: Access = context.obj  # the context itself cannot travel to other machines
+    credentials: Credentials = context.obj  # the context itself cannot travel to other machines
 
     @contextmanager
     def connect() -> Iterator[Scorer]:
-        with server.connected(access) as client:
+        with server.connected(credentials) as client:
             yield ClientScorer(client)
 
-    raise typer.Exit(Labelling(dataset, texts, labels, run, ray, connect, report).run())
+    raise typer.Exit(LabelCommand(dataset, texts, labels, run, ray, connect, report).run())
 
 
 @dataclass(frozen=True)
-class Labelling:
+class LabelCommand:
     """A labelling run of a command: label, try, or only report.
 
     source: of ``open_dataset``; connect: gives a scorer; say: is called with a line for a person

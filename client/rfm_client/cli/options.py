@@ -21,7 +21,7 @@ from rfm_client.contract.samples import MAX_FRAME_STEPS, MIN_FRAME_STEPS
 from rfm_client.contract.settings import ConfigError, Settings, Texts, setting
 from rfm_client.data.orientation import Orientation
 from rfm_client.data.sampling import Rule, Sampling
-from rfm_client.transport.access import Access
+from rfm_client.transport.credentials import Credentials
 
 DEFAULT_URL = "grpc://localhost:8001"
 MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.001, 86_400
@@ -30,7 +30,7 @@ _ENDINGS = {"json": (".json",), "plot": (".png", ".pdf", ".svg"), "rrd": (".rrd"
 
 
 @dataclass(frozen=True)
-class AccessFiles(Settings):
+class CredentialFiles(Settings):
     """Files with which a server is reached that is not open to all."""
 
     ca_file: Path | None = setting(None, "Authorities (PEM) to trust; else the system's.", variable="RFM_CA_FILE")
@@ -42,13 +42,13 @@ class AccessFiles(Settings):
         None, "File with the key that requests show as Bearer.", variable="RFM_API_KEY_FILE"
     )
 
-    def read(self) -> Access:
+    def read(self) -> Credentials:
         """What the files hold. Raises ValueError for what cannot be used."""
         try:
             api_key = None if self.api_key_file is None else self.api_key_file.read_text().strip()
         except (OSError, UnicodeDecodeError) as error:
             raise ValueError(f"api_key_file: expected a text file, got {error}") from None
-        return Access(self.ca_file, self.client_certificate, self.client_key, api_key=api_key)
+        return Credentials(self.ca_file, self.client_certificate, self.client_key, api_key=api_key)
 
 
 @dataclass(frozen=True)
@@ -78,24 +78,26 @@ class ServerOptions(Settings):
         """What JSON documents say of it."""
         return {"servers": list(self.urls), "model": self.model}
 
-    def client(self, access: Access, **options: Any) -> RewardClient:
+    def client(self, credentials: Credentials, **options: Any) -> RewardClient:
         """A client. Raises typer.BadParameter for a URL that is none."""
         with usage_errors("'--url'"):
             return RewardClient(
-                self.urls, model=self.model, **{"timeout_s": self.timeout_s, **access.options, **options}
+                self.urls, model=self.model, **{"timeout_s": self.timeout_s, **credentials.options, **options}
             )
 
     @contextmanager
-    def connected(self, access: Access) -> Iterator[RewardClient]:
+    def connected(self, credentials: Credentials) -> Iterator[RewardClient]:
         """A client, once one of the servers answers and serves the model. If none does, it fails without a wait."""
-        with self.client(access) as client:
-            self._check(access)
+        with self.client(credentials) as client:
+            self._check(credentials)
             yield client
 
-    def _check(self, access: Access) -> None:
+    def _check(self, credentials: Credentials) -> None:
         problems = []
         for url in self.urls:
-            with RewardClient(url, model=self.model, timeout_s=self.timeout_s, retry=False, **access.options) as one:
+            with RewardClient(
+                url, model=self.model, timeout_s=self.timeout_s, retry=False, **credentials.options
+            ) as one:
                 try:
                     try:
                         one.model_info()

@@ -31,7 +31,7 @@ from rfm_client.contract.errors import (
 )
 from rfm_client.contract.results import FrameScores, ProgressResult, Result
 from rfm_client.contract.samples import ProgressSample, Trajectory
-from rfm_client.data.fitting import FittedSample, fitted, with_frame_indices
+from rfm_client.data.fit_to_checkpoint import FittedSample, fitted, with_frame_indices
 from rfm_client.data.sampling import Sampling, of_prefixes, prefix_samples
 
 PREFIXES_AT_A_TIME = 64  # of one video: their frames lie in memory
@@ -117,7 +117,7 @@ Record = Callable[[int, Source, FrameScores], None]  # is called by any thread
 
 
 @dataclass
-class Asking:
+class SourceScorer:
     """Scores one source after the other, until no server answers any more. For several threads.
 
     record: is given each source with its frames, before they are forgotten; None: nothing is recorded

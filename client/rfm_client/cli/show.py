@@ -101,7 +101,7 @@ def print_tables(*tables: object) -> None:
     console.print(*tables, sep="\n", markup=False, highlight=False)
 
 
-class RowByRow:
+class StreamedTable:
     """A table on standard output that is written row by row, as wide as the terminal.
 
     columns: headers and widths; the first is as wide as ``names``, all that it will have, and the terminal allow

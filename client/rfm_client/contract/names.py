@@ -9,7 +9,7 @@ Part: TypeAlias = Literal["embeddings", "encoder", "frames"]  # of a served chec
 
 DEFAULT_MODEL = "rfm"  # scores embeddings; the names of the others are made from it
 
-PROBE_PREFIX = "rfm-canary"  # of the request ids of health probes; a model does not count those for a blank sample
+PROBE_PREFIX = "rfm-probe"  # of the request ids of health probes; a model does not count those for a blank sample
 
 ADMIN_KEY_VARIABLE = "RFM_ADMIN_KEY"
 GATEWAY_KEY_VARIABLE = "RFM_GATEWAY_API_KEY"

@@ -141,7 +141,7 @@ Sample: TypeAlias = ProgressSample | PreferenceSample | SimilaritySample
 
 
 @dataclass(frozen=True, eq=False)
-class Footage:
+class EncoderSample:
     """The trajectories of one sample, for an encoder: those that it reads have frames, and the first one's task counts.
 
     Those that it gives have embeddings of the frames and of that task.

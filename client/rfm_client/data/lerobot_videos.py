@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Which video files of LeRobot datasets are no film of one episode.
+"""Which video files of LeRobot datasets are no video of one episode.
 
-Up to v2.1 a dataset has one film for each episode and camera. Since v3.0 one file holds many episodes, one behind the
-other. Read as one film, it would be scored as one long episode: it is refused unless the dataset has one episode in
+Up to v2.1 a dataset has one video for each episode and camera. Since v3.0 one file holds many episodes, one behind the
+other. Read as one video, it would be scored as one long episode: it is refused unless the dataset has one episode in
 all. No table is read: that would need pyarrow.
 """
 
@@ -19,11 +19,11 @@ _INSTEAD = (
     "label the dataset with rfm-client label, or name the part of the file that is one episode: start_s and end_s of "
     "load_trajectory (meta/episodes tells its from_timestamp and to_timestamp)"
 )
-_FILM_AN_EPISODE = re.compile(r"v[12]\.")
+_VIDEO_AN_EPISODE = re.compile(r"v[12]\.")
 _SHARED_FILE = re.compile(r"/videos/[^/]+/chunk-\d+/file-\d+\.\w+$")  # the layout of v3.0
 
 
-def check_local_film(source: str | Path) -> None:
+def check_local_video(source: str | Path) -> None:
     """Raises InvalidSampleError for a file in which a LeRobot dataset keeps several episodes.
 
     Where no dataset's ``meta/info.json`` lies above the file, the layout of its path decides.
@@ -38,7 +38,7 @@ def check_local_film(source: str | Path) -> None:
     _check_layout(given.as_posix())
 
 
-def check_film_behind(url: str) -> None:
+def check_video_behind(url: str) -> None:
     """Raises InvalidSampleError for such a file behind a URL, judged by the URL's path alone."""
     _check_layout(unquote(urlsplit(url).path))
 
@@ -59,15 +59,15 @@ def _info(file: Path) -> dict[str, object] | None:
     return info if isinstance(info, dict) and "codebase_version" in info else None
 
 
-def _check_dataset(info: dict[str, object], film: Path, root: Path) -> None:
+def _check_dataset(info: dict[str, object], video: Path, root: Path) -> None:
     version, total = info["codebase_version"], info.get("total_episodes")
-    if (isinstance(version, str) and _FILM_AN_EPISODE.match(version)) or total == 1:
+    if (isinstance(version, str) and _VIDEO_AN_EPISODE.match(version)) or total == 1:
         return
-    of_camera = root / Path(*film.relative_to(root).parts[:2])  # videos/<camera>
-    files = [file for file in of_camera.rglob(f"*{film.suffix}") if file.is_file()]
-    held = f"{total}" if files == [film] else f"some of the dataset's {total}"
+    of_camera = root / Path(*video.relative_to(root).parts[:2])  # videos/<camera>
+    files = [file for file in of_camera.rglob(f"*{video.suffix}") if file.is_file()]
+    held = f"{total}" if files == [video] else f"some of the dataset's {total}"
     raise _refusal(f"a LeRobot {version} file that holds {held} episodes")
 
 
 def _refusal(got: str) -> InvalidSampleError:
-    return InvalidSampleError.at("video", "a film of one episode", f"{got}: {_INSTEAD}")
+    return InvalidSampleError.at("video", "a video of one episode", f"{got}: {_INSTEAD}")

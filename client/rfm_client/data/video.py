@@ -20,18 +20,18 @@ from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.numbers import checked_finite, checked_positive
 from rfm_client.contract.proxies import open_url
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.film_files import (
+from rfm_client.data.lerobot_videos import check_local_video, check_video_behind
+from rfm_client.data.video_decoding import (
     DAMAGED,
     UNDAMAGED,
-    FilmError,
     Packets,
-    film_stream,
+    VideoError,
     import_av,
     judged,
     read_packets,
     upright,
+    video_stream,
 )
-from rfm_client.data.lerobot_videos import check_film_behind, check_local_film
 
 DOWNLOAD_TIMEOUT_S = 60.0
 
@@ -68,7 +68,7 @@ def read_video(
 
     Frames are counted, not timed: in a video of variable frame rate, T is that of its average rate, and frames are
     even in number, not in time. Colours are those of ``ffmpeg -pix_fmt rgb24``, whatever PyAV is installed. A video
-    that is to be shown turned (as phones film) or mirrored is. Of all decoded frames only those that are returned are
+    that is to be shown turned (as phones record) or mirrored is. Of all decoded frames only those that are returned are
     held in memory. A URL is downloaded once, to a temporary file.
 
     start_s, end_s: only the frames from here to before there, by their time stamps; None: from the start, to the end
@@ -78,7 +78,7 @@ def read_video(
         name other files or addresses, which are then opened; None: whatever it looks like
 
     Raises InvalidSampleError for what is no video, breaks off, or cannot be had, for a damaged frame among those that
-    are returned, for a file of several films or of depth maps, and for one of several LeRobot episodes
+    are returned, for a file of several videos or of depth maps, and for one of several LeRobot episodes
     (``lerobot_videos``) unless ``start_s`` and ``end_s`` name a part of it.
     """
     import_av()
@@ -86,24 +86,24 @@ def read_video(
     take = take or (lambda num_bytes: None)
     with _errors_of(source):
         if start_s is None or end_s is None:
-            check_film_behind(str(source)) if is_url(source) else check_local_film(source)
+            check_video_behind(str(source)) if is_url(source) else check_local_video(source)
         with _opened(source, timeout_s) as file:
             packets = read_packets(file, container)
             if packets.count - 1 in packets.corrupt:
-                raise FilmError("a whole video file", f"one that breaks off in frame {packets.count - 1}")
+                raise VideoError("a whole video file", f"one that breaks off in frame {packets.count - 1}")
             is_part = (start_s, end_s) != (None, None)
             if not packets.fps and (is_part or fps is not None):
-                raise FilmError("a frame rate", "none")
+                raise VideoError("a frame rate", "none")
             first, end = _part(packets, start_s, end_s) if is_part else (0, packets.count)
             frames, total = _decoded(file, _picked(first, end, packets, fps), take, container)
             if is_part and (total != packets.count or len(packets.times_s) != total):
-                raise FilmError(f"{packets.count} frames with time stamps", f"{total}")
+                raise VideoError(f"{packets.count} frames with time stamps", f"{total}")
             if total != packets.count:  # a packet may hold several frames
                 frames, total = _decoded(file, _picked(0, total, packets, fps), take, container)
         if not total:
-            raise FilmError("at least one frame", "none")
+            raise VideoError("at least one frame", "none")
         if len({frame.shape for frame in frames}) > 1:
-            raise FilmError("frames of one size", "several")
+            raise VideoError("frames of one size", "several")
         take(sum(frame.nbytes for frame in frames))
         return np.stack(frames)
 
@@ -126,7 +126,7 @@ def _errors_of(source: str | Path) -> Iterator[None]:
     """Raises InvalidSampleError with the source for what goes wrong inside."""
     try:
         yield
-    except FilmError as error:
+    except VideoError as error:
         raise InvalidSampleError.at("video", error.expected, f"{error.got} ({source})") from error
     except InvalidSampleError as error:
         raise InvalidSampleError(f"{error} ({source})") from error
@@ -172,7 +172,7 @@ def _download(url: str, file: BinaryIO, timeout_s: float) -> None:
     except (OSError, HTTPException, ValueError) as error:
         if isinstance(error, HTTPError):
             error.close()  # it is a response too, and holds the connection
-        raise FilmError(_EXPECTED, str(error)) from error
+        raise VideoError(_EXPECTED, str(error)) from error
 
 
 def _part(packets: Packets, start_s: float | None, end_s: float | None) -> tuple[int, int]:
@@ -199,7 +199,7 @@ def _decoded(
     picked, total = [], 0
     file.seek(0)
     with import_av().open(file, format=container) as opened:
-        for frame, is_damaged in judged(opened.decode(film_stream(opened))):
+        for frame, is_damaged in judged(opened.decode(video_stream(opened))):
             take(frame.width * frame.height * _RGB_BYTES if total in wanted else 0)
             if total in wanted:
                 if is_damaged:

@@ -18,8 +18,8 @@ from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.frame_size import FrameSize
 from rfm_client.contract.samples import as_array
 from rfm_client.data.sampling import Sampling
-from rfm_client.episodes.steps import EpisodeFrames, EpisodeOptions, StepQuestion, StepScore, StepScores, copied
-from rfm_client.episodes.windows import NamedFrame
+from rfm_client.episodes.steps import EpisodeFrames, EpisodeOptions, StepRequest, StepScore, StepScores, copied
+from rfm_client.episodes.windows import FrameRef
 from rfm_client.transport.deadline import Deadline
 from rfm_client.transport.lifetime import AsyncClosing, Closing, OneProcess
 
@@ -71,7 +71,7 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
             for episode, frame in zip(added, new, strict=True):
                 episode.append(frame)
             try:
-                question = StepQuestion(added, sampling, asked_s)
+                question = StepRequest(added, sampling, asked_s)
                 outcomes = await self._client.score_windows(question.windows, timeout_s=_left_s(deadline))
                 scores = question.scores(outcomes)
             except BaseException:
@@ -114,13 +114,11 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
         info = await self._client.model_info(frames=True, timeout_s=_left_s(deadline))
         return self._options.sampling_for(info), info.frame_size if self._options.resize else None
 
-    async def _checked(
-        self, frames: Any, indices: Sequence[int], size: FrameSize | None
-    ) -> list[tuple[NamedFrame, ...]]:
+    async def _checked(self, frames: Any, indices: Sequence[int], size: FrameSize | None) -> list[tuple[FrameRef, ...]]:
         """The new frames of these episodes, in as many threads as there are processors."""
         given = self._given(frames, indices)
 
-        def checked(some: Sequence[int]) -> list[tuple[NamedFrame, ...]]:
+        def checked(some: Sequence[int]) -> list[tuple[FrameRef, ...]]:
             return [self._episodes[index].checked(given[index], size) for index in some]
 
         count = max(1, math.ceil(len(indices) / (os.cpu_count() or 1)))

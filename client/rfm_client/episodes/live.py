@@ -32,7 +32,7 @@ from rfm_client.contract.checks import require
 from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.resize import as_jpeg, load_pillow
-from rfm_client.transport.access import Access
+from rfm_client.transport.credentials import Credentials
 from rfm_client.transport.lifetime import Closing
 
 if TYPE_CHECKING:
@@ -113,8 +113,8 @@ class LiveView(Closing):
         load_pillow()
         self.name = name
         self._url = url
-        self._access = Access(ca_file, client_certificate, client_key, headers or {}, api_key)
-        self._reporter = Reporter(url, self._access)
+        self._credentials = Credentials(ca_file, client_certificate, client_key, headers or {}, api_key)
+        self._reporter = Reporter(url, self._credentials)
         weakref.finalize(self, self._reporter.stop).atexit = False  # the reporter closes itself then
 
     def episode(self, task: str, env: int = 0, threshold: float = 0.5) -> LiveEpisode:
@@ -138,22 +138,22 @@ class LiveView(Closing):
         self._reporter.close()
 
     def __reduce__(self) -> tuple[object, ...]:
-        return partial(LiveView, self._url, name=self.name, **self._access.options), ()
+        return partial(LiveView, self._url, name=self.name, **self._credentials.options), ()
 
 
 class Reporter:
     """Reports to one gateway, in a thread of its own. Raises ValueError for a URL that is none."""
 
-    def __init__(self, url: str, access: Access) -> None:
-        self._url, self._access = url, access
+    def __init__(self, url: str, credentials: Credentials) -> None:
+        self._url, self._credentials = url, credentials
         self._parts = urlsplit(url)
         is_plain = "@" not in self._parts.netloc and not self._parts.query and not self._parts.fragment
         is_url = self._parts.scheme in ("http", "https") and bool(self._parts.hostname) and is_plain
         require("url", is_url, "http://host:port or https://host:port of a gateway", repr(url))
-        is_secure = self._parts.scheme == "https" or not access.uses_tls
+        is_secure = self._parts.scheme == "https" or not credentials.uses_tls
         require("url", is_secure, "https://host:port with certificates", repr(url))
         self._port = self._parts.port  # raises ValueError for one out of range
-        self._headers = {**access.shown, "content-type": "application/json"}
+        self._headers = {**credentials.shown, "content-type": "application/json"}
         self._steps: deque[Entry] = deque(maxlen=MOST_STEPS_KEPT)
         self._frames: dict[str, UInt8Array] = {}  # by episode; first the one that has waited longest
         self._running: dict[str, About] = {}
@@ -245,7 +245,7 @@ class Reporter:
         """Status and text of the gateway's answer."""
         host = self._parts.hostname or ""
         connection = (
-            HTTPSConnection(host, self._port, timeout=ANSWER_WITHIN_S, context=self._access.ssl_context)
+            HTTPSConnection(host, self._port, timeout=ANSWER_WITHIN_S, context=self._credentials.ssl_context)
             if self._parts.scheme == "https"
             else HTTPConnection(host, self._port, timeout=ANSWER_WITHIN_S)
         )

@@ -26,7 +26,7 @@ from rfm_client.data.camera_fusion import FUSES, Fuse
 from rfm_client.data.orientation import Orient, Orientation, turned
 from rfm_client.data.resize import resize_frames
 from rfm_client.data.sampling import Prefix, Rule, Sampling, of_frames
-from rfm_client.episodes.windows import NamedFrame, Window
+from rfm_client.episodes.windows import FrameRef, Window
 
 if TYPE_CHECKING:
     from rfm_client.episodes.live import LiveEpisode, LiveView
@@ -174,7 +174,7 @@ class EpisodeFrames:
         self.task = task
         self._options, self._index, self._where = options, index, where
         self._orientations = options.orientations
-        self._frames: list[tuple[NamedFrame, ...]] = []  # of each camera
+        self._frames: list[tuple[FrameRef, ...]] = []  # of each camera
         self._live: LiveEpisode | None = None
 
     @property
@@ -182,7 +182,7 @@ class EpisodeFrames:
         """Number of the newest frame, from 0; -1: there is none yet."""
         return len(self._frames) - 1
 
-    def checked(self, frame: Any, size: FrameSize | None = None) -> tuple[NamedFrame, ...]:
+    def checked(self, frame: Any, size: FrameSize | None = None) -> tuple[FrameRef, ...]:
         """A copy of the next frame of each camera, upright. Raises InvalidSampleError.
 
         frame: uint8 [H, W, 3]; with cameras, such by name
@@ -201,12 +201,12 @@ class EpisodeFrames:
                     expected = f"uint8 {list(first.pixels.shape)}, as the episode's first"
                     expected += "" if size is None else ", or a reset"  # by now another checkpoint may be served
                     raise InvalidSampleError.at(where, expected, f"uint8 {list(pixels.shape)}")
-                kept.append(NamedFrame(pixels))
+                kept.append(FrameRef(pixels))
         except InvalidSampleError as error:
             raise self.located(error) from None
         return tuple(kept)
 
-    def append(self, frame: tuple[NamedFrame, ...]) -> None:
+    def append(self, frame: tuple[FrameRef, ...]) -> None:
         """Adds what ``checked`` gave."""
         self._frames.append(frame)
 
@@ -254,7 +254,7 @@ class EpisodeFrames:
         return error.inside(self._where) if self._where and isinstance(error, InvalidSampleError) else error
 
 
-class StepQuestion:
+class StepRequest:
     """What is asked about the newest frames of some episodes at a time.
 
     asked_s: since when the caller waits, by ``time.perf_counter``

@@ -18,7 +18,7 @@ import numpy as np
 
 from rfm_client.contract import wire
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError, RewardError
-from rfm_client.contract.named_frames import NamedTrajectory, frame_digest
+from rfm_client.contract.frame_refs import TrajectoryRefs, frame_digest
 from rfm_client.contract.names import frames_name
 from rfm_client.contract.results import ProgressResult, Result
 from rfm_client.contract.samples import ProgressSample, Trajectory, UInt8Array, check_task
@@ -32,7 +32,7 @@ _OUTPUTS = (wire.PROGRESS, wire.SUCCESS)
 
 
 @dataclass(frozen=True, eq=False)
-class NamedFrame:
+class FrameRef:
     """A frame, uint8 [H, W, 3], which nobody changes any more."""
 
     pixels: UInt8Array
@@ -47,7 +47,7 @@ class NamedFrame:
 class Window:
     """How far has the task come at each of these frames? All are of one size. Raises InvalidSampleError."""
 
-    frames: tuple[NamedFrame, ...]
+    frames: tuple[FrameRef, ...]
     task: str
 
     def __post_init__(self) -> None:
@@ -66,9 +66,9 @@ class Window:
         return ProgressSample(Trajectory(frames=np.stack([frame.pixels for frame in self.frames]), task=self.task))
 
     @property
-    def named(self) -> NamedTrajectory:
+    def named(self) -> TrajectoryRefs:
         """The frames' digests, without pixels."""
-        return NamedTrajectory(tuple(frame.digest for frame in self.frames), {}, self.task)
+        return TrajectoryRefs(tuple(frame.digest for frame in self.frames), {}, self.task)
 
 
 class WindowScorer:
@@ -152,7 +152,7 @@ class WindowScorer:
     ) -> Sequence[ProgressResult]:
         request_id = next(call.request_ids)
         num_bytes = _padded_bytes(len(windows), len(sent), sent[0].nbytes if sent else 0)
-        tensors = partial(wire.encode_named, [window.named for window in windows], sent)
+        tensors = partial(wire.encode_refs, [window.named for window in windows], sent)
         try:
             answer = await self._scorer.infer(self._model, num_bytes, tensors, _OUTPUTS, call.deadline, request_id)
         except RewardError as error:

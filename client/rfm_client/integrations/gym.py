@@ -26,7 +26,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rfm_client.contract.errors import InvalidSampleError
-from rfm_client.integrations.rewards import ClientSource, Info, PaidEpisode, Payer, RewardOptions
+from rfm_client.integrations.rewards import ClientSource, EpisodeRewarder, Info, RewardedEpisode, RewardOptions
 
 try:
     import gymnasium
@@ -65,7 +65,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
         check_kind(env, gymnasium.Env)
         check_frame_source(options, env.render_mode, env.observation_space)
         super().__init__(env)
-        self._payer = Payer(client, options)
+        self._rewarder = EpisodeRewarder(client, options)
         self._options = options
         self._task = task
         self._autoresets: list[gymnasium.wrappers.Autoreset] = []  # among the wrappers of the environment
@@ -73,7 +73,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
             if isinstance(env, gymnasium.wrappers.Autoreset):
                 self._autoresets.append(env)
             env = env.env
-        self._episode: PaidEpisode | None = None
+        self._episode: RewardedEpisode | None = None
         self._is_whole = False  # all frames of the episode are kept
         self._has_ended = False
 
@@ -97,7 +97,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
             _check_shows_its_end(info)
         episode.add(self._frame(observation))
         self._is_whole = True
-        self._payer.score({episode: self._has_ended})
+        self._rewarder.score({episode: self._has_ended})
         reward = episode.reward(float(env_reward))
         scores = {**episode.info(), "env_reward": float(env_reward)}
         return observation, reward, bool(terminated or episode.succeeded), truncated, {**info, INFO: scores}
@@ -106,7 +106,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
         """Cancels what is open, and closes the environment, and the client if it was made here."""
         if self._episode is not None:
             self._episode.end()
-        self._payer.close()
+        self._rewarder.close()
         super().close()
 
     def _begin(self, observation: Any, info: Info) -> Info:
@@ -114,12 +114,12 @@ class RewardModelWrapper(gymnasium.Wrapper):
         if self._episode is not None:
             self._episode.end()
         task = self._task if isinstance(self._task, str) else self._task(info)
-        self._episode = self._payer.begin(task, self._frame(observation))
+        self._episode = self._rewarder.begin(task, self._frame(observation))
         self._is_whole = True
-        self._payer.score({self._episode: False})
+        self._rewarder.score({self._episode: False})
         return {**info, INFO: self._episode.info()}
 
-    def _checked_episode(self) -> PaidEpisode:
+    def _checked_episode(self) -> RewardedEpisode:
         """The episode whose next frame the next step shows. Raises ResetNeeded if there is none."""
         if self._episode is None:
             raise ResetNeeded("step: expected a reset before it")

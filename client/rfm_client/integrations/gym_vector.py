@@ -16,9 +16,9 @@ from rfm_client.contract.checks import require
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.episodes.steps import copied
 from rfm_client.integrations.gym import DEFAULTS, INFO, LOST, check_frame_source, check_kind
-from rfm_client.integrations.rewards import ClientSource, Info, PaidEpisode, Payer, RewardOptions
+from rfm_client.integrations.rewards import ClientSource, EpisodeRewarder, Info, RewardedEpisode, RewardOptions
 
-OfEnvs: TypeAlias = dict[int, PaidEpisode]  # by number of the environment
+OfEnvs: TypeAlias = dict[int, RewardedEpisode]  # by number of the environment
 Mask: TypeAlias = npt.NDArray[np.bool_]
 
 _INSTEAD_OF_SAME_STEP = "make the vector with autoreset_mode=AutoresetMode.NEXT_STEP"
@@ -54,7 +54,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         tasks = [task] * env.num_envs if isinstance(task, str) else list(task)
         require("task", len(tasks) == env.num_envs, f"one for each of the {env.num_envs} environments", len(tasks))
         super().__init__(env)  # a wrapper that is refused must not close the environments when it is collected
-        self._payer = Payer(client, options)
+        self._rewarder = EpisodeRewarder(client, options)
         self._options = options
         self._autoreset_mode = autoreset_mode
         self._tasks = tasks
@@ -75,7 +75,7 @@ class RewardModelVectorWrapper(VectorWrapper):
             episode.end()
         shown = self._shown(observations)
         fresh = {index: self._begin(index, self._frame(shown[index])) for index in indices}
-        self._payer.score(dict.fromkeys(fresh.values(), False))
+        self._rewarder.score(dict.fromkeys(fresh.values(), False))
         return observations, self._with_scores(infos, fresh)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, Info]:
@@ -86,7 +86,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         observations, env_rewards, terminations, truncations, infos = self.env.step(actions)
         self._ended = ended = terminations | truncations
         stepped, fresh, final = self._added(self._shown(observations), infos, resetting)
-        self._payer.score(
+        self._rewarder.score(
             {episode: bool(ended[index]) for index, episode in stepped.items()} | dict.fromkeys(fresh.values(), False)
         )
         rewards = np.zeros(self.num_envs)
@@ -100,7 +100,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         """Cancels what is open, and closes the environments, and the client if it was made here."""
         for episode in self._episodes.values():
             episode.end()
-        self._payer.close()
+        self._rewarder.close()
         super().close(**kwargs)
 
     def _check_can_reset(self, twice: Mask) -> None:
@@ -158,9 +158,9 @@ class RewardModelVectorWrapper(VectorWrapper):
                 _check_differ(index, last[index], copied(frame))
         return stepped, fresh, final
 
-    def _begin(self, index: int, frame: Any) -> PaidEpisode:
+    def _begin(self, index: int, frame: Any) -> RewardedEpisode:
         """A new episode, whose first frame this is."""
-        self._episodes[index] = self._payer.begin(self._tasks[index], frame, index)
+        self._episodes[index] = self._rewarder.begin(self._tasks[index], frame, index)
         self._whole[index] = True
         return self._episodes[index]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Frames and their scores as a recording of Rerun (.rrd): one timeline, on which the curves and the film move together.
+"""A Rerun recording (.rrd) of frames and their scores: one timeline, on which curves and video move together.
 
 Needs ``rfm-client[rerun]``; labelled episodes need ``rfm-client[label]``, too. T frames, S of them scored.
 """
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 TIME = "video_time"  # a timeline: seconds of the video
 FRAME = "frame"  # or, where they are not known, the number of the frame
 IMAGE, PROGRESS, SUCCESS = "image", "progress", "success"
-JPEG_QUALITY = 90  # as good as the film, at a tenth of the size
+JPEG_QUALITY = 90  # as good as the video, at a tenth of the size
 
 _APPLICATION = "rfm-client"
 _COLOURS = {PROGRESS: (31, 119, 180), SUCCESS: (44, 160, 44)}  # as in plots
@@ -59,15 +59,15 @@ class Recording(Closing):
         self,
         entity: Sequence[str],
         scores: FrameScores,
-        films: Mapping[str, Iterable[UInt8Array]],
+        videos: Mapping[str, Iterable[UInt8Array]],
         times_s: npt.NDArray[np.float64] | None = None,
     ) -> None:
         """Adds a trajectory with its scores.
 
         entity: its name, part by part; empty if it is the only one of the file
-        films: T frames, uint8 [H, W, 3], by the camera's name, which is empty if there is only one; none: it is of
+        videos: T frames, uint8 [H, W, 3], by the camera's name, which is empty if there is only one; none: it is of
             embeddings
-        times_s: [T], when each frame is in the film; None: it is not known
+        times_s: [T], when each frame is in the video; None: it is not known
         """
         scored = np.arange(len(scores.progress)) if scores.frame_indices is None else scores.frame_indices
         curves = {curve: getattr(scores, curve) for curve in _COLOURS if not np.isnan(getattr(scores, curve)).all()}
@@ -77,7 +77,7 @@ class Recording(Closing):
             for curve in curves:
                 style = self._rerun.SeriesLines(names=curve, colors=_COLOURS[curve])
                 self._log((*entity, curve), style, static=True)
-            for camera, frames in films.items():
+            for camera, frames in videos.items():
                 for index, frame in enumerate(frames):
                     self._set_time(index, times_s)
                     image = self._rerun.Image(frame).compress(jpeg_quality=JPEG_QUALITY)
@@ -122,9 +122,9 @@ def record_episodes(folder: Path, dataset: Dataset, plan: Plan, parts: Parts) ->
 def _record(folder: Path, dataset: Dataset, item: Item, labels: Any, cameras: Sequence[str]) -> Path:
     file = folder / f"episode_{item.episode.index:06d}.rrd"
     with Recording(file) as recording:
-        films = {camera: dataset.frames(item.episode, camera) for camera in cameras}
-        recording.add((), _scores(labels, ""), films if len(films) > 1 else {"": films[cameras[0]]})
-        for camera in films if len(films) > 1 else ():
+        videos = {camera: dataset.frames(item.episode, camera) for camera in cameras}
+        recording.add((), _scores(labels, ""), videos if len(videos) > 1 else {"": videos[cameras[0]]})
+        for camera in videos if len(videos) > 1 else ():
             recording.add((camera,), _scores(labels, f".{camera}"), {})
     return file
 

@@ -24,7 +24,7 @@ from rfm_client.data.camera_fusion import Fuse
 from rfm_client.data.orientation import Orientation
 from rfm_client.data.sampling import Rule
 from rfm_client.episodes.live import LiveView
-from rfm_client.episodes.steps import EpisodeFrames, EpisodeOptions, StepQuestion, StepScore, SuccessRule
+from rfm_client.episodes.steps import EpisodeFrames, EpisodeOptions, StepRequest, StepScore, SuccessRule
 
 Info: TypeAlias = dict[str, Any]
 ClientSource: TypeAlias = RewardClient | Callable[[], RewardClient]
@@ -113,7 +113,7 @@ class RewardOptions:
         return {camera: found[camera] for camera in self.cameras}
 
 
-class PaidEpisode:
+class RewardedEpisode:
     """One episode: its frames, what is known of it, and the questions that have no answer yet.
 
     index: number of its environment; None: there is only one
@@ -126,7 +126,7 @@ class PaidEpisode:
         where = "" if index is None else f"envs[{index}]"
         self.frames = EpisodeFrames(task, options.scoring, index or 0, where)
         self._options, self._size = options, size
-        self.pending: list[tuple[StepQuestion, list[Future[ProgressResult]]]] = []
+        self.pending: list[tuple[StepRequest, list[Future[ProgressResult]]]] = []
         self.known: StepScore | None = None
         self._paid_progress = np.nan
         self.num_skipped = 0
@@ -192,7 +192,7 @@ class PaidEpisode:
         return told if self._options.terminate_on_success is None else told | {"succeeded": self.succeeded}
 
 
-class Payer:
+class EpisodeRewarder:
     """Asks about the episodes of environments, by one client. Connects at the first question."""
 
     def __init__(self, client: ClientSource, options: RewardOptions) -> None:
@@ -202,14 +202,14 @@ class Payer:
         self._options = options
         self._made: RewardClient | None = None
 
-    def begin(self, task: str, frame: Any, index: int | None = None) -> PaidEpisode:
+    def begin(self, task: str, frame: Any, index: int | None = None) -> RewardedEpisode:
         """A new episode, whose first frame this is. Raises RewardError. index: number of its environment"""
         size = self._client.model_info(frames=True).frame_size if self._options.resize else None
-        episode = PaidEpisode(self._options, task, index, size)
+        episode = RewardedEpisode(self._options, task, index, size)
         episode.add(frame)
         return episode
 
-    def score(self, episodes: Mapping[PaidEpisode, bool]) -> None:
+    def score(self, episodes: Mapping[RewardedEpisode, bool]) -> None:
         """Collects the answers that have come, and asks about the newest frames where that is due. Raises RewardError.
 
         episodes: with whether their newest frame is their last
@@ -225,7 +225,7 @@ class Payer:
         if self._made is not None:
             self._made.close()
 
-    def _score(self, episodes: Mapping[PaidEpisode, bool]) -> None:
+    def _score(self, episodes: Mapping[RewardedEpisode, bool]) -> None:
         awaited = []
         for episode, ends in episodes.items():
             episode.collect()
@@ -249,12 +249,12 @@ class Payer:
             for episode, score in zip(awaited, scores, strict=True):
                 episode.learn(score)
 
-    def _question(self, episodes: Sequence[PaidEpisode]) -> StepQuestion:
+    def _question(self, episodes: Sequence[RewardedEpisode]) -> StepRequest:
         """About their newest frames, sampled as the options say and as suits the checkpoint that is served now."""
         asked_s = time.perf_counter()
         scoring = self._options.scoring
         info: ModelInfo | None = self._client.model_info(frames=True) if scoring.needs_model_info else None
-        return StepQuestion([episode.frames for episode in episodes], scoring.sampling_for(info), asked_s)
+        return StepRequest([episode.frames for episode in episodes], scoring.sampling_for(info), asked_s)
 
     @property
     def _client(self) -> RewardClient:

@@ -31,7 +31,7 @@ MAX_FRAME_BYTES = 2 * 2**30  # that the workers of a process hold together
 
 
 class FrameMemory:
-    """A bound on the frames that all workers together hold; more only where one film alone has more."""
+    """A bound on the frames that all workers together hold; more only where one video alone has more."""
 
     def __init__(self, max_bytes: int = MAX_FRAME_BYTES) -> None:
         self._max_bytes = max_bytes

@@ -28,7 +28,7 @@ from rfm_client.labelling.labelled_before import LabelFile, joined, restore
 from rfm_client.labelling.options import Format, LabelOptions, RayOptions
 from rfm_client.labelling.plan import Item, Plan, Recipe, make_plan, selected
 from rfm_client.labelling.ray_engine import Connect, RayJob, finish_all_with_ray
-from rfm_client.labelling.run import Failure, Run, Watch
+from rfm_client.labelling.run import FailedEpisode, Run, Watch
 from rfm_client.labelling.scorer import Scorer
 from rfm_client.labelling.summary import Summary, summary_of
 
@@ -49,7 +49,7 @@ class Report:
     """
 
     files: Sequence[Path]
-    failures: Sequence[Failure]
+    failures: Sequence[FailedEpisode]
     parts: str
     summary: Summary | None
     plan: Plan
@@ -214,7 +214,7 @@ def _begin(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch
     return outputs, plan
 
 
-def _put_together(plan: Plan, outputs: Outputs, failures: Sequence[Failure], watch: Watch) -> Report:
+def _put_together(plan: Plan, outputs: Outputs, failures: Sequence[FailedEpisode], watch: Watch) -> Report:
     """Writes the files, unless an episode failed or only a shard was labelled."""
     report = Report([], failures, outputs.parts.url, None, plan)
     if failures or outputs.options.shard is not None:

@@ -19,7 +19,7 @@ from rfm_client.labelling.run import Watch
 
 Reader: TypeAlias = Callable[[Sequence[Item]], Iterator[tuple[Item, Columns]]]
 
-_OTHERS = "those of others, or of films that have changed or were copied (--verify knows copies by their content)"
+_OTHERS = "those of others, or of videos that have changed or were copied (--verify knows copies by their content)"
 
 
 @dataclass(frozen=True)

@@ -96,7 +96,7 @@ class LabelOptions(Settings):
     )
     workers: int = setting(DEFAULT_WORKERS, "Episodes under way at a time.", least=1)
     overwrite: bool = setting(False, "Replace labels of another recipe; those of the same are kept.")
-    verify: bool = setting(False, "Tell films from others by their SHA-256, not by their size and time of change.")
+    verify: bool = setting(False, "Tell videos from others by their SHA-256, not by their size and time of change.")
     in_place: bool = setting(False, "Write the labels into the HDF5 file itself.")
 
     def __post_init__(self) -> None:

@@ -33,7 +33,7 @@ class Recipe:
 
     decoders: what decodes each camera's pictures, since versions differ in colours; None: they are stored as pixels
     orientations: of the cameras that are turned
-    verify: films are told from others by their content
+    verify: videos are told from others by their content
     """
 
     checkpoint: CheckpointFacts
@@ -168,11 +168,11 @@ def selected(dataset: Dataset, options: LabelOptions) -> list[DatasetEpisode]:
 
 
 def make_plan(dataset: Dataset, recipe: Recipe, episodes: Iterable[DatasetEpisode]) -> Plan:
-    """The plan of these episodes. Looks at no frame of a film; raises DatasetError for a file that is not there."""
+    """The plan of these episodes. Looks at no frame of a video; raises DatasetError for a file that is not there."""
     document = json.dumps(recipe.document(), sort_keys=True)
     items = []
     for episode in episodes:
         about = f"{episode.index} {episode.first_index} {episode.num_frames} {episode.task}"
-        films = [f"{each} {dataset.identity(episode, each, verify=recipe.verify)}" for each in recipe.cameras]
-        items.append(Item(episode, digest_of(part.encode() for part in (document, about, *films))))
+        videos = [f"{each} {dataset.identity(episode, each, verify=recipe.verify)}" for each in recipe.cameras]
+        items.append(Item(episode, digest_of(part.encode() for part in (document, about, *videos))))
     return Plan(items, recipe, {"kind": dataset.kind, "source": dataset.source, "revision": dataset.revision})

@@ -17,7 +17,7 @@ from rfm_client.data.datasets.opening import open_dataset
 from rfm_client.labelling.finished_episodes import Parts
 from rfm_client.labelling.options import RayOptions
 from rfm_client.labelling.plan import Plan
-from rfm_client.labelling.run import Failure, Run, Watch, begin, by_episode
+from rfm_client.labelling.run import FailedEpisode, Run, Watch, begin, by_episode
 from rfm_client.labelling.scorer import Scorer
 
 Connect: TypeAlias = Callable[[], AbstractContextManager[Scorer]]
@@ -67,7 +67,7 @@ class EpisodeActor:
         }
 
 
-def finish_all_with_ray(job: RayJob, options: RayOptions, watch: Watch) -> list[Failure]:
+def finish_all_with_ray(job: RayJob, options: RayOptions, watch: Watch) -> list[FailedEpisode]:
     """Labels what has no part, on a cluster. Gives what failed; raises what stops an actor, as ``RewardError``."""
     try:
         import ray
@@ -85,7 +85,7 @@ def finish_all_with_ray(job: RayJob, options: RayOptions, watch: Watch) -> list[
         for row in _labelled(ray, job, options, places).iter_rows():
             episode = job.plan.items[row["place"]].episode
             if row["reason"]:
-                failures.append(Failure(episode, RewardError(row["reason"])))
+                failures.append(FailedEpisode(episode, RewardError(row["reason"])))
                 watch.failed(episode, failures[-1].error)
             else:
                 watch.scored(episode)

@@ -50,7 +50,7 @@ class Watch:
 
 
 @dataclass(frozen=True)
-class Failure:
+class FailedEpisode:
     """An episode that has no labels, and why."""
 
     episode: DatasetEpisode
@@ -69,10 +69,10 @@ class Run:
         self._memory = FrameMemory()
         self._stopping = threading.Event()
         self._lock = threading.Lock()
-        self._failures: list[Failure] = []
+        self._failures: list[FailedEpisode] = []
         self._cause: Exception | None = None
 
-    def finish_all(self, workers: int) -> list[Failure]:
+    def finish_all(self, workers: int) -> list[FailedEpisode]:
         """Labels what has no part, several episodes at a time. Gives what failed.
 
         Raises, after the episodes under way have ended, what no episode is to blame for: a server that is gone
@@ -104,7 +104,7 @@ class Run:
                 self._stop(error)
                 return
             with self._lock:
-                self._failures.append(Failure(item.episode, error))
+                self._failures.append(FailedEpisode(item.episode, error))
             self._watch.failed(item.episode, error)
         except (OSError, ImportError) as error:
             self._stop(error)
@@ -149,6 +149,6 @@ def begin(plan: Plan, parts: Parts, watch: Watch) -> list[Item]:
     return [item for item in plan.items if item.key not in finished]
 
 
-def by_episode(failures: Sequence[Failure]) -> list[Failure]:
+def by_episode(failures: Sequence[FailedEpisode]) -> list[FailedEpisode]:
     """The failures in the order of their episodes."""
     return sorted(failures, key=lambda failure: failure.episode.index)

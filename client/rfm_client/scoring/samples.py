@@ -16,12 +16,12 @@ from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.names import encoder_name
 from rfm_client.contract.results import Result
 from rfm_client.contract.samples import Sample, Trajectory
-from rfm_client.data.fitting import FittedSample, fitted, whole, with_frame_indices
+from rfm_client.data.fit_to_checkpoint import FittedSample, fitted, whole, with_frame_indices
 from rfm_client.scoring.batching import groups, model_of, padded_bytes, parts
 from rfm_client.scoring.call import Call
 from rfm_client.transport.calls import Answer
+from rfm_client.transport.concurrency import ConcurrencyLimiter
 from rfm_client.transport.deadline import Deadline
-from rfm_client.transport.in_flight import InFlight
 from rfm_client.transport.off_loop import off_loop
 from rfm_client.transport.servers import Servers
 
@@ -37,10 +37,10 @@ class SampleScorer:
     model: name of the model that scores embeddings
     """
 
-    def __init__(self, model: str, servers: Servers, in_flight: InFlight) -> None:
+    def __init__(self, model: str, servers: Servers, concurrency: ConcurrencyLimiter) -> None:
         self._model = model
         self._servers = servers
-        self._in_flight = in_flight
+        self._concurrency = concurrency
         self._infos: dict[str, ModelInfo] = {}  # until another version of the model answers
 
     async def result(self, sample: Sample, call: Call) -> Result:
@@ -140,7 +140,7 @@ class SampleScorer:
 
         num_bytes: of the tensors
         """
-        async with self._in_flight.room(num_bytes, deadline):  # tensors are made in turn, so they do not pile up
+        async with self._concurrency.room(num_bytes, deadline):  # tensors are made in turn, so they do not pile up
             inputs = await off_loop(num_bytes, tensors)
             answer = await self._servers.infer(model, inputs, outputs, deadline, request_id=request_id)
         known = self._infos.get(model)

@@ -21,8 +21,8 @@ from rfm_client.contract.addresses import split_url
 from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.proxies import grpc_proxy
 from rfm_client.contract.wire import Tensors
-from rfm_client.transport.access import SECURE_SCHEMES, Access
 from rfm_client.transport.connection import Connection, grpc_options
+from rfm_client.transport.credentials import SECURE_SCHEMES, Credentials
 from rfm_client.transport.deadline import timeout
 from rfm_client.transport.off_loop import MIN_BYTES, off_loop
 from rfm_client.transport.shared_memory import Region, SharedMemory
@@ -64,16 +64,16 @@ class Transport(Protocol):
         """Closes the connection to the server."""
 
 
-def connect(url: str, *, shared_memory: bool = False, access: Access | None = None) -> Transport:
+def connect(url: str, *, shared_memory: bool = False, credentials: Credentials | None = None) -> Transport:
     """The transport for ``grpc://host:port`` or ``http://host:port``, or with TLS ``grpcs://`` or ``https://``.
 
     It connects when it is first used. Raises ValueError.
 
     shared_memory: large inputs go through memory that the server, on the same host, maps too
-    access: certificates, and what is shown with each request
+    credentials: certificates, and what is shown with each request
     """
     kind = GrpcTransport if split_url(url)[0].startswith("grpc") else HttpTransport
-    return kind(url, access or Access(), shared_memory=shared_memory)
+    return kind(url, credentials or Credentials(), shared_memory=shared_memory)
 
 
 class TritonTransport:
@@ -86,11 +86,11 @@ class TritonTransport:
     _as_json: ClassVar[dict[str, bool]] = {}  # by which its methods give dictionaries
     _proxy: str | None = None  # as an error tells it
 
-    def __init__(self, url: str, access: Access, *, shared_memory: bool) -> None:
+    def __init__(self, url: str, credentials: Credentials, *, shared_memory: bool) -> None:
         self.url = url
         self._scheme, self._address = split_url(url)
-        self._access = access
-        if access.uses_tls and self._scheme not in SECURE_SCHEMES:
+        self._credentials = credentials
+        if credentials.uses_tls and self._scheme not in SECURE_SCHEMES:
             raise ValueError(f"url: expected grpcs:// or https:// with certificates, got {url}")
         self._shared_memory = SharedMemory(url) if shared_memory else None
         self._connection: Connection | None = None
@@ -212,7 +212,7 @@ class TritonTransport:
     def _connected(self) -> Connection:
         if self._connection is None:
             client = self._open()
-            self._access.show_with_each_request(client)
+            self._credentials.show_with_each_request(client)
             self._connection = Connection(client)
         return self._connection
 
@@ -231,8 +231,8 @@ class GrpcTransport(TritonTransport):
     _as_json: ClassVar[dict[str, bool]] = {"as_json": True}
     _first_process: int | None = None  # that used gRPC
 
-    def __init__(self, url: str, access: Access, *, shared_memory: bool) -> None:
-        super().__init__(url, access, shared_memory=shared_memory)
+    def __init__(self, url: str, credentials: Credentials, *, shared_memory: bool) -> None:
+        super().__init__(url, credentials, shared_memory=shared_memory)
         self._proxy = grpc_proxy(self._address)
 
     def _open(self) -> Any:
@@ -243,7 +243,7 @@ class GrpcTransport(TritonTransport):
                 "have multiprocessing start its processes by spawn or forkserver"
             )
         return self._triton.InferenceServerClient(
-            self._address, channel_args=grpc_options(self._address), **self._access.grpc_options(self._scheme)
+            self._address, channel_args=grpc_options(self._address), **self._credentials.grpc_options(self._scheme)
         )
 
 
@@ -253,7 +253,7 @@ class HttpTransport(TritonTransport):
     _module = "tritonclient.http.aio"
 
     def _open(self) -> Any:
-        secure = {"ssl": True, "ssl_context": self._access.ssl_context} if self._scheme in SECURE_SCHEMES else {}
+        secure = {"ssl": True, "ssl_context": self._credentials.ssl_context} if self._scheme in SECURE_SCHEMES else {}
         client = self._triton.InferenceServerClient(self._address, conn_limit=0, conn_timeout=None, **secure)
         post = client._post
 

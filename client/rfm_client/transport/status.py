@@ -20,8 +20,8 @@ from rfm_client.contract import triton
 from rfm_client.contract.addresses import split_url
 from rfm_client.contract.errors import DeadlineExceededError, ServerUnavailableError
 from rfm_client.contract.proxies import grpc_proxy, open_url
-from rfm_client.transport.access import Access
 from rfm_client.transport.connection import grpc_options
+from rfm_client.transport.credentials import Credentials
 from rfm_client.transport.ports import OF_A_PORT, wrong_port
 
 METRICS_PORT = 8002
@@ -168,13 +168,13 @@ class _Metrics:
 
 
 def read_status(
-    url: str, *, metrics_url: str | None = None, timeout_s: float = 60.0, access: Access | None = None
+    url: str, *, metrics_url: str | None = None, timeout_s: float = 60.0, credentials: Credentials | None = None
 ) -> ServerStatus:
     """The state of the server at ``grpc://host:port`` or ``http://host:port``, or with TLS ``grpcs://`` or ``https://``.
 
     metrics_url: where it shows its metrics; None: port METRICS_PORT of the same host. What only they contain is missing
         if they cannot be read.
-    access: certificates, and what is shown with each request, but not to the metrics
+    credentials: certificates, and what is shown with each request, but not to the metrics
 
     Raises ServerUnavailableError, AccessDeniedError, DeadlineExceededError, and InferenceFailedError for what is no
     Triton server.
@@ -182,7 +182,7 @@ def read_status(
     scheme, address = split_url(url)
     metrics_url = metrics_url or f"http://{address.rpartition(':')[0]}:{METRICS_PORT}/metrics"
     try:
-        version, is_ready, index, statistics = _read_server(scheme, address, timeout_s, access or Access())
+        version, is_ready, index, statistics = _read_server(scheme, address, timeout_s, credentials or Credentials())
         metrics = _read_metrics(metrics_url, timeout_s)
         models = tuple(_models(index, statistics, metrics))
     except Exception as raised:
@@ -201,7 +201,7 @@ def read_status(
 
 
 def _read_server(
-    scheme: str, address: str, timeout_s: float, access: Access
+    scheme: str, address: str, timeout_s: float, credentials: Credentials
 ) -> tuple[str, bool, list[dict[str, Any]], list[dict[str, Any]]]:
     """Triton's version, whether it is ready, its index and statistics, as its HTTP endpoints write them."""
     is_grpc = scheme.startswith("grpc")
@@ -211,13 +211,13 @@ def _read_server(
     if is_grpc:
         from tritonclient.grpc import InferenceServerClient
 
-        options = {"channel_args": grpc_options(address), **access.grpc_options(scheme)}
+        options = {"channel_args": grpc_options(address), **credentials.grpc_options(scheme)}
     else:
         from tritonclient.http import InferenceServerClient
 
-        options = {"connection_timeout": timeout_s, "network_timeout": timeout_s, **access.http_options(scheme)}
+        options = {"connection_timeout": timeout_s, "network_timeout": timeout_s, **credentials.http_options(scheme)}
     client = InferenceServerClient(address, **options)
-    access.show_with_each_request(client)
+    credentials.show_with_each_request(client)
     try:
         version = client.get_server_metadata(**as_json)["version"]
         statistics = client.get_inference_statistics(**as_json).get("model_stats", [])

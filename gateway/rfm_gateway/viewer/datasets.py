@@ -23,12 +23,12 @@ from fastapi import HTTPException
 
 from rfm_client.contract.results import SUCCESS_THRESHOLD
 from rfm_client.contract.settings import ConfigError
-from rfm_client.data.datasets.films import Span
 from rfm_client.data.datasets.lerobot import LeRobotDataset
 from rfm_client.data.datasets.lerobot_rows import INFO_FILE
 from rfm_client.data.datasets.protocol import DatasetEpisode, DatasetError
-from rfm_client.data.film_files import FilmError, film_stream
+from rfm_client.data.datasets.video_frames import Span
 from rfm_client.data.orientation import ORIENTATIONS
+from rfm_client.data.video_decoding import VideoError, video_stream
 from rfm_client.labelling.label_files import (
     PROVENANCE_KEY,
     SIGNALS_PROVENANCE_KEY,
@@ -85,8 +85,8 @@ class ShownDataset:
         rows = {} if summary is None else dict(zip(summary.episodes.tolist(), _rows(summary), strict=True))
         return {
             "labels": None if file is None else self._name_of(file),
-            "cameras": list(self.dataset.info.films),
-            "orientations": [_orientations(file).get(camera, "none") for camera in self.dataset.info.films],
+            "cameras": list(self.dataset.info.videos),
+            "orientations": [_orientations(file).get(camera, "none") for camera in self.dataset.info.videos],
             "fps": self.dataset.info.fps,
             "threshold": SUCCESS_THRESHOLD,
             "bins": None if summary is None else _bins(summary),
@@ -118,9 +118,9 @@ class ShownDataset:
 
     def video(self, number: int, camera: int, take: Callable[[int], object]) -> bytes:
         """The frames of an episode as an MP4 file of their own. take: told how many bytes are taken, before they are"""
-        cameras = self.dataset.info.films
+        cameras = self.dataset.info.videos
         if not 0 <= camera < len(cameras):
-            raise HTTPException(404, f"camera: expected one of {len(cameras)} with films, got {camera}")
+            raise HTTPException(404, f"camera: expected one of {len(cameras)} with videos, got {camera}")
         return _cut(self.dataset.span(self._episode(number), cameras[camera]), take)
 
     def without_folder(self, message: str) -> str:
@@ -222,9 +222,9 @@ def _cut(span: Span, take: Callable[[int], object]) -> bytes:
     """
     clip = io.BytesIO()
     try:
-        with av.open(str(span.file), format="mov") as film:  # a play list would be read as what it names
-            stream = film_stream(film)
-            packets = _packets(film, stream, span, take)
+        with av.open(str(span.file), format="mov") as video:  # a play list would be read as what it names
+            stream = video_stream(video)
+            packets = _packets(video, stream, span, take)
             zero = min(packet.pts for packet in packets if packet.pts * stream.time_base > _begin_s(span))
             with av.open(clip, "w", format="mp4") as copy:
                 written = copy.add_stream_from_template(stream, opaque=True)  # no encoder is needed
@@ -233,10 +233,10 @@ def _cut(span: Span, take: Callable[[int], object]) -> bytes:
                     packet.dts -= zero
                     packet.stream = written
                     copy.mux(packet)
-    except FilmError as error:
+    except VideoError as error:
         raise span.error(error.expected, error.got) from error
     except (av.FFmpegError, OSError) as error:
-        raise span.error("a film of the episode", error.strerror or str(error)) from error
+        raise span.error("a video of the episode", error.strerror or str(error)) from error
     return clip.getvalue()
 
 
@@ -244,12 +244,12 @@ def _begin_s(span: Span) -> float:
     return float(span.times_s[0]) - span.tolerance_s
 
 
-def _packets(film: Any, stream: Any, span: Span, take: Callable[[int], object]) -> list[Any]:
+def _packets(video: Any, stream: Any, span: Span, take: Callable[[int], object]) -> list[Any]:
     """The packets of an episode, and those before it that it needs, in the order of decoding."""
     begin_s, end_s = _begin_s(span), float(span.times_s[-1]) + span.tolerance_s
-    film.seek(max(round(begin_s / stream.time_base), 0), stream=stream)
+    video.seek(max(round(begin_s / stream.time_base), 0), stream=stream)
     packets: list[Any] = []
-    for packet in film.demux(stream):
+    for packet in video.demux(stream):
         if packet.pts is None or packet.dts is None:
             continue
         if packet.dts * stream.time_base > end_s:
@@ -267,6 +267,6 @@ def _packets(film: Any, stream: Any, span: Span, take: Callable[[int], object]) 
     if max(shown_s) > end_s:
         remedy = "encode it without frames that need later ones: ffmpeg -i IN -bf 0 OUT"
         raise span.error(
-            f"an episode that can be cut out of its film ({remedy})", "one that needs frames behind its end"
+            f"an episode that can be cut out of its video ({remedy})", "one that needs frames behind its end"
         )
     return packets

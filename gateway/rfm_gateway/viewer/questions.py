@@ -45,7 +45,7 @@ class ShownVideo:
     times_s: npt.NDArray[np.float64] | None
 
 
-class VideoQuestion(BaseModel):
+class VideoRequest(BaseModel):
     """How videos are scored: the fields of a form, of which those that are empty count as not there.
 
     fps: frames a second that are taken of a video
@@ -63,7 +63,7 @@ class VideoQuestion(BaseModel):
     orient: Orientation = "none"
 
     @classmethod
-    def of(cls, fields: Mapping[str, str], default_model: str) -> VideoQuestion:
+    def of(cls, fields: Mapping[str, str], default_model: str) -> VideoRequest:
         """The question of a form. Raises RequestValidationError for a field that is not allowed."""
         given = {name: text for name, text in fields.items() if text.strip()}
         try:

@@ -29,7 +29,7 @@ from rfm_client.contract.model_info import ModelInfo
 from rfm_client.contract.names import DEFAULT_MODEL, frames_name
 from rfm_client.contract.results import PreferenceResult, ProgressResult
 from rfm_client.contract.samples import ProgressSample, Trajectory
-from rfm_client.data.fitting import fitted
+from rfm_client.data.fit_to_checkpoint import fitted
 from rfm_client.data.orientation import ORIENTATIONS
 from rfm_client.data.sampling import RULES, Rule, Sampling, prefix_samples, trained_rule
 from rfm_client.transport.off_loop import off_loop
@@ -38,7 +38,7 @@ from rfm_gateway.body import BodyLimits, Decoded, invalid
 from rfm_gateway.config import GatewayConfig
 from rfm_gateway.observe import GatewayMetrics, while_connected
 from rfm_gateway.viewer import numbers_or_null
-from rfm_gateway.viewer.questions import DEFAULT_FPS, ShownVideo, VideoQuestion
+from rfm_gateway.viewer.questions import DEFAULT_FPS, ShownVideo, VideoRequest
 
 MOST_PREFIXES = 32  # of one video at a time
 MOST_BYTES = 64 * 2**20  # of the frames of these
@@ -53,7 +53,7 @@ logger = logging.getLogger("rfm_gateway")
 class _Asked:
     """A question, the model that answers it, and the videos that it is about."""
 
-    question: VideoQuestion
+    question: VideoRequest
     sampling: Sampling
     info: ModelInfo
     videos: tuple[ShownVideo, ...]
@@ -100,7 +100,7 @@ def viewer_routes(
         RewardError.
         """
         async with limits.form(request) as (fields, uploads):
-            question = VideoQuestion.of(fields, default_model)
+            question = VideoRequest.of(fields, default_model)
             async with new_client(model=question.model) as client:
                 info = await client.model_info(frames=True)
             sampling = question.sampling(info)
@@ -108,7 +108,7 @@ def viewer_routes(
         return _Asked(question, sampling, info, videos, request.state.request_id)
 
     async def decoded(
-        question: VideoQuestion, uploads: Mapping[str, UploadFile], names: tuple[str, ...]
+        question: VideoRequest, uploads: Mapping[str, UploadFile], names: tuple[str, ...]
     ) -> tuple[ShownVideo, ...]:
         taken = Decoded(max_decoded_bytes)
         try:
@@ -150,7 +150,7 @@ async def _infos(config: GatewayConfig, new_client: Callable[..., AsyncRewardCli
         config.triton_url,
         metrics_url=config.metrics_url,
         timeout_s=STATUS_TIMEOUT_S,
-        access=config.access,
+        credentials=config.credentials,
     )
     ready = {model.name for model in status.models if model.state == "READY" and model.name.endswith(_FRAMES_ENDING)}
     infos = []

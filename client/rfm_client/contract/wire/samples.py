@@ -10,15 +10,15 @@ import numpy as np
 import numpy.typing as npt
 
 from rfm_client.contract.errors import InferenceFailedError, InvalidSampleError
-from rfm_client.contract.named_frames import (
+from rfm_client.contract.frame_refs import (
     DIGEST_BYTES,
-    NamedFootage,
-    NamedProgressSample,
-    NamedTrajectory,
+    EncoderSampleRefs,
+    ProgressSampleRefs,
+    TrajectoryRefs,
     frame_digest,
 )
 from rfm_client.contract.samples import (
-    Footage,
+    EncoderSample,
     PreferenceSample,
     ProgressSample,
     Sample,
@@ -73,7 +73,7 @@ def encode_samples(samples: Sequence[Sample]) -> Tensors:
     return tensors
 
 
-def decode_samples(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Sample | NamedProgressSample]:
+def decode_samples(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Sample | ProgressSampleRefs]:
     """The samples of one request. Raises InvalidSampleError that names the sample and the field."""
     return _decode_rows(tensors, _decode_sample)
 
@@ -95,12 +95,12 @@ def decode_embeddings(tensors: Mapping[str, npt.NDArray[Any]], trajectory: Traje
         raise InferenceFailedError(f"embeddings: {error}") from error
 
 
-def decode_trajectories(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Footage | NamedFootage]:
+def decode_trajectories(tensors: Mapping[str, npt.NDArray[Any]]) -> list[EncoderSample | EncoderSampleRefs]:
     """What the encoder is to encode: of each sample the frames of its trajectories, without padding, and its task."""
-    return _decode_rows(tensors, _decode_footage)
+    return _decode_rows(tensors, _decode_encoder_sample)
 
 
-def encode_named(trajectories: Sequence[NamedTrajectory], sent: Sequence[UInt8Array]) -> Tensors:
+def encode_refs(trajectories: Sequence[TrajectoryRefs], sent: Sequence[UInt8Array]) -> Tensors:
     """One request for the progress of each trajectory, whose frames have the digests.
 
     sent: uint8 [H, W, 3] of one size, the frames that the model may not know; none: it knows all
@@ -122,10 +122,10 @@ def encode_named(trajectories: Sequence[NamedTrajectory], sent: Sequence[UInt8Ar
     }
 
 
-def encode_trajectories(encoded: Sequence[Footage], num_positions: int, outputs: Collection[str]) -> Tensors:
+def encode_trajectories(encoded: Sequence[EncoderSample], num_positions: int, outputs: Collection[str]) -> Tensors:
     """The requested outputs of the encoder for one request of ``num_positions`` = P, padded with zeros."""
-    rows = [[trajectory.positions for trajectory in footage.trajectories] for footage in encoded]
-    texts = [footage.trajectories[0].text_embedding for footage in encoded]
+    rows = [[trajectory.positions for trajectory in encoder_sample.trajectories] for encoder_sample in encoded]
+    texts = [encoder_sample.trajectories[0].text_embedding for encoder_sample in encoded]
     embeddings = {
         VIDEO_EMBEDDINGS: pad_stack(rows, num_positions),
         TEXT_EMBEDDING: np.stack([text for text in texts if text is not None]),
@@ -159,7 +159,7 @@ def _decode_rows(
     return decoded
 
 
-def _decode_sample(row: Row, pixels: dict[bytes, UInt8Array]) -> Sample | NamedProgressSample:
+def _decode_sample(row: Row, pixels: dict[bytes, UInt8Array]) -> Sample | ProgressSampleRefs:
     sample_type, frame_steps = int(row[SAMPLE_TYPE][0]), int(row[FRAME_STEPS][0])
     lengths = row[NUM_FRAMES].tolist()
     if sample_type not in list(SampleType):
@@ -170,7 +170,7 @@ def _decode_sample(row: Row, pixels: dict[bytes, UInt8Array]) -> Sample | NamedP
             raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, 0] for progress", str(lengths))
         positions, _ = _positions(row, lengths)
         if FRAME_DIGESTS in row:
-            return NamedProgressSample(_named(row, positions, pixels), frame_steps)
+            return ProgressSampleRefs(_named(row, positions, pixels), frame_steps)
         return ProgressSample(_trajectory(row, positions), frame_steps)
     if FRAME_DIGESTS in row:
         raise InvalidSampleError.at(SAMPLE_TYPE, f"progress with {FRAME_DIGESTS}", SampleType(sample_type).name.lower())
@@ -182,14 +182,14 @@ def _decode_sample(row: Row, pixels: dict[bytes, UInt8Array]) -> Sample | NamedP
     return (PreferenceSample if sample_type == SampleType.PREFERENCE else SimilaritySample)(first, second)
 
 
-def _decode_footage(row: Row, pixels: dict[bytes, UInt8Array]) -> Footage | NamedFootage:
+def _decode_encoder_sample(row: Row, pixels: dict[bytes, UInt8Array]) -> EncoderSample | EncoderSampleRefs:
     lengths = row[NUM_FRAMES].tolist()
     if lengths[0] < 1 or lengths[1] < 0:
         raise InvalidSampleError.at(NUM_FRAMES, "[at least 1, at least 0]", str(lengths))
     arrays = [array for array in _positions(row, lengths) if len(array)]
     if FRAME_DIGESTS in row:
-        return NamedFootage(tuple(_named(row, array, pixels) for array in arrays))
-    return Footage(tuple(_trajectory(row, array) for array in arrays))
+        return EncoderSampleRefs(tuple(_named(row, array, pixels) for array in arrays))
+    return EncoderSample(tuple(_trajectory(row, array) for array in arrays))
 
 
 def _trajectory(row: Row, positions: npt.NDArray[Any]) -> Trajectory:
@@ -198,8 +198,8 @@ def _trajectory(row: Row, positions: npt.NDArray[Any]) -> Trajectory:
     return Trajectory(video_embeddings=positions, text_embedding=row[TEXT_EMBEDDING])
 
 
-def _named(row: Row, digests: npt.NDArray[Any], pixels: dict[bytes, UInt8Array]) -> NamedTrajectory:
-    return NamedTrajectory(tuple(map(bytes, digests)), pixels, _task(row))
+def _named(row: Row, digests: npt.NDArray[Any], pixels: dict[bytes, UInt8Array]) -> TrajectoryRefs:
+    return TrajectoryRefs(tuple(map(bytes, digests)), pixels, _task(row))
 
 
 def _positions(row: Row, lengths: Sequence[int]) -> list[npt.NDArray[Any]]:

@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.contract.named_frames import DIGEST_BYTES
+from rfm_client.contract.frame_refs import DIGEST_BYTES
 
 Tensors: TypeAlias = dict[str, npt.NDArray[Any]]
 

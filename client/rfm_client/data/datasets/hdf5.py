@@ -20,7 +20,7 @@ from rfm_client.data.datasets.protocol import (
     Dataset,
     DatasetEpisode,
     DatasetError,
-    GivenTask,
+    TaskOverride,
     digest_of,
     orientations_of,
     require,
@@ -53,7 +53,7 @@ class Hdf5Dataset(Dataset):
 
     kind = "HDF5"
 
-    def __init__(self, file: Path, *, task: GivenTask = GivenTask(), orient: Orient = Orient()) -> None:
+    def __init__(self, file: Path, *, task: TaskOverride = TaskOverride(), orient: Orient = Orient()) -> None:
         self.file = file
         self.root = file.parent
         self.source = file.name
@@ -90,23 +90,23 @@ class Hdf5Dataset(Dataset):
 
     def check(self, episode: DatasetEpisode, camera: str) -> int:
         with self._opened() as opened:
-            return int(self._film(opened, episode, camera).nbytes)
+            return int(self._video(opened, episode, camera).nbytes)
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
         with self._opened() as opened:
-            film = self._film(opened, episode, camera)
+            video = self._video(opened, episode, camera)
             for start in range(0, episode.num_frames, _FRAMES_AT_A_TIME):
                 try:
-                    yield from film[start : start + _FRAMES_AT_A_TIME]
+                    yield from video[start : start + _FRAMES_AT_A_TIME]
                 except OSError as error:
                     raise DatasetError.at(self._where(episode, camera), "readable frames", error) from error
 
-    def _film(self, opened: Any, episode: DatasetEpisode, camera: str) -> Any:
-        film = opened["data"][episode.name]["obs"].get(camera)
-        is_film = film is not None and not _fault(film) and len(film) == episode.num_frames
-        got = "none" if film is None else _form(film)
-        require(self._where(episode, camera), is_film, f"uint8 [{episode.num_frames}, H, W, 3]", got)
-        return film
+    def _video(self, opened: Any, episode: DatasetEpisode, camera: str) -> Any:
+        video = opened["data"][episode.name]["obs"].get(camera)
+        is_video = video is not None and not _fault(video) and len(video) == episode.num_frames
+        got = "none" if video is None else _form(video)
+        require(self._where(episode, camera), is_video, f"uint8 [{episode.num_frames}, H, W, 3]", got)
+        return video
 
     def _where(self, episode: DatasetEpisode, camera: str) -> str:
         return f"{self.file}: data/{episode.name}/obs/{camera}"

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """LeRobot datasets of all versions, without LeRobot: frame t is the dataset's frame t. Needs pyarrow, and PyAV.
 
-A film has as many frames as the rows of its episodes, each at its row's time, or it is refused: nothing tells which row
-a frame belongs to. It may begin at another time than its rows, for all of them alike.
+A video must have one frame for each row of its episodes, at the row's time. Otherwise it is refused, because nothing
+tells which row a frame belongs to. It may begin at another time than its rows, for all of them alike.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ import numpy as np
 
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.datasets import lerobot_v21, lerobot_v30
-from rfm_client.data.datasets.films import Span, Times, decode, film_identity, film_packets
 from rfm_client.data.datasets.lerobot_rows import Entry, Info, RowReader, read_table
 from rfm_client.data.datasets.protocol import (
     Dataset,
     DatasetEpisode,
     DatasetError,
-    GivenTask,
+    TaskOverride,
     digest_of,
     orientations_of,
     require,
 )
-from rfm_client.data.film_files import Packets, decoder
+from rfm_client.data.datasets.video_frames import Span, Times, decode, video_identity, video_packets
 from rfm_client.data.orientation import Orient
+from rfm_client.data.video_decoding import Packets, decoder
 
-_FILMS_AT_A_TIME = 4  # whose tables of packets are kept in memory
+_VIDEOS_AT_A_TIME = 4  # whose tables of packets are kept in memory
 _TOLERANCE_S = 1e-4  # LeRobot's own between the time of a row and that of its frame
 _CONTAINER = {".mp4": "mov"}  # FFmpeg's names by suffix: a play list of another's would be read as what it names
-_AGAIN = "write the dataset again, or leave this film's episodes out (--episodes)"
+_AGAIN = "write the dataset again, or leave this video's episodes out (--episodes)"
 _COLOURS = ("1", "L", "LA", "P", "RGB", "RGBA")  # Pillow's names of what has 8 bits a channel, or fewer
 _DEEP = ";16"  # how Pillow names 16 bits a channel that it cuts to 8
 
@@ -48,7 +48,7 @@ class LeRobotDataset(Dataset):
         *,
         source: str | None = None,
         revision: str | None = None,
-        task: GivenTask = GivenTask(),
+        task: TaskOverride = TaskOverride(),
         orient: Orient = Orient(),
     ) -> None:
         self.root = root
@@ -56,7 +56,7 @@ class LeRobotDataset(Dataset):
         self.revision = revision
         self.info = info = Info.read(root)
         self.kind = f"LeRobot {info.version}"
-        self.cameras = (*info.films, *info.images)
+        self.cameras = (*info.videos, *info.images)
         self.depth_cameras = info.depth
         self.orientations = orientations_of(orient, self.cameras)
         version = lerobot_v30 if info.version == "v3.0" else lerobot_v21
@@ -64,7 +64,7 @@ class LeRobotDataset(Dataset):
         self._entries = {entry.index: entry for entry in entries}
         self._task = task
         self._rows = RowReader({} if task.overrides else version.read_tasks(root), task)
-        self._film = lru_cache(_FILMS_AT_A_TIME)(self._read_film)
+        self._video = lru_cache(_VIDEOS_AT_A_TIME)(self._read_video)
         is_whole = sorted(self._entries) == list(range(info.total_episodes))
         require(root / "meta", is_whole, f"{info.total_episodes} episodes, as info.json says", len(self._entries))
         num_frames = sum(entry.length for entry in self._entries.values())
@@ -80,17 +80,17 @@ class LeRobotDataset(Dataset):
         return episodes
 
     def decoder(self, camera: str) -> str | None:
-        return decoder() if camera in self.info.films else _pillow()
+        return decoder() if camera in self.info.videos else _pillow()
 
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
-        if camera not in self.info.films:
+        if camera not in self.info.videos:
             return digest_of(self._images(episode, camera))
-        film, from_s = self._entries[episode.index].films[camera]
-        return f"{film_identity(film, verify=verify, revision=self.revision)} {from_s}"
+        video, from_s = self._entries[episode.index].videos[camera]
+        return f"{video_identity(video, verify=verify, revision=self.revision)} {from_s}"
 
     def check(self, episode: DatasetEpisode, camera: str) -> int:
-        if camera in self.info.films:
-            packets, frames = self._film(camera, self.film(episode, camera))
+        if camera in self.info.videos:
+            packets, frames = self._video(camera, self.video(episode, camera))
             return sum(packets.num_bytes[frames[episode.index]])
         images = self._images(episode, camera)
         for t, image in enumerate(images):
@@ -98,7 +98,7 @@ class LeRobotDataset(Dataset):
         return sum(map(len, images))
 
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
-        if camera in self.info.films:
+        if camera in self.info.videos:
             return decode(self.span(episode, camera))
         images = self._images(episode, camera)
         return (_decoded_image(_where(episode, camera, t), image) for t, image in enumerate(images))
@@ -107,36 +107,36 @@ class LeRobotDataset(Dataset):
         """float64 [T], when each frame was taken, from the start of the episode. Raises DatasetError."""
         return self._rows.read(self._entries[episode.index]).times_s
 
-    def film(self, episode: DatasetEpisode, camera: str) -> Path:
-        """The film of a camera, one of ``info.films``, that the episode is in."""
-        return self._entries[episode.index].films[camera][0]
+    def video(self, episode: DatasetEpisode, camera: str) -> Path:
+        """The video of a camera, one of ``info.videos``, that the episode is in."""
+        return self._entries[episode.index].videos[camera][0]
 
     def span(self, episode: DatasetEpisode, camera: str) -> Span:
-        """Where the episode's frames are in that film. Raises DatasetError if its frames and rows differ."""
-        file = self.film(episode, camera)
-        packets, frames = self._film(camera, file)
+        """Where the episode's frames are in that video. Raises DatasetError if its frames and rows differ."""
+        file = self.video(episode, camera)
+        packets, frames = self._video(camera, file)
         where, container = f"{episode.name}: {camera}", _CONTAINER.get(file.suffix.lower())
         return Span(file, packets.times_s[frames[episode.index]], 0.5 / self.info.fps, where, container)
 
     @cached_property
-    def _in_film(self) -> Mapping[tuple[str, Path], Sequence[Entry]]:
-        """The episodes in each film of each camera."""
+    def _in_video(self) -> Mapping[tuple[str, Path], Sequence[Entry]]:
+        """The episodes in each video of each camera."""
         found: dict[tuple[str, Path], list[Entry]] = {}
         for entry in self._entries.values():
-            for camera, (file, _) in entry.films.items():
+            for camera, (file, _) in entry.videos.items():
                 found.setdefault((camera, file), []).append(entry)
         return found
 
-    def _read_film(self, camera: str, file: Path) -> tuple[Packets, Mapping[int, slice]]:
-        """A film, and which of its frames are each episode's. Raises DatasetError where frames and rows differ."""
-        entries = self._in_film[camera, file]
-        parts = [(entry, entry.films[camera][1] + self._rows.read(entry).times_s) for entry in entries]
+    def _read_video(self, camera: str, file: Path) -> tuple[Packets, Mapping[int, slice]]:
+        """A video, and which of its frames are each episode's. Raises DatasetError where frames and rows differ."""
+        entries = self._in_video[camera, file]
+        parts = [(entry, entry.videos[camera][1] + self._rows.read(entry).times_s) for entry in entries]
         parts.sort(key=lambda part: float(part[1][0]))
         rows_s = np.concatenate([times_s for _, times_s in parts])
-        packets = film_packets(file, _CONTAINER.get(file.suffix.lower()))
+        packets = video_packets(file, _CONTAINER.get(file.suffix.lower()))
         fps, rates = self.info.fps, ""
         if packets.fps and f"{packets.fps:.2f}" != f"{self.info.fps:.2f}":
-            rates = f" (the film has {packets.fps:.2f} frames a second, meta/info.json says {fps:g})"
+            rates = f" (the video has {packets.fps:.2f} frames a second, meta/info.json says {fps:g})"
 
         where = " to ".join(dict.fromkeys((parts[0][0].where, parts[-1][0].where)))
         got = f"{len(packets.times_s)}{rates}; {_AGAIN}"

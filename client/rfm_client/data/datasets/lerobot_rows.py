@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfm_client.data.datasets.protocol import DatasetError, GivenTask, require
+from rfm_client.data.datasets.protocol import DatasetError, TaskOverride, require
 
 INFO_FILE = Path("meta", "info.json")
 VERSIONS = ("v2.0", "v2.1", "v3.0")
@@ -29,7 +29,7 @@ _DEPTH_MARKS = ("video.is_depth_map", "is_depth_map")
 class Info:
     """What a LeRobot dataset says of itself.
 
-    films, images: keys of its cameras whose frames are in video files, and of those whose frames are in its tables
+    videos, images: keys of its cameras whose frames are in video files, and of those whose frames are in its tables
     depth: keys of those of both whose pictures are depth maps
     total_frames: of all episodes
     data_path, video_path: templates of the paths of its files
@@ -38,7 +38,7 @@ class Info:
     root: Path
     version: str
     fps: float
-    films: tuple[str, ...]
+    videos: tuple[str, ...]
     images: tuple[str, ...]
     depth: tuple[str, ...]
     total_episodes: int
@@ -65,7 +65,7 @@ class Info:
             return value
 
         features = {key: feature for key, feature in field("features", dict).items() if isinstance(feature, dict)}
-        films, images = (
+        videos, images = (
             tuple(key for key, feature in features.items() if feature.get("dtype") == kind)
             for kind in ("video", "image")
         )
@@ -76,14 +76,14 @@ class Info:
             root,
             version,
             fps,
-            films,
+            videos,
             images,
-            depth=tuple(key for key in (*films, *images) if _is_depth(features[key])),
+            depth=tuple(key for key in (*videos, *images) if _is_depth(features[key])),
             total_episodes=field("total_episodes", int),
             total_frames=field("total_frames", int),
             chunks_size=field("chunks_size", int),
             data_path=field("data_path", str),
-            video_path=field("video_path", str) if films else None,
+            video_path=field("video_path", str) if videos else None,
         )
 
     def path(self, template: str | None, **values: Any) -> Path:
@@ -109,7 +109,7 @@ class Entry:
     tasks: sentences that its metadata name
     first_index: number of its first frame in the dataset; None: only the rows say it
     data_file: Parquet file with its rows
-    films: for each camera the video file, and when the episode begins in it, in seconds
+    videos: for each camera the video file, and when the episode begins in it, in seconds
     """
 
     index: int
@@ -117,7 +117,7 @@ class Entry:
     length: int
     first_index: int | None
     data_file: Path
-    films: Mapping[str, tuple[Path, float]]
+    videos: Mapping[str, tuple[Path, float]]
 
     @property
     def where(self) -> str:
@@ -140,7 +140,7 @@ class RowReader:
     tasks: sentences by number; given: what the caller says of them
     """
 
-    def __init__(self, tasks: Mapping[int, str | None], given: GivenTask) -> None:
+    def __init__(self, tasks: Mapping[int, str | None], given: TaskOverride) -> None:
         self._tasks = tasks
         self._given = given
         self._columns = lru_cache(_FILES_AT_A_TIME)(_read_columns)

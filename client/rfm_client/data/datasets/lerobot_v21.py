@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Episodes of LeRobot v2.0 and v2.1: a table and a film for each episode and camera."""
+"""Episodes of LeRobot v2.0 and v2.1: a table and a video for each episode and camera."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def read_entries(info: Info) -> Iterator[Entry]:
             length=length,
             first_index=None,
             data_file=info.path(info.data_path, **values),
-            films={key: (info.path(info.video_path, **values, video_key=key), 0.0) for key in info.films},
+            videos={key: (info.path(info.video_path, **values, video_key=key), 0.0) for key in info.videos},
         )
 
 

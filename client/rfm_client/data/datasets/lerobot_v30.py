@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Episodes of LeRobot v3.0: many in one table and one film, which are found by numbers of files and by time stamps."""
+"""Episodes of LeRobot v3.0: many in one table and one video, which are found by numbers of files and by time stamps."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ _OF_AN_EPISODE = (
     *("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index"),
     *("data/chunk_index", "data/file_index"),
 )
-_OF_A_FILM = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
+_OF_A_VIDEO = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
 
 
 def read_entries(info: Info) -> Iterator[Entry]:
     """The episodes that the metadata list. Raises DatasetError."""
     files = sorted((info.root / EPISODES_FOLDER).rglob("*.parquet"))
     require(info.root / EPISODES_FOLDER, bool(files), "Parquet files", "none")
-    of_films = [f"videos/{key}/{name}" for key in info.films for name in _OF_A_FILM]
+    of_videos = [f"videos/{key}/{name}" for key in info.videos for name in _OF_A_VIDEO]
     for file in files:
-        for row in read_table(file, [*_OF_AN_EPISODE, *of_films]).to_pylist():
+        for row in read_table(file, [*_OF_AN_EPISODE, *of_videos]).to_pylist():
             yield _entry(info, file, row)
 
 
@@ -58,12 +58,12 @@ def _entry(info: Info, file: Path, row: dict[str, Any]) -> Entry:
         length=length,
         first_index=first,
         data_file=info.path(info.data_path, **data),
-        films={key: _film(info, where, row, key) for key in info.films},
+        videos={key: _video(info, where, row, key) for key in info.videos},
     )
 
 
-def _film(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path, float]:
-    chunk, number, from_s, to_s = (row[f"videos/{key}/{name}"] for name in _OF_A_FILM)
+def _video(info: Info, where: str, row: dict[str, Any], key: str) -> tuple[Path, float]:
+    chunk, number, from_s, to_s = (row[f"videos/{key}/{name}"] for name in _OF_A_VIDEO)
     lasts_s, expected_s = to_s - from_s, row["length"] / info.fps
     is_as_long = abs(lasts_s - expected_s) <= 0.5 / info.fps
     expected = f"{expected_s:.4f} s for {row['length']} frames"

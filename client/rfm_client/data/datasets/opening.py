@@ -9,7 +9,7 @@ from pathlib import Path
 from rfm_client.data.datasets.hdf5 import ALOHA, ALOHA_GROUP, SUFFIXES, Hdf5Dataset
 from rfm_client.data.datasets.lerobot import LeRobotDataset
 from rfm_client.data.datasets.lerobot_rows import INFO_FILE
-from rfm_client.data.datasets.protocol import Dataset, DatasetError, GivenTask, require
+from rfm_client.data.datasets.protocol import Dataset, DatasetError, TaskOverride, require
 from rfm_client.data.datasets.videos import TABLES, VideoFolder
 from rfm_client.data.orientation import Orient
 
@@ -30,7 +30,7 @@ _UNREAD = {  # what is to be done with a layout that is not read, by the names o
     r".*\.(bag|mcap|db3)": "a rosbag: convert it to LeRobot with https://github.com/arpitg1304/forge, or write each "
     f"camera's topic to a video (the package rosbags reads it without ROS) and {_TABLE}",
 }
-_PICTURES, _FILMS = ("png", "jpg", "jpeg"), ("mp4", "mkv", "mov", "webm", "avi")
+_PICTURES, _VIDEOS = ("png", "jpg", "jpeg"), ("mp4", "mkv", "mov", "webm", "avi")
 
 
 def open_dataset(
@@ -43,7 +43,7 @@ def open_dataset(
 
     Raises DatasetError.
     """
-    path, given = Path(source), GivenTask(task, override_task)
+    path, given = Path(source), TaskOverride(task, override_task)
     if path.is_file() and path.suffix.lower() in SUFFIXES:
         return Hdf5Dataset(path, task=given, orient=orient)
     if (path / INFO_FILE).is_file():
@@ -59,7 +59,7 @@ def open_dataset(
     return _from_hub(match[1], match[2], given, orient)
 
 
-def _from_hub(name: str, revision: str | None, task: GivenTask, orient: Orient) -> LeRobotDataset:
+def _from_hub(name: str, revision: str | None, task: TaskOverride, orient: Orient) -> LeRobotDataset:
     """The dataset of the Hub at a commit, a branch or a tag; None: its main branch."""
     try:
         from huggingface_hub import snapshot_download
@@ -83,20 +83,20 @@ def _unread(path: Path) -> str | None:
         if any(re.fullmatch(pattern, name, re.IGNORECASE) for name in names):
             return what
     if path.is_file():
-        is_film = path.suffix.lower().lstrip(".") in _FILMS
-        return "a video: label its folder, with tasks.csv in it (columns video, task)" if is_film else None
+        is_video = path.suffix.lower().lstrip(".") in _VIDEOS
+        return "a video: label its folder, with tasks.csv in it (columns video, task)" if is_video else None
     if files := _pattern(path, [suffix.lstrip(".") for suffix in SUFFIXES]):
         loop = f'for f in {files}; do rfm-client label "$f"; done'
         return ALOHA if _is_aloha(path, files) else f"a folder of HDF5 files, each a dataset of its own: {loop}"
-    pictures = None if _pattern(path, _FILMS) else _pattern(path, _PICTURES)
+    pictures = None if _pattern(path, _VIDEOS) else _pattern(path, _PICTURES)
     if pictures is None:
         return None
     encoding = "ffmpeg -framerate 10 -i - -c:v libx264rgb -crf 0"
     if pictures.parent == path:
-        film = f"cat $(ls -v {pictures}) | {encoding} {path}/0.mp4"
+        video = f"cat $(ls -v {pictures}) | {encoding} {path}/0.mp4"
     else:
-        film = f"for e in {pictures.parent}/; do cat $(ls -v $e{pictures.name}) | {encoding} ${{e%/}}.mp4; done"
-    return f"a folder of pictures: make a video of each episode ({film}) and {_TABLE}"
+        video = f"for e in {pictures.parent}/; do cat $(ls -v $e{pictures.name}) | {encoding} ${{e%/}}.mp4; done"
+    return f"a folder of pictures: make a video of each episode ({video}) and {_TABLE}"
 
 
 def _is_aloha(folder: Path, pattern: Path) -> bool:

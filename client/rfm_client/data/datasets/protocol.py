@@ -94,7 +94,7 @@ class Dataset(ABC):
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
         """What tells the episode's stored frames from others.
 
-        Of a film its size and time of change, or with ``verify`` its SHA-256. Of pictures in a table, into which other
+        Of a video its size and time of change, or with ``verify`` its SHA-256. Of pictures in a table, into which other
         programs write too, a digest of the pictures. Raises DatasetError.
         """
 
@@ -167,8 +167,8 @@ def iter_episodes(
     for episode in dataset.episodes:
         for camera in names:
             dataset.check(episode, camera)
-        films = {camera: np.stack(list(dataset.frames(episode, camera))) for camera in names}
-        yield episode, {camera: Trajectory(frames=film, task=episode.task) for camera, film in films.items()}
+        videos = {camera: np.stack(list(dataset.frames(episode, camera))) for camera in names}
+        yield episode, {camera: Trajectory(frames=video, task=episode.task) for camera, video in videos.items()}
 
 
 def digest_of(parts: Iterable[bytes]) -> str:
@@ -181,7 +181,7 @@ def digest_of(parts: Iterable[bytes]) -> str:
 
 
 @dataclass(frozen=True)
-class GivenTask:
+class TaskOverride:
     """What the caller says of tasks. Raises DatasetError for an override without a text.
 
     text: of episodes that have none of their own; None: the caller does not say

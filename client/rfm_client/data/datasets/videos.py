@@ -2,7 +2,7 @@
 """A folder of videos, one an episode, with a table of their tasks: ``tasks.csv`` or ``tasks.json``. Needs PyAV.
 
 The CSV file has the columns ``video`` and ``task``, where a task with a comma is in quotes; the JSON file is
-``{"film.mp4": "put the block in the bowl"}``. Paths are relative to the table. The table's order is the order of the
+``{"video.mp4": "put the block in the bowl"}``. Paths are relative to the table. The table's order is the order of the
 episodes. Every frame of a video counts.
 """
 
@@ -15,19 +15,19 @@ from functools import lru_cache
 from pathlib import Path
 
 from rfm_client.contract.samples import UInt8Array
-from rfm_client.data.datasets.films import Span, decode, film_identity, film_packets
 from rfm_client.data.datasets.protocol import (
     Dataset,
     DatasetEpisode,
     DatasetError,
-    GivenTask,
+    TaskOverride,
     chosen_cameras,
     orientations_of,
     require,
 )
-from rfm_client.data.film_files import decoder
-from rfm_client.data.lerobot_videos import check_local_film
+from rfm_client.data.datasets.video_frames import Span, decode, video_identity, video_packets
+from rfm_client.data.lerobot_videos import check_local_video
 from rfm_client.data.orientation import Orient
+from rfm_client.data.video_decoding import decoder
 
 TABLES = ("tasks.csv", "tasks.json")
 
@@ -40,11 +40,11 @@ class VideoFolder(Dataset):
     kind = "videos"
     cameras = ("video",)
 
-    def __init__(self, table: Path, *, task: GivenTask = GivenTask(), orient: Orient = Orient()) -> None:
+    def __init__(self, table: Path, *, task: TaskOverride = TaskOverride(), orient: Orient = Orient()) -> None:
         self._table = _table_in(table) if table.is_dir() else table
         self.root = self._table.parent
         self.source = self.root.resolve().name
-        self._packets = lru_cache(_FILES_AT_A_TIME)(film_packets)
+        self._packets = lru_cache(_FILES_AT_A_TIME)(video_packets)
         self._task = task
         self.orientations = orientations_of(orient, self.cameras)
         self._tasks = _read(self._table, {"video"} if task.text else {"video", "task"})
@@ -54,7 +54,7 @@ class VideoFolder(Dataset):
         first = 0
         for index, (name, own) in enumerate(self._tasks.items()):
             task = self._task.of(f"{self._table}: {name}", own)
-            check_local_film(self.root / name)
+            check_local_video(self.root / name)
             num_frames = len(self._packets(self.root / name).times_s)
             require(self.root / name, num_frames > 0, "frames", "none")
             episodes.append(DatasetEpisode(index, name, task.strip(), num_frames, first))
@@ -66,7 +66,7 @@ class VideoFolder(Dataset):
         return decoder()
 
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
-        return film_identity(self.root / episode.name, verify=verify)
+        return video_identity(self.root / episode.name, verify=verify)
 
     def check(self, episode: DatasetEpisode, camera: str) -> int:
         chosen_cameras(self, [camera])

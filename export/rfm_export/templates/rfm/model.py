@@ -20,10 +20,10 @@ from rfm.parameters import (
 )
 from rfm.triton_model.batch_model import BatchModel
 from rfm_client.contract import Result, RewardError, Sample, wire
-from rfm_client.contract.named_frames import NamedProgressSample
+from rfm_client.contract.frame_refs import ProgressSampleRefs
 
 
-class TritonPythonModel(BatchModel[Sample | NamedProgressSample, Result]):
+class TritonPythonModel(BatchModel[Sample | ProgressSampleRefs, Result]):
     """One instance: one engine on one device."""
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
@@ -37,10 +37,10 @@ class TritonPythonModel(BatchModel[Sample | NamedProgressSample, Result]):
             feature_cache_mb=int(settings.get(FEATURE_CACHE_PARAMETER) or 0),
         )
 
-    def decode(self, tensors: wire.Tensors) -> list[Sample | NamedProgressSample]:
+    def decode(self, tensors: wire.Tensors) -> list[Sample | ProgressSampleRefs]:
         return wire.decode_samples(tensors)
 
-    def prepare(self, question: Sample | NamedProgressSample) -> tuple[Prepared, int]:
+    def prepare(self, question: Sample | ProgressSampleRefs) -> tuple[Prepared, int]:
         prepared = self.engine.prepare(question)
         if isinstance(prepared.rows, RewardError):
             raise prepared.rows

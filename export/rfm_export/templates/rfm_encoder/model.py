@@ -15,11 +15,11 @@ from rfm.engine.feature_cache import BYTES_PER_MB, FeatureCache
 from rfm.parameters import FAMILY_PARAMETER, FEATURE_CACHE_PARAMETER, SAMPLE_TOKENS_PARAMETER
 from rfm.triton_model.batch_model import BatchModel
 from rfm_client.contract import InvalidSampleError, RewardError, wire
-from rfm_client.contract.named_frames import NamedFootage
-from rfm_client.contract.samples import Float32Array, Footage
+from rfm_client.contract.frame_refs import EncoderSampleRefs
+from rfm_client.contract.samples import EncoderSample, Float32Array
 
 
-class TritonPythonModel(BatchModel[Footage | NamedFootage, Footage]):
+class TritonPythonModel(BatchModel[EncoderSample | EncoderSampleRefs, EncoderSample]):
     """One instance: one pair of encoders on one device."""
 
     def load(self, version: Path, device: torch.device, settings: Mapping[str, str]) -> None:
@@ -28,15 +28,17 @@ class TritonPythonModel(BatchModel[Footage | NamedFootage, Footage]):
         self.cache = FeatureCache[Float32Array](cache_mb * BYTES_PER_MB) if cache_mb else None
         self.max_frames = int(settings.get(SAMPLE_TOKENS_PARAMETER) or DEFAULT_SAMPLE_TOKENS)
 
-    def decode(self, tensors: wire.Tensors) -> list[Footage | NamedFootage]:
+    def decode(self, tensors: wire.Tensors) -> list[EncoderSample | EncoderSampleRefs]:
         num_frames = len(tensors[wire.NUM_FRAMES]) * wire.num_positions(tensors)
         if num_frames > self.max_frames:  # a frame may be much smaller than what is made of it, and a digest is
             expected = f"at most {self.max_frames} frames in a request, with padding (max_sample_tokens of this server)"
             raise InvalidSampleError.at(wire.NUM_FRAMES, expected, str(num_frames))
         return wire.decode_trajectories(tensors)
 
-    def answer(self, questions: Sequence[Footage | NamedFootage], execution: Execution) -> list[Footage | RewardError]:
+    def answer(
+        self, questions: Sequence[EncoderSample | EncoderSampleRefs], execution: Execution
+    ) -> list[EncoderSample | RewardError]:
         return self.encoders.encode(questions, execution, self.cache)
 
-    def encode(self, answers: Sequence[Footage], tensors: wire.Tensors, outputs: Collection[str]) -> wire.Tensors:
+    def encode(self, answers: Sequence[EncoderSample], tensors: wire.Tensors, outputs: Collection[str]) -> wire.Tensors:
         return wire.encode_trajectories(answers, wire.num_positions(tensors), outputs)

@@ -18,7 +18,7 @@ from torch import Tensor
 from rfm.engine.predictor import prefix_indices
 from rfm.vlm.images import FRAMES_PER_GROUP
 from rfm_client.contract import InvalidSampleError, wire
-from rfm_client.contract.named_frames import NamedTrajectory, frame_digest
+from rfm_client.contract.frame_refs import TrajectoryRefs, frame_digest
 from rfm_client.contract.samples import UInt8Array
 
 Indices: TypeAlias = npt.NDArray[np.int64]
@@ -27,11 +27,11 @@ Shot: TypeAlias = tuple[int, ...]
 
 @dataclass(frozen=True, eq=False)
 class SizedFrames:
-    """The frames of a film that the backbone is still to be shown, brought to size.
+    """The frames of a video that the backbone is still to be shown, brought to size.
 
     pixels: uint8 [N, H', W', 3], on the CPU or the device
-    places: int64 [T], at which of the N each of the film's frames is; -1: only shots that are kept show it
-    keys: of each of the film's shots
+    places: int64 [T], at which of the N each of the video's frames is; -1: only shots that are kept show it
+    keys: of each of the video's shots
     kept: [tokens, levels, D] by key, what the vision tower has made before of some of the shots
     """
 
@@ -42,7 +42,7 @@ class SizedFrames:
 
 
 @dataclass(eq=False)
-class VlmFilm:
+class VlmVideo:
     """A trajectory's frames, which all rows about it share.
 
     frames: uint8 [H, W, 3] each, of one size
@@ -61,15 +61,15 @@ class VlmFilm:
     @classmethod
     def of(
         cls, frames: Sequence[UInt8Array] | UInt8Array, frame_steps: int, named: Sequence[bytes] | None = None
-    ) -> VlmFilm:
-        """The film of a sample's frames. ``frame_steps``: of dense mode; 0: one conversation shows all frames."""
+    ) -> VlmVideo:
+        """The video of a sample's frames. ``frame_steps``: of dense mode; 0: one conversation shows all frames."""
         count = len(frames)
         conversations = list(prefix_indices(count, frame_steps)) if frame_steps else [np.arange(count)]
         return cls(frames, frame_steps or count, conversations, named)
 
     @property
     def ready(self) -> SizedFrames:
-        """The frames of a film that has been brought to size."""
+        """The frames of a video that has been brought to size."""
         assert self.sized is not None
         return self.sized
 
@@ -109,7 +109,7 @@ class VlmFilm:
         return list(dict.fromkeys(shown))
 
 
-def named_frames(trajectory: NamedTrajectory) -> list[UInt8Array]:
+def named_frames(trajectory: TrajectoryRefs) -> list[UInt8Array]:
     """uint8 [H, W, 3] of each frame. Raises InvalidSampleError for pixels that are not there, or of several sizes."""
     unknown = sum(digest not in trajectory.pixels for digest in trajectory.digests)
     if unknown:

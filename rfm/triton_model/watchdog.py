@@ -22,7 +22,7 @@ _LOOK_S = 1.0
 _STDERR = 2
 
 
-class Guard:
+class Watchdog:
     """Watches the process in a thread of its own, and ends it after a fault.
 
     hang_s: longest time of a batch without progress; a forward pass is progress
@@ -37,7 +37,7 @@ class Guard:
         self._has_scored_blank = False  # only then a failure of the blank sample means a broken device
         self._closed = threading.Event()
         self._triton = os.getppid()
-        self._thread = threading.Thread(target=self._watch, name="rfm-guard", daemon=True)
+        self._thread = threading.Thread(target=self._watch, name="rfm-watchdog", daemon=True)
         self._thread.start()
 
     def step(self) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What all readers of films keep to: which stream is the film, colours, frames that are upright, damage, broken files.
+"""Decoding that all readers of videos share: choice of the stream, colours, orientation, damaged frames, broken files.
 
 The containers, streams, packets and frames are PyAV's.
 """
@@ -24,7 +24,7 @@ _MATRICES = (1, 4, 5, 7, 9)  # from YUV to RGB, as libswscale numbers them; the 
 _BT709, _BT601, _BT2020 = 1, 5, 9
 _SAME_MATRIX = {6: _BT601, 10: _BT2020}  # numbers of H.273 that stand for one of them
 _LIMITED, _FULL = 1, 2  # ranges, numbered likewise
-_BITS = 8  # of the one channel of a grey film; depth maps have more
+_BITS = 8  # of the one channel of a grey video; depth maps have more
 _NEARLY = math.tan(math.radians(1))  # how far FFmpeg lets a display matrix be from quarter turns
 
 _EBML, _SEGMENT = 0x1A45DFA3, 0x18538067  # how Matroska and WebM begin (RFC 8794, RFC 9559)
@@ -34,8 +34,8 @@ _FRAMES = b"mdat"
 _BOXES = (b"ftyp", b"styp", b"free", b"skip", b"wide", b"moov", b"moof", b"sidx", b"uuid", b"emsg", b"prft", _FRAMES)
 
 
-class FilmError(Exception):
-    """A file that cannot be read as one film: what was expected, and what is there."""
+class VideoError(Exception):
+    """A file that cannot be read as one video: what was expected, and what is there."""
 
     def __init__(self, expected: str, got: str) -> None:
         super().__init__(expected, got)
@@ -59,27 +59,27 @@ def decoder() -> str:
     return f"PyAV {av.__version__}, {', '.join(libraries)}"
 
 
-def film_stream(container: Any) -> Any:
-    """The video stream of an opened file that is the film. Attached pictures, such as cover art, are none.
+def video_stream(container: Any) -> Any:
+    """The video stream of an opened file that is the video. Attached pictures, such as cover art, are none.
 
-    Raises FilmError if there is none, or more than one, and for depth maps.
+    Raises VideoError if there is none, or more than one, and for depth maps.
     """
     attached = import_av().stream.Disposition.attached_pic
-    films = {n: stream for n, stream in enumerate(container.streams.video) if not stream.disposition & attached}
-    if not films:
-        raise FilmError("a file with a video stream", "none")
-    if len(films) > 1:
-        codecs = {n: stream.codec_context for n, stream in films.items()}
+    videos = {n: stream for n, stream in enumerate(container.streams.video) if not stream.disposition & attached}
+    if not videos:
+        raise VideoError("a file with a video stream", "none")
+    if len(videos) > 1:
+        codecs = {n: stream.codec_context for n, stream in videos.items()}
         told = ", ".join(f"0:v:{n} ({codec.name}, {codec.width}x{codec.height})" for n, codec in codecs.items())
-        raise FilmError("one video stream (take one: ffmpeg -i IN -map 0:v:N -c copy OUT)", f"{len(films)}: {told}")
-    (stream,) = films.values()
+        raise VideoError("one video stream (take one: ffmpeg -i IN -map 0:v:N -c copy OUT)", f"{len(videos)}: {told}")
+    (stream,) = videos.values()
     _check_colours(stream.codec_context.format)
     return stream
 
 
 @dataclass(frozen=True, eq=False)
 class Packets:
-    """What a film holds, read without decoding it.
+    """What a video holds, read without decoding it.
 
     count: of its frames that are shown, as far as each has a packet of its own
     times_s: float64 [N], rising, of those that have a time stamp
@@ -98,23 +98,23 @@ class Packets:
 
 
 def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
-    """The packets of a film. Counts them, since what the container says may be wrong.
+    """The packets of a video. Counts them, since what the container says may be wrong.
 
     container: FFmpeg's name of the format that the file is read as; None: whatever it looks like
 
-    Raises FilmError, as for a file that breaks off, and what PyAV raises.
+    Raises VideoError, as for a file that breaks off, and what PyAV raises.
     """
     missing = _broken_off(file)
     if missing is not None:
-        raise FilmError("a whole video file", missing)
+        raise VideoError("a whole video file", missing)
     file.seek(0)
     timed: list[tuple[float, int]] = []
     corrupt: list[int] = []
     count = 0
     with import_av().open(file, format=container) as opened:
-        stream = film_stream(opened)
+        stream = video_stream(opened)
         for packet in opened.demux(stream):
-            if not packet.size or packet.is_discard:  # not shown, as a film that was cut without encoding has them
+            if not packet.size or packet.is_discard:  # not shown, as a video that was cut without encoding has them
                 continue
             if packet.pts is not None:
                 timed.append((float(packet.pts * packet.time_base), packet.size))
@@ -130,7 +130,7 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
 def upright(frame: Any) -> UInt8Array:
     """uint8 [H, W, 3], a decoded frame in RGB as it is to be shown, turned and mirrored as FFmpeg does.
 
-    Raises FilmError for a frame that is to be shown aslant.
+    Raises VideoError for a frame that is to be shown aslant.
     """
     image, matrix = _rgb(frame), frame.side_data.get("DISPLAYMATRIX")
     return image if matrix is None else np.ascontiguousarray(_shown(image, np.frombuffer(bytes(matrix), np.int32)))
@@ -145,19 +145,19 @@ def judged(frames: Iterable[Any]) -> Iterator[tuple[Any, bool]]:
 
 
 def _check_colours(pixels: Any) -> None:
-    """Raises FilmError for pixels as depth maps have them: of one channel, but for transparency, or of floats."""
+    """Raises VideoError for pixels as depth maps have them: of one channel, but for transparency, or of floats."""
     if pixels is None:
         return
     has_one = len(pixels.components) <= 2 and max(component.bits for component in pixels.components) > _BITS
     if has_one or "f16" in pixels.name or "f32" in pixels.name:
-        remedy = "leave a depth camera out (--cameras), or convert the film: ffmpeg -i IN -pix_fmt yuv420p OUT"
-        raise FilmError(f"a film of colours ({remedy})", f"{pixels.name}, as depth maps have")
+        remedy = "leave a depth camera out (--cameras), or convert the video: ffmpeg -i IN -pix_fmt yuv420p OUT"
+        raise VideoError(f"a video of colours ({remedy})", f"{pixels.name}, as depth maps have")
 
 
 def _rgb(frame: Any) -> UInt8Array:
     """uint8 [H, W, 3], equal to what ``ffmpeg -pix_fmt rgb24`` makes of the frame.
 
-    Matrix and range are passed, since PyAV before 17 takes each film for one of BT.601 and limited range. It also does
+    Matrix and range are passed, since PyAV before 17 takes each video for one of BT.601 and limited range. It also does
     so where source and target are equal: they differ here, which means nothing for RGB.
     """
     options: dict[str, int] = {}
@@ -179,7 +179,7 @@ def _shown(image: UInt8Array, matrix: npt.NDArray[np.int32]) -> UInt8Array:
     is_turned = max(abs(a), abs(d)) < _NEARLY * min(abs(b), abs(c))
     if not is_turned and max(abs(b), abs(c)) > _NEARLY * min(abs(a), abs(d)):
         got = f"one that is turned by {abs(math.degrees(math.atan2(b, a))):.0f} degrees, or skewed"
-        raise FilmError("a film that is shown upright or by quarter turns (turn it: ffmpeg -i IN OUT)", got)
+        raise VideoError("a video that is shown upright or by quarter turns (turn it: ffmpeg -i IN OUT)", got)
     across, down = (c, b) if is_turned else (a, d)
     image = image.swapaxes(0, 1) if is_turned else image
     return image[:: -1 if down < 0 else 1, :: -1 if across < 0 else 1]

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from rfm_client.contract import ProgressSample, wire
-from rfm_client.contract.made_up import blank_trajectory
+from rfm_client.contract.synthetic import blank_trajectory
 
 
-def blank_question(config: Mapping[str, Any]) -> wire.Tensors:
+def probe_request(config: Mapping[str, Any]) -> wire.Tensors:
     """The inputs of one blank sample, for a model with this configuration."""
     dims = {tensor["name"]: [int(dim) for dim in tensor["dims"]] for tensor in config["input"]}
     widths = None

@@ -23,7 +23,7 @@ def frame_digest(frame: UInt8Array) -> bytes:
 
 
 @dataclass(frozen=True, eq=False)
-class NamedTrajectory:
+class TrajectoryRefs:
     """A trajectory whose frames are named.
 
     digests: of each frame
@@ -40,24 +40,24 @@ class NamedTrajectory:
         return len(self.digests)
 
     @classmethod
-    def of(cls, frames: UInt8Array, task: str) -> NamedTrajectory:
+    def of(cls, frames: UInt8Array, task: str) -> TrajectoryRefs:
         """The trajectory of the frames [T, H, W, 3], all of which are at hand."""
         digests = tuple(map(frame_digest, frames))
         return cls(digests, dict(zip(digests, frames, strict=True)), task)
 
 
 @dataclass(frozen=True, eq=False)
-class NamedFootage:
+class EncoderSampleRefs:
     """The trajectories of one sample, for an encoder, with named frames."""
 
-    trajectories: tuple[NamedTrajectory, ...]
+    trajectories: tuple[TrajectoryRefs, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class NamedProgressSample:
+class ProgressSampleRefs:
     """A ``ProgressSample`` of a trajectory with named frames. Raises InvalidSampleError."""
 
-    trajectory: NamedTrajectory
+    trajectory: TrajectoryRefs
     frame_steps: int = 0
 
     def __post_init__(self) -> None:
@@ -67,6 +67,6 @@ class NamedProgressSample:
         check_frame_steps(self.frame_steps)
 
     @property
-    def trajectories(self) -> tuple[NamedTrajectory, ...]:
+    def trajectories(self) -> tuple[TrajectoryRefs, ...]:
         """The trajectory alone, as of any sample."""
         return (self.trajectory,)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Made-up trajectories: blank ones, to see whether a model answers, and random ones, to compare answers.
+"""Synthetic trajectories: blank ones, to see whether a model answers, and random ones, to compare answers.
 
 ``widths`` are Dv and Dt of the embeddings that a model reads; None: it reads raw frames.
 """
@@ -16,7 +16,7 @@ Widths: TypeAlias = tuple[int, int] | None
 
 BLANK_FRAMES = 2
 SIDE_PX = 64
-PROBE_TASK = "canary"  # of a blank trajectory: every probe has the same inputs, by which a model recognises it
+PROBE_TASK = "probe"  # of a blank trajectory: every probe has the same inputs, by which a model recognises it
 
 
 def blank_trajectory(widths: Widths, task: str = PROBE_TASK) -> Trajectory:

@@ -13,7 +13,7 @@ from rfm_client.transport.deadline import Deadline, timeout
 MAX_BYTES = 256 * 2**20  # of inputs; they are held several times over while they are written to a socket
 
 
-class InFlight:
+class ConcurrencyLimiter:
     """Room for ``max_requests`` requests of MAX_BYTES together, for one event loop. First come, first served."""
 
     def __init__(self, max_requests: int) -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Frames of a film at given times: found by their time stamps, each exactly once. Needs PyAV.
+"""Frames of a video at given times: found by their time stamps, each exactly once. Needs PyAV.
 
-T times, N frames of the whole film. Seconds are those of the film, whose first frame need not be at 0.
+T times, N frames of the whole video. Seconds are those of the video, whose first frame need not be at 0.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ import numpy.typing as npt
 
 from rfm_client.contract.samples import UInt8Array
 from rfm_client.data.datasets.protocol import DatasetError, require
-from rfm_client.data.film_files import (
+from rfm_client.data.video_decoding import (
     DAMAGED,
     UNDAMAGED,
-    FilmError,
     Packets,
-    film_stream,
+    VideoError,
     import_av,
     judged,
     read_packets,
     upright,
+    video_stream,
 )
 
 Times = npt.NDArray[np.float64]
@@ -36,8 +36,8 @@ _READ_BYTES = 2**20
 _DIGESTS_AT_A_TIME = 2**16
 
 
-def film_identity(file: Path, *, verify: bool, revision: str | None = None) -> str:
-    """What tells a film from others: its size and time of change, or with ``verify`` its SHA-256.
+def video_identity(file: Path, *, verify: bool, revision: str | None = None) -> str:
+    """What tells a video from others: its size and time of change, or with ``verify`` its SHA-256.
 
     revision: of the Hub, whose files have other times on every machine: it stands for the time. Raises DatasetError.
     """
@@ -63,9 +63,9 @@ def _sha256(file: Path, _size: int, _changed_ns: int) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Span:
-    """The frames of one episode in a film.
+    """The frames of one episode in a video.
 
-    times_s: float64 [T], rising; each frame's time stamp in the film
+    times_s: float64 [T], rising; each frame's time stamp in the video
     tolerance_s: half the time from one frame to the next
     where: names episode and camera in messages
     container: FFmpeg's name of the format that the file is read as; None: whatever it looks like
@@ -78,17 +78,17 @@ class Span:
     container: str | None = None
 
     def error(self, expected: str, got: str) -> DatasetError:
-        """The error of this span's film."""
+        """The error of this span's video."""
         return DatasetError.at(f"{self.where}: {self.file}", expected, got)
 
 
-def film_packets(file: Path, container: str | None = None) -> Packets:
-    """The packets of a film's frames. Raises DatasetError for a missing or truncated file, and one of several films."""
+def video_packets(file: Path, container: str | None = None) -> Packets:
+    """The packets of a video's frames. Raises DatasetError for a missing or truncated file, or one of several."""
     av = import_av()
     try:
         with file.open("rb") as opened:
             packets = read_packets(opened, container)
-    except FilmError as error:
+    except VideoError as error:
         raise DatasetError.at(file, error.expected, error.got) from error
     except FileNotFoundError as error:
         raise DatasetError.at(file, "a video file", "none") from error
@@ -109,7 +109,7 @@ def decode(span: Span) -> Iterator[UInt8Array]:
                     raise DatasetError.at(f"{span.where}: {span.file}: frame {num_given}", UNDAMAGED, DAMAGED)
                 yield upright(frame)
                 num_given += 1
-    except FilmError as error:
+    except VideoError as error:
         raise span.error(error.expected, error.got) from error
     except (av.FFmpegError, OSError) as error:
         raise span.error(f"frame {num_given} to be decoded", error.strerror or str(error)) from error
@@ -117,14 +117,14 @@ def decode(span: Span) -> Iterator[UInt8Array]:
 
 def _decoded(container: Any, span: Span) -> Iterator[Any]:
     """Frames from before the span on, in the order of their times."""
-    stream = film_stream(container)
+    stream = video_stream(container)
     stream.thread_type = "AUTO"
     first_s = float(span.times_s[0])
     # one frame earlier: time stamps are rounded
     container.seek(max(int((first_s - 2 * span.tolerance_s) / stream.time_base), 0), stream=stream)
     frames = container.decode(stream)
     first = next(frames, None)
-    if first is None or first.time > first_s + span.tolerance_s:  # the film's index has led too far
+    if first is None or first.time > first_s + span.tolerance_s:  # the video's index has led too far
         container.seek(0, stream=stream)
         frames = container.decode(stream)
         first = next(frames, None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Films that are turned, that break off, that are damaged: labels and scores judge them alike."""
+"""Videos that are turned, that break off, that are damaged: labels and scores judge them alike."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ Write = Callable[[Path, UInt8Array], object]
 
 
 def noise(count: int = NUM_FRAMES) -> UInt8Array:
-    """Frames that hardly compress: the film is mostly frames."""
+    """Frames that hardly compress: the video is mostly frames."""
     return np.random.default_rng(0).integers(0, 256, (count, 64, 64, 3), np.uint8)
 
 
 def labelled(file: Path) -> UInt8Array:
-    """The frames that ``label`` shows of a folder that holds this film."""
+    """The frames that ``label`` shows of a folder that holds this video."""
     (file.parent / "tasks.csv").write_text(f"video,task\n{file.name},stack the cups\n")
     dataset = open_dataset(file.parent)
     episode = dataset.episodes[0]
@@ -46,10 +46,10 @@ def assert_both_refuse(file: Path, reason: str) -> None:
 
 
 @pytest.mark.parametrize(("matrix", "shown"), TURNS.values(), ids=TURNS)
-def test_a_turned_or_mirrored_film_is_read_upright(
+def test_a_turned_or_mirrored_video_is_read_upright(
     tmp_path: Path, matrix: Matrix, shown: Callable[[UInt8Array], UInt8Array]
 ) -> None:
-    file = tmp_path / "film.mp4"
+    file = tmp_path / "video.mp4"
     pictures = np.zeros((3, 32, 64, 3), np.uint8)
     pictures[:, :16, :32], pictures[:, :16, 32:], pictures[:, 16:, :32] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
     write_video(file, pictures)
@@ -62,15 +62,15 @@ def test_a_turned_or_mirrored_film_is_read_upright(
 
 
 @pytest.mark.parametrize("matrix", [(1, 1, -1, 1), (1, 0, 1, 1)], ids=["half a quarter turn", "skewed"])
-def test_a_film_that_is_shown_aslant_is_refused(tmp_path: Path, matrix: Matrix) -> None:
-    write_video(tmp_path / "film.mp4", numbered(3))
-    turn(tmp_path / "film.mp4", matrix)
-    reason = r"expected a film that is shown upright or by quarter turns \(turn it: ffmpeg -i IN OUT\), got one that"
-    assert_both_refuse(tmp_path / "film.mp4", reason)
+def test_a_video_that_is_shown_aslant_is_refused(tmp_path: Path, matrix: Matrix) -> None:
+    write_video(tmp_path / "video.mp4", numbered(3))
+    turn(tmp_path / "video.mp4", matrix)
+    reason = r"expected a video that is shown upright or by quarter turns \(turn it: ffmpeg -i IN OUT\), got one that"
+    assert_both_refuse(tmp_path / "video.mp4", reason)
 
 
 def test_packets_that_are_not_shown_are_no_frames(tmp_path: Path) -> None:
-    file = tmp_path / "film.mp4"
+    file = tmp_path / "video.mp4"
     write_video(file, numbered(10), shown_from=4)
     with av.open(str(file)) as container:
         assert container.streams.video[0].frames == 10  # as the container tells, wrongly
@@ -78,7 +78,7 @@ def test_packets_that_are_not_shown_are_no_frames(tmp_path: Path) -> None:
     assert numbers(read_video(file, 5), 10) == [4, 6, 9]
 
 
-# Pixel format, matrix and range (1: limited, 2: full) of a film, as ITU-T H.273 numbers them; 2: no matrix is named.
+# Pixel format, matrix and range (1: limited, 2: full) of a video, as ITU-T H.273 numbers them; 2: no matrix is named.
 COLOURS = {
     "BT.709": ("yuv420p", 1, 1),
     "BT.709, full range": ("yuv420p", 1, 2),
@@ -109,7 +109,7 @@ def rgb(levels: np.ndarray[Any, Any], matrix: int, is_full: bool) -> np.ndarray[
 
 
 def write_levels(file: Path, levels: UInt8Array, pixels: str, matrix: int, full: int) -> None:
-    """A film of blocks of one colour each, levels uint8 [rows, columns, 3], without a loss."""
+    """A video of blocks of one colour each, levels uint8 [rows, columns, 3], without a loss."""
     with av.open(str(file), "w") as container:
         stream: Any = container.add_stream("libx264", rate=10, options={"qp": "0"})
         stream.height, stream.width, stream.pix_fmt = *(BLOCK_PX * n for n in levels.shape[:2]), pixels
@@ -130,48 +130,48 @@ def write_levels(file: Path, levels: UInt8Array, pixels: str, matrix: int, full:
 
 
 @pytest.mark.parametrize(("pixels", "matrix", "full"), COLOURS.values(), ids=COLOURS)
-def test_colours_are_those_of_the_film_s_matrix_and_range(tmp_path: Path, pixels: str, matrix: int, full: int) -> None:
-    """Whatever PyAV is installed: some take each film for one of BT.601, 6 to 29 levels off."""
+def test_colours_are_those_of_the_video_s_matrix_and_range(tmp_path: Path, pixels: str, matrix: int, full: int) -> None:
+    """Whatever PyAV is installed: some take each video for one of BT.601, 6 to 29 levels off."""
     levels = np.random.default_rng(0).integers(60, 190, (6, 8, 3), np.uint8)
-    write_levels(tmp_path / "film.mp4", levels, pixels, matrix, full)
-    read = read_video(tmp_path / "film.mp4")[0]
+    write_levels(tmp_path / "video.mp4", levels, pixels, matrix, full)
+    read = read_video(tmp_path / "video.mp4")[0]
     centres = read[BLOCK_PX // 2 :: BLOCK_PX, BLOCK_PX // 2 :: BLOCK_PX]
     assert np.abs(centres - rgb(levels.astype(float), matrix, full == 2)).max() < 3.5  # libswscale rounds
-    np.testing.assert_array_equal(labelled(tmp_path / "film.mp4")[0], read)
+    np.testing.assert_array_equal(labelled(tmp_path / "video.mp4")[0], read)
 
 
 GREY = {"gray": False, "gray10le": True, "gray16le": True, "yuv420p10le": False, "bgr0": False}
 
 
 @pytest.mark.parametrize(("pixels", "is_depth"), GREY.items())
-def test_films_of_one_deep_channel_are_refused_as_depth_maps(tmp_path: Path, pixels: str, is_depth: bool) -> None:
-    file = tmp_path / "film.mkv"
+def test_videos_of_one_deep_channel_are_refused_as_depth_maps(tmp_path: Path, pixels: str, is_depth: bool) -> None:
+    file = tmp_path / "video.mkv"
     encode_here(file, numbered(3), "ffv1", pixels=pixels)
     if is_depth:
-        refused = rf"expected a film of colours \(leave a depth camera out .*\), got {pixels}, as depth maps have"
+        refused = rf"expected a video of colours \(leave a depth camera out .*\), got {pixels}, as depth maps have"
         assert_both_refuse(file, refused)
     else:
         assert numbers(read_video(file), 3) == numbers(labelled(file), 3) == [0, 1, 2]
 
 
-def write_streams(file: Path, *films: tuple[UInt8Array, bool]) -> None:
-    """Several films in one file, and whether each is an attached picture."""
+def write_streams(file: Path, *videos: tuple[UInt8Array, bool]) -> None:
+    """Several videos in one file, and whether each is an attached picture."""
     with av.open(str(file), "w") as container:
         streams: list[Any] = []
-        for frames, attached in films:
+        for frames, attached in videos:
             stream: Any = container.add_stream("mjpeg" if attached else "libx264", rate=10)
             stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], "yuvj420p" if attached else "yuv420p"
             if attached:
                 stream.disposition = av.stream.Disposition.attached_pic.value
             streams.append(stream)
-        for stream, (frames, _) in zip(streams, films, strict=True):
+        for stream, (frames, _) in zip(streams, videos, strict=True):
             for image in [*frames, None]:
                 frame = None if image is None else av.VideoFrame.from_ndarray(image, format="rgb24")
                 container.mux(stream.encode(frame))
 
 
-def test_cover_art_is_no_film(tmp_path: Path) -> None:
-    file = tmp_path / "film.mp4"
+def test_cover_art_is_no_video(tmp_path: Path) -> None:
+    file = tmp_path / "video.mp4"
     write_streams(file, (numbered(1)[:, :16], True), (numbered(5), False))
     with av.open(str(file)) as container:
         assert len(container.streams.video) == 2
@@ -181,8 +181,8 @@ def test_cover_art_is_no_film(tmp_path: Path) -> None:
     assert_both_refuse(file, "expected a file with a video stream, got none")
 
 
-def test_a_file_of_several_films_is_refused(tmp_path: Path) -> None:
-    file = tmp_path / "film.mp4"
+def test_a_file_of_several_videos_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "video.mp4"
     write_streams(file, (numbered(1)[:, :16], False), (numbered(1), True), (numbered(5), False))
     refused = (
         r"expected one video stream \(take one: ffmpeg -i IN -map 0:v:N -c copy OUT\), "
@@ -198,7 +198,7 @@ def at_irregular_times(file: Path, frames: UInt8Array) -> None:
 
 
 def coded(codec: str = "libx264", **more: Any) -> Write:
-    """Writes a film with this codec. more: as in ``encode_here``"""
+    """Writes a video with this codec. more: as in ``encode_here``"""
     return lambda file, frames: encode_here(file, frames, codec, **more)
 
 
@@ -209,28 +209,28 @@ def recorded_live(file: Path, frames: UInt8Array) -> None:
 
 
 BROKEN_OFF: dict[str, tuple[str, Write]] = {
-    "Matroska": ("film.mkv", write_video),
-    "Matroska of a variable rate": ("film.mkv", at_irregular_times),
-    "WebM": ("film.webm", coded("libvpx", options={"deadline": "realtime"})),
-    "MP4": ("film.mp4", write_video),
-    "MP4 with its index in front": ("film.mp4", coded(of_container={"movflags": "+faststart"})),
-    "MP4 in fragments": ("film.mp4", coded(of_container={"movflags": "+frag_keyframe+empty_moov"})),
-    "AVI": ("film.avi", coded("mpeg4")),
+    "Matroska": ("video.mkv", write_video),
+    "Matroska of a variable rate": ("video.mkv", at_irregular_times),
+    "WebM": ("video.webm", coded("libvpx", options={"deadline": "realtime"})),
+    "MP4": ("video.mp4", write_video),
+    "MP4 with its index in front": ("video.mp4", coded(of_container={"movflags": "+faststart"})),
+    "MP4 in fragments": ("video.mp4", coded(of_container={"movflags": "+frag_keyframe+empty_moov"})),
+    "AVI": ("video.avi", coded("mpeg4")),
 }
 UNBOUNDED: dict[str, tuple[str, Write]] = {  # the file does not say where it ends
-    "Matroska recorded live": ("film.mkv", recorded_live),
-    "MPEG-TS": ("film.ts", coded()),
+    "Matroska recorded live": ("video.mkv", recorded_live),
+    "MPEG-TS": ("video.ts", coded()),
 }
 
 
 @pytest.mark.parametrize(("name", "write"), UNBOUNDED.values(), ids=UNBOUNDED)
-def test_a_film_that_does_not_say_where_it_ends_is_read(tmp_path: Path, name: str, write: Write) -> None:
+def test_a_video_that_does_not_say_where_it_ends_is_read(tmp_path: Path, name: str, write: Write) -> None:
     write(tmp_path / name, noise())
     assert len(read_video(tmp_path / name)) == len(labelled(tmp_path / name)) == NUM_FRAMES
 
 
 @pytest.mark.parametrize(("name", "write"), BROKEN_OFF.values(), ids=BROKEN_OFF)
-def test_a_whole_film_is_read_and_one_that_breaks_off_refused(tmp_path: Path, name: str, write: Write) -> None:
+def test_a_whole_video_is_read_and_one_that_breaks_off_refused(tmp_path: Path, name: str, write: Write) -> None:
     """Behind a frame, and amid one."""
     file = tmp_path / name
     write(file, noise())
@@ -247,7 +247,7 @@ def test_a_whole_film_is_read_and_one_that_breaks_off_refused(tmp_path: Path, na
 
 def test_damage_counts_up_to_the_next_key_frame_and_only_in_frames_that_are_used(tmp_path: Path) -> None:
     """Each 20th frame needs no other; the others are made from the one before. x264 notices damage in CAVLC."""
-    file = tmp_path / "film.mp4"
+    file = tmp_path / "video.mp4"
     options = {"preset": "ultrafast", "bf": "0", "g": "20", "sc_threshold": "0"}
     encode_here(file, noise(), "libx264", options)
     assert len(read_video(file)) == len(labelled(file)) == NUM_FRAMES
@@ -276,16 +276,16 @@ STREAMS = {
 
 @pytest.mark.parametrize("at_key_frame", [True, False])
 @pytest.mark.parametrize(("codec", "options"), STREAMS.values(), ids=STREAMS)
-def test_a_film_that_begins_amid_a_stream_is_not_called_damaged(
+def test_a_video_that_begins_amid_a_stream_is_not_called_damaged(
     tmp_path: Path, codec: str, options: dict[str, str], at_key_frame: bool
 ) -> None:
     """As cutting without encoding leaves it: the decoder leaves out what it cannot show."""
     encode_here(tmp_path / "all.mkv", noise(), codec, options)
-    with av.open(str(tmp_path / "all.mkv")) as whole, av.open(str(tmp_path / "film.mkv"), "w") as part:
+    with av.open(str(tmp_path / "all.mkv")) as whole, av.open(str(tmp_path / "video.mkv"), "w") as part:
         stream = part.add_stream_from_template(whole.streams.video[0])
         packets = [packet for packet in whole.demux(video=0) if packet.dts is not None]
         second = [k for k, packet in enumerate(packets) if packet.is_keyframe][1:2] if at_key_frame else []
         for packet in packets[second[0] if second else 13 :]:
             packet.stream = stream
             part.mux(packet)
-    assert len(read_video(tmp_path / "film.mkv")) >= 15
+    assert len(read_video(tmp_path / "video.mkv")) >= 15

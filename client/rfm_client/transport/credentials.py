@@ -21,7 +21,7 @@ _VALUE = re.compile("[!-~]([ -~]*[!-~])?")  # visible ASCII; blanks inside
 
 
 @dataclass(frozen=True)
-class Access:
+class Credentials:
     """Credentials of a client. Raises ValueError for what cannot be used, without showing a key.
 
     ca_file: certificates (PEM) of the authorities that may vouch for the server; None: those of the system

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Samples made up from a seed, to see that a server answers and how fast; also as input of ``perf_analyzer``.
+"""Synthetic samples of a seed, to see that a server answers and how fast; also as input of ``perf_analyzer``.
 
 Their scores mean nothing. The file has the format of perf_analyzer's ``--input-data`` (its docs/input_data.md): under
 ``data`` one entry a request, each tensor as ``content`` in row-major order and ``shape`` without the batch axis, which
@@ -23,9 +23,9 @@ import numpy.typing as npt
 
 from rfm_client.client import RewardClient
 from rfm_client.contract.errors import ModelNotFoundError
-from rfm_client.contract.made_up import random_trajectory
 from rfm_client.contract.samples import PreferenceSample, ProgressSample, Sample, SimilaritySample
 from rfm_client.contract.settings import Settings, setting
+from rfm_client.contract.synthetic import random_trajectory
 from rfm_client.contract.wire import encode_samples
 
 TASK = "put the block in the bowl"
@@ -47,7 +47,7 @@ def parse_lengths(text: str) -> list[int]:
 
 
 @dataclass(frozen=True)
-class MadeUpSamples(Settings):
+class SyntheticSamples(Settings):
     """Samples of one type, as many as ``num_samples``, whose trajectories have the lengths in turn."""
 
     TITLE: ClassVar[str] = "Samples"
@@ -80,7 +80,7 @@ class MadeUpSamples(Settings):
 
 
 def are_frames(samples: Sequence[Sample]) -> bool:
-    """Whether made-up samples are of raw frames."""
+    """Whether synthetic samples are of raw frames."""
     return samples[0].trajectories[0].frames is not None
 
 

@@ -26,7 +26,7 @@ from rfm.launch.ending import EXIT_TIMEOUT_S, end, ending_with_parent
 from rfm.launch.endpoints import Endpoints, check_version
 from rfm.launch.http import NO_ANSWER, Http
 from rfm.launch.installation import WHEEL_VERSION, Installation, ServerStartError
-from rfm.launch.proc import cpu_s_of_group
+from rfm.launch.process_table import cpu_s_of_group
 from rfm.launch.repository_api import INDEX_PATH, versions_of
 from rfm.launch.repository_folder import CONFIG_FILE, models_in, no_models
 from rfm.launch.triton_options import check_arguments, size_limits

@@ -13,9 +13,9 @@ PATIENCE_S = 60.0
 GUARD = """
     import os, sys, threading, time
     from types import SimpleNamespace
-    from rfm.triton_model.guard import Guard
+    from rfm.triton_model.watchdog import Watchdog
     WORKS = threading.Event()
-    guard = Guard(0.8, WORKS.is_set)
+    watchdog = Watchdog(0.8, WORKS.is_set)
 """
 
 
@@ -46,10 +46,10 @@ def test_a_batch_that_gets_on_and_a_model_that_waits_go_on() -> None:
         WORKS.set()
         for _ in range(15):
             time.sleep(0.1)
-            guard.step()
+            watchdog.step()
         WORKS.clear()
         time.sleep(1.5)
-        guard.close()
+        watchdog.close()
         sys.exit(7)
     """)
     assert ended.returncode == 7, ended.stderr
@@ -74,9 +74,9 @@ def test_an_instance_that_fails_at_the_blank_sample_after_three_failed_batches_e
         ([[scored], [failed], [failed, refused]], broken),
     ):
         for batch in batches:
-            guard.look_at(batch, blank)
+            watchdog.look_at(batch, blank)
     print("goes on", flush=True)
-    guard.look_at([failed], broken)
+    watchdog.look_at([failed], broken)
     os._exit(7)
     """)
     assert (ended.returncode, ended.stdout) == (1, "goes on\n"), ended.stderr
