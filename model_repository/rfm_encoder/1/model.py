@@ -16,7 +16,7 @@ from rfm.parameters import FAMILY_PARAMETER, FEATURE_CACHE_PARAMETER, SAMPLE_TOK
 from rfm.triton_model.batch_model import BatchModel
 from rfm_client.contract import InvalidSampleError, RewardError, wire
 from rfm_client.contract.frame_refs import EncoderSampleRefs
-from rfm_client.contract.samples import Float32Array, EncoderSample
+from rfm_client.contract.samples import EncoderSample, Float32Array
 
 
 class TritonPythonModel(BatchModel[EncoderSample | EncoderSampleRefs, EncoderSample]):
@@ -35,7 +35,9 @@ class TritonPythonModel(BatchModel[EncoderSample | EncoderSampleRefs, EncoderSam
             raise InvalidSampleError.at(wire.NUM_FRAMES, expected, str(num_frames))
         return wire.decode_trajectories(tensors)
 
-    def answer(self, questions: Sequence[EncoderSample | EncoderSampleRefs], execution: Execution) -> list[EncoderSample | RewardError]:
+    def answer(
+        self, questions: Sequence[EncoderSample | EncoderSampleRefs], execution: Execution
+    ) -> list[EncoderSample | RewardError]:
         return self.encoders.encode(questions, execution, self.cache)
 
     def encode(self, answers: Sequence[EncoderSample], tensors: wire.Tensors, outputs: Collection[str]) -> wire.Tensors:
