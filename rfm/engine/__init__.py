@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The engine: samples in, results out. No Triton in it."""
+"""The engine: scores samples without Triton."""
 
 from rfm.engine.scoring import Engine, Outcome, Prepared
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""All that is CUDA's own: no other module asks for it. On the CPU, nothing of it is done.
+"""The engine's calls of CUDA for memory, streams and the current device, and errors for a lack of memory.
 
-``tests/support/pretended.py`` has a twin, with which the same code runs on a device that PyTorch pretends to have.
+``tests/support/pretended.py`` replaces the functions of CUDA, so that tests run the same code without a GPU.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-_CPU_OUT_OF_MEMORY = re.compile(  # PyTorch's allocator and oneDNN, which gives no reason, raise plain RuntimeErrors
+_CPU_OUT_OF_MEMORY = re.compile(  # PyTorch's allocator and oneDNN (which gives no reason) raise plain RuntimeErrors
     r"DefaultCPUAllocator: can't allocate memory|could not (create|execute) a (primitive|memory object)"
 )
 
 
 @contextmanager
 def memory_errors() -> Iterator[None]:
-    """A context in which every lack of memory is a torch.OutOfMemoryError: a GPU's, PyTorch's on the CPU, Python's."""
+    """Turn errors for a lack of memory, from Python or from PyTorch on the CPU, into torch.OutOfMemoryError."""
     try:
         yield
     except MemoryError as error:
@@ -32,39 +32,42 @@ def memory_errors() -> Iterator[None]:
 
 
 def free_unused() -> None:
-    """Gives back the memory that PyTorch keeps for later; nothing where there is no GPU."""
+    """Free the GPU memory that PyTorch caches; do nothing without a GPU."""
     torch.cuda.empty_cache()
 
 
 def use(device: torch.device) -> None:
-    """To be called in each thread that computes: some kernels launch on the current device, whatever their tensors'."""
+    """Make ``device`` the current device of this thread.
+
+    Each thread that computes must call this: some kernels launch on the current device, not on that of their tensors.
+    """
     if device.type == "cuda":
         torch.cuda.set_device(device)
 
 
 def pinned(tensor: Tensor) -> Tensor:
-    """The tensor in memory from which a GPU copies while the host goes on."""
+    """Return the tensor in pinned memory, from which a GPU copies asynchronously."""
     return tensor.pin_memory()
 
 
 class Copies:
-    """Copies to a GPU while it computes: from pinned memory, on a stream of their own. On the CPU they do nothing."""
+    """Copies to a GPU from pinned memory, on a separate stream, while the GPU computes. On the CPU they do nothing."""
 
     def __init__(self, device: torch.device) -> None:
         self.pins = device.type == "cuda"
         self._stream = torch.cuda.Stream(device) if self.pins else None
 
     def send(self, pixels: Tensor) -> Tensor:
-        """The pixels on the device, or on their way there; may be called in any thread."""
+        """Start to copy the pixels to the device, and return the copy; thread-safe."""
         if self._stream is None:
             return pixels
         with torch.cuda.stream(self._stream):  # PyTorch keeps the pinned copy until this stream has read it
             return pinned(pixels).to(self._stream.device, non_blocking=True)
 
     def wait_for(self, pixels: Iterable[Tensor]) -> None:
-        """Has the current stream, not the host, wait until all pixels that were sent so far have arrived.
+        """Make the current stream, not the host, wait for all copies that were started so far.
 
-        pixels: what the current stream reads; their memory is not used again before it has
+        pixels: copies that the current stream reads; PyTorch does not reuse their memory before that
         """
         if self._stream is None:
             return

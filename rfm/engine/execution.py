@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What one batch took: times, tokens, failures of memory. The code that answers adds to it."""
+"""The costs of one batch: times, tokens, encoded frames and failures of memory."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class Execution:
-    """The work on one batch.
+    """The costs of one batch; the code that scores the batch adds to them.
 
-    collate_s: seconds in which no forward pass ran: rows were made, and batches of them
-    forward_s: seconds in forward passes, with what it takes to read their results
-    num_tokens, num_slots: tokens of the rows that were scored, and of the forward passes, padding included
-    num_encoded, num_found: frames that went through an encoder or a vision tower; frames whose features were at hand
-    cache_bytes: of the features that are kept now; None: none are
-    out_of_memory_count: forward passes that did not fit in memory; their halves were tried again
-    on_forward: called after each forward pass, one that did not fit included
+    collate_s: seconds without a forward pass, in which rows and batches were made
+    forward_s: seconds in forward passes, including the reading of their results
+    num_tokens, num_slots: tokens in the forward passes, without and with padding
+    num_encoded, num_found: frames that an encoder or vision tower read, and frames with features from the cache
+    cache_bytes: bytes of the cached features; None: there is no cache
+    out_of_memory_count: forward passes that did not fit in memory and were tried again in halves
+    on_forward: called after each forward pass, also if it did not fit in memory
     """
 
     collate_s: float = 0.0
@@ -44,9 +44,11 @@ class Execution:
     on_forward: Callable[[], None] = field(default=lambda: None, compare=False, repr=False)
 
     def run(self, forward: Callable[[Any], Sequence[Output]], rows: Any) -> list[Output | InferenceFailedError]:
-        """What a forward pass gives for each of ``rows``: a sequence, or a tensor of them.
+        """Return the output of ``forward`` for each row.
 
-        Out of memory, its halves are tried; a row that does not fit alone is an error of its own.
+        If the rows do not fit in memory, each half is tried. A row that does not fit alone gets an error.
+
+        rows: a sequence, or a tensor with the rows along its first axis
         """
         try:
             with memory_errors():
@@ -64,24 +66,24 @@ class Execution:
 
     @contextmanager
     def collating(self) -> Iterator[None]:
-        """A context in which no forward pass runs: its time counts as collate time."""
+        """Add the time in this context, in which no forward pass runs, to ``collate_s``."""
         started_s = time.perf_counter()
         yield
         self.collate_s += time.perf_counter() - started_s
 
     @contextmanager
     def forwarding(self) -> Iterator[None]:
-        """A context in which forward passes run: its time, without that in ``collating``, counts as forward time."""
+        """Add the time in this context, except in ``collating`` inside it, to ``forward_s``."""
         started_s, collated_s = time.perf_counter(), self.collate_s
         yield
         self.forward_s += time.perf_counter() - started_s - (self.collate_s - collated_s)
 
     def add_tokens(self, num_tokens: int, num_slots: int) -> None:
-        """Counts the tokens and slots of one more forward pass."""
+        """Count the tokens of one forward pass, without and with padding."""
         self.num_tokens += num_tokens
         self.num_slots += num_slots
 
     @property
     def padding_ratio(self) -> float:
-        """The share 0..1 of the token slots that held no token; 0 if there was no forward pass."""
+        """The share of padding among all token slots, 0 to 1; 0 if there was no forward pass."""
         return 1 - self.num_tokens / self.num_slots if self.num_slots else 0.0

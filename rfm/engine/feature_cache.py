@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What encoders have made of frames and tasks, kept by what these show: the least recently used goes first."""
+"""A cache of the features of frames and tasks, by digest, in bounded memory."""
 
 from __future__ import annotations
 
@@ -14,24 +14,25 @@ from rfm_client.contract import RewardError
 from rfm_client.contract.samples import Float32Array
 
 BYTES_PER_MB = 2**20
-_ENTRY_BYTES = 256  # of a key, an array's header and a place in the order
+_ENTRY_BYTES = 256  # of a key, the array's header and the entry in the ordered dict
 
 
 Source = TypeVar("Source")
 Kept = TypeVar("Kept", bound="_Array")
 
 
-class _Array(Protocol):  # of NumPy, or a tensor on any device
+class _Array(Protocol):  # a NumPy array, or a tensor on any device
     @property
     def nbytes(self) -> int: ...
 
 
 class FeatureCache(Generic[Kept]):
-    """Arrays by key, in bounded memory. For any threads.
+    """Arrays by key, thread-safe. The least recently used arrays are removed first.
 
-    limit_bytes: of all arrays together; what does not fit is not kept
+    limit_bytes: largest size of all arrays together, with a fixed overhead for each
 
-    A key must hold a digest of what the array was made of, computed where it was: never one that a caller claims.
+    Each key must contain a digest that this process computed from the array's source. A digest from a caller could
+    name other content.
     """
 
     def __init__(self, limit_bytes: int) -> None:
@@ -44,13 +45,13 @@ class FeatureCache(Generic[Kept]):
         return len(self._arrays)
 
     def clear(self) -> None:
-        """Forgets every array that it keeps."""
+        """Remove every array from the cache."""
         with self._changing:
             self._arrays.clear()
             self.num_bytes = 0
 
     def found(self, keys: Iterable[Hashable]) -> dict[Hashable, Kept]:
-        """The arrays of those keys that have some; they count as used now."""
+        """Return the cached arrays among ``keys``, and mark them as recently used."""
         with self._changing:
             found = {key: self._arrays[key] for key in keys if key in self._arrays}
             for key in found:
@@ -58,9 +59,9 @@ class FeatureCache(Generic[Kept]):
         return found
 
     def keep(self, arrays: Mapping[Hashable, Kept]) -> None:
-        """Keeps arrays, and lets go of those that were used least recently if there are too many.
+        """Add arrays, then remove the least recently used until the rest fits ``limit_bytes``.
 
-        arrays: none is a view, which would keep all that it is a part of
+        arrays: no views, since a view keeps the whole array behind it in memory
         """
         with self._changing:
             for key, array in arrays.items():
@@ -79,12 +80,12 @@ def get_or_make(
     make: Callable[[Sequence[Source]], Sequence[Float32Array | RewardError]],
     is_always_made: Callable[[Source], bool] = lambda _: False,
 ) -> tuple[dict[bytes, Float32Array | RewardError], int]:
-    """The features of the wanted keys: those that are kept, and those that are made of their sources now, each once.
-    A key that has neither is left out. And how many were made.
+    """Return the features of the wanted keys, from the cache or made from their sources, and how many were made.
 
-    What cannot be made, or is not finite, is not kept.
+    Each feature is made once. Keys without cached features and without a source are left out. Errors and features
+    with values that are not finite are not cached.
 
-    is_always_made: of which sources features are made although some are kept
+    is_always_made: True for a source whose cached features must not be used
     """
     wanted = list(dict.fromkeys(wanted))
     kept = cache.found(key for key in wanted if key not in sources or not is_always_made(sources[key]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Parts of networks that more than one family has, and the precision in which they compute."""
+"""Layers that several families share, and the precision of their computation."""
 
 from __future__ import annotations
 
@@ -12,30 +12,33 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-WORTH_ONEDNN = 1 << 21  # multiplications; of fewer, to begin costs more than is gained
+WORTH_ONEDNN = 1 << 21  # multiplications; for fewer, the start of oneDNN costs more than it saves
 
 
 class Linear(nn.Linear):
-    """An ``nn.Linear`` whose large float32 products on the CPU are computed by oneDNN.
+    """An ``nn.Linear`` that computes large float32 products on the CPU with oneDNN.
 
-    torch asks oneDNN only for bfloat16, but MKL is slow on processors other than Intel's
-    (docs/explanation/performance.md). The operation is that of torch.compile. oneDNN builds a kernel for each new
-    shape, so ReWiND's tokens come in few shapes (``rfm.rewind.network.rounded_up``).
+    PyTorch itself uses oneDNN only for bfloat16, and MKL is slow on processors other than Intel's
+    (docs/explanation/performance.md). torch.compile uses the same operation. oneDNN builds a kernel for each new
+    shape, so ReWiND pads its tokens to few shapes (``rfm.rewind.network.rounded_up``).
     """
 
     def forward(self, input: Tensor, *, relu: bool = False, plus: Tensor | None = None) -> Tensor:
-        """[..., K] -> [..., N]."""
+        """Float [..., in_features] -> [..., out_features]; then ReLU, or ``plus`` added."""
         return linear(input, self.weight, self.bias, relu=relu, plus=plus)
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None, *, relu: bool = False, plus: Tensor | None = None) -> Tensor:
-    """``x @ weight.T + bias``: [..., K], [N, K] and [N] -> [..., N]; then ReLU, or ``plus`` [..., N] added."""
+    """Return ``x @ weight.T + bias``, then ReLU, or with ``plus`` added; x: [..., D], weight: [N, D], bias: [N].
+
+    plus and the result: [..., N]
+    """
     if _by_onednn(x, weight, bias):
         onednn = torch.ops.mkldnn._linear_pointwise
         if plus is not None:
             return onednn.binary(x, plus, weight, bias, "add")
         product = onednn.default(x, weight, bias, "none", [], "")
-        return product.relu_() if relu else product  # oneDNN's own ReLU makes 0 of NaN, which would hide it
+        return product.relu_() if relu else product  # oneDNN's own ReLU turns NaN into 0, which would hide it
     product = F.linear(x, weight, bias)
     if plus is not None:
         return product + plus
@@ -43,7 +46,7 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None, *, relu: bool = False
 
 
 def speed_up(network: nn.Module) -> None:
-    """Puts ``Linear`` in place of every ``nn.Linear``, with the same parameters."""
+    """Replace every ``nn.Linear`` of the network by a ``Linear`` with the same parameters."""
     for module in network.modules():
         for name, child in module.named_children():
             if type(child) is nn.Linear:
@@ -54,7 +57,7 @@ def speed_up(network: nn.Module) -> None:
 
 
 def _by_onednn(x: Tensor, weight: Tensor, bias: Tensor | None) -> bool:
-    """Whether oneDNN computes the product: it has no gradient, and needs a bias without gaps in memory."""
+    """True if oneDNN computes the product: it computes no gradients, and needs a contiguous bias."""
     return (
         x.device.type == "cpu"
         and x.dtype is torch.float32
@@ -67,23 +70,23 @@ def _by_onednn(x: Tensor, weight: Tensor, bias: Tensor | None) -> bool:
 
 
 class PredictionHead(nn.Sequential):
-    """[..., D] hidden states -> [..., n] logits. The indices 0, 1 and 4 are the names in checkpoints."""
+    """Hidden states [..., D] -> logits [..., N]. Checkpoints name the layers by their indices 0, 1 and 4."""
 
     def __init__(self, hidden_dim: int, num_outputs: int) -> None:
         super().__init__(
             Linear(hidden_dim, hidden_dim // 2),
             nn.LayerNorm(hidden_dim // 2),
             nn.GELU(),
-            nn.Dropout(),  # holds its index; serving never trains
+            nn.Dropout(),  # keeps index 4 for the last layer; serving never trains
             Linear(hidden_dim // 2, num_outputs),
         )
 
 
 def progress_from_logits(logits: Tensor) -> Tensor:
-    """float32 [...] in 0..1 from the progress head's [..., n].
+    """Return progress, float32 [...] from 0 to 1, of the progress head's logits [..., K].
 
-    n = 1: the sigmoid. n = K bins: the mean of the bins' centres linspace(0, 1, K) under the softmax,
-    in float32 whatever the model's precision.
+    K = 1: the sigmoid. K > 1 bins: the mean of the bin centres linspace(0, 1, K) under the softmax, in float32 for
+    every dtype of the model.
     """
     if logits.shape[-1] == 1:
         return logits.squeeze(-1).sigmoid().float()
@@ -92,11 +95,11 @@ def progress_from_logits(logits: Tensor) -> Tensor:
 
 
 def as_tensor(array: npt.NDArray[Any]) -> Tensor:
-    """The array as a tensor; a copy only where torch cannot share its memory (read-only, reversed)."""
+    """Return the array as a tensor; it shares the array's memory unless that is read-only or not C-contiguous."""
     return torch.from_numpy(np.require(array, requirements=("C", "W")))
 
 
-# What PyTorch has MKL compute on a CPU: IMPLEMENT_VML_MKL in its ATen/cpu/vml.h.
+# The functions that PyTorch computes with MKL on a CPU: IMPLEMENT_VML_MKL in its ATen/cpu/vml.h.
 MKL_FUNCTIONS = (
     torch.acos,
     torch.asin,
@@ -118,13 +121,13 @@ MKL_FUNCTIONS = (
 
 
 def keep_float32() -> None:
-    """Has GPUs and CPUs compute float32 as float32. To be called before they compute anything.
+    """Make GPUs and CPUs compute float32 in full precision; to be called before any computation.
 
-    GPU: PyTorch has cuDNN round what a convolution reads to TF32, with 10 bits of 23, which moves scores by more than
-    1e-5.
-    CPU: MKL 2024.2 chooses the code of a function at its first call. If several threads make that call together, one of
-    them may compute its part with less exact code, and a cosine is 1.5e-4 off (pytorch/pytorch#188792). So one thread
-    makes the first calls here.
+    GPU: by default cuDNN rounds the inputs of a convolution to TF32, with 10 of 23 mantissa bits. That changes scores
+    by more than 1e-5.
+    CPU: MKL 2024.2 selects the code of a function at its first call. If several threads make that call at once, some
+    may use less exact code: a cosine is off by 1.5e-4 (pytorch/pytorch#188792). Here a single thread makes the first
+    calls.
     """
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cuda.matmul.allow_tf32 = False

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the engine needs of a network: how samples become its batches, and batches scores."""
+"""The interface between the engine and a network: samples become rows, rows a batch, a batch scores."""
 
 from __future__ import annotations
 
@@ -30,47 +30,51 @@ Batch = TypeVar("Batch")
 
 
 class Predictor(Protocol[Row, Batch]):
-    """A network on a device, and how samples become its batches. A row is one token sequence of a forward."""
+    """A network on a device, with the collation of its batches. A row is one token sequence of a forward pass."""
 
     @property
     def works_ahead(self) -> bool:
-        """Whether ``work_ahead`` is worth a thread."""
+        """True if ``work_ahead`` takes enough time to be worth a thread."""
 
     def rows(self, sample: Sample | ProgressSampleRefs) -> list[Row]:
-        """The sample's rows, in dense mode one a frame; takes no forward pass.
+        """Return the sample's rows, in dense mode one for each frame, without a forward pass.
 
-        sample: has named frames only where the checkpoint's description says that it keeps features
-        Raises InvalidSampleError if this checkpoint cannot score it.
+        sample: with frame references only if ``Description.keeps_features``
+        Raises InvalidSampleError if this checkpoint cannot score the sample.
         """
 
     def num_tokens(self, row: Row) -> int:
-        """Tokens of the row. Rows of similar numbers share a batch."""
+        """Return the number of tokens in the row. Rows with similar numbers share a batch."""
 
     def work_ahead(self, rows: Sequence[Row]) -> None:
-        """What takes long of collation and can be done rows alone, in any thread; ``collate`` does what is left."""
+        """Do the slow, independent work on these rows; thread-safe. ``collate`` does the rest."""
 
     def collate(self, rows: Sequence[Row]) -> Batch:
-        """One batch, on the CPU; may run while the device computes."""
+        """Return one batch on the CPU; may run while the device computes."""
 
     def count(self, batch: Batch, execution: Execution) -> None:
-        """Adds what the batch's forward pass works on: tokens, with and without padding, and frames that it encodes."""
+        """Add the batch's tokens, with and without padding, and its encoded frames to ``execution``."""
 
     def score(self, rows: Sequence[Row], batch: Batch) -> list[RowScores | RewardError]:
-        """One forward pass, read back to the CPU; an error for a row that has no scores."""
+        """Run one forward pass; return each row's scores on the CPU, or its error."""
 
 
 @dataclass(frozen=True, eq=False)
 class RowScores:
-    """Scores of one row: of the frames of its trajectories, and of its question about two of them."""
+    """Scores of one row.
+
+    frames: of each trajectory
+    query: the preference or similarity of two trajectories; None: the row asks for neither
+    """
 
     frames: list[FrameScores]
     query: float | None = None
 
 
 def are_finite(frames: Iterable[FrameScores], queries: Iterable[float], *, has_success: bool = True) -> bool:
-    """Whether all scores of frames and all answers to questions are numbers.
+    """True if all progress, success and query scores are finite.
 
-    has_success: the network predicts success
+    has_success: False if the network does not predict success, which is NaN then
     """
     names = ("progress", "success") if has_success else ("progress",)
     arrays = (getattr(scores, name) for scores in frames for name in names)
@@ -78,7 +82,7 @@ def are_finite(frames: Iterable[FrameScores], queries: Iterable[float], *, has_s
 
 
 def checked(rows: Iterable[RowScores], *, has_success: bool = True) -> list[RowScores | RewardError]:
-    """The rows, with an error in place of one that has a score that is not finite."""
+    """Return the rows, with an error in place of each row with a score that is not finite."""
     failed = InferenceFailedError("the network gave a score that is not finite")
 
     def is_good(row: RowScores) -> bool:
@@ -88,9 +92,9 @@ def checked(rows: Iterable[RowScores], *, has_success: bool = True) -> list[RowS
 
 
 def check_type(sample: Sample | ProgressSampleRefs, config: Any) -> None:
-    """Raises InvalidSampleError for a question about two trajectories that the network has no head for.
+    """Raise InvalidSampleError for a preference or similarity sample if the network lacks that head.
 
-    config: its configuration
+    config: the network's configuration
     """
     heads = {"preference": config.has_preference, "similarity": config.has_similarity}
     asked = {PreferenceSample: "preference", SimilaritySample: "similarity"}.get(type(sample))
@@ -100,12 +104,12 @@ def check_type(sample: Sample | ProgressSampleRefs, config: Any) -> None:
 
 
 def no_success(progress: Float32Array) -> Float32Array:
-    """What stands for success beside this progress, where the network does not predict it: NaN."""
+    """Return NaN in the shape of ``progress``, as the success of a network without a success head."""
     return np.full_like(progress, np.nan)
 
 
 def frame_scores(progress_logits: Tensor, success_logits: Tensor | None) -> FrameScores:
-    """Scores on the CPU, from progress logits [..., K] and success logits [...]; with the logits where K > 1."""
+    """Return scores on the CPU from progress logits [..., K] and success logits [...]; logits included if K > 1."""
     discrete = progress_logits.shape[-1] > 1
     progress = progress_from_logits(progress_logits).cpu().numpy()
     return FrameScores(
@@ -116,7 +120,7 @@ def frame_scores(progress_logits: Tensor, success_logits: Tensor | None) -> Fram
 
 
 def part_of(scores: FrameScores, index: slice | npt.NDArray[np.intp]) -> FrameScores:
-    """The scores at ``index`` of each array."""
+    """Return the scores at ``index`` of each array."""
     logits = scores.progress_logits
     return FrameScores(
         progress=scores.progress[index],
@@ -126,8 +130,8 @@ def part_of(scores: FrameScores, index: slice | npt.NDArray[np.intp]) -> FrameSc
 
 
 def prefix_indices(num_frames: int, frame_steps: int) -> npt.NDArray[np.int64]:
-    """int64 [T, K], the frames that stand for each prefix 0..t.
+    """Return the frames that represent each prefix 0..t in dense mode, int64 [T, frame_steps].
 
-    K positions evenly from 0 to t, truncated to whole frames, as the original server samples them.
+    The positions are evenly spaced from 0 to t and truncated to whole frames, as upstream's server samples them.
     """
     return np.stack([np.linspace(0, t, frame_steps).astype(np.int64) for t in range(num_frames)])

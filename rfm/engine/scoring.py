@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The engine: samples in, results out, in as few forward passes as the token budget allows. No Triton in it."""
+"""The engine: scores samples in as few forward passes as the token budget allows, without Triton."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ Outcome: TypeAlias = Result | RewardError
 class Prepared:
     """A sample that is ready for its forward pass.
 
-    rows: what the network scores of it; an error: why it cannot
-    num_tokens: of all rows
+    rows: the sample's rows; an error: why the network cannot score it
+    num_tokens: tokens in all rows
     """
 
     sample: Sample | ProgressSampleRefs
@@ -57,10 +57,10 @@ class Prepared:
 class Engine:
     """Scores samples with one network on one device.
 
-    predictor: the network and how samples become its batches
-    encoders: on the same device, for samples of raw frames where the network scores embeddings
-    token_budget: the most tokens, padding included, of one forward pass of several rows; a larger row runs alone
-    max_sample_tokens: the most tokens of one row; a sample that needs more is refused
+    predictor: the network, with the collation of its batches
+    encoders: on the same device, for samples of raw frames if the network scores embeddings
+    token_budget: largest number of tokens, with padding, in a forward pass of several rows; a larger row runs alone
+    max_sample_tokens: largest number of tokens in one row; a sample with a larger row is refused
     """
 
     def __init__(
@@ -90,9 +90,10 @@ class Engine:
         max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS,
         feature_cache_mb: int = 0,
     ) -> Engine:
-        """The engine of a checkpoint folder or Hugging Face id. Raises CheckpointError.
+        """Return the engine for a checkpoint's folder or Hugging Face id.
 
-        family, base_model: as in ``rfm.families.load``; the others as in ``of``
+        source, family, base_model: as in ``rfm.families.load``; the others as in ``of``
+        Raises CheckpointError.
         """
         return cls.of(
             families.load(source, family=family, base_model=base_model),
@@ -116,11 +117,12 @@ class Engine:
         max_sample_tokens: int = DEFAULT_SAMPLE_TOKENS,
         feature_cache_mb: int = 0,
     ) -> Engine:
-        """The engine of a checkpoint in memory. Raises CheckpointError.
+        """Return the engine for a checkpoint in memory.
 
-        encoders: for samples of raw frames, where the network scores embeddings
-        dtype: of the network; None: float32, and a vision-language checkpoint's own on a GPU
-        feature_cache_mb: MiB of what a network that reads raw frames makes of each; 0: nothing is kept
+        encoders: for samples of raw frames if the network scores embeddings
+        dtype: of the network; None: float32, or a vision-language checkpoint's own on a GPU
+        feature_cache_mb: MiB for the features of frames in a network that reads raw frames; 0: no cache
+        Raises CheckpointError.
         """
         keep_float32()
         on = torch.device(device)
@@ -130,11 +132,12 @@ class Engine:
         return cls(predictor, encoders=encoders, token_budget=token_budget, max_sample_tokens=max_sample_tokens)
 
     def evaluate(self, samples: Sequence[Sample], execution: Execution | None = None) -> list[Outcome]:
-        """The result of each sample, or the error of one that has none; neighbours make no difference.
+        """Score the samples; return each sample's result or error, which does not depend on the other samples.
 
-        execution: what it took is added to it
+        execution: the batch's costs are added to it
+
         InvalidSampleError: this checkpoint cannot score the sample.
-        InferenceFailedError: the network gave something that is no number, or the sample does not fit in memory.
+        InferenceFailedError: a score is not finite, or the sample does not fit in memory.
         """
         execution = execution or Execution()
         before = replace(execution)
@@ -144,30 +147,28 @@ class Engine:
         return self._results(prepared, execution, before)
 
     def prepare(self, sample: Sample | ProgressSampleRefs) -> Prepared:
-        """The first half of ``evaluate``. Takes no forward pass, and may run in one thread while another scores.
+        """Do the first half of ``evaluate``, without a forward pass; may run while another thread scores.
 
-        sample: of what the network reads; no encoders are asked
+        sample: in the form that the network reads; the encoders are not used
         """
         return self._prepared(sample, sample)
 
     @property
     def works_ahead(self) -> bool:
-        """Whether ``work_ahead`` is worth a thread."""
+        """True if ``work_ahead`` takes enough time to be worth a thread."""
         return self.predictor.works_ahead
 
     def work_ahead(self, prepared: Prepared) -> None:
-        """What takes long between the halves of ``evaluate``, in any thread; where nobody calls it, the second half
-        does it.
-        """
+        """Do slow work between ``prepare`` and ``score``; thread-safe, optional (``score`` does it otherwise)."""
         if not isinstance(prepared.rows, RewardError):
             self.predictor.work_ahead(prepared.rows)
 
     def score(self, prepared: Sequence[Prepared], execution: Execution) -> list[Outcome]:
-        """The second half of ``evaluate``."""
+        """Do the second half of ``evaluate``: forward passes."""
         return self._results(prepared, execution, replace(execution))
 
     def _embedded(self, samples: Sequence[Sample], execution: Execution) -> Sequence[Sample | RewardError]:
-        """The samples with embeddings in place of raw frames, which are encoded together; or why a sample has none."""
+        """Encode the raw frames of all samples together; an error replaces a sample that cannot be encoded."""
         outcomes: list[Sample | RewardError] = list(samples)
         raw = {i: EncoderSample(s.trajectories) for i, s in enumerate(samples) if s.trajectories[0].frames is not None}
         if self.encoders is None or not raw:
@@ -195,7 +196,7 @@ class Engine:
         return Prepared(sample, rows, sum(num_tokens))
 
     def _results(self, prepared: Sequence[Prepared], execution: Execution, before: Execution) -> list[Outcome]:
-        """The result or the error of each sample. ``before``: ``execution`` when this batch had cost nothing."""
+        """Return each sample's result or error. ``before``: ``execution`` at the start of this batch."""
         collated_s, started_s, forwarded_s = execution.collate_s, time.perf_counter(), execution.forward_s
         rows: list[Any] = []
         rows_of: list[slice] = []
@@ -221,20 +222,20 @@ class Engine:
         return [scores[index] for index in range(len(rows))]
 
     def _collated(self, rows: Sequence[Any], parts: Sequence[list[int]]) -> Iterator[tuple[list[int], Any]]:
-        """Each part with its batch. While one is scored the next is collated, in a thread; the first needs none."""
+        """Yield each part with its batch. While the caller scores a part, a thread collates the next."""
         batch = self._collate([rows[i] for i in parts[0]]) if parts else None
         if len(parts) < 2:
             yield from ((part, batch) for part in parts)
             return
         with ThreadPoolExecutor(1) as collating:
             for part, following in zip(parts, [*parts[1:], None], strict=True):
-                steps = copy_context()  # whoever is told of steps is told of those of the other thread
+                steps = copy_context()  # so that an observer of this thread's steps also sees the other thread's
                 coming = collating.submit(steps.run, self._collate, [rows[i] for i in following]) if following else None
                 yield part, batch
                 batch = coming.result() if coming is not None else None
 
     def _collate(self, rows: Sequence[Any]) -> Any:
-        """The batch of the rows; None if it does not fit in memory now."""
+        """Return the batch of the rows; None if it does not fit in memory now."""
         try:
             with memory_errors():
                 return self.predictor.collate(rows)
@@ -242,9 +243,9 @@ class Engine:
             return None
 
     def _score(self, rows: Sequence[Any], batch: Any, execution: Execution) -> Sequence[RowScores | RewardError]:
-        """The scores of each row from one forward pass.
+        """Return the scores of each row from one forward pass.
 
-        batch: the batch of all rows; None: it is made here
+        batch: of all rows; None: it did not fit in memory, and is made again here
         """
 
         def forward(part: Sequence[Any]) -> Sequence[RowScores | RewardError]:
@@ -256,7 +257,7 @@ class Engine:
         return execution.run(forward, rows)
 
     def _micro_batches(self, rows: Sequence[Any]) -> Iterator[list[int]]:
-        """Indices of the rows of each forward: similar numbers of tokens, within the token budget."""
+        """Yield the indices of the rows of each forward pass: similar in length, within the token budget."""
         num_tokens = [self.predictor.num_tokens(row) for row in rows]
         part: list[int] = []
         for index in sorted(range(len(rows)), key=num_tokens.__getitem__):
@@ -280,14 +281,14 @@ def _outcome(
         return ProgressResult(progress=frames.progress, success=frames.success, progress_logits=logits, timing=timing)
     first, second = rows[0].frames
     query = rows[0].query
-    assert query is not None  # every row of two trajectories carries a question
+    assert query is not None  # every row of two trajectories has a query
     if isinstance(sample, PreferenceSample):
         return PreferenceResult(preference=query, first=first, second=second, timing=timing)
     return SimilarityResult(similarity=query, reference=first, other=second, timing=timing)
 
 
 def _last_of_each(rows: Sequence[RowScores]) -> FrameScores:
-    """Dense mode: frame t's score is the last one of the row of its prefix."""
+    """Return the scores of dense mode: frame t's score is the last score in the row of its prefix."""
     frames = [row.frames[0] for row in rows]
     logits = [scores.progress_logits[-1] for scores in frames if scores.progress_logits is not None]
     return FrameScores(
