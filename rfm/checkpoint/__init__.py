@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Files of a checkpoint, of whatever family: found, read, checked, digested.
+"""Files of a checkpoint of any family: find, read, check and digest them.
 
-A checkpoint is a local folder or a Hugging Face id ``org/name[/subfolder][@tag]``. In it: ``model.safetensors`` (or
-shards with an index, or an adapter), ``config.json`` (the network) and, in the folder, its parent or on main of the
-Hub's repository, ``config.yaml`` (the training run). Nothing in a checkpoint is executed: safetensors only, and YAML
-tags construct nothing.
+A checkpoint is a local folder or a Hugging Face id ``org/name[/subfolder][@tag]``. It holds ``model.safetensors`` (or
+shards with an index, or an adapter) and ``config.json`` (the network). ``config.yaml`` (the training run) is there,
+in the parent folder, or on main of the Hub's repository. Nothing in a checkpoint is executed: weights are read from
+safetensors alone, and YAML tags construct no objects.
 """

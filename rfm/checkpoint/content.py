@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What one file of a checkpoint holds. Whoever wrote it may lie: it is read in bounded memory and time, or refused."""
+"""Readers of one file of a checkpoint. Files are not trusted: they are read in bounded memory and time, or refused."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ NETWORK_CONFIG = "config.json"
 ADAPTER_CONFIG = "adapter_config.json"
 ADAPTER_WEIGHTS = "adapter_model.safetensors"
 RUN_CONFIG = "config.yaml"
-RUN_CONFIGS = (RUN_CONFIG, "config.yml", ".hydra/config.yaml")  # the first is read
-PREPROCESSOR_CONFIG = "preprocessor_config.json"  # beside a model's weights: how its images are made
-PIL_BICUBIC = 3  # the value of `resample` in it
+RUN_CONFIGS = (RUN_CONFIG, "config.yml", ".hydra/config.yaml")  # the first that exists is read
+PREPROCESSOR_CONFIG = "preprocessor_config.json"  # image preprocessing, beside a model's weights
+PIL_BICUBIC = 3  # a value of `resample` in it
 MAX_UINT8 = 255
 
 MAX_JSON_BYTES = 2**24
-MAX_HEADER_BYTES = 2**24  # of a safetensors file: a hundred for each tensor
+MAX_HEADER_BYTES = 2**24  # of a safetensors file; a tensor takes about 100 bytes
 
 _LENGTH = struct.Struct("<Q")  # of a safetensors file's header
 _DTYPES = ("F64", "F32", "F16", "BF16", "I64", "I32", "I16", "I8", "U8", "BOOL")
@@ -44,7 +44,7 @@ _KINDS = {
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
 }
-# What libraries raise of content that they did not expect.
+# Exceptions of libraries for unexpected content.
 _MISFITS = (
     ArithmeticError,
     AssertionError,
@@ -62,11 +62,11 @@ _MAX_LISTED = 20
 
 
 class CheckpointError(Exception):
-    """A checkpoint that cannot be loaded: what is wrong with which file, and what to do about it."""
+    """A checkpoint that cannot be loaded: the file, its fault and the remedy."""
 
 
 def misfits(*others: type[Exception]) -> tuple[type[Exception], ...]:
-    """``others``, and errors of libraries about content that they did not expect: transformers 5 raises the Hub's."""
+    """Return ``others`` and the exceptions of libraries for unexpected content, with the Hub's from transformers 5."""
     from huggingface_hub import errors
 
     return (*others, *_MISFITS, getattr(errors, "StrictDataclassError", ValueError))
@@ -74,7 +74,7 @@ def misfits(*others: type[Exception]) -> tuple[type[Exception], ...]:
 
 @contextmanager
 def expecting(what: str, where: object) -> Iterator[None]:
-    """Turns whatever code raises of content that does not fit into a CheckpointError."""
+    """Turn exceptions for unexpected content into a CheckpointError."""
     try:
         yield
     except misfits() as error:
@@ -82,27 +82,27 @@ def expecting(what: str, where: object) -> Iterator[None]:
 
 
 def shown(value: object) -> str:
-    """The value as it stands in an error: on one line, and not long."""
+    """Return the value as a short line for an error message."""
     try:
         return _short.repr(value)
-    except ValueError:  # a number of more digits than Python writes out
+    except ValueError:  # Python does not print a number with so many digits
         return f"a huge {type(value).__name__}"
 
 
 def cut(text: str, most: int = 1000) -> str:
-    """The text, or its beginning, on one line."""
+    """Return the text, or its beginning, on one line."""
     line = " ".join(text[:most].split())
     return line if len(text) <= most else f"{line}..."
 
 
 def listed(names: Sequence[str]) -> str:
-    """The names as Python writes a list; of many names the first."""
+    """Return the names, or the first of many, as a Python list."""
     more = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
     return cut(repr(list(names[:_MAX_LISTED])), 4000) + more
 
 
 def is_there(file: Path) -> bool:
-    """Whether there is such a file. Raises CheckpointError for what is there and cannot be read as one."""
+    """True if the file exists. Raises CheckpointError for a folder, a broken link or anything else but a file."""
     try:
         kind = stat.S_IFMT(file.stat().st_mode)
     except (FileNotFoundError, NotADirectoryError):
@@ -111,13 +111,13 @@ def is_there(file: Path) -> bool:
         return False
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{file}: expected a file, got: {error}") from error
-    if kind != stat.S_IFREG:  # to open a pipe would be to wait for its writer
+    if kind != stat.S_IFREG:  # opening a pipe would wait for its writer
         raise CheckpointError(f"{file}: expected a file, got {_KINDS.get(kind, 'something else')}")
     return True
 
 
 def read_json(file: Path) -> dict[str, Any]:
-    """A JSON object. Raises CheckpointError."""
+    """Return the file's JSON object. Raises CheckpointError."""
     _require(file)
     try:
         with file.open("rb") as stream:
@@ -133,7 +133,10 @@ def read_json(file: Path) -> dict[str, Any]:
 
 
 def read_run_config(file: Path) -> dict[str, Any]:
-    """config.yaml as plain mappings, lists and scalars, whatever Python objects its tags ask for."""
+    """Return config.yaml as plain mappings, lists and scalars, also where its tags name Python objects.
+
+    Raises CheckpointError.
+    """
     _require(file)
     try:
         config = read_yaml(file, _PlainLoader)
@@ -145,8 +148,8 @@ def read_run_config(file: Path) -> dict[str, Any]:
 
 
 def read_tensors(file: Path) -> dict[str, Tensor]:
-    """All tensors of one safetensors file. Raises CheckpointError."""
-    from safetensors.torch import load_file  # not before: PyTorch takes seconds, and few commands need it
+    """Return all tensors of a safetensors file. Raises CheckpointError."""
+    from safetensors.torch import load_file  # imported here: PyTorch takes seconds, and few commands need it
 
     _require(file)
     try:
@@ -157,7 +160,7 @@ def read_tensors(file: Path) -> dict[str, Tensor]:
 
 
 def tensor_names(file: Path) -> list[str]:
-    """The names of the tensors of one safetensors file. Raises CheckpointError."""
+    """Return the tensor names in a safetensors file. Raises CheckpointError."""
     _require(file)
     try:
         _check_header(file)
@@ -173,7 +176,7 @@ def _require(file: Path) -> None:
 
 
 def _check_header(file: Path) -> None:
-    """What the library's own check of offsets and sizes leaves out. Raises ValueError, OSError, RecursionError."""
+    """Check the header beyond the library's offsets and sizes. Raises ValueError, OSError, RecursionError."""
     with file.open("rb") as content:
         start = content.read(len(_LFS_POINTER))
         if start == _LFS_POINTER:
@@ -192,7 +195,7 @@ def _check_header(file: Path) -> None:
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A JSON object in which no key stands twice."""
+    """Return a JSON object. Raises ValueError for a key that stands twice."""
     content: dict[str, Any] = {}
     for name, value in pairs:
         if name in content:
@@ -202,7 +205,7 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """SafeLoader that reads nodes tagged as Python objects as the plain data that they hold."""
+    """A SafeLoader that reads nodes tagged as Python objects as plain data."""
 
 
 def _plain(loader: yaml.SafeLoader, _suffix: str, node: yaml.Node) -> Any:

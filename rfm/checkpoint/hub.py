@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where a checkpoint is: a local folder, or a repository of the Hugging Face Hub."""
+"""Find a checkpoint: in a local folder, or in a repository of the Hugging Face Hub."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ _BEST_TAG = re.compile(r"best-.*?-(-?\d+\.\d+)-step-\d+")
 
 
 def find(source: str | Path) -> Path:
-    """The local folder of a checkpoint, fetched from the Hub if need be. An existing path wins over an id."""
+    """Return the local folder of a checkpoint, fetched from the Hub if necessary. Raises CheckpointError.
+
+    An existing folder wins over a Hub id of the same name.
+    """
     try:
         path = Path(source).expanduser()
         if str(source) and path.is_dir():
@@ -36,9 +39,9 @@ def find(source: str | Path) -> Path:
 
 
 def check_links(folder: Path) -> None:
-    """Raises CheckpointError for a link in ``folder``, or one level below, to somewhere else.
+    """Raise CheckpointError for a link out of ``folder``, in it or one level below.
 
-    Those of the Hub's cache lead from ``snapshots/<commit>`` to ``blobs`` beside it.
+    Links of the Hub's cache, from ``snapshots/<commit>`` to ``blobs``, are allowed.
     """
     home = folder.resolve()
     snapshots = next((path for path in home.parents if path.name == "snapshots"), None)
@@ -49,18 +52,18 @@ def check_links(folder: Path) -> None:
 
 
 def commit_of(folder: Path) -> str:
-    """The commit of a checkpoint in the Hub's cache: the name of its snapshot."""
+    """Return the commit of a checkpoint in the Hub's cache (its snapshot's name), else the folder's name."""
     return next((path.name for path in (folder, *folder.parents) if path.parent.name == "snapshots"), folder.name)
 
 
 def best_tag(tags: Iterable[str]) -> str | None:
-    """The tag ``best-<metric>-<score>-step-<n>`` of the highest score, the first of equals; None if there is none."""
+    """Return the tag ``best-<metric>-<score>-step-<n>`` with the highest score, the first of equals; else None."""
     scores = {tag: float(match[1]) for tag in tags if (match := _BEST_TAG.search(tag))}
     return max(scores, key=scores.__getitem__, default=None)
 
 
 def _fetch(repo_id: str, subfolder: str, tag: str | None, path: Path) -> Path:
-    """The folder in the Hub's cache, with all but pickles. ``path``: where a local folder of this name would be."""
+    """Fetch a checkpoint without pickles into the Hub's cache. ``path``: the local folder that does not exist."""
     from huggingface_hub import HfApi, snapshot_download
 
     patterns, run_configs = _FILES, [RUN_CONFIG]
@@ -75,7 +78,7 @@ def _fetch(repo_id: str, subfolder: str, tag: str | None, path: Path) -> Path:
         folder = snapshot / subfolder
         if not any(folder.glob("**/*.safetensors")):
             _refuse_pickles(repo_id, subfolder, tag)
-        if not any(is_there(snapshot / name) for name in run_configs):  # upstream's uploader tags a commit of before it
+        if not any(is_there(snapshot / name) for name in run_configs):  # upstream tags the commit before its upload
             _fetch_run_config_of_main(repo_id, run_configs)
     except _failures() as error:
         where = f"{repo_id}@{tag or 'latest'}"
@@ -91,7 +94,7 @@ def _fetch(repo_id: str, subfolder: str, tag: str | None, path: Path) -> Path:
 
 
 def _failures() -> tuple[type[Exception], ...]:
-    """What huggingface_hub raises; from version 1 on it lets errors of httpx through."""
+    """Exceptions of huggingface_hub, which from version 1 include those of httpx."""
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError
 
     try:
@@ -102,7 +105,7 @@ def _failures() -> tuple[type[Exception], ...]:
 
 
 def _refuse_pickles(repo_id: str, subfolder: str, tag: str | None) -> None:
-    """Raises CheckpointError if all weights are pickles, which are not fetched."""
+    """Raise CheckpointError if the repository has pickled weights, which are never fetched."""
     from huggingface_hub import HfApi
 
     files = [Path(file.rfilename) for file in HfApi().model_info(repo_id, revision=tag).siblings or ()]
@@ -118,7 +121,7 @@ def _refuse_pickles(repo_id: str, subfolder: str, tag: str | None) -> None:
 
 
 def _near(path: Path) -> str:
-    """Folders beside a path that is none, whose names are like its own."""
+    """Name the folders beside a missing path that have similar names."""
     try:
         names = [beside.name for beside in path.parent.iterdir() if beside.is_dir()]
     except OSError:
@@ -128,7 +131,7 @@ def _near(path: Path) -> str:
 
 
 def _cached(repo_id: str, subfolder: str) -> str:
-    """Ids of what the Hub's cache has of a repository, which need no network."""
+    """Name the revisions of a repository in the Hub's cache, which need no network."""
     from huggingface_hub.constants import HF_HUB_CACHE
 
     refs = Path(HF_HUB_CACHE) / f"models--{repo_id.replace('/', '--')}" / "refs"
@@ -138,9 +141,7 @@ def _cached(repo_id: str, subfolder: str) -> str:
 
 
 def _fetch_run_config_of_main(repo_id: str, names: Iterable[str]) -> None:
-    """Fetches the first of main's files of these names into the Hub's cache, where ``find_run_config`` looks. Even main
-    may have none.
-    """
+    """Fetch the first existing of these files of main into the Hub's cache, where ``find_run_config`` looks."""
     from huggingface_hub import _CACHED_NO_EXIST, hf_hub_download, try_to_load_from_cache
     from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
 
@@ -148,7 +149,7 @@ def _fetch_run_config_of_main(repo_id: str, names: Iterable[str]) -> None:
         try:
             hf_hub_download(repo_id, name)
             return
-        except LocalEntryNotFoundError:  # the Hub was not reached; earlier it may have been
+        except LocalEntryNotFoundError:  # no connection; the cache may record that main lacks the file
             if try_to_load_from_cache(repo_id, name) is not _CACHED_NO_EXIST:
                 raise
         except EntryNotFoundError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a checkpoint's scores depend on: what decided each setting, and the digests that identify it."""
+"""The source of each setting that a checkpoint's scores depend on, and digests that identify the checkpoint."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ PROVENANCE = "provenance.json"  # beside an exported checkpoint's config.json; n
 OF_WEIGHTS = "weights"
 OF_UPSTREAM = "default of upstream"
 
-_NAMED_PARTS = 2  # of a path; the whole path may be private
+_NAMED_PARTS = 2  # of a path, whose rest may be private
 
 
 @dataclass(frozen=True)
 class Decision:
-    """One thing that scores depend on, and what decided it.
+    """A setting that scores depend on, with its source.
 
-    value: as JSON can hold it
-    source: OF_WEIGHTS, a file and its key, an option of the caller, or a default and whose it is
-    is_assumed: neither weights nor files prove it, so that it may not be what training had
+    value: a value of JSON
+    source: OF_WEIGHTS, a file and its key, the caller's option, or a default and its author
+    is_assumed: neither weights nor files prove the value, so training may have used another
     """
 
     name: str
@@ -34,32 +34,32 @@ class Decision:
 
     @property
     def text(self) -> str:
-        """The value on one line."""
+        """The value as one line."""
         is_plain = isinstance(self.value, str) and self.value.isprintable()
         return self.value if is_plain else json.dumps(self.value)
 
 
-# Clients pad short trajectories by default, for a checkpoint of either family.
+# The reason why clients pad short trajectories by default, for every family.
 TRAINED_WITH_PADDING = Decision("trained_padding", True, "upstream: every training run pads")
 
 
 def source_name(source: str | Path) -> str:
-    """How models name the source of a checkpoint: by the end of a folder's path, or the Hub id."""
+    """Return the public name of a checkpoint's source: the end of a folder's path, or the Hub id."""
     return "/".join(Path(source).expanduser().resolve().parts[-_NAMED_PARTS:]) if is_folder(source) else str(source)
 
 
 def is_folder(source: str | Path) -> bool:
-    """Whether it is a folder here, which wins over a Hub id."""
+    """True if the source is a local folder, which wins over a Hub id."""
     return bool(str(source)) and Path(source).expanduser().is_dir()
 
 
 def file_name(file: Path, folder: Path) -> str:
-    """The path of a checkpoint's file as seen from its folder."""
+    """Return the path of a checkpoint's file relative to the checkpoint's folder."""
     return os.path.relpath(file, folder if file.is_relative_to(folder) else folder.resolve())
 
 
 def assumed(decisions: Sequence[Decision]) -> list[str]:
-    """One line for the user on all that was assumed; none if nothing was."""
+    """Return one line for the user about all assumed settings, or no line."""
     listed = [f"{each.name} {each.text} ({each.source})" for each in decisions if each.is_assumed]
     if not listed:
         return []
@@ -70,28 +70,28 @@ def assumed(decisions: Sequence[Decision]) -> list[str]:
 
 
 def table(decisions: Sequence[Decision]) -> str:
-    """Lines of name, source and value in columns."""
+    """Return the decisions as lines, with columns for name, source and value."""
     rows = [(each.name, each.source + (", assumed" if each.is_assumed else ""), each.text) for each in decisions]
     widths = [max((len(row[column]) for row in rows), default=0) for column in range(2)]
     return "\n".join(f"{name:{widths[0]}}  {source:{widths[1]}}  {text}" for name, source, text in rows)
 
 
 def write(decisions: Sequence[Decision], folder: Path) -> None:
-    """Writes PROVENANCE into an exported checkpoint's folder."""
+    """Write PROVENANCE into an exported checkpoint's folder."""
     content = json.dumps([asdict(each) for each in decisions], indent=2)
     (folder / PROVENANCE).write_text(content + "\n")
 
 
-DIGEST_DIGITS = 16  # of 64: enough to identify a checkpoint, and to find damage
+DIGEST_DIGITS = 16  # of 64; enough to identify a checkpoint and to detect damage
 
-# Of files beside the weights that decide scores: configuration, tokenizer, image processor.
+# Suffixes of the files that decide scores, besides weights: configuration, tokenizer, image processor.
 SETTINGS_SUFFIXES = (".json", ".jinja", ".model", ".txt", ".yaml")
 
 _CHUNK_BYTES = 2**22
 
 
 def weights_digest(folders: Iterable[Path]) -> str:
-    """The first digits of the SHA-256 of all safetensors files in the folders, one behind the other. Raises OSError."""
+    """Return the first DIGEST_DIGITS of the SHA-256 of all safetensors files in the folders. Raises OSError."""
     digest = hashlib.sha256()
     for file in (file for folder in folders for file in sorted(folder.rglob("*.safetensors"))):
         with file.open("rb") as content:
@@ -101,10 +101,10 @@ def weights_digest(folders: Iterable[Path]) -> str:
 
 
 def settings_digest(folders: Iterable[Path], told: Mapping[str, Any]) -> str:
-    """The first digits of the SHA-256 of what decides scores beside the weights. Raises OSError.
+    """Return the first DIGEST_DIGITS of the SHA-256 of all settings that decide scores. Raises OSError.
 
-    folders: whose files of SETTINGS_SUFFIXES count, with their paths; but for PROVENANCE, which decides nothing
-    told: what no file says, as JSON can hold it
+    folders: of these, all files of SETTINGS_SUFFIXES count, with their paths, except PROVENANCE
+    told: settings that no file holds, as values of JSON
     """
     digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
     for folder in folders:

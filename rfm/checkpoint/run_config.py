@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""config.yaml of the training run: where it is, and what it says of how the heads were trained. No score shows that."""
+"""config.yaml of the training run: its place, and how the run trained the heads, which no score shows."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 PROGRESS, PREFERENCE, SUCCESS, SIMILARITY = HEADS = ("progress", "preference", "success", "similarity")
-MAX_COUNT = 2**20  # of frames: longer than any trajectory
+MAX_COUNT = 2**20  # frames; longer than any trajectory
 _COMMIT_DIGITS = 40
 
 
 def find_run_config(folder: Path) -> Path | None:
-    """The training run's configuration in the checkpoint's folder, its parent, or there on main in the Hub's cache.
+    """Return the run's configuration file: in the checkpoint's folder, its parent, or these on main in the Hub's cache.
 
-    Raises CheckpointError for one from outside the folder that is of another kind of network.
+    Raises CheckpointError if a file outside the folder belongs to another kind of network.
     """
     home = folder.resolve()
     for place in (folder, home.parent, *_places_on_main(home)):
@@ -45,7 +45,7 @@ def find_run_config(folder: Path) -> Path | None:
 
 
 def _check_base(file: Path, folder: Path) -> None:
-    """Raises CheckpointError if the run's base model and the checkpoint's network are of different kinds."""
+    """Raise CheckpointError if the run's base model and the checkpoint's network are of different kinds."""
 
     def plain(name: str) -> str:
         return re.sub(r"[^a-z0-9]", "", name.lower())
@@ -53,7 +53,7 @@ def _check_base(file: Path, folder: Path) -> None:
     base = section_of(read_run_config(file), "model").get("base_model_id")
     if is_there(folder / NETWORK_CONFIG):
         kind = read_json(folder / NETWORK_CONFIG).get("model_type")
-    else:  # an adapter names its base model; the first ReWiND checkpoints say nothing
+    else:  # an adapter names its base model; the first ReWiND checkpoints have no config.json
         kind = None if is_there(folder / ADAPTER_CONFIG) else "rewind_transformer"
     if isinstance(kind, str) and isinstance(base, str) and base and plain(kind) not in plain(base):
         raise CheckpointError(
@@ -63,7 +63,7 @@ def _check_base(file: Path, folder: Path) -> None:
 
 
 def _places_on_main(home: Path) -> list[Path]:
-    """``home``, and the folder above a subfolder, in the Hub's cache of main: the snapshot that refs/main names."""
+    """Return ``home`` (and its parent, for a subfolder) in the snapshot of main in the Hub's cache."""
     snapshot = next((path for path in (home, *home.parents) if path.parent.name == "snapshots"), home)
     main = snapshot.parent.parent / "refs" / "main"
     if snapshot.parent.name != "snapshots" or not is_there(main):
@@ -77,13 +77,16 @@ def _places_on_main(home: Path) -> list[Path]:
 
 
 def section_of(run: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    """The section of that name; an empty one if it is none, which is for the family to refuse."""
+    """Return a section of the configuration; empty if it is no mapping, which the family refuses."""
     section = run.get(name)
     return section if isinstance(section, dict) else {}
 
 
 def trained_frames(run: Mapping[str, Any], file: Path) -> int | None:
-    """The most frames of a trajectory in training, as config.yaml has it; None if it has none."""
+    """Return data.max_frames of config.yaml, the largest number of frames of a trajectory in training, or None.
+
+    Raises CheckpointError.
+    """
     data = run.get("data") or {}
     if not isinstance(data, dict):
         raise CheckpointError(f"{file}: data: expected a mapping, got {shown(data)}")
@@ -91,7 +94,7 @@ def trained_frames(run: Mapping[str, Any], file: Path) -> int | None:
 
 
 def frame_count(frames: Any, where: str) -> int | None:
-    """The value if it is a count of frames, or None. Raises CheckpointError."""
+    """Return ``frames`` if it is None or a valid number of frames. Raises CheckpointError otherwise."""
     if frames is not None and (type(frames) is not int or frames < 1):
         raise CheckpointError(f"{where}: expected a whole number of at least 1, got {shown(frames)}")
     if frames is not None and frames > MAX_COUNT:
@@ -100,12 +103,12 @@ def frame_count(frames: Any, where: str) -> int | None:
 
 
 def check_progress(run: Mapping[str, Any], file: Path) -> None:
-    """Raises CheckpointError for a head that was trained on increments of progress, not on progress.
+    """Raise CheckpointError for a head that was trained on increments of progress.
 
     run: config.yaml, read from ``file``
     """
     kind = section_of(run, "data").get("progress_pred_type")
-    if isinstance(kind, str) and kind.startswith("relative"):  # as upstream's names of increments begin
+    if isinstance(kind, str) and kind.startswith("relative"):  # upstream's names for increments
         raise CheckpointError(
             f"{file}: data.progress_pred_type: expected absolute progress, got {shown(kind)}: such a head predicts how "
             "far the task has come since the frame before, which would be served as how far it has come"
@@ -113,9 +116,9 @@ def check_progress(run: Mapping[str, Any], file: Path) -> None:
 
 
 def training_notes(folder: Path, answered: Collection[str]) -> list[str]:
-    """A line for the user on each thing that the training run of the checkpoint in ``folder`` left untrained.
+    """Return a line for the user about each setting of the training run that makes scores doubtful.
 
-    answered: heads of which its answers are made. The run it started from may have trained them
+    answered: heads that the model serves; an earlier run may have trained them
     Raises CheckpointError for a config.yaml that cannot be read.
     """
     file = find_run_config(folder)
@@ -143,7 +146,7 @@ def training_notes(folder: Path, answered: Collection[str]) -> list[str]:
 
 
 def constant_heads(weights: Mapping[str, Tensor], answered: Collection[str]) -> list[str]:
-    """A line for the user on each head of ``answered`` whose last layer multiplies by 0, as before any training."""
+    """Return a line for the user about each head of ``answered`` whose last weight is 0 throughout, as if untrained."""
     heads = {head: weights.get(f"{head}_head.4.weight") for head in answered}
     return [
         f"{WEIGHTS}: {head}_head.4.weight is 0 throughout: {head} is the same whatever is scored, as if untrained"

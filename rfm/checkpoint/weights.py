@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The weights of a checkpoint: from safetensors files, never from pickles, and without prefixes of training code."""
+"""Read a checkpoint's weights: from safetensors files, never pickles, without the name prefixes of training code."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from rfm.checkpoint.content import (
 if TYPE_CHECKING:
     from torch import Tensor
 
-PICKLE_STEM = "pytorch_model"  # of transformers' pickles of weights
+PICKLE_STEM = "pytorch_model"  # of the names of transformers' pickled weights
 _SHARDS = "model-*.safetensors"
-_ENCODERS = ("image_encoder", "text_encoder")  # below an exported checkpoint's
-_LEVELS = ("*", "*/*", "*/*/*")  # below a folder: a training run's checkpoints, those of a model repository
+_ENCODERS = ("image_encoder", "text_encoder")  # subfolders of an exported checkpoint
+_LEVELS = ("*", "*/*", "*/*/*")  # depth of checkpoints in the folder of a training run or in a model repository
 _MAX_SUGGESTED = 5
 
 _PICKLES = ("*.bin", "*.pt", "*.pth", "*.ckpt", "*.pkl")
-# What training leaves beside weights, to go on from.
+# Files besides weights from which training resumes.
 _STATES = ("optimizer*", "*optim_states*", "scheduler*", "rng_state*", "random_states*", "scaler*", "training_args*")
 _CONVERT = (
     "import argparse, functools, sys, torch, safetensors.torch as s; "
@@ -48,10 +48,10 @@ _CONVERT = (
     "sys.argv[1], {'format': 'pt'})"
 )
 
-# Prefixes that training code puts before names of weights; those inside stand before names of layers, too.
+# Prefixes that training code puts before the names of weights. Those in _INSIDE also stand before names of layers.
 _INSIDE = r"_orig_mod|_fsdp_wrapped_module|_checkpoint_wrapped_module|_forward_module"
 _WRAPPERS = re.compile(rf"^(?:(?:module|base_model\.model|{_INSIDE})\.)+|(?<=\.)(?:(?:{_INSIDE})\.)+")
-_HEAD = "progress_head.4.weight"  # of every network of ours
+_HEAD = "progress_head.4.weight"  # in every reward network
 _STRIP = (
     "import sys, safetensors.torch as s; prefix, target, *files = sys.argv[1:]; "
     "t = [(name.removeprefix(prefix), v) for file in files for name, v in s.load_file(file).items()]; "
@@ -60,7 +60,7 @@ _STRIP = (
 
 
 def read_weights(folder: Path) -> dict[str, Tensor]:
-    """All tensors of model.safetensors or of the shards that its index names, without the prefixes of wrappers.
+    """Return all tensors of model.safetensors, or of its shards, without the prefixes of wrappers.
 
     Raises CheckpointError.
     """
@@ -77,7 +77,7 @@ def read_weights(folder: Path) -> dict[str, Tensor]:
 
 
 def check_one_form(folder: Path) -> None:
-    """Raises CheckpointError for weights that are there whole and in shards: which are the newer, no file says."""
+    """Raise CheckpointError for weights both in one file and in shards, since no file tells which are newer."""
     shards = [path.name for path in (folder / WEIGHTS_INDEX, *sorted(folder.glob(_SHARDS))) if is_there(path)]
     if shards and is_there(folder / WEIGHTS):
         raise CheckpointError(
@@ -87,7 +87,7 @@ def check_one_form(folder: Path) -> None:
 
 
 def _read_shards(index: Path) -> tuple[list[Path], dict[str, Tensor]]:
-    """The shards that the index names, and their tensors."""
+    """Return the shards in the index, and their tensors."""
     weight_map = read_json(index).get("weight_map")
     if not isinstance(weight_map, dict):
         raise CheckpointError(f"{index}: expected a weight_map, got none")
@@ -113,10 +113,11 @@ def _read_shards(index: Path) -> tuple[list[Path], dict[str, Tensor]]:
 
 
 def _unwrapped(weights: Mapping[str, Tensor], files: Sequence[Path], target: Path) -> dict[str, Tensor]:
-    """The weights without the prefixes of DataParallel, torch.compile, PEFT, FSDP, nor another one that all have.
+    """Remove the prefixes of DataParallel, torch.compile, PEFT and FSDP, and any prefix that all names share.
 
-    files: those that hold the weights; target: that which would hold them without another prefix
-    Raises CheckpointError if only some have it, or two would have one name. Which names are right is not known here.
+    files: the files with the weights
+    target: the file for the weights without the prefix, in the error's command
+    Raises CheckpointError if only some names have the prefix, or two names would be equal.
     """
     bare: dict[str, Tensor] = {}
     for name, tensor in weights.items():
@@ -138,7 +139,7 @@ def _unwrapped(weights: Mapping[str, Tensor], files: Sequence[Path], target: Pat
 
 
 def _below(folder: Path) -> str:
-    """Where there are weights below a folder that has none, or what a folder with weights looks like."""
+    """Name the checkpoints below a folder that has no weights, or describe a checkpoint's folder."""
     names = (WEIGHTS, WEIGHTS_INDEX, ADAPTER_WEIGHTS)
     found = [file.parent for level in _LEVELS for name in names for file in sorted(folder.glob(f"{level}/{name}"))]
     checkpoints = [str(path) for path in dict.fromkeys(found) if path.name not in _ENCODERS]
@@ -148,18 +149,18 @@ def _below(folder: Path) -> str:
 
 
 def take_prefix(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Moves the tensors under ``prefix`` out of ``weights``, without the prefix."""
+    """Remove the tensors under ``prefix`` from ``weights``; return them without the prefix."""
     names = [name for name in weights if name.startswith(prefix)]
     return {name.removeprefix(prefix): weights.pop(name) for name in names}
 
 
 def has_head(weights: Iterable[str], head: str) -> bool:
-    """Whether there are weights of the head of ``head``; one of which some are missing is refused later."""
+    """True if the weights contain any of this head's; ``check_shapes`` finds an incomplete head."""
     return any(name.startswith(f"{head}_head.") for name in weights)
 
 
 def check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> None:
-    """Raises CheckpointError unless both have the same names, shapes and kinds of numbers."""
+    """Raise CheckpointError unless names, shapes and kinds of numbers (floating-point or not) agree."""
     _check_names(expected.keys(), got.keys())
     for name, tensor in got.items():
         if tensor.shape != expected[name].shape:
@@ -169,11 +170,11 @@ def check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> N
 
 
 def check_finite(weights: Mapping[str, Tensor]) -> None:
-    """Raises CheckpointError for a weight that is no number. A score that it makes may still be one: success of 1."""
+    """Raise CheckpointError for a weight that is not finite. Its scores may still be finite, such as a success of 1."""
     for name, tensor in weights.items():
         if not (tensor.is_floating_point() and tensor.numel()):
             continue
-        if not all(extreme.isfinite() for extreme in tensor.aminmax()):  # fifty times as fast as isfinite of each
+        if not all(extreme.isfinite() for extreme in tensor.aminmax()):  # 50 times as fast as isfinite of each value
             at = (~tensor.isfinite()).nonzero()[0].tolist()
             raise CheckpointError(f"{name}: expected finite weights, got {tensor[tuple(at)].item()} at {at}")
 
@@ -186,9 +187,9 @@ def _check_names(expected: Iterable[str], got: Iterable[str]) -> None:
 
 
 def pickled_weights(names: Iterable[str], stem: str) -> list[str]:
-    """Those of a folder's files that are pickles and may hold its weights.
+    """Return the pickles among a folder's files that may hold weights.
 
-    stem: how transformers begins their names; if there are such, the others are left out
+    stem: of transformers' names; if files with such names exist, only these are returned
     """
 
     def is_any(name: str, patterns: Sequence[str]) -> bool:
@@ -200,9 +201,9 @@ def pickled_weights(names: Iterable[str], stem: str) -> list[str]:
 
 
 def refuse_pickles(folder: Path, wanted: str, stem: str) -> None:
-    """Raises CheckpointError if ``folder`` has pickled weights, where the file ``wanted`` is not there.
+    """Raise CheckpointError if ``folder`` has pickled weights in place of the missing file ``wanted``.
 
-    They are never opened here, since that may run code; the message has the command that converts them.
+    Pickles are never opened, since that may run code. The message holds a command that converts them.
     """
     names = pickled_weights((file.name for file in folder.iterdir()), stem)
     if not names:
@@ -220,5 +221,5 @@ def refuse_pickles(folder: Path, wanted: str, stem: str) -> None:
 
 
 def _command(code: str, arguments: Iterable[str | Path]) -> str:
-    """A line for a shell that runs ``code``, which has no double quotes."""
+    """Return a shell command that runs ``code``, which must have no double quotes."""
     return f'python -c "{code}" {shlex.join(map(str, arguments))}'

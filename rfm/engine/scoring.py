@@ -214,7 +214,6 @@ class Engine:
         ]
 
     def _scores(self, rows: Sequence[Any], execution: Execution) -> list[RowScores | RewardError]:
-        """Each row's scores. While a batch is in its forward pass the next is collated."""
         scores: dict[int, RowScores | RewardError] = {}
         for part, batch in self._collated(rows, list(self._micro_batches(rows))):
             with execution.forwarding():
