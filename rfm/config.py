@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""What an export and a server are told: the sections ``export`` and ``serve`` of one YAML file.
+"""The settings of an export and a server: the sections ``export`` and ``serve`` of one YAML file.
 
-``rfm_commands.config`` reads that file.
+``rfm_commands.config`` reads this file.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_TOKEN_BUDGET = 16_384
 DEFAULT_SAMPLE_TOKENS = 131_072
-DEFAULT_FEATURE_CACHE_MB = 256  # 80,000 embeddings of 768 numbers; of a 4B Qwen3-VL 170 frames of 256x256
+DEFAULT_FEATURE_CACHE_MB = 256  # 80,000 embeddings of 768 numbers, or 170 frames of 256x256 of a 4B Qwen3-VL
 MAX_OF_A_MACHINE = 4096  # GPUs, instances, threads
 MAX_INT32 = 2**31 - 1
-MAX_NAME = 100  # characters; it becomes the name of a folder
+MAX_NAME = 100  # characters; the name of a model becomes that of a folder
 Dtype: TypeAlias = Literal["float32", "bfloat16", "float16"]
 
 _COUNT = {"least": 1, "most": MAX_INT32}
@@ -36,7 +36,7 @@ _OF_A_MACHINE = {"most": MAX_OF_A_MACHINE}
 
 @dataclass(frozen=True)
 class ExportConfig(Settings):
-    """What ``rfm export`` writes into a repository. To change it, export again."""
+    """The settings that ``rfm export`` writes into a repository. To change them, export again."""
 
     TITLE: ClassVar[str] = "Export (section export of the file)"
 
@@ -93,16 +93,16 @@ class ExportConfig(Settings):
     @property
     def torch_dtype(self) -> torch.dtype | None:
         """The torch type that ``dtype`` names; None: ``dtype`` is not set."""
-        import torch  # imported here: few readers of a configuration need torch
+        import torch  # imported here: few readers of a configuration need it
 
         return getattr(torch, self.dtype) if self.dtype else None
 
 
 @dataclass(frozen=True)
 class ServeConfig(Settings):
-    """What ``rfm serve`` itself reads. To change it, start it again.
+    """The settings of ``rfm serve`` itself. To change them, start it again.
 
-    ``host`` may be written as a URL, as in the FastAPI server's file; it is the address alone here.
+    ``host`` may be a URL, as in the FastAPI server's file; only its address is kept.
     """
 
     TITLE: ClassVar[str] = "Triton and its watch (section serve of the file)"
@@ -140,21 +140,21 @@ class ServeConfig(Settings):
 
     @property
     def is_loopback(self) -> bool:
-        """Whether only this machine can reach it."""
+        """True if only this machine can reach the server."""
         return is_loopback(self.host)
 
 
 def _address(host: str) -> str:
-    """The IP address in a host that may be written as a URL. Raises ConfigError."""
+    """Return the IP address of a host, which may be a URL. Raises ConfigError."""
     address = (host.partition("://")[2] or host).rstrip("/")
     if address == "localhost":
         return DEFAULT_HOST
     if address.startswith("[") and address.endswith("]"):
         address = address[1:-1]
     try:
-        if "%" in address:  # a zone, which Triton's HTTP server does not take
+        if "%" in address:  # an IPv6 zone, which Triton's HTTP server does not support
             raise ValueError
         return str(ipaddress.ip_address(address))
-    except ValueError:  # Triton would listen for a name at 255.255.255.255
+    except ValueError:  # Triton would take a name as 255.255.255.255
         expected = "an IP address without port (http_port), such as 127.0.0.1, ::1, 0.0.0.0 or ::"
         raise ConfigError("host", f"expected {expected}, got {address!r:.200}") from None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which family a checkpoint is of: found by its name, or by its files; loaded and checked."""
+"""Find a checkpoint's family by name or by the checkpoint's files, and load the checkpoint."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from rfm.checkpoint.run_config import HEADS, SIMILARITY, constant_heads, trainin
 from rfm.checkpoint.weights import check_finite
 from rfm.family import NETWORK, Checkpoint, Family, FrameEncoders, Options
 
-# Packages in the order in which they are tried. ReWiND's comes last: its first checkpoints do not say what they are.
+# Packages in the order in which they are tried. ReWiND comes last: its first checkpoints do not name their network.
 FAMILIES = ("rfm.vlm", "rfm.rewind")
 
 
 def named(package: str) -> Family:
-    """The family that a package holds as its ``FAMILY``. Raises CheckpointError if it holds none."""
+    """Return a package's ``FAMILY``. Raises CheckpointError if there is none."""
     try:
         family = getattr(import_module(package), "FAMILY", None)
     except ImportError as error:
@@ -32,8 +32,9 @@ def named(package: str) -> Family:
 
 
 def encoders_of(package: str | None) -> type[FrameEncoders]:
-    """The class of the encoders of a family; None: of the one whose exports did not name it. Raises CheckpointError if
-    it has none.
+    """Return the class of a family's encoders. Raises CheckpointError if the family has none.
+
+    package: None: ReWiND, which old exports do not name
     """
     encoders = named(package or FAMILIES[-1]).encoders
     if encoders is None:
@@ -42,11 +43,11 @@ def encoders_of(package: str | None) -> type[FrameEncoders]:
 
 
 def choose(folder: Path, package: str | None = None) -> Family:
-    """The family of the checkpoint in a local folder: that of ``package``, else the first that reads the folder."""
+    """Return the family ``package``, else the first family that reads the folder. Raises CheckpointError."""
     if package:
         return named(package)
     known = [named(name) for name in FAMILIES]
-    return next((family for family in known if family.reads(folder)), known[-1])  # whose error says what was expected
+    return next((family for family in known if family.reads(folder)), known[-1])  # its load explains the fault
 
 
 def load(
@@ -57,7 +58,7 @@ def load(
     image_encoder: str | None = None,
     text_encoder: str | None = None,
 ) -> Checkpoint:
-    """The checkpoint at a local folder or Hugging Face id. Raises CheckpointError.
+    """Load the checkpoint of a local folder or Hugging Face id. Raises CheckpointError.
 
     family: package of its family; None: the family that reads the folder's files
     others: as in ``rfm.family.Options``
@@ -68,7 +69,7 @@ def load(
 
 
 def load_from(folder: Path, family: Family, options: Options) -> Checkpoint:
-    """The checkpoint in a local folder. Raises CheckpointError, also for weights that are no numbers."""
+    """Load the checkpoint of a local folder. Raises CheckpointError, also for weights that are not finite."""
     checkpoint = family.load(folder, options)
     for weights in checkpoint.parts.values():
         check_finite(weights)
@@ -76,14 +77,14 @@ def load_from(folder: Path, family: Family, options: Options) -> Checkpoint:
 
 
 def notes(folder: Path, checkpoint: Checkpoint, answered: Collection[str] = HEADS) -> list[str]:
-    """A line for the user on each thing that decides the scores of the checkpoint in ``folder``, and may be wrong.
+    """Return a line for the user about each doubtful setting or head that the checkpoint's scores depend on.
 
-    answered: heads of which its answers are made; of those that it lacks only that is said
+    answered: heads that the model serves; of a missing head, only its absence is noted
     Raises CheckpointError for a config.yaml that cannot be read.
     """
     lacks = checkpoint.description.lacks
     heads = [head for head in answered if head not in lacks]
-    missing = [head for head in answered if head in lacks - {SIMILARITY}]  # most have no head of similarity
+    missing = [head for head in answered if head in lacks - {SIMILARITY}]  # most checkpoints have no similarity head
     without = [f"{WEIGHTS}: there is no head of {' and '.join(missing)}: served without"] if missing else []
     of_weights = constant_heads(checkpoint.parts[NETWORK], heads)
     of_run = training_notes(folder, heads)

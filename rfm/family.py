@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The seam of a family of checkpoints: what the engine and the export need of it.
-
-A package that holds a ``FAMILY`` is one."""
+"""The interface of a family of checkpoints to the engine and the export. A family is a package with a ``FAMILY``."""
 
 from __future__ import annotations
 
@@ -23,17 +21,17 @@ if TYPE_CHECKING:
     from rfm.engine.feature_cache import FeatureCache
     from rfm.engine.predictor import Predictor
 
-NETWORK = "network"  # in Checkpoint.parts: the weights of the network that scores
-_USUAL_HEADS = ("has_preference", "has_success")  # fields of configurations
+NETWORK = "network"  # key in Checkpoint.parts: the weights of the network that scores
+_USUAL_HEADS = ("has_preference", "has_success")  # fields of networks' configurations
 
 
 @dataclass(frozen=True)
 class Options:
-    """What a user may say of a checkpoint that its files do not hold. Each family reads its own fields.
+    """The user's options for files that a checkpoint lacks. Each family reads its own fields.
 
-    base_model: folder or id of a vision-language checkpoint's backbone; None: the one that the checkpoint names
-    image_encoder, text_encoder: folders or ids of a ReWiND checkpoint's encoders; None: the usual ones, if the
-        checkpoint has weights of encoders
+    base_model: folder or id of a vision-language checkpoint's base model; None: as the checkpoint names it
+    image_encoder, text_encoder: folders or ids of a ReWiND checkpoint's encoders; None: upstream's, if the checkpoint
+        has weights of encoders or the other is set
     """
 
     base_model: str | None = None
@@ -43,18 +41,17 @@ class Options:
 
 @dataclass(frozen=True)
 class Description:
-    """What a checkpoint takes, and what it answers.
+    """The inputs and outputs of a checkpoint.
 
-    widths: Dv and Dt of the embeddings that it scores; None: it scores raw frames
+    widths: Dv and Dt, the widths of the frame and task embeddings that it scores; None: it scores raw frames
     progress_bins: K; 1: continuous progress
-    max_frames: the longest trajectory that its network can take; None: any length
-    trained_frames, trained_padding: the most frames of a trajectory in training, and whether shorter ones were padded;
-        None: the checkpoint does not say
-    frame_size: to what it brings each raw frame; None: that depends on the frame
-    frames_per_value: frames that share their scores
-    keeps_features: it can keep what it makes of frames, and takes samples with named frames then
-    is_large: its exports are verified in the type that serves it, and on a GPU with room for it, since float32 on the
-        CPU takes long
+    max_frames: frames of the longest trajectory that the network can score; None: no limit
+    trained_frames: largest number of frames of a trajectory in training; None: unknown
+    trained_padding: training padded shorter trajectories; None: unknown
+    frame_size: the size to which the checkpoint resizes each raw frame; None: it depends on the frame
+    frames_per_value: consecutive frames with one score
+    keeps_features: it can cache features of frames, and then takes samples with frame references
+    is_large: exports are verified in the dtype that serves, on a GPU if it has room, since float32 on the CPU is slow
     """
 
     network_class: str
@@ -73,15 +70,15 @@ class Description:
 
     @property
     def lacks(self) -> frozenset[str]:
-        """Names of the heads that the network has not."""
+        """Names of the heads that the network lacks."""
         heads = {"preference": self.has_preference, "success": self.has_success, "similarity": self.has_similarity}
         return frozenset(name for name, is_there in heads.items() if not is_there)
 
 
 def config_fields(config: Any) -> dict[str, Any]:
-    """The fields of a network's configuration, as files and digests have them.
+    """Return the fields of a network's configuration, as in files and digests.
 
-    The heads of preference and of success are named only where they are missing, as before networks could lack them.
+    The preference and success heads stand there only if missing, so that older files and digests stay valid.
     """
     fields = asdict(config)
     return {name: value for name, value in fields.items() if name not in _USUAL_HEADS or not value}
@@ -89,32 +86,35 @@ def config_fields(config: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class EncodersDescription:
-    """What the export records of encoders; ``frame_size``: to what they bring each raw frame; None: it depends."""
+    """The export's record of encoders.
+
+    frame_size: the size to which they resize each raw frame; None: it depends on the frame
+    """
 
     network_class: str
     frame_size: FrameSize | None = None
 
 
 class FrameEncoders(Protocol):
-    """Networks that make the embeddings that a checkpoint scores of raw frames and their task."""
+    """Networks that turn raw frames and a task into embeddings for a checkpoint."""
 
     @classmethod
     def load(cls, folder: Path) -> FrameEncoders:
-        """The encoders that ``save`` wrote into ``folder``."""
+        """Load the encoders that ``save`` wrote into ``folder``."""
 
     @classmethod
     def describe(cls, folder: Path) -> EncodersDescription:
-        """The description of the encoders that ``save`` wrote into ``folder``, without loading them."""
+        """Return the description of the encoders that ``save`` wrote into ``folder``, without loading them."""
 
     @property
     def description(self) -> EncodersDescription:
-        """What the export records of these encoders."""
+        """The export's record of these encoders."""
 
     def save(self, folder: Path) -> None:
-        """Writes them into a folder that may be there, so that ``load`` needs no network."""
+        """Write the encoders into a folder, which may exist; ``load`` then needs no internet."""
 
     def to(self, device: torch.device) -> FrameEncoders:
-        """Moves the encoders to ``device``, and returns them."""
+        """Move the encoders to ``device``, and return them."""
 
     def encode(
         self,
@@ -122,10 +122,10 @@ class FrameEncoders(Protocol):
         execution: Execution,
         cache: FeatureCache[Float32Array] | None,
     ) -> list[EncoderSample | RewardError]:
-        """Each sample with embeddings of its trajectories' frames and of its task, or why it has none.
+        """Return each sample with embeddings of its frames and task, or its error.
 
-        execution: what it took is added to it
-        cache: where it keeps embeddings, and finds those that it has kept; None: nowhere, and no frames are named
+        execution: the costs are added to it
+        cache: of embeddings; None: no cache, and no samples with frame references
         """
 
 
@@ -134,47 +134,47 @@ class Checkpoint(Protocol):
 
     @property
     def config(self) -> Any:
-        """What its network looks like: a dataclass."""
+        """The network's configuration, a dataclass."""
 
     @property
     def description(self) -> Description:
-        """What the checkpoint takes, and what it answers."""
+        """The checkpoint's inputs and outputs."""
 
     @property
     def parts(self) -> Mapping[str, Mapping[str, Tensor]]:
-        """All weights by part and name. The part NETWORK is always there."""
+        """All weights by part and name. The part NETWORK always exists."""
 
     @property
     def notes(self) -> Sequence[str]:
-        """A line for the user on each thing that contradicts what is known of the training run."""
+        """A line for the user about each contradiction to the known facts of training."""
 
     def decisions(self) -> Sequence[Decision]:
-        """What decided each thing that scores depend on. Raises CheckpointError for files that cannot be had."""
+        """Return the source of each setting that scores depend on. Raises CheckpointError for missing files."""
 
     def encoders(self) -> FrameEncoders | None:
-        """The checkpoint's encoders; None: it has none. Raises CheckpointError if they cannot be had or do not fit."""
+        """Return the checkpoint's encoders, or None. Raises CheckpointError if they are missing or do not fit."""
 
     def predictor(
         self, device: torch.device, dtype: torch.dtype | None = None, cache: FeatureCache[Any] | None = None
     ) -> Predictor[Any, Any]:
-        """The checkpoint's network on ``device``, as a predictor. Raises CheckpointError.
+        """Return a predictor with the checkpoint's network on ``device``. Raises CheckpointError.
 
         dtype: of the network; None: as checkpoint and device decide
-        cache: where it keeps what it makes of frames, if the description says that it does; None: nowhere
+        cache: for features of frames, if ``Description.keeps_features``; None: no cache
         """
 
     def save(self, folder: Path) -> None:
-        """Writes all but its encoders into a new folder that its family loads without options and without network."""
+        """Write all but the encoders into a new folder, which the family loads without options or internet."""
 
 
 @dataclass(frozen=True)
 class Family:
-    """How checkpoints of one kind are recognised and loaded.
+    """The functions that recognise and load the checkpoints of a family.
 
-    name: the package that has this as its ``FAMILY``
-    reads: whether a folder may hold a checkpoint of this kind; used where nobody names the family
-    load: the checkpoint in a local folder; raises CheckpointError
-    encoders: the class of its checkpoints' encoders; None: they score raw frames
+    name: the package with this object as its ``FAMILY``
+    reads: returns True if a folder may hold a checkpoint of the family; used if the caller names no family
+    load: loads the checkpoint of a local folder; raises CheckpointError
+    encoders: the class of the family's encoders; None: its checkpoints score raw frames
     """
 
     name: str

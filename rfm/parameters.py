@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""What a model process is told: its version's folder, parameters in config.pbtxt, variables of rfm serve."""
+"""Names of a model process's settings: folder in its version, parameters in config.pbtxt, environment variables."""
 
-CHECKPOINT_FOLDER = "checkpoint"  # in a version of a model that scores
+CHECKPOINT_FOLDER = "checkpoint"  # in a version of a scoring model
 
 THREADS_PARAMETER = "torch_threads"
 BUDGET_PARAMETER = "token_budget"
 SAMPLE_TOKENS_PARAMETER = "max_sample_tokens"
-FAMILY_PARAMETER = "family"  # the package of its checkpoint's family
-DTYPE_PARAMETER = "dtype"  # empty: as the checkpoint and the device decide
-FEATURE_CACHE_PARAMETER = "feature_cache_mb"  # 0: nothing is kept
-OLD_QUEUE_PARAMETERS = ("max_queue_size", "queue_timeout_ms")  # of exports before Triton's queue was bounded itself
+FAMILY_PARAMETER = "family"  # the package of the checkpoint's family
+DTYPE_PARAMETER = "dtype"  # empty: as checkpoint and device decide
+FEATURE_CACHE_PARAMETER = "feature_cache_mb"  # 0: no cache
+OLD_QUEUE_PARAMETERS = ("max_queue_size", "queue_timeout_ms")  # of old exports; today's bound Triton's own queue
 
-HANG_VARIABLE = "RFM_HANG_S"  # after how many seconds without progress of a batch it ends
+HANG_VARIABLE = "RFM_HANG_S"  # seconds without progress of a batch after which the process ends
 DEFAULT_HANG_S = 120

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""YAML files of others: plain values, in bounded memory and time."""
+"""Read untrusted YAML files as plain values, in bounded memory and time."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any
 import yaml
 
 MAX_YAML_BYTES = 2**18  # a training run's config.yaml has a few thousand
-MAX_YAML_VALUES = 100_000  # with every alias and merge key written out
+MAX_YAML_VALUES = 100_000  # with all aliases and merge keys expanded
 MAX_DIGITS = 100
 
-# What PyYAML raises beside its own errors: of `!!timestamp x`, `!!bool x`, `!!int ""`, 5000 digits, 1000 brackets.
+# PyYAML's own errors and those that it raises for `!!timestamp x`, `!!bool x`, `!!int ""`, 5000 digits, 1000 brackets.
 _MISREAD = (yaml.YAMLError, ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 
 
 def read_yaml(file: Path, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
-    """The one document in the file. Raises OSError, and ValueError for what is no YAML, or more than is bearable."""
+    """Return the file's single document. Raises OSError, and ValueError for invalid YAML or exceeded limits."""
     with file.open("rb") as content:
         text = content.read(MAX_YAML_BYTES + 1)
     if len(text) > MAX_YAML_BYTES:
@@ -39,9 +39,9 @@ def read_yaml(file: Path, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> An
 
 
 def _num_values(node: yaml.Node, known: dict[int, int | None]) -> int:
-    """Number of values in a node with its aliases written out.
+    """Count the values in a node, with its aliases expanded.
 
-    Raises ValueError for a node inside itself and for a key that stands twice.
+    Raises ValueError for a node inside itself and for a duplicate key.
     """
     if id(node) in known:
         count = known[id(node)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The request of a health probe: the smallest one that a model can answer."""
+"""The smallest request that a model can answer, for health probes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rfm_client.contract.synthetic import blank_trajectory
 
 
 def probe_request(config: Mapping[str, Any]) -> wire.Tensors:
-    """The inputs of one blank sample, for a model with this configuration."""
+    """Return the inputs of one blank sample, for a model with this configuration."""
     dims = {tensor["name"]: [int(dim) for dim in tensor["dims"]] for tensor in config["input"]}
     widths = None
     if wire.VIDEO_EMBEDDINGS in dims:
