@@ -7,7 +7,7 @@ TOOL := PYTHONPATH=tests/support:tools $(BIN)/python
 
 # `make help` shows the first line of the comment above each target.
 .PHONY: help demo test test-all nightly test-newest check parity bench bench-full perf chaos soak format model_repository \
-  clean ops-check ops-tools audit lock mutate docs prose
+  clean ops-check ops-tools audit lock mutate docs prose version
 
 # What can be made: this list.
 help:
@@ -139,6 +139,13 @@ lock:
 	  --no-annotate --universal --python-version 3.10 --generate-hashes --constraints constraints.txt --excludes - \
 	  --extra encoders --extra vlm client/pyproject.toml gateway/pyproject.toml pyproject.toml; } > $(VENV)/lock/requirements.txt
 	mv $(VENV)/lock/requirements.txt docker/requirements.txt
+
+VERSIONED := pyproject.toml client/pyproject.toml gateway/pyproject.toml CITATION.cff docker/.env.example docker/compose.yaml \
+  docker/kubernetes/kserve/kustomization.yaml $(wildcard docker/kubernetes/overlays/*/kustomization.yaml) docs/guides/deploy.md
+
+# Write a version into every file that names it: make version VERSION=1.2.3
+version:
+	sed -i "s/$$(sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)/$(VERSION)/g" $(VERSIONED)
 
 # Format the code.
 format: $(INSTALLED)

@@ -193,8 +193,8 @@ def test_a_dataset_with_links_that_leave_it_is_refused(folders: list[Path], tmp_
 
 def test_links_inside_a_dataset_are_followed(tmp_path: Path) -> None:
     root = copied("toy_v30_many", tmp_path)
-    (root / "videos").rename(root / "videos")
-    (root / "videos").symlink_to(root / "videos")
+    (root / "videos").rename(root / "elsewhere")
+    (root / "videos").symlink_to(root / "elsewhere")
     with serving(root) as get:
         check_frames(get, root, 1)
 

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from commands import REPOSITORY, nothing_left_behind
 from rfm.config import ConfigError, ServeConfig
-from rfm.launch import endpoints, proc
+from rfm.launch import endpoints, process_table
 from rfm.launch.endpoints import PORTS, Endpoints, GrpcTls, check_version, free_ports
 from rfm.launch.installation import ServerStartError
 from rfm.launch.triton_server import TritonServer
@@ -132,14 +132,16 @@ def test_children_are_found_dead_or_alive(monkeypatch: pytest.MonkeyPatch, has_l
     children = [subprocess.Popen(["sleep", "3600"]) for _ in range(2)]
     try:
         children[0].kill()
-        wait_for(lambda: (stat := proc.stat_of(children[0].pid)) is not None and stat.state == proc.ZOMBIE)
-        assert {child.pid for child in children} <= set(proc.children_of(os.getpid()))
-        assert os.getppid() not in proc.children_of(os.getpid())
+        wait_for(
+            lambda: (stat := process_table.stat_of(children[0].pid)) is not None and stat.state == process_table.ZOMBIE
+        )
+        assert {child.pid for child in children} <= set(process_table.children_of(os.getpid()))
+        assert os.getppid() not in process_table.children_of(os.getpid())
     finally:
         for child in children:
             child.kill()
             child.wait()
-    assert not {child.pid for child in children} & set(proc.children_of(os.getpid()))
+    assert not {child.pid for child in children} & set(process_table.children_of(os.getpid()))
 
 
 @pytest.mark.slow

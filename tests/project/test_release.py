@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: MIT
+"""A release: one version everywhere, and wheels that serve without the source tree."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import sysconfig
+import venv
+from pathlib import Path
+
+import pytest
+
+from paths import ROOT
+from rfm.launch.endpoints import Endpoints
+
+DISTRIBUTIONS = {"rfm_client": ROOT / "client", "rfm_gateway": ROOT / "gateway", "rfm_triton": ROOT}
+
+
+def version() -> str:
+    found = re.search(r'^version = "(.*)"', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
+    assert found
+    return found[1]
+
+
+def test_every_file_names_the_version() -> None:
+    listed = subprocess.run(
+        ["make", "--just-print", "version", "VERSION=9.9.9"], cwd=ROOT, check=True, capture_output=True, text=True
+    ).stdout.split()
+    files = [word for word in listed if (ROOT / word).is_file()]
+    assert len(files) >= 10
+    for file in dict.fromkeys(files):
+        assert version() in (ROOT / file).read_text(), file
+    released = re.search(r"^## \[(\d.*)\] - \d{4}-\d\d-\d\d$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert released
+    assert released[1] == version()
+
+
+@pytest.mark.slow
+def test_wheels_serve_and_score_without_the_source_tree(tmp_path: Path) -> None:
+    copy, wheels, environment = tmp_path / "source", tmp_path / "wheels", tmp_path / "environment"
+    subprocess.run(["git", "clone", "--quiet", ROOT, copy], check=True)
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    for folder in DISTRIBUTIONS.values():
+        source = copy / folder.relative_to(ROOT)
+        words = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", wheels, source]
+        subprocess.run([*pip, *words], check=True, timeout=300)
+    venv.create(environment, with_pip=False, symlinks=True)
+    python = environment / "bin" / "python"
+    install = ["--python", python, "install", "--no-deps", "--no-index", *wheels.glob("*.whl")]
+    subprocess.run([*pip, *install], check=True, timeout=300)
+    # the dependencies are this environment's, whose own editable packages a .pth file does not bring along
+    packages = environment / "lib" / f"python{sysconfig.get_python_version()}" / "site-packages"
+    (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+    where = "import rfm, rfm_client, rfm_commands, rfm_export, rfm_gateway as g; print(rfm.__file__, g.__file__)"
+    told = subprocess.run([python, "-c", where], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+    assert all(path.startswith(str(packages)) for path in told.split())
+    for package in ("rfm", "rfm_client", "rfm_commands", "rfm_export", "rfm_gateway"):
+        assert (packages / package / "py.typed").is_file()
+    for program, name in (("rfm", "rfm-triton"), ("rfm-client", "rfm-client")):
+        done = subprocess.run([environment / "bin" / program, "--version"], check=True, capture_output=True, text=True)
+        assert done.stdout == f"{program} {version()}\n", name
+    ports = Endpoints.free()
+    serve = [environment / "bin" / "rfm", "serve", ROOT / "model_repository", "--grpc-port", str(ports.grpc_port)]
+    serve += ["--http-port", str(ports.http_port), "--metrics-port", str(ports.metrics_port)]
+    client = [environment / "bin" / "rfm-client"]
+    url = ["--url", f"grpc://127.0.0.1:{ports.grpc_port}"]
+    with (tmp_path / "serve.log").open("wb") as log, subprocess.Popen(serve, cwd=tmp_path, stderr=log) as server:
+        try:
+            subprocess.run([*client, "wait", *url, "--timeout", "100"], check=True)
+            sample = [*client, "sample", *url, "--json", tmp_path / "answer.json"]
+            subprocess.run(sample, check=True, capture_output=True)
+        finally:
+            server.terminate()
+    assert "progress" in (tmp_path / "answer.json").read_text()
