@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""ReWiND: embeddings, or raw frames through encoders, into the ReWiND transformer."""
+"""ReWiND: the transformer that scores embeddings, and the encoders that make them from raw frames."""
 
 from rfm.family import Family
 from rfm.rewind.checkpoint import load, reads

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""ReWiND checkpoints: one flat file of weights, the encoders' under a prefix.
+"""ReWiND checkpoints: the weights of the network and, under a prefix, of the encoders.
 
 Where configuration and weights disagree, the weights decide.
 """
@@ -50,9 +50,9 @@ MODEL_TYPE = "rewind_transformer"
 IMAGE_ENCODER_PREFIX = "image_encoder."
 TEXT_ENCODER_PREFIX = "text_encoder."
 
-# Upstream's configurations of before causal_mask, when no network had one, state all of these.
+# Upstream's configurations from before causal_mask state all of these fields; no network had a causal mask then.
 _FIRST_FIELDS = ("video_feature_dim", "text_feature_dim", "hidden_dim", "num_layers", "num_attention_heads", "max_len")
-# What no ReWiND network is beyond, nor below 1: whatever is larger is a lie that would only cost memory and time.
+# Upper limits of a network's sizes, against files that would only cost memory and time; the lower limit is 1.
 _LIMITS = dict.fromkeys((*_FIRST_FIELDS, "progress_bins"), MAX_COUNT) | {"num_layers": 1024}
 _LAYERS = "transformer.layers."
 _OF_WEIGHTS = (
@@ -61,11 +61,11 @@ _OF_WEIGHTS = (
 )  # fmt: skip
 _STATED_TYPES: dict[str, type] = {"num_attention_heads": int, "max_len": int, "causal_mask": bool}
 
-# The first ReWiND code, the paper's (https://github.com/Jiahui-3205/ReWiND_Release): progress alone, names of its own,
-# no configuration. Its network always has so many heads and a causal mask. Its training script shows 16 frames unless
-# told otherwise.
+# The paper's code, the first (https://github.com/Jiahui-3205/ReWiND_Release), has progress alone, other names and no
+# configuration. Its networks all have 8 attention heads and a causal mask. Its training script shows 16 frames by
+# default.
 _FIRST_CODES_FRAME = "first_pos_embed"  # [1, D]; added to the first frame
-_FIRST_CODES_UNREAD = "class_token"  # a parameter that its network never reads
+_FIRST_CODES_UNREAD = "class_token"  # a parameter that the network never reads
 _FIRST_CODES_SETTINGS = {
     name: Decision(name, value, "default of the first ReWiND code", is_assumed=True)
     for name, value in {"num_attention_heads": 8, "causal_mask": True, "max_len": 16}.items()
@@ -77,10 +77,10 @@ class RewindCheckpoint:
     """A ReWiND checkpoint in memory.
 
     network: weights of RewindTransformer
-    image_encoder, text_encoder: encoder weights without their prefix; empty if the checkpoint has none
-    image_source, text_source: folders or ids of the encoders that the user names; None: the usual ones, if the
-        checkpoint has weights of encoders
-    settings: what decided its configuration
+    image_encoder, text_encoder: weights of encoders without their prefix; empty if the checkpoint has none
+    image_source, text_source: folders or ids of encoders from the user; None: upstream's, if the checkpoint has
+        weights of encoders or the other is set
+    settings: the source of each setting of the configuration
     """
 
     config: RewindConfig
@@ -93,7 +93,7 @@ class RewindCheckpoint:
 
     @property
     def description(self) -> Description:
-        """What the checkpoint takes, and what it answers."""
+        """The checkpoint's inputs and outputs."""
         return Description(
             network_class=RewindTransformer.__name__,
             widths=(self.config.video_feature_dim, self.config.text_feature_dim),
@@ -108,12 +108,12 @@ class RewindCheckpoint:
 
     @property
     def parts(self) -> dict[str, dict[str, Tensor]]:
-        """All weights, by part and name."""
+        """All weights by part and name."""
         return {NETWORK: self.network, "image_encoder": self.image_encoder, "text_encoder": self.text_encoder}
 
     @property
     def notes(self) -> list[str]:
-        """A line on each encoder that is as wide as upstream's and another one."""
+        """A line for each encoder that differs from upstream's of the same width."""
         if not self._has_encoders:
             return []
         compared = zip((IMAGE_ENCODER, TEXT_ENCODER), self._sources, map(differences, self._facts()), strict=True)
@@ -125,7 +125,10 @@ class RewindCheckpoint:
         ]
 
     def decisions(self) -> list[Decision]:
-        """What decided each setting, and the encoders, which no file of a training run names."""
+        """Return the source of each setting and encoder; no file of a training run names encoders.
+
+        Raises CheckpointError if the encoders' files are missing.
+        """
         decided = [*self.settings]
         if not self._has_encoders:
             return decided
@@ -145,19 +148,18 @@ class RewindCheckpoint:
 
     @property
     def _sources(self) -> tuple[str, str]:
-        """Folders or ids of the image encoder and of the text encoder."""
         return self.image_source or IMAGE_ENCODER, self.text_source or TEXT_ENCODER
 
     def _facts(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """What the files of the image encoder and of the text encoder say. Raises CheckpointError."""
+        """Return the settings in the files of both encoders. Raises CheckpointError."""
         image_source, text_source = self._sources
         with self._having_encoders():
             return image_facts(image_source), text_facts(text_source)
 
     def encoders(self) -> Encoders | None:
-        """The encoders of a checkpoint that has them, or for which the user names them; else None.
+        """Return the encoders if the checkpoint has their weights or the user names them; else None.
 
-        Raises CheckpointError if they cannot be had or do not fit the network.
+        Raises CheckpointError if they are missing or do not fit the network.
         """
         if not self._has_encoders:
             return None
@@ -172,7 +174,7 @@ class RewindCheckpoint:
 
     @contextmanager
     def _having_encoders(self) -> Iterator[None]:
-        """Turns what is raised of encoders that cannot be had into a CheckpointError."""
+        """Turn exceptions about the encoders' files into a CheckpointError."""
         try:
             yield
         except misfits(ImportError, OSError) as error:
@@ -184,14 +186,14 @@ class RewindCheckpoint:
     def predictor(
         self, device: torch.device, dtype: torch.dtype | None = None, cache: FeatureCache[Any] | None = None
     ) -> RewindPredictor:
-        """The network on ``device``, in ``dtype`` (None: float32); it reads embeddings, and needs no cache.
+        """Return a predictor on ``device``, in ``dtype`` (None: float32). Raises CheckpointError.
 
-        Raises CheckpointError.
+        cache: not used, since the network reads embeddings
         """
         return RewindPredictor(self.build(), device, dtype or torch.float32)
 
     def save(self, folder: Path) -> None:
-        """Writes network and configuration in the layout that ``load`` reads, without encoders."""
+        """Write network and configuration for ``load``, without encoders."""
         folder.mkdir(parents=True)
         config = {"model_type": MODEL_TYPE, **config_fields(self.config)}
         (folder / NETWORK_CONFIG).write_text(json.dumps(config, indent=2) + "\n")
@@ -199,26 +201,26 @@ class RewindCheckpoint:
         save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
 
     def build(self) -> RewindTransformer:
-        """The network with these weights, on the CPU, ready to score. Raises CheckpointError."""
+        """Return the network with these weights, on the CPU, ready to score. Raises CheckpointError."""
         self.check()
         network = RewindTransformer(self.config)
         network.load_state_dict(self.network, strict=True)
         return network.eval().requires_grad_(False)
 
     def check(self) -> None:
-        """Raises CheckpointError unless the weights are those of the network; no memory is taken for it before."""
+        """Raise CheckpointError unless the weights fit the network, before memory is allocated for it."""
         with torch.device("meta"):
             network = RewindTransformer(self.config)
         check_shapes(network.state_dict(), self.network)
 
 
 def reads(folder: Path) -> bool:
-    """Whether the folder does not say that it holds something else; the first ReWiND checkpoints say nothing."""
+    """True unless config.json names another network; the first ReWiND checkpoints have no config.json."""
     return _saved(folder).get("model_type", MODEL_TYPE) == MODEL_TYPE
 
 
 def load(folder: Path, options: Options) -> RewindCheckpoint:
-    """The checkpoint in a local folder. Raises CheckpointError."""
+    """Load the checkpoint of a local folder. Raises CheckpointError."""
     network = read_weights(folder)
     if _FIRST_CODES_FRAME in network:
         return _of_first_code(folder, network, options)
@@ -226,7 +228,7 @@ def load(folder: Path, options: Options) -> RewindCheckpoint:
     text_encoder = take_prefix(network, TEXT_ENCODER_PREFIX)
     stated = _stated(folder)
     config = _config(folder, network, stated)
-    if not config.has_preference:  # weights that upstream's network has for the sake of heads that this one lacks
+    if not config.has_preference:  # upstream's networks have these weights even without the heads that use them
         network.pop("preference_token", None)
     if not config.has_pairs:
         network.pop("first_embedding_B", None)
@@ -237,7 +239,7 @@ def load(folder: Path, options: Options) -> RewindCheckpoint:
 
 
 def _of_first_code(folder: Path, weights: dict[str, Tensor], options: Options) -> RewindCheckpoint:
-    """The checkpoint, with its weights under upstream's names."""
+    """Return the checkpoint, with its weights renamed to upstream's names."""
     first = weights.pop(_FIRST_CODES_FRAME)
     if first.dim() != 2:
         raise CheckpointError(f"{_FIRST_CODES_FRAME}: expected 2 axes, got {list(first.shape)}")
@@ -258,7 +260,7 @@ def _of_first_code(folder: Path, weights: dict[str, Tensor], options: Options) -
 
 
 def _settings(config: RewindConfig, stated: Mapping[str, Decision]) -> tuple[Decision, ...]:
-    """What decided each setting of the network, and the clients' defaults."""
+    """Return the source of each setting of the network and of the clients' defaults."""
     of_weights = (*_OF_WEIGHTS, *(["max_len"] if config.use_per_frame_progress_token else []))
     return (
         *(Decision(name, getattr(config, name), OF_WEIGHTS) for name in of_weights),
@@ -268,7 +270,6 @@ def _settings(config: RewindConfig, stated: Mapping[str, Decision]) -> tuple[Dec
 
 def _config(folder: Path, weights: Mapping[str, Tensor], stated: Mapping[str, Decision]) -> RewindConfig:
     def required(name: str) -> Any:
-        """A value that weights do not tell."""
         if name not in stated:
             places = f"{NETWORK_CONFIG} or model.rewind of {RUN_CONFIG}"
             got = "got it in neither; weights do not tell it"
@@ -308,7 +309,7 @@ def _config(folder: Path, weights: Mapping[str, Tensor], stated: Mapping[str, De
 
 
 def _shape(weights: Mapping[str, Tensor], name: str, rank: int) -> torch.Size:
-    """Raises KeyError if there is no such weight, CheckpointError if it has another number of axes."""
+    """Return a weight's shape. Raises KeyError if it is missing, CheckpointError if it has not ``rank`` axes."""
     shape = weights[name].shape
     if len(shape) != rank:
         raise CheckpointError(f"{name}: expected {rank} axes, got {list(shape)}")
@@ -316,12 +317,12 @@ def _shape(weights: Mapping[str, Tensor], name: str, rank: int) -> torch.Size:
 
 
 def _saved(folder: Path) -> dict[str, Any]:
-    """What config.json says; nothing if there is none."""
+    """Return the content of config.json; empty if there is none."""
     return read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
 
 
 def _stated(folder: Path) -> dict[str, Decision]:
-    """What config.json and config.yaml say of the network. Both may lack a field; neither may contradict the other."""
+    """Return the network's settings in config.json and config.yaml. Raises CheckpointError if the files disagree."""
     saved, run, run_file = _saved(folder), {}, find_run_config(folder)
     network: Any = {}
     places = {NETWORK_CONFIG: NETWORK_CONFIG}
@@ -343,14 +344,14 @@ def _stated(folder: Path) -> dict[str, Decision]:
         for source, value in values.items():
             if type(value) is not kind:
                 raise CheckpointError(f"{folder}: {name} in {source}: expected {kind.__name__}, got {shown(value)}")
-        if name != "max_len" and len(set(values.values())) > 1:  # weights show max_len where it matters
+        if name != "max_len" and len(set(values.values())) > 1:  # where max_len matters, the weights show it
             raise CheckpointError(f"{folder}: {name}: expected {' and '.join(values)} to agree, got {values}")
         if values:
             stated[name] = Decision(name, next(iter(values.values())), " and ".join(places[each] for each in values))
     if any(content.keys() >= {*_FIRST_FIELDS} for content in sources.values()):
         older = Decision("causal_mask", False, f"{OF_UPSTREAM} of before causal_mask", is_assumed=True)
         stated.setdefault("causal_mask", older)
-    # What ``save`` wrote of the training, else what the run says of it.
+    # ``save`` wrote these into config.json; else the run's file has them.
     frames, source = (
         frame_count(saved.get("trained_frames"), f"{folder / NETWORK_CONFIG}: trained_frames"),
         NETWORK_CONFIG,

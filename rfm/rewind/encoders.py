@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Raw frames and task -> the embeddings that a ReWiND transformer reads.
+"""Encode raw frames and tasks into the embeddings that a ReWiND transformer reads.
 
-A DINOv2-type image encoder (its pooled output) and a BERT-type sentence encoder (the mean of its last
-hidden state over the text's tokens, not normalised), both carried by ``transformers``.
-C = 3 channels, H x W pixels, T frames, L tokens, Dv and Dt widths of the embeddings.
+A frame's embedding is the pooled output of a DINOv2-type image encoder. A task's is the mean of the last hidden state
+of a BERT-type sentence encoder over the tokens, not normalised. ``transformers`` provides both networks.
+T frames, H x W pixels, Dv and Dt widths of the embeddings.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from rfm_client.contract import InferenceFailedError, InvalidSampleError, Reward
 from rfm_client.contract.frame_refs import EncoderSampleRefs, TrajectoryRefs
 from rfm_client.contract.samples import EncoderSample, Float32Array, UInt8Array
 
-IMAGE_ENCODER_FOLDER = "image_encoder"  # in an exported version of a model that encodes
+IMAGE_ENCODER_FOLDER = "image_encoder"  # in an exported version of a model with encoders
 TEXT_ENCODER_FOLDER = "text_encoder"
 IMAGES_PER_FORWARD = 64
-FRAMES_TOGETHER = 16  # that are brought to size in one call, for which they are copied
+FRAMES_TOGETHER = 16  # frames that are stacked (a copy) and resized in one call
 MAX_ENCODER_ASPECT_RATIO = 50
 
 
 class Encoders:
-    """An image and a text encoder with what goes before them. Built by ``from_pretrained``."""
+    """An image encoder and a text encoder, with their preprocessing. Built by ``from_pretrained``."""
 
     def __init__(self, image_model: Any, preprocessor: ImagePreprocessor, text_model: Any, tokenizer: Any) -> None:
         self.image_model = image_model.eval()
@@ -63,11 +63,11 @@ class Encoders:
         image_weights: Mapping[str, Tensor] | None = None,
         text_weights: Mapping[str, Tensor] | None = None,
     ) -> Encoders:
-        """The encoders in local folders or of Hugging Face ids. Weights that are given (a checkpoint's own) win over
-        theirs.
+        """Load the encoders from local folders or Hugging Face ids.
 
-        Raises ImportError without transformers, OSError for a source that cannot be had, ValueError and CheckpointError
-        for one that does not fit.
+        image_weights, text_weights: a checkpoint's own, in place of the sources'
+        Raises ImportError without transformers, OSError for a source that cannot be read, ValueError and
+        CheckpointError for a source that does not fit.
         """
         try:
             import transformers  # noqa: F401
@@ -80,11 +80,11 @@ class Encoders:
 
     @classmethod
     def load(cls, folder: Path) -> Encoders:
-        """The encoders that ``save`` wrote into ``folder``."""
+        """Load the encoders that ``save`` wrote into ``folder``."""
         return cls.from_pretrained(folder / IMAGE_ENCODER_FOLDER, folder / TEXT_ENCODER_FOLDER)
 
     def save(self, folder: Path) -> None:
-        """Writes the image and the text encoder into ``folder``, from which ``load`` needs no network."""
+        """Write both encoders into ``folder``; ``load`` then needs no internet."""
         image_folder, text_folder = folder / IMAGE_ENCODER_FOLDER, folder / TEXT_ENCODER_FOLDER
         self.image_model.save_pretrained(image_folder)
         content = json.dumps(self.preprocessor.to_config(), indent=2)
@@ -94,18 +94,18 @@ class Encoders:
 
     @classmethod
     def describe(cls, folder: Path) -> EncodersDescription:
-        """The description of the encoders that ``save`` wrote into ``folder``, without loading them."""
+        """Return the description of the encoders that ``save`` wrote into ``folder``, without loading them."""
         file = folder / IMAGE_ENCODER_FOLDER / PREPROCESSOR_CONFIG
         preprocessor = ImagePreprocessor.from_config(read_json(file), str(file))
         return EncodersDescription(cls.__name__, preprocessor.frame_size)
 
     @property
     def description(self) -> EncodersDescription:
-        """What the export records of these encoders."""
+        """The export's record of these encoders."""
         return EncodersDescription(type(self).__name__, self.preprocessor.frame_size)
 
     def to(self, device: torch.device) -> Encoders:
-        """Moves both encoders to ``device``."""
+        """Move both encoders to ``device``, and return them."""
         self.image_model.to(device)
         self.text_model.to(device)
         return self
@@ -126,11 +126,11 @@ class Encoders:
         execution: Execution | None = None,
         cache: FeatureCache[Float32Array] | None = None,
     ) -> list[EncoderSample | RewardError]:
-        """Each sample with embeddings of its trajectories' frames and of its task, or why it has none.
+        """Return each sample with embeddings of its frames and task, or its error.
 
-        execution: what it took is added to it; its tokens are those of images, which have no padding, and of tasks
-        cache: of embeddings that were made before; equal frames, and equal tasks, are encoded once. Without it only
-            pixels can be encoded
+        execution: the costs are added to it; its tokens are those of images (without padding) and tasks
+        cache: of embeddings; equal frames and equal tasks are then encoded once. None: no cache, and no samples with
+            frame references
         """
         execution = execution or Execution()
         with execution.forwarding():
@@ -167,10 +167,10 @@ class Encoders:
         execution: Execution,
         cache: FeatureCache[Float32Array] | None,
     ) -> tuple[Sequence[Float32Array | RewardError], Sequence[Float32Array | RewardError]]:
-        """The embeddings of each trajectory's frames [T, Dv], and of each task [Dt]."""
+        """Return the embeddings of each trajectory's frames [T, Dv] and of each task [Dt]."""
         if cache is None:
             whole = [each.positions for each in trajectories if isinstance(each, Trajectory)]
-            assert len(whole) == len(trajectories)  # a model without a cache takes no digests
+            assert len(whole) == len(trajectories)  # a model without a cache takes no frame references
             execution.num_encoded += sum(map(len, whole))
             return self.encode_frames(whole, execution), self.encode_tasks(tasks, execution)
         with execution.collating():
@@ -185,7 +185,7 @@ class Encoders:
             wanted,
             pixels,
             lambda frames: self._each_frame(frames, execution),
-            is_always_made=lambda frame: not frame.any(),  # with these a server probes itself
+            is_always_made=lambda frame: not frame.any(),  # the probe's frames: a cached result would prove nothing
         )
         execution.num_encoded += num_made
         execution.num_found += len(images) - num_made
@@ -197,7 +197,7 @@ class Encoders:
     def _each_frame(
         self, frames: Sequence[UInt8Array], execution: Execution
     ) -> Sequence[Float32Array | InferenceFailedError]:
-        """float32 [Dv] of each frame [H, W, 3], or why there is none."""
+        """Return float32 [Dv] of each frame [H, W, 3], or its error."""
         by_size = sorted(range(len(frames)), key=lambda index: frames[index].shape)
         sizes = groupby(by_size, key=lambda index: frames[index].shape)
         same = [list(of_size) for _, of_size in sizes]
@@ -213,19 +213,19 @@ class Encoders:
     def encode_frames(
         self, videos: Sequence[UInt8Array], execution: Execution | None = None
     ) -> list[Float32Array | InferenceFailedError]:
-        """uint8 [T, H, W, 3] of any T, H, W each -> float32 [T, Dv] each, or why there is none."""
+        """Encode videos, uint8 [T, H, W, 3] each; return float32 [T, Dv] or an error for each."""
         images = iter(self._images(videos, execution or Execution()))
         return [_of_video(list(islice(images, len(video)))) for video in videos]
 
     @torch.inference_mode()
     def _images(self, videos: Sequence[UInt8Array], execution: Execution) -> list[Tensor | InferenceFailedError]:
-        """[Dv] of each frame of all videos, on the device, or why there is none."""
+        """Return [Dv] of each frame of all videos, on the device, or its error."""
 
         def forward(crops: Tensor) -> list[Tensor]:
             output = self.image_model(pixel_values=crops.to(self.image_model.device))
             num_tokens = output.last_hidden_state.shape[:2].numel()
             execution.add_tokens(num_tokens, num_tokens)
-            return list(output.pooler_output.clone())  # as a view it would keep the states of all tokens
+            return list(output.pooler_output.clone())  # a view would keep the states of all tokens in memory
 
         batches = self._crop_batches(videos, execution)
         return [image for crops in batches for image in execution.run(forward, crops)]
@@ -234,7 +234,7 @@ class Encoders:
     def encode_tasks(
         self, tasks: Sequence[str], execution: Execution | None = None
     ) -> list[Float32Array | InferenceFailedError]:
-        """float32 [Dt] of each task, or why there is none."""
+        """Return float32 [Dt] of each task, or its error."""
         execution = execution or Execution()
 
         def forward(part: list[str]) -> list[Float32Array]:
@@ -247,14 +247,14 @@ class Encoders:
         return execution.run(forward, list(tasks))
 
     def _crop_batches(self, videos: Sequence[UInt8Array], execution: Execution) -> Iterator[Tensor]:
-        """The crops of all videos' frames, in order, IMAGES_PER_FORWARD of them at a time, whosever they are."""
+        """Yield the crops of all videos' frames in order, IMAGES_PER_FORWARD at a time across videos."""
         waiting: list[Tensor] = []
         room = IMAGES_PER_FORWARD
         for video in videos:
             start = 0
             while start < len(video):
                 images = as_tensor(video[start : start + room])
-                with execution.collating():  # on the CPU: torch resizes uint8 with antialiasing only there
+                with execution.collating():  # on the CPU: only there PyTorch resizes uint8 with antialiasing
                     waiting.append(self.preprocessor(images))
                 start, room = start + len(images), room - len(images)
                 if not room:
@@ -264,7 +264,7 @@ class Encoders:
             yield torch.cat(waiting)
 
     def _check_task(self, task: str) -> None:
-        """Raises InvalidSampleError for a task longer than the text encoder reads; it is never cut silently."""
+        """Raise InvalidSampleError for an empty task, or a task beyond the text encoder's limit: none is truncated."""
         if not task.strip():
             raise InvalidSampleError.at("task", "a task sentence", repr(task))
         limit = min(self.tokenizer.model_max_length, self.text_model.config.max_position_embeddings)
@@ -273,19 +273,19 @@ class Encoders:
             raise InvalidSampleError.at("task", f"at most {limit} tokens (limit of the text encoder)", str(count))
 
     def _tokenize(self, text: str | list[str], **options: Any) -> Any:
-        # A task is data: "[SEP]" in it is five characters, not a separator.
+        # A task is data: "[SEP]" in it is text, not a separator.
         return self.tokenizer(text, split_special_tokens=True, verbose=False, **options)
 
 
 def task_digest(task: str) -> bytes:
-    """The key of a task's embedding. No frame's digest, which a caller may claim, is as long."""
+    """Return the cache key of a task's embedding. It is longer than a frame's digest, so no caller can send it."""
     return b"task" + hashlib.sha256(task.encode()).digest()
 
 
 def _of_named(
     trajectory: TrajectoryRefs, images: Mapping[bytes, Float32Array | RewardError]
 ) -> Float32Array | RewardError:
-    """float32 [T, Dv], or why there is none."""
+    """Return float32 [T, Dv] of a trajectory, or its error."""
     frames = []
     for digest in trajectory.digests:
         if digest not in images:
@@ -299,7 +299,7 @@ def _of_named(
 
 
 def _of_video(images: Sequence[Tensor | InferenceFailedError]) -> Float32Array | InferenceFailedError:
-    """float32 [T, Dv] from each frame's."""
+    """Stack the frames' embeddings to float32 [T, Dv]; the first error replaces them."""
     for image in images:
         if isinstance(image, InferenceFailedError):
             return image
@@ -321,8 +321,8 @@ def _embedded(
 
 
 def _check_shapes(trajectory: Trajectory | TrajectoryRefs) -> None:
-    """The shorter side is brought to size; a sliver of an image would become a huge one."""
-    if isinstance(trajectory, TrajectoryRefs):  # all that came with it: another may name them
+    """Raise InvalidSampleError for narrow frames: resizing the shorter side would make huge images of them."""
+    if isinstance(trajectory, TrajectoryRefs):  # all its pixels, since other trajectories may refer to them
         sizes = {frame.shape[:2] for frame in trajectory.pixels.values()}
     else:
         sizes = {trajectory.positions.shape[1:3]}

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: MIT
 """The ReWiND transformer: frame and text embeddings in; progress, success, preference, similarity out.
 
-B rows, T frames of a trajectory, N tokens of all rows, L tokens of the longest, D width, K progress bins (1: continuous
-progress).
+B rows, L tokens of the longest row, N tokens of all rows, T frames of a trajectory, D width, K progress bins (1:
+continuous progress).
 
-A row is the token sequence ``[text] [first trajectory] ([second trajectory] [query])``. The order of frames is known
-through the causal mask, the embedding added to each trajectory's first frame and, where the checkpoint has them, a
-progress token behind each frame; there is no other positional encoding. Rows of unlike lengths are packed one after the
-other, without padding between them: everything but attention is computed of the packed tokens [N, D]; attention alone
-needs rows of one length, [B, L, D].
+A row is the token sequence ``[text] [first trajectory] ([second trajectory] [query])``. The network learns the order
+of frames from the causal mask, from an embedding added to each trajectory's first frame and, in some checkpoints, from
+a progress token behind each frame. There is no other positional encoding.
+Rows are packed one after the other without padding, [N, D]. Only attention needs rows of equal length, [B, L, D].
 Architecture: ReWiND (https://arxiv.org/abs/2505.10911) as in the public implementation ``reward_fm``.
 """
 
@@ -29,9 +28,9 @@ _SIGNIFICANT_BITS = 5
 
 
 def rounded_up(count: int) -> int:
-    """The next number with at most five significant bits, at most a sixteenth more.
+    """Return the next number with at most five significant bits, at most 1/16 above ``count``.
 
-    Tensors of as many rows have one of few shapes, so that kernels which are made for each shape are made once.
+    Tensors then have few shapes, so that kernels that are built for each shape are built once.
     """
     step = 1 << max(count.bit_length() - _SIGNIFICANT_BITS, 0)
     return -(-count // step) * step
@@ -39,11 +38,11 @@ def rounded_up(count: int) -> int:
 
 @dataclass(frozen=True)
 class Packing:
-    """Rows of some numbers of tokens, one after the other. Behind the last is room for tokens that mean nothing.
+    """The layout of packed rows: one after the other, then padding up to ``rounded_up(N)`` tokens, P in all.
 
     num_rows, longest, num_tokens: B, L and N
-    at: int64 [N + room], where each token lies in [B * L, ...]; those that mean nothing are said to lie at 0
-    mask: bool [B, 1, 1, L], true at tokens of the row; None if all rows are of one length
+    at: int64 [P], the index of each token in [B * L]; 0 for padding
+    mask: bool [B, 1, 1, L], true at tokens of the row; None if all rows are equally long
     """
 
     num_rows: int
@@ -54,7 +53,7 @@ class Packing:
 
     @classmethod
     def of(cls, lengths: npt.NDArray[np.int64]) -> Packing:
-        """The packing of rows with so many tokens each; lengths: int64 [B]."""
+        """Return the packing of rows with these numbers of tokens, int64 [B]."""
         num_rows, longest, num_tokens = len(lengths), int(lengths.max()), int(lengths.sum())
         at = np.zeros(rounded_up(num_tokens), np.int64)
         at[:num_tokens] = np.arange(num_tokens) + np.repeat(np.arange(num_rows) * longest - starts(lengths), lengths)
@@ -64,15 +63,15 @@ class Packing:
         return cls(num_rows, longest, num_tokens, torch.from_numpy(at), mask)
 
     def to(self, device: torch.device) -> Packing:
-        """The packing with its tensors on ``device``."""
+        """Return the packing with its tensors on ``device``."""
         return replace(self, at=self.at.to(device), mask=None if self.mask is None else self.mask.to(device))
 
     def empty(self, width: int, like: Tensor) -> Tensor:
-        """Zeros [N + room, D]."""
+        """Return zeros [P, width] with dtype and device of ``like``."""
         return like.new_zeros(len(self.at), width)
 
     def padded(self, packed: Tensor) -> Tensor:
-        """[N + room, D] -> [B, L, D], zeros behind the end of each row."""
+        """Unpack tokens: [P, D] -> [B, L, D], zeros behind the end of each row."""
         tokens = packed[: self.num_tokens]
         if self.mask is not None:
             rows = packed.new_zeros(self.num_rows * self.longest, packed.shape[-1])
@@ -81,14 +80,14 @@ class Packing:
         return tokens.unflatten(0, (self.num_rows, self.longest))
 
     def packed(self, padded: Tensor) -> Tensor:
-        """[B, L, D] -> [N + room, D]."""
+        """Pack tokens: [B, L, D] -> [P, D]."""
         rows = padded.flatten(0, 1)
         is_packed = self.mask is None and len(rows) == len(self.at)
         return rows if is_packed else rows[self.at]
 
 
 def starts(lengths: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """int64 [B], where each of parts of int64 [B] begins when they lie one after the other."""
+    """Return the start of each of B consecutive parts with these lengths, int64 [B]."""
     return np.cumsum(lengths) - lengths
 
 
@@ -97,11 +96,10 @@ FEED_FORWARD_RATIO = 4
 
 @dataclass(frozen=True)
 class RewindConfig:
-    """What a checkpoint's network looks like; field names as in upstream's config.json where it has them.
+    """The configuration of a network, with the field names of upstream's config.json.
 
-    trained_frames: the most frames of a trajectory in training; None: the checkpoint does not say
-    trained_padding: whether training padded shorter trajectories to ``trained_frames``, as upstream's does; None: the
-        checkpoint does not say
+    trained_frames: largest number of frames of a trajectory in training; None: unknown
+    trained_padding: training padded shorter trajectories to ``trained_frames``, as upstream's does; None: unknown
     """
 
     video_feature_dim: int
@@ -121,12 +119,12 @@ class RewindConfig:
 
     @property
     def has_pairs(self) -> bool:
-        """Whether there are questions about two trajectories that the network can answer."""
+        """True if the network predicts preference or similarity, for two trajectories."""
         return self.has_preference or self.has_similarity
 
     @property
     def max_frames(self) -> int | None:
-        """The longest trajectory the network can take; None: any length."""
+        """Frames of the longest trajectory that the network can score; None: no limit."""
         return self.max_len if self.use_per_frame_progress_token else None
 
     @property
@@ -135,24 +133,24 @@ class RewindConfig:
         return 2 if self.use_per_frame_progress_token else 1
 
     def num_tokens(self, num_first: int, num_second: int) -> int:
-        """L of a row of two trajectories of so many frames; num_second = 0: of one trajectory."""
+        """Return the tokens of a row with these numbers of frames; num_second = 0: a single trajectory."""
         query = 1 if num_second else 0
         return 1 + self.tokens_per_frame * (num_first + num_second) + query
 
 
 @dataclass(frozen=True)
 class RewindBatch:
-    """Rows of any lengths and kinds, packed. F frames of all rows' trajectories, Q rows of two trajectories.
+    """Packed rows of any lengths and kinds, with F frames in all and Q queries (rows of two trajectories).
 
     text: float32 [B, Dt]
-    video: float32 [V, Dv], embeddings of frames; as many as F, or more that mean nothing, unless ``shown`` says which
-    shown: int64 [F], which of ``video`` each frame of a row is (dense mode shows one in many rows); None: in order
-    is_similarity: bool [Q], asks for similarity rather than preference; None: all ask for preference
-    packing: where tokens lie; ``*_at`` are positions in its packed tokens
-    text_at, frame_at, query_at: int64 [B], [F], [Q]
-    place: int64 [F], each frame's number in its trajectory, and max_len more in a second one
-    first_starts, second_starts: int64, those of the F frames that begin a first or second trajectory
-    read_at: int64 [F + Q + room], the tokens whose outputs are read: each frame's last, then the queries
+    video: float32 [V, Dv], embeddings of frames, then padding
+    shown: int64 [F], the index in ``video`` of each frame (in dense mode many rows show a frame); None: 0 to F - 1
+    is_similarity: bool [Q], true for similarity, false for preference; None: all are preference
+    packing: the layout of the tokens
+    text_at, frame_at, query_at: int64 [B], [F], [Q], indices of packed tokens
+    place: int64 [F], each frame's index in its trajectory, plus max_len in a second trajectory
+    first_starts, second_starts: int64 [B], [Q], index among the F frames of each first and second trajectory's start
+    read_at: int64 [R], packed tokens whose outputs are read: each frame's last, each query, then padding
     """
 
     text: Tensor
@@ -179,9 +177,11 @@ class RewindBatch:
         shown: Tensor | None = None,
         is_similarity: Tensor | None = None,
     ) -> RewindBatch:
-        """Rows whose trajectories have int64 [B, 2] frames; the second has 0 in rows of one.
+        """Return the batch of rows with these frames.
 
-        Raises ValueError for a trajectory of more frames than there are progress tokens.
+        num_frames: int64 [B, 2], frames of the first and second trajectory; 0: no second trajectory
+        others: as in the class
+        Raises ValueError for a trajectory with more frames than progress tokens.
         """
         if config.max_frames is not None and num_frames.max() > config.max_frames:
             raise ValueError(f"num_frames: expected at most {config.max_frames}, got {num_frames.max()}")
@@ -205,7 +205,7 @@ class RewindBatch:
         return cls(text, video, shown, is_similarity, packing, *map(torch.from_numpy, positions))
 
     def to(self, device: torch.device, dtype: torch.dtype) -> RewindBatch:
-        """The batch on ``device``, with embeddings of ``dtype``."""
+        """Return the batch on ``device``, with embeddings in ``dtype``."""
         parts: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
         moved: dict[str, Any] = {name: None if part is None else part.to(device) for name, part in parts.items()}
         moved |= {name: moved[name].to(dtype) for name in ("text", "video")}
@@ -214,7 +214,7 @@ class RewindBatch:
 
 @dataclass(frozen=True)
 class RewindOutput:
-    """Raw scores of a RewindBatch: progress logits [F, K], success logits [F], query logits [Q]."""
+    """Logits of a RewindBatch: progress [F, K], success [F] (None without that head), query [Q]."""
 
     progress: Tensor
     success: Tensor | None
@@ -222,9 +222,9 @@ class RewindOutput:
 
 
 class SelfAttention(nn.Module):
-    """Multi-head attention of packed tokens [N, D] to those of their row; parameters named as nn.MultiheadAttention's.
+    """Multi-head attention of packed tokens within their row; parameters named as nn.MultiheadAttention's.
 
-    ``out_proj`` is left to the layer, which needs it of some tokens alone.
+    The layer applies ``out_proj``, since it may need it for some tokens alone.
     """
 
     def __init__(self, config: RewindConfig) -> None:
@@ -238,7 +238,7 @@ class SelfAttention(nn.Module):
         nn.init.xavier_uniform_(self.in_proj_weight)
 
     def forward(self, x: Tensor, packing: Packing) -> Tensor:
-        """[N, D] -> [N, D]. What lies behind the end of a row is never looked at."""
+        """Attend: [P, D] -> [P, D]. No token attends to padding behind its row."""
         padded = packing.padded(linear(x, self.in_proj_weight, self.in_proj_bias))
         parts = padded.chunk(3, dim=-1)
         queries, keys, values = (part.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for part in parts)
@@ -248,7 +248,7 @@ class SelfAttention(nn.Module):
 
 
 class EncoderLayer(nn.Module):
-    """Post-norm transformer layer with a ReLU feed-forward; parameters named as nn.TransformerEncoderLayer's."""
+    """Post-norm transformer layer with ReLU; parameters named as nn.TransformerEncoderLayer's."""
 
     def __init__(self, config: RewindConfig) -> None:
         super().__init__()
@@ -260,7 +260,7 @@ class EncoderLayer(nn.Module):
         self.norm2 = nn.LayerNorm(width)
 
     def forward(self, x: Tensor, packing: Packing, read_at: Tensor | None = None) -> Tensor:
-        """[N, D] -> [N, D], or [R, D]: of the tokens ``read_at``, int64 [R], alone."""
+        """Transform tokens: [P, D] -> [P, D], or [R, D] for the tokens ``read_at``, int64 [R]."""
         attended = self.self_attn(x, packing)
         if read_at is not None:
             attended, x = attended[read_at], x[read_at]
@@ -269,21 +269,21 @@ class EncoderLayer(nn.Module):
 
 
 class Encoder(nn.Module):
-    """A stack of EncoderLayer, the last of which is computed of those tokens alone that are read."""
+    """A stack of EncoderLayer; the last computes only the tokens whose outputs are read."""
 
     def __init__(self, config: RewindConfig) -> None:
         super().__init__()
         self.layers = nn.ModuleList(EncoderLayer(config) for _ in range(config.num_layers))
 
     def forward(self, x: Tensor, packing: Packing, read_at: Tensor) -> Tensor:
-        """[N, D] -> [R, D], the tokens at int64 [R]."""
+        """Transform tokens: [P, D] -> [R, D], those at ``read_at``, int64 [R]."""
         for layer in self.layers[:-1]:
             x = layer(x, packing)
         return self.layers[-1](x, packing, read_at)
 
 
 class RewindTransformer(nn.Module):
-    """The network; its state dict has upstream's names."""
+    """The ReWiND network; its state dict has upstream's names."""
 
     def __init__(self, config: RewindConfig) -> None:
         super().__init__()
@@ -310,7 +310,7 @@ class RewindTransformer(nn.Module):
             self.similarity_head = PredictionHead(width, 1)
 
     def forward(self, batch: RewindBatch) -> RewindOutput:
-        """The raw scores of the batch: progress and success of each frame, and one score of each query."""
+        """Return the logits of every frame and query in the batch."""
         hidden = self.transformer(self._tokens(batch), batch.packing, batch.read_at)
         num_frames, num_queries = len(batch.frame_at), len(batch.query_at)
         query = self._query_scores(hidden[num_frames : num_frames + num_queries], batch)
@@ -319,7 +319,7 @@ class RewindTransformer(nn.Module):
         return RewindOutput(progress, success, query)
 
     def _tokens(self, batch: RewindBatch) -> Tensor:
-        """[N + room, D], what the transformer reads."""
+        """Return the transformer's input, [P, D]."""
         text = self.text_proj(batch.text)
         frames = self.video_proj(batch.video)
         frames = frames[: len(batch.frame_at)] if batch.shown is None else frames[batch.shown]
@@ -337,7 +337,7 @@ class RewindTransformer(nn.Module):
         return tokens
 
     def _query_tokens(self, batch: RewindBatch) -> Tensor:
-        """[Q or 1, D]: the tokens whose outputs answer the rows' questions."""
+        """Return the query tokens, [Q, D], or [1, D] if all are equal."""
         if batch.is_similarity is None:
             return self.preference_token[0]
         if not self.config.has_preference:
@@ -345,7 +345,7 @@ class RewindTransformer(nn.Module):
         return torch.where(batch.is_similarity[:, None], self.similarity_token[0], self.preference_token[0])
 
     def _query_scores(self, hidden: Tensor, batch: RewindBatch) -> Tensor:
-        """[Q] logits of the query tokens' [Q, D]."""
+        """Return logits [Q] of the query tokens' states [Q, D]."""
         if not self.config.has_preference:
             return self.similarity_head(hidden).squeeze(-1) if self.config.has_similarity else hidden[:, 0]
         preference = self.preference_head(hidden).squeeze(-1)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Samples of embeddings -> rows -> packed batches -> scores.
+"""Score samples of embeddings: samples -> rows -> packed batches -> scores.
 
-A row is one token sequence of one forward: a sample is one row, and in dense mode one row per frame.
+A row is a token sequence of a forward pass. A sample has one row, in dense mode one for each frame.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from rfm_client.contract import InvalidSampleError, ProgressSample, RewardError,
 from rfm_client.contract.frame_refs import ProgressSampleRefs
 from rfm_client.contract.samples import Float32Array
 
-MAX_EMBEDDING = 1e6  # thousands of times what an encoder gives
+MAX_EMBEDDING = 1e6  # thousands of times an encoder's values
 
 
 @dataclass(frozen=True, eq=False)
 class RewindRow:
-    """One token sequence: text [Dt], first [T, Dv], and in a question about two trajectories second [T, Dv].
+    """A token sequence: of text [Dt], first [T, Dv] and, for preference or similarity, second [T, Dv].
 
-    picked: in dense mode int64 [K], the frames of ``first`` that the row is about; None: all
+    picked: in dense mode int64 [frame_steps], the frames of ``first`` in the row; None: all
     """
 
     text: Float32Array
@@ -44,27 +44,27 @@ class RewindRow:
 
     @property
     def num_second(self) -> int:
-        """Frames of the second trajectory in the row, 0 without one."""
+        """Frames of the second trajectory in the row, or 0."""
         return 0 if self.second is None else len(self.second)
 
     @property
     def videos(self) -> tuple[Float32Array, ...]:
-        """The first trajectory, and the second if there is one."""
+        """The embeddings of the first trajectory and of the second, if there is a second."""
         return (self.first,) if self.second is None else (self.first, self.second)
 
     def shown(self, video: Float32Array) -> npt.NDArray[np.int64]:
-        """int64 [T], the frames of one of ``videos`` that are in the row."""
+        """Return the indices of the frames of ``video`` (of ``videos``) in the row, int64 [T]."""
         return np.arange(len(video)) if self.picked is None else self.picked
 
 
 @dataclass(frozen=True)
 class RewindCollator:
-    """What a checkpoint can take of a sample, and how a batch of it looks."""
+    """Turns samples into rows, and rows into batches, for a ReWiND configuration."""
 
     config: RewindConfig
 
     def rows(self, sample: Sample) -> list[RewindRow]:
-        """The rows of a sample of embeddings. Raises InvalidSampleError if the checkpoint cannot score it."""
+        """Return the rows of a sample. Raises InvalidSampleError if the checkpoint cannot score it."""
         check_type(sample, self.config)
         frame_steps = sample.frame_steps if isinstance(sample, ProgressSample) else 0
         if sample.trajectories[0].frames is not None:
@@ -78,7 +78,7 @@ class RewindCollator:
         return [RewindRow(text, videos[0], videos[1], isinstance(sample, SimilaritySample))]
 
     def collate(self, rows: Sequence[RewindRow]) -> RewindBatch:
-        """One batch of rows of any kinds. Frames that several rows show are in it once."""
+        """Return one batch of rows of any kinds. It holds frames that several rows show once."""
         videos: dict[int, Float32Array] = {}
         starts: dict[int, int] = {}
         num_frames = 0
@@ -114,7 +114,6 @@ class RewindCollator:
         return text
 
     def _video(self, trajectory: Trajectory, frame_steps: int) -> Float32Array:
-        """The trajectory's embeddings [T, Dv]."""
         width, limit = self.config.video_feature_dim, self.config.max_frames
         video = trajectory.video_embeddings
         if video is None or video.shape[1] != width:
@@ -129,7 +128,7 @@ class RewindCollator:
 
 
 def _check_range(where: str, embeddings: Float32Array) -> None:
-    """Raises InvalidSampleError for values with which the network's own would overflow."""
+    """Raise InvalidSampleError for values so large that the network would overflow."""
     largest = max(float(embeddings.max()), -float(embeddings.min()))
     if largest > MAX_EMBEDDING:
         raise InvalidSampleError.at(where, f"values from {-MAX_EMBEDDING:g} to {MAX_EMBEDDING:g}", f"{largest:g}")
@@ -138,7 +137,7 @@ def _check_range(where: str, embeddings: Float32Array) -> None:
 class RewindPredictor:
     """A ReWiND network on a device.
 
-    dtype: of the network. Others than float32 move scores by more than 1e-5
+    dtype: of the network; any but float32 changes scores by more than 1e-5
     """
 
     works_ahead = False
@@ -150,29 +149,29 @@ class RewindPredictor:
         self.collator = RewindCollator(network.config)
 
     def rows(self, sample: Sample | ProgressSampleRefs) -> list[RewindRow]:
-        """The rows of a sample of embeddings. Raises InvalidSampleError."""
+        """Return the rows of a sample of embeddings. Raises InvalidSampleError."""
         if isinstance(sample, ProgressSampleRefs):
             raise InvalidSampleError.at("frames", "video_embeddings (this checkpoint reads embeddings)", "named frames")
         return self.collator.rows(sample)
 
     def num_tokens(self, row: RewindRow) -> int:
-        """Number of tokens that the row takes in the transformer."""
+        """Return the number of tokens in the row."""
         return self.network.config.num_tokens(row.num_first, row.num_second)
 
     def work_ahead(self, rows: Sequence[RewindRow]) -> None:
-        """Nothing: collation is cheap."""
+        """Do nothing: collation is cheap."""
 
     def collate(self, rows: Sequence[RewindRow]) -> RewindBatch:
-        """One batch of rows, which may be of different kinds."""
+        """Return one batch of rows of any kinds."""
         return self.collator.collate(rows)
 
     def count(self, batch: RewindBatch, execution: Execution) -> None:
-        """Counts tokens, and slots that the network computes, the last few of which hold no token."""
+        """Count the batch's tokens, without and with the padding behind the last."""
         execution.add_tokens(batch.packing.num_tokens, len(batch.packing.at))
 
     @torch.inference_mode()
     def score(self, rows: Sequence[RewindRow], batch: RewindBatch) -> list[RowScores | RewardError]:
-        """The scores of each row of the batch, or why it has none, from one forward pass."""
+        """Run one forward pass; return each row's scores, or its error."""
         output = self.network(batch.to(self.device, self.dtype))
         frames = frame_scores(output.progress, output.success)
         logits, probabilities = output.query.float().tolist(), output.query.sigmoid().float().tolist()
@@ -189,6 +188,6 @@ class RewindPredictor:
             scored.append(RowScores(of_trajectories, query))
             start = end
         has_success = output.success is not None
-        if are_finite([frames], logits, has_success=has_success):  # of all rows at once, which is faster
+        if are_finite([frames], logits, has_success=has_success):  # all rows at once, which is faster
             return list(scored)
         return checked(scored, has_success=has_success)

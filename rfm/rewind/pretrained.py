@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The files of ReWiND's encoders, as transformers writes them: settings, preprocessing, tokenizer, weights.
-
-N images, C = 3 channels, H x W pixels.
-"""
+"""Load the files of ReWiND's encoders in transformers' format: settings, preprocessing, tokenizer, weights."""
 
 from __future__ import annotations
 
@@ -19,11 +16,11 @@ from rfm.checkpoint.content import MAX_UINT8, PIL_BICUBIC, PREPROCESSOR_CONFIG, 
 from rfm.checkpoint.weights import check_finite, check_one_form
 from rfm_client.contract.frame_size import FrameSize
 
-IMAGE_MODELS = ("dinov2", "dinov2_with_registers")  # whose pooled output is that of the class token
-TEXT_MODELS = ("bert", "distilbert", "mpnet", "roberta", "xlm-roberta")  # of sentences
+IMAGE_MODELS = ("dinov2", "dinov2_with_registers")  # types whose pooled output is that of the class token
+TEXT_MODELS = ("bert", "distilbert", "mpnet", "roberta", "xlm-roberta")  # types of sentence encoders
 _LOADING_PROBLEMS = ("missing_keys", "unexpected_keys", "mismatched_keys")  # as transformers reports a load
 
-# Upstream's encoders, on whose embeddings ReWiND checkpoints are trained, and what is known of their files.
+# Upstream's encoders, whose embeddings ReWiND checkpoints are trained on, and the known settings in their files.
 IMAGE_ENCODER = "facebook/dinov2-base"
 TEXT_ENCODER = "sentence-transformers/all-MiniLM-L12-v2"
 
@@ -50,10 +47,10 @@ _TEXT: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class ImagePreprocessor:
-    """uint8 images -> normalised crops, bit for bit as the "fast" (torchvision) Bit image processor makes them.
+    """uint8 images -> normalised crops, bit-exact with transformers' "fast" (torchvision) Bit image processor.
 
-    Shortest edge to ``resize_px`` (bicubic, antialiased, on uint8), centre crop to ``crop_px`` = (height, width),
-    then per channel (value - 255 mean) / (255 std).
+    Resizes the shorter side to ``resize_px`` (bicubic, antialiased, on uint8), crops the centre to ``crop_px`` =
+    (height, width), then computes (value - 255 mean) / (255 std) for each channel.
     """
 
     resize_px: int
@@ -63,16 +60,16 @@ class ImagePreprocessor:
 
     @property
     def frame_size(self) -> FrameSize:
-        """What becomes of a frame before it is cropped."""
+        """The size to which a frame is resized before the crop."""
         return FrameSize("shortest", (self.resize_px,))
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], where: str) -> ImagePreprocessor:
-        """The preprocessing that preprocessor_config.json describes. Raises ValueError for other steps."""
+        """Read the content of preprocessor_config.json. Raises ValueError for other steps."""
         size: Any = config.get("size")
         crop: Any = config.get("crop_size")
         if _is_count(size) and str(config.get("image_processor_type", "Bit")).startswith(("Bit", "CLIP")):
-            size = {"shortest_edge": size}  # as transformers once wrote it for processors that keep proportions
+            size = {"shortest_edge": size}  # the older form, for processors that keep proportions
         if _is_count(crop):
             crop = {"height": crop, "width": crop}
         required = {
@@ -102,7 +99,7 @@ class ImagePreprocessor:
         )
 
     def to_config(self) -> dict[str, Any]:
-        """The fields of preprocessor_config.json from which ``from_config`` makes this."""
+        """Return the fields of preprocessor_config.json that ``from_config`` reads."""
         return {
             "do_resize": True,
             "size": {"shortest_edge": self.resize_px},
@@ -118,7 +115,7 @@ class ImagePreprocessor:
         }
 
     def __call__(self, images: Tensor) -> Tensor:
-        """uint8 [N, H, W, C] -> float32 [N, C, *crop_px], on the CPU."""
+        """Preprocess images on the CPU: uint8 [N, H, W, C = 3] -> float32 [N, C, *crop_px]."""
         crops = self._crop(self._resize(images.permute(0, 3, 1, 2))).float()
         mean, std = (torch.tensor(values).view(-1, 1, 1) * MAX_UINT8 for values in (self.mean, self.std))
         return (crops - mean) / std
@@ -149,19 +146,19 @@ def _is_count(value: Any) -> bool:
 
 
 def _has_counts(value: Any, *names: str) -> bool:
-    """Whether it is a mapping of just these names to numbers of pixels."""
+    """True for a mapping of exactly these names to numbers of pixels."""
     return isinstance(value, dict) and set(value) == set(names) and all(map(_is_count, value.values()))
 
 
 def load_config(source: str | Path) -> Any:
-    """The configuration of a model. Raises OSError and ValueError."""
+    """Load the configuration of a model's folder or id. Raises OSError and ValueError."""
     from transformers import AutoConfig
 
-    return AutoConfig.from_pretrained(str(source), trust_remote_code=False)  # None would ask the user
+    return AutoConfig.from_pretrained(str(source), trust_remote_code=False)  # None would prompt the user
 
 
 def load_preprocessor(source: str | Path) -> ImagePreprocessor:
-    """The preprocessing of an image model. Raises OSError, ValueError, CheckpointError."""
+    """Load the preprocessing of an image model. Raises OSError, ValueError, CheckpointError."""
     from transformers.utils.hub import cached_file
 
     config = read_json(Path(str(cached_file(str(source), PREPROCESSOR_CONFIG))))
@@ -169,15 +166,15 @@ def load_preprocessor(source: str | Path) -> ImagePreprocessor:
 
 
 def load_tokenizer(source: str | Path, vocab_size: int) -> Any:
-    """The tokenizer of a text model with that many embeddings. Raises OSError and ValueError."""
+    """Load the tokenizer of a text model with ``vocab_size`` token embeddings. Raises OSError and ValueError."""
     from transformers import AutoTokenizer
 
     expected = "files of a tokenizer (tokenizer.json, or vocab.txt), got none that can be read"
     try:
         tokenizer = AutoTokenizer.from_pretrained(str(source), use_fast=True, trust_remote_code=False)
-    except TypeError as error:  # as transformers 4 says that there are none
+    except TypeError as error:  # transformers 4, if there are no files
         raise ValueError(f"{source}: expected {expected}: {error}") from error
-    if not set(tokenizer.get_vocab()) - set(tokenizer.all_special_tokens):  # as transformers 5 makes one of no files
+    if not set(tokenizer.get_vocab()) - set(tokenizer.all_special_tokens):  # transformers 5, if there are no files
         raise ValueError(f"{source}: expected {expected}")
     if len(tokenizer) > vocab_size:
         raise ValueError(f"{source}: expected a tokenizer of at most {vocab_size} tokens, got {len(tokenizer)}")
@@ -185,11 +182,12 @@ def load_tokenizer(source: str | Path, vocab_size: int) -> Any:
 
 
 def load_model(source: str | Path, weights: Mapping[str, Tensor] | None, known: Sequence[str]) -> Any:
-    """The model of ``source``, with ``weights`` in place of its own.
+    """Load the model of ``source``, with ``weights`` in place of its own if given.
 
-    transformers does the loading, since it knows how names of weights changed from release to release.
-    known: the types of models that may be there
-    Raises OSError, CheckpointError, and ValueError for another type, or weights that do not fit to the letter.
+    transformers loads the weights, since it knows how their names changed between releases.
+
+    known: the accepted types of models
+    Raises OSError, CheckpointError, and ValueError for another type or for weights that do not fit exactly.
     """
     from transformers import AutoModel
 
@@ -210,14 +208,14 @@ def load_model(source: str | Path, weights: Mapping[str, Tensor] | None, known: 
         raise ValueError(f"{source}: the encoder's weights do not fit: {error}") from error
     problems = ("missing_keys", "mismatched_keys") if weights is None else _LOADING_PROBLEMS
     found = {name: sorted(map(str, loaded[name])) for name in problems if loaded[name]}
-    if found:  # transformers would leave missing ones random, and others out
+    if found:  # transformers would leave missing weights random and ignore the others
         raise ValueError(f"{source}: the encoder's weights do not fit: {found}")
     check_finite(model.state_dict())
     return model
 
 
 def image_facts(source: str) -> dict[str, Any]:
-    """What an image encoder's files say, as JSON can hold it. Raises OSError, ValueError, CheckpointError."""
+    """Return the settings in an image encoder's files, as JSON. Raises OSError, ValueError, CheckpointError."""
     config, images = load_config(source), load_preprocessor(source)
     of_images = {
         "resize_px": images.resize_px,
@@ -229,13 +227,13 @@ def image_facts(source: str) -> dict[str, Any]:
 
 
 def text_facts(source: str) -> dict[str, Any]:
-    """What a text encoder's files say, as JSON can hold it. Raises OSError, ValueError."""
+    """Return the settings in a text encoder's files, as JSON. Raises OSError, ValueError."""
     config = load_config(source)
     return {name: getattr(config, name, None) for name in (*_OF_BOTH, "vocab_size")}
 
 
 def differences(facts: dict[str, Any]) -> list[str]:
-    """Where an encoder that is as wide as upstream's is another one."""
+    """Return the differences between upstream's encoder and another of the same width."""
     known = _IMAGE if "crop_px" in facts else _TEXT
     if facts["hidden_size"] != known["hidden_size"]:
         return []
