@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Trajectories from files, and made as a served model reads them."""
+"""Trajectories from files, fitted to the served checkpoint."""

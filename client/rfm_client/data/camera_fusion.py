@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How the scores of several cameras become one."""
+"""Functions that fuse the scores of several cameras."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A sample made as small as its checkpoint reads it: fewer frames, smaller frames."""
+"""Fit a sample to its checkpoint: fewer frames, smaller frames."""
 
 from __future__ import annotations
 
@@ -16,14 +16,17 @@ from rfm_client.data.sampling import FrameIndices, taken, thinned
 
 @dataclass(frozen=True)
 class FittedSample:
-    """A sample to be sent, and which frames of each of its trajectories are in it (None: all)."""
+    """A sample to send, and the frames that it kept.
+
+    frame_indices: for each trajectory int64 [N], its frames in the sample; None: all
+    """
 
     sample: Sample
     frame_indices: Sequence[FrameIndices | None]
 
 
 def whole(sample: Sample) -> FittedSample:
-    """The sample as it is. Raises InvalidSampleError for any other value."""
+    """Return the sample with all its frames. Raises InvalidSampleError for any other value."""
     if not isinstance(sample, Sample):
         expected = "ProgressSample, PreferenceSample or SimilaritySample"
         raise InvalidSampleError.at("sample", expected, type(sample).__name__)
@@ -31,7 +34,7 @@ def whole(sample: Sample) -> FittedSample:
 
 
 def snapshot(sample: Sample) -> Sample:
-    """The sample with arrays of its own, so that changes of the caller's arrays do not change what is sent."""
+    """Return the sample with copies of its arrays, so that the caller may change the originals before it is sent."""
 
     def copied(trajectory: Trajectory) -> Trajectory:
         names = ("frames", "video_embeddings", "text_embedding")
@@ -42,10 +45,11 @@ def snapshot(sample: Sample) -> Sample:
 
 
 def fitted(sample: Sample, info: ModelInfo, *, subsample: bool, resize: bool) -> FittedSample:
-    """The sample with at most ``info.max_frames`` frames a trajectory, of at most ``info.frame_size``, as requested.
+    """Return the sample with at most ``info.max_frames`` frames a trajectory, of at most ``info.frame_size``.
 
-    Frames are left out as in training (``sampling.thinned``). In dense mode each prefix is sampled by the server, so
-    none is left out here.
+    subsample: leave frames out, as training does (``sampling.thinned``). Not in dense mode, where the server samples
+        each prefix
+    resize: shrink frames
     """
     dense = isinstance(sample, ProgressSample) and sample.frame_steps > 0
     limit = info.max_frames if subsample and not dense else None
@@ -62,7 +66,7 @@ def fitted(sample: Sample, info: ModelInfo, *, subsample: bool, resize: bool) ->
 
 
 def with_frame_indices(result: Result, indices: Sequence[FrameIndices | None]) -> Result:
-    """The result, with the indices of its trajectories' frames that were scored."""
+    """Return the result with the indices of the scored frames, as of ``FittedSample.frame_indices``."""
     if all(kept is None for kept in indices):
         return result
     if isinstance(result, ProgressResult):

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""What people have -> Trajectory: files, URLs, and steps as robot datasets give them.
+"""Trajectories from files, URLs, and the steps of robot datasets.
 
-T steps, H x W pixels. Any array may be a torch tensor, on a GPU or with a gradient too; torch is not imported.
+T steps, H x W pixels, D width of an embedding. Any array may be a torch tensor, also on a GPU or with a gradient; torch
+is not imported.
 """
 
 from __future__ import annotations
@@ -23,15 +24,15 @@ from rfm_client.contract.samples import Trajectory, UInt8Array, as_array
 from rfm_client.data.orientation import Orientation, turned
 from rfm_client.data.video import is_url, read_video
 
-BROKEN_NPY = (  # what numpy raises of a broken .npy header
+BROKEN_NPY = (  # numpy's errors for a broken .npy header
     *(ValueError, TypeError, LookupError, SyntaxError),
     *(tokenize.TokenError, MemoryError, RecursionError),
 )
 ARRAY_SUFFIXES = (".npy", ".npz")
 
-_CAMERA_PREFIX = "observation.images."  # LeRobot's keys, followed by the camera's name
-_ONLY_CAMERA = "observation.image"  # of its datasets of one camera without a name
-_IS_PAD = "_is_pad"  # bool [T] beside a camera: steps before the episode's start or after its end
+_CAMERA_PREFIX = "observation.images."  # of LeRobot's keys, before the camera's name
+_ONLY_CAMERA = "observation.image"  # LeRobot's key of a single camera without a name
+_IS_PAD = "_is_pad"  # suffix of bool [T]: True for steps before the episode's start or after its end
 _FRAMES = "uint8 or float in 0..1 [T, H, W, 3] or [T, 3, H, W]"
 
 
@@ -44,18 +45,18 @@ def load_trajectory(
     end_s: float | None = None,
     orient: Orientation = "none",
 ) -> Trajectory:
-    """The trajectory in a file or behind an http(s) URL.
+    """Return the trajectory in a file or behind an http(s) URL.
 
-    ``.npy``: frames, or embeddings [T, D]. ``.npz``: ``frames``, or ``video_embeddings`` and ``text_embedding``, and
-    ``task``, as in ``as_trajectory``. All else, and every URL, is a video, as in ``read_video``.
+    ``.npy``: frames, or embeddings [T, D]. ``.npz``: ``frames``, or ``video_embeddings`` and ``text_embedding``; and
+    ``task``, as in ``as_trajectory``. All other files, and every URL, are videos, as in ``read_video``.
 
-    task: instead of the file's own
-    fps: frames a second to take of a video; None: all frames
-    start_s, end_s: the part of a video to take, by its time stamps; None: from the start, to the end
-    orient: how frames are turned, so that they are upright
+    task: replaces the task of the file
+    fps: frames a second to take from a video; None: all frames
+    start_s, end_s: part of a video, by its time stamps; None: from the start, to the end
+    orient: the turn that makes frames upright
 
-    Raises InvalidSampleError. Arrays of Python objects are refused: to read them is to run code. So are video files in
-    which LeRobot v3.0 keeps several episodes, unless ``start_s`` and ``end_s`` name a part.
+    Raises InvalidSampleError, also for arrays of Python objects, because reading them runs code. Also for a video file
+    of several LeRobot v3.0 episodes, unless ``start_s`` and ``end_s`` select a part.
     """
     if is_url(source) or Path(source).suffix.lower() not in ARRAY_SUFFIXES:
         return Trajectory(frames=turned(read_video(source, fps, start_s=start_s, end_s=end_s), orient), task=task)
@@ -72,18 +73,20 @@ def load_trajectory(
 def as_trajectory(
     episode: Mapping[str, Any] | Iterable[Mapping[str, Any]], *, task: str = "", camera: str | None = None
 ) -> Trajectory:
-    """The trajectory of an episode of a Hugging Face or LeRobot dataset: a dict over all steps, or one dict a step.
+    """Return the trajectory of an episode of a Hugging Face or LeRobot dataset.
+
+    episode: a dict over all steps, or one dict a step, with the keys
 
     ``observation.images.<camera>`` or ``frames``: [T, H, W, 3] or [T, 3, H, W], or a sequence of T images (arrays,
-        tensors, PIL); uint8, or float in 0..1, which is multiplied by 255 and rounded. Steps that a LeRobot item
-        marks as padding (``<key>_is_pad``) are left out.
+        tensors, PIL); uint8, or float in 0..1, which is multiplied by 255 and rounded. Steps that LeRobot marks as
+        padding (``<key>_is_pad``) are left out.
     ``video_embeddings``, ``text_embedding``: as in Trajectory
     ``task``: text, the same at all steps
 
-    Other keys are not read, but ``episode_index``, if there is one, must be the same at all steps.
+    Other keys are ignored, but ``episode_index``, if present, must be the same at all steps.
 
-    task: instead of the episode's own
-    camera: which, if there are several; ``image`` for the nameless ``observation.image``
+    task: replaces the episode's own
+    camera: the camera to take of several; ``image`` for the nameless ``observation.image``
 
     Raises InvalidSampleError.
     """
@@ -128,7 +131,7 @@ def _arrays(file: Path) -> Mapping[str, npt.NDArray[Any]]:
 
 
 def _columns(steps: Iterable[Mapping[str, Any]]) -> Mapping[str, Any]:
-    """Each key's values at all steps, None where a step lacks it."""
+    """Each key's values at all steps; None where a step lacks the key."""
     items = list(steps) if isinstance(steps, Iterable) else [steps]
     strangers = [type(item).__name__ for item in items if not isinstance(item, Mapping)]
     got = [*strangers, "nothing"][0]
@@ -138,7 +141,7 @@ def _columns(steps: Iterable[Mapping[str, Any]]) -> Mapping[str, Any]:
 
 
 def _only(columns: Mapping[str, Any], key: str, default: Any) -> Any:
-    """The value that the key has at every step. Raises InvalidSampleError for several."""
+    """The key's value. Raises InvalidSampleError if it differs between steps."""
     values = _values(columns[key]) if key in columns else [default]
     for value in values:
         got = f"{values[0]!r} and {value!r}"
@@ -147,7 +150,7 @@ def _only(columns: Mapping[str, Any], key: str, default: Any) -> Any:
 
 
 def _values(column: Any) -> list[Any]:
-    """What a column holds, be it one value for all steps or one a step, in whatever container."""
+    """Flatten a column: one value for all steps or one a step, in any container."""
     if isinstance(column, str):
         return [column]
     if isinstance(column, Sequence):
@@ -173,7 +176,7 @@ def _camera_key(columns: Mapping[str, Any], camera: str | None) -> str:
 
 
 def _frames(where: str, values: Any) -> UInt8Array:
-    """uint8 [T, H, W, 3]."""
+    """Convert T images to uint8 [T, H, W, 3]."""
     images = [as_array(image) for image in values] if isinstance(values, Sequence) else np.atleast_1d(as_array(values))
     kinds = {(image.dtype, image.shape) for image in images}
     got = " and ".join(sorted(f"{dtype} {list(shape)}" for dtype, shape in kinds)) or "none"
@@ -188,5 +191,5 @@ def _frames(where: str, values: Any) -> UInt8Array:
 def _uint8(where: str, image: npt.NDArray[Any]) -> UInt8Array:
     lowest, highest = float(image.min()), float(image.max())
     got = f"values from {lowest:g} to {highest:g} (of floats in 0..255: float_frames_to_uint8)"
-    require(where, lowest >= 0 and highest <= 1, _FRAMES, got, InvalidSampleError)  # and not NaN
+    require(where, lowest >= 0 and highest <= 1, _FRAMES, got, InvalidSampleError)  # false for NaN, too
     return (image.astype(np.float32) * np.float32(255)).round().astype(np.uint8)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Which video files of LeRobot datasets are no video of one episode.
+"""Refuse LeRobot video files that hold several episodes.
 
-Up to v2.1 a dataset has one video for each episode and camera. Since v3.0 one file holds many episodes, one behind the
-other. Read as one video, it would be scored as one long episode: it is refused unless the dataset has one episode in
-all. No table is read: that would need pyarrow.
+Up to v2.1, each episode and camera has its own video. Since v3.0, a file holds many episodes in a row. Read as a single
+video, it would be scored as a long episode. It is refused unless the dataset has only this episode. Tables are not
+read, because that needs pyarrow.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ _SHARED_FILE = re.compile(r"/videos/[^/]+/chunk-\d+/file-\d+\.\w+$")  # the layo
 
 
 def check_local_video(source: str | Path) -> None:
-    """Raises InvalidSampleError for a file in which a LeRobot dataset keeps several episodes.
+    """Raise InvalidSampleError for a file in which a LeRobot dataset keeps several episodes.
 
-    Where no dataset's ``meta/info.json`` lies above the file, the layout of its path decides.
+    The layout of its path decides if no folder above it has a dataset's ``meta/info.json``.
     """
     given = Path(source).absolute()
     for file in dict.fromkeys((given, given.resolve())):  # a download may consist of links into a cache
@@ -39,7 +39,7 @@ def check_local_video(source: str | Path) -> None:
 
 
 def check_video_behind(url: str) -> None:
-    """Raises InvalidSampleError for such a file behind a URL, judged by the URL's path alone."""
+    """Raise InvalidSampleError if a URL's path has the layout of a file of several episodes."""
     _check_layout(unquote(urlsplit(url).path))
 
 

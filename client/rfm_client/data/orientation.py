@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How stored pictures are turned so that they are upright, for each camera. T frames, H x W pixels."""
+"""Turn stored frames upright, for each camera. H x W pixels."""
 
 from __future__ import annotations
 
@@ -16,9 +16,11 @@ ORIENTATIONS: tuple[Orientation, ...] = get_args(Orientation)
 
 
 def turned(frames: UInt8Array, orientation: Orientation) -> UInt8Array:
-    """uint8 [..., H, W, 3], turned: ``rotate90`` is a quarter turn clockwise; ``flip-vertical`` puts the top below.
+    """Return frames, uint8 [..., H, W, 3], turned.
 
-    Raises ValueError for another orientation.
+    ``rotate90`` is a quarter turn clockwise; ``flip-vertical`` swaps top and bottom.
+
+    Raises ValueError for an unknown orientation.
     """
     check_orientation(orientation)
     if orientation == "none":
@@ -34,16 +36,16 @@ def turned(frames: UInt8Array, orientation: Orientation) -> UInt8Array:
 
 
 def check_orientation(orientation: str) -> None:
-    """Raises ValueError for what is no orientation."""
+    """Raise ValueError for an unknown orientation."""
     if orientation not in ORIENTATIONS:
         raise ValueError(f"orient: expected one of {', '.join(ORIENTATIONS)}, got {orientation!r}")
 
 
 @dataclass(frozen=True)
 class Orient:
-    """What the caller says of orientations. Raises ValueError for an unknown one.
+    """The caller's orientations. Raises ValueError for an unknown orientation.
 
-    default: of every camera that ``cameras`` does not name; None: the caller does not say
+    default: for every camera that ``cameras`` does not name; None: not given
     """
 
     default: Orientation | None = None
@@ -56,7 +58,10 @@ class Orient:
 
     @classmethod
     def parse(cls, texts: Iterable[str]) -> Orient:
-        """From ``rotate180``, or ``agentview_rgb=rotate180`` for one camera, each once. Raises ValueError."""
+        """Return the orientations in texts: ``rotate180``, or ``agentview_rgb=rotate180`` for one camera.
+
+        Raises ValueError for a repeated camera or default.
+        """
         default: str | None = None
         cameras: dict[str, str] = {}
         for text in texts:
@@ -67,4 +72,4 @@ class Orient:
                 cameras[camera] = orientation
             else:
                 default = orientation
-        return cls(default, cameras)  # type: ignore[arg-type]  # checked there
+        return cls(default, cameras)  # type: ignore[arg-type]  # Orient checks them

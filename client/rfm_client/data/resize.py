@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Frames made as small as the checkpoint reads them, before they travel. Needs Pillow: ``rfm-client[resize]``."""
+"""Shrink frames to the size that the checkpoint reads, before they travel. Needs Pillow: ``rfm-client[resize]``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ JPEG_QUALITY = 85
 
 
 def load_pillow() -> Any:
-    """Pillow's ``Image``. Raises ImportError, which says how to install it."""
+    """Return Pillow's ``Image``. Raises ImportError with the extra to install."""
     try:
         from PIL import Image
     except ImportError as error:
@@ -24,22 +24,23 @@ def load_pillow() -> Any:
 
 
 def as_jpeg(frame: UInt8Array, longest_px: int) -> bytes:
-    """A frame, uint8 [H, W, 3], as a JPEG file. Its longer side has at most ``longest_px`` pixels."""
+    """Return a frame, uint8 [H, W, 3], as a JPEG file with at most ``longest_px`` pixels on its longer side."""
     image = load_pillow().fromarray(frame)
     image.thumbnail((longest_px, longest_px))
     file = io.BytesIO()
-    image.save(file, "JPEG", quality=JPEG_QUALITY, subsampling=0)  # colours as sharp as the rest
+    image.save(file, "JPEG", quality=JPEG_QUALITY, subsampling=0)  # full resolution of colours
     return file.getvalue()
 
 
 def resize_frames(frames: UInt8Array, size: FrameSize) -> UInt8Array:
-    """uint8 [T, H, W, 3], as small as a checkpoint of this frame size reads them; the same array if they are.
+    """Return frames, uint8 [T, H, W, 3], no larger than the checkpoint reads them; the same array if they fit.
 
-    Resized by Pillow: bicubic, but ``longest`` Lanczos, as SmolVLM. What the network then reads is for SmolVLM the
-    same to the bit, for ReWiND within a grey level or two. Qwen's backbones read the same if ``exact`` is the size that
-    they read; if they round it to whole patches, frames are resized twice, and single pixels differ by up to 15.
+    Pillow resizes: Lanczos for the rule ``longest``, as SmolVLM does; otherwise bicubic. The network's input stays the
+    same to the bit for SmolVLM, and within a grey level or two for ReWiND. For Qwen's backbones it stays the same if
+    they read the size ``exact`` itself. If they round this size to whole patches, frames are resized twice, and single
+    pixels differ by up to 15.
     """
-    Image = load_pillow()  # noqa: N806  as Pillow writes it
+    Image = load_pillow()  # noqa: N806  Pillow's spelling
     height, width = size.fitted(frames.shape[1], frames.shape[2])
     if (height, width) == frames.shape[1:3]:
         return frames

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Which frames of an episode a model is shown when the newest is frame t: the rules in use, by name.
+"""Sampling rules: which frames of an episode the model sees when frame t is the newest.
 
-``docs/guides/choose_frames.md`` has them in a table, with who uses which. No rule shows a frame after t.
+``docs/guides/choose_frames.md`` lists the rules and their users. No rule shows a frame after t.
 
-Shapes: K frames that the rule shows, S slots of the sample that is sent, T frames of the episode.
+Shapes: K frames that the rule shows, S slots of the sample, T frames of the episode.
 """
 
 from __future__ import annotations
@@ -27,23 +27,26 @@ Rule: TypeAlias = Literal[
 FrameIndices: TypeAlias = npt.NDArray[np.int64]
 
 RULES: tuple[Rule, ...] = get_args(Rule)
-REWIND_FRAMES = 16  # of the first ReWiND code, whatever its checkpoint
+REWIND_FRAMES = 16  # fixed in the first ReWiND code, for every checkpoint
 
 _REWIND: tuple[Rule, ...] = ("rewind_pad16_online", "rewind_pad16_offline")
-_PADDED: tuple[Rule, ...] = ("rint_pad", *_REWIND)  # with the newest frame, to K slots
+_PADDED: tuple[Rule, ...] = ("rint_pad", *_REWIND)  # filled up to K slots with the newest frame
 
 
 def trained_rule(trained_padding: bool) -> Rule:
-    """The rule by which a checkpoint's training cut its clips, and padded shorter ones or did not."""
+    """Return the rule by which training cut the clips of a checkpoint.
+
+    trained_padding: True if training padded shorter clips
+    """
     return "rint_pad" if trained_padding else "rint"
 
 
 @dataclass(frozen=True, eq=False)
 class Prefix:
-    """What a model is shown of the frames 0..t, and where its answer about frame t is.
+    """The frames that a rule shows of the frames 0 to t, and the slot with frame t's score.
 
     indices: int64 [S], the frame in each slot, padding included
-    read: the slot whose score is that of frame t
+    read: the slot with frame t's score
     """
 
     indices: FrameIndices
@@ -51,9 +54,9 @@ class Prefix:
 
     @property
     def frame_slots(self) -> FrameIndices:
-        """int64 [N], a slot of each frame that is shown, in order.
+        """int64 [N], a slot for each of the N distinct frames, in order.
 
-        Of a frame that repeats the last one, of frame t the one that is read.
+        A repeated frame has its last slot, frame t the slot ``read``.
         """
         slots = np.flatnonzero(np.diff(self.indices, append=self.indices[-1] + 1))
         slots[-1] = self.read
@@ -62,9 +65,9 @@ class Prefix:
 
 @dataclass(frozen=True)
 class Sampling:
-    """A rule, and how many frames it shows. Raises ValueError for a number that the rule does not take.
+    """A sampling rule and its number of frames. Raises ValueError if the rule does not take the number.
 
-    frames: K; None where the rule needs none (``all``) or has its own (``rewind_pad16_*``: 16)
+    frames: K; None for the rule ``all``. For ``rewind_pad16_*``, None becomes 16
     """
 
     rule: Rule
@@ -86,11 +89,11 @@ class Sampling:
     def of(
         cls, rule: Rule | None, frames: int | None, trained_frames: int | None, *, trained_padding: bool = True
     ) -> Sampling:
-        """The rule and its number of frames: where the caller says neither (None), those of the checkpoint's training.
+        """Return the caller's rule and number of frames; where they are None, those of the checkpoint's training.
 
         trained_frames, trained_padding: ``max_frames`` and ``trained_padding`` of the checkpoint's ``ModelInfo``
 
-        Raises ValueError if neither says how many frames a rule shows that needs a number.
+        Raises ValueError if the rule needs a number, and neither the caller nor the checkpoint gives it.
         """
         rule = rule or trained_rule(trained_padding)
         if frames is None and rule not in (*_REWIND, "all"):
@@ -103,7 +106,7 @@ class Sampling:
         return self.rule if self.frames is None else f"{self.rule}, {self.frames} frames"
 
     def prefix(self, t: int) -> Prefix:
-        """What the model is shown when frame ``t``, counted from 0, is the newest."""
+        """Return the frames to show when frame ``t``, counted from 0, is the newest."""
         if self.frames is None:
             shown = np.arange(t + 1)
         elif self.rule in ("rint", "rint_pad"):
@@ -120,33 +123,33 @@ class Sampling:
 
 
 def thinned(num_frames: int, limit: int | None) -> FrameIndices | None:
-    """int64 [limit], the frames of a longer clip that training would have kept; None: all may stay.
+    """Return int64 [limit], the frames that training would keep of a longer clip; None: all frames.
 
-    As ``robometer`` cuts its training clips: the rule ``rint``.
+    Uses the rule ``rint``, by which ``robometer`` cuts training clips.
     """
     return None if limit is None or num_frames <= limit else _rint(num_frames - 1, limit)
 
 
 def taken(trajectory: Trajectory, indices: FrameIndices) -> Trajectory:
-    """The trajectory of these of its frames, or frame embeddings; its text stays."""
+    """Return the trajectory with the frames, or frame embeddings, at ``indices``, int64 [N]; its text stays."""
     if trajectory.frames is not None:
         return replace(trajectory, frames=trajectory.frames[indices])
-    assert trajectory.video_embeddings is not None  # a Trajectory has one of them
+    assert trajectory.video_embeddings is not None  # a Trajectory has frames or embeddings
     return replace(trajectory, video_embeddings=trajectory.video_embeddings[indices])
 
 
 def prefix_samples(trajectory: Trajectory, sampling: Sampling) -> Iterator[ProgressSample]:
-    """The sample of each prefix 0..t of the trajectory, made one after the other. Raises InvalidSampleError."""
+    """Yield the sample of each prefix, for t from 0 to T - 1. Raises InvalidSampleError."""
     for t in range(trajectory.num_frames):
         yield ProgressSample(taken(trajectory, sampling.prefix(t).indices))
 
 
 def of_prefixes(results: Sequence[ProgressResult], sampling: Sampling) -> ProgressResult:
-    """The result of the episode: frame t's score is the one of the prefix 0..t at the slot that the rule reads.
+    """Return the result of the episode: frame t has the scores of prefix 0 to t at the slot ``Prefix.read``.
 
-    results: [T], of the samples of ``prefix_samples``
+    results: [T], for the samples of ``prefix_samples``
 
-    Raises InferenceFailedError if several versions of the checkpoint gave them.
+    Raises InferenceFailedError if the results come from several versions of the checkpoint.
     """
     versions = sorted({str(result.model_version) for result in results})
     if len(versions) > 1:
@@ -160,7 +163,7 @@ def of_prefixes(results: Sequence[ProgressResult], sampling: Sampling) -> Progre
 
 
 def of_frames(result: ProgressResult, prefix: Prefix) -> ProgressResult:
-    """The scores of the frames that a prefix shows, each once, without padding."""
+    """Return the scores of the frames that a prefix shows, each once, without padding."""
     slots = prefix.frame_slots
     return replace(result, progress=result.progress[slots], success=result.success[slots])
 
@@ -170,4 +173,4 @@ def _rint(t: int, frames: int) -> FrameIndices:
         return np.arange(t + 1)
     if frames == 1:
         return np.array([t], np.int64)
-    return np.linspace(0, t, frames).round().astype(np.int64)  # 0 and t are whole, and rounding keeps the order
+    return np.linspace(0, t, frames).round().astype(np.int64)  # keeps the ends 0 and t, and the order

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Video files and URLs -> frames. Needs PyAV: ``pip install "./client[video]"``."""
+"""Read the frames of video files and URLs. Needs PyAV: ``pip install "./client[video]"``."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ _RGB_BYTES = 3  # of a pixel
 
 
 def frame_indices(total: int, native_fps: float, fps: float) -> npt.NDArray[np.int64]:
-    """int64 [T], which of ``total`` frames stand for the video at ``fps``.
+    """Return int64 [T], the indices of the frames that show a video of ``total`` frames at ``fps``.
 
-    As the original example client picks them: round(total * fps / native_fps) frames, at least one and at most
-    all, evenly from the first to the last, truncated to whole frames.
+    As in upstream's example client: T = round(total * fps / native_fps), at least 1 and at most ``total``, evenly
+    spaced from first to last, rounded down.
     """
     count = min(max(round(total * fps / native_fps), 1), total)
     return _spread(total, count)
@@ -64,22 +64,22 @@ def read_video(
     take: Callable[[int], object] | None = None,
     container: str | None = None,
 ) -> UInt8Array:
-    """uint8 [T, H, W, 3], the frames at ``fps`` of a video file or http(s) URL; None: all of them.
+    """Return uint8 [T, H, W, 3], the frames at ``fps`` of a video file or http(s) URL; None: all frames.
 
-    Frames are counted, not timed: in a video of variable frame rate, T is that of its average rate, and frames are
-    even in number, not in time. Colours are those of ``ffmpeg -pix_fmt rgb24``, whatever PyAV is installed. A video
-    that is to be shown turned (as phones record) or mirrored is. Of all decoded frames only those that are returned are
-    held in memory. A URL is downloaded once, to a temporary file.
+    Frames are counted, not timed: at a variable frame rate, T follows the average rate, and frames are evenly spaced in
+    number, not in time. Colours equal ``ffmpeg -pix_fmt rgb24`` with any PyAV. Frames are turned and mirrored as the
+    file says, as phones record. Only the returned frames stay in memory. A URL is downloaded once, to a temporary file.
 
-    start_s, end_s: only the frames from here to before there, by their time stamps; None: from the start, to the end
-    timeout_s: the longest that the server of a URL may be silent
-    take: told at each frame how many bytes of memory are taken, before they are; what it raises ends the reading
-    container: FFmpeg's name of the format that the file is read as, for files that nobody vouches for: some formats
-        name other files or addresses, which are then opened; None: whatever it looks like
+    start_s, end_s: take the frames from ``start_s`` to before ``end_s``, by time stamps; None: from the start, to the
+        end
+    timeout_s: longest silence of a URL's server
+    take: called before each frame takes memory, with the number of bytes; its error ends the reading
+    container: FFmpeg's name of the file's format; None: FFmpeg guesses it. Name it for untrusted files, because some
+        formats make FFmpeg open other files or addresses
 
-    Raises InvalidSampleError for what is no video, breaks off, or cannot be had, for a damaged frame among those that
-    are returned, for a file of several videos or of depth maps, and for one of several LeRobot episodes
-    (``lerobot_videos``) unless ``start_s`` and ``end_s`` name a part of it.
+    Raises InvalidSampleError if the file is missing, truncated or no video, or has several videos or depth maps; if a
+    returned frame is damaged; and for a file of several LeRobot episodes (``lerobot_videos``) without both ``start_s``
+    and ``end_s``.
     """
     import_av()
     _check_numbers(fps, start_s, end_s, timeout_s)
@@ -109,8 +109,9 @@ def read_video(
 
 
 def frame_times_s(file: str | Path, num_frames: int, *, container: str | None = None) -> npt.NDArray[np.float64] | None:
-    """float64 [T], when each of T frames that ``read_video`` took of a file is shown, the first at 0; None: unknown.
+    """Return float64 [T], the times of the frames that ``read_video`` took of a file, from 0; None: unknown.
 
+    num_frames: T
     container: as in ``read_video``
     """
     with _errors_of(file), Path(file).open("rb") as opened:
@@ -123,7 +124,7 @@ def frame_times_s(file: str | Path, num_frames: int, *, container: str | None = 
 
 @contextmanager
 def _errors_of(source: str | Path) -> Iterator[None]:
-    """Raises InvalidSampleError with the source for what goes wrong inside."""
+    """Raise errors of the block as InvalidSampleError with the source."""
     try:
         yield
     except VideoError as error:
@@ -147,7 +148,7 @@ def _check_numbers(fps: float | None, start_s: float | None, end_s: float | None
 
 
 def _spread(total: int, count: int) -> npt.NDArray[np.int64]:
-    """int64 [count], evenly from the first to the last of ``total``, truncated."""
+    """int64 [count], evenly spaced from first to last of ``total``, rounded down."""
     return np.linspace(0, total - 1, count).astype(np.int64)
 
 
@@ -157,7 +158,7 @@ def _opened(source: str | Path, timeout_s: float) -> Iterator[BinaryIO]:
         with Path(source).open("rb") as file:
             yield file
         return
-    with TemporaryFile() as copy:  # it is read twice, and the index of an MP4 may be at its end
+    with TemporaryFile() as copy:  # read twice, and an MP4's index may be at its end
         _download(str(source), copy, timeout_s)
         yield copy
 
@@ -167,16 +168,16 @@ def _download(url: str, file: BinaryIO, timeout_s: float) -> None:
         with open_url(url, timeout_s) as response:
             shutil.copyfileobj(response, file)
             length = response.headers.get("Content-Length")
-        if length and file.tell() != int(length):  # urllib takes a connection that broke for the end
+        if length and file.tell() != int(length):  # urllib takes a broken connection for the end
             raise OSError(f"{file.tell()} of {length} bytes came")
     except (OSError, HTTPException, ValueError) as error:
         if isinstance(error, HTTPError):
-            error.close()  # it is a response too, and holds the connection
+            error.close()  # an HTTPError holds the connection
         raise VideoError(_EXPECTED, str(error)) from error
 
 
 def _part(packets: Packets, start_s: float | None, end_s: float | None) -> tuple[int, int]:
-    """Numbers of the first frame from ``start_s`` and the first from ``end_s`` on, within half a frame."""
+    """Numbers of the first frames from ``start_s`` and from ``end_s`` on, within half a frame."""
     half_s, times_s = 0.5 / packets.fps, packets.times_s
     bounds_s = [(start_s or 0.0) - half_s, (math.inf if end_s is None else end_s) - half_s]
     first, end = np.searchsorted(times_s, bounds_s).tolist()
@@ -187,7 +188,7 @@ def _part(packets: Packets, start_s: float | None, end_s: float | None) -> tuple
 
 
 def _picked(first: int, end: int, packets: Packets, fps: float | None) -> set[int]:
-    """Numbers of the frames that stand for those from ``first`` to before ``end`` at ``fps``."""
+    """Numbers of the frames that show ``first`` to ``end`` - 1 at ``fps``."""
     own_fps, fps = (1.0, 1.0) if fps is None else (packets.fps, fps)
     return set((first + frame_indices(end - first, own_fps, fps)).tolist())
 
@@ -195,7 +196,7 @@ def _picked(first: int, end: int, packets: Packets, fps: float | None) -> set[in
 def _decoded(
     file: BinaryIO, wanted: set[int], take: Callable[[int], object], container: str | None
 ) -> tuple[Sequence[UInt8Array], int]:
-    """The wanted frames, and how many there are in all. Raises InvalidSampleError for a damaged one."""
+    """The wanted frames, and the number of all frames. Raises InvalidSampleError if a wanted frame is damaged."""
     picked, total = [], 0
     file.seek(0)
     with import_av().open(file, format=container) as opened:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Decoding that all readers of videos share: choice of the stream, colours, orientation, damaged frames, broken files.
+"""Decoding shared by all readers of videos: stream, colours, orientation, damaged frames, broken files.
 
-The containers, streams, packets and frames are PyAV's.
+Containers, streams, packets and frames are PyAV's.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from rfm_client.contract.samples import UInt8Array
 UNDAMAGED = "an undamaged frame"
 DAMAGED = "one that the decoder marks, or is made from such a one"
 
-_MATRICES = (1, 4, 5, 7, 9)  # from YUV to RGB, as libswscale numbers them; the frame's numbers (ITU-T H.273) are equal
+_MATRICES = (1, 4, 5, 7, 9)  # YUV to RGB, in libswscale's numbers, which equal a frame's (ITU-T H.273)
 _BT709, _BT601, _BT2020 = 1, 5, 9
-_SAME_MATRIX = {6: _BT601, 10: _BT2020}  # numbers of H.273 that stand for one of them
-_LIMITED, _FULL = 1, 2  # ranges, numbered likewise
-_BITS = 8  # of the one channel of a grey video; depth maps have more
-_NEARLY = math.tan(math.radians(1))  # how far FFmpeg lets a display matrix be from quarter turns
+_SAME_MATRIX = {6: _BT601, 10: _BT2020}  # other numbers of H.273 for the same matrix
+_LIMITED, _FULL = 1, 2  # ranges, in the same numbering
+_BITS = 8  # most bits of a grey video's only channel; depth maps have more
+_NEARLY = math.tan(math.radians(1))  # FFmpeg's tolerance for quarter turns of a display matrix
 
-_EBML, _SEGMENT = 0x1A45DFA3, 0x18538067  # how Matroska and WebM begin (RFC 8794, RFC 9559)
-_BOX_BYTES = 8  # size and kind of an MP4 box (ISO 14496-12)
-_BIG = 1  # a size that says that 8 more bytes tell it
+_EBML, _SEGMENT = 0x1A45DFA3, 0x18538067  # first IDs of Matroska and WebM files (RFC 8794, RFC 9559)
+_BOX_BYTES = 8  # header of an MP4 box: size and kind (ISO 14496-12)
+_BIG = 1  # this size means that the next 8 bytes hold the size
 _FRAMES = b"mdat"
 _BOXES = (b"ftyp", b"styp", b"free", b"skip", b"wide", b"moov", b"moof", b"sidx", b"uuid", b"emsg", b"prft", _FRAMES)
 
 
 class VideoError(Exception):
-    """A file that cannot be read as one video: what was expected, and what is there."""
+    """A file that is not one readable video. ``expected`` and ``got`` are the parts of a message."""
 
     def __init__(self, expected: str, got: str) -> None:
         super().__init__(expected, got)
@@ -44,7 +44,7 @@ class VideoError(Exception):
 
 
 def import_av() -> Any:
-    """The module ``av``. Raises ImportError that names the extra."""
+    """Return the module ``av``. Raises ImportError with the extra to install."""
     try:
         import av
     except ImportError as error:
@@ -53,16 +53,16 @@ def import_av() -> Any:
 
 
 def decoder() -> str:
-    """PyAV with its version, and those of the libraries in it that decide what a decoded frame looks like."""
+    """Return the versions of PyAV and of its libraries that decide the pixels of a decoded frame."""
     av = import_av()
     libraries = (f"{name} {'.'.join(map(str, av.library_versions[name]))}" for name in ("libswscale", "libavcodec"))
     return f"PyAV {av.__version__}, {', '.join(libraries)}"
 
 
 def video_stream(container: Any) -> Any:
-    """The video stream of an opened file that is the video. Attached pictures, such as cover art, are none.
+    """Return the only video stream of an opened container. Attached pictures, such as cover art, do not count.
 
-    Raises VideoError if there is none, or more than one, and for depth maps.
+    Raises VideoError for no stream, several streams, or depth maps.
     """
     attached = import_av().stream.Disposition.attached_pic
     videos = {n: stream for n, stream in enumerate(container.streams.video) if not stream.disposition & attached}
@@ -79,14 +79,14 @@ def video_stream(container: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Packets:
-    """What a video holds, read without decoding it.
+    """The packets of a video's frames, read without decoding.
 
-    count: of its frames that are shown, as far as each has a packet of its own
-    times_s: float64 [N], rising, of those that have a time stamp
-    num_bytes: how many bytes each of these has
-    corrupt: numbers of the packets that are broken
-    tick_s: what times are multiples of
-    fps: frames a second on average; 0: the file does not say it
+    count: packets of frames that are shown; equals the number of frames unless a packet holds several
+    times_s: float64 [N], sorted time stamps; packets without a time stamp are left out
+    num_bytes: size of each of these N packets
+    corrupt: numbers of the broken packets, in the order of the file
+    tick_s: unit of the time stamps, in seconds
+    fps: average frames a second; 0: the file does not say it
     """
 
     count: int
@@ -98,11 +98,11 @@ class Packets:
 
 
 def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
-    """The packets of a video. Counts them, since what the container says may be wrong.
+    """Return the packets of a video. They are counted, because the container's own count may be wrong.
 
-    container: FFmpeg's name of the format that the file is read as; None: whatever it looks like
+    container: FFmpeg's name of the file's format; None: FFmpeg guesses it
 
-    Raises VideoError, as for a file that breaks off, and what PyAV raises.
+    Raises VideoError, also for a truncated file, and the errors of PyAV.
     """
     missing = _broken_off(file)
     if missing is not None:
@@ -114,7 +114,7 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
     with import_av().open(file, format=container) as opened:
         stream = video_stream(opened)
         for packet in opened.demux(stream):
-            if not packet.size or packet.is_discard:  # not shown, as a video that was cut without encoding has them
+            if not packet.size or packet.is_discard:  # hidden, in videos cut without encoding
                 continue
             if packet.pts is not None:
                 timed.append((float(packet.pts * packet.time_base), packet.size))
@@ -128,16 +128,16 @@ def read_packets(file: BinaryIO, container: str | None = None) -> Packets:
 
 
 def upright(frame: Any) -> UInt8Array:
-    """uint8 [H, W, 3], a decoded frame in RGB as it is to be shown, turned and mirrored as FFmpeg does.
+    """Return uint8 [H, W, 3]: a decoded frame in RGB, turned and mirrored as FFmpeg shows it.
 
-    Raises VideoError for a frame that is to be shown aslant.
+    Raises VideoError for a frame that FFmpeg would show aslant.
     """
     image, matrix = _rgb(frame), frame.side_data.get("DISPLAYMATRIX")
     return image if matrix is None else np.ascontiguousarray(_shown(image, np.frombuffer(bytes(matrix), np.int32)))
 
 
 def judged(frames: Iterable[Any]) -> Iterator[tuple[Any, bool]]:
-    """Each decoded frame, and whether it is damaged: the decoder marks it, or one that it may be made from."""
+    """Yield each decoded frame with True if the decoder marked it, or a frame before it since the last key frame."""
     is_damaged = False
     for frame in frames:
         is_damaged = frame.is_corrupt or (is_damaged and not frame.key_frame)
@@ -145,7 +145,7 @@ def judged(frames: Iterable[Any]) -> Iterator[tuple[Any, bool]]:
 
 
 def _check_colours(pixels: Any) -> None:
-    """Raises VideoError for pixels as depth maps have them: of one channel, but for transparency, or of floats."""
+    """Raise VideoError for pixels of depth maps: floats, or one deep channel besides transparency."""
     if pixels is None:
         return
     has_one = len(pixels.components) <= 2 and max(component.bits for component in pixels.components) > _BITS
@@ -155,10 +155,10 @@ def _check_colours(pixels: Any) -> None:
 
 
 def _rgb(frame: Any) -> UInt8Array:
-    """uint8 [H, W, 3], equal to what ``ffmpeg -pix_fmt rgb24`` makes of the frame.
+    """Convert a frame to uint8 [H, W, 3], equal to the output of ``ffmpeg -pix_fmt rgb24``.
 
-    Matrix and range are passed, since PyAV before 17 takes each video for one of BT.601 and limited range. It also does
-    so where source and target are equal: they differ here, which means nothing for RGB.
+    PyAV before 17 assumes BT.601 and limited range unless both are passed. It also does so if the source's matrix
+    equals the target's. So the target's differs here, which means nothing for RGB.
     """
     options: dict[str, int] = {}
     if not frame.format.is_rgb:
@@ -174,7 +174,7 @@ def _rgb(frame: Any) -> UInt8Array:
 
 
 def _shown(image: UInt8Array, matrix: npt.NDArray[np.int32]) -> UInt8Array:
-    """The image by a display matrix: x' = a x + c y, y' = b x + d y, y downwards (ISO 14496-12)."""
+    """Turn the image by a display matrix: x' = a x + c y, y' = b x + d y, y downwards (ISO 14496-12)."""
     a, b, _, c, d = (float(value) for value in matrix[:5])
     is_turned = max(abs(a), abs(d)) < _NEARLY * min(abs(b), abs(c))
     if not is_turned and max(abs(b), abs(c)) > _NEARLY * min(abs(a), abs(d)):
@@ -186,10 +186,10 @@ def _shown(image: UInt8Array, matrix: npt.NDArray[np.int32]) -> UInt8Array:
 
 
 def _broken_off(file: BinaryIO) -> str | None:
-    """What is there of an MP4, Matroska or WebM file that is shorter than it says itself; None: nothing is missing.
+    """Describe an MP4, Matroska or WebM file that is shorter than its header says; None: it is whole.
 
-    The container's sizes tell it, not its duration: they are exact whatever the frame rate and the sound. A file that
-    does not know its size, as live recordings do not, is believed; so is any other format.
+    The container's sizes are exact for any frame rate and sound; its duration is not. A file of unknown size, such as
+    a live recording, and any other format count as whole.
     """
     there = file.seek(0, os.SEEK_END)
     file.seek(0)
@@ -198,7 +198,7 @@ def _broken_off(file: BinaryIO) -> str | None:
 
 
 def _matroska_bytes(file: BinaryIO) -> int | None:
-    """Where a Matroska file ends by its own account. The file is read from behind its first 4 bytes on."""
+    """The size that a Matroska file declares; None: unknown. Reads on after the first 4 bytes."""
     header_bytes = _ebml_number(file)
     if header_bytes is None:
         return None
@@ -210,7 +210,7 @@ def _matroska_bytes(file: BinaryIO) -> int | None:
 
 
 def _ebml_number(file: BinaryIO) -> int | None:
-    """The size of an element; None: unknown. Leading zero bits count its further bytes; all ones stand for unknown."""
+    """The size of an EBML element; None: unknown (all bits 1). Leading zero bits count the further bytes."""
     first = file.read(1)
     if not first or not first[0]:
         return None
@@ -221,9 +221,9 @@ def _ebml_number(file: BinaryIO) -> int | None:
 
 
 def _mp4_bytes(file: BinaryIO, there: int) -> int | None:
-    """Where the box of frames that reaches furthest out of an MP4 file would end; None: none does.
+    """The declared end of an MP4 box of frames that reaches beyond the file; None: there is no such box.
 
-    What follows an unknown box is not judged: cameras append notes of their own.
+    Stops at an unknown box, because cameras append notes of their own.
     """
     begin = 0
     while begin < there:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A dataset by its path or Hub id, whatever its layout; of a layout that is not read, how it becomes one that is."""
+"""Open a dataset by path or Hub id, or say how to convert its layout."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LAYOUTS = (
     f"a folder of videos with {' or '.join(TABLES)}, or a Hub id org/name[@revision]"
 )
 _TABLE = "list the videos in tasks.csv (columns video, task)"
-_UNREAD = {  # what is to be done with a layout that is not read, by the names of its files
+_UNREAD = {  # remedies for layouts without a reader, by pattern of file names
     r"meta_data": "a LeRobot dataset of v1: convert it to v2.0 with convert_dataset_v1_to_v2.py of lerobot/datasets/v2 "
     "(LeRobot 0.3), and label that",
     r"features\.json|.*\.tfrecord.*": "an RLDS (TensorFlow) dataset: convert it to LeRobot with openx2lerobot of "
@@ -36,10 +36,11 @@ _PICTURES, _VIDEOS = ("png", "jpg", "jpeg"), ("mp4", "mkv", "mov", "webm", "avi"
 def open_dataset(
     source: str | Path, *, task: str | None = None, override_task: bool = False, orient: Orient = Orient()
 ) -> Dataset:
-    """The dataset at a path, or of a Hub id ``org/name[@revision]``, which is downloaded. A path that exists wins.
+    """Return the dataset at a path, or download the Hub id ``org/name[@revision]``. An existing path wins.
 
-    task: what is to be done in the episodes that do not say it; override_task: in all episodes
-    orient: how the pictures of each camera are turned; HDF5 files that say that they are LIBERO's are turned without it
+    task: task of episodes without their own
+    override_task: True: ``task`` is the task of all episodes
+    orient: turn of each camera's frames. HDF5 files marked as LIBERO's are turned by default
 
     Raises DatasetError.
     """
@@ -60,23 +61,23 @@ def open_dataset(
 
 
 def _from_hub(name: str, revision: str | None, task: TaskOverride, orient: Orient) -> LeRobotDataset:
-    """The dataset of the Hub at a commit, a branch or a tag; None: its main branch."""
+    """Download a dataset at a commit, branch or tag; None: the main branch."""
     try:
         from huggingface_hub import snapshot_download
     except ImportError as error:
         raise ImportError('datasets of the Hub need huggingface-hub: pip install "./client[label]"') from error
     try:
         folder = Path(snapshot_download(name, repo_type="dataset", revision=revision))
-    except (OSError, ValueError) as error:  # what the Hub's library raises, requests' errors included
+    except (OSError, ValueError) as error:  # the Hub's library raises these, errors of requests included
         raise DatasetError.at(name, "a local dataset or one of the Hub", str(error).splitlines()[0]) from error
     if not (folder / INFO_FILE).is_file():
         raise DatasetError.at(name, f"a LeRobot dataset's {INFO_FILE}", _unread(folder) or "none")
-    commit = folder.name  # the folder is called after it
+    commit = folder.name  # names a folder in the Hub's cache
     return LeRobotDataset(folder, source=name, revision=commit, task=task, orient=orient)
 
 
 def _unread(path: Path) -> str | None:
-    """What lies at a path that no reader takes, and what to do with it; None: nothing of a known form."""
+    """A known layout without a reader, and its remedy; None: the layout is unknown."""
     found = [path] if path.is_file() else [each for below in ("*", "*/*") for each in path.glob(below)]
     names = [path.name, *(each.name for each in found)]
     for pattern, what in _UNREAD.items():
@@ -105,11 +106,11 @@ def _is_aloha(folder: Path, pattern: Path) -> bool:
 
         with h5py.File(next(iter(folder.glob(str(pattern.relative_to(folder))))), "r") as opened:
             return ALOHA_GROUP in opened
-    except (ImportError, OSError):  # it is a folder of HDF5 files all the same
+    except (ImportError, OSError):  # treated as any folder of HDF5 files
         return False
 
 
 def _pattern(folder: Path, suffixes: tuple[str, ...] | list[str]) -> Path | None:
-    """The pattern of the folder's files with one of these suffixes, or of those one level below; None: it has none."""
+    """Glob pattern of files with one of these suffixes, in the folder or a level below; None: no such files."""
     patterns = [f"{below}*.{suffix}" for below in ("", "*/") for suffix in suffixes]
     return next((folder / pattern for pattern in patterns if any(folder.glob(pattern))), None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a dataset gives: episodes with their tasks, and each camera's frames when they are asked for.
+"""Interface of a dataset: episodes with their tasks, and each camera's frames on demand.
 
 T frames of an episode, H x W pixels.
 """
@@ -24,16 +24,16 @@ _CAMERA_PREFIX = "observation.images."
 
 
 class DatasetError(RewardError, ValueError):
-    """A dataset that contradicts itself or cannot be read, reported as ``where: expected X, got Y``."""
+    """A contradictory or unreadable dataset, reported as ``where: expected X, got Y``."""
 
     @classmethod
     def at(cls, where: object, expected: str, got: object) -> DatasetError:
-        """The error at a file, or at a place in it."""
+        """Return the error at a file, or at a place in it."""
         return cls(f"{where}: expected {expected}, got {got}")
 
 
 def require(where: object, condition: bool, expected: str, got: object) -> None:
-    """Raises DatasetError unless the condition holds."""
+    """Raise DatasetError unless the condition holds."""
     checks.require(where, condition, expected, got, DatasetError)
 
 
@@ -42,8 +42,8 @@ class DatasetEpisode:
     """One episode of a dataset.
 
     index: its number in the dataset
-    name: what it is called there
-    first_index: the dataset's number of its first frame; the others follow one by one
+    name: its name in the dataset
+    first_index: the dataset's number of its first frame; the others follow
     """
 
     index: int
@@ -54,17 +54,17 @@ class DatasetEpisode:
 
 
 class Dataset(ABC):
-    """Episodes on disk. Opening one reads tables and no frames.
+    """Episodes on disk. Opening a dataset reads its tables, but no frames.
 
-    kind: its layout, for example ``LeRobot v3.0``
-    root: the folder in which labels are written unless the caller names another one
-    source: its id on the Hub, or the name of its folder or file
-    revision: the commit of the Hub; None: it is local
-    cameras: their names, in the dataset's order
-    depth_cameras: those whose pictures are distances, not colours: left out unless they are named
-    left_out: pictures that cannot be scored and are none of ``cameras``, with the reason
-    orientations: how ``frames`` turns the stored pictures of each camera that it turns
-    notes: what the caller should know of its pictures before they are scored, a line each
+    kind: layout, for example ``LeRobot v3.0``
+    root: default folder for labels
+    source: id on the Hub, or name of the folder or file
+    revision: commit on the Hub; None: local
+    cameras: names, in the dataset's order
+    depth_cameras: cameras of distances instead of colours, used only if named
+    left_out: pictures that cannot be scored, with the reason; not in ``cameras``
+    orientations: turn that ``frames`` makes, by camera; others are not turned
+    notes: lines for the caller to read before scoring
     """
 
     kind: str
@@ -84,42 +84,42 @@ class Dataset(ABC):
 
     @abstractmethod
     def read_episodes(self) -> Sequence[DatasetEpisode]:
-        """Reads and checks the tables of all episodes."""
+        """Read and check the tables of all episodes."""
 
     @abstractmethod
     def decoder(self, camera: str) -> str | None:
-        """The library that decodes the camera's pictures, with its version; None: they are stored as pixels."""
+        """Return the library that decodes the camera's frames, with its version; None: they are stored as pixels."""
 
     @abstractmethod
     def identity(self, episode: DatasetEpisode, camera: str, *, verify: bool) -> str:
-        """What tells the episode's stored frames from others.
+        """Return a text that identifies the episode's stored frames. Raises DatasetError.
 
-        Of a video its size and time of change, or with ``verify`` its SHA-256. Of pictures in a table, into which other
-        programs write too, a digest of the pictures. Raises DatasetError.
+        For a video, its size and modification time, or its SHA-256 with ``verify``. For pictures in a table, their
+        digest, because other programs write into tables too.
         """
 
     @abstractmethod
     def check(self, episode: DatasetEpisode, camera: str) -> int:
-        """Finds every frame of the episode without decoding one. Gives how many bytes they take as they are stored.
+        """Find every frame of the episode without decoding. Return their size in bytes, as stored.
 
-        Raises DatasetError for what contradicts itself, or is missing.
+        Raises DatasetError for missing or contradictory data.
         """
 
     @abstractmethod
     def stored_frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
-        """The T frames in order, uint8 [H, W, 3], RGB, each decoded once, as they are stored. Raises DatasetError."""
+        """Yield the T frames in order, uint8 [H, W, 3], RGB, as stored, each decoded once. Raises DatasetError."""
 
     def frames(self, episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
-        """The T frames in order, uint8 [H, W, 3], RGB, turned as ``orientations`` says. Raises DatasetError."""
+        """Yield the T frames in order, uint8 [H, W, 3], RGB, turned as in ``orientations``. Raises DatasetError."""
         orientation = self.orientations.get(camera, "none")
         return (turned(frame, orientation) for frame in self.stored_frames(episode, camera))
 
 
 def chosen_cameras(dataset: Dataset, names: Iterable[str]) -> tuple[str, ...]:
-    """The dataset's cameras of these names; none: all but depth cameras.
+    """Return the dataset's cameras of these names; without names, all but depth cameras.
 
-    A name may leave LeRobot's ``observation.images.`` out. Raises DatasetError for a camera that the dataset does not
-    have, and if only depth cameras could be meant.
+    A name may omit LeRobot's ``observation.images.``. Raises DatasetError for an unknown camera, and without names if
+    all are depth cameras.
     """
     some = f"some of {', '.join(dataset.cameras)}"
     chosen = []
@@ -137,9 +137,9 @@ def chosen_cameras(dataset: Dataset, names: Iterable[str]) -> tuple[str, ...]:
 def orientations_of(
     orient: Orient, cameras: Sequence[str], defaults: Mapping[str, Orientation] | None = None
 ) -> Mapping[str, Orientation]:
-    """The orientation of each camera that is turned. Raises DatasetError for a camera that is not there.
+    """Return the orientation of each camera that is turned. Raises DatasetError for an unknown camera.
 
-    defaults: of cameras that the caller does not speak of
+    defaults: for cameras without an orientation from the caller
     """
     asked: dict[str, Orientation] = dict(defaults or {})
     if orient.default is not None:
@@ -159,9 +159,11 @@ def _camera_named(name: str, cameras: Sequence[str]) -> str | None:
 def iter_episodes(
     dataset: Dataset, cameras: Sequence[str] | None = None
 ) -> Iterator[tuple[DatasetEpisode, Mapping[str, Trajectory]]]:
-    """Each episode with its trajectory as each camera filmed it, for loops of one's own. Raises DatasetError.
+    """Yield each episode with its trajectory from each camera. Raises DatasetError.
 
-    cameras: some of the dataset's; None: all but depth cameras. The frames of one episode are in memory at a time.
+    cameras: some of the dataset's; None: all but depth cameras
+
+    Only one episode's frames are in memory at a time.
     """
     names = chosen_cameras(dataset, cameras or ())
     for episode in dataset.episodes:
@@ -172,7 +174,7 @@ def iter_episodes(
 
 
 def digest_of(parts: Iterable[bytes]) -> str:
-    """A digest of these bytes, in which it matters where one part ends and the next begins."""
+    """Return a digest of the parts and of the bounds between them."""
     digest = hashlib.blake2b(digest_size=16)
     for part in parts:
         digest.update(len(part).to_bytes(8, "little"))
@@ -182,10 +184,10 @@ def digest_of(parts: Iterable[bytes]) -> str:
 
 @dataclass(frozen=True)
 class TaskOverride:
-    """What the caller says of tasks. Raises DatasetError for an override without a text.
+    """The caller's task for episodes. Raises DatasetError for an empty text, or an override without a text.
 
-    text: of episodes that have none of their own; None: the caller does not say
-    overrides: whether it is the task of all episodes
+    text: task of episodes without their own; None: not given
+    overrides: True: ``text`` is the task of all episodes
     """
 
     text: str | None = None
@@ -197,7 +199,7 @@ class TaskOverride:
         require("task", is_said or (self.text is None and not self.overrides), "a sentence", got)
 
     def of(self, where: object, own: object) -> str:
-        """The task of an episode, whose own task may be missing. Raises DatasetError if neither is there."""
+        """Return the task of an episode; ``own`` is its own. Raises DatasetError if there is none, or it is no text."""
         is_missing = not own or (isinstance(own, str) and not own.strip())
         if self.text is not None and (self.overrides or is_missing):
             return self.text
@@ -207,7 +209,7 @@ class TaskOverride:
         return own
 
     def check_used(self, episodes: Sequence[DatasetEpisode]) -> None:
-        """Raises DatasetError if no episode has the task, since all have other ones."""
+        """Raise DatasetError if the text is given, but is no episode's task."""
         is_used = self.text is None or any(episode.task == self.text for episode in episodes)
         got = f"{self.text!r}: leave it out, or put it in the place of theirs with --override-task"
         require("task", is_used, "none for episodes that all have tasks of their own", got)

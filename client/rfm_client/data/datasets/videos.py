@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""A folder of videos, one an episode, with a table of their tasks: ``tasks.csv`` or ``tasks.json``. Needs PyAV.
+"""A folder of videos, one for each episode, with their tasks in ``tasks.csv`` or ``tasks.json``. Needs PyAV.
 
-The CSV file has the columns ``video`` and ``task``, where a task with a comma is in quotes; the JSON file is
-``{"video.mp4": "put the block in the bowl"}``. Paths are relative to the table. The table's order is the order of the
+The CSV file has the columns ``video`` and ``task``; a task with a comma is in quotes. The JSON file is
+``{"video.mp4": "put the block in the bowl"}``. Paths are relative to the table, whose order is the order of the
 episodes. Every frame of a video counts.
 """
 
@@ -35,7 +35,7 @@ _FILES_AT_A_TIME = 4
 
 
 class VideoFolder(Dataset):
-    """Videos and their tasks. table: the file of tasks, or the folder that holds it"""
+    """Videos and their tasks. table: the table of tasks, or its folder"""
 
     kind = "videos"
     cameras = ("video",)
@@ -89,9 +89,9 @@ def _table_in(folder: Path) -> Path:
 
 
 def _read(table: Path, required: Set[str]) -> Mapping[str, str | None]:
-    """The task of each video, by its path; None: the table has none. required: columns of a CSV file"""
+    """The task of each video, by path; None: no task. required: columns of a CSV file"""
     try:
-        text = table.read_text(encoding="utf-8-sig")  # with the mark that spreadsheets put before it, or without
+        text = table.read_text(encoding="utf-8-sig")  # spreadsheets put a byte order mark first
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError.at(table, "a readable table of tasks", error) from error
     return _from_json(table, text) if table.suffix.lower() == ".json" else _from_csv(table, text, required)
@@ -115,7 +115,7 @@ def _from_csv(table: Path, text: str, required: Set[str]) -> Mapping[str, str | 
     tasks: dict[str, str | None] = {}
     for row in rows:
         where = f"{table}: line {rows.line_num}"
-        num_cells = sum(isinstance(cell, str) for cell in row.values()) + len(row.get(None, ()))  # of no column
+        num_cells = sum(isinstance(cell, str) for cell in row.values()) + len(row.get(None, ()))  # key None: cells beyond the columns
         require(where, num_cells == len(columns), f"{len(columns)} cells (text with a comma in quotes)", num_cells)
         require(where, row["video"] not in tasks, "each video once", row["video"])
         tasks[row["video"]] = row.get("task")
