@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""HDF5 files as robomimic and LIBERO lay them out: ``data/demo_<i>/obs/<camera>``. Needs ``rfm-client[hdf5]``.
+"""HDF5 files of robomimic and LIBERO: ``data/demo_<i>/obs/<camera>``. Needs ``rfm-client[hdf5]``.
 
-The task is LIBERO's sentence (``problem_info`` of ``data``), robomimic's own (``env_args``), or one that the caller
-gives. LIBERO stores its pictures upside down: they are turned, unless the caller says otherwise.
+The task is LIBERO's sentence (``problem_info`` of ``data``), robomimic's (``env_args``), or the caller's. LIBERO stores
+its pictures upside down: they are turned, unless the caller says otherwise.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ ALOHA = (
 
 _FRAMES_AT_A_TIME = 64
 _DEMO = re.compile(r"demo_(\d+)$")
-_SENTENCES = ("language_instruction", "language", "lang")  # where problem_info and env_args may hold it
-_LIBERO: Orientation = "flip-vertical"  # as upstream's training data and evaluation turn it
+_SENTENCES = ("language_instruction", "language", "lang")  # keys of the task in problem_info and env_args
+_LIBERO: Orientation = "flip-vertical"  # as in upstream's training data and evaluation
 _LIBERO_CAMERAS = ("agentview_rgb", "eye_in_hand_rgb")
 _NO_PICTURES = "robomimic's dataset_states_to_obs.py renders the pictures of a low-dimensional file"
 _LEAST_SIZE_PX = 8  # a smaller array of numbers is no picture
-_ENCODED = (b"\xff\xd8\xff", b"\x89PNG")  # how JPEG and PNG begin
+_ENCODED = (b"\xff\xd8\xff", b"\x89PNG")  # first bytes of JPEG and PNG
 
 
 class Hdf5Dataset(Dataset):
     """The demonstrations of one file.
 
-    task: what the caller says of their task
-    orient: how pictures are turned; a camera of which it does not speak is turned if the file says that it is LIBERO's
+    task: the caller's task
+    orient: the caller's orientations; other cameras are turned if the file is marked as LIBERO's
     """
 
     kind = "HDF5"
@@ -64,7 +64,7 @@ class Hdf5Dataset(Dataset):
             self.cameras, self.left_out = _cameras_in(file, dict(demos.values()))
             attributes = opened["data"].attrs
             is_libero = _is_libero(attributes)
-            is_upright = "opencv" in str(attributes.get("macros_image_convention"))  # as robosuite then renders
+            is_upright = "opencv" in str(attributes.get("macros_image_convention"))  # robosuite renders so, upright
         defaults: dict[str, Orientation] = dict.fromkeys(self.cameras, _LIBERO) if is_libero and not is_upright else {}
         self.orientations = orientations_of(orient, self.cameras, defaults)
         untold = [camera for camera in self.cameras if orient.default is None and camera not in orient.cameras]
@@ -112,7 +112,7 @@ class Hdf5Dataset(Dataset):
         return f"{self.file}: data/{episode.name}/obs/{camera}"
 
     def _length(self, opened: Any, name: str) -> int:
-        """T of a demonstration: that of its actions, if there are some, and of each camera."""
+        """T of a demonstration, equal for its cameras and actions, if present."""
         demo = opened["data"][name]
         lengths = {f"obs/{camera}": len(demo["obs"][camera]) for camera in self.cameras}
         lengths |= {"actions": len(demo["actions"])} if "actions" in demo else {}
@@ -133,7 +133,7 @@ class Hdf5Dataset(Dataset):
 
 
 def _demos_in(file: Path, opened: Any) -> dict[int, tuple[str, Any]]:
-    """Name and content of each demonstration, by its number. Raises DatasetError."""
+    """Name and content of each demonstration, by number. Raises DatasetError."""
     require(file, ALOHA_GROUP not in opened, "data/demo_0/obs/<camera>", ALOHA)
     group = opened.get("data")
     names = list(group) if hasattr(group, "keys") else []
@@ -144,7 +144,7 @@ def _demos_in(file: Path, opened: Any) -> dict[int, tuple[str, Any]]:
 
 
 def _cameras_in(file: Path, demos: Mapping[str, Any]) -> tuple[Sequence[str], Mapping[str, str]]:
-    """The cameras of all demonstrations, and other pictures with what is wrong. Raises DatasetError if all are."""
+    """The cameras of all demonstrations, and the faults of other pictures. Raises DatasetError without any camera."""
     observations = {name: demo.get("obs", {}) for name, demo in demos.items()}
     faults: dict[str, str] = {}
     for of_demo in observations.values():
@@ -163,7 +163,7 @@ def _cameras_in(file: Path, demos: Mapping[str, Any]) -> tuple[Sequence[str], Ma
 
 
 def _fault(value: Any) -> str:
-    """What keeps an observation from being a camera's frames; "": nothing."""
+    """Why an observation is not a camera's frames; "": it is."""
     if not hasattr(value, "shape"):
         return "a group: expected its pictures one level up"
     shape = value.shape if len(value.shape) == 4 else (0, 0, 0, 0)
@@ -193,14 +193,14 @@ def _is_picture(value: Any) -> bool:
 
 
 def _is_encoded(value: Any) -> bool:
-    """Whether the observation holds a JPEG or PNG file for each step."""
+    """True if the observation holds a JPEG or PNG file for each step."""
     if len(value.shape) not in (1, 2) or not value.shape[0] or value.dtype.kind not in "OSVu":
         return False
     return bool(np.asarray(value[0]).tobytes().startswith(_ENCODED))
 
 
 def _notes(untold: Sequence[str], is_libero: bool) -> Sequence[str]:
-    """What is to be said of cameras of whose orientation the caller has told nothing."""
+    """Notes on cameras without an orientation from the caller."""
     if is_libero and untold:
         why = "LIBERO stores its pictures upside down; --orient none leaves them"
         return [f"orient: {', '.join(untold)} {_LIBERO} ({why})"]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""LeRobot datasets of all versions, without LeRobot: frame t is the dataset's frame t. Needs pyarrow, and PyAV.
+"""LeRobot datasets v2.0 to v3.0, read without LeRobot. Needs pyarrow and PyAV.
 
-A video must have one frame for each row of its episodes, at the row's time. Otherwise it is refused, because nothing
-tells which row a frame belongs to. It may begin at another time than its rows, for all of them alike.
+Frame t is the dataset's frame t. A video must have one frame for each row of its episodes, at the row's time, apart
+from an offset common to all rows. Otherwise it is refused, because the row of a frame is unknown.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from rfm_client.data.datasets.video_frames import Span, Times, decode, video_ide
 from rfm_client.data.orientation import Orient
 from rfm_client.data.video_decoding import Packets, decoder
 
-_VIDEOS_AT_A_TIME = 4  # whose tables of packets are kept in memory
-_TOLERANCE_S = 1e-4  # LeRobot's own between the time of a row and that of its frame
-_CONTAINER = {".mp4": "mov"}  # FFmpeg's names by suffix: a play list of another's would be read as what it names
+_VIDEOS_AT_A_TIME = 4  # whose packets stay in memory
+_TOLERANCE_S = 1e-4  # LeRobot's, between a row's time and its frame's
+_CONTAINER = {".mp4": "mov"}  # FFmpeg's names by suffix. Otherwise FFmpeg would open the files that a playlist names
 _AGAIN = "write the dataset again, or leave this video's episodes out (--episodes)"
-_COLOURS = ("1", "L", "LA", "P", "RGB", "RGBA")  # Pillow's names of what has 8 bits a channel, or fewer
-_DEEP = ";16"  # how Pillow names 16 bits a channel that it cuts to 8
+_COLOURS = ("1", "L", "LA", "P", "RGB", "RGBA")  # Pillow's modes of at most 8 bits a channel
+_DEEP = ";16"  # Pillow's mark of 16 bits a channel, which it cuts to 8
 
 
 class LeRobotDataset(Dataset):
-    """A LeRobot dataset in a local folder. source, revision: of the Hub, if it came from there"""
+    """A LeRobot dataset in a local folder. source, revision: its id and commit on the Hub; None: not from the Hub"""
 
     def __init__(
         self,
@@ -104,15 +104,15 @@ class LeRobotDataset(Dataset):
         return (_decoded_image(_where(episode, camera, t), image) for t, image in enumerate(images))
 
     def times_s(self, episode: DatasetEpisode) -> Times:
-        """float64 [T], when each frame was taken, from the start of the episode. Raises DatasetError."""
+        """Return float64 [T], each frame's time from the start of the episode. Raises DatasetError."""
         return self._rows.read(self._entries[episode.index]).times_s
 
     def video(self, episode: DatasetEpisode, camera: str) -> Path:
-        """The video of a camera, one of ``info.videos``, that the episode is in."""
+        """Return the episode's video file of a camera in ``info.videos``."""
         return self._entries[episode.index].videos[camera][0]
 
     def span(self, episode: DatasetEpisode, camera: str) -> Span:
-        """Where the episode's frames are in that video. Raises DatasetError if its frames and rows differ."""
+        """Return the episode's frames in that video. Raises DatasetError if frames and rows differ."""
         file = self.video(episode, camera)
         packets, frames = self._video(camera, file)
         where, container = f"{episode.name}: {camera}", _CONTAINER.get(file.suffix.lower())
@@ -120,7 +120,7 @@ class LeRobotDataset(Dataset):
 
     @cached_property
     def _in_video(self) -> Mapping[tuple[str, Path], Sequence[Entry]]:
-        """The episodes in each video of each camera."""
+        """Episodes by camera and video file."""
         found: dict[tuple[str, Path], list[Entry]] = {}
         for entry in self._entries.values():
             for camera, (file, _) in entry.videos.items():
@@ -128,7 +128,7 @@ class LeRobotDataset(Dataset):
         return found
 
     def _read_video(self, camera: str, file: Path) -> tuple[Packets, Mapping[int, slice]]:
-        """A video, and which of its frames are each episode's. Raises DatasetError where frames and rows differ."""
+        """The packets of a video and each episode's slice of its frames. Raises DatasetError if rows differ."""
         entries = self._in_video[camera, file]
         parts = [(entry, entry.videos[camera][1] + self._rows.read(entry).times_s) for entry in entries]
         parts.sort(key=lambda part: float(part[1][0]))
@@ -145,7 +145,7 @@ class LeRobotDataset(Dataset):
 
         offsets_s = packets.times_s - rows_s
         tolerance_s = min(max(_TOLERANCE_S, packets.tick_s), 0.25 / fps)
-        if np.ptp(offsets_s) > 2 * tolerance_s:  # no one offset is within the tolerance of all
+        if np.ptp(offsets_s) > 2 * tolerance_s:  # no common offset fits all frames
             k = int(np.argmax(np.abs(offsets_s - offsets_s[0]) > tolerance_s))
             where = [f"{entry.where}, row {t}" for entry, times_s in parts for t in range(len(times_s))][k]
             remedy = f"ffmpeg -r {fps:g} -i IN OUT gives it that rate" if rates else _AGAIN
@@ -157,7 +157,7 @@ class LeRobotDataset(Dataset):
         }
 
     def _images(self, episode: DatasetEpisode, camera: str) -> list[bytes]:
-        """The episode's images as they are stored: encoded as PNG or JPEG."""
+        """The episode's images as stored: PNG or JPEG."""
         file = self._entries[episode.index].data_file
         stored = read_table(file, [camera], filters=[("episode_index", "=", episode.index)])[camera].to_pylist()
         require(f"{file}: {camera}", len(stored) == episode.num_frames, f"{episode.num_frames} images", len(stored))
@@ -189,7 +189,7 @@ def _decoded_image(where: str, image: bytes) -> UInt8Array:
 
 
 def _opened_image(where: str, image: bytes) -> Any:
-    """A picture of which only the head is read. Raises DatasetError for what is none of 8-bit colours."""
+    """Open a picture and read only its header. Raises DatasetError unless it has 8-bit colours."""
     _pillow()
     from PIL import Image, UnidentifiedImageError
 
@@ -205,7 +205,7 @@ def _opened_image(where: str, image: bytes) -> Any:
 
 
 def _pillow() -> str:
-    """Pillow with its version. Raises ImportError that names the extra."""
+    """Pillow with its version. Raises ImportError with the extra to install."""
     try:
         import PIL
     except ImportError as error:

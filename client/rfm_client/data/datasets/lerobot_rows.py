@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the tables of a LeRobot dataset say: ``meta/info.json``, each episode's entry, and the rows. Needs pyarrow."""
+"""Tables of a LeRobot dataset: ``meta/info.json``, the entries of episodes, and their rows. Needs pyarrow."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ INFO_FILE = Path("meta", "info.json")
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 
 _ROW_COLUMNS = ("index", "episode_index", "frame_index", "timestamp", "task_index")
-_FILES_AT_A_TIME = 4  # whose rows are kept in memory
-_OF_PICTURES = ("info", "video_info")  # what a feature says of its pictures, by the version of the writer
+_FILES_AT_A_TIME = 4  # whose rows stay in memory
+_OF_PICTURES = ("info", "video_info")  # keys in a feature of a camera, by version of the writer
 _DEPTH_MARKS = ("video.is_depth_map", "is_depth_map")
 
 
 @dataclass(frozen=True)
 class Info:
-    """What a LeRobot dataset says of itself.
+    """Contents of ``meta/info.json``.
 
-    videos, images: keys of its cameras whose frames are in video files, and of those whose frames are in its tables
-    depth: keys of those of both whose pictures are depth maps
+    videos, images: keys of cameras with frames in video files, and in tables
+    depth: keys of the depth cameras in both
     total_frames: of all episodes
-    data_path, video_path: templates of the paths of its files
+    data_path, video_path: templates of file paths
     """
 
     root: Path
@@ -49,7 +49,7 @@ class Info:
 
     @classmethod
     def read(cls, root: Path) -> Info:
-        """The information in ``root``. Raises DatasetError."""
+        """Return the information in ``root``. Raises DatasetError."""
         file = root / INFO_FILE
         try:
             document = json.loads(file.read_bytes())
@@ -87,7 +87,7 @@ class Info:
         )
 
     def path(self, template: str | None, **values: Any) -> Path:
-        """The file that a template names, inside the dataset. Raises DatasetError."""
+        """Return the file inside the dataset that a template names. Raises DatasetError."""
         try:
             path = (template or "").format(**values)
         except (LookupError, ValueError) as error:
@@ -104,12 +104,12 @@ def _is_depth(feature: Mapping[str, Any]) -> bool:
 
 @dataclass(frozen=True)
 class Entry:
-    """What a dataset's metadata say of one episode, whatever its version.
+    """Metadata of one episode, in the same form for all versions.
 
-    tasks: sentences that its metadata name
-    first_index: number of its first frame in the dataset; None: only the rows say it
+    tasks: sentences in the metadata
+    first_index: the dataset's number of its first frame; None: only the rows have it
     data_file: Parquet file with its rows
-    videos: for each camera the video file, and when the episode begins in it, in seconds
+    videos: by camera, the video file and the episode's start in it, in seconds
     """
 
     index: int
@@ -121,13 +121,13 @@ class Entry:
 
     @property
     def where(self) -> str:
-        """How messages name the episode."""
+        """The episode's name in messages."""
         return f"episode {self.index}"
 
 
 @dataclass(frozen=True, eq=False)
 class EpisodeRows:
-    """The rows of one episode. times_s: float64 [T], from the start of the episode, rising"""
+    """The rows of one episode. times_s: float64 [T], rising, from the start of the episode"""
 
     first_index: int
     times_s: npt.NDArray[np.float64]
@@ -135,9 +135,10 @@ class EpisodeRows:
 
 
 class RowReader:
-    """Reads and checks rows. The columns of the files that were read last are kept.
+    """Reads and checks rows. Keeps the columns of the latest files.
 
-    tasks: sentences by number; given: what the caller says of them
+    tasks: sentences by number
+    given: the caller's task
     """
 
     def __init__(self, tasks: Mapping[int, str | None], given: TaskOverride) -> None:
@@ -146,7 +147,7 @@ class RowReader:
         self._columns = lru_cache(_FILES_AT_A_TIME)(_read_columns)
 
     def read(self, entry: Entry) -> EpisodeRows:
-        """The episode's rows. Raises DatasetError where they and its metadata contradict each other."""
+        """Return the episode's rows. Raises DatasetError if they contradict its metadata."""
         columns = self._columns(entry.data_file)
         own = np.flatnonzero(columns["episode_index"] == entry.index)
         rows = {name: column[own] for name, column in columns.items()}
@@ -175,7 +176,7 @@ class RowReader:
 
 
 def read_table(file: Path, columns: list[str] | None = None, filters: Any = None) -> Any:
-    """A Parquet file's table. Raises DatasetError for a missing or broken file, or one without these columns."""
+    """Return a Parquet file's table. Raises DatasetError for a missing or broken file, or a missing column."""
     try:
         import pyarrow
         from pyarrow import parquet

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Episodes of LeRobot v2.0 and v2.1: a table and a video for each episode and camera."""
+"""Episodes of LeRobot v2.0 and v2.1: each has a table, and a video of each camera."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TASKS_FILE = Path("meta", "tasks.jsonl")
 
 
 def read_entries(info: Info) -> Iterator[Entry]:
-    """The episodes that the metadata list. Raises DatasetError."""
+    """Yield the episodes in the metadata. Raises DatasetError."""
     for where, line in _lines(info.root / EPISODES_FILE):
         index, length = _number(where, line, "episode_index"), _number(where, line, "length")
         values = {"episode_chunk": index // info.chunks_size, "episode_index": index}
@@ -33,12 +33,12 @@ def read_entries(info: Info) -> Iterator[Entry]:
 
 
 def read_tasks(root: Path) -> dict[int, str | None]:
-    """Each task's sentence by its number. Raises DatasetError."""
+    """Return each task's sentence by its number. Raises DatasetError."""
     return {_number(where, line, "task_index"): line.get("task", "") for where, line in _lines(root / TASKS_FILE)}
 
 
 def _lines(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Each line of a file of JSON objects, and how messages name it."""
+    """Each object of a file of JSON lines, with its place for messages first."""
     try:
         texts = file.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Episodes of LeRobot v3.0: many in one table and one video, which are found by numbers of files and by time stamps."""
+"""Episodes of LeRobot v3.0: many share a table and a video, found by file numbers and time stamps."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _OF_A_VIDEO = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
 
 
 def read_entries(info: Info) -> Iterator[Entry]:
-    """The episodes that the metadata list. Raises DatasetError."""
+    """Yield the episodes in the metadata. Raises DatasetError."""
     files = sorted((info.root / EPISODES_FOLDER).rglob("*.parquet"))
     require(info.root / EPISODES_FOLDER, bool(files), "Parquet files", "none")
     of_videos = [f"videos/{key}/{name}" for key in info.videos for name in _OF_A_VIDEO]
@@ -31,9 +31,9 @@ def read_entries(info: Info) -> Iterator[Entry]:
 
 
 def read_tasks(root: Path) -> dict[int, str | None]:
-    """Each task's sentence by its number. Raises DatasetError.
+    """Return each task's sentence by its number. Raises DatasetError.
 
-    The sentences are the index of a pandas table, whose column has another name in each version of its writer.
+    The sentences are the index of a pandas table. The column's name depends on the version of its writer.
     """
     file = root / TASKS_FILE
     columns: dict[str, list[Any]] = read_table(file).to_pydict()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Frames of a video at given times: found by their time stamps, each exactly once. Needs PyAV.
+"""Frames of a video at T given times, found by their time stamps, each exactly once. Needs PyAV.
 
-T times, N frames of the whole video. Seconds are those of the video, whose first frame need not be at 0.
+Seconds are the video's, whose first frame need not be at 0.
 """
 
 from __future__ import annotations
@@ -37,9 +37,11 @@ _DIGESTS_AT_A_TIME = 2**16
 
 
 def video_identity(file: Path, *, verify: bool, revision: str | None = None) -> str:
-    """What tells a video from others: its size and time of change, or with ``verify`` its SHA-256.
+    """Return a text that identifies a video: its size and modification time, or with ``verify`` its SHA-256.
 
-    revision: of the Hub, whose files have other times on every machine: it stands for the time. Raises DatasetError.
+    revision: commit on the Hub; replaces the time, which differs on every machine
+
+    Raises DatasetError.
     """
     try:
         status = file.stat()
@@ -65,10 +67,10 @@ def _sha256(file: Path, _size: int, _changed_ns: int) -> str:
 class Span:
     """The frames of one episode in a video.
 
-    times_s: float64 [T], rising; each frame's time stamp in the video
-    tolerance_s: half the time from one frame to the next
-    where: names episode and camera in messages
-    container: FFmpeg's name of the format that the file is read as; None: whatever it looks like
+    times_s: float64 [T], rising time stamps in the video
+    tolerance_s: half the time between frames
+    where: episode and camera, for messages
+    container: FFmpeg's name of the file's format; None: FFmpeg guesses it
     """
 
     file: Path
@@ -78,12 +80,12 @@ class Span:
     container: str | None = None
 
     def error(self, expected: str, got: str) -> DatasetError:
-        """The error of this span's video."""
+        """Return the error of this span's video."""
         return DatasetError.at(f"{self.where}: {self.file}", expected, got)
 
 
 def video_packets(file: Path, container: str | None = None) -> Packets:
-    """The packets of a video's frames. Raises DatasetError for a missing or truncated file, or one of several."""
+    """Return the packets of a video. Raises DatasetError for a missing or broken file, or several videos in a file."""
     av = import_av()
     try:
         with file.open("rb") as opened:
@@ -99,7 +101,7 @@ def video_packets(file: Path, container: str | None = None) -> Packets:
 
 
 def decode(span: Span) -> Iterator[UInt8Array]:
-    """The T frames, uint8 [H, W, 3], upright. Raises DatasetError for a frame that is not there, or damaged."""
+    """Yield the T frames, uint8 [H, W, 3], upright. Raises DatasetError for a missing or damaged frame."""
     av = import_av()
     num_given = 0
     try:
@@ -116,15 +118,15 @@ def decode(span: Span) -> Iterator[UInt8Array]:
 
 
 def _decoded(container: Any, span: Span) -> Iterator[Any]:
-    """Frames from before the span on, in the order of their times."""
+    """Frames from before the span on, in order of time."""
     stream = video_stream(container)
     stream.thread_type = "AUTO"
     first_s = float(span.times_s[0])
-    # one frame earlier: time stamps are rounded
+    # a frame earlier, because time stamps are rounded
     container.seek(max(int((first_s - 2 * span.tolerance_s) / stream.time_base), 0), stream=stream)
     frames = container.decode(stream)
     first = next(frames, None)
-    if first is None or first.time > first_s + span.tolerance_s:  # the video's index has led too far
+    if first is None or first.time > first_s + span.tolerance_s:  # the video's index led too far
         container.seek(0, stream=stream)
         frames = container.decode(stream)
         first = next(frames, None)
@@ -134,7 +136,7 @@ def _decoded(container: Any, span: Span) -> Iterator[Any]:
 
 
 def _within(span: Span, frames: Iterator[tuple[Any, bool]]) -> Iterator[tuple[Any, bool]]:
-    """Of the judged frames those of the span. Raises DatasetError for one that is missing among them."""
+    """The judged frames of the span. Raises DatasetError for a missing frame."""
     for t, time_s in enumerate(span.times_s.tolist()):
         found = next((each for each in frames if each[0].time > time_s - span.tolerance_s), None)
         if found is None or found[0].time > time_s + span.tolerance_s:

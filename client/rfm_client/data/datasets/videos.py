@@ -115,7 +115,7 @@ def _from_csv(table: Path, text: str, required: Set[str]) -> Mapping[str, str | 
     tasks: dict[str, str | None] = {}
     for row in rows:
         where = f"{table}: line {rows.line_num}"
-        num_cells = sum(isinstance(cell, str) for cell in row.values()) + len(row.get(None, ()))  # key None: cells beyond the columns
+        num_cells = sum(isinstance(cell, str) for cell in row.values()) + len(row.get(None, ()))  # in no column
         require(where, num_cells == len(columns), f"{len(columns)} cells (text with a comma in quotes)", num_cells)
         require(where, row["video"] not in tasks, "each video once", row["video"])
         tasks[row["video"]] = row.get("task")
