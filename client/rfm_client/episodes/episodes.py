@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Episodes that grow frame by frame, for asyncio and for code that waits. N episodes, H x W pixels."""
+"""Episodes that grow frame by frame, for asyncio and for blocking code. N episodes, H x W pixels."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 
 
 class AsyncEpisodes(AsyncClosing, OneProcess):
-    """N episodes that grow side by side, as those of vectorised environments; as few requests a step as fit. An async
-    context manager that closes it.
+    """N episodes that grow together, as in vectorised environments. An async context manager.
 
-    All frames of the running episodes are kept, as later ones are shown with them.
+    A step takes as few requests as possible. All frames of the running episodes are kept, because later steps show them
+    again.
 
-    tasks: of each episode
-    timeout_s: the longest that a step may take, retries included; None: the client's
+    tasks: sentence of each episode
+    timeout_s: longest time of a step, retries included; None: the client's
     """
 
     def __init__(
@@ -53,13 +53,13 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
         return len(self._tasks)
 
     async def add(self, frames: Any, mask: npt.ArrayLike | None = None) -> StepScores:
-        """Adds a frame to each episode, and gives the scores of the episodes so far.
+        """Add a frame to each episode, and return the scores of the episodes so far.
 
-        frames: uint8 [N, H, W, 3], an array, a torch tensor or a sequence of frames; with cameras, such by name
-        mask: bool [N], which episodes have a new frame; None: all
+        frames: uint8 [N, H, W, 3], an array, a torch tensor or a sequence of frames; with cameras, a dict of these
+        mask: bool [N], True for episodes with a new frame; None: all
 
-        Raises RewardError, ``episodes[3].frame: expected X, got Y``. Then no episode has grown: the step may be tried
-        again.
+        Raises RewardError, ``episodes[3].frame: expected X, got Y``. Then no episode has grown, and the step may be
+        repeated.
         """
         asked_s = time.perf_counter()
         deadline = None if self._timeout_s is None else Deadline(self._timeout_s)
@@ -83,10 +83,10 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
             return self._gathered(dict(zip(indices, scores, strict=True)))
 
     async def reset(self, mask: npt.ArrayLike | None = None, task: str | Sequence[str] | None = None) -> None:
-        """Begins new episodes, when no step is open.
+        """Begin new episodes, once no step is open.
 
-        mask: bool [N], which ones; None: all
-        task: of all of these, or of each; None: as before
+        mask: bool [N], True for episodes that begin anew; None: all
+        task: of all new episodes, or a sequence with a task for each; None: as before
         """
         async with self._adding:
             indices = _indices(mask, len(self))
@@ -98,7 +98,7 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
                 self._episodes[index] = self._new(index)
 
     async def close(self) -> None:
-        """Returns when no step is open. Who watches is told that the episodes have ended."""
+        """End the episodes, also in the live view, once no step is open."""
         async with self._adding:
             for episode in self._episodes:
                 episode.end()
@@ -108,14 +108,14 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
         return EpisodeFrames(self._tasks[index], self._options, index, where)
 
     async def _shown(self, deadline: Deadline | None) -> tuple[Sampling, FrameSize | None]:
-        """What the checkpoint is shown. The client knows it, until another version of the checkpoint answers."""
+        """Rule and frame size for the checkpoint. The client caches both until another version answers."""
         if not self._options.needs_model_info:
             return self._options.sampling_for(None), None
         info = await self._client.model_info(frames=True, timeout_s=_left_s(deadline))
         return self._options.sampling_for(info), info.frame_size if self._options.resize else None
 
     async def _checked(self, frames: Any, indices: Sequence[int], size: FrameSize | None) -> list[tuple[FrameRef, ...]]:
-        """The new frames of these episodes, in as many threads as there are processors."""
+        """Check the new frames of these episodes, in as many threads as processors."""
         given = self._given(frames, indices)
 
         def checked(some: Sequence[int]) -> list[tuple[FrameRef, ...]]:
@@ -124,11 +124,11 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
         count = max(1, math.ceil(len(indices) / (os.cpu_count() or 1)))
         parts = [indices[first : first + count] for first in range(0, len(indices), count)]
         making = [asyncio.create_task(asyncio.to_thread(checked, part)) for part in parts]
-        await asyncio.gather(*making, return_exceptions=True)  # then the first error is raised, not the quickest
+        await asyncio.gather(*making, return_exceptions=True)  # raises the first episode's error, not the quickest
         return [frame for part in making for frame in part.result()]
 
     def _given(self, frames: Any, indices: Sequence[int]) -> dict[int, Any]:
-        """The new frame of each of these episodes; with cameras, such by name. Raises InvalidSampleError."""
+        """The new frame of each of these episodes; with cameras, a dict of frames. Raises InvalidSampleError."""
         cameras = self._options.cameras
         names = sorted(frames) if isinstance(frames, Mapping) else []
         expected = f"the cameras {list(cameras)}" if cameras else "one camera (cameras=... names several)"
@@ -143,7 +143,7 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
         return {index: {camera: frames[camera][index] for camera in cameras} for index in indices}
 
     def _gathered(self, scores: Mapping[int, StepScore]) -> StepScores:
-        """The scores of all episodes; of those without one, none."""
+        """The scores of all episodes; NaN and False where there is none."""
         progress, success = (np.full(len(self), np.nan, np.float32) for _ in range(2))
         succeeded = np.zeros(len(self), bool)
         for index, score in scores.items():
@@ -155,30 +155,32 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
 
 
 class AsyncEpisode(AsyncClosing, OneProcess):
-    """One episode that grows, for asyncio. Built by ``AsyncRewardClient.episode``. An async context manager that closes
-    it.
-    """
+    """One episode that grows, for asyncio. ``AsyncRewardClient.episode`` builds it. An async context manager."""
 
     def __init__(
         self, client: AsyncRewardClient, task: str, options: EpisodeOptions, timeout_s: float | None = None
     ) -> None:
         self._episodes = AsyncEpisodes(client, [task], options, timeout_s)
         self._open: asyncio.Task[StepScore] | None = None
-        self._waiting: asyncio.Task[StepScore] | None = None  # for the open question to be answered
+        self._waiting: asyncio.Task[StepScore] | None = None  # for the open request to end
 
     async def add(self, frame: Any) -> StepScore:
-        """Adds a frame, uint8 [H, W, 3] or such by camera, and gives the score of the episode so far. It waits for a
-        question that is open; a frame that waits for that, too, is dropped.
+        """Add a frame, and return the score of the episode so far.
 
-        Raises RewardError. Then the episode has not grown: the step may be tried again.
+        Waits for an open request. Drops a frame of ``add_nowait`` that waits for it, too.
+
+        frame: uint8 [H, W, 3]; with cameras, a dict of these
+
+        Raises RewardError. Then the episode has not grown, and the step may be repeated.
         """
         await self._settle()
         return await self._add(frame)
 
     def add_nowait(self, frame: Any) -> asyncio.Future[StepScore]:
-        """Adds a frame, and gives the score to come. While a question is open the frame waits; if another comes
-        meanwhile, the newer one takes its place, and the older's answer is cancelled. A frame whose answer is
-        cancelled is not part of the episode.
+        """Add a frame, and return the future of its score.
+
+        While a request is open, the frame waits. A newer frame replaces it, and cancels its future. A frame with a
+        cancelled future is not part of the episode.
         """
         frame = copied(frame)
         if self._open is None or (self._open.done() and self._waiting is None):
@@ -189,19 +191,19 @@ class AsyncEpisode(AsyncClosing, OneProcess):
         return self._waiting
 
     async def reset(self, task: str | None = None) -> None:
-        """Begins a new episode, when no question is open; a frame that waits is dropped. ``task``: None: as before."""
+        """Begin a new episode, once no request is open; drop a waiting frame. ``task``: None: as before."""
         await self._settle()
         await self._episodes.reset(task=task)
 
     async def close(self) -> None:
-        """Returns when no question is open; a frame that waits is dropped. Who watches is told that it has ended."""
+        """End the episode, also in the live view, once no request is open; drop a waiting frame."""
         await self._settle()
         await self._episodes.close()
 
     async def _settle(self) -> None:
         self._drop_waiting()
         if self._open is not None and not self._open.done():
-            await asyncio.wait({self._open})  # who stops to wait does not stop the question
+            await asyncio.wait({self._open})  # cancelling this wait does not cancel the request
 
     def _drop_waiting(self) -> None:
         if self._waiting is not None:
@@ -219,9 +221,9 @@ class AsyncEpisode(AsyncClosing, OneProcess):
 
 
 class Episodes(Closing, OneProcess):
-    """AsyncEpisodes without ``await``. Built by ``RewardClient.episodes``, whose client lives as long as this.
+    """AsyncEpisodes without ``await``. ``RewardClient.episodes`` builds it. A context manager.
 
-    A context manager that closes it.
+    It keeps its client alive.
     """
 
     def __init__(self, episodes: AsyncEpisodes, loop: LoopThread, client: object) -> None:
@@ -231,33 +233,33 @@ class Episodes(Closing, OneProcess):
         return len(self._episodes)
 
     def add(self, frames: Any, mask: npt.ArrayLike | None = None) -> StepScores:
-        """As ``AsyncEpisodes.add``. Raises RewardError. Then no episode has grown: the step may be tried again."""
+        """Add a frame to each episode, and return the scores, as ``AsyncEpisodes.add``. Raises RewardError."""
         return self._loop.wait(self._episodes.add(frames, mask))
 
     def reset(self, mask: npt.ArrayLike | None = None, task: str | Sequence[str] | None = None) -> None:
-        """Begins new episodes: those in ``mask``, bool [N], or all. ``task``: of all of these, or of each."""
+        """Begin new episodes, as ``AsyncEpisodes.reset``. mask: bool [N]"""
         self._loop.wait(self._episodes.reset(mask, task))
 
     def close(self) -> None:
-        """Returns when no step is open. Who watches is told that the episodes have ended."""
+        """End the episodes, also in the live view, once no step is open."""
         self._loop.wait(self._episodes.close())
 
 
 class Episode(Closing, OneProcess):
-    """AsyncEpisode without ``await``. Built by ``RewardClient.episode``, whose client lives as long as this.
+    """AsyncEpisode without ``await``. ``RewardClient.episode`` builds it. A context manager.
 
-    A context manager that closes it.
+    It keeps its client alive.
     """
 
     def __init__(self, episode: AsyncEpisode, loop: LoopThread, client: object) -> None:
         self._episode, self._loop, self._client = episode, loop, client
 
     def add(self, frame: Any) -> StepScore:
-        """As ``AsyncEpisode.add``. Raises RewardError. Then the episode has not grown: the step may be tried again."""
+        """Add a frame, uint8 [H, W, 3], and return the score, as ``AsyncEpisode.add``. Raises RewardError."""
         return self._loop.wait(self._episode.add(frame))
 
     def add_nowait(self, frame: Any) -> Future[StepScore]:
-        """As ``AsyncEpisode.add_nowait``; returns at once. The future raises RewardError."""
+        """Add a frame, and return the future of its score at once, as ``AsyncEpisode.add_nowait``."""
         frame = copied(frame)
 
         async def answer() -> StepScore:
@@ -266,11 +268,11 @@ class Episode(Closing, OneProcess):
         return self._loop.start(answer())
 
     def reset(self, task: str | None = None) -> None:
-        """Begins a new episode; a frame that waits is dropped. ``task``: None: as before."""
+        """Begin a new episode, as ``AsyncEpisode.reset``. ``task``: None: as before."""
         self._loop.wait(self._episode.reset(task))
 
     def close(self) -> None:
-        """Returns when no question is open; a frame that waits is dropped. Who watches is told that it has ended."""
+        """End the episode, as ``AsyncEpisode.close``."""
         self._loop.wait(self._episode.close())
 
 
@@ -279,7 +281,7 @@ def _left_s(deadline: Deadline | None) -> float | None:
 
 
 def _indices(mask: npt.ArrayLike | None, count: int) -> list[int]:
-    """Which of the episodes a mask names. Raises ValueError for a mask that is none."""
+    """Indices of the episodes in a mask. Raises ValueError unless it is bool [count]."""
     if mask is None:
         return list(range(count))
     array = np.asarray(as_array(mask))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Episodes that somebody watches while they run: their newest frames and scores go to the page of a gateway.
+"""Live view: running episodes report their newest frames and scores to the page of a gateway.
 
-Whoever adds a step never waits for that: a thread reports, a few times a second, what has come since. A report holds
-the steps that have come, 2000 at most, and the newest frame of each of the 16 episodes whose picture is oldest. So what
-a report costs has a bound, however many environments there are.
+A thread sends the reports, a few times a second, so that adding a step never waits for it. A report holds at most 2000
+new steps, and the newest frame of the 16 episodes that have waited longest. So its cost is bounded for any number of
+environments.
 """
 
 from __future__ import annotations
@@ -43,33 +43,33 @@ REPORT_EVERY_S = 0.25
 TRY_AGAIN_AFTER_S = 5.0
 ANSWER_WITHIN_S = 5.0
 CLOSE_WITHIN_S = 2.0
-MOST_STEPS_KEPT = 10_000  # of all episodes together; the newest
+MOST_STEPS_KEPT = 10_000  # newest steps, of all episodes together
 MOST_STEPS = 2_000  # of one report
 MOST_FRAMES = 16  # of one report
 MOST_FRAMES_KEPT = 128  # as many episodes as a gateway keeps
-MOST_RUNNING = 1024  # of which it is known that they run; the newest
-MOST_ANSWER_BYTES = 300  # what a warning shows
+MOST_RUNNING = 1024  # newest episodes that are known to run
+MOST_ANSWER_BYTES = 300  # in a warning
 MOST_LETTERS = 2000  # of a text that a gateway takes
-LONGEST_PX = 256  # the longer side of a frame that is reported
+LONGEST_PX = 256  # longer side of a reported frame
 
-About: TypeAlias = Mapping[str, Any]  # which episode it is
-Entry: TypeAlias = tuple[About, Mapping[str, Any] | None]  # one of its steps; None: it has ended
+About: TypeAlias = Mapping[str, Any]  # identity of an episode
+Entry: TypeAlias = tuple[About, Mapping[str, Any] | None]  # a step of it; None: it has ended
 
 logger = logging.getLogger(__name__)
 
 
 class LiveEpisode:
-    """One episode that is watched. Built by ``LiveView.episode``."""
+    """One episode in a live view. ``LiveView.episode`` builds it."""
 
     def __init__(self, view: LiveView, reporter: Reporter, about: About) -> None:
-        self._view = view  # which reports as long as somebody holds it
+        self._view = view  # keeps the view, and so the reporter, alive
         self._reporter, self._about = reporter, about
         self._has_ended = False
 
     def add(self, frame: UInt8Array, score: StepScore) -> None:
-        """Has a step reported, unless the episode has ended. Returns at once, and raises nothing.
+        """Queue a step for the reports, unless the episode has ended. Return at once, and raise nothing.
 
-        frame: uint8 [H, W, 3], not written to any more
+        frame: uint8 [H, W, 3], which must not change any more
         """
         if self._has_ended:
             return
@@ -78,7 +78,7 @@ class LiveEpisode:
         self._reporter.add(self._about, step, np.asarray(frame))
 
     def end(self) -> None:
-        """Has it reported that no step will follow. Returns at once, and raises nothing."""
+        """Queue the end of the episode for the reports. Return at once, and raise nothing."""
         self._has_ended = True
         self._reporter.end(self._about)
 
@@ -86,17 +86,17 @@ class LiveEpisode:
 class LiveView(Closing):
     """The tab Live of a gateway's page, for episodes: ``client.episode(task, live=LiveView("http://robot:8100"))``.
 
-    One view serves any number of episodes and clients. It reports at most four times a second, for all together: the
-    scores of every step, and of each episode the newest frame, with at most 256 pixels on its longer side. If the
-    gateway cannot be reached, the episodes go on; a warning is logged, and the newest 10 000 steps are kept.
+    A view serves any number of episodes and clients, with at most four reports a second in all. It reports the scores
+    of every step, and the newest frame of each episode, at most 256 pixels on its longer side. If the gateway cannot be
+    reached, the episodes go on, a warning is logged, and the newest 10 000 steps are kept.
 
     url: ``http://host:port`` or ``https://host:port`` of the gateway
-    name: what the page calls the run
+    name: the run's name on the page
     others: as of a client; ``api_key`` is the gateway's key
 
-    A context manager that closes it. It may be pickled: each process then reports by itself. A process that was forked
-    reports nothing, and logs a warning.
-    Raises ValueError for what cannot be used, ImportError without Pillow (``rfm-client[resize]``).
+    A context manager. It can be pickled: each process then reports by itself. A forked process reports nothing, and
+    logs a warning.
+    Raises ValueError for unusable arguments, ImportError without Pillow (``rfm-client[resize]``).
     """
 
     def __init__(
@@ -115,12 +115,13 @@ class LiveView(Closing):
         self._url = url
         self._credentials = Credentials(ca_file, client_certificate, client_key, headers or {}, api_key)
         self._reporter = Reporter(url, self._credentials)
-        weakref.finalize(self, self._reporter.stop).atexit = False  # the reporter closes itself then
+        weakref.finalize(self, self._reporter.stop).atexit = False  # at exit, _close_all closes the reporter
 
     def episode(self, task: str, env: int = 0, threshold: float = 0.5) -> LiveEpisode:
-        """An episode that appears with its first step.
+        """Return a new episode, which appears on the page with its first step.
 
-        env: number of its environment, from 0; threshold: at which success counts; inf: never
+        env: number of its environment, from 0
+        threshold: least success that counts as success; inf: none does
 
         Raises ValueError.
         """
@@ -132,9 +133,7 @@ class LiveView(Closing):
         return LiveEpisode(self, self._reporter, {"id": uuid.uuid4().hex, **about, **numbers})
 
     def close(self) -> None:
-        """Ends the episodes, and returns when the last report has gone out, or after two seconds. What comes later is
-        not reported.
-        """
+        """End the episodes. Return after the last report, or after two seconds. Later steps are not reported."""
         self._reporter.close()
 
     def __reduce__(self) -> tuple[object, ...]:
@@ -142,7 +141,7 @@ class LiveView(Closing):
 
 
 class Reporter:
-    """Reports to one gateway, in a thread of its own. Raises ValueError for a URL that is none."""
+    """Reports to one gateway, in a thread of its own. Raises ValueError for an invalid URL."""
 
     def __init__(self, url: str, credentials: Credentials) -> None:
         self._url, self._credentials = url, credentials
@@ -152,10 +151,10 @@ class Reporter:
         require("url", is_url, "http://host:port or https://host:port of a gateway", repr(url))
         is_secure = self._parts.scheme == "https" or not credentials.uses_tls
         require("url", is_secure, "https://host:port with certificates", repr(url))
-        self._port = self._parts.port  # raises ValueError for one out of range
+        self._port = self._parts.port  # raises ValueError if out of range
         self._headers = {**credentials.shown, "content-type": "application/json"}
         self._steps: deque[Entry] = deque(maxlen=MOST_STEPS_KEPT)
-        self._frames: dict[str, UInt8Array] = {}  # by episode; first the one that has waited longest
+        self._frames: dict[str, UInt8Array] = {}  # by episode; the longest waiting first
         self._running: dict[str, About] = {}
         self._lock = threading.Lock()
         self._has_more, self._stopping = threading.Event(), threading.Event()
@@ -166,7 +165,7 @@ class Reporter:
         _open.add(self)
 
     def add(self, about: About, step: Mapping[str, Any], frame: UInt8Array) -> None:
-        """Has a step reported, and ``frame`` unless a newer one comes before."""
+        """Queue a step, and its frame, uint8 [H, W, 3], unless a newer frame replaces it."""
         if self._stopping.is_set() or self._was_forked():
             return
         with self._lock:
@@ -178,7 +177,7 @@ class Reporter:
         self._has_more.set()
 
     def end(self, about: About) -> None:
-        """Has it reported that an episode has ended, if it runs."""
+        """Queue the end of an episode, if it runs."""
         if self._was_forked():
             return
         with self._lock:
@@ -189,7 +188,7 @@ class Reporter:
         self._has_more.set()
 
     def close(self) -> None:
-        """Has it reported that all episodes have ended. Returns when that has happened, or after CLOSE_WITHIN_S."""
+        """Report the end of all episodes. Return when it has been reported, or after CLOSE_WITHIN_S."""
         if self._was_forked():
             return
         with self._lock:
@@ -200,7 +199,7 @@ class Reporter:
         self._thread.join(CLOSE_WITHIN_S)
 
     def stop(self) -> None:
-        """Ends the thread as soon as what is left has been reported, or cannot be."""
+        """End the thread after the last report, or a failed report."""
         self._stopping.set()
         self._has_more.set()
 
@@ -216,7 +215,7 @@ class Reporter:
             continue
 
     def _report(self) -> bool:
-        """Reports what there is, and says whether it has arrived. What has not is kept, unless it cannot arrive."""
+        """Send a report. False: it did not arrive; its content is kept unless the gateway would refuse it again."""
         with self._lock:
             steps = [self._steps.popleft() for _ in range(min(len(self._steps), MOST_STEPS))]
             frames = {key: self._frames.pop(key) for key in list(self._frames)[:MOST_FRAMES]}
@@ -224,18 +223,18 @@ class Reporter:
             return True
         try:
             body = report_body(steps, frames)
-        except (OSError, TypeError, ValueError):  # which must not keep later steps from being reported
+        except (OSError, TypeError, ValueError):  # must not block later reports
             logger.exception("%s: a live report has failed, and is dropped", self._url)
             return True
         try:
             status, text = self._post(body)
-        except (OSError, HTTPException, ValueError) as error:  # ValueError: of a host's name
+        except (OSError, HTTPException, ValueError) as error:  # ValueError: an invalid host name
             status, text = None, str(error) or type(error).__name__
         if status is not None and status < 300:
             self._is_away = False
             return True
         self._warn(text if status is None else f"{status} {text}")
-        if status is None or status >= 500:  # others would be refused again
+        if status is None or status >= 500:  # a refusal would come again
             with self._lock:
                 self._steps = deque([*steps, *self._steps], MOST_STEPS_KEPT)
                 self._frames = {key: frame for key, frame in frames.items() if key in self._running} | self._frames
@@ -257,7 +256,7 @@ class Reporter:
             connection.close()
 
     def _was_forked(self) -> bool:
-        """Whether this process has no thread that reports, since it was forked. It is told once."""
+        """True in a forked process, which has no reporting thread. Logs a warning once."""
         if self._process_id == os.getpid() or self._stopping.is_set():
             return self._process_id != os.getpid()
         self._stopping.set()
@@ -266,7 +265,7 @@ class Reporter:
         return True
 
     def _warn(self, reason: str) -> None:
-        """Logs why reports do not arrive, once until they do."""
+        """Log why reports do not arrive, once until they do."""
         if not self._is_away:
             expected = "%s: expected a gateway that takes live reports, got %s; episodes go on, and are not shown"
             logger.warning(expected, self._url, reason)
@@ -278,13 +277,13 @@ _open: weakref.WeakSet[Reporter] = weakref.WeakSet()
 
 @atexit.register
 def _close_all() -> None:
-    """Has the last steps reported before the process ends. A worker of multiprocessing ends without this."""
+    """Report the last steps before the process ends. A worker of multiprocessing ends without this."""
     for reporter in list(_open):
         reporter.close()
 
 
 def report_body(steps: list[Entry], frames: Mapping[str, UInt8Array]) -> bytes:
-    """A report as a gateway takes it: JSON of episodes with their new steps, and of JPEG frames by episode."""
+    """Return a report as a gateway takes it: JSON of episodes with their new steps, and JPEG frames by episode."""
     episodes: dict[str, dict[str, Any]] = {}
     for about, step in steps:
         told = episodes.setdefault(about["id"], {**about, "ended": False, "steps": []})
@@ -297,10 +296,10 @@ def report_body(steps: list[Entry], frames: Mapping[str, UInt8Array]) -> bytes:
 
 
 def _or_none(score: float) -> float | None:
-    """A score or threshold as JSON has it: null for one that there is not."""
+    """A score or threshold for JSON; None unless finite."""
     return float(score) if math.isfinite(score) else None
 
 
 def _shown(text: str) -> str:
-    """A text as a gateway takes it."""
+    """A text as a gateway takes it: short, in valid UTF-8."""
     return text[:MOST_LETTERS].encode(errors="replace").decode()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""How the steps of an episode are scored: the options, the frames so far, the questions about them, and the scores.
+"""Steps of an episode: options, frames so far, requests about them, and scores.
 
-Nothing here sends anything: ``episodes.py`` and the Gymnasium wrappers do. N episodes, H x W pixels.
+Nothing here sends: ``episodes.py`` and the Gymnasium wrappers do. N episodes, H x W pixels.
 """
 
 from __future__ import annotations
@@ -34,11 +34,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SuccessRule:
-    """A scored step succeeds when most of the last frames shown to the model have a success of ``threshold`` or more.
-    Raises ValueError.
+    """A scored step succeeds if most of the last frames shown to the model reach ``threshold``.
 
-    threshold: a probability, 0..1
-    last: how many frames vote. Padding and repeated frames count once.
+    threshold: least success of such a frame, 0..1
+    last: number of frames that vote; padding and repeated frames count once
+
+    Raises ValueError.
     """
 
     threshold: float = SUCCESS_THRESHOLD
@@ -50,7 +51,7 @@ class SuccessRule:
 
 
 class EpisodeSettings(TypedDict, total=False):
-    """The fields of EpisodeOptions, as arguments."""
+    """Fields of EpisodeOptions, as keyword arguments."""
 
     sampling: Rule | None
     frames: int | None
@@ -66,18 +67,17 @@ class EpisodeSettings(TypedDict, total=False):
 class EpisodeOptions:
     """How each step of an episode is scored. Raises ValueError for contradictory options.
 
-    sampling: which frames of the episode so far a model is shown: a rule of ``rfm_client.data.sampling``; None: that of
-        the checkpoint's training
-    frames: the rule's number of frames; None: the checkpoint's ``ModelInfo.max_frames``. If it has none, a rule
-        that needs a number raises ValueError at the first step
-    cameras: names of the cameras whose frames each step brings; none: there is one, without a name
-    fuse: how the scores of several cameras become one
-    orient: how frames are turned so that they are upright, before all else: an Orientation, or such by camera; a camera
-        that is not named: not at all
-    resize: frames are made as small as the checkpoint reads them before they are kept and sent (needs Pillow);
-        ReWiND's scores differ slightly from those of the frames as they are
-    success: when a step counts as a success
-    live: where each step is reported to, of several cameras the first one's frame; it delays nothing
+    sampling: a rule of ``rfm_client.data.sampling``; None: the rule of the checkpoint's training
+    frames: the rule's number of frames; None: the checkpoint's ``ModelInfo.max_frames``. If the rule needs a number and
+        the checkpoint has none, the first step raises ValueError
+    cameras: names of the cameras with a frame in each step; empty: a single camera without a name
+    fuse: how to combine the scores of several cameras
+    orient: turn that makes frames upright, before all else: an Orientation, or a dict by camera; cameras that it omits
+        are not turned
+    resize: True: shrink frames to the checkpoint's size before they are kept and sent (needs Pillow); ReWiND's scores
+        then differ slightly
+    success: rule of a step's success
+    live: view to which each step is reported, with the first camera's frame; it delays no step
     """
 
     sampling: Rule | None = None
@@ -95,7 +95,7 @@ class EpisodeOptions:
         is_each_once = len(set(self.cameras)) == len(self.cameras)
         require("cameras", is_each_once, "names that differ", list(self.cameras))
         require("fuse", self.fuse in FUSES, f"one of {', '.join(FUSES)}", repr(self.fuse))
-        Sampling.of(self.sampling, self.frames, trained_frames=1)  # whether rule and number go together
+        Sampling.of(self.sampling, self.frames, trained_frames=1)  # raises ValueError if rule and number contradict
         unknown = [repr(camera) for camera in self._orient.cameras if camera not in self.cameras]
         cameras = list(self.cameras)
         expected = f"some of the cameras {cameras}" if cameras else "one orientation, as cameras names none"
@@ -103,17 +103,20 @@ class EpisodeOptions:
 
     @property
     def orientations(self) -> list[Orientation]:
-        """How the frames of each camera are turned."""
+        """Orientation of each camera, in their order."""
         said = self._orient
         return [said.cameras.get(camera, said.default or "none") for camera in self.cameras or ("",)]
 
     @property
     def needs_model_info(self) -> bool:
-        """Whether it depends on the checkpoint what is shown."""
+        """True if the checkpoint decides which frames are shown, or their size."""
         return self.resize or self.sampling is None or self.frames is None
 
     def sampling_for(self, info: ModelInfo | None) -> Sampling:
-        """The rule with its number of frames. info: of the checkpoint, if ``needs_model_info``. Raises ValueError."""
+        """Return the rule with its number of frames. Raises ValueError.
+
+        info: of the checkpoint; required if ``needs_model_info``
+        """
         if info is None:
             return Sampling.of(self.sampling, self.frames, None)
         return Sampling.of(self.sampling, self.frames, info.max_frames, trained_padding=info.trained_padding)
@@ -127,11 +130,11 @@ class EpisodeOptions:
 class StepScore:
     """The score of one episode at its newest frame.
 
-    progress: share of the task done, 0..1
+    progress: how much of the task is done, 0..1
     success: probability that the task is done; NaN: the checkpoint does not predict it
-    succeeded: what the success rule says; never true without success
+    succeeded: True if the success rule holds; False where success is NaN
     step: number of the frame, from 0
-    ms: how long the answer took, milliseconds
+    ms: time to the answer, milliseconds
     """
 
     progress: float
@@ -145,10 +148,10 @@ class StepScore:
 class StepScores:
     """The scores of N episodes, each at its newest frame.
 
-    progress, success: float32 [N], as of StepScore; NaN where ``mask`` left an episode out
+    progress, success: float32 [N], as in StepScore; NaN where ``mask`` left an episode out
     succeeded: bool [N]; False there
-    step: int64 [N], number of each newest frame, from 0; -1: the episode has none yet
-    ms: how long the answer took, milliseconds
+    step: int64 [N], number of each newest frame, from 0; -1: none yet
+    ms: time to the answer, milliseconds
     """
 
     progress: Float32Array
@@ -158,35 +161,35 @@ class StepScores:
     ms: float
 
     def of(self, index: int) -> StepScore:
-        """The score of one episode."""
+        """Return the score of one episode."""
         numbers = float(self.progress[index]), float(self.success[index])
         return StepScore(*numbers, bool(self.succeeded[index]), int(self.step[index]), self.ms)
 
 
 class EpisodeFrames:
-    """The frames of one episode so far, what they are asked, and who watches.
+    """The frames of one episode so far, their requests, and the live view.
 
-    index: number of the episode among those beside it, from 0
-    where: how errors name it, as ``episodes[3]``; empty: not at all
+    index: number of the episode beside others, from 0
+    where: its name in errors, such as ``episodes[3]``; empty: no name
     """
 
     def __init__(self, task: str, options: EpisodeOptions, index: int = 0, where: str = "") -> None:
         self.task = task
         self._options, self._index, self._where = options, index, where
         self._orientations = options.orientations
-        self._frames: list[tuple[FrameRef, ...]] = []  # of each camera
+        self._frames: list[tuple[FrameRef, ...]] = []  # by step and camera
         self._live: LiveEpisode | None = None
 
     @property
     def step(self) -> int:
-        """Number of the newest frame, from 0; -1: there is none yet."""
+        """Number of the newest frame, from 0; -1: none yet."""
         return len(self._frames) - 1
 
     def checked(self, frame: Any, size: FrameSize | None = None) -> tuple[FrameRef, ...]:
-        """A copy of the next frame of each camera, upright. Raises InvalidSampleError.
+        """Return a copy of the next frame of each camera, upright. Raises InvalidSampleError.
 
-        frame: uint8 [H, W, 3]; with cameras, such by name
-        size: what the checkpoint reads: frames are made as small
+        frame: uint8 [H, W, 3]; with cameras, a dict of these
+        size: size to which frames shrink; None: no change
         """
         cameras = self._options.cameras
         given = {f"frame[{camera!r}]": frame[camera] for camera in cameras} if cameras else {"frame": frame}
@@ -199,7 +202,7 @@ class EpisodeFrames:
                     pixels = resize_frames(pixels[np.newaxis], size)[0]
                 if first is not None and first.pixels.shape != pixels.shape:
                     expected = f"uint8 {list(first.pixels.shape)}, as the episode's first"
-                    expected += "" if size is None else ", or a reset"  # by now another checkpoint may be served
+                    expected += "" if size is None else ", or a reset"  # another checkpoint may be served by now
                     raise InvalidSampleError.at(where, expected, f"uint8 {list(pixels.shape)}")
                 kept.append(FrameRef(pixels))
         except InvalidSampleError as error:
@@ -207,21 +210,22 @@ class EpisodeFrames:
         return tuple(kept)
 
     def append(self, frame: tuple[FrameRef, ...]) -> None:
-        """Adds what ``checked`` gave."""
+        """Add the frames that ``checked`` returned."""
         self._frames.append(frame)
 
     def pop(self) -> None:
-        """Takes the newest frame back."""
+        """Remove the newest frame again."""
         self._frames.pop()
 
     def windows(self, prefix: Prefix) -> list[Window]:
-        """What each camera's prefix is asked. Raises InvalidSampleError for a task that is none."""
+        """Return the window of each camera. Raises InvalidSampleError for an invalid task."""
         shown = [self._frames[index] for index in prefix.indices]
         return [Window(of_camera, self.task) for of_camera in zip(*shown, strict=True)]
 
     def score(self, step: int, prefix: Prefix, outcomes: Sequence[Result | RewardError], ms: float) -> StepScore:
-        """The score of a step of the answers to its ``windows``. Raises the RewardError of one that failed; ValueError
-        if the checkpoint does not predict progress.
+        """Return the score of a step from the outcomes of its ``windows``.
+
+        Raises the RewardError of a failed window; ValueError if the checkpoint does not predict progress.
         """
         for outcome in outcomes:
             if isinstance(outcome, RewardError):
@@ -237,29 +241,29 @@ class EpisodeFrames:
         return StepScore(fused.last_progress, float(fused.success[-1]), succeeded, step, ms)
 
     def report(self, score: StepScore) -> None:
-        """Tells who watches the score of a step."""
+        """Report the score of a step to the live view."""
         view = self._options.live
         if view is not None:
             self._live = self._live or view.episode(self.task, self._index, self._options.success.threshold)
             self._live.add(self._frames[score.step][0].pixels, score)
 
     def end(self) -> None:
-        """Tells who watches that no step will follow."""
+        """Tell the live view that no step will follow."""
         if self._live is not None:
             self._live.end()
             self._live = None
 
     def located(self, error: RewardError) -> RewardError:
-        """The error, which says which episode it is about if a sample is at fault."""
+        """Return the error, with the episode's name if a sample is at fault."""
         return error.inside(self._where) if self._where and isinstance(error, InvalidSampleError) else error
 
 
 class StepRequest:
-    """What is asked about the newest frames of some episodes at a time.
+    """The windows of the newest frames of some episodes.
 
-    asked_s: since when the caller waits, by ``time.perf_counter``
+    asked_s: start of the caller's wait, by ``time.perf_counter``
 
-    Raises InvalidSampleError for a task that is none.
+    Raises InvalidSampleError for an invalid task.
     """
 
     def __init__(self, episodes: Sequence[EpisodeFrames], sampling: Sampling, asked_s: float) -> None:
@@ -271,7 +275,7 @@ class StepRequest:
         self.windows = [window for *_, windows in self._asked for window in windows]
 
     def scores(self, outcomes: Sequence[Result | RewardError]) -> list[StepScore]:
-        """The score of each episode, of the outcomes of ``windows``. Raises RewardError."""
+        """Return the score of each episode from the outcomes of ``windows``. Raises RewardError."""
         left, ms = iter(outcomes), (time.perf_counter() - self._asked_s) * 1e3
         return [
             episode.score(step, prefix, list(islice(left, len(windows))), ms)
@@ -280,7 +284,7 @@ class StepRequest:
 
 
 def checked_frame(frame: Any, where: str) -> UInt8Array:
-    """A copy of a frame: an environment may draw into the same array again. Raises InvalidSampleError."""
+    """Return a copy of a frame, uint8 [H, W, 3], whose array may be drawn into again. Raises InvalidSampleError."""
     kept = copied(frame)
     is_frame = kept.dtype == np.uint8 and kept.ndim == 3 and kept.shape[2] == 3 and 0 not in kept.shape
     require(where, is_frame, "uint8 [H, W, 3]", f"{kept.dtype} {list(kept.shape)}", InvalidSampleError)
@@ -288,7 +292,7 @@ def checked_frame(frame: Any, where: str) -> UInt8Array:
 
 
 def copied(frame: Any) -> Any:
-    """A copy of a frame, or of such by camera, that may be scored later."""
+    """Return a copy of a frame, or of a dict of frames by camera."""
     if isinstance(frame, Mapping):
         return {camera: np.array(as_array(each)) for camera, each in frame.items()}
     return np.array(as_array(frame))

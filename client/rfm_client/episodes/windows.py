@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Progress questions about frames of which the server may know most: only the others are sent.
+"""Progress requests that send only the frames that the server lacks.
 
-A server that does not know what it was expected to (it was restarted, is another one, or has let frames go) refuses.
-Then all pixels are sent: the answer is that of a ``ProgressSample`` of the same frames, whatever the server knows.
+A server may lack more frames than expected: it restarted, dropped frames, or is another server. Then it refuses, and
+all pixels are sent. In both cases the answer equals that for a ``ProgressSample`` of the same frames.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ from rfm_client.scoring.call import Call
 from rfm_client.scoring.samples import SampleScorer, for_each
 from rfm_client.transport.off_loop import off_loop
 
-MAX_NEW_BYTES = 3 * 2**20  # of frames in a request, so that the server prepares one while another is sent
-MAX_REMEMBERED = 2**17  # digests of frames that have been sent; the oldest are forgotten
+MAX_NEW_BYTES = 3 * 2**20  # of a request's frames: the server prepares a request while the next is sent
+MAX_REMEMBERED = 2**17  # digests of sent frames; the oldest are forgotten
 _OUTPUTS = (wire.PROGRESS, wire.SUCCESS)
 
 
 @dataclass(frozen=True, eq=False)
 class FrameRef:
-    """A frame, uint8 [H, W, 3], which nobody changes any more."""
+    """A frame, uint8 [H, W, 3], that must not change, and its digest."""
 
     pixels: UInt8Array
 
     @cached_property
     def digest(self) -> bytes:
-        """What a server knows it by. Takes about 2 ms a megabyte the first time."""
+        """Digest by which a server knows the frame. The first call takes about 2 ms a megabyte."""
         return frame_digest(self.pixels)
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """How far has the task come at each of these frames? All are of one size. Raises InvalidSampleError."""
+    """Frames of one size with their task, to be scored for progress. Raises InvalidSampleError for an invalid task."""
 
     frames: tuple[FrameRef, ...]
     task: str
@@ -62,35 +62,35 @@ class Window:
 
     @property
     def sample(self) -> ProgressSample:
-        """The same question with all pixels. Raises InvalidSampleError."""
+        """The window as a sample, with all pixels. Raises InvalidSampleError."""
         return ProgressSample(Trajectory(frames=np.stack([frame.pixels for frame in self.frames]), task=self.task))
 
     @property
     def named(self) -> TrajectoryRefs:
-        """The frames' digests, without pixels."""
+        """The frames' digests and the task, without pixels."""
         return TrajectoryRefs(tuple(frame.digest for frame in self.frames), {}, self.task)
 
 
 class WindowScorer:
     """Scores windows for one client, in its event loop.
 
-    model: name under which the checkpoint was exported
+    model: name of the exported model
     """
 
     def __init__(self, model: str, scorer: SampleScorer) -> None:
         self._model = frames_name(model)
         self._scorer = scorer
-        self._remembered: OrderedDict[bytes, None] = OrderedDict()  # digests of frames that the servers have been sent
+        self._remembered: OrderedDict[bytes, None] = OrderedDict()  # digests of frames sent to the servers
 
     async def outcomes(self, windows: Sequence[Window], call: Call) -> list[Result | RewardError]:
-        """The result or error of each window."""
+        """Return the result or error of each window."""
         try:
             info = await self._scorer.model_info(self._model, call.deadline)
         except RewardError as error:
             return for_each(error, len(windows))
         if not info.by_digest:
             return await self._whole(windows, call)
-        num_new = sum(w.num_bytes // len(w.frames) for w in windows)  # about one frame of each is new
+        num_new = sum(w.num_bytes // len(w.frames) for w in windows)  # about one frame of each window is new
         await off_loop(num_new, lambda: [frame.digest for window in windows for frame in window.frames])
         outcomes: dict[int, Result | RewardError] = {}
         parts = list(self._parts(windows, info.max_batch_size))
@@ -100,8 +100,10 @@ class WindowScorer:
         return [outcomes[index] for index in range(len(windows))]
 
     def _parts(self, windows: Sequence[Window], limit: int) -> Iterator[list[int]]:
-        """Indices of the windows of each request: frames of one size, at most ``limit`` windows, and MAX_NEW_BYTES
-        unless one has more.
+        """Indices of the windows of each request.
+
+        A request has frames of one size, at most ``limit`` windows, and at most MAX_NEW_BYTES unless a window alone
+        has more.
         """
 
         def size(index: int) -> tuple[int, ...]:
@@ -122,13 +124,13 @@ class WindowScorer:
             yield part
 
     async def _outcomes(self, windows: Sequence[Window], call: Call) -> Sequence[Result | RewardError]:
-        """One request, and one with all pixels if the server lacks some."""
+        """Send a request; if it fails, perhaps because the server lacks frames, send all pixels."""
         new = {frame.digest: frame.pixels for window in windows for frame in window.frames}
         digests = list(new)
         sent = [pixels for digest, pixels in new.items() if digest not in self._remembered]
         try:
             results = await self._request(windows, sent, call)
-        except (InvalidSampleError, InferenceFailedError):  # perhaps as the server does not know them: all are sent
+        except (InvalidSampleError, InferenceFailedError):  # the server may lack frames
             for digest in digests:
                 self._remembered.pop(digest, None)
             outcomes = await self._whole(windows, call)
@@ -169,5 +171,5 @@ class WindowScorer:
 
 
 def _padded_bytes(num_windows: int, num_frames: int, frame_bytes: int) -> int:
-    """Bytes of a request's frames: each window's row has as many."""
+    """Bytes of a request's frames, padded to equally many in each window's row."""
     return num_windows * -(-num_frames // num_windows) * frame_bytes
