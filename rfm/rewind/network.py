@@ -96,7 +96,7 @@ FEED_FORWARD_RATIO = 4
 
 @dataclass(frozen=True)
 class RewindConfig:
-    """The configuration of a network, with the field names of upstream's config.json.
+    """The configuration of a network; the fields of upstream's config.json keep their names.
 
     trained_frames: largest number of frames of a trajectory in training; None: unknown
     trained_padding: training padded shorter trajectories to ``trained_frames``, as upstream's does; None: unknown

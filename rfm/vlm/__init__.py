@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""RFM and Robometer: raw frames and a task, as a conversation, into a vision-language model with reward heads."""
+"""RFM and Robometer: a vision-language model with reward heads scores frames and a task as a conversation."""
 
 from rfm.family import Family
 from rfm.vlm.checkpoint import load, reads

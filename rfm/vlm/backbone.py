@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""config.json of a backbone, and the names of its weights, in the form that transformers 4.57 and 5 read alike.
+"""config.json of a backbone, and the names of its weights, in a form that transformers 4.57 and 5 read alike.
 
-Transformers 5 keeps all of a rotary embedding in ``rope_parameters``, which 4.57 ignores; before 4.52 a Qwen2.5-VL had
-no ``text_config``. No weight shows how positions were rotated, so nothing about that is left to a default.
+Transformers 5 keeps a rotary embedding's settings in ``rope_parameters``, which 4.57 ignores. Before 4.52, a
+Qwen2.5-VL had no ``text_config``. Weights do not show how positions were rotated, so no such setting has a default.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from rfm.checkpoint.content import CheckpointError, shown
 
 SMOL, QWEN_2_5 = "smolvlm", "qwen2_5_vl"
 BACKBONES = {QWEN_2_5: "Qwen2_5_VLModel", "qwen3_vl": "Qwen3VLModel", SMOL: "SmolVLMModel"}
-VISION_THETA = 10_000.0  # which transformers 4.57 has in its code, for each backbone
+VISION_THETA = 10_000.0  # a constant in the code of transformers 4.57, for each backbone
 
-# What no shape of a weight shows, and transformers has defaults for.
+# Required fields of text_config and vision_config: no weight's shape shows them, and transformers has defaults.
 _NEEDED = {
     SMOL: (("num_attention_heads", "rms_norm_eps"), ("num_attention_heads",)),
     QWEN_2_5: (("num_attention_heads", "rms_norm_eps"), ("num_heads", "window_size", "fullatt_block_indexes")),
     "qwen3_vl": (("num_attention_heads", "rms_norm_eps"), ("num_heads", "deepstack_visual_indexes")),
 }
-# Of a Qwen2.5-VL whose text model's fields stand beside the others.
+# Fields that stay outside text_config, in a Qwen2.5-VL from before text_config.
 _NOT_OF_TEXT = (
     "architectures", "dtype", "image_token_id", "model_type", "tie_word_embeddings", "torch_dtype",
     "transformers_version", "video_token_id", "vision_config", "vision_end_token_id", "vision_start_token_id",
     "vision_token_id",
 )  # fmt: skip
-NF4 = "bitsandbytes nf4"  # as ``quantization`` names it
+NF4 = "bitsandbytes nf4"  # a result of ``quantization``
 _ROPE = ("rope_theta", "rope_scaling", "rope_parameters", "partial_rotary_factor")
 UNQUANTIZED = (
     "export the checkpoint that was quantized (its scores differ), or load this one with the code that trained it, "
@@ -49,14 +49,15 @@ _COPY = "copy it from config.json of the base model"
 
 
 def is_at_least(version: int) -> bool:
-    """Whether the installed transformers is of that major version, or a later one."""
+    """True if the installed transformers has at least this major version."""
     return int(importlib.metadata.version("transformers").partition(".")[0]) >= version
 
 
 def backbone_config(content: Mapping[str, Any], where: object) -> dict[str, Any]:
-    """The same configuration, with ``rope_theta`` and ``rope_scaling`` in its ``text_config``.
+    """Return the configuration with ``rope_theta`` and ``rope_scaling`` in its ``text_config``.
 
-    where: its file. Raises CheckpointError for what it does not say of positions, or says twice.
+    where: its file
+    Raises CheckpointError for a missing setting, or two that disagree.
     """
     family = content.get("model_type")
     if family not in BACKBONES:
@@ -74,7 +75,7 @@ def backbone_config(content: Mapping[str, Any], where: object) -> dict[str, Any]
 
 
 def quantization(config: Any) -> str | None:
-    """How weights were rounded to fewer bits: the method and, of bitsandbytes, the type; None: they were not."""
+    """Return the method by which weights were rounded to fewer bits, with bitsandbytes' type; None: they were not."""
     found = config.get("quantization_config") if isinstance(config, dict) else None
     if not found or not isinstance(found, dict):
         return str(found) if found else None
@@ -84,14 +85,14 @@ def quantization(config: Any) -> str | None:
 
 
 def check_not_quantized(config: Mapping[str, Any], where: object, remedy: str) -> None:
-    """Raises CheckpointError, which ends in ``remedy``, for a configuration of weights of fewer bits."""
+    """Raise CheckpointError, with ``remedy`` at its end, if the configuration is of weights rounded to fewer bits."""
     for part in (config, config.get("text_config")):
         if (found := quantization(part)) is not None:
             raise CheckpointError(f"{where}: quantization_config: expected none, got {shown(found)}; {remedy}")
 
 
 def _nested(content: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of the text model in a ``text_config``, where transformers has them since 4.52."""
+    """Move the text model's fields into ``text_config``, as transformers does since 4.52."""
     rest = {name: value for name, value in content.items() if name in _NOT_OF_TEXT}
     text = {name: value for name, value in content.items() if name not in _NOT_OF_TEXT}
     return rest | {"text_config": text | {"model_type": f"{QWEN_2_5}_text"}}
@@ -110,7 +111,7 @@ def _text(config: dict[str, Any], family: str, where: str) -> dict[str, Any]:
 
 
 def _rope(config: dict[str, Any], where: str) -> dict[str, Any]:
-    """All that is said of the rotary embedding, in either form. Raises CheckpointError where the forms disagree."""
+    """Return the rotary embedding's settings from both forms. Raises CheckpointError if the forms disagree."""
     rope: dict[str, Any] = {}
     for part in ("rope_parameters", "rope_scaling"):
         section = config.get(part) or {}
@@ -130,15 +131,15 @@ def _rope(config: dict[str, Any], where: str) -> dict[str, Any]:
 
 def _add(rope: dict[str, Any], section: Mapping[str, Any], where: str, part: str) -> None:
     for name, value in section.items():
-        name = "rope_type" if name == "type" else name  # its older name
-        value = "default" if name == "rope_type" and value == "mrope" else value  # so too
+        name = "rope_type" if name == "type" else name  # an older name
+        value = "default" if name == "rope_type" and value == "mrope" else value  # an older value
         if value is not None and rope.setdefault(name, value) != value:
             got = f"{shown(rope[name])} and {shown(value)}"
             raise CheckpointError(f"{where}: expected one value of {name} in {part}, got {got}; {_COPY}")
 
 
 def _vision(config: dict[str, Any], where: str) -> dict[str, Any]:
-    """Without the rotary embedding, which transformers 5 writes as 4.57 has it in its code."""
+    """Remove the rotary embedding's settings, which transformers 5 writes and 4.57 has in its code."""
     rope = config.get("rope_parameters") or {}
     theta = rope.get("rope_theta", VISION_THETA) if isinstance(rope, dict) else rope
     kind = rope.get("rope_type", "axial") if isinstance(rope, dict) else rope
@@ -148,27 +149,27 @@ def _vision(config: dict[str, Any], where: str) -> dict[str, Any]:
     return {name: value for name, value in config.items() if name != "rope_parameters"}
 
 
-# Renames of one form, tried in order on each name; the first that matches is applied.
+# Renames for a form of weights. The first pattern that matches a name is applied.
 Renames: TypeAlias = Sequence[tuple[str, str]]
 SMOL_NAMES: Renames = ((r"^model\.model\.", "model."),)
 LORA_INSIDE: Renames = ((r"^(model(\.\w+)?)\.base_model\.model\.", r"\1."),)
 ADAPTER_NAMES: Renames = ((r"^base_model\.model\.", "model."),)
-# Of a Qwen backbone as transformers had its weights before 4.52, and as it writes them since in some cases.
+# For names of a Qwen backbone from transformers before 4.52, and in some cases since.
 QWEN_NAMES: Renames = (
     (r"^visual\.", "model.visual."),
     (r"^model\.(embed_tokens|layers|norm)\.", r"model.language_model.\1."),
 )
 
-# What makes text, which no reward head reads; the rotary frequencies, which transformers once saved, and computes.
+# Weights without effect on scores: the head that generates text, and rotary frequencies, which transformers computes.
 UNUSED = re.compile(r"(model\.)?lm_head\.weight|.*\.(rotary_emb|rotary_pos_emb)\.(original_)?inv_freq")
-# What bitsandbytes, GPTQ, AWQ and FP8 write beside or in place of a weight.
+# Tensors that bitsandbytes, GPTQ, AWQ and FP8 write beside or in place of a weight.
 QUANTIZED = re.compile(
     r"\.(absmax|quant_map|nested_absmax|SCB|qweight|qzeros|weight_packed|weight_scale|weight_scale_inv)$|\.quant_state\."
 )
 
 
 def renamed(weights: Mapping[str, Tensor], renames: Renames) -> dict[str, Tensor]:
-    """The weights under other names. Raises CheckpointError if two would have one."""
+    """Return the weights under new names. Raises CheckpointError if two names become equal."""
 
     def rename(name: str) -> str:
         for pattern, replacement in renames:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""A batch of conversations on its way to the device: tokens and uint8 pixels on the host, float pixels on the device.
+"""A batch of conversations: tokens and uint8 pixels on the host, float pixels on the device.
 
-B conversations of L tokens. Each shot is there once, whichever videos and conversations it stands in. Frames of one
-size, H' x W' pixels, go together.
+B conversations of L tokens, H' x W' pixels of a frame. The batch holds each shot once, even if several videos and
+conversations show it, and groups frames of equal size.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from rfm.vlm.video import Indices, Shot, SizedFrames, VlmVideo, shots_of
 
 @dataclass(eq=False)
 class SizedShots:
-    """Shots of one size that the vision tower is to read.
+    """Shots of equal size for the vision tower.
 
-    videos: uint8 [N, H', W', 3] each
-    firsts: of each video, by the id of its sized frames, the first among those of all videos
-    shots: by key, its frames among those of all videos
+    videos: frames of each video, uint8 [N, H', W', 3]
+    firsts: index of each video's first frame among those of all videos, by the id of its SizedFrames
+    shots: indices of a shot's frames among those of all videos, by key
     """
 
     videos: list[Tensor] = field(default_factory=list)
@@ -34,26 +34,26 @@ class SizedShots:
     shots: dict[Hashable, Shot] = field(default_factory=dict)
 
     def add(self, sized: SizedFrames, key: Hashable, shot: Shot) -> None:
-        """Adds a shot of a video."""
+        """Add a shot of a video."""
         if id(sized) not in self.firsts:
             self.firsts[id(sized)] = sum(map(len, self.videos))
             self.videos.append(sized.pixels)
         first = self.firsts[id(sized)]
         places = [int(sized.places[frame]) for frame in shot]
-        assert min(places) >= 0  # it is not kept
+        assert min(places) >= 0  # the shot is not cached
         self.shots[key] = tuple(first + place for place in places)
 
     def frames(self) -> FramesOfOneSize:
-        """The videos, and which of their frames each shot is made of."""
+        """Return the videos, with the frames of each shot."""
         shots = torch.tensor(list(self.shots.values()))
         is_each = torch.equal(shots, torch.arange(sum(map(len, self.videos)))[:, None])
         return FramesOfOneSize(self.videos, None if is_each else shots)
 
 
 class Shots:
-    """Finds the shots of a batch.
+    """The different shots of a batch.
 
-    are_images: each frame is a shot; else two
+    are_images: each frame is a shot; else each pair
     """
 
     def __init__(self, *, are_images: bool) -> None:
@@ -61,15 +61,15 @@ class Shots:
         self._of_size: dict[torch.Size, SizedShots] = {}
         self._kept: dict[Hashable, Tensor] = {}
         self._seen: set[Hashable] = set()
-        self._sized: list[SizedFrames] = []  # whose ids are taken
+        self._sized: list[SizedFrames] = []  # references, so that their ids stay unique
 
     @property
     def sizes(self) -> list[SizedShots]:
-        """The shots of each size that are to be read, in the order in which they first came."""
+        """The uncached shots of each size, in the order of their addition."""
         return list(self._of_size.values())
 
     def add(self, video: VlmVideo, shown: Indices) -> list[Hashable]:
-        """The keys of the shots of a conversation that shows these frames of a video."""
+        """Add the shots of a conversation that shows these frames of a video; return their keys."""
         sized, keys = video.ready, []
         self._sized.append(sized)
         for shot in shots_of(shown, are_images=self._are_images):
@@ -81,7 +81,7 @@ class Shots:
         return keys
 
     def layout(self, tokens_per_shot: Sequence[int]) -> Layout:
-        """Where each shot's tokens lie. ``tokens_per_shot``: of each of ``sizes``."""
+        """Return the layout of the shots' tokens. ``tokens_per_shot``: for each of ``sizes``."""
         made: dict[Hashable, slice] = {}
         start = 0
         for size, tokens in zip(self.sizes, tokens_per_shot, strict=True):
@@ -99,10 +99,10 @@ class Shots:
 
 @dataclass(frozen=True)
 class FramesOfOneSize:
-    """Frames that share a size, video by video, and the shots that are read of them.
+    """Frames of equal size, by video, and the shots that they form.
 
     videos: uint8 [T, H', W', 3] each
-    shots: int64 [S, 1], which frames are images, or [S, 2], which pairs are temporal groups; None: each frame an image
+    shots: frames of each of S shots, int64 [S, 1] for images, [S, 2] for videos; None: each frame is an image
     """
 
     videos: Sequence[Tensor]
@@ -110,50 +110,50 @@ class FramesOfOneSize:
 
     @property
     def num_shown(self) -> int:
-        """Frames in the shots; of a group that is filled up with a frame, that frame twice."""
+        """Number of frames in the shots; a frame that fills up a pair counts twice."""
         return sum(map(len, self.videos)) if self.shots is None else self.shots.numel()
 
     def frames(self, device: torch.device) -> Tensor:
-        """uint8 [T of all videos, H', W', 3] on ``device``."""
+        """Return the frames of all videos on ``device``, uint8 [sum of T, H', W', 3]."""
         return torch.cat([video.to(device, non_blocking=True) for video in self.videos])
 
 
 @dataclass(frozen=True)
 class QwenPixels:
-    """Pixels as the Qwen backbones read them: patches of images, or of pairs of frames, in the order of ``sizes``."""
+    """Pixels for the Qwen backbones: patches of images, or of pairs of frames, in the order of ``sizes``."""
 
     images: QwenImages
     sizes: Sequence[FramesOfOneSize]
 
     @property
     def videos(self) -> list[Tensor]:
-        """uint8 [T, H', W', 3] each."""
+        """The frames of each video, uint8 [T, H', W', 3]."""
         return [video for size in self.sizes for video in size.videos]
 
     @property
     def num_shown(self) -> int:
-        """Frames of all shots."""
+        """Number of frames in all shots."""
         return sum(size.num_shown for size in self.sizes)
 
     def changed(self, change: Callable[[Tensor], Tensor]) -> QwenPixels:
-        """The same with ``change`` made to the shots."""
+        """Return these pixels with ``change`` applied to the indices of the shots."""
         shots = [None if size.shots is None else change(size.shots) for size in self.sizes]
         sizes = [replace(size, shots=changed) for size, changed in zip(self.sizes, shots, strict=True)]
         return replace(self, sizes=sizes)
 
     def inputs(self, device: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
-        """The patches of all shots."""
+        """Return the backbone's input: the patches of all shots on ``device``."""
         patches = [self.images.patches(size.frames(device), size.shots, dtype) for size in self.sizes]
         return {"pixel_values": torch.cat(patches) if len(patches) > 1 else patches[0]}
 
 
 @dataclass(frozen=True)
 class SmolPixels:
-    """Pixels as SmolVLM reads them: of each conversation as many squares as of the one with the most.
+    """Pixels for SmolVLM: each conversation is padded to the largest number of squares.
 
-    squares: uint8 [T, side, side, 3] of all videos
-    rows, places, frames: int64 [I], in which conversation each square stands, at which place, and which frame it is
-    shape: conversations, and squares of each
+    squares: the square frames of all videos
+    rows, places, frames: int64 [N], conversation, place in it and frame of each of N shown squares
+    shape: number of conversations, and of squares in each
     """
 
     images: SmolImages
@@ -165,20 +165,20 @@ class SmolPixels:
 
     @property
     def videos(self) -> list[Tensor]:
-        """uint8 [T, side, side, 3] each."""
+        """The frames of each video, uint8 [T, side, side, 3]."""
         return list(self.squares.videos)
 
     @property
     def num_shown(self) -> int:
-        """Frames of all squares."""
+        """Number of squares of all videos."""
         return self.squares.num_shown
 
     def changed(self, change: Callable[[Tensor], Tensor]) -> SmolPixels:
-        """The same with ``change`` made to where each square stands."""
+        """Return these pixels with ``change`` applied to the indices of the squares."""
         return replace(self, rows=change(self.rows), places=change(self.places), frames=change(self.frames))
 
     def inputs(self, device: torch.device, dtype: torch.dtype) -> dict[str, Tensor]:
-        """The squares, and where there are some; the backbone leaves out squares of zeros."""
+        """Return the backbone's inputs: squares and their mask. The backbone skips squares of zeros."""
         squares = self.images.normalisation(self.squares.frames(device)).to(dtype)
         pixels = squares.new_zeros(*self.shape, *squares.shape[1:])
         mask = torch.zeros(*self.shape, *squares.shape[2:], dtype=torch.bool, device=device)
@@ -188,10 +188,10 @@ class SmolPixels:
 
 
 class Layout:
-    """Where the merged tokens of each shot lie: those that the tower makes in order of size, then those that are kept.
+    """The indices of each shot's merged tokens: first those from the vision tower, by size, then those from the cache.
 
-    made: of each shot that the tower reads
-    kept: [tokens, levels, D] of each of the others
+    made: indices for each shot that the tower reads
+    kept: features of each cached shot, [tokens, levels, D]
     """
 
     def __init__(self, made: dict[Hashable, slice], kept: dict[Hashable, Tensor]) -> None:
@@ -202,7 +202,7 @@ class Layout:
             start += len(features)
 
     def tokens(self, keys: Sequence[Hashable]) -> Indices:
-        """int64 [M]: the merged tokens of shots of one size, one shot after the other."""
+        """Return the indices of the merged tokens of shots of equal size, in order, int64 [M]."""
         first = self._tokens[keys[0]]
         starts = np.array([self._tokens[key].start for key in keys], np.int64)
         tokens: Indices = (starts[:, None] + np.arange(first.stop - first.start)).ravel()
@@ -211,15 +211,15 @@ class Layout:
 
 @dataclass(frozen=True)
 class VlmBatch:
-    """Conversations, padded to the longest.
+    """Conversations, padded to the longest, with F frames (or temporal patches) and Q queries.
 
     inputs: the backbone's arguments by name
-    spans: int64 [F, 3], row and first and behind-the-last token of each frame's state
-    query_rows, query_tokens: int64 [Q], where the questions' tokens stand
-    num_tokens, num_span_tokens: of all conversations, without padding; of all spans
-    pixels: of which the arguments about pixels are made; None: they are among the inputs, or all shots are kept
-    plan: of a Qwen backbone's vision tower; None: all shots are kept
-    layout: of the shots of a Qwen backbone
+    spans: int64 [F, 3], row, first token and token behind the last of each frame's state
+    query_rows, query_tokens: int64 [Q], row and token of each query
+    num_tokens, num_span_tokens: tokens without padding; tokens in all spans
+    pixels: source of the arguments for pixels; None: these are in ``inputs``, or all shots are cached
+    plan: of a Qwen backbone's vision tower; None: all shots are cached, or the backbone is SmolVLM
+    layout: of a Qwen backbone's shots; None: the backbone is SmolVLM
     """
 
     inputs: dict[str, Tensor]
@@ -233,11 +233,11 @@ class VlmBatch:
     layout: Layout | None = None
 
     def pinned(self) -> VlmBatch:
-        """The batch in memory from which a GPU copies while the host goes on; its frames stay where they are."""
+        """Return the batch with its tensors, except the frames, in pinned memory."""
         return self._changed(pinned)
 
     def to(self, device: torch.device, dtype: torch.dtype) -> VlmBatch:
-        """The batch on ``device``. Pixels are rescaled, normalised and put in order there, and come in ``dtype``."""
+        """Return the batch on ``device``, where pixels are normalised, put in order and converted to ``dtype``."""
         moved = self._changed(lambda tensor: tensor.to(device, non_blocking=True))
         made = {} if moved.pixels is None else moved.pixels.inputs(device, dtype)
         return replace(moved, inputs=moved.inputs | made, pixels=None)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Samples of raw frames -> rows -> padded batches for a vision-language backbone.
+"""Turn samples of raw frames into rows, and rows into padded batches for a vision-language backbone.
 
-B rows, T frames, L tokens. A row is one conversation: its tokens, and where in them each frame's and the
-question's hidden states are read. Token ids are those of the original inference collator, sample for sample.
-Reading a row is cheap. Bringing its frames to size is not: that may be done before its batch is collated.
+T frames, L tokens. A row is a conversation: its tokens, and the tokens whose hidden states are read for each frame and
+for the query. Token ids equal those of upstream's inference collator.
+Making a row is cheap. Resizing its frames is not, and may be done before its batch is collated.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from rfm_client.contract import InvalidSampleError, ProgressSample, Sample, Simi
 from rfm_client.contract.frame_refs import ProgressSampleRefs, TrajectoryRefs
 from rfm_client.contract.samples import UInt8Array
 
-SECONDS_PER_GROUP = 1  # the original gives it to Qwen2.5-VL with its videos
+SECONDS_PER_GROUP = 1  # upstream's value for videos of Qwen2.5-VL
 TOKENS_PER_SECOND = 4  # transformers' default for Qwen2.5-VL
-VIDEO_FPS = 1  # the original gives it to Qwen3-VL, which writes each group's time into the prompt
+VIDEO_FPS = 1  # upstream's value for Qwen3-VL, whose prompt has the time of each temporal patch
 QWEN3 = "qwen3_vl"
 VISION_START, VISION_END = "<|vision_start|>", "<|vision_end|>"
 IMAGE_PAD, VIDEO_PAD = "<|image_pad|>", "<|video_pad|>"
@@ -42,14 +42,14 @@ Spans: TypeAlias = list[tuple[int, int]]
 
 @dataclass(frozen=True, eq=False)
 class VlmRow:
-    """One conversation.
+    """A conversation.
 
     input_ids: int64 [L]
     videos: of each trajectory
-    spans: for each trajectory, the tokens (first, behind the last) over which each frame's state is read
-    query: token whose state answers the question about two trajectories
-    picked: in dense mode int64 [K], the frames that the conversation shows; None: all
-    position_ids: of a Qwen backbone int64 [3, L]
+    spans: for each trajectory, the tokens (first, behind the last) whose states are read for each frame
+    query: index of the token whose state gives preference or similarity; None: a single trajectory
+    picked: in dense mode int64 [frame_steps], the frames in the conversation; None: all
+    position_ids: int64 [3, L] for a Qwen backbone; None: for SmolVLM
     """
 
     input_ids: Indices
@@ -62,25 +62,25 @@ class VlmRow:
 
     @property
     def frames(self) -> tuple[Sequence[UInt8Array] | UInt8Array, ...]:
-        """uint8 [H, W, 3] of each frame of each trajectory, as they came."""
+        """The frames of each trajectory before resizing, uint8 [H, W, 3] each."""
         return tuple(video.frames for video in self.videos)
 
     @property
     def shown(self) -> Iterator[tuple[VlmVideo, Indices]]:
-        """Each trajectory, and which of its frames the conversation shows."""
+        """Each trajectory, and the indices of its frames in the conversation."""
         return ((video, np.arange(video.num_shown) if self.picked is None else self.picked) for video in self.videos)
 
     @property
     def num_tokens(self) -> int:
-        """L, the number of tokens of the conversation."""
+        """L, the number of tokens in the conversation."""
         return len(self.input_ids)
 
 
 class VlmCollator:
-    """What a checkpoint can take of a sample, and how a batch of it looks.
+    """Turns samples into rows, and rows into batches, for a vision-language configuration.
 
-    tokenizer: the base model's, with the checkpoint's special tokens appended and a chat template
-    images: preprocessing of the backbone's kind
+    tokenizer: the base model's, with the checkpoint's special tokens and a chat template
+    images: the backbone's preprocessing
     """
 
     def __init__(self, config: VlmConfig, tokenizer: Any, images: QwenImages | SmolImages) -> None:
@@ -92,13 +92,13 @@ class VlmCollator:
 
     @property
     def frames_per_shot(self) -> int:
-        """Frames that the vision tower reads as one."""
+        """Number of frames in a temporal patch."""
         return 1 if self.config.multi_image else FRAMES_PER_GROUP
 
     def rows(self, sample: Sample | ProgressSampleRefs) -> list[VlmRow]:
-        """The conversations about a sample, all of whose frames are at hand.
+        """Return the conversations of a sample. Raises InvalidSampleError if the checkpoint cannot score it.
 
-        Raises InvalidSampleError if the checkpoint cannot score it.
+        sample: with the pixels of all its frames
         """
         check_type(sample, self.config)
         frame_steps = sample.frame_steps if isinstance(sample, (ProgressSample, ProgressSampleRefs)) else 0
@@ -106,25 +106,25 @@ class VlmCollator:
         self._check_task(sample.trajectories[0].task)
         row = self._row(sample, videos)
         if frame_steps:
-            # Every prefix is as long and its frames are as large, so all conversations have the same tokens.
+            # All prefixes show equally many frames of equal size, so all conversations have the same tokens.
             return [replace(row, picked=picked) for picked in videos[0].conversations]
         return [row]
 
     def to_size(self, video: VlmVideo, cache: FeatureCache[Any] | None = None) -> SizedFrames:
-        """A video's frames as large as the backbone reads them.
+        """Resize a video's frames for the backbone.
 
-        cache: of shots whose frames need not be brought to size; None: there is none
+        cache: frames of shots in it need no resizing; None: no cache
         """
         frames = np.arange(len(video.frames))
         keys = {shot: (id(video), shot) for shot in video.shots(are_images=self.config.multi_image)}
         return SizedFrames(self._to_size(video, frames.tolist()), frames, keys)
 
     def _to_size(self, video: VlmVideo, needed: Sequence[int]) -> Tensor:
-        """uint8 [N, H', W', 3] of some of a video's frames."""
+        """Resize some of a video's frames to uint8 [N, H', W', 3]."""
         raise NotImplementedError
 
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
-        """A batch of conversations of any kind and length, whose videos have been brought to size."""
+        """Return the batch of conversations of any kinds and lengths, whose frames have been resized."""
         length = max(row.num_tokens for row in rows)
         pad = self.tokenizer.pad_token_id
         ids = torch.full((len(rows), length), pad, dtype=torch.int64)
@@ -157,7 +157,7 @@ class VlmCollator:
             parts += self._frame_parts(videos[part.index].num_shown) if isinstance(part, TrajectoryPart) else [part]
         try:
             text, pad, lengths = self._placed(self._chat.text(tuple(parts)), videos)
-        except ValueError as error:  # an image of a shape that cannot be brought to size
+        except ValueError as error:  # the frames are too narrow to be resized
             raise InvalidSampleError.at("frames", *str(error).split(", got ")) from error
         ids = _expanded(self._chat.tokens(text), self.tokenizer.convert_tokens_to_ids(pad), lengths)
         is_similarity = isinstance(sample, SimilaritySample)
@@ -168,7 +168,7 @@ class VlmCollator:
         )
 
     def _frame_parts(self, num_frames: int) -> list[str | Visual]:
-        """Placeholders of one trajectory in the conversation."""
+        """Return the placeholders of a trajectory in the conversation."""
         if not self.config.multi_image:
             return [Visual.VIDEO]
         each: list[str | Visual] = [Visual.IMAGE]
@@ -177,25 +177,23 @@ class VlmCollator:
         return each * num_frames
 
     def _placed(self, text: str, videos: tuple[VlmVideo, ...]) -> tuple[str, str, list[int]]:
-        """The text with one pad token for each image or video or group of it, which token, and of how many it stands
-        for.
-        """
+        """Return the text with a pad token for each image, video or temporal patch, this token, and its repetitions."""
         raise NotImplementedError
 
     def _spans(self, ids: Indices, videos: tuple[VlmVideo, ...]) -> tuple[Spans, ...]:
-        """Where each frame's state is read."""
+        """Return the tokens at which each frame's state is read."""
         raise NotImplementedError
 
     def _position_ids(self, ids: Indices, videos: tuple[VlmVideo, ...]) -> Indices | None:
-        """int64 [3, L], if the backbone wants them."""
+        """Return position ids, int64 [3, L], if the backbone needs them."""
         return None
 
     def _with_pixels(self, batch: VlmBatch, rows: Sequence[VlmRow]) -> VlmBatch:
-        """The batch with what its backbone wants besides tokens."""
+        """Return the batch with the backbone's inputs besides tokens."""
         raise NotImplementedError
 
     def _image_spans(self, ids: Indices, videos: tuple[VlmVideo, ...], ends: Spans) -> tuple[Spans, ...]:
-        """Spans of frames that are images of their own; ``ends``: the tokens around each one's."""
+        """Return the spans of frames that are separate images; ``ends``: the tokens around each image."""
         if self.config.per_frame_progress_token:
             spans = [(int(token), int(token) + 1) for token in self._positions(ids, PROGRESS_TOKEN)]
         elif self.config.frame_pooling == "boundary":
@@ -209,7 +207,7 @@ class VlmCollator:
         return np.flatnonzero(ids == self.tokenizer.convert_tokens_to_ids(token))
 
     def _check_task(self, task: str) -> None:
-        """A task is data: what would be read as more than text is refused."""
+        """Raise InvalidSampleError for an empty task or special tokens in it: a task is data."""
         if not task.strip():
             raise InvalidSampleError.at("task", "a task sentence", repr(task))
         for token in self._special_tokens:
@@ -218,12 +216,12 @@ class VlmCollator:
 
 
 class QwenCollator(VlmCollator):
-    """Qwen2.5-VL and Qwen3-VL: runs of pad tokens between vision start and end, for images or videos."""
+    """The collator for Qwen2.5-VL and Qwen3-VL: images and videos are pad tokens between vision start and end."""
 
     images: QwenImages
 
     def to_size(self, video: VlmVideo, cache: FeatureCache[Any] | None = None) -> SizedFrames:
-        """The frames of the shots that are not kept."""
+        """Resize the frames of the shots that are not in the cache."""
         if cache is None:
             return super().to_size(video)
         keys = self.shot_keys(video)
@@ -236,13 +234,12 @@ class QwenCollator(VlmCollator):
         return SizedFrames(self._to_size(video, needed), places[alike], keys, kept)
 
     def shot_keys(self, video: VlmVideo) -> dict[Shot, Hashable]:
-        """What is shown of each of a video's shots, in which size: all that the vision tower's answer depends on."""
+        """Return each shot's key: its size and its frames' digests, on which alone the shot's features depend."""
         grid, digests = self.grid(video), video.digests
         shots = video.shots(are_images=self.config.multi_image)
         return {shot: (grid.rows, grid.columns, *(digests[frame] for frame in shot)) for shot in shots}
 
     def _to_size(self, video: VlmVideo, needed: Sequence[int]) -> Tensor:
-        """uint8 [N, H', W', 3] of images, or of a video's frames."""
         frames = video.stack(needed)
         if self.config.multi_image:
             return self.images.images_to_size(frames)
@@ -253,7 +250,7 @@ class QwenCollator(VlmCollator):
         return IMAGE_PAD if self.config.multi_image else VIDEO_PAD
 
     def grid(self, video: VlmVideo) -> Grid:
-        """The grid of all that is shown of a video: images, or temporal groups."""
+        """Return the grid of a conversation's frames of a video, as images or as a video."""
         if self.config.multi_image:
             return replace(self.images.image_grid(*video.size), groups=video.num_shown)
         return self.images.video_grid(*video.size, video.num_shown)
@@ -273,8 +270,8 @@ class QwenCollator(VlmCollator):
         if self.config.multi_image:
             ends = list(zip(starts.tolist(), self._positions(ids, VISION_END).tolist(), strict=True))
             return self._image_spans(ids, videos, ends)
-        # In strides from the n-th vision start of the row, for the n-th trajectory. Qwen3-VL writes times and a
-        # start of its own before each group, which upstream does not heed, in training as in inference.
+        # As upstream: strides from the row's n-th vision start for the n-th trajectory. Upstream ignores, in training
+        # and inference, that Qwen3-VL writes a time and a vision start before each temporal patch.
         grids = map(self.grid, videos)
         return tuple(self._video_spans(int(start), grid) for start, grid in zip(starts, grids, strict=False))
 
@@ -285,7 +282,7 @@ class QwenCollator(VlmCollator):
         return [(bound, bound + 1) for bound in bounds[1:]]
 
     def _position_ids(self, ids: Indices, videos: tuple[VlmVideo, ...]) -> Indices:
-        """Of images, and of Qwen3-VL's groups, each is a box of its own; else a video is one."""
+        """Return position ids: a box for each image or temporal patch of Qwen3-VL, or for a video of Qwen2.5-VL."""
         is_whole = not self.config.multi_image and self.config.family != QWEN3
         step = SECONDS_PER_GROUP * self.config.backbone["vision_config"].get("tokens_per_second", TOKENS_PER_SECOND)
         boxes, read, starts = [], 0, self._positions(ids, self._pad)
@@ -320,12 +317,11 @@ class QwenCollator(VlmCollator):
 
 
 class SmolCollator(VlmCollator):
-    """SmolVLM: images as runs of image tokens between two of FAKE."""
+    """The collator for SmolVLM: images are image tokens between two FAKE tokens."""
 
     images: SmolImages
 
     def _to_size(self, video: VlmVideo, needed: Sequence[int]) -> Tensor:
-        """uint8 [N, side, side, 3]."""
         return self.images.images_to_size(video.stack(needed))
 
     def _placed(self, text: str, videos: tuple[VlmVideo, ...]) -> tuple[str, str, list[int]]:
@@ -337,7 +333,7 @@ class SmolCollator(VlmCollator):
         return self._image_spans(ids, videos, list(zip(around[::2], around[1::2], strict=True)))
 
     def _with_pixels(self, batch: VlmBatch, rows: Sequence[VlmRow]) -> VlmBatch:
-        """Each conversation's squares side by side; a video that several show is there once."""
+        """Add each conversation's squares; the frames of a video in several conversations are in the batch once."""
         firsts: dict[VlmVideo, int] = {}
         for video in (video for row in rows for video, _ in row.shown):
             if video not in firsts:
@@ -364,14 +360,14 @@ def _video(trajectory: Trajectory | TrajectoryRefs, frame_steps: int) -> VlmVide
 
 
 def _replaced(text: str, placeholder: str, replacements: Sequence[str]) -> str:
-    """The text with each occurrence of ``placeholder`` replaced by the next of ``replacements``."""
+    """Replace each occurrence of ``placeholder`` in the text by the next of ``replacements``."""
     pieces = text.split(placeholder)
     assert len(pieces) == len(replacements) + 1, "the chat template shows each image or video once"
     return pieces[0] + "".join(new + piece for new, piece in zip(replacements, pieces[1:], strict=True))
 
 
 def _expanded(ids: Indices, pad: int, lengths: Sequence[int]) -> Indices:
-    """The tokens with each ``pad`` as often as ``lengths`` says; faster than to tokenise that many."""
+    """Repeat each ``pad`` token by ``lengths``, which is faster than to tokenise so many."""
     times = np.ones(len(ids), np.int64)
     at = np.flatnonzero(ids == pad)
     assert len(at) == len(lengths), "the chat template shows each image or video once"
@@ -380,7 +376,7 @@ def _expanded(ids: Indices, pad: int, lengths: Sequence[int]) -> Indices:
 
 
 def _timed_groups(grid: Grid) -> str:
-    """A video as Qwen3-VL reads it: each temporal group behind the mean time of its frames."""
+    """Return Qwen3-VL's text of a video: each temporal patch behind the mean time of its frames."""
     groups = []
     for group in range(grid.groups):
         frame_times = [(group * FRAMES_PER_GROUP + frame) / VIDEO_FPS for frame in range(FRAMES_PER_GROUP)]

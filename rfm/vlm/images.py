@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Raw frames -> the pixels that a vision-language backbone reads, value for value as the original collator's.
+"""Turn raw frames into a vision-language backbone's pixels, with the same values as upstream's collator.
 
-T frames, H x W pixels, C = 3 channels; P pixels a side of a patch. A merged token stands for MERGE x MERGE patches.
-On the CPU each frame is brought to size once, as uint8 (``to_size``). All else, in float, is for the device.
+T frames, H x W pixels (H' x W' after resizing), C = 3 channels, P pixels a side of a patch. A merged token stands for
+MERGE x MERGE patches.
+The CPU resizes each frame once, as uint8 (``..._to_size``). The device does the rest in float.
 Sources: the resizing rules of ``qwen-vl-utils`` 0.0.14, the patch order of ``transformers``' Qwen2-VL image
-processor, and its SmolVLM image processor. Neither torchvision nor those processors are needed.
+processor, and its SmolVLM image processor. Neither torchvision nor these processors are needed.
 """
 
 from __future__ import annotations
@@ -24,40 +25,40 @@ from rfm.checkpoint.content import MAX_UINT8, PIL_BICUBIC
 from rfm_client.contract.samples import UInt8Array
 
 MERGE = 2
-FRAMES_PER_GROUP = 2  # frames that share the patches of one temporal group
-IMAGE_TOKENS = (4, 16_384)  # merged tokens of one image: at least, at most
-VIDEO_TOKENS = (128.0, 768.0)  # of one frame of a video
+FRAMES_PER_GROUP = 2  # frames of a video's temporal patch
+IMAGE_TOKENS = (4, 16_384)  # merged tokens of an image: least, most
+VIDEO_TOKENS = (128.0, 768.0)  # of a frame of a video
 VIDEO_TOTAL_TOKENS = 128_000 * 0.9  # of a whole video
 MAX_QWEN_ASPECT_RATIO = 200
-MAX_VIDEO_SIDE_PX = 480  # longer frames are scaled down before anything else, in video mode
+MAX_VIDEO_SIDE_PX = 480  # larger frames of videos are scaled down first
 
 
 @dataclass(frozen=True)
 class Normalisation:
-    """Normalisation of pixels per channel: (value - 255 mean) / (255 std)."""
+    """Normalisation of each channel's pixels: (value - 255 mean) / (255 std)."""
 
     mean: tuple[float, ...]
     std: tuple[float, ...]
 
     def to_config(self) -> dict[str, Any]:
-        """The fields of preprocessor_config.json that describe this."""
+        """Return the corresponding fields of preprocessor_config.json."""
         return {"image_mean": self.mean, "image_std": self.std, "rescale_factor": 1 / MAX_UINT8}
 
     def __call__(self, frames: Tensor) -> Tensor:
-        """uint8 [..., H, W, C] -> float32 [..., C, H, W]."""
+        """Normalise pixels: uint8 [..., H, W, C] -> float32 [..., C, H, W]."""
         mean, std = (_channels(values, frames.device) for values in (self.mean, self.std))
         return (frames.movedim(-1, -3).float() - mean) / std
 
 
 @lru_cache
 def _channels(values: tuple[float, ...], device: torch.device) -> Tensor:
-    """float32 [C, 1, 1]: fractions of white on the device, where they stay, in grey levels."""
+    """Return values from 0 to 1 as grey levels, float32 [C, 1, 1], cached on the device."""
     return (torch.tensor(values).view(-1, 1, 1) * MAX_UINT8).to(device)
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Temporal groups, patch rows and patch columns of an image or video."""
+    """Number of temporal patches, and rows and columns of patches in each, of an image or video."""
 
     groups: int
     rows: int
@@ -65,13 +66,15 @@ class Grid:
 
     @property
     def tokens_per_group(self) -> int:
-        """Merged tokens of one temporal group."""
+        """Merged tokens of a temporal patch."""
         return self.rows * self.columns // MERGE**2
 
 
 def fitted_size(height: int, width: int, factor: int, tokens: tuple[float, float] = IMAGE_TOKENS) -> tuple[int, int]:
-    """Height and width in multiples of ``factor``, about the same shape, with a count of merged tokens in ``tokens``.
+    """Return the nearest height and width in multiples of ``factor``, of similar shape, for a Qwen backbone.
 
+    factor: pixels a side of a merged token
+    tokens: least and most merged tokens
     Raises ValueError for an image over 200 times as long as wide.
     """
     if max(height, width) / min(height, width) > MAX_QWEN_ASPECT_RATIO:
@@ -88,7 +91,7 @@ def fitted_size(height: int, width: int, factor: int, tokens: tuple[float, float
 
 
 def resized(frame: UInt8Array, height: int, width: int, resample: int = PIL_BICUBIC) -> UInt8Array:
-    """uint8 [H, W, 3] -> [height, width, 3], as Pillow resizes; ``resample``: its number of the filter."""
+    """Resize a frame with Pillow: uint8 [H, W, 3] -> [height, width, 3]; ``resample``: Pillow's filter."""
     if frame.shape[:2] == (height, width):
         return frame
     try:
@@ -100,10 +103,10 @@ def resized(frame: UInt8Array, height: int, width: int, resample: int = PIL_BICU
 
 @dataclass(frozen=True)
 class QwenImages:
-    """Preprocessing for the Qwen backbones.
+    """Image preprocessing for the Qwen backbones.
 
     patch_px: P
-    size_px: height and width that the training run set for every frame; None: each frame's own
+    size_px: height and width in the training run's settings; None: each frame's own
     """
 
     patch_px: int
@@ -111,45 +114,46 @@ class QwenImages:
     size_px: tuple[int, int] | None = None
 
     def to_config(self) -> dict[str, Any]:
-        """The fields of preprocessor_config.json that describe this."""
+        """Return the corresponding fields of preprocessor_config.json."""
         return {"patch_size": self.patch_px, **self.normalisation.to_config()}
 
     def image_grid(self, height: int, width: int) -> Grid:
-        """Grid of a frame [H, W, 3] as an image of its own."""
+        """Return the grid of a frame [H, W, 3] as an image."""
         return self.grid(1, *self._image_size(height, width))
 
     def video_grid(self, height: int, width: int, num_shown: int) -> Grid:
-        """Grid of a video that shows so many frames [H, W, 3]."""
+        """Return the grid of a video of ``num_shown`` frames [H, W, 3]."""
         groups = math.ceil(num_shown / FRAMES_PER_GROUP)
         return self.grid(groups, *self._video_sizes(height, width, num_shown)[-1])
 
     def images_to_size(self, frames: UInt8Array) -> Tensor:
-        """uint8 [T, H, W, 3] -> [T, H', W', 3]: each frame as the image of its own that the network reads."""
+        """Resize frames to separate images: uint8 [T, H, W, 3] -> [T, H', W', 3]."""
         return _to_sizes(frames, [self._image_size(frames.shape[1], frames.shape[2])])
 
     def video_to_size(self, frames: UInt8Array, num_shown: int) -> Tensor:
-        """uint8 [T, H, W, 3] -> [T, H', W', 3]: each frame as the network reads it in a video of ``num_shown``."""
+        """Resize frames for a video of ``num_shown`` frames: uint8 [T, H, W, 3] -> [T, H', W', 3]."""
         *first_sizes, last_size = self._video_sizes(frames.shape[1], frames.shape[2], num_shown)
         video = _to_sizes(frames, first_sizes)
         if first_sizes[-1] == last_size:
             return video
         scaled = torch.empty(len(video), *last_size, video.shape[-1], dtype=torch.uint8)
         for index, frame in enumerate(video):
-            # in float and rounded, as torchvision resizes; torch's own uint8 path differs by up to one
+            # In float and rounded, as torchvision does. PyTorch's own uint8 resizing differs by up to 1.
             planes = frame.movedim(-1, 0)[None].float()
             planes = F.interpolate(planes, last_size, mode="bicubic", antialias=True).clamp_(0, MAX_UINT8).round_()
             scaled[index] = planes[0].movedim(0, -1)
         return scaled
 
     def patches(self, frames: Tensor, shots: Tensor | None, dtype: torch.dtype = torch.float32) -> Tensor:
-        """uint8 [T, H', W', 3] -> [N, C * FRAMES_PER_GROUP * P * P], those that are merged next to each other.
+        """Cut frames into N patches: uint8 [T, H', W', 3] -> [N, C * FRAMES_PER_GROUP * P * P].
 
-        shots: int64 [S, 1], which frames are images, or [S, FRAMES_PER_GROUP], which are temporal groups of a video;
-            None: each frame is an image
+        Patches of a merged token are next to each other.
+        shots: frames of each of S temporal patches: int64 [S, 1] for images, [S, FRAMES_PER_GROUP] for videos; None:
+            each frame is an image
         """
         planes = self.normalisation(frames).to(dtype)
         groups = planes[:, None] if shots is None else planes[shots]
-        groups = groups.expand(-1, FRAMES_PER_GROUP, -1, -1, -1)  # an image is a group of the same frame twice
+        groups = groups.expand(-1, FRAMES_PER_GROUP, -1, -1, -1)  # an image becomes the same frame twice
         num_groups, _, channels, height, width = groups.shape
         grid = self.grid(num_groups, height, width)
         patches = groups.reshape(
@@ -163,10 +167,10 @@ class QwenImages:
         return fitted_size(*(self.size_px or (height, width)), self.patch_px * MERGE)
 
     def _video_sizes(self, height: int, width: int, num_shown: int) -> list[tuple[int, int]]:
-        """Height and width to which the frames of a video of ``num_shown`` are brought one after the other."""
+        """Return the heights and widths to which frames of a video of ``num_shown`` are resized in turn."""
         factor = self.patch_px * MERGE
         sizes = []
-        fitted_size(height, width, factor)  # refuses slivers, which scaling down would leave without pixels
+        fitted_size(height, width, factor)  # refuses narrow frames, which scaling down would leave without pixels
         if max(height, width) > MAX_VIDEO_SIDE_PX:
             scale = MAX_VIDEO_SIDE_PX / max(height, width)
             height, width = max(int(height * scale), 1), max(int(width * scale), 1)
@@ -182,16 +186,16 @@ class QwenImages:
         return [*sizes, fitted_size(*sizes[-1], factor, (least, most_px / factor**2))]
 
     def grid(self, groups: int, height: int, width: int) -> Grid:
-        """The grid of so many images or temporal groups of that size in pixels."""
+        """Return the grid of ``groups`` temporal patches of this size in pixels."""
         return Grid(groups, height // self.patch_px, width // self.patch_px)
 
 
 @dataclass(frozen=True)
 class SmolImages:
-    """Preprocessing for SmolVLM: the longer side to ``size_px``, then a square of it.
+    """Image preprocessing for SmolVLM: the longer side is resized to ``size_px``, then both sides.
 
-    resample: Pillow's number of the filter
-    tokens: image tokens that stand for one
+    resample: Pillow's filter
+    tokens: image tokens of a frame
     """
 
     size_px: int
@@ -200,17 +204,17 @@ class SmolImages:
     normalisation: Normalisation
 
     def to_config(self) -> dict[str, Any]:
-        """The fields of preprocessor_config.json that describe this."""
+        """Return the corresponding fields of preprocessor_config.json."""
         return {"resample": self.resample, **self.normalisation.to_config()}
 
     def images_to_size(self, frames: UInt8Array) -> Tensor:
-        """uint8 [T, H, W, 3] -> [T, size_px, size_px, 3]."""
+        """Resize frames to squares: uint8 [T, H, W, 3] -> [T, size_px, size_px, 3]."""
         scaled = _scaled_to_longest(frames.shape[1], frames.shape[2], self.size_px)
         return _to_sizes(frames, [scaled, (self.size_px, self.size_px)], self.resample)
 
 
 def _scaled_to_longest(height: int, width: int, longest: int) -> tuple[int, int]:
-    """The longer side ``longest``, the other in proportion and even."""
+    """Return height and width with the longer side ``longest``, the other in proportion and even."""
     if width >= height:
         scaled = int(longest / (width / height))
         return max(scaled + scaled % 2, 1), longest
@@ -219,10 +223,7 @@ def _scaled_to_longest(height: int, width: int, longest: int) -> tuple[int, int]
 
 
 def _to_sizes(frames: UInt8Array, sizes: Sequence[tuple[int, int]], resample: int = PIL_BICUBIC) -> Tensor:
-    """uint8 [T, H, W, 3] -> [T, *sizes[-1], 3]: each frame brought to one size after the other; no copy if it has all.
-
-    resample: Pillow's number of the filter
-    """
+    """Resize frames to each of ``sizes`` in turn: uint8 [T, H, W, 3] -> [T, *sizes[-1], 3]."""
     if frames.flags.writeable and all(size == frames.shape[1:3] for size in sizes):
         return torch.from_numpy(frames)
     sized = np.empty((len(frames), *sizes[-1], frames.shape[-1]), np.uint8)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Weights that bitsandbytes rounded to NF4: 4 bits for a value, and one scale for a block of values.
+"""Dequantize weights that bitsandbytes rounded to NF4: 4 bits for each value, and a scale for each block.
 
-A value is code * scale (https://arxiv.org/abs/2305.14314). Blocks go on from one row to the next. Scales may be rounded
-themselves: to 8 bits, around an offset, with one scale of their own for a block of them.
+A value is code * scale (https://arxiv.org/abs/2305.14314). Blocks continue across rows. Scales may be rounded too: to
+8 bits, around an offset, with a scale for each block of scales.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from rfm.checkpoint.content import CheckpointError, shown
 _STATE = ".quant_state.bitsandbytes__nf4"  # behind a weight's name: JSON in bytes
 _MAX_STATE_BYTES = 2**16
 _DTYPES = {"bfloat16": torch.bfloat16, "float16": torch.float16, "float32": torch.float32}
-_BLOCK_SIZES = [2**power for power in range(5, 13)]  # that bitsandbytes has, of weights and of scales
-_VALUES_AT_ONCE = 2**22  # more would take memory and no less time
+_BLOCK_SIZES = [2**power for power in range(5, 13)]  # of bitsandbytes, for weights and scales
+_VALUES_AT_ONCE = 2**22  # more would take more memory and save no time
 _CODES = (
     -1.0, -0.6961928009986877, -0.5250730514526367, -0.39491748809814453, -0.28444138169288635, -0.18477343022823334,
     -0.09105003625154495, 0.0, 0.07958029955625534, 0.16093020141124725, 0.24611230194568634, 0.33791524171829224,
@@ -31,7 +31,7 @@ _CODES = (
 
 
 def dequantize(tensors: dict[str, Tensor]) -> int:
-    """Put weights of the type that they were rounded from in the place of NF4 weights; the number of these.
+    """Replace NF4 weights by weights in their original dtype; return their number.
 
     Raises CheckpointError for a weight whose parts are missing or do not fit.
     """
@@ -67,7 +67,7 @@ def _state(name: str, packed: Tensor) -> dict[str, Any]:
 
 
 def _dequantized(name: str, state: Mapping[str, Any], tensors: dict[str, Tensor]) -> Tensor:
-    """The weight of that name. Takes its parts out of ``tensors``."""
+    """Return the weight of that name, and remove its parts from ``tensors``."""
 
     def part(suffix: str, dtype: torch.dtype, length: int) -> Tensor:
         tensor = tensors.pop(name + suffix, None)
@@ -89,7 +89,7 @@ def _dequantized(name: str, state: Mapping[str, Any], tensors: dict[str, Tensor]
     else:
         scales = part(".absmax", torch.float32, blocks)
     packed = pad(part("", torch.uint8, (count + 1) // 2), (0, (blocks * size - count) // 2))
-    pairs = torch.cartesian_prod(codes, codes)  # of each byte, whose higher bits come first
+    pairs = torch.cartesian_prod(codes, codes)  # the two values of each byte, the higher bits first
     whole = torch.empty(blocks, size, dtype=_DTYPES[state["dtype"]])
     step = _VALUES_AT_ONCE // size
     for start in range(0, blocks, step):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A vision-language reward model as a predictor: samples of raw frames in, scores of conversations out."""
+"""The predictor of a vision-language reward model: samples of raw frames in, scores of conversations out."""
 
 from __future__ import annotations
 
@@ -27,8 +27,7 @@ from rfm_client.contract.frame_refs import ProgressSampleRefs
 class VlmPredictor:
     """A vision-language reward model on a device.
 
-    cache: of what the vision tower makes of shots, on the device, and of frames, which callers may name then; None:
-        nothing is kept
+    cache: of shots' features on the device, and of frames, to which samples may then refer; None: no cache
     """
 
     works_ahead = True
@@ -46,9 +45,9 @@ class VlmPredictor:
         self._max_tokens = int(network.model.config.get_text_config().max_position_embeddings)
 
     def rows(self, sample: Sample | ProgressSampleRefs) -> list[VlmRow]:
-        """The conversations about a sample. Raises InvalidSampleError, too for named frames that are not known."""
+        """Return the conversations of a sample. Raises InvalidSampleError, also for unknown frame references."""
         rows = self.collator.rows(self._completed(sample) if isinstance(sample, ProgressSampleRefs) else sample)
-        # The backbone has learned no positions beyond its own; its scores of those would mean nothing.
+        # Scores would mean nothing: the backbone has learned no positions beyond this limit.
         longest = max(row.num_tokens for row in rows)
         if longest > self._max_tokens:
             expected = f"at most {self._max_tokens} tokens (max_position_embeddings of this checkpoint)"
@@ -56,26 +55,24 @@ class VlmPredictor:
         return rows
 
     def num_tokens(self, row: VlmRow) -> int:
-        """Number of tokens of the row's conversation."""
+        """Return the number of tokens in the row."""
         return row.num_tokens
 
     def work_ahead(self, rows: Sequence[VlmRow]) -> None:
-        """Brings each frame to size once, and sends it on its way to the device."""
+        """Resize each frame once, and start its copy to the device."""
         for video in (video for row in rows for video in row.videos):
             if video.sized is None:
                 sized = self.collator.to_size(video, self.cache)
                 video.sized = replace(sized, pixels=self._copies.send(sized.pixels))
 
     def collate(self, rows: Sequence[VlmRow]) -> VlmBatch:
-        """Conversations of any kind."""
+        """Return one batch of conversations of any kind."""
         self.work_ahead(rows)
         batch = self.collator.collate(rows)
         return batch.pinned() if self._copies.pins else batch
 
     def count(self, batch: VlmBatch, execution: Execution) -> None:
-        """Counts tokens, padding to the longest conversation, and the frames of the different shots that go through the
-        vision tower, and of those that are kept.
-        """
+        """Count tokens, without and with padding, and the frames of shots that are encoded and that are cached."""
         execution.add_tokens(batch.num_tokens, batch.inputs["input_ids"].numel())
         execution.num_encoded += 0 if batch.pixels is None else batch.pixels.num_shown
         execution.num_found += 0 if batch.layout is None else len(batch.layout.kept) * self.collator.frames_per_shot
@@ -83,7 +80,7 @@ class VlmPredictor:
 
     @torch.inference_mode()
     def score(self, rows: Sequence[VlmRow], batch: VlmBatch) -> list[RowScores | RewardError]:
-        """The scores of each row of the batch, or why it has none, from one forward pass."""
+        """Run one forward pass; return each row's scores, or its error."""
         self._copies.wait_for([] if batch.pixels is None else batch.pixels.videos)
         output = self._output(batch)
         scores, preference, similarity, may_keep = _read(output)
@@ -99,12 +96,12 @@ class VlmPredictor:
                 num_queries += 1
             of_rows.append(RowScores(frames, query))
         if batch.layout is not None and may_keep:
-            with suppress(torch.OutOfMemoryError), memory_errors():  # the scores are there
+            with suppress(torch.OutOfMemoryError), memory_errors():  # the scores are complete without the cache
                 self._keep(rows, batch.layout, output.made)
         return checked(of_rows, has_success=output.success is not None)
 
     def _output(self, batch: VlmBatch) -> VlmOutput:
-        """What the network gives. If its memory does not do, nothing stays in the cache: another attempt will come."""
+        """Return the network's output. Out of memory, clear the cache, since the engine tries again with fewer rows."""
         try:
             with memory_errors():
                 output: VlmOutput = self.network(batch.to(self.device, self._dtype))
@@ -115,7 +112,7 @@ class VlmPredictor:
             raise
 
     def _completed(self, sample: ProgressSampleRefs) -> ProgressSampleRefs:
-        """The sample with the pixels of frames that were kept."""
+        """Return the sample with the pixels of cached frames."""
         named = sample.trajectory
         kept = {} if self.cache is None else self.cache.found(named.digests)
         found = {digest: named.pixels.get(digest, kept.get(digest)) for digest in named.digests}
@@ -123,7 +120,7 @@ class VlmPredictor:
         return replace(sample, trajectory=replace(named, pixels=pixels))
 
     def _keep(self, rows: Sequence[VlmRow], layout: Layout, made: torch.Tensor | None) -> None:
-        """Keep the rows' frames and the features of their shots, but nothing of a video that alone is too large."""
+        """Cache the rows' frames and their shots' features, except of a video that alone exceeds the cache."""
         if self.cache is None:
             return
         for video in dict.fromkeys(video for row in rows for video in row.videos):
@@ -138,15 +135,16 @@ class VlmPredictor:
                     self.cache.keep({key: made[layout.made[key]].clone()})
 
     def _per_frame(self, scores: FrameScores, num_frames: int) -> FrameScores:
-        """The scores of each frame: in video mode both frames of a temporal group carry its value."""
+        """Return the scores of each frame; in video mode both frames of a temporal patch share its score."""
         if self.network.config.multi_image:
             return scores
         return part_of(scores, np.arange(num_frames) // FRAMES_PER_GROUP)
 
 
 def _read(output: VlmOutput) -> tuple[FrameScores, list[float], list[float], bool]:
-    """The scores of all frames, preference and similarity of all questions, and whether all that was made of shots is
-    finite, read from the device at once.
+    """Return scores of all frames, preferences, similarities, and True if all new features are finite.
+
+    A single copy from the device reads them all.
     """
     made = {
         "progress": progress_from_logits(output.progress),

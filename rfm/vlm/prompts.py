@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The conversations of vision-language checkpoints, to the letter: the wording is part of the checkpoint.
+"""The exact prompts of vision-language checkpoints: scores depend on the wording.
 
-A question is a list of parts in the order in which the model reads them: text, and whole trajectories. The chat
-template makes text of it, and the tokenizer tokens.
+A question is a list of parts in reading order: text and whole trajectories. The chat template turns it into text, the
+tokenizer the text into tokens.
 Source: the collators of ``reward_fm`` and ``robometer``.
 """
 
@@ -24,9 +24,9 @@ REWARD_TOKEN = "<|reward_token|>"
 PREFERENCE_TOKEN = "<|pref_token|>"
 SIMILARITY_TOKEN = "<|sim_token|>"
 PROGRESS_TOKEN = "<|prog_token|>"
-# In the order in which they are appended to the tokenizer.
+# In the order in which the tokenizer gets them.
 SPECIAL_TOKENS = (SPLIT_TOKEN, REWARD_TOKEN, PREFERENCE_TOKEN, SIMILARITY_TOKEN, PROGRESS_TOKEN)
-OLD_SPECIAL_TOKENS = 8  # how many upstream appended before 2026-01-21
+OLD_SPECIAL_TOKENS = 8  # number of upstream's special tokens before 2026-01-21
 OF_AN_OLD_RUN = (
     "upstream's networks have it since 2026-01-21. A run of before that day was trained with 8 special tokens in place "
     "of 5, and with resized images; score it with the upstream commit that trained it, or train it anew"
@@ -53,7 +53,7 @@ SIMILARITY_PROMPT = (
 
 @dataclass(frozen=True)
 class TrajectoryPart:
-    """Where the frames of trajectory ``index`` (0 or 1) stand in a question."""
+    """The place of the frames of trajectory ``index`` (0 or 1) in a question."""
 
     index: int
 
@@ -62,9 +62,9 @@ Part: TypeAlias = str | TrajectoryPart
 
 
 def question(sample: Sample | ProgressSampleRefs, *, progress_in_preference: bool) -> list[Part]:
-    """The parts of the prompt for a sample.
+    """Return the parts of the prompt for a sample.
 
-    progress_in_preference: the checkpoint was trained with preference prompts that request progress, too
+    progress_in_preference: the checkpoint was trained with preference prompts that also ask for progress
     """
     task = sample.trajectories[0].task
     if isinstance(sample, (ProgressSample, ProgressSampleRefs)):
@@ -92,20 +92,20 @@ def question(sample: Sample | ProgressSampleRefs, *, progress_in_preference: boo
     ]
 
 
-KEPT_TEXTS = 256  # conversations: an RL loop asks about the same task again and again
-MAX_KEPT_BYTES = 16_384  # of one's text; a task sentence and 128 frames have fewer. A byte is a token at most.
-FRAME_BYTES = 64  # of a chat template's text about a frame, about
+KEPT_TEXTS = 256  # cached conversations; an RL loop repeats the same task
+MAX_KEPT_BYTES = 16_384  # of a conversation's text; a task and 128 frames have fewer. A byte is at most one token
+FRAME_BYTES = 64  # of a chat template's text for a frame, about
 
 
 class Visual(Enum):
-    """What a chat template shows besides text, by the name that it has there."""
+    """The parts of a chat template besides text, by their names in it."""
 
     IMAGE = "image"
     VIDEO = "video"
 
 
 class Chat:
-    """A base model's chat template and tokenizer. The latest short conversations are kept: they come again."""
+    """A base model's chat template and tokenizer, with a cache of the latest short conversations."""
 
     def __init__(self, tokenizer: Any) -> None:
         self._tokenizer = tokenizer
@@ -113,12 +113,12 @@ class Chat:
         self._tokens = lru_cache(KEPT_TEXTS)(self._tokenise)
 
     def text(self, parts: tuple[str | Visual, ...]) -> str:
-        """The chat template's text of one user message."""
+        """Return the chat template's text for one user message."""
         is_short = sum(_num_bytes(part) if isinstance(part, str) else FRAME_BYTES for part in parts) <= MAX_KEPT_BYTES
         return (self._text if is_short else self._render)(parts)
 
     def tokens(self, text: str) -> Indices:
-        """int64 [L]: the text's tokens; not to be changed."""
+        """Return the text's tokens, int64 [L], read-only."""
         return (self._tokens if _num_bytes(text) <= MAX_KEPT_BYTES else self._tokenise)(text)
 
     def _render(self, parts: tuple[str | Visual, ...]) -> str:

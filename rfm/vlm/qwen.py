@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""The forward pass of the Qwen backbones, through the layers of ``transformers``' modules, in which no step waits.
+"""The forward pass of the Qwen backbones, with the layers of ``transformers``, without synchronisation.
 
-Where everything stands is worked out on the host beforehand: the device is asked for nothing, so that it never runs out
-of work. Numbers and order of sums are those of ``transformers`` 4.57.
+The host computes all positions and indices beforehand and never waits for the device, so the device always has work.
+Results and order of sums are those of ``transformers`` 4.57.
 
-Language model: B conversations of L tokens, D width, M visual tokens of all conversations. Text goes on by one in all
-three coordinates. An image or a video is a box: each of its tokens stands where it is in it, and what follows goes on
-behind the box's largest coordinate. Padding stands behind the tokens, where causal attention does not see it: no mask
-is needed, and PyTorch's fastest attention takes none.
+Language model: B conversations of L tokens, D width, M visual tokens in all. A token has three coordinates: time, row
+and column. From one text token to the next, all three grow by 1. An image or video is a box, in which a token's
+coordinates are its place. The next text continues behind the box's largest coordinate. Padding follows the tokens,
+where causal attention does not see it, so that PyTorch's fastest attention works, which takes no mask.
 
-Vision tower: a shot is an image or one temporal group of a video; attention never crosses from one into another. N
-patches, in the order of the shots, those that are merged next to each other; S of one shot, U = MERGE x MERGE of one
-merged token. Shots of one size are one call, where transformers computes one shot after the other.
+Vision tower: a shot is a temporal patch, an image or two frames of a video. Attention stays within a shot. N patches
+of all shots in order, those of a merged token together; S patches of a shot, U = MERGE x MERGE of a merged token.
+Shots of a size share a call; transformers computes them one after the other.
 """
 
 from __future__ import annotations
@@ -33,11 +33,12 @@ from rfm.vlm.images import MERGE, Grid
 
 @dataclass(frozen=True)
 class Box:
-    """An image or video among the tokens.
+    """The merged tokens of an image or video in a conversation.
 
-    start: its first token
-    groups, rows, columns: of its merged tokens
-    step: coordinates from one temporal group to the next
+    start: index of the first token
+    groups: number of temporal patches
+    rows, columns: of merged tokens in each
+    step: difference in time coordinate between temporal patches
     """
 
     start: int
@@ -48,14 +49,14 @@ class Box:
 
     @property
     def num_tokens(self) -> int:
-        """How many tokens it takes."""
+        """Number of tokens in the box."""
         return self.groups * self.rows * self.columns
 
 
 def positions(length: int, boxes: Sequence[Box]) -> npt.NDArray[np.int64]:
-    """int64 [3, L]: time, row and column of each token; ``boxes`` in the order in which they stand."""
+    """Return time, row and column of each of ``length`` = L tokens, int64 [3, L]; ``boxes`` in order."""
     found = np.empty((3, length), np.int64)
-    read = following = 0  # tokens that have their positions; the coordinate of the next one
+    read = following = 0  # tokens with positions so far; the next text token's coordinate
     for box in boxes:
         text = box.start - read
         found[:, read : box.start] = np.arange(following, following + text)
@@ -76,14 +77,14 @@ Indices = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class VisionPlan:
-    """What a vision tower must know of the shots of a batch.
+    """The layout of a batch's shots for a vision tower.
 
-    shots: of each size how many there are, and patches of one
-    positions: int64 [sum of S, 2], row and column of the patches of one shot of each size
-    corners, weights: of Qwen3-VL int64 and float32 [4, sum of S]: the learned positions around each of these patches
-    windows: of Qwen2.5-VL how many windows of how many patches there are, one behind the other
-    order: of Qwen2.5-VL int64 [N / U], the merged tokens in the order of the windows
-    back: its inverse
+    shots: number of shots and S, for each size
+    positions: int64 [sum of S, 2], row and column of each patch, for a shot of each size
+    corners, weights: Qwen3-VL: int64 and float32 [4, sum of S], learned positions around these patches, their weights
+    windows: Qwen2.5-VL: runs of equal windows, as number of windows and patches of a window
+    order: Qwen2.5-VL: int64 [N / U], the merged tokens in the order of the windows
+    back: the inverse of ``order``
     """
 
     shots: Runs
@@ -95,7 +96,7 @@ class VisionPlan:
     back: Tensor | None = None
 
     def changed(self, change: Callable[[Tensor], Tensor]) -> VisionPlan:
-        """The same with ``change`` made to its tensors."""
+        """Return the plan with ``change`` applied to its tensors."""
         changed: dict[str, Any] = {
             name: change(value) for name, value in vars(self).items() if isinstance(value, Tensor)
         }
@@ -103,10 +104,10 @@ class VisionPlan:
 
 
 def plan(grids: Sequence[Grid], config: dict[str, Any]) -> VisionPlan:
-    """The plan for shots of these sizes, on the CPU.
+    """Return the plan for shots of these sizes, on the CPU.
 
-    grids: of each size; its groups are the shots of that size
-    config: of the vision tower, as config.json has it
+    grids: of each size, with its number of shots as ``groups``
+    config: vision_config of config.json
     """
     sizes = [(grid.rows, grid.columns) for grid in grids]
     shots = tuple((grid.groups, grid.rows * grid.columns) for grid in grids)
@@ -123,10 +124,11 @@ def plan(grids: Sequence[Grid], config: dict[str, Any]) -> VisionPlan:
 
 
 def features(visual: Any, patches: Tensor, plan: VisionPlan) -> Tensor:
-    """[N / U, levels, D] of patches [N, C * T * P * P]: the merged tokens of all shots, and those of Qwen3-VL's deeper
-    layers.
+    """Return the features of all merged tokens, [N / U, levels, D], of patches [N, C * T * P * P].
 
-    visual: transformers' vision tower; of it only the layers are used
+    levels: 1, and in Qwen3-VL more from deeper layers
+    C = 3 channels, T = 2 frames, P pixels a side of a patch
+    visual: transformers' vision tower, of which only the layers are used
     """
     hidden = visual.patch_embed(patches)
     if plan.corners is not None:
@@ -149,7 +151,7 @@ def features(visual: Any, patches: Tensor, plan: VisionPlan) -> Tensor:
 
 
 def _attention(attention: Any, hidden: Tensor, turned: Turn, plan: VisionPlan, *, is_full: bool) -> Tensor:
-    """[N, D] of [N, D], within each shot, or within each window; all of one size in one call."""
+    """Attend within each shot (``is_full``) or window, equal sizes in one call: [N, D] -> [N, D]."""
     heads = attention.qkv(hidden).reshape(len(hidden), 3, attention.num_heads, -1)
     query, key, value = heads.unbind(1)
     query, key = turned(query), turned(key)
@@ -164,20 +166,20 @@ def _attention(attention: Any, hidden: Tensor, turned: Turn, plan: VisionPlan, *
 
 
 def _within(run: tuple[int, int], query: Tensor, key: Tensor, value: Tensor, *, scale: float) -> Tensor:
-    """[N, D] of [N, heads, D / heads]: attention within each of the sequences, N = how many there are * the length."""
+    """Attend within equal sequences, ``run`` = number and length: [N, heads, D / heads] -> [N, D]."""
     query, key, value = (each.unflatten(0, run).transpose(1, 2) for each in (query, key, value))
     return F.scaled_dot_product_attention(query, key, value, scale=scale).transpose(1, 2).flatten(2).flatten(0, 1)
 
 
 @dataclass(frozen=True)
 class Turn:
-    """The rotation of queries and keys by their positions: float32 [N, 1, D / heads]."""
+    """The rotary embedding: cosines and sines of positions, float32 [N, 1, D / heads]."""
 
     cosine: Tensor
     sine: Tensor
 
     def __call__(self, heads: Tensor) -> Tensor:
-        """[N, heads, D / heads] of the same; computed in float32."""
+        """Rotate queries or keys, [N, heads, D / heads], in float32; the result has their dtype."""
         values = heads.float()
         first, second = values.chunk(2, dim=-1)
         turned = values * self.cosine + torch.cat((-second, first), dim=-1) * self.sine
@@ -193,7 +195,7 @@ def _turned(frequencies: Tensor, plan: VisionPlan) -> Turn:
 
 
 def _learned_positions(embedding: Any, plan: VisionPlan) -> Tensor:
-    """[sum of S, D]: learned positions, interpolated."""
+    """Return interpolated learned positions, [sum of S, D]."""
     assert plan.corners is not None
     assert plan.weights is not None
     around = embedding(plan.corners) * plan.weights.to(embedding.weight.dtype)[..., None]
@@ -201,26 +203,26 @@ def _learned_positions(embedding: Any, plan: VisionPlan) -> Tensor:
 
 
 def _repeated(of_sizes: Tensor, shots: Runs) -> Tensor:
-    """[N, ...] of [sum of S, ...]: what is the same for all shots of a size."""
+    """Repeat the values of a shot of each size for all its shots: [sum of S, ...] -> [N, ...]."""
     parts = of_sizes.split([length for _, length in shots])
     return torch.cat([part.repeat(count, 1) for part, (count, _) in zip(parts, shots, strict=True)])
 
 
 def _moved(patches: Tensor, order: Tensor | None) -> Tensor:
-    """[N, ...] of [N, ...]: the merged tokens' patches in another order."""
+    """Reorder patches by merged tokens: [N, ...] -> [N, ...]."""
     return patches.unflatten(0, (-1, UNIT))[order].flatten(0, 1)
 
 
 @lru_cache(maxsize=256)
 def _positions(rows: int, columns: int) -> Tensor:
-    """int64 [S, 2], row and column of each patch."""
+    """Return row and column of each patch, int64 [S, 2]."""
     indices = np.indices((rows, columns)).reshape(2, rows // MERGE, MERGE, columns // MERGE, MERGE)
     return torch.from_numpy(np.ascontiguousarray(indices.transpose(1, 3, 2, 4, 0).reshape(-1, 2)))
 
 
 @lru_cache(maxsize=256)
 def _corners(rows: int, columns: int, side: int) -> tuple[Tensor, Tensor]:
-    """int64 and float32 [4, S]: the four learned positions, of side x side, around each patch, and their shares."""
+    """Return the 4 learned positions (of side x side) around each patch, int64 [4, S], and weights, float32 [4, S]."""
     of_axes = []
     for count in (rows, columns):
         at = torch.linspace(0, side - 1, count)
@@ -239,7 +241,7 @@ def _corners(rows: int, columns: int, side: int) -> tuple[Tensor, Tensor]:
 
 @lru_cache(maxsize=256)
 def _windows_of(rows: int, columns: int, side: int) -> dict[int, Indices]:
-    """By the merged tokens of a window, int64 [windows, tokens]: the merged tokens of one shot, window by window."""
+    """Return a shot's merged tokens by window, int64 [windows, tokens], for each number of tokens in a window."""
     tokens = np.arange(rows * columns).reshape(rows, columns)
     found: dict[int, list[Indices]] = {}
     for top in range(0, rows, side):
@@ -250,7 +252,7 @@ def _windows_of(rows: int, columns: int, side: int) -> dict[int, Indices]:
 
 
 def _windows(grids: Sequence[Grid], side: int) -> tuple[Runs, Indices]:
-    """How many windows of how many patches there are, and the merged tokens in their order."""
+    """Return runs of windows (number, patches of each), and the merged tokens in the windows' order, int64 [N / U]."""
     runs, order, start = [], [], 0
     for grid in grids:
         for length, windows in _windows_of(grid.rows // MERGE, grid.columns // MERGE, side).items():
@@ -265,14 +267,12 @@ FULL_ATTENTION = "full_attention"
 
 
 def last_hidden_state(language: Any, inputs: dict[str, Tensor], features: Tensor) -> Tensor:
-    """[B, L, D], behind the final norm.
+    """Return the hidden states behind the final norm, [B, L, D].
 
     language: transformers' language model
-    inputs: of a batch on its device
-    input_ids: int64 [B, L]; position_ids: int64 [3, B, L]
-    visual_tokens: int64 [M], where visual tokens stand among all B * L
-    visual_features: int64 [M], which of the shots' merged tokens each of them is
-    features: [N, levels, D], the merged tokens of all shots
+    inputs: on its device: input_ids, int64 [B, L]; position_ids, int64 [3, B, L]; visual_tokens, int64 [M], the visual
+        tokens' indices among all B * L; visual_features, int64 [M], the index of each in ``features``
+    features: [N / U, levels, D], the merged tokens of all shots
     """
     at, picked = inputs["visual_tokens"], inputs["visual_features"]
     merged, *deeper = features.unbind(1)
@@ -288,7 +288,7 @@ def last_hidden_state(language: Any, inputs: dict[str, Tensor], features: Tensor
 
 
 def check_attention(backbone: Any) -> None:
-    """Raises CheckpointError for a language model with layers that do not see all tokens before."""
+    """Raise CheckpointError for a language model with layers that do not attend to all earlier tokens."""
     kinds = set(getattr(backbone.config.get_text_config(), "layer_types", None) or [FULL_ATTENTION])
     if kinds != {FULL_ATTENTION}:
         raise CheckpointError(f"text_config.layer_types: expected {FULL_ATTENTION} alone, got {sorted(kinds)}")

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """config.yaml of a vision-language training run: the settings that weights do not hold.
 
-docs/reference/checkpoints.md lists every setting, and what decides it where the file lacks its key.
+docs/reference/checkpoints.md lists every setting and its default.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from rfm.vlm.network import VlmConfig
 if TYPE_CHECKING:
     from rfm.vlm.lora import Scaling
 
-HEADS, VQA = "default", "vqa"  # values of model.model_type: reward heads, and answers in generated text
+HEADS, VQA = "default", "vqa"  # values of model.model_type: reward heads, generated text
 DTYPES = ("float32", "bfloat16", "float16")
 POOLINGS = ("mean", "boundary", "attention")
 _SECTIONS = ("model", "data", "training", "peft")
-# Where a run's configuration has the fields of VlmConfig that it decides; of two keys both count.
+# The keys of a run's configuration that decide fields of VlmConfig; two keys must agree.
 SETTINGS = {
     "dtype": ("model.torch_dtype",),
     "multi_image": ("model.use_multi_image", "data.use_multi_image"),
@@ -39,18 +39,18 @@ SETTINGS = {
 }
 _OF_WEIGHTS = ("progress_bins", "has_similarity", "has_preference", "has_success")
 _BASE_MODEL = "--base-model"
-_VARIANT = re.compile(r"-unsloth$")  # of one model, which Unsloth puts in the place of a base model
-_DROPPED = ("pairwise_progress", "use_progress_token")  # other ways to prompt that upstream once had
+_VARIANT = re.compile(r"-unsloth$")  # Unsloth's name for its copy of a base model
+_DROPPED = ("pairwise_progress", "use_progress_token")  # settings of prompts that upstream has dropped
 
 Value = TypeVar("Value", bool, str, float)
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """The sections of a run's config.yaml. A null is a key that is not there, as it is upstream.
+    """The sections of a run's config.yaml. As upstream, a null means that the key is missing.
 
-    file: where it lies
-    name: its path as seen from the checkpoint's folder
+    file: path of config.yaml
+    name: its path relative to the checkpoint's folder
     """
 
     file: Path
@@ -59,8 +59,9 @@ class RunConfig:
 
     @classmethod
     def of(cls, folder: Path) -> RunConfig:
-        """The run configuration of the checkpoint in ``folder``. Raises CheckpointError if there is none, or none of
-        upstream's.
+        """Read the run configuration of the checkpoint in ``folder``.
+
+        Raises CheckpointError if there is none, or it is not upstream's.
         """
         file = find_run_config(folder)
         if file is None:
@@ -79,7 +80,7 @@ class RunConfig:
         return cls(file, file_name(file, folder), sections)
 
     def check_model_type(self) -> None:
-        """Raises CheckpointError for a checkpoint that upstream does not score by reward heads as they are today."""
+        """Raise CheckpointError for a checkpoint without reward heads, or with prompts that upstream has dropped."""
         model_type, why = self.get("model.model_type", HEADS), ""
         if model_type == VQA:
             why = (
@@ -95,7 +96,10 @@ class RunConfig:
                     raise CheckpointError(f"{self.file}: {section}.{key}: expected {expected}, got true")
 
     def network(self) -> dict[str, Any]:
-        """Fields of VlmConfig about the network and its prompts, but for the frames' size."""
+        """Return the fields of VlmConfig about the network and its prompts, except the frame size.
+
+        Raises CheckpointError.
+        """
         temperature = self.get("model.frame_pooling_attn_temperature", 1.0)
         if not 0 < temperature < math.inf:
             where = f"{self.file}: model.frame_pooling_attn_temperature"
@@ -113,21 +117,21 @@ class RunConfig:
         }
 
     def size_px(self, family: str, multi_image: bool) -> tuple[int, int] | None:
-        """Height and width to which every frame is brought; None: each frame's own size is where resizing begins.
+        """Return height and width to which every frame is resized first; None: resizing starts from each frame's size.
 
-        Images have none: upstream ignores the keys for them since the day that its networks have a frame_pool_attn.
+        None for images: upstream ignores the keys since its networks have a frame_pool_attn. Raises CheckpointError.
         """
         if family == SMOL or multi_image:
             return None
         keys = ("resized_height", "resized_width")
         for key in keys:
-            if key not in self.sections["data"]:  # upstream's default was 224 first and null later
+            if key not in self.sections["data"]:  # upstream's default changed from 224 to null
                 raise CheckpointError(f"{self.file}: data.{key}: expected a number or null, got no such key")
         height, width = (frame_count(self.sections["data"].get(key), f"{self.file}: data.{key}") for key in keys)
         return None if height is None or width is None else (height, width)
 
     def decision(self, setting: str, value: Any) -> Decision:
-        """What decided one of SETTINGS: its keys, or upstream's default where the file has none of them."""
+        """Return the source of one of SETTINGS: its keys, or upstream's default."""
         places = SETTINGS[setting]
         there = [place for place in places if self.states(place)]
         if value is None:
@@ -137,12 +141,12 @@ class RunConfig:
         return Decision(setting, value, f"{self.name}: {', '.join(there)}")
 
     def states(self, place: str) -> bool:
-        """Whether there is a value at ``section.key``."""
+        """True if there is a value at ``section.key``."""
         section, _, key = place.partition(".")
         return self.sections[section].get(key) is not None
 
     def get(self, place: str, default: Value) -> Value:
-        """The value at ``section.key``, of the default's type; the default where there is none."""
+        """Return the value at ``section.key``, else the default. Raises CheckpointError for another type."""
         section, _, key = place.partition(".")
         value = self.sections[section].get(key)
         if value is None:
@@ -160,7 +164,7 @@ class RunConfig:
         return value
 
     def _of_either(self, setting: str) -> bool:
-        """Upstream has it twice: its network reads that of ``model``, its collator that of ``data``."""
+        """Return a setting that upstream has twice: its network reads ``model``, its collator ``data``."""
         places = [place for place in SETTINGS[setting] if self.states(place)]
         values = {place: self.get(place, False) for place in places}
         if len(set(values.values())) > 1:
@@ -179,15 +183,15 @@ def decisions_of(
     is_adapter: bool = False,
     num_nf4: int = 0,
 ) -> tuple[Decision, ...]:
-    """What decided each setting of a checkpoint.
+    """Return the source of each setting of a checkpoint.
 
-    run: None: ``rfm export`` wrote it, and its config.json has every setting
-    base_model: the one that the caller names
+    run: None: ``rfm export`` wrote the checkpoint, whose config.json has every setting
+    base_model: the caller's option
     scaling: of LoRA factors; None: there are none
     is_adapter: the base model's weights are not in the checkpoint
-    num_nf4: weights in NF4, which may have been rounded after training
+    num_nf4: number of weights in NF4, which may have been rounded after training
     """
-    idle = {"average_temporal_patches", "size_px"} if config.multi_image else set()  # change nothing about it
+    idle = {"average_temporal_patches", "size_px"} if config.multi_image else set()  # settings without effect
     idle |= set() if config.pools_images else {"frame_pooling"}
     idle |= set() if config.pools_by_attention else {"pooling_temperature"}
     deciding = {name: getattr(config, name) for name in SETTINGS if name not in idle}
@@ -203,7 +207,7 @@ def decisions_of(
         decided.append(Decision(name, value, NETWORK_CONFIG) if run is None else run.decision(name, value))
     decided.append(TRAINED_WITH_PADDING)
     if run is not None and config.family == QWEN_2_5 and not config.multi_image:
-        version = config.backbone.get("transformers_version")  # of 5 or later, VlmCheckpoint.notes tells
+        version = config.backbone.get("transformers_version")  # for 5 and later, VlmCheckpoint.notes has a line
         stated = f"{NETWORK_CONFIG}: transformers_version {version}"
         source = stated if str(version).startswith("4.") else "default: no file names transformers 4"
         decided.append(Decision("positions_behind_videos", "as transformers 4", source, is_assumed=version is None))
@@ -214,7 +218,7 @@ def decisions_of(
 
 
 def _base_model(named: str, run: RunConfig | None, given: str | None) -> Decision:
-    """Where the tokenizer and image preprocessing are from, and of an adapter what it changes."""
+    """Return the source of tokenizer and image preprocessing, and of an adapter's base weights."""
     if given is None:
         file = NETWORK_CONFIG if run is None else f"{run.name}: model.base_model_id"
         return Decision("base_model", source_name(named), file)
@@ -225,5 +229,5 @@ def _base_model(named: str, run: RunConfig | None, given: str | None) -> Decisio
 
 
 def model_name(base: str) -> str:
-    """What is left of a base model's id or path where the same model may have several."""
+    """Return the name by which ids and paths of the same base model are compared."""
     return _VARIANT.sub("", base.rstrip("/").rpartition("/")[2].lower())

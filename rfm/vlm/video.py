@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The frames of a trajectory, and the shots that a vision tower reads of them: images, or groups of two frames.
+"""A trajectory's frames, and its shots: the temporal patches (images, or pairs of frames) that a vision tower reads.
 
-A shot's key says what the tower is shown: the digests of its frames, and the size that they are brought to.
+A Qwen shot's key holds all that its features depend on: the digests of its frames, and their size after resizing.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ Shot: TypeAlias = tuple[int, ...]
 
 @dataclass(frozen=True, eq=False)
 class SizedFrames:
-    """The frames of a video that the backbone is still to be shown, brought to size.
+    """A video's resized frames, without those whose shots are all cached.
 
     pixels: uint8 [N, H', W', 3], on the CPU or the device
-    places: int64 [T], at which of the N each of the video's frames is; -1: only shots that are kept show it
-    keys: of each of the video's shots
-    kept: [tokens, levels, D] by key, what the vision tower has made before of some of the shots
+    places: int64 [T], the index in ``pixels`` of each frame; -1: only cached shots show the frame
+    keys: cache key of each shot
+    kept: cached features of shots by key, [tokens, levels, D]
     """
 
     pixels: Tensor
@@ -43,13 +43,13 @@ class SizedFrames:
 
 @dataclass(eq=False)
 class VlmVideo:
-    """A trajectory's frames, which all rows about it share.
+    """A trajectory's frames, shared by all its rows.
 
-    frames: uint8 [H, W, 3] each, of one size
-    num_shown: of them, in one conversation
-    conversations: int64 [num_shown] each, the frames that one shows
-    named: digests of the frames, if they came with the frames; they were computed here
-    sized: its frames in the size that the backbone reads; None: not yet
+    frames: T frames, uint8 [H, W, 3], of equal size
+    num_shown: frames in a conversation
+    conversations: indices of the frames in each, int64 [num_shown]
+    named: digests of the frames in a sample with frame references, computed by the server; None: no references
+    sized: the resized frames; None: not yet resized
     """
 
     frames: Sequence[UInt8Array] | UInt8Array
@@ -62,14 +62,14 @@ class VlmVideo:
     def of(
         cls, frames: Sequence[UInt8Array] | UInt8Array, frame_steps: int, named: Sequence[bytes] | None = None
     ) -> VlmVideo:
-        """The video of a sample's frames. ``frame_steps``: of dense mode; 0: one conversation shows all frames."""
+        """Return the video of a sample's frames. ``frame_steps``: of dense mode; 0: one conversation, of all frames."""
         count = len(frames)
         conversations = list(prefix_indices(count, frame_steps)) if frame_steps else [np.arange(count)]
         return cls(frames, frame_steps or count, conversations, named)
 
     @property
     def ready(self) -> SizedFrames:
-        """The frames of a video that has been brought to size."""
+        """The resized frames, which must exist."""
         assert self.sized is not None
         return self.sized
 
@@ -86,31 +86,32 @@ class VlmVideo:
 
     @property
     def alike(self) -> Indices:
-        """int64 [T]: of each frame the first one that shows the same."""
+        """The index of the first equal frame, for each frame, int64 [T]."""
         first: dict[bytes, int] = {}
         return np.array([first.setdefault(digest, index) for index, digest in enumerate(self.digests)])
 
     def is_blank(self, shot: Shot) -> bool:
-        """Whether a shot that came with its pixels is all black, as those are with which a server probes itself: what
-        was kept of such a one would tell nothing of how the network is.
+        """True if a shot's frames, not from frame references, are black, as a probe's are.
+
+        The network must compute these: cached features would not show that it works.
         """
         return self.named is None and not any(self.frames[frame].any() for frame in shot)
 
     def stack(self, needed: Sequence[int]) -> UInt8Array:
-        """uint8 [N, H, W, 3]: some of the frames, in order. A copy, unless all are wanted and lie side by side."""
+        """Return the frames at ``needed``, uint8 [N, H, W, 3]; all frames of an array are not copied."""
         if isinstance(self.frames, np.ndarray) and len(needed) == len(self.frames):
             return self.frames
         height, width = self.size
         return np.stack([self.frames[i] for i in needed]) if needed else np.empty((0, height, width, 3), np.uint8)
 
     def shots(self, *, are_images: bool) -> list[Shot]:
-        """The different shots of all conversations."""
+        """Return the different shots of all conversations."""
         shown = (shot for frames in self.conversations for shot in shots_of(frames, are_images=are_images))
         return list(dict.fromkeys(shown))
 
 
 def named_frames(trajectory: TrajectoryRefs) -> list[UInt8Array]:
-    """uint8 [H, W, 3] of each frame. Raises InvalidSampleError for pixels that are not there, or of several sizes."""
+    """Return each frame, uint8 [H, W, 3]. Raises InvalidSampleError for unknown frames or unequal sizes."""
     unknown = sum(digest not in trajectory.pixels for digest in trajectory.digests)
     if unknown:
         raise InvalidSampleError.at(wire.FRAME_DIGESTS, wire.UNKNOWN_FRAMES, f"{unknown} others")
@@ -122,9 +123,9 @@ def named_frames(trajectory: TrajectoryRefs) -> list[UInt8Array]:
 
 
 def shots_of(shown: Indices, *, are_images: bool) -> Iterable[Shot]:
-    """The shots of a conversation that shows these frames.
+    """Return the shots of a conversation that shows these frames.
 
-    are_images: each frame is a shot; else two, and an odd count is filled up with the last frame
+    are_images: each frame is a shot; else each pair, and the last frame is repeated if their number is odd
     """
     if are_images:
         return zip(shown.tolist(), strict=True)
