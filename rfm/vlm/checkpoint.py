@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Vision-language checkpoints: full weights, or LoRA factors beside them or beside those of a base model.
+"""Vision-language checkpoints: whole weights, perhaps with LoRA factors, or an adapter to a base model.
 
-Names of weights become those of VlmRewardModel, by one rename table per form.
+A table of renames for each form turns the names of weights into those of VlmRewardModel.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ from rfm.vlm.processor import (
 from rfm.vlm.prompts import OF_AN_OLD_RUN
 from rfm.vlm.run_config import RunConfig, decisions_of
 
-LORA = "lora"  # in VlmCheckpoint.parts: the factors that change the network's weights
-SETTINGS = "rfm"  # key of our own fields in an exported config.json
+LORA = "lora"  # key in VlmCheckpoint.parts: the factors that change the network's weights
+SETTINGS = "rfm"  # key in an exported config.json: this project's fields
 
 _NAMES_OF = {SMOL: SMOL_NAMES}
 _LAYER_COUNTS = ("num_hidden_layers", "num_layers", "depth")
@@ -82,10 +82,10 @@ class VlmCheckpoint:
     """A vision-language checkpoint in memory.
 
     weights: of VlmRewardModel, without LoRA
-    factors: of LoRA, as ``rfm.vlm.lora.split`` names them; none: the weights are whole
-    processor: its own folder of tokenizer and image preprocessing; None: those of the base model are taken
-    base_model: folder or id that the caller names; None: the one that the checkpoint names
-    settings: what decided its configuration
+    factors: of LoRA, with the names of ``rfm.vlm.lora.split``; empty without LoRA
+    processor: the checkpoint's own folder of tokenizer and image preprocessing; None: the base model's are used
+    base_model: folder or id from the caller; None: as the checkpoint names it
+    settings: the source of each setting of the configuration
     """
 
     config: VlmConfig
@@ -97,7 +97,7 @@ class VlmCheckpoint:
 
     @property
     def description(self) -> Description:
-        """What the checkpoint takes, and what it answers."""
+        """The checkpoint's inputs and outputs."""
         return Description(
             network_class=VlmRewardModel.__name__,
             widths=None,
@@ -119,7 +119,7 @@ class VlmCheckpoint:
 
     @property
     def notes(self) -> list[str]:
-        """That prompts, images or positions may be others than in training."""
+        """A line for each sign that prompts, images or positions differ from those in training."""
         lines = []
         if not self._is_own and (found := differences(self.collator)):
             known = f"the published processors of {self.config.family}"
@@ -136,7 +136,7 @@ class VlmCheckpoint:
         return lines
 
     def decisions(self) -> list[Decision]:
-        """What decided each setting. Raises CheckpointError if the processor cannot be had."""
+        """Return the source of each setting. Raises CheckpointError if the processor is missing or does not fit."""
         return [*self.settings, *of_processor(self.collator, PROCESSOR_FOLDER if self._is_own else self._source)]
 
     @property
@@ -146,12 +146,12 @@ class VlmCheckpoint:
 
     @property
     def _is_own(self) -> bool:
-        """Whether the processor is the checkpoint's own, as an export has it."""
+        """True if the checkpoint's own processor is used, which an export has."""
         return self._source == self.processor
 
     @cached_property
     def collator(self) -> VlmCollator:
-        """What makes batches of samples. Raises CheckpointError if the processor cannot be had or does not fit."""
+        """The collator of samples. Raises CheckpointError if the processor is missing or does not fit."""
         embedding = next(t for name, t in self.weights.items() if name.endswith("embed_tokens.weight"))
         collator = load_collator(self.config, len(embedding), self._source)
         if self.base_model is not None and is_published(self.config.base_model_id, self.config.family):
@@ -159,25 +159,25 @@ class VlmCheckpoint:
         return collator
 
     def encoders(self) -> None:
-        """None: the network reads raw frames, and needs no encoders."""
+        """Return None: the network reads raw frames and needs no encoders."""
 
     def predictor(
         self, device: torch.device, dtype: torch.dtype | None = None, cache: FeatureCache[Any] | None = None
     ) -> VlmPredictor:
-        """The network on ``device``. Raises CheckpointError.
+        """Return a predictor with the network on ``device``. Raises CheckpointError.
 
         dtype: of the network; None: float32 on the CPU, else the checkpoint's own
-        cache: of what the vision tower makes of frames; None: nothing is kept. SmolVLM keeps nothing
+        cache: for features of frames; SmolVLM does not use it; None: no cache
         """
         if dtype is None and device.type == "cpu":
             dtype = torch.float32
-        collator = self.collator  # first: what is missing is reported before the weights are read
+        collator = self.collator  # first, so that a missing file is reported before the network is built
         kept = cache if self.description.keeps_features else None
         return VlmPredictor(self.build(dtype), collator, device, kept)
 
     def save(self, folder: Path) -> None:
-        """Writes weights and LoRA factors, one config.json that says all, and the processor."""
-        collator = self.collator  # first: what is missing is reported before the weights are written
+        """Write weights and LoRA factors, a config.json with all settings, and the processor."""
+        collator = self.collator  # first, so that a missing file is reported before the weights are written
         folder.mkdir(parents=True)
         settings = {name: value for name, value in config_fields(self.config).items() if name != "backbone"}
         config = {**self.config.backbone, SETTINGS: settings}
@@ -187,19 +187,22 @@ class VlmCheckpoint:
         save_processor(collator, folder / PROCESSOR_FOLDER)
 
     def build(self, dtype: torch.dtype | None = None) -> VlmRewardModel:
-        """The network with these weights, on the CPU, ready to score, in ``dtype`` (None: its own)."""
+        """Return the network with these weights, on the CPU, ready to score, in ``dtype`` (None: its own).
+
+        Raises CheckpointError.
+        """
         wanted = dtype or self.config.torch_dtype
-        if self.config.family == SMOL and is_at_least(5):  # it computes other image features than in training
+        if self.config.family == SMOL and is_at_least(5):  # transformers 5 computes other image features
             expected = "transformers < 5 for a SmolVLM checkpoint, whose scores would differ"
             version = importlib.metadata.version("transformers")
             raise CheckpointError(f"transformers: expected {expected}, got {version}")
         network = self._network(wanted)
-        # Parameters only: rotary frequencies stay float32, as in the original.
+        # Parameters only: rotary frequencies stay float32, as upstream.
         network.load_state_dict(merged(self.weights, self.factors, wanted), strict=True, assign=True)
         return network.eval().requires_grad_(False)
 
     def check(self) -> None:
-        """Raises CheckpointError unless the weights are those of the network; no memory is taken for it before."""
+        """Raise CheckpointError unless the weights fit the network, before memory is allocated for it."""
         _check_layers(self.config.backbone)
         with expecting("a backbone that transformers can make", NETWORK_CONFIG), torch.device("meta"):
             network = self._network(self.config.torch_dtype)
@@ -210,7 +213,7 @@ class VlmCheckpoint:
 
 
 def reads(folder: Path) -> bool:
-    """Whether the folder holds an adapter, or a network on one of the known backbones."""
+    """True if the folder holds an adapter, or a network on a known backbone."""
     if is_there(folder / ADAPTER_CONFIG):
         return True
     model_type = read_json(folder / NETWORK_CONFIG).get("model_type") if is_there(folder / NETWORK_CONFIG) else None
@@ -218,7 +221,7 @@ def reads(folder: Path) -> bool:
 
 
 def load(folder: Path, options: Options) -> VlmCheckpoint:
-    """The checkpoint in a local folder. Raises CheckpointError."""
+    """Load the checkpoint of a local folder. Raises CheckpointError."""
     with expecting("a vision-language checkpoint", folder):
         is_adapter = has_adapter(folder)
         file = folder / NETWORK_CONFIG
@@ -286,7 +289,7 @@ def _trained_config(
 
 
 def _in_full_precision(folder: Path, is_nf4: bool) -> tuple[dict[str, Tensor], int]:
-    """The tensors in the folder, and the number of those that were in NF4; is_nf4: config.json says that some are."""
+    """Return the folder's tensors, dequantized, and how many were in NF4; is_nf4: config.json says that some are."""
     tensors = read_weights(folder)
     num_nf4 = dequantize(tensors)
     quantized = next((name for name in tensors if QUANTIZED.search(name)), None)
@@ -301,7 +304,7 @@ def _in_full_precision(folder: Path, is_nf4: bool) -> tuple[dict[str, Tensor], i
 def _whole(
     tensors: dict[str, Tensor], folder: Path, backbone: Mapping[str, Any], run: RunConfig
 ) -> tuple[dict[str, Tensor], Scaling | None]:
-    """The weights of the network by name, with LoRA factors if it has some; what these are scaled with."""
+    """Return whole weights, renamed, with LoRA factors among them, and the factors' scaling if there are any."""
     scaling = None
     if any(LORA_NAME.fullmatch(name) for name in tensors):
         tensors, scaling = renamed(tensors, LORA_INSIDE), Scaling.of(run.file, run.sections["peft"])
@@ -311,14 +314,14 @@ def _whole(
 
 
 def _used(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """The weights that a reward is made with, and their LoRA factors; ``scaling``: of these."""
+    """Return the weights that scores depend on, and their LoRA factors; ``scaling``: of these."""
     weights, factors = split(tensors, scaling)
     weights = {name: tensor for name, tensor in weights.items() if not UNUSED.fullmatch(name)}
     return weights, {name: tensor for name, tensor in factors.items() if changed_by(name) in weights}
 
 
 def _check_layers(config: Any) -> None:
-    """Raises CheckpointError for so many layers that making them would not end."""
+    """Raise CheckpointError for too many layers to build."""
     inner = config.values() if isinstance(config, dict) else config if isinstance(config, list) else ()
     for part in inner:
         _check_layers(part)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""LoRA: a weight is W + alpha / r * B A (https://arxiv.org/abs/2106.09685); adapters as PEFT saves them.
+"""LoRA: a weight is W + alpha / r * B A (https://arxiv.org/abs/2106.09685); adapters in PEFT's format.
 
-W and the factors are kept apart until the dtype of the network is known. Many updates are smaller than half a step of
-bfloat16, in which W usually is: a sum in that dtype would lose them, also where float32 is served.
+W and the factors stay separate until the dtype of the network is known. W is usually bfloat16, and many updates are
+smaller than half a step of bfloat16. A sum in bfloat16 would lose them, even for a network in float32.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ from rfm.vlm.run_config import RunConfig, model_name
 LORA_NAME = re.compile(r"(?P<module>.+)\.lora_(?P<side>[AB])(\.default)?\.weight")
 _BASE_LAYER = ".base_layer."
 MERGE = "merge it where it was trained (merge_and_unload() of PEFT) and export the whole model that this makes"
-# How factors may begin: without a change of the base model's weights.
+# Initialisations of factors that do not change the base model's weights.
 _PLAIN_INITS = (True, False, "gaussian", "orthogonal")
-# Fields of adapter_config.json that change no score. Any other that is set may make another function of the factors.
+# Fields of adapter_config.json that change no score. Any other field, if set, may change the formula above.
 _HARMLESS = {
     "auto_mapping", "base_model_name_or_path", "bias", "ensure_weight_tying", "exclude_modules", "inference_mode",
     "init_lora_weights", "layers_pattern", "layers_to_transform", "lora_alpha", "lora_dropout", "megatron_core",
@@ -60,7 +60,7 @@ _HARMLESS = {
 
 @dataclass(frozen=True)
 class Scaling:
-    """Rank and alpha of LoRA factors, and the file that states them."""
+    """Rank and alpha of LoRA factors, and the file with them."""
 
     file: Path
     rank: int
@@ -68,7 +68,7 @@ class Scaling:
 
     @classmethod
     def of(cls, file: Path, config: Mapping[str, Any]) -> Scaling:
-        """What a LoRA configuration states. Raises CheckpointError for an adapter of another kind."""
+        """Read a LoRA configuration. Raises CheckpointError for an adapter of another kind."""
         kind = config.get("peft_type", "LORA")
         if kind != "LORA":
             raise CheckpointError(f"{file}: peft_type: expected LORA, got {shown(kind)}; {MERGE}")
@@ -83,7 +83,7 @@ class Scaling:
         return cls(file, rank, float(config["lora_alpha"]))
 
     def check_rank(self, module: str, factor: Tensor) -> None:
-        """Raises CheckpointError for a factor A of another rank than is stated."""
+        """Raise CheckpointError for a factor A, [r, D], of another rank."""
         if len(factor) != self.rank:
             raise CheckpointError(
                 f"{self.file}: r: expected {len(factor)}, the rows of {module}.lora_A, got {self.rank}; "
@@ -91,7 +91,7 @@ class Scaling:
             )
 
     def check_equal(self, other: Scaling) -> None:
-        """Raises CheckpointError if another file states it otherwise."""
+        """Raise CheckpointError if another file has other values."""
         mine, its = (f"r {each.rank} and lora_alpha {each.alpha:g}" for each in (self, other))
         if mine != its:
             raise CheckpointError(
@@ -100,7 +100,7 @@ class Scaling:
 
 
 def check_adapter(file: Path, config: Mapping[str, Any]) -> None:
-    """Raises CheckpointError for an adapter that changed weights which it leaves out."""
+    """Raise CheckpointError for an adapter that may have changed weights that it does not contain."""
     init, bias = config.get("init_lora_weights", True), config.get("bias", "none")
     if init not in _PLAIN_INITS:
         got = f"{shown(init)}, which may change the base model's weights before training"
@@ -112,10 +112,10 @@ def check_adapter(file: Path, config: Mapping[str, Any]) -> None:
 
 
 def split(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """The weights, and the LoRA factors of some of them: ``<module>.lora_A.weight`` and ``<module>.lora_B.weight``.
+    """Split tensors into weights and LoRA factors ``<module>.lora_A.weight`` and ``<module>.lora_B.weight``.
 
-    scaling: alpha and r, by which B is multiplied; None: it has been
-    Raises CheckpointError for factors that do not fit their weight, or are of another rank.
+    scaling: B is multiplied by its alpha / r; None: B is multiplied already
+    Raises CheckpointError for factors that do not fit their weight, or have another rank.
     """
     weights: dict[str, Tensor] = {}
     pairs: dict[str, dict[str, Tensor]] = {}
@@ -137,14 +137,14 @@ def split(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tupl
 
 
 def changed_by(factor: str) -> str:
-    """The name of the weight that the factor of this name changes."""
+    """Return the name of the weight that a factor changes."""
     match = LORA_NAME.fullmatch(factor)
     assert match is not None
     return f"{match['module']}.weight"
 
 
 def merged(weights: Mapping[str, Tensor], factors: Mapping[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
-    """The weights in ``dtype``, with B A of the factors added in float32."""
+    """Return the weights in ``dtype``, with B A of the factors added in float32."""
     whole = {}
     for name, weight in weights.items():
         module = name.removesuffix(".weight")
@@ -170,7 +170,7 @@ def _check(module: str, weight: Tensor | None, pair: Mapping[str, Tensor]) -> No
 
 
 CUSTOM_HEADS = "custom_heads.safetensors"
-ADAPTER_TARGET = "peft_target_module.json"  # upstream writes it where it saves an adapter beside the whole model
+ADAPTER_TARGET = "peft_target_module.json"  # from upstream, if it saves an adapter beside the whole model
 EMBEDDING = "model.language_model.embed_tokens.weight"
 
 _NO_EMBEDDING = (
@@ -178,14 +178,15 @@ _NO_EMBEDDING = (
     "lost with the run; save the whole model where it was trained (save_model() of the trainer), or the adapter with "
     "save_pretrained(..., save_embedding_layers=True)"
 )
-# In names of SmolVLM's weights, of LoRA of an embedding, and of an embedding that PEFT saves in two ways at once.
+# In names of SmolVLM's weights, of LoRA factors of embeddings, and of an embedding that PEFT saves in two ways at once.
 _OTHER = re.compile(r"\.(text_model|lora_embedding_[AB]|modules_to_save|original_module)(\.|$)")
-_FEW_BITS = re.compile(r"-bnb-\dbit/?$")  # how Unsloth names a base model of fewer bits, which it trains on
+_FEW_BITS = re.compile(r"-bnb-\dbit/?$")  # Unsloth's names of base models rounded to fewer bits, for training
 
 
 def has_adapter(folder: Path) -> bool:
-    """Whether the folder's weights are an adapter alone. Of one beside the whole model that upstream saved with it, the
-    whole model is read. Raises CheckpointError for one beside weights of which nothing is known.
+    """True if the folder's weights are an adapter alone; False also if upstream saved the whole model beside it.
+
+    Raises CheckpointError for an adapter beside other whole weights.
     """
     adapter = [name for name in (ADAPTER_CONFIG, ADAPTER_WEIGHTS, CUSTOM_HEADS) if is_there(folder / name)]
     whole = [name for name in (WEIGHTS, WEIGHTS_INDEX) if is_there(folder / name)]
@@ -200,8 +201,10 @@ def has_adapter(folder: Path) -> bool:
 
 
 def base_of_adapter(folder: Path, run: RunConfig) -> str:
-    """The base model that the run names. Raises CheckpointError if the adapter names another, or the run began with a
-    checkpoint, whose weights its adapter may change in place of the base model's.
+    """Return the base model that the run names.
+
+    Raises CheckpointError if the adapter names another, or if the run began with a checkpoint: the adapter may then
+    change this checkpoint's weights.
     """
     base = run.get("model.base_model_id", "")
     if not base:
@@ -226,8 +229,9 @@ def base_of_adapter(folder: Path, run: RunConfig) -> str:
 
 
 def adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Tensor], Scaling]:
-    """Configuration of the base model's backbone; its weights with those of the adapter; what its factors are scaled
-    with.
+    """Load an adapter and its base model: the backbone's configuration, all weights, and the factors' scaling.
+
+    Raises CheckpointError.
     """
     file = folder / ADAPTER_CONFIG
     adapter_config = read_json(file)
@@ -255,7 +259,7 @@ def adapted(folder: Path, base_model: str) -> tuple[dict[str, Any], dict[str, Te
 
 
 def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """The backbone of a base model: its configuration and its weights, named as in VlmRewardModel."""
+    """Return a base model's backbone: its configuration, and its weights under VlmRewardModel's names."""
     import transformers
 
     if Path(base_model).is_dir():
@@ -279,5 +283,5 @@ def _read_base(base_model: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if loaded["missing_keys"]:
         raise CheckpointError(f"base model {base_model}: missing keys: {listed(sorted(loaded['missing_keys']))}")
     config = backbone_config(network.config.to_dict(), base_model)
-    config.pop("transformers_version", None)  # the one installed here, which says nothing of the training
+    config.pop("transformers_version", None)  # the installed version, not that of training
     return config, {f"model.{name}": tensor for name, tensor in network.state_dict().items()}

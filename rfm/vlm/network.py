@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Reward heads on a vision-language backbone: RFM and Robometer checkpoints.
+"""Reward heads on a vision-language backbone of ``transformers``: RFM and Robometer checkpoints.
 
-B rows, L tokens, D width, F frames (in video mode: temporal groups) of all rows together, K progress bins.
-``transformers`` carries the backbone. Ours is how its last hidden states (behind the final norm) are read: a
-frame's state is pooled over a span of tokens, a question's is that of its token.
+F frames (in video mode: temporal patches) and Q queries of all rows, L tokens, D width, K progress bins.
+The heads read the last hidden states, behind the final norm: of a frame, pooled over a span of tokens, and of a query,
+at its token.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ Pooling: TypeAlias = Literal["mean", "boundary", "attention"]
 
 @dataclass(frozen=True)
 class VlmConfig:
-    """What a checkpoint's network looks like, and which prompts it was trained with.
+    """The configuration of a checkpoint's network and prompts.
 
-    backbone: transformers' configuration of it (config.json)
+    backbone: transformers' configuration (config.json)
     dtype: of all parameters, heads included
-    multi_image: each frame is an image of its own; else a trajectory is one video
-    per_frame_progress_token: a progress token behind each image carries its state
-    frame_pooling: else, how an image's tokens make up its state; boundary: the last one. Videos are not pooled so
+    multi_image: each frame is an image; else a trajectory is a video
+    per_frame_progress_token: the state of an image is that of a progress token behind it
+    frame_pooling: else, how an image's tokens are pooled to its state; boundary: its last token. Not for videos
     pooling_temperature: of attention pooling
-    average_temporal_patches: in video mode, a group's tokens are averaged; else the token behind them is read
-    progress_in_preference: questions of preference ask for progress too
-    size_px: height and width that every frame is brought to; None: each its own
-    trained_frames: the most frames of a trajectory in training; None: the checkpoint does not say
+    average_temporal_patches: in video mode, a temporal patch's tokens are averaged; else the token behind them is read
+    progress_in_preference: prompts for preference also ask for progress
+    size_px: height and width to which every frame is resized first; None: resizing starts from each frame's size
+    trained_frames: largest number of frames of a trajectory in training; None: unknown
     """
 
     backbone: dict[str, Any]
@@ -57,22 +57,22 @@ class VlmConfig:
 
     @property
     def family(self) -> str:
-        """Name of the backbone's kind: a key of BACKBONES."""
+        """The backbone's model_type, a key of BACKBONES."""
         return str(self.backbone["model_type"])
 
     @property
     def pools_images(self) -> bool:
-        """Whether the tokens of an image are pooled, as ``frame_pooling`` says. Upstream heeds it in images alone."""
+        """True if an image's tokens are pooled by ``frame_pooling``, which upstream uses only for images."""
         return self.multi_image and not self.per_frame_progress_token
 
     @property
     def pools_by_attention(self) -> bool:
-        """Whether the attention of frame_pool_attn weighs the tokens of an image."""
+        """True if the attention of frame_pool_attn weighs an image's tokens."""
         return self.pools_images and self.frame_pooling == "attention"
 
     @property
     def pads_left(self) -> bool:
-        """Whether padding stands before the tokens, as in the checkpoint's training."""
+        """True if padding stands before the tokens, as in SmolVLM's training."""
         return self.family == SMOL
 
     @property
@@ -88,9 +88,10 @@ class VlmConfig:
 
 @dataclass(frozen=True)
 class VlmOutput:
-    """Raw scores: progress logits [F, K], success logits [F], preference and similarity logits [Q].
+    """Logits: progress [F, K], success [F], preference and similarity [Q]; None without that head.
 
-    made: [N, levels, D], what the vision tower has made of the shots that it was shown; None: it was shown none
+    made: features from the vision tower, [merged tokens, levels, D]; None: all shots are cached, or the backbone is
+        SmolVLM
     """
 
     progress: Tensor
@@ -101,7 +102,7 @@ class VlmOutput:
 
 
 class VlmRewardModel(nn.Module):
-    """Backbone and heads; the heads' names are upstream's."""
+    """Backbone and heads, with upstream's names of the heads."""
 
     def __init__(self, config: VlmConfig, backbone: nn.Module) -> None:
         super().__init__()
@@ -118,7 +119,7 @@ class VlmRewardModel(nn.Module):
         self.frame_pool_attn = nn.Linear(width, 1, bias=False)
 
     def forward(self, batch: VlmBatch) -> VlmOutput:
-        """Raw scores of every frame and question of the batch, which is on the network's device."""
+        """Return the logits of every frame and query in the batch, which is on the network's device."""
         made = None
         if self.config.family == SMOL:
             hidden = self.model(**batch.inputs, use_cache=False).last_hidden_state
@@ -140,9 +141,9 @@ class VlmRewardModel(nn.Module):
         )
 
     def _frame_states(self, hidden: Tensor, spans: Tensor, num_tokens: int) -> Tensor:
-        """[F, D]: each span's states, pooled; a span of one token is that token's state.
+        """Return each span's pooled state, [F, D].
 
-        The spans' N = num_tokens lie one span after the other, [N, D], so that a long span costs the others nothing.
+        The spans are packed one after the other, [num_tokens, D], so that a long span adds no padding to the others.
         """
         rows, starts, stops = spans.unbind(dim=1)
         lengths = stops - starts
@@ -157,20 +158,20 @@ class VlmRewardModel(nn.Module):
 
 
 def _of_each(reduction: str, values: Tensor, lengths: Tensor) -> Tensor:
-    """[F, ...] of float32 [N, ...]: the sum, or the maximum, of each segment."""
-    # unsafe: the lengths are not checked, for which the host would wait
+    """Return the sum or maximum of each segment, float32 [N, ...] -> [F, ...]."""
+    # unsafe: without a check of the lengths, for which the host would wait
     return torch.segment_reduce(values, reduction, lengths=lengths, axis=0, unsafe=True)
 
 
 def _softmax_of_each(scores: Tensor, lengths: Tensor, segment: Tensor) -> Tensor:
-    """[N] of [N]: the softmax within each segment; ``segment``: each value's. In float32, given in the scores' type."""
+    """Return the softmax within segments, [N] -> [N], computed in float32; ``segment``: index for each value."""
     largest = _of_each("max", scores.float(), lengths)
     weights = (scores.float() - largest[segment]).exp()
     return (weights / _of_each("sum", weights, lengths)[segment]).to(scores.dtype)
 
 
 def build_backbone(config: VlmConfig, dtype: torch.dtype) -> nn.Module:
-    """The backbone with memory for its weights but no values in it; buffers keep the type that they need."""
+    """Return the backbone with uninitialised weights in ``dtype``; buffers keep their own dtype."""
     try:
         import transformers
     except ImportError as error:
@@ -185,7 +186,7 @@ def build_backbone(config: VlmConfig, dtype: torch.dtype) -> nn.Module:
 
 
 def _no_init_weights() -> AbstractContextManager[None]:
-    """transformers' own switch, which moved between its major versions."""
+    """Return transformers' switch, which moved between its major versions."""
     try:
         from transformers.initialization import no_init_weights
     except ImportError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A base model's tokenizer and image preprocessing, read and written in transformers' files."""
+"""Load, check and save a base model's tokenizer and image preprocessing, in transformers' files."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ from rfm.vlm.network import VlmConfig
 from rfm.vlm.prompts import OLD_SPECIAL_TOKENS, SPECIAL_TOKENS, Chat, Visual
 from rfm_client.contract import FrameSize
 
-PROCESSOR_FOLDER = "processor"  # in an exported checkpoint: its tokenizer and image preprocessing
+PROCESSOR_FOLDER = "processor"  # in an exported checkpoint
 PROCESSOR_CONFIG = "processor_config.json"
 TOKENIZER_CONFIG = "tokenizer_config.json"
-# Fields of it that transformers 4.57 and 5 read alike; all else stands in tokenizer.json.
+# Fields of TOKENIZER_CONFIG that transformers 4.57 and 5 read alike; the rest is in tokenizer.json.
 _KEPT = (
     "bos_token", "clean_up_tokenization_spaces", "eos_token", "model_max_length", "pad_token", "padding_side",
     "unk_token",
 )  # fmt: skip
-# Fields of a backbone's config.json that number its tokens.
+# Fields of a backbone's config.json with token ids.
 _OF_QWEN = {"image_token_id": IMAGE_PAD, "video_token_id": VIDEO_PAD, "vision_start_token_id": VISION_START}
 _STATED_TOKENS = {QWEN_2_5: _OF_QWEN, QWEN3: _OF_QWEN, SMOL: {"image_token_id": SMOL_IMAGE}}
-SMOL_SIZE_PX = 512  # what upstream sets, whatever the base model says; so no image is split
+SMOL_SIZE_PX = 512  # upstream sets it for every base model, so that no image is split
 
 
 def frame_size(config: VlmConfig) -> FrameSize | None:
-    """The size to which a checkpoint brings each frame first; None: it depends on the frame."""
+    """Return the size to which a checkpoint first resizes each frame; None: it depends on the frame."""
     if config.family == SMOL:
         return FrameSize("longest", (SMOL_SIZE_PX,))
     if config.size_px is None:
@@ -51,10 +51,10 @@ def frame_size(config: VlmConfig) -> FrameSize | None:
 
 
 def load_collator(config: VlmConfig, num_tokens: int, processor: str | Path) -> VlmCollator:
-    """The collator of a checkpoint. Raises CheckpointError for a processor that cannot be had or does not fit.
+    """Load the collator of a checkpoint. Raises CheckpointError for a processor that is missing or does not fit.
 
-    num_tokens: rows of the checkpoint's embedding
-    processor: folder or id with the tokenizer and image preprocessing
+    num_tokens: rows of the checkpoint's token embedding
+    processor: folder or id with tokenizer and image preprocessing
     """
     try:
         tokenizer = _tokenizer(processor)
@@ -64,7 +64,7 @@ def load_collator(config: VlmConfig, num_tokens: int, processor: str | Path) -> 
         hint = "name its folder with --base-model"
         raise CheckpointError(f"base model {processor}: tokenizer and processor: {error} ({hint})") from error
     tokenizer.add_tokens(list(SPECIAL_TOKENS), special_tokens=True)
-    if len(tokenizer) != num_tokens:  # upstream resizes the embedding to it
+    if len(tokenizer) != num_tokens:  # upstream resizes the embedding to the tokenizer
         expected = f"a tokenizer of {num_tokens} tokens with the special ones, as the checkpoint's embedding"
         is_old = num_tokens - len(tokenizer) == OLD_SPECIAL_TOKENS - len(SPECIAL_TOKENS)
         hint = (
@@ -78,7 +78,7 @@ def load_collator(config: VlmConfig, num_tokens: int, processor: str | Path) -> 
 
 
 def _check_tokens(config: VlmConfig, tokenizer: Any, processor: str | Path) -> None:
-    """Raises CheckpointError for tokens that do not stand where the checkpoint was trained with them."""
+    """Raise CheckpointError for tokens whose ids differ from those in training."""
     first = len(tokenizer) - len(SPECIAL_TOKENS)
     expected = {token: first + index for index, token in enumerate(SPECIAL_TOKENS)}
     stated = {token: config.backbone.get(name) for name, token in _STATED_TOKENS[config.family].items()}
@@ -93,7 +93,7 @@ def _check_tokens(config: VlmConfig, tokenizer: Any, processor: str | Path) -> N
 
 
 def _tokenizer(processor: str | Path) -> Any:
-    """The tokenizer. Transformers 5 writes a configuration that 4.57 does not read, beside the same tokenizer.json."""
+    """Load the tokenizer, also if transformers 5 wrote its configuration, which 4.57 does not read."""
     from transformers import AutoTokenizer, PreTrainedTokenizerFast
 
     config = read_json(_cached(processor, TOKENIZER_CONFIG))
@@ -106,7 +106,7 @@ def _tokenizer(processor: str | Path) -> Any:
 
 
 def _preprocessor(processor: str | Path) -> dict[str, Any]:
-    """The image preprocessing, of its own file, or of transformers 5's. Raises OSError, ValueError."""
+    """Read the image preprocessing from PREPROCESSOR_CONFIG or transformers 5's file. Raises OSError, ValueError."""
     try:
         return read_json(_cached(processor, PREPROCESSOR_CONFIG))
     except OSError:
@@ -117,19 +117,19 @@ def _preprocessor(processor: str | Path) -> dict[str, Any]:
 
 
 def _cached(processor: str | Path, name: str) -> Path:
-    """A file of the processor, from the Hub if need be. Raises OSError."""
+    """Return a file of the processor, fetched from the Hub if necessary. Raises OSError."""
     from transformers.utils.hub import cached_file
 
     return Path(str(cached_file(str(processor), name)))
 
 
 def _chat_template(processor: str | Path, tokenizer: Any) -> str:
-    """The processor's, by which upstream prompts; the tokenizer's where the processor has none. Raises ValueError."""
+    """Return the processor's chat template, which upstream uses, else the tokenizer's. Raises ValueError."""
     from transformers import ProcessorMixin
 
     of_processor = ProcessorMixin.get_processor_dict(str(processor))[0].get("chat_template")
     template = tokenizer.chat_template if of_processor is None else of_processor
-    if isinstance(template, dict):  # several, by name
+    if isinstance(template, dict):  # several templates by name
         template = template.get("default")
     if not isinstance(template, str):
         raise ValueError("expected a chat template, got none")
@@ -137,7 +137,7 @@ def _chat_template(processor: str | Path, tokenizer: Any) -> str:
 
 
 def save_processor(collator: VlmCollator, folder: Path) -> None:
-    """Writes what ``load_collator`` reads, so that serving needs no network."""
+    """Write the files that ``load_collator`` reads, so that serving needs no internet."""
     collator.tokenizer.save_pretrained(folder)
     (folder / PREPROCESSOR_CONFIG).write_text(json.dumps(collator.images.to_config(), indent=2) + "\n")
 
@@ -179,24 +179,22 @@ _FACTS: dict[str, dict[str, Any]] = {
 
 
 def is_published(base_model_id: str, family: str) -> bool:
-    """Whether the base model is one of those whose processors are known."""
+    """True for a base model whose published processor is known."""
     return re.fullmatch(_NAMES[family], base_model_id) is not None
 
 
 def facts(collator: VlmCollator) -> dict[str, Any]:
-    """What a processor does, as JSON can hold it: the text of a conversation that shows one frame or video, and how
-    images become numbers.
-    """
+    """Return a processor's effect, as JSON: the text of a conversation with an image or video, and image settings."""
     visual = Visual.IMAGE if collator.config.multi_image else Visual.VIDEO
     images = {**collator.images.to_config()}
-    del images["rescale_factor"]  # the only one that loads
+    del images["rescale_factor"]  # the same for every processor that loads
     for name in ("image_mean", "image_std"):
         images[name] = list(images[name])
     return {"prompt": Chat(collator.tokenizer).text((_EXAMPLE, visual)), **images}
 
 
 def check_published(collator: VlmCollator, processor: str) -> None:
-    """Raises CheckpointError for a processor that stands for a published one, and is another."""
+    """Raise CheckpointError if a processor in place of a published processor differs from it."""
     found = differences(collator)
     if found:
         named = collator.config.base_model_id
@@ -208,7 +206,7 @@ def check_published(collator: VlmCollator, processor: str) -> None:
 
 
 def differences(collator: VlmCollator) -> list[str]:
-    """Where a processor differs from the published ones of its backbone's kind."""
+    """Return the differences between a processor and the published processors of its family of backbones."""
     words = (
         {"visual": "Picture", "pad": "image"} if collator.config.multi_image else {"visual": "Video", "pad": "video"}
     )
@@ -219,7 +217,7 @@ def differences(collator: VlmCollator) -> list[str]:
 
 
 def of_processor(collator: VlmCollator, source: object) -> list[Decision]:
-    """The decisions about prompts and images. ``source``: folder or id of the processor."""
+    """Return the decisions about prompts and images. ``source``: folder or id of the processor."""
     name = f"processor of {source_name(str(source))}" if source != PROCESSOR_FOLDER else f"{PROCESSOR_FOLDER}/"
     tokens = [collator.tokenizer.convert_tokens_to_ids(token) for token in SPECIAL_TOKENS]
     read = [Decision(fact, value, name) for fact, value in facts(collator).items()]
