@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Rewards for other libraries, each in a module of its own."""
+"""Rewards and recordings for other libraries."""

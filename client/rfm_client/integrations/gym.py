@@ -1,23 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""Gymnasium environments whose reward is a served reward model's. Needs ``pip install "./client[gym]"``.
+"""Gymnasium environments with the reward of a served reward model. Needs ``pip install "./client[gym]"``.
 
 env = gymnasium.make("CartPole-v1", render_mode="rgb_array")
 env = RewardModelWrapper(env, partial(RewardClient, "grpc://localhost:8001"), "balance the pole")
 
-All frames of the running episode are kept, H * W * 3 bytes a step: the rule ``sampling`` says which are shown.
+A wrapper keeps all frames of the running episode, H * W * 3 bytes a step. The rule ``sampling`` selects the frames that
+the model sees.
 
-Scored are the frame of the reset, every ``every``-th step, and the last step of an episode. With ``blocking`` a step
-waits for its score. Without, it goes on with the newest answer that has come; with ``max_pending`` questions open
-nothing is asked, and the step counts as skipped. Even then the frame of the reset is waited for, and the last step is,
-unless ``await_last=False``; older questions are cancelled.
+A wrapper scores the frame of the reset, every ``every``-th step, and the last step of an episode. With ``blocking``, a
+step waits for its score. Without, it takes the newest known score; while ``max_pending`` steps have open requests, a
+step is skipped. Even then, a wrapper waits for the score of the reset's frame, and of the last step unless
+``await_last=False``. The last step cancels older requests.
 
-``info["reward_model"]``: ``progress`` and ``success`` (NaN: the checkpoint does not predict it) of the newest known
-answer; the ``step`` that it is about, and its ``lag`` in steps; the steps ``skipped`` in this episode; after a step the
-``env_reward``; with ``terminate_on_success`` whether the episode has ``succeeded``.
+``info["reward_model"]`` has ``progress`` and ``success`` of the newest known score (NaN: the checkpoint does not
+predict it), its ``step``, its ``lag`` in steps, and the steps ``skipped`` in this episode. After a step it also has
+``env_reward``; with ``terminate_on_success``, ``succeeded``.
 
-A RewardError comes out of ``reset`` or ``step`` and never becomes a reward. If the server failed, the frame is part of
-the episode; in delta mode the next step pays what that one did not. If there was no frame to keep, the next ``step``
-raises ResetNeeded. So does a step after an episode's end, unless the environment resets in that step.
+``reset`` and ``step`` raise RewardError; an error never becomes a reward. If the server failed, the episode keeps the
+frame, and in delta mode the next reward makes up for it. If the frame was lost, the next ``step`` raises ResetNeeded.
+A step after an episode's end does, too, unless the environment resets in that step.
 """
 
 from __future__ import annotations
@@ -34,25 +35,26 @@ try:
 except ImportError as error:
     raise ImportError('rfm_client.gym needs gymnasium >= 1.1: pip install "./client[gym]"') from error
 
-INFO = "reward_model"  # key of info
+INFO = "reward_model"  # key in info
 
-_ENDS = ("final_obs", "final_observation", "terminal_observation")  # what environments that reset in step add to info
+_ENDS = ("final_obs", "final_observation", "terminal_observation")  # in info after a reset in step
 
 DEFAULTS = RewardOptions()
 LOST = "a frame was lost to the error of an earlier call"
 
 
 class RewardModelWrapper(gymnasium.Wrapper):
-    """An environment paid by a reward model; the module's docstring says how.
+    """An environment with the reward of a reward model, by the rules in the module's docstring.
 
-    client: a RewardClient, which stays open; or what makes one, at the first reset, which ``close()`` closes. For
-        environments that are made in another process than they work in (AsyncVectorEnv) only the latter is right.
+    client: a RewardClient, which stays open; or a function that makes a client at the first reset, which ``close()``
+        closes. Pass a function if the environment runs in another process than the one that made it (AsyncVectorEnv)
     task: the task sentence, or a function that reads it from the info of each reset
 
-    A step after the episode's end raises ResetNeeded. If ``gymnasium.wrappers.Autoreset`` is among the wrappers of
-    ``env``, the step after its end begins a new episode, and pays 0. ``env`` must not reset in the step of its end.
+    A step after an episode's end raises ResetNeeded. With ``gymnasium.wrappers.Autoreset`` among the wrappers of
+    ``env``, this step begins a new episode instead, with reward 0. ``env`` must not reset in the last step.
 
-    Raises ValueError if frames cannot come from where ``options`` says, TypeError for what is no ``gymnasium.Env``.
+    Raises ValueError if ``options`` names a source of frames that ``env`` lacks, TypeError for a ``env`` that is no
+    ``gymnasium.Env``.
     """
 
     def __init__(
@@ -68,7 +70,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
         self._rewarder = EpisodeRewarder(client, options)
         self._options = options
         self._task = task
-        self._autoresets: list[gymnasium.wrappers.Autoreset] = []  # among the wrappers of the environment
+        self._autoresets: list[gymnasium.wrappers.Autoreset] = []  # among the environment's wrappers
         while isinstance(env, gymnasium.Wrapper):
             if isinstance(env, gymnasium.wrappers.Autoreset):
                 self._autoresets.append(env)
@@ -78,14 +80,14 @@ class RewardModelWrapper(gymnasium.Wrapper):
         self._has_ended = False
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Resets the environment and scores its first frame. Open requests are cancelled. Raises RewardError."""
+        """Reset the environment and score its first frame. Cancel open requests. Raises RewardError."""
         self._is_whole = False
         observation, info = self.env.reset(seed=seed, options=options)
         self._has_ended = False
         return observation, self._begin(observation, info)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
-        """Steps the environment, with the reward model's reward. Raises RewardError, ResetNeeded."""
+        """Step the environment; return the reward model's reward. Raises RewardError, ResetNeeded."""
         resets = any(wrapper.autoreset for wrapper in self._autoresets)
         episode = None if resets else self._checked_episode()
         self._is_whole = False  # until the frame is kept
@@ -103,14 +105,14 @@ class RewardModelWrapper(gymnasium.Wrapper):
         return observation, reward, bool(terminated or episode.succeeded), truncated, {**info, INFO: scores}
 
     def close(self) -> None:
-        """Cancels what is open, and closes the environment, and the client if it was made here."""
+        """Cancel open requests; close the environment, and the client if it was made here."""
         if self._episode is not None:
             self._episode.end()
         self._rewarder.close()
         super().close()
 
     def _begin(self, observation: Any, info: Info) -> Info:
-        """A new episode, whose first frame this is; its scores beside the info."""
+        """Begin an episode with its first frame; return the info with its scores."""
         if self._episode is not None:
             self._episode.end()
         task = self._task if isinstance(self._task, str) else self._task(info)
@@ -120,7 +122,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
         return {**info, INFO: self._episode.info()}
 
     def _checked_episode(self) -> RewardedEpisode:
-        """The episode whose next frame the next step shows. Raises ResetNeeded if there is none."""
+        """The episode that the next step continues. Raises ResetNeeded if there is none."""
         if self._episode is None:
             raise ResetNeeded("step: expected a reset before it")
         if self._has_ended or self._episode.succeeded:
@@ -135,7 +137,7 @@ class RewardModelWrapper(gymnasium.Wrapper):
 
 
 def check_kind(env: Any, kind: type[Any]) -> None:
-    """Raises TypeError for another kind of environment."""
+    """Raise TypeError for another kind of environment."""
     if not isinstance(env, kind):
         got = f"{type(env).__module__}.{type(env).__name__}"
         remedy = "wrap each environment in RewardModelWrapper before you make another kind of vector of them"
@@ -143,7 +145,7 @@ def check_kind(env: Any, kind: type[Any]) -> None:
 
 
 def _check_shows_its_end(info: Info) -> None:
-    """Raises InvalidSampleError for an environment that already shows its next episode."""
+    """Raise InvalidSampleError for an environment that already shows its next episode."""
     found = [key for key in _ENDS if key in info]
     if found:
         expected = f"none of {', '.join(_ENDS)} from an environment that shows the last frame of its episode"
@@ -152,7 +154,7 @@ def _check_shows_its_end(info: Info) -> None:
 
 
 def check_frame_source(options: RewardOptions, render_mode: str | None, space: gymnasium.Space[Any]) -> None:
-    """Raises ValueError if frames cannot come from where the options say."""
+    """Raise ValueError if the options name a source of frames that the environment lacks."""
     if options.renders and render_mode != "rgb_array":
         expected = "'rgb_array', since frames come from render() unless frames_from or cameras say otherwise"
         raise ValueError(f"render_mode: expected {expected}, got {render_mode!r}")

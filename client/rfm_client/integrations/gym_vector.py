@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Vectors of Gymnasium environments whose reward is a served reward model's. ``gym.py`` states the rules."""
+"""Vectors of Gymnasium environments with the reward of a served reward model. ``gym.py`` states the rules."""
 
 from __future__ import annotations
 
@@ -25,20 +25,22 @@ _INSTEAD_OF_SAME_STEP = "make the vector with autoreset_mode=AutoresetMode.NEXT_
 
 
 class RewardModelVectorWrapper(VectorWrapper):
-    """A vector environment paid by a reward model: its sub-environments' questions of a step go in one call.
+    """A vector environment with the reward of a reward model. A step scores all sub-environments in one call.
 
     client: as in RewardModelWrapper
-    task: one task sentence for all sub-environments, or one for each
+    task: one task sentence for all sub-environments, or a sequence with a sentence for each
 
-    ``infos["reward_model"]`` has arrays and masks as Gymnasium's own infos; where a sub-environment resets in the step
-    that ends its episode (SAME_STEP), the end's is in ``infos["final_info"]``. The step in which one does nothing but
-    reset (NEXT_STEP) is paid 0, as in Gymnasium, and waits for the score of that frame even when not blocking. Where
-    the caller resets (DISABLED), a step after an episode's end raises ResetNeeded.
+    ``infos["reward_model"]`` has arrays and masks, like Gymnasium's own infos. The mode of autoreset matters:
 
-    Raises ValueError if frames cannot come from where ``options`` says, for SAME_STEP with frames from ``render()``,
-    which never shows an episode's last frame, and for ``terminate_on_success`` unless the mode is DISABLED: what
-    resets by itself does not know of it. Wrap each sub-environment in RewardModelWrapper then. Raises TypeError for
-    what is no ``gymnasium.vector.VectorEnv``.
+    - SAME_STEP: the last scores of an ended episode are in ``infos["final_info"]``.
+    - NEXT_STEP: a step that only resets a sub-environment has reward 0, as in Gymnasium. It waits for the score of that
+      frame even when not blocking.
+    - DISABLED: a step after an episode's end raises ResetNeeded.
+
+    Raises ValueError if ``options`` names a source of frames that ``env`` lacks; for SAME_STEP with frames from
+    ``render()``, which never shows an episode's last frame; and for ``terminate_on_success`` unless DISABLED, because
+    an environment that resets by itself does not know of the success. In the last two cases, wrap each sub-environment
+    in RewardModelWrapper instead. Raises TypeError for an ``env`` that is no ``gymnasium.vector.VectorEnv``.
     """
 
     def __init__(
@@ -53,7 +55,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         autoreset_mode = _checked_autoreset_mode(env, options)
         tasks = [task] * env.num_envs if isinstance(task, str) else list(task)
         require("task", len(tasks) == env.num_envs, f"one for each of the {env.num_envs} environments", len(tasks))
-        super().__init__(env)  # a wrapper that is refused must not close the environments when it is collected
+        super().__init__(env)  # last: a refused wrapper must not close the environments when collected
         self._rewarder = EpisodeRewarder(client, options)
         self._options = options
         self._autoreset_mode = autoreset_mode
@@ -63,9 +65,9 @@ class RewardModelVectorWrapper(VectorWrapper):
         self._ended: Mask = np.zeros(env.num_envs, np.bool_)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
-        """Resets the environments (those of ``reset_mask``), and scores their first frames. Raises RewardError."""
+        """Reset the environments, or those in ``reset_mask``, and score their first frames. Raises RewardError."""
         everyone = np.ones(self.num_envs, np.bool_)
-        reset_mask = (options or {}).get("reset_mask", everyone)  # before env.reset, which takes it out of the options
+        reset_mask = (options or {}).get("reset_mask", everyone)  # read first: env.reset removes it
         self._check_can_reset(self._resetting & reset_mask)
         whole, self._whole = self._whole, np.zeros_like(self._whole)
         observations, infos = self.env.reset(seed=seed, options=options)
@@ -79,7 +81,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         return observations, self._with_scores(infos, fresh)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, Info]:
-        """Steps the environments; rewards: float64 [num_envs], the model's. Raises RewardError, ResetNeeded."""
+        """Step the environments; return the model's rewards, float64 [num_envs]. Raises RewardError, ResetNeeded."""
         self._check_can_step()
         resetting = self._resetting
         self._whole = np.zeros_like(self._whole)  # until each frame is kept
@@ -97,16 +99,16 @@ class RewardModelVectorWrapper(VectorWrapper):
         return observations, rewards, terminations | self._succeeded(), truncations, self._with_scores(infos, fresh)
 
     def close(self, **kwargs: Any) -> None:
-        """Cancels what is open, and closes the environments, and the client if it was made here."""
+        """Cancel open requests; close the environments, and the client if it was made here."""
         for episode in self._episodes.values():
             episode.end()
         self._rewarder.close()
         super().close(**kwargs)
 
     def _check_can_reset(self, twice: Mask) -> None:
-        """Raises ValueError where Gymnasium (1.4) forgets that its workers are to reset, and they reset once more.
+        """Raise ValueError where workers of Gymnasium (1.4) would reset again in the next step, despite this reset.
 
-        twice: which environments would reset in the next step anyway
+        twice: environments that are due to reset in the next step
         """
         vector = self.unwrapped
         if twice.any() and isinstance(vector, AsyncVectorEnv) and not vector.shared_memory:
@@ -115,10 +117,10 @@ class RewardModelVectorWrapper(VectorWrapper):
             raise ValueError(f"reset: expected none whose episode has ended, got {got}; {remedy}")
 
     def _check_can_step(self) -> None:
-        """Raises ResetNeeded if a step would show a frame that is not the next one of an episode."""
+        """Raise ResetNeeded if a step would not show the next frame of an episode."""
         if len(self._episodes) != self.num_envs:
             raise ResetNeeded("step: expected a reset of every environment before it")
-        is_caller_s = self._autoreset_mode is AutoresetMode.DISABLED  # whether to reset
+        is_caller_s = self._autoreset_mode is AutoresetMode.DISABLED  # the caller resets
         over = (self._ended | self._succeeded()) & is_caller_s
         for indices, reason in ((over, "their episodes have ended"), (~self._whole & ~self._resetting, LOST)):
             if indices.any():
@@ -128,16 +130,16 @@ class RewardModelVectorWrapper(VectorWrapper):
 
     @property
     def _resetting(self) -> Mask:
-        """Which environments do nothing but reset in the next step."""
+        """Environments that only reset in the next step."""
         return self._ended & (self._autoreset_mode is AutoresetMode.NEXT_STEP)
 
     def _succeeded(self) -> Mask:
         return np.array([episode.succeeded for _, episode in sorted(self._episodes.items())], np.bool_)
 
     def _added(self, shown: Sequence[Any], infos: Info, resetting: Mask) -> tuple[OfEnvs, OfEnvs, Collection[int]]:
-        """Adds the frames of a step, each as soon as it is made: it may be drawn into the array of the one before.
+        """Add the frames of a step, each as soon as it is made: it may reuse the array of the frame before.
 
-        The episodes that went on, those that began, and the environments that did both (SAME_STEP).
+        Returns the continued episodes, the new episodes, and the environments with both (SAME_STEP).
         """
         final = self._final_observations(infos) if self._autoreset_mode is AutoresetMode.SAME_STEP else {}
         stepped = {index: self._episodes[index] for index in np.flatnonzero(~resetting).tolist()}
@@ -159,13 +161,13 @@ class RewardModelVectorWrapper(VectorWrapper):
         return stepped, fresh, final
 
     def _begin(self, index: int, frame: Any) -> RewardedEpisode:
-        """A new episode, whose first frame this is."""
+        """Begin an episode with its first frame."""
         self._episodes[index] = self._rewarder.begin(self._tasks[index], frame, index)
         self._whole[index] = True
         return self._episodes[index]
 
     def _shown(self, observations: Any) -> Sequence[Any]:
-        """What each environment shows: its rendered frame, or its observation."""
+        """The rendered frame, or the observation, of each environment."""
         if self._options.renders:
             shown = list(self.env.render() or ())
         else:
@@ -178,7 +180,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         return shown if self._options.renders else self._options.frames_of(shown)
 
     def _final_observations(self, infos: Info) -> dict[int, Any]:
-        """The last ones of the episodes that ended, whose environments show the next episode already."""
+        """Last observations of ended episodes, whose environments already show the next episode."""
         observations = infos.get("final_obs", [None] * self.num_envs)
         final = {index: observations[index] for index in np.flatnonzero(self._ended).tolist()}
         missing = [index for index, observation in final.items() if observation is None]
@@ -194,7 +196,7 @@ class RewardModelVectorWrapper(VectorWrapper):
 
 
 def _check_differ(index: int, last: Any, first: Any) -> None:
-    """Raises InvalidSampleError where a reset has drawn over the last frame of the episode before."""
+    """Raise InvalidSampleError if a reset has drawn over the last frame of the episode before."""
     of_cameras = [(last[camera], first[camera]) for camera in last] if isinstance(last, Mapping) else [(last, first)]
     if any(np.array_equal(*pair) for pair in of_cameras):
         got = "the first frame of the next one: the environment seems to draw into the array that it has returned"

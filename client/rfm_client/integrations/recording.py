@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""A Rerun recording (.rrd) of frames and their scores: one timeline, on which curves and video move together.
+"""Rerun recordings (.rrd) of frames and scores, on one timeline.
 
-Needs ``rfm-client[rerun]``; labelled episodes need ``rfm-client[label]``, too. T frames, S of them scored.
+Needs ``rfm-client[rerun]``; labelled episodes need ``rfm-client[label]``, too. T frames, H x W pixels.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from rfm_client.labelling.finished_episodes import Parts
     from rfm_client.labelling.plan import Item, Plan
 
-TIME = "video_time"  # a timeline: seconds of the video
-FRAME = "frame"  # or, where they are not known, the number of the frame
+TIME = "video_time"  # timeline in seconds of the video
+FRAME = "frame"  # timeline in frames, where seconds are unknown
 IMAGE, PROGRESS, SUCCESS = "image", "progress", "success"
 JPEG_QUALITY = 90  # as good as the video, at a tenth of the size
 
@@ -33,7 +33,7 @@ _COLOURS = {PROGRESS: (31, 119, 180), SUCCESS: (44, 160, 44)}  # as in plots
 
 
 def load_rerun() -> Any:
-    """The package. Raises ImportError, which says how to install it."""
+    """Return the package ``rerun``. Raises ImportError with the extra to install."""
     try:
         import rerun
     except ImportError as error:
@@ -42,14 +42,14 @@ def load_rerun() -> Any:
 
 
 class Recording(Closing):
-    """A recording file to which trajectories are added, by any threads. The file is made with the first one.
+    """A recording file to which any thread can add trajectories. The first trajectory creates the file.
 
-    Each is an entity, which holds ``image``, ``progress`` and ``success``. Scores that the checkpoint does
-    not predict are left out.
+    Each trajectory is an entity with ``image``, ``progress`` and ``success``. Scores that the checkpoint does not
+    predict are left out.
     """
 
     def __init__(self, file: Path) -> None:
-        """Raises ImportError if the package is missing."""
+        """Raise ImportError if the package is missing."""
         self._rerun = load_rerun()
         self._file = file
         self._stream: Any = None
@@ -62,18 +62,17 @@ class Recording(Closing):
         videos: Mapping[str, Iterable[UInt8Array]],
         times_s: npt.NDArray[np.float64] | None = None,
     ) -> None:
-        """Adds a trajectory with its scores.
+        """Add a trajectory with its scores.
 
-        entity: its name, part by part; empty if it is the only one of the file
-        videos: T frames, uint8 [H, W, 3], by the camera's name, which is empty if there is only one; none: it is of
-            embeddings
-        times_s: [T], when each frame is in the video; None: it is not known
+        entity: parts of its name; empty for the only trajectory of a file
+        videos: by camera, T frames, uint8 [H, W, 3]; a single camera's name is empty; empty for embeddings
+        times_s: float64 [T], times of the frames in the video; None: unknown
         """
         scored = np.arange(len(scores.progress)) if scores.frame_indices is None else scores.frame_indices
         curves = {curve: getattr(scores, curve) for curve in _COLOURS if not np.isnan(getattr(scores, curve)).all()}
         with self._lock:
             self._open()
-            self._stream.reset_time()  # of what this thread has added before
+            self._stream.reset_time()  # of this thread's trajectory before
             for curve in curves:
                 style = self._rerun.SeriesLines(names=curve, colors=_COLOURS[curve])
                 self._log((*entity, curve), style, static=True)
@@ -88,7 +87,7 @@ class Recording(Closing):
                     self._log((*entity, curve), self._rerun.Scalars(float(values[position])))
 
     def close(self) -> None:
-        """Writes what is left to the file."""
+        """Write the rest to the file."""
         if self._stream is not None:
             self._stream.disconnect()
 
@@ -104,13 +103,13 @@ class Recording(Closing):
             self._stream.set_time(TIME, duration=float(times_s[index]))
 
     def _log(self, parts: Sequence[str], what: Any, *, static: bool = False) -> None:
-        self._stream.log(list(parts), what, static=static, strict=True)  # or it would only warn of an error
+        self._stream.log(list(parts), what, static=static, strict=True)  # otherwise it only warns of errors
 
 
 def record_episodes(folder: Path, dataset: Dataset, plan: Plan, parts: Parts) -> Iterator[Path]:
-    """The file of each episode of the plan that is labelled, as it is written. The frames are decoded once more.
+    """Write a file for each labelled episode of the plan, and yield its path. Frames are decoded again.
 
-    Of several cameras each has its frames and its own scores beside the fused ones.
+    Each of several cameras has its frames, and its own scores beside the fused scores.
     """
     folder.mkdir(parents=True, exist_ok=True)
     finished = parts.finished(plan.items)
@@ -130,7 +129,7 @@ def _record(folder: Path, dataset: Dataset, item: Item, labels: Any, cameras: Se
 
 
 def _scores(labels: Any, suffix: str) -> FrameScores:
-    """The columns of a part whose names end so; NaN: not predicted."""
+    """The columns of a part with this suffix; NaN: not predicted."""
     progress = labels[PROGRESS + suffix].to_numpy()
     name = SUCCESS + suffix
     success = labels[name].to_numpy() if name in labels.column_names else np.full_like(progress, np.nan)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How the scores of an episode become the rewards of a Gymnasium environment. ``gym.py`` states the rules."""
+"""Rewards of a Gymnasium environment from the scores of its episodes. ``gym.py`` states the rules."""
 
 from __future__ import annotations
 
@@ -32,24 +32,24 @@ ClientSource: TypeAlias = RewardClient | Callable[[], RewardClient]
 
 @dataclass(frozen=True, kw_only=True)
 class RewardOptions:
-    """How an episode is scored, and how progress becomes reward. Raises ValueError for contradictory options.
+    """How to score an episode, and to make rewards of progress. Raises ValueError for contradictory options.
 
-    mode: a step is paid the newest known progress (absolute), or how far that has come since the step before (delta):
-        then an episode's rewards add up to its last known progress less its first, however late answers come
-    scale: factor of what is paid
-    add_to_env_reward: the environment's own reward is added; otherwise it is replaced
-    every: steps from one scoring to the next; in between, absolute holds its value and delta is 0
-    terminate_on_success: terminates the episode when an answer says success, except one about the frame of the reset.
-        The reset raises ValueError if the checkpoint does not predict success
-    frames_from: where frames, uint8 [H, W, 3], come from. None: ``render()``; or a key of the observation; or what
-        takes one environment's observation and gives its frame
-    cameras: each is scored, and the scores fused: keys, of the observation or of what ``frames_from`` says, that hold a
-        frame of each; none: there is one camera, without a name
-    sampling, fuse, orient, resize, live: as of ``rfm_client.episodes.EpisodeOptions``; rendered frames are turned, too
-    max_frames: the rule's number of frames, EpisodeOptions' ``frames``
-    blocking: a step waits for its score
-    max_pending: most steps of one environment whose questions are open when not blocking
-    await_last: the last step of an episode is waited for even when not blocking; otherwise what is open is dropped
+    mode: ``absolute``: the reward is the newest known progress. ``delta``: its change since the step before, so that an
+        episode's rewards add up to its last known progress minus its first, however late scores come
+    scale: factor of this reward
+    add_to_env_reward: True: add the environment's own reward; False: replace it
+    every: steps from one score to the next; in between, ``absolute`` repeats its value and ``delta`` is 0
+    terminate_on_success: rule that ends the episode at a success, except at the frame of the reset. The reset raises
+        ValueError if the checkpoint does not predict success
+    frames_from: source of frames, uint8 [H, W, 3]: a key of the observation, or a function from an environment's
+        observation to its frame; None: ``render()``
+    cameras: keys of the frames to score and fuse, in the observation or the result of ``frames_from``; empty: a single
+        camera without a name
+    sampling, fuse, orient, resize, live: as in ``rfm_client.episodes.EpisodeOptions``; rendered frames are turned, too
+    max_frames: ``frames`` of EpisodeOptions: the rule's number of frames
+    blocking: True: a step waits for its score
+    max_pending: most steps of an environment with open requests when not blocking
+    await_last: True: wait for the score of an episode's last step even when not blocking; False: drop open requests
     """
 
     mode: Literal["absolute", "delta"] = "absolute"
@@ -79,7 +79,7 @@ class RewardOptions:
 
     @cached_property
     def scoring(self) -> EpisodeOptions:
-        """How the episode's steps are scored. Raises ValueError."""
+        """Options of the episode's steps. Raises ValueError."""
         return EpisodeOptions(
             sampling=self.sampling,
             frames=self.max_frames,
@@ -93,11 +93,11 @@ class RewardOptions:
 
     @property
     def renders(self) -> bool:
-        """Whether frames come from ``render()``."""
+        """True if frames come from ``render()``."""
         return self.frames_from is None and not self.cameras
 
     def frames_of(self, observation: Any) -> Any:
-        """The frame in one environment's observation; with cameras, such by name. Raises InvalidSampleError."""
+        """Return the frame in an environment's observation; with cameras, a dict. Raises InvalidSampleError."""
         source = self.frames_from
         if source is None:
             found = observation
@@ -114,12 +114,12 @@ class RewardOptions:
 
 
 class RewardedEpisode:
-    """One episode: its frames, what is known of it, and the questions that have no answer yet.
+    """One episode: its frames, newest known score, and open requests.
 
-    index: number of its environment; None: there is only one
-    size: what the checkpoint reads: frames are made as small; None: they stay as they are
-    pending: questions, and the answers to come about each of their windows
-    known: the newest score that has come
+    index: number of its environment; None: the only environment
+    size: size to which frames shrink; None: no change
+    pending: open requests, with the future of each window
+    known: the newest known score
     """
 
     def __init__(self, options: RewardOptions, task: str, index: int | None, size: FrameSize | None) -> None:
@@ -133,14 +133,14 @@ class RewardedEpisode:
         self.succeeded = False
 
     def add(self, frame: Any) -> None:
-        """Adds a copy of the frame: an environment may draw into the same array again. With cameras, such by name.
+        """Add a copy of a frame, uint8 [H, W, 3], or of a dict by camera: the array may be drawn into again.
 
         Raises InvalidSampleError.
         """
         self.frames.append(self.frames.checked(frame, self._size))
 
     def collect(self) -> None:
-        """Takes over the answers that have come. Raises the RewardError of one that failed."""
+        """Take over the scores of completed requests. Raises the RewardError of a failed request."""
         for each in [each for each in self.pending if all(answer.done() for answer in each[1])]:
             self.pending.remove(each)
             question, answers = each
@@ -151,19 +151,19 @@ class RewardedEpisode:
             self.learn(*question.scores(outcomes))
 
     def cancel(self) -> None:
-        """Cancels the questions that have no answer yet."""
+        """Cancel the requests that are still open."""
         for _, answers in self.pending:
             for answer in answers:
                 answer.cancel()
         self.pending.clear()
 
     def end(self) -> None:
-        """Cancels the questions that have no answer yet, and tells who watches that the episode is over."""
+        """Cancel open requests, and tell the live view that the episode has ended."""
         self.cancel()
         self.frames.end()
 
     def learn(self, score: StepScore) -> None:
-        """Takes over the score of a step, unless a newer one is known."""
+        """Take over a score, unless a newer score is known. Raises ValueError if it lacks a required success."""
         if self.known is not None and score.step <= self.known.step:
             return
         rule = self._options.terminate_on_success
@@ -178,14 +178,14 @@ class RewardedEpisode:
         self.frames.report(score)
 
     def reward(self, env_reward: float) -> float:
-        """The reward of the step."""
+        """Return the reward of the newest step."""
         progress = np.nan if self.known is None else self.known.progress
         change, self._paid_progress = progress - self._paid_progress, progress
         reward = self._options.scale * (progress if self._options.mode == "absolute" else change)
         return reward + env_reward if self._options.add_to_env_reward else reward
 
     def info(self) -> Info:
-        """The newest known scores, and by how many steps they lag."""
+        """Return the newest known scores, and their lag in steps."""
         known = self.known or StepScore(np.nan, np.nan, False, -1, np.nan)
         told = {"progress": known.progress, "success": known.success, "step": known.step}
         told |= {"lag": self.frames.step - known.step, "skipped": self.num_skipped}
@@ -193,7 +193,7 @@ class RewardedEpisode:
 
 
 class EpisodeRewarder:
-    """Asks about the episodes of environments, by one client. Connects at the first question."""
+    """Scores the episodes of environments through one client. Connects at the first request."""
 
     def __init__(self, client: ClientSource, options: RewardOptions) -> None:
         if not (isinstance(client, RewardClient) or callable(client)):
@@ -203,16 +203,20 @@ class EpisodeRewarder:
         self._made: RewardClient | None = None
 
     def begin(self, task: str, frame: Any, index: int | None = None) -> RewardedEpisode:
-        """A new episode, whose first frame this is. Raises RewardError. index: number of its environment"""
+        """Return a new episode with its first frame. Raises RewardError.
+
+        frame: as of ``RewardedEpisode.add``
+        index: number of its environment; None: the only environment
+        """
         size = self._client.model_info(frames=True).frame_size if self._options.resize else None
         episode = RewardedEpisode(self._options, task, index, size)
         episode.add(frame)
         return episode
 
     def score(self, episodes: Mapping[RewardedEpisode, bool]) -> None:
-        """Collects the answers that have come, and asks about the newest frames where that is due. Raises RewardError.
+        """Collect known scores, and request those of newest frames that are due. Raises RewardError.
 
-        episodes: with whether their newest frame is their last
+        episodes: to each, True if its newest frame is its last
         """
         try:
             self._score(episodes)
@@ -221,7 +225,7 @@ class EpisodeRewarder:
                 episode.end()
 
     def close(self) -> None:
-        """Closes the client if it was made here."""
+        """Close the client if it was made here."""
         if self._made is not None:
             self._made.close()
 
@@ -250,7 +254,7 @@ class EpisodeRewarder:
                 episode.learn(score)
 
     def _question(self, episodes: Sequence[RewardedEpisode]) -> StepRequest:
-        """About their newest frames, sampled as the options say and as suits the checkpoint that is served now."""
+        """Request about their newest frames, sampled by the options and the checkpoint now served."""
         asked_s = time.perf_counter()
         scoring = self._options.scoring
         info: ModelInfo | None = self._client.model_info(frames=True) if scoring.needs_model_info else None
