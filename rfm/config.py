@@ -145,7 +145,6 @@ class ServeConfig(Settings):
 
 
 def _address(host: str) -> str:
-    """Return the IP address of a host, which may be a URL. Raises ConfigError."""
     address = (host.partition("://")[2] or host).rstrip("/")
     if address == "localhost":
         return DEFAULT_HOST

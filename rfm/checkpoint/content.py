@@ -195,7 +195,6 @@ def _check_header(file: Path) -> None:
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return a JSON object. Raises ValueError for a key that stands twice."""
     content: dict[str, Any] = {}
     for name, value in pairs:
         if name in content:

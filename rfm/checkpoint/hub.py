@@ -105,7 +105,6 @@ def _failures() -> tuple[type[Exception], ...]:
 
 
 def _refuse_pickles(repo_id: str, subfolder: str, tag: str | None) -> None:
-    """Raise CheckpointError if the repository has pickled weights, which are never fetched."""
     from huggingface_hub import HfApi
 
     files = [Path(file.rfilename) for file in HfApi().model_info(repo_id, revision=tag).siblings or ()]

@@ -45,8 +45,6 @@ def find_run_config(folder: Path) -> Path | None:
 
 
 def _check_base(file: Path, folder: Path) -> None:
-    """Raise CheckpointError if the run's base model and the checkpoint's network are of different kinds."""
-
     def plain(name: str) -> str:
         return re.sub(r"[^a-z0-9]", "", name.lower())
 

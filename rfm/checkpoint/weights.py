@@ -87,7 +87,6 @@ def check_one_form(folder: Path) -> None:
 
 
 def _read_shards(index: Path) -> tuple[list[Path], dict[str, Tensor]]:
-    """Return the shards in the index, and their tensors."""
     weight_map = read_json(index).get("weight_map")
     if not isinstance(weight_map, dict):
         raise CheckpointError(f"{index}: expected a weight_map, got none")

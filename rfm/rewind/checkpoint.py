@@ -151,7 +151,6 @@ class RewindCheckpoint:
         return self.image_source or IMAGE_ENCODER, self.text_source or TEXT_ENCODER
 
     def _facts(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return the settings in the files of both encoders. Raises CheckpointError."""
         image_source, text_source = self._sources
         with self._having_encoders():
             return image_facts(image_source), text_facts(text_source)
@@ -174,7 +173,6 @@ class RewindCheckpoint:
 
     @contextmanager
     def _having_encoders(self) -> Iterator[None]:
-        """Turn exceptions about the encoders' files into a CheckpointError."""
         try:
             yield
         except misfits(ImportError, OSError) as error:
@@ -260,7 +258,6 @@ def _of_first_code(folder: Path, weights: dict[str, Tensor], options: Options) -
 
 
 def _settings(config: RewindConfig, stated: Mapping[str, Decision]) -> tuple[Decision, ...]:
-    """Return the source of each setting of the network and of the clients' defaults."""
     of_weights = (*_OF_WEIGHTS, *(["max_len"] if config.use_per_frame_progress_token else []))
     return (
         *(Decision(name, getattr(config, name), OF_WEIGHTS) for name in of_weights),
@@ -317,7 +314,6 @@ def _shape(weights: Mapping[str, Tensor], name: str, rank: int) -> torch.Size:
 
 
 def _saved(folder: Path) -> dict[str, Any]:
-    """Return the content of config.json; empty if there is none."""
     return read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
 
 

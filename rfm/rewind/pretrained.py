@@ -146,7 +146,6 @@ def _is_count(value: Any) -> bool:
 
 
 def _has_counts(value: Any, *names: str) -> bool:
-    """True for a mapping of exactly these names to numbers of pixels."""
     return isinstance(value, dict) and set(value) == set(names) and all(map(_is_count, value.values()))
 
 

@@ -141,7 +141,6 @@ class VlmCheckpoint:
 
     @property
     def _source(self) -> str | Path:
-        """Folder or id of the processor."""
         return self.base_model or self.processor or self.config.base_model_id
 
     @property
@@ -321,7 +320,6 @@ def _used(tensors: Mapping[str, Tensor], scaling: Scaling | None = None) -> tupl
 
 
 def _check_layers(config: Any) -> None:
-    """Raise CheckpointError for too many layers to build."""
     inner = config.values() if isinstance(config, dict) else config if isinstance(config, list) else ()
     for part in inner:
         _check_layers(part)

@@ -168,7 +168,6 @@ class VlmCollator:
         )
 
     def _frame_parts(self, num_frames: int) -> list[str | Visual]:
-        """Return the placeholders of a trajectory in the conversation."""
         if not self.config.multi_image:
             return [Visual.VIDEO]
         each: list[str | Visual] = [Visual.IMAGE]
@@ -360,7 +359,6 @@ def _video(trajectory: Trajectory | TrajectoryRefs, frame_steps: int) -> VlmVide
 
 
 def _replaced(text: str, placeholder: str, replacements: Sequence[str]) -> str:
-    """Replace each occurrence of ``placeholder`` in the text by the next of ``replacements``."""
     pieces = text.split(placeholder)
     assert len(pieces) == len(replacements) + 1, "the chat template shows each image or video once"
     return pieces[0] + "".join(new + piece for new, piece in zip(replacements, pieces[1:], strict=True))

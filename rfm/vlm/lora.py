@@ -203,8 +203,8 @@ def has_adapter(folder: Path) -> bool:
 def base_of_adapter(folder: Path, run: RunConfig) -> str:
     """Return the base model that the run names.
 
-    Raises CheckpointError if the adapter names another, or if the run began with a checkpoint: the adapter may then
-    change this checkpoint's weights.
+    Raises CheckpointError if the adapter names another, or if the run began with a checkpoint, whose weights the
+    adapter may change.
     """
     base = run.get("model.base_model_id", "")
     if not base:

@@ -31,7 +31,7 @@ class VlmConfig:
     dtype: of all parameters, heads included
     multi_image: each frame is an image; else a trajectory is a video
     per_frame_progress_token: the state of an image is that of a progress token behind it
-    frame_pooling: else, how an image's tokens are pooled to its state; boundary: its last token. Not for videos
+    frame_pooling: pools an image's tokens to its state, without progress tokens; boundary: takes the last token
     pooling_temperature: of attention pooling
     average_temporal_patches: in video mode, a temporal patch's tokens are averaged; else the token behind them is read
     progress_in_preference: prompts for preference also ask for progress

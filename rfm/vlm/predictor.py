@@ -112,7 +112,6 @@ class VlmPredictor:
             raise
 
     def _completed(self, sample: ProgressSampleRefs) -> ProgressSampleRefs:
-        """Return the sample with the pixels of cached frames."""
         named = sample.trajectory
         kept = {} if self.cache is None else self.cache.found(named.digests)
         found = {digest: named.pixels.get(digest, kept.get(digest)) for digest in named.digests}

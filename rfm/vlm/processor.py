@@ -78,7 +78,6 @@ def load_collator(config: VlmConfig, num_tokens: int, processor: str | Path) -> 
 
 
 def _check_tokens(config: VlmConfig, tokenizer: Any, processor: str | Path) -> None:
-    """Raise CheckpointError for tokens whose ids differ from those in training."""
     first = len(tokenizer) - len(SPECIAL_TOKENS)
     expected = {token: first + index for index, token in enumerate(SPECIAL_TOKENS)}
     stated = {token: config.backbone.get(name) for name, token in _STATED_TOKENS[config.family].items()}
@@ -117,7 +116,6 @@ def _preprocessor(processor: str | Path) -> dict[str, Any]:
 
 
 def _cached(processor: str | Path, name: str) -> Path:
-    """Return a file of the processor, fetched from the Hub if necessary. Raises OSError."""
     from transformers.utils.hub import cached_file
 
     return Path(str(cached_file(str(processor), name)))

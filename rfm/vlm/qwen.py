@@ -7,7 +7,7 @@ Results and order of sums are those of ``transformers`` 4.57.
 Language model: B conversations of L tokens, D width, M visual tokens in all. A token has three coordinates: time, row
 and column. From one text token to the next, all three grow by 1. An image or video is a box, in which a token's
 coordinates are its place. The next text continues behind the box's largest coordinate. Padding follows the tokens,
-where causal attention does not see it, so that PyTorch's fastest attention works, which takes no mask.
+where causal attention does not see it. So no mask is needed, and PyTorch's fastest attention accepts none.
 
 Vision tower: a shot is a temporal patch, an image or two frames of a video. Attention stays within a shot. N patches
 of all shots in order, those of a merged token together; S patches of a shot, U = MERGE x MERGE of a merged token.

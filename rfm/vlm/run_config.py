@@ -119,7 +119,8 @@ class RunConfig:
     def size_px(self, family: str, multi_image: bool) -> tuple[int, int] | None:
         """Return height and width to which every frame is resized first; None: resizing starts from each frame's size.
 
-        None for images: upstream ignores the keys since its networks have a frame_pool_attn. Raises CheckpointError.
+        None for images, for which all upstream versions with a frame_pool_attn ignore the keys.
+        Raises CheckpointError.
         """
         if family == SMOL or multi_image:
             return None
