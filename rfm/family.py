@@ -46,7 +46,7 @@ class Description:
     widths: Dv and Dt, the widths of the frame and task embeddings that it scores; None: it scores raw frames
     progress_bins: K; 1: continuous progress
     max_frames: frames of the longest trajectory that the network can score; None: no limit
-    trained_frames: largest number of frames of a trajectory in training; None: unknown
+    trained_frames: most frames of a trajectory in training; None: unknown
     trained_padding: training padded shorter trajectories; None: unknown
     frame_size: the size to which the checkpoint resizes each raw frame; None: it depends on the frame
     frames_per_value: consecutive frames with one score
@@ -78,7 +78,7 @@ class Description:
 def config_fields(config: Any) -> dict[str, Any]:
     """Return the fields of a network's configuration, as in files and digests.
 
-    The preference and success heads stand there only if missing, so that older files and digests stay valid.
+    ``has_preference`` and ``has_success`` are left out if true, so that older files and digests stay valid.
     """
     fields = asdict(config)
     return {name: value for name, value in fields.items() if name not in _USUAL_HEADS or not value}

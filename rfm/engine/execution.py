@@ -22,15 +22,15 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class Execution:
-    """The costs of one batch; the code that scores the batch adds to them.
+    """The costs of a batch, added up while it is scored.
 
-    collate_s: seconds without a forward pass, in which rows and batches were made
-    forward_s: seconds in forward passes, including the reading of their results
-    num_tokens, num_slots: tokens in the forward passes, without and with padding
-    num_encoded, num_found: frames that an encoder or vision tower read, and frames with features from the cache
-    cache_bytes: bytes of the cached features; None: there is no cache
+    collate_s: seconds in which rows and batches were made, without a forward pass
+    forward_s: seconds in forward passes, including the reading of results
+    num_tokens, num_slots: tokens in forward passes, without and with padding
+    num_encoded, num_found: frames read by an encoder or vision tower; frames with cached features
+    cache_bytes: size of the cached features; None: no cache
     out_of_memory_count: forward passes that did not fit in memory and were tried again in halves
-    on_forward: called after each forward pass, also if it did not fit in memory
+    on_forward: called after each forward pass, even if it did not fit in memory
     """
 
     collate_s: float = 0.0

@@ -18,9 +18,9 @@ WORTH_ONEDNN = 1 << 21  # multiplications; for fewer, the start of oneDNN costs 
 class Linear(nn.Linear):
     """An ``nn.Linear`` that computes large float32 products on the CPU with oneDNN.
 
-    PyTorch itself uses oneDNN only for bfloat16, and MKL is slow on processors other than Intel's
-    (docs/explanation/performance.md). torch.compile uses the same operation. oneDNN builds a kernel for each new
-    shape, so ReWiND pads its tokens to few shapes (``rfm.rewind.network.rounded_up``).
+    PyTorch uses MKL, which is slow on processors other than Intel's (docs/explanation/performance.md), and oneDNN only
+    for bfloat16. torch.compile uses the same operation. oneDNN builds a kernel for each new shape, so ReWiND pads its
+    tokens to few shapes (``rfm.rewind.network.rounded_up``).
     """
 
     def forward(self, input: Tensor, *, relu: bool = False, plus: Tensor | None = None) -> Tensor:
@@ -123,11 +123,10 @@ MKL_FUNCTIONS = (
 def keep_float32() -> None:
     """Make GPUs and CPUs compute float32 in full precision; to be called before any computation.
 
-    GPU: by default cuDNN rounds the inputs of a convolution to TF32, with 10 of 23 mantissa bits. That changes scores
-    by more than 1e-5.
-    CPU: MKL 2024.2 selects the code of a function at its first call. If several threads make that call at once, some
-    may use less exact code: a cosine is off by 1.5e-4 (pytorch/pytorch#188792). Here a single thread makes the first
-    calls.
+    GPU: by default cuDNN rounds inputs of convolutions to TF32 (10 of 23 mantissa bits), which changes scores by more
+    than 1e-5.
+    CPU: MKL 2024.2 selects a function's code at its first call. If threads make that call at once, one may use less
+    exact code: a cosine is off by 1.5e-4 (pytorch/pytorch#188792). Here a single thread makes the first calls.
     """
     torch.backends.cudnn.allow_tf32 = False
     torch.backends.cuda.matmul.allow_tf32 = False

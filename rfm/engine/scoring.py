@@ -59,8 +59,8 @@ class Engine:
 
     predictor: the network, with the collation of its batches
     encoders: on the same device, for samples of raw frames if the network scores embeddings
-    token_budget: largest number of tokens, with padding, in a forward pass of several rows; a larger row runs alone
-    max_sample_tokens: largest number of tokens in one row; a sample with a larger row is refused
+    token_budget: most tokens, with padding, in a forward pass of several rows; a larger row runs alone
+    max_sample_tokens: most tokens in a row; a sample with a larger row is refused
     """
 
     def __init__(
@@ -119,9 +119,9 @@ class Engine:
     ) -> Engine:
         """Return the engine for a checkpoint in memory.
 
-        encoders: for samples of raw frames if the network scores embeddings
         dtype: of the network; None: float32, or a vision-language checkpoint's own on a GPU
-        feature_cache_mb: MiB for the features of frames in a network that reads raw frames; 0: no cache
+        feature_cache_mb: MiB for features of raw frames; 0: no cache
+        others: as in the class
         Raises CheckpointError.
         """
         keep_float32()
@@ -132,7 +132,7 @@ class Engine:
         return cls(predictor, encoders=encoders, token_budget=token_budget, max_sample_tokens=max_sample_tokens)
 
     def evaluate(self, samples: Sequence[Sample], execution: Execution | None = None) -> list[Outcome]:
-        """Score the samples; return each sample's result or error, which does not depend on the other samples.
+        """Return each sample's result or error, independent of the other samples.
 
         execution: the batch's costs are added to it
 
@@ -159,7 +159,7 @@ class Engine:
         return self.predictor.works_ahead
 
     def work_ahead(self, prepared: Prepared) -> None:
-        """Do slow work between ``prepare`` and ``score``; thread-safe, optional (``score`` does it otherwise)."""
+        """Do slow work before ``score``, which otherwise does it; thread-safe."""
         if not isinstance(prepared.rows, RewardError):
             self.predictor.work_ahead(prepared.rows)
 

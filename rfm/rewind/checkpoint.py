@@ -78,8 +78,7 @@ class RewindCheckpoint:
 
     network: weights of RewindTransformer
     image_encoder, text_encoder: weights of encoders without their prefix; empty if the checkpoint has none
-    image_source, text_source: folders or ids of encoders from the user; None: upstream's, if the checkpoint has
-        weights of encoders or the other is set
+    image_source, text_source: image_encoder and text_encoder of ``rfm.family.Options``
     settings: the source of each setting of the configuration
     """
 

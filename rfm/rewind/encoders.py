@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Encode raw frames and tasks into the embeddings that a ReWiND transformer reads.
 
-A frame's embedding is the pooled output of a DINOv2-type image encoder. A task's is the mean of the last hidden state
-of a BERT-type sentence encoder over the tokens, not normalised. ``transformers`` provides both networks.
+A frame's embedding is the pooled output of a DINOv2-type image encoder. A task's is the mean over the tokens of a
+BERT-type sentence encoder's last hidden state, not normalised. Both networks are from ``transformers``.
 T frames, H x W pixels, Dv and Dt widths of the embeddings.
 """
 
@@ -129,8 +129,7 @@ class Encoders:
         """Return each sample with embeddings of its frames and task, or its error.
 
         execution: the costs are added to it; its tokens are those of images (without padding) and tasks
-        cache: of embeddings; equal frames and equal tasks are then encoded once. None: no cache, and no samples with
-            frame references
+        cache: of embeddings, which encodes equal frames and tasks once; None: no cache, and no frame references
         """
         execution = execution or Execution()
         with execution.forwarding():

@@ -30,7 +30,7 @@ _SIGNIFICANT_BITS = 5
 def rounded_up(count: int) -> int:
     """Return the next number with at most five significant bits, at most 1/16 above ``count``.
 
-    Tensors then have few shapes, so that kernels that are built for each shape are built once.
+    Tensors then have few shapes, and few kernels are built: some libraries build one for each shape.
     """
     step = 1 << max(count.bit_length() - _SIGNIFICANT_BITS, 0)
     return -(-count // step) * step
@@ -98,7 +98,7 @@ FEED_FORWARD_RATIO = 4
 class RewindConfig:
     """The configuration of a network; the fields of upstream's config.json keep their names.
 
-    trained_frames: largest number of frames of a trajectory in training; None: unknown
+    trained_frames: as in ``rfm.family.Description``
     trained_padding: training padded shorter trajectories to ``trained_frames``, as upstream's does; None: unknown
     """
 

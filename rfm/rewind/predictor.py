@@ -78,7 +78,7 @@ class RewindCollator:
         return [RewindRow(text, videos[0], videos[1], isinstance(sample, SimilaritySample))]
 
     def collate(self, rows: Sequence[RewindRow]) -> RewindBatch:
-        """Return one batch of rows of any kinds. It holds frames that several rows show once."""
+        """Return one batch of rows of any kinds. A frame that several rows show is in the batch once."""
         videos: dict[int, Float32Array] = {}
         starts: dict[int, int] = {}
         num_frames = 0

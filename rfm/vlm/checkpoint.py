@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from safetensors.torch import save_file
@@ -52,6 +52,7 @@ from rfm.vlm.backbone import (
 )
 from rfm.vlm.collator import VlmCollator
 from rfm.vlm.images import FRAMES_PER_GROUP
+from rfm.vlm.lerobot import LEROBOT_BACKBONE, check_bins, is_lerobot, lerobot_run, lerobot_weights
 from rfm.vlm.lora import LORA_NAME, Scaling, adapted, base_of_adapter, changed_by, has_adapter, merged, split
 from rfm.vlm.network import VlmConfig, VlmRewardModel, build_backbone
 from rfm.vlm.nf4 import dequantize
@@ -212,45 +213,73 @@ class VlmCheckpoint:
 
 
 def reads(folder: Path) -> bool:
-    """True if the folder holds an adapter, or a network on a known backbone."""
+    """True if the folder holds an adapter, a network on a known backbone, or a Robometer of LeRobot."""
     if is_there(folder / ADAPTER_CONFIG):
         return True
-    model_type = read_json(folder / NETWORK_CONFIG).get("model_type") if is_there(folder / NETWORK_CONFIG) else None
-    return isinstance(model_type, str) and model_type in BACKBONES
+    content = read_json(folder / NETWORK_CONFIG) if is_there(folder / NETWORK_CONFIG) else {}
+    model_type = content.get("model_type")
+    return is_lerobot(content) or (isinstance(model_type, str) and model_type in BACKBONES)
 
 
 def load(folder: Path, options: Options) -> VlmCheckpoint:
     """Load the checkpoint of a local folder. Raises CheckpointError."""
-    with expecting("a vision-language checkpoint", folder):
-        is_adapter = has_adapter(folder)
-        file = folder / NETWORK_CONFIG
-        backbone = {} if is_adapter else backbone_config(read_json(file), file)
-        is_nf4, num_nf4 = quantization(backbone) == NF4, 0
-        if is_nf4:
-            del backbone["quantization_config"]
-        check_not_quantized(backbone, file, UNQUANTIZED)
-        if SETTINGS in backbone:  # written by VlmCheckpoint.save, with every setting
-            config = _saved_config(backbone)
-            weights, factors = _used(renamed(read_weights(folder), _NAMES_OF.get(config.family, QWEN_NAMES)))
-            settings = decisions_of(config, None, options.base_model)
-        else:
-            run = RunConfig.of(folder)
-            run.check_model_type()
-            check_progress(run.sections, run.file)
-            scaling: Scaling | None
-            if is_adapter:
-                backbone, tensors, scaling = adapted(folder, options.base_model or base_of_adapter(folder, run))
-            else:
-                tensors, num_nf4 = _in_full_precision(folder, is_nf4)
-                tensors, scaling = _whole(tensors, folder, backbone, run)
-            weights, factors = _used(tensors, scaling)
-            config = _trained_config(folder, backbone, run, weights)
-            settings = decisions_of(config, run, options.base_model, scaling, is_adapter=is_adapter, num_nf4=num_nf4)
     own = folder / PROCESSOR_FOLDER
     processor = own if own.is_dir() else None
+    with expecting("a vision-language checkpoint", folder):
+        content = {} if has_adapter(folder) else read_json(folder / NETWORK_CONFIG)
+        read = _exported if SETTINGS in content else _by_lerobot if is_lerobot(content) else _trained
+        config, weights, factors, settings = read(folder, content, options.base_model)
     checkpoint = VlmCheckpoint(config, weights, factors, processor, options.base_model, settings)
     checkpoint.check()
     return checkpoint
+
+
+_Parts: TypeAlias = tuple[VlmConfig, dict[str, Tensor], dict[str, Tensor], tuple[Decision, ...]]
+
+
+def _exported(folder: Path, content: Mapping[str, Any], base_model: str | None) -> _Parts:
+    """Read a checkpoint that ``VlmCheckpoint.save`` wrote, with every setting in config.json."""
+    file = folder / NETWORK_CONFIG
+    backbone = backbone_config(content, file)
+    check_not_quantized(backbone, file, UNQUANTIZED)
+    config = _saved_config(backbone)
+    weights, factors = _used(renamed(read_weights(folder), _NAMES_OF.get(config.family, QWEN_NAMES)))
+    return config, weights, factors, decisions_of(config, None, base_model)
+
+
+def _by_lerobot(folder: Path, content: Mapping[str, Any], base_model: str | None) -> _Parts:
+    """Read a Robometer that LeRobot saved, with every setting in config.json."""
+    file = folder / NETWORK_CONFIG
+    run = lerobot_run(content, file)
+    backbone = backbone_config(content[LEROBOT_BACKBONE], f"{file}: {LEROBOT_BACKBONE}")
+    check_not_quantized(backbone, file, UNQUANTIZED)
+    weights, factors = _used(lerobot_weights(read_weights(folder), backbone))
+    check_bins(content, weights, file)
+    config = _config(folder, backbone, run, weights)
+    return config, weights, factors, decisions_of(config, run, base_model)
+
+
+def _trained(folder: Path, content: Mapping[str, Any], base_model: str | None) -> _Parts:
+    """Read the checkpoint of a training run, with the run's config.yaml. content: {} for an adapter."""
+    file = folder / NETWORK_CONFIG
+    backbone = backbone_config(content, file) if content else {}
+    is_nf4, num_nf4 = quantization(backbone) == NF4, 0
+    if is_nf4:
+        del backbone["quantization_config"]
+    check_not_quantized(backbone, file, UNQUANTIZED)
+    run = RunConfig.of(folder)
+    run.check_model_type()
+    check_progress(run.sections, run.file)
+    scaling: Scaling | None
+    if content:
+        tensors, num_nf4 = _in_full_precision(folder, is_nf4)
+        tensors, scaling = _whole(tensors, folder, backbone, run)
+    else:
+        backbone, tensors, scaling = adapted(folder, base_model or base_of_adapter(folder, run))
+    weights, factors = _used(tensors, scaling)
+    config = _config(folder, backbone, run, weights)
+    told = decisions_of(config, run, base_model, scaling, is_adapter=not content, num_nf4=num_nf4)
+    return config, weights, factors, told
 
 
 def _saved_config(content: Mapping[str, Any]) -> VlmConfig:
@@ -260,7 +289,7 @@ def _saved_config(content: Mapping[str, Any]) -> VlmConfig:
     return VlmConfig(backbone=rest, size_px=tuple(size) if size else None, **settings)
 
 
-def _trained_config(
+def _config(
     folder: Path,
     backbone: dict[str, Any],
     run: RunConfig,

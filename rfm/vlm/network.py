@@ -36,7 +36,7 @@ class VlmConfig:
     average_temporal_patches: in video mode, a temporal patch's tokens are averaged; else the token behind them is read
     progress_in_preference: prompts for preference also ask for progress
     size_px: height and width to which every frame is resized first; None: resizing starts from each frame's size
-    trained_frames: largest number of frames of a trajectory in training; None: unknown
+    trained_frames: as in ``rfm.family.Description``
     """
 
     backbone: dict[str, Any]

@@ -51,11 +51,13 @@ class RunConfig:
 
     file: path of config.yaml
     name: its path relative to the checkpoint's folder
+    has_sections: False: the file has no sections, and messages name the key alone
     """
 
     file: Path
     name: str
     sections: dict[str, dict[str, Any]]
+    has_sections: bool = True
 
     @classmethod
     def of(cls, folder: Path) -> RunConfig:
@@ -102,7 +104,7 @@ class RunConfig:
         """
         temperature = self.get("model.frame_pooling_attn_temperature", 1.0)
         if not 0 < temperature < math.inf:
-            where = f"{self.file}: model.frame_pooling_attn_temperature"
+            where = f"{self.file}: {self.shown('model.frame_pooling_attn_temperature')}"
             raise CheckpointError(f"{where}: expected a number above 0, got {shown(temperature)}")
         return {
             "dtype": self._one_of("model.torch_dtype", "bfloat16", DTYPES),
@@ -134,12 +136,18 @@ class RunConfig:
     def decision(self, setting: str, value: Any) -> Decision:
         """Return the source of one of SETTINGS: its keys, or upstream's default."""
         places = SETTINGS[setting]
-        there = [place for place in places if self.states(place)]
+        there = [self.shown(place) for place in places if self.states(place)]
         if value is None:
-            return Decision(setting, value, f"{self.name}: no {' and '.join(places)}")
+            return Decision(setting, value, f"{self.name}: no {' and '.join(map(self.shown, places))}")
         if not there:
-            return Decision(setting, value, f"{OF_UPSTREAM}, as {self.name} has no {places[0]}", is_assumed=True)
+            return Decision(
+                setting, value, f"{OF_UPSTREAM}, as {self.name} has no {self.shown(places[0])}", is_assumed=True
+            )
         return Decision(setting, value, f"{self.name}: {', '.join(there)}")
+
+    def shown(self, place: str) -> str:
+        """Return ``section.key`` as the file has it."""
+        return place if self.has_sections else place.partition(".")[2]
 
     def states(self, place: str) -> bool:
         """True if there is a value at ``section.key``."""
@@ -155,13 +163,15 @@ class RunConfig:
         if type(value) is int and type(default) is float:
             value = float(value)
         if type(value) is not type(default):
-            raise CheckpointError(f"{self.file}: {place}: expected {type(default).__name__}, got {shown(value)}")
+            raise CheckpointError(
+                f"{self.file}: {self.shown(place)}: expected {type(default).__name__}, got {shown(value)}"
+            )
         return value
 
     def _one_of(self, place: str, default: str, known: tuple[str, ...]) -> str:
         value = self.get(place, default).removeprefix("torch.")
         if value not in known:
-            raise CheckpointError(f"{self.file}: {place}: expected one of {known}, got {shown(value)}")
+            raise CheckpointError(f"{self.file}: {self.shown(place)}: expected one of {known}, got {shown(value)}")
         return value
 
     def _of_either(self, setting: str) -> bool:
@@ -221,7 +231,7 @@ def decisions_of(
 def _base_model(named: str, run: RunConfig | None, given: str | None) -> Decision:
     """Return the source of tokenizer and image preprocessing, and of an adapter's base weights."""
     if given is None:
-        file = NETWORK_CONFIG if run is None else f"{run.name}: model.base_model_id"
+        file = NETWORK_CONFIG if run is None else f"{run.name}: {run.shown('model.base_model_id')}"
         return Decision("base_model", source_name(named), file)
     if run is None or not named or model_name(named) in given.lower():
         return Decision("base_model", source_name(given), _BASE_MODEL)
