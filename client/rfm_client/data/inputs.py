@@ -53,10 +53,10 @@ def load_trajectory(
     task: replaces the task of the file
     fps: frames a second to take from a video; None: all frames
     start_s, end_s: part of a video, by its time stamps; None: from the start, to the end
-    orient: the turn that makes frames upright
+    orient: turn that makes frames upright
 
-    Raises InvalidSampleError, also for arrays of Python objects, because reading them runs code. Also for a video file
-    of several LeRobot v3.0 episodes, unless ``start_s`` and ``end_s`` select a part.
+    Raises InvalidSampleError, also for arrays of Python objects, because reading them runs code, and for a video of
+    several LeRobot v3.0 episodes, unless ``start_s`` and ``end_s`` select a part.
     """
     if is_url(source) or Path(source).suffix.lower() not in ARRAY_SUFFIXES:
         return Trajectory(frames=turned(read_video(source, fps, start_s=start_s, end_s=end_s), orient), task=task)
@@ -75,7 +75,7 @@ def as_trajectory(
 ) -> Trajectory:
     """Return the trajectory of an episode of a Hugging Face or LeRobot dataset.
 
-    episode: a dict over all steps, or one dict a step, with the keys
+    episode: a dict over all steps, or a dict for each step, with the keys
 
     ``observation.images.<camera>`` or ``frames``: [T, H, W, 3] or [T, 3, H, W], or a sequence of T images (arrays,
         tensors, PIL); uint8, or float in 0..1, which is multiplied by 255 and rounded. Steps that LeRobot marks as
@@ -141,7 +141,7 @@ def _columns(steps: Iterable[Mapping[str, Any]]) -> Mapping[str, Any]:
 
 
 def _only(columns: Mapping[str, Any], key: str, default: Any) -> Any:
-    """The key's value. Raises InvalidSampleError if it differs between steps."""
+    """The key's value, equal at all steps."""
     values = _values(columns[key]) if key in columns else [default]
     for value in values:
         got = f"{values[0]!r} and {value!r}"
@@ -176,7 +176,6 @@ def _camera_key(columns: Mapping[str, Any], camera: str | None) -> str:
 
 
 def _frames(where: str, values: Any) -> UInt8Array:
-    """Convert T images to uint8 [T, H, W, 3]."""
     images = [as_array(image) for image in values] if isinstance(values, Sequence) else np.atleast_1d(as_array(values))
     kinds = {(image.dtype, image.shape) for image in images}
     got = " and ".join(sorted(f"{dtype} {list(shape)}" for dtype, shape in kinds)) or "none"

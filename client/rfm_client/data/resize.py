@@ -35,10 +35,10 @@ def as_jpeg(frame: UInt8Array, longest_px: int) -> bytes:
 def resize_frames(frames: UInt8Array, size: FrameSize) -> UInt8Array:
     """Return frames, uint8 [T, H, W, 3], no larger than the checkpoint reads them; the same array if they fit.
 
-    Pillow resizes: Lanczos for the rule ``longest``, as SmolVLM does; otherwise bicubic. The network's input stays the
-    same to the bit for SmolVLM, and within a grey level or two for ReWiND. For Qwen's backbones it stays the same if
-    they read the size ``exact`` itself. If they round this size to whole patches, frames are resized twice, and single
-    pixels differ by up to 15.
+    Pillow resizes: Lanczos for the rule ``longest``, as SmolVLM does; otherwise bicubic. The network's input stays
+    identical for SmolVLM, and within a grey level or two for ReWiND. For Qwen's backbones it stays identical if they
+    read the size ``exact``. If they round it to whole patches, frames are resized twice, and single pixels differ by up
+    to 15.
     """
     Image = load_pillow()  # noqa: N806  Pillow's spelling
     height, width = size.fitted(frames.shape[1], frames.shape[2])

@@ -93,7 +93,7 @@ class Sampling:
 
         trained_frames, trained_padding: ``max_frames`` and ``trained_padding`` of the checkpoint's ``ModelInfo``
 
-        Raises ValueError if the rule needs a number, and neither the caller nor the checkpoint gives it.
+        Raises ValueError if a required number is missing in both.
         """
         rule = rule or trained_rule(trained_padding)
         if frames is None and rule not in (*_REWIND, "all"):
@@ -145,11 +145,11 @@ def prefix_samples(trajectory: Trajectory, sampling: Sampling) -> Iterator[Progr
 
 
 def of_prefixes(results: Sequence[ProgressResult], sampling: Sampling) -> ProgressResult:
-    """Return the result of the episode: frame t has the scores of prefix 0 to t at the slot ``Prefix.read``.
+    """Return the episode's result: frame t's scores are those of prefix 0 to t at the slot ``Prefix.read``.
 
     results: [T], for the samples of ``prefix_samples``
 
-    Raises InferenceFailedError if the results come from several versions of the checkpoint.
+    Raises InferenceFailedError for results of several versions of the checkpoint.
     """
     versions = sorted({str(result.model_version) for result in results})
     if len(versions) > 1:

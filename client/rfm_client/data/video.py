@@ -68,18 +68,17 @@ def read_video(
 
     Frames are counted, not timed: at a variable frame rate, T follows the average rate, and frames are evenly spaced in
     number, not in time. Colours equal ``ffmpeg -pix_fmt rgb24`` with any PyAV. Frames are turned and mirrored as the
-    file says, as phones record. Only the returned frames stay in memory. A URL is downloaded once, to a temporary file.
+    file says. Only the returned frames stay in memory. A URL is downloaded once, to a temporary file.
 
-    start_s, end_s: take the frames from ``start_s`` to before ``end_s``, by time stamps; None: from the start, to the
-        end
+    start_s, end_s: part from ``start_s`` to before ``end_s``, by time stamps; None: from the start, to the end
     timeout_s: longest silence of a URL's server
     take: called before each frame takes memory, with the number of bytes; its error ends the reading
     container: FFmpeg's name of the file's format; None: FFmpeg guesses it. Name it for untrusted files, because some
         formats make FFmpeg open other files or addresses
 
-    Raises InvalidSampleError if the file is missing, truncated or no video, or has several videos or depth maps; if a
-    returned frame is damaged; and for a file of several LeRobot episodes (``lerobot_videos``) without both ``start_s``
-    and ``end_s``.
+    Raises InvalidSampleError for a missing or truncated file, a file of no video, several videos or depth maps, and a
+    damaged frame among those returned. Also for a file of several LeRobot episodes (``lerobot_videos``) without both
+    ``start_s`` and ``end_s``.
     """
     import_av()
     _check_numbers(fps, start_s, end_s, timeout_s)
@@ -188,7 +187,6 @@ def _part(packets: Packets, start_s: float | None, end_s: float | None) -> tuple
 
 
 def _picked(first: int, end: int, packets: Packets, fps: float | None) -> set[int]:
-    """Numbers of the frames that show ``first`` to ``end`` - 1 at ``fps``."""
     own_fps, fps = (1.0, 1.0) if fps is None else (packets.fps, fps)
     return set((first + frame_indices(end - first, own_fps, fps)).tolist())
 
@@ -196,7 +194,7 @@ def _picked(first: int, end: int, packets: Packets, fps: float | None) -> set[in
 def _decoded(
     file: BinaryIO, wanted: set[int], take: Callable[[int], object], container: str | None
 ) -> tuple[Sequence[UInt8Array], int]:
-    """The wanted frames, and the number of all frames. Raises InvalidSampleError if a wanted frame is damaged."""
+    """The wanted frames, and the number of all frames."""
     picked, total = [], 0
     file.seek(0)
     with import_av().open(file, format=container) as opened:

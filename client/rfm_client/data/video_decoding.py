@@ -145,7 +145,7 @@ def judged(frames: Iterable[Any]) -> Iterator[tuple[Any, bool]]:
 
 
 def _check_colours(pixels: Any) -> None:
-    """Raise VideoError for pixels of depth maps: floats, or one deep channel besides transparency."""
+    """Refuse pixels of depth maps: floats, or a single deep channel besides transparency."""
     if pixels is None:
         return
     has_one = len(pixels.components) <= 2 and max(component.bits for component in pixels.components) > _BITS
@@ -157,8 +157,8 @@ def _check_colours(pixels: Any) -> None:
 def _rgb(frame: Any) -> UInt8Array:
     """Convert a frame to uint8 [H, W, 3], equal to the output of ``ffmpeg -pix_fmt rgb24``.
 
-    PyAV before 17 assumes BT.601 and limited range unless both are passed. It also does so if the source's matrix
-    equals the target's. So the target's differs here, which means nothing for RGB.
+    PyAV before 17 assumes BT.601 and limited range if they are not passed, or equal for source and target. So the
+    target's matrix differs here, which means nothing for RGB.
     """
     options: dict[str, int] = {}
     if not frame.format.is_rgb:
@@ -188,8 +188,8 @@ def _shown(image: UInt8Array, matrix: npt.NDArray[np.int32]) -> UInt8Array:
 def _broken_off(file: BinaryIO) -> str | None:
     """Describe an MP4, Matroska or WebM file that is shorter than its header says; None: it is whole.
 
-    The container's sizes are exact for any frame rate and sound; its duration is not. A file of unknown size, such as
-    a live recording, and any other format count as whole.
+    The container's sizes are exact; its duration is not, depending on frame rate and sound. A file of unknown size,
+    such as a live recording, and any other format count as whole.
     """
     there = file.seek(0, os.SEEK_END)
     file.seek(0)
@@ -221,7 +221,7 @@ def _ebml_number(file: BinaryIO) -> int | None:
 
 
 def _mp4_bytes(file: BinaryIO, there: int) -> int | None:
-    """The declared end of an MP4 box of frames that reaches beyond the file; None: there is no such box.
+    """The declared end of an MP4 box of frames that reaches beyond the file; None: none does.
 
     Stops at an unknown box, because cameras append notes of their own.
     """

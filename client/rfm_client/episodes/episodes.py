@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 class AsyncEpisodes(AsyncClosing, OneProcess):
     """N episodes that grow together, as in vectorised environments. An async context manager.
 
-    A step takes as few requests as possible. All frames of the running episodes are kept, because later steps show them
+    A step takes as few requests as possible. All frames are kept until the episode ends, because later steps show them
     again.
 
     tasks: sentence of each episode
@@ -128,7 +128,7 @@ class AsyncEpisodes(AsyncClosing, OneProcess):
         return [frame for part in making for frame in part.result()]
 
     def _given(self, frames: Any, indices: Sequence[int]) -> dict[int, Any]:
-        """The new frame of each of these episodes; with cameras, a dict of frames. Raises InvalidSampleError."""
+        """The new frame of each of these episodes; with cameras, a dict of frames."""
         cameras = self._options.cameras
         names = sorted(frames) if isinstance(frames, Mapping) else []
         expected = f"the cameras {list(cameras)}" if cameras else "one camera (cameras=... names several)"
@@ -177,7 +177,7 @@ class AsyncEpisode(AsyncClosing, OneProcess):
         return await self._add(frame)
 
     def add_nowait(self, frame: Any) -> asyncio.Future[StepScore]:
-        """Add a frame, and return the future of its score.
+        """Add a frame, as in ``add``, and return the future of its score.
 
         While a request is open, the frame waits. A newer frame replaces it, and cancels its future. A frame with a
         cancelled future is not part of the episode.
@@ -221,10 +221,7 @@ class AsyncEpisode(AsyncClosing, OneProcess):
 
 
 class Episodes(Closing, OneProcess):
-    """AsyncEpisodes without ``await``. ``RewardClient.episodes`` builds it. A context manager.
-
-    It keeps its client alive.
-    """
+    """AsyncEpisodes without ``await``. ``RewardClient.episodes`` builds it. A context manager."""
 
     def __init__(self, episodes: AsyncEpisodes, loop: LoopThread, client: object) -> None:
         self._episodes, self._loop, self._client = episodes, loop, client
@@ -237,19 +234,16 @@ class Episodes(Closing, OneProcess):
         return self._loop.wait(self._episodes.add(frames, mask))
 
     def reset(self, mask: npt.ArrayLike | None = None, task: str | Sequence[str] | None = None) -> None:
-        """Begin new episodes, as ``AsyncEpisodes.reset``. mask: bool [N]"""
+        """Begin new episodes, as ``AsyncEpisodes.reset``. mask: bool [N]."""
         self._loop.wait(self._episodes.reset(mask, task))
 
     def close(self) -> None:
-        """End the episodes, also in the live view, once no step is open."""
+        """End the episodes, as ``AsyncEpisodes.close``."""
         self._loop.wait(self._episodes.close())
 
 
 class Episode(Closing, OneProcess):
-    """AsyncEpisode without ``await``. ``RewardClient.episode`` builds it. A context manager.
-
-    It keeps its client alive.
-    """
+    """AsyncEpisode without ``await``. ``RewardClient.episode`` builds it. A context manager."""
 
     def __init__(self, episode: AsyncEpisode, loop: LoopThread, client: object) -> None:
         self._episode, self._loop, self._client = episode, loop, client

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Live view: running episodes report their newest frames and scores to the page of a gateway.
 
-A thread sends the reports, a few times a second, so that adding a step never waits for it. A report holds at most 2000
-new steps, and the newest frame of the 16 episodes that have waited longest. So its cost is bounded for any number of
-environments.
+A thread reports a few times a second, so that no step waits. A report holds at most 2000 new steps, and the newest
+frames of the 16 episodes that have waited longest. So its cost is bounded for any number of environments.
 """
 
 from __future__ import annotations
@@ -188,7 +187,7 @@ class Reporter:
         self._has_more.set()
 
     def close(self) -> None:
-        """Report the end of all episodes. Return when it has been reported, or after CLOSE_WITHIN_S."""
+        """Report the end of all episodes. Return after the last report, or after CLOSE_WITHIN_S."""
         if self._was_forked():
             return
         with self._lock:
@@ -241,7 +240,6 @@ class Reporter:
         return False
 
     def _post(self, body: bytes) -> tuple[int, str]:
-        """Status and text of the gateway's answer."""
         host = self._parts.hostname or ""
         connection = (
             HTTPSConnection(host, self._port, timeout=ANSWER_WITHIN_S, context=self._credentials.ssl_context)
@@ -265,7 +263,6 @@ class Reporter:
         return True
 
     def _warn(self, reason: str) -> None:
-        """Log why reports do not arrive, once until they do."""
         if not self._is_away:
             expected = "%s: expected a gateway that takes live reports, got %s; episodes go on, and are not shown"
             logger.warning(expected, self._url, reason)

@@ -4,13 +4,12 @@
 env = gymnasium.make("CartPole-v1", render_mode="rgb_array")
 env = RewardModelWrapper(env, partial(RewardClient, "grpc://localhost:8001"), "balance the pole")
 
-A wrapper keeps all frames of the running episode, H * W * 3 bytes a step. The rule ``sampling`` selects the frames that
-the model sees.
+A wrapper keeps all frames of the running episode, H * W * 3 bytes a step. The rule ``sampling`` selects from them.
 
 A wrapper scores the frame of the reset, every ``every``-th step, and the last step of an episode. With ``blocking``, a
-step waits for its score. Without, it takes the newest known score; while ``max_pending`` steps have open requests, a
-step is skipped. Even then, a wrapper waits for the score of the reset's frame, and of the last step unless
-``await_last=False``. The last step cancels older requests.
+step waits for its score. Without, it takes the newest known score, and is skipped while ``max_pending`` steps have open
+requests. Even then, the reset waits for its score, and so does the last step unless ``await_last=False``. The last step
+cancels older requests.
 
 ``info["reward_model"]`` has ``progress`` and ``success`` of the newest known score (NaN: the checkpoint does not
 predict it), its ``step``, its ``lag`` in steps, and the steps ``skipped`` in this episode. After a step it also has
@@ -47,13 +46,13 @@ class RewardModelWrapper(gymnasium.Wrapper):
     """An environment with the reward of a reward model, by the rules in the module's docstring.
 
     client: a RewardClient, which stays open; or a function that makes a client at the first reset, which ``close()``
-        closes. Pass a function if the environment runs in another process than the one that made it (AsyncVectorEnv)
+        closes. Pass a function if the environment will run in another process (AsyncVectorEnv)
     task: the task sentence, or a function that reads it from the info of each reset
 
     A step after an episode's end raises ResetNeeded. With ``gymnasium.wrappers.Autoreset`` among the wrappers of
     ``env``, this step begins a new episode instead, with reward 0. ``env`` must not reset in the last step.
 
-    Raises ValueError if ``options`` names a source of frames that ``env`` lacks, TypeError for a ``env`` that is no
+    Raises ValueError if ``options`` names a source of frames that ``env`` lacks, TypeError if ``env`` is no
     ``gymnasium.Env``.
     """
 
@@ -112,7 +111,6 @@ class RewardModelWrapper(gymnasium.Wrapper):
         super().close()
 
     def _begin(self, observation: Any, info: Info) -> Info:
-        """Begin an episode with its first frame; return the info with its scores."""
         if self._episode is not None:
             self._episode.end()
         task = self._task if isinstance(self._task, str) else self._task(info)
@@ -145,7 +143,6 @@ def check_kind(env: Any, kind: type[Any]) -> None:
 
 
 def _check_shows_its_end(info: Info) -> None:
-    """Raise InvalidSampleError for an environment that already shows its next episode."""
     found = [key for key in _ENDS if key in info]
     if found:
         expected = f"none of {', '.join(_ENDS)} from an environment that shows the last frame of its episode"

@@ -39,8 +39,8 @@ class RewardModelVectorWrapper(VectorWrapper):
 
     Raises ValueError if ``options`` names a source of frames that ``env`` lacks; for SAME_STEP with frames from
     ``render()``, which never shows an episode's last frame; and for ``terminate_on_success`` unless DISABLED, because
-    an environment that resets by itself does not know of the success. In the last two cases, wrap each sub-environment
-    in RewardModelWrapper instead. Raises TypeError for an ``env`` that is no ``gymnasium.vector.VectorEnv``.
+    an environment that resets by itself does not know of the success. In these two cases, wrap each sub-environment in
+    RewardModelWrapper instead. Raises TypeError if ``env`` is no ``gymnasium.vector.VectorEnv``.
     """
 
     def __init__(
@@ -117,7 +117,6 @@ class RewardModelVectorWrapper(VectorWrapper):
             raise ValueError(f"reset: expected none whose episode has ended, got {got}; {remedy}")
 
     def _check_can_step(self) -> None:
-        """Raise ResetNeeded if a step would not show the next frame of an episode."""
         if len(self._episodes) != self.num_envs:
             raise ResetNeeded("step: expected a reset of every environment before it")
         is_caller_s = self._autoreset_mode is AutoresetMode.DISABLED  # the caller resets
@@ -161,13 +160,11 @@ class RewardModelVectorWrapper(VectorWrapper):
         return stepped, fresh, final
 
     def _begin(self, index: int, frame: Any) -> RewardedEpisode:
-        """Begin an episode with its first frame."""
         self._episodes[index] = self._rewarder.begin(self._tasks[index], frame, index)
         self._whole[index] = True
         return self._episodes[index]
 
     def _shown(self, observations: Any) -> Sequence[Any]:
-        """The rendered frame, or the observation, of each environment."""
         if self._options.renders:
             shown = list(self.env.render() or ())
         else:

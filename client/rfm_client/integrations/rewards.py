@@ -133,10 +133,7 @@ class RewardedEpisode:
         self.succeeded = False
 
     def add(self, frame: Any) -> None:
-        """Add a copy of a frame, uint8 [H, W, 3], or of a dict by camera: the array may be drawn into again.
-
-        Raises InvalidSampleError.
-        """
+        """Add a copy of a frame, uint8 [H, W, 3], or of a dict of these by camera. Raises InvalidSampleError."""
         self.frames.append(self.frames.checked(frame, self._size))
 
     def collect(self) -> None:
@@ -163,7 +160,10 @@ class RewardedEpisode:
         self.frames.end()
 
     def learn(self, score: StepScore) -> None:
-        """Take over a score, unless a newer score is known. Raises ValueError if it lacks a required success."""
+        """Take over a score, unless a newer score is known.
+
+        Raises ValueError if ``terminate_on_success`` is set, but success is not predicted.
+        """
         if self.known is not None and score.step <= self.known.step:
             return
         rule = self._options.terminate_on_success
@@ -205,8 +205,7 @@ class EpisodeRewarder:
     def begin(self, task: str, frame: Any, index: int | None = None) -> RewardedEpisode:
         """Return a new episode with its first frame. Raises RewardError.
 
-        frame: as of ``RewardedEpisode.add``
-        index: number of its environment; None: the only environment
+        frame, index: as of RewardedEpisode
         """
         size = self._client.model_info(frames=True).frame_size if self._options.resize else None
         episode = RewardedEpisode(self._options, task, index, size)

@@ -133,7 +133,7 @@ class Hdf5Dataset(Dataset):
 
 
 def _demos_in(file: Path, opened: Any) -> dict[int, tuple[str, Any]]:
-    """Name and content of each demonstration, by number. Raises DatasetError."""
+    """Name and content of each demonstration, by number."""
     require(file, ALOHA_GROUP not in opened, "data/demo_0/obs/<camera>", ALOHA)
     group = opened.get("data")
     names = list(group) if hasattr(group, "keys") else []
@@ -144,7 +144,7 @@ def _demos_in(file: Path, opened: Any) -> dict[int, tuple[str, Any]]:
 
 
 def _cameras_in(file: Path, demos: Mapping[str, Any]) -> tuple[Sequence[str], Mapping[str, str]]:
-    """The cameras of all demonstrations, and the faults of other pictures. Raises DatasetError without any camera."""
+    """The cameras of all demonstrations, and the faults of other pictures."""
     observations = {name: demo.get("obs", {}) for name, demo in demos.items()}
     faults: dict[str, str] = {}
     for of_demo in observations.values():
@@ -193,14 +193,12 @@ def _is_picture(value: Any) -> bool:
 
 
 def _is_encoded(value: Any) -> bool:
-    """True if the observation holds a JPEG or PNG file for each step."""
     if len(value.shape) not in (1, 2) or not value.shape[0] or value.dtype.kind not in "OSVu":
         return False
     return bool(np.asarray(value[0]).tobytes().startswith(_ENCODED))
 
 
 def _notes(untold: Sequence[str], is_libero: bool) -> Sequence[str]:
-    """Notes on cameras without an orientation from the caller."""
     if is_libero and untold:
         why = "LIBERO stores its pictures upside down; --orient none leaves them"
         return [f"orient: {', '.join(untold)} {_LIBERO} ({why})"]

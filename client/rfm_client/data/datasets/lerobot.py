@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """LeRobot datasets v2.0 to v3.0, read without LeRobot. Needs pyarrow and PyAV.
 
-Frame t is the dataset's frame t. A video must have one frame for each row of its episodes, at the row's time, apart
-from an offset common to all rows. Otherwise it is refused, because the row of a frame is unknown.
+Frame t is the dataset's frame t. A video must have a frame for each row of its episodes, at the row's time plus an
+offset common to all rows. Otherwise it is refused, because the row of a frame is unknown.
 """
 
 from __future__ import annotations
@@ -120,7 +120,6 @@ class LeRobotDataset(Dataset):
 
     @cached_property
     def _in_video(self) -> Mapping[tuple[str, Path], Sequence[Entry]]:
-        """Episodes by camera and video file."""
         found: dict[tuple[str, Path], list[Entry]] = {}
         for entry in self._entries.values():
             for camera, (file, _) in entry.videos.items():
@@ -128,7 +127,7 @@ class LeRobotDataset(Dataset):
         return found
 
     def _read_video(self, camera: str, file: Path) -> tuple[Packets, Mapping[int, slice]]:
-        """The packets of a video and each episode's slice of its frames. Raises DatasetError if rows differ."""
+        """The packets of a video and each episode's slice of its frames."""
         entries = self._in_video[camera, file]
         parts = [(entry, entry.videos[camera][1] + self._rows.read(entry).times_s) for entry in entries]
         parts.sort(key=lambda part: float(part[1][0]))
@@ -157,7 +156,6 @@ class LeRobotDataset(Dataset):
         }
 
     def _images(self, episode: DatasetEpisode, camera: str) -> list[bytes]:
-        """The episode's images as stored: PNG or JPEG."""
         file = self._entries[episode.index].data_file
         stored = read_table(file, [camera], filters=[("episode_index", "=", episode.index)])[camera].to_pylist()
         require(f"{file}: {camera}", len(stored) == episode.num_frames, f"{episode.num_frames} images", len(stored))
@@ -189,7 +187,7 @@ def _decoded_image(where: str, image: bytes) -> UInt8Array:
 
 
 def _opened_image(where: str, image: bytes) -> Any:
-    """Open a picture and read only its header. Raises DatasetError unless it has 8-bit colours."""
+    """Open a picture of 8-bit colours, and read only its header."""
     _pillow()
     from PIL import Image, UnidentifiedImageError
 
@@ -205,7 +203,6 @@ def _opened_image(where: str, image: bytes) -> Any:
 
 
 def _pillow() -> str:
-    """Pillow with its version. Raises ImportError with the extra to install."""
     try:
         import PIL
     except ImportError as error:

@@ -61,7 +61,6 @@ def open_dataset(
 
 
 def _from_hub(name: str, revision: str | None, task: TaskOverride, orient: Orient) -> LeRobotDataset:
-    """Download a dataset at a commit, branch or tag; None: the main branch."""
     try:
         from huggingface_hub import snapshot_download
     except ImportError as error:

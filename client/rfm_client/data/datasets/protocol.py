@@ -118,8 +118,8 @@ class Dataset(ABC):
 def chosen_cameras(dataset: Dataset, names: Iterable[str]) -> tuple[str, ...]:
     """Return the dataset's cameras of these names; without names, all but depth cameras.
 
-    A name may omit LeRobot's ``observation.images.``. Raises DatasetError for an unknown camera, and without names if
-    all are depth cameras.
+    A name may omit LeRobot's ``observation.images.``. Raises DatasetError for an unknown camera, or if all
+    are depth cameras and none is named.
     """
     some = f"some of {', '.join(dataset.cameras)}"
     chosen = []
@@ -199,7 +199,7 @@ class TaskOverride:
         require("task", is_said or (self.text is None and not self.overrides), "a sentence", got)
 
     def of(self, where: object, own: object) -> str:
-        """Return the task of an episode; ``own`` is its own. Raises DatasetError if there is none, or it is no text."""
+        """Return the task of an episode; ``own`` is its own. Raises DatasetError without a task."""
         is_missing = not own or (isinstance(own, str) and not own.strip())
         if self.text is not None and (self.overrides or is_missing):
             return self.text

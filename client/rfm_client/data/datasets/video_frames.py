@@ -136,7 +136,6 @@ def _decoded(container: Any, span: Span) -> Iterator[Any]:
 
 
 def _within(span: Span, frames: Iterator[tuple[Any, bool]]) -> Iterator[tuple[Any, bool]]:
-    """The judged frames of the span. Raises DatasetError for a missing frame."""
     for t, time_s in enumerate(span.times_s.tolist()):
         found = next((each for each in frames if each[0].time > time_s - span.tolerance_s), None)
         if found is None or found[0].time > time_s + span.tolerance_s:
