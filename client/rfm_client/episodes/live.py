@@ -52,7 +52,7 @@ MOST_LETTERS = 2000  # of a text that a gateway takes
 LONGEST_PX = 256  # longer side of a reported frame
 
 About: TypeAlias = Mapping[str, Any]  # identity of an episode
-Entry: TypeAlias = tuple[About, Mapping[str, Any] | None]  # a step of it; None: it has ended
+Entry: TypeAlias = tuple[About, Mapping[str, Any] | None]  # its step; None: it has ended
 
 logger = logging.getLogger(__name__)
 

@@ -55,7 +55,7 @@ class RewardModelVectorWrapper(VectorWrapper):
         autoreset_mode = _checked_autoreset_mode(env, options)
         tasks = [task] * env.num_envs if isinstance(task, str) else list(task)
         require("task", len(tasks) == env.num_envs, f"one for each of the {env.num_envs} environments", len(tasks))
-        super().__init__(env)  # last: a refused wrapper must not close the environments when collected
+        super().__init__(env)  # after the checks: a refused wrapper must not close the environments when collected
         self._rewarder = EpisodeRewarder(client, options)
         self._options = options
         self._autoreset_mode = autoreset_mode

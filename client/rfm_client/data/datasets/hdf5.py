@@ -64,7 +64,7 @@ class Hdf5Dataset(Dataset):
             self.cameras, self.left_out = _cameras_in(file, dict(demos.values()))
             attributes = opened["data"].attrs
             is_libero = _is_libero(attributes)
-            is_upright = "opencv" in str(attributes.get("macros_image_convention"))  # robosuite renders so, upright
+            is_upright = "opencv" in str(attributes.get("macros_image_convention"))  # robosuite then renders upright
         defaults: dict[str, Orientation] = dict.fromkeys(self.cameras, _LIBERO) if is_libero and not is_upright else {}
         self.orientations = orientations_of(orient, self.cameras, defaults)
         untold = [camera for camera in self.cameras if orient.default is None and camera not in orient.cameras]

@@ -71,7 +71,7 @@ def _from_hub(name: str, revision: str | None, task: TaskOverride, orient: Orien
         raise DatasetError.at(name, "a local dataset or one of the Hub", str(error).splitlines()[0]) from error
     if not (folder / INFO_FILE).is_file():
         raise DatasetError.at(name, f"a LeRobot dataset's {INFO_FILE}", _unread(folder) or "none")
-    commit = folder.name  # names a folder in the Hub's cache
+    commit = folder.name  # the name of a snapshot's folder
     return LeRobotDataset(folder, source=name, revision=commit, task=task, orient=orient)
 
 
