@@ -17,7 +17,7 @@ from rfm.vlm.backbone import Renames, renamed
 from rfm.vlm.run_config import RunConfig
 
 TYPE = "robometer"  # the value of config.json's key ``type``
-BACKBONE = "vlm_config"  # the key of the backbone's configuration
+LEROBOT_BACKBONE = "vlm_config"  # the key of the backbone's configuration
 _NAMES: Renames = ((r"^model\.model\.", "model."),)
 _EMBEDDING, _TEXT_HEAD = "model.language_model.embed_tokens.weight", "model.lm_head.weight"
 # Keys of config.json that decide scores, by their section in the config.yaml of a Robometer run.
@@ -42,13 +42,13 @@ def is_lerobot(content: Mapping[str, Any]) -> bool:
     return content.get("type") == TYPE
 
 
-def run_config(content: Mapping[str, Any], file: Path) -> RunConfig:
+def lerobot_run(content: Mapping[str, Any], file: Path) -> RunConfig:
     """Return the settings in LeRobot's config.json. Raises CheckpointError for a missing, null or unknown key."""
-    known = {BACKBONE, _BINS, _LOSS, *_IDLE, *(key for keys in _DECIDING.values() for key in keys)}
+    known = {LEROBOT_BACKBONE, _BINS, _LOSS, *_IDLE, *(key for keys in _DECIDING.values() for key in keys)}
     if unknown := sorted(content.keys() - known):
         remedy = "if it changes no score, remove it"
         raise CheckpointError(f"{file}: expected the keys of LeRobot's Robometer, got {shown(unknown[0])}; {remedy}")
-    for key in (BACKBONE, *(key for key in _DECIDING["model"])):
+    for key in (LEROBOT_BACKBONE, *(key for key in _DECIDING["model"])):
         if content.get(key) is None:
             raise CheckpointError(f"{file}: {key}: expected a value, got none; save the model with LeRobot again")
     sections = {name: {key: content.get(key) for key in keys} for name, keys in _DECIDING.items()}
@@ -56,7 +56,7 @@ def run_config(content: Mapping[str, Any], file: Path) -> RunConfig:
     return RunConfig(file, NETWORK_CONFIG, {"training": {}, "peft": {}, **sections}, has_sections=False)
 
 
-def network_weights(tensors: Mapping[str, Tensor], backbone: Mapping[str, Any]) -> dict[str, Tensor]:
+def lerobot_weights(tensors: Mapping[str, Tensor], backbone: Mapping[str, Any]) -> dict[str, Tensor]:
     """Return the weights under the network's names.
 
     If text head and embedding are tied, LeRobot's file holds the tensor once, as the text head's.
