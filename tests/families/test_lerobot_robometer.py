@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: MIT
+"""Robometer as LeRobot publishes it: scores of LeRobot's own code, and checkpoints that are refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from reward_models import BASE, ROOT, Reference, references
+from rfm import families
+from rfm.checkpoint.content import CheckpointError
+from rfm.engine import Engine
+from rfm.vlm.lerobot import LEROBOT_BACKBONE
+from rfm_client import ProgressResult
+
+CASES = references("lerobot_robometer")
+CHECKPOINT = ROOT / "lerobot_robometer" / "tok_disc10" / "checkpoint"
+TOLERANCES = (1e-4, 2e-5)  # of logits and of answers, in float32; seen: 2e-6, 3e-7
+ROUNDED = 0.05  # of answers in bfloat16
+TOKENS = "model.lm_head.weight"
+
+Change = Callable[[dict[str, Any], dict[str, torch.Tensor]], Any]
+
+
+def check(results: list[Any], decoded: dict[str, Any], frames_per_value: int, tolerance: float) -> None:
+    for result, progress, success in zip(results, decoded["progress_pred"], decoded["success_probs"], strict=True):
+        assert isinstance(result, ProgressResult)
+        np.testing.assert_allclose(result.progress[::frames_per_value], progress, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(result.success[::frames_per_value], success, rtol=0, atol=tolerance)
+
+
+@pytest.mark.reference
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_scores_are_those_of_lerobot(case: Reference) -> None:
+    content, frames_per_value = case.content, 1 if case.summary["use_multi_image"] else 2
+    last, is_rounded = content.get("cropped_to_last"), case.summary["torch_dtype"] == "bfloat16"
+    engine = Engine.from_checkpoint(str(case.config / "checkpoint"), base_model=str(BASE))
+    results = engine.evaluate(case.samples(last))
+    if is_rounded:
+        rounded = Engine.from_checkpoint(str(case.config / "checkpoint"), base_model=str(BASE), dtype=torch.bfloat16)
+        check(rounded.evaluate(case.samples(last)), content["decoded"], frames_per_value, ROUNDED)
+        if "fp32_decoded" in content:
+            check(results, content["fp32_decoded"], frames_per_value, TOLERANCES[1])
+        return
+    check(results, content["decoded"], frames_per_value, TOLERANCES[1])
+    if "all_frames" in content:
+        check(engine.evaluate(case.samples()), content["all_frames"]["decoded"], frames_per_value, TOLERANCES[1])
+    if case.summary["progress_head_outputs"] > 1 and content["upstream_status"] == "ok":
+        for result, expected in zip(results, case.arrays["progress.progress_logits_A"], strict=True):
+            assert isinstance(result, ProgressResult)
+            assert result.progress_logits is not None
+            got = result.progress_logits[::frames_per_value]
+            np.testing.assert_allclose(got, expected[: len(got)], rtol=0, atol=TOLERANCES[0])
+
+
+def test_an_export_scores_the_same_and_every_setting_has_a_source(tmp_path: Path) -> None:
+    case = next(case for case in CASES if case.config == CHECKPOINT.parent)
+    checkpoint = families.load(CHECKPOINT, base_model=str(BASE))
+    checkpoint.save(tmp_path / "saved")
+    saved = Engine.from_checkpoint(str(tmp_path / "saved")).evaluate(case.samples())
+    for result, expected in zip(saved, Engine.of(checkpoint).evaluate(case.samples()), strict=True):
+        assert isinstance(result, ProgressResult)
+        assert isinstance(expected, ProgressResult)
+        np.testing.assert_array_equal(result.progress, expected.progress)
+    told = {decision.name: decision.source for decision in checkpoint.decisions()}
+    assert told["trained_frames"] == "config.json: max_frames"
+    assert told["frame_pooling" if checkpoint.config.pools_images else "multi_image"].startswith("config.json: ")
+    assumed = [decision.name for decision in checkpoint.decisions() if decision.is_assumed]
+    # the tests' own processor, and a prompt about pairs, which LeRobot does not score
+    assert assumed == ["base_model", "progress_in_preference"]
+
+
+def changed(tmp_path: Path, change: Change) -> Path:
+    folder = tmp_path / "checkpoint"
+    shutil.copytree(CHECKPOINT, folder)
+    config, weights = json.loads((folder / "config.json").read_text()), load_file(folder / "model.safetensors")
+    change(config, weights)
+    (folder / "config.json").write_text(json.dumps(config))
+    save_file(weights, folder / "model.safetensors")
+    return folder
+
+
+def text_config(config: dict[str, Any]) -> dict[str, Any]:
+    text: dict[str, Any] = config[LEROBOT_BACKBONE]["text_config"]
+    return text
+
+
+REFUSED: dict[str, tuple[Change, str]] = {
+    "an unknown key": (
+        lambda config, _: config.update(frame_stride=2),
+        "expected the keys of LeRobot's Robometer, got 'frame_stride'; if it changes no score, remove it",
+    ),
+    "a missing key": (
+        lambda config, _: config.pop("use_multi_image"),
+        "use_multi_image: expected a value, got none; save the model with LeRobot again",
+    ),
+    "no backbone": (lambda config, _: config.update(vlm_config=None), "vlm_config: expected a value, got none"),
+    "no theta": (
+        lambda config, _: text_config(config)["rope_parameters"].pop("rope_theta"),
+        "vlm_config: text_config.rope_theta: expected a number above 0, got None",
+    ),
+    "other bins": (
+        lambda config, _: config.update(progress_discrete_bins=5),
+        "progress_discrete_bins: expected 10 outputs, as progress_head has, got 5 with progress_loss_type discrete",
+    ),
+    "one number, by the file": (
+        lambda config, _: config.update(progress_loss_type="l2"),
+        "progress_discrete_bins: expected 10 outputs, as progress_head has, got 10 with progress_loss_type l2",
+    ),
+    "an unknown loss": (
+        lambda config, _: config.update(progress_loss_type="mse"),
+        "progress_loss_type: expected one of discrete, l1, l2, got 'mse'",
+    ),
+    "an unknown pooling": (lambda config, _: config.update(frame_pooling="max"), "frame_pooling: expected one of"),
+    "no frames": (lambda config, _: config.update(max_frames=0), "max_frames: expected a whole number of at least 1"),
+    "progress tokens with videos": (
+        lambda config, _: config.update(use_multi_image=False),
+        "use_multi_image with per-frame progress tokens: expected true, got false",
+    ),
+    "no progress head": (
+        lambda _, weights: [weights.pop(name) for name in [*weights] if name.startswith("progress_head")],
+        "expected reward heads, got no progress_head.4.weight",
+    ),
+    "half a head": (lambda _, weights: weights.pop("success_head.0.weight"), "missing keys"),
+    "no embedding": (lambda _, weights: weights.pop(TOKENS), "embed_tokens"),
+    "untied, without the embedding": (
+        lambda config, _: config[LEROBOT_BACKBONE].update(tie_word_embeddings=False),
+        "embed_tokens",
+    ),
+}
+
+
+@pytest.mark.parametrize("change, message", REFUSED.values(), ids=REFUSED)
+def test_a_checkpoint_that_does_not_say_all_is_refused(tmp_path: Path, change: Change, message: str) -> None:
+    with pytest.raises(CheckpointError) as refusal:
+        families.load(changed(tmp_path, change), base_model=str(BASE))
+    assert message in str(refusal.value)
+
+
+def test_the_theta_of_the_rotation_is_the_file_s(tmp_path: Path) -> None:
+    folder = changed(tmp_path, lambda config, _: text_config(config)["rope_parameters"].update(rope_theta=20_000.0))
+    assert families.load(folder, base_model=str(BASE)).config.backbone["text_config"]["rope_theta"] == 20_000.0
+
+
+def test_of_untied_weights_the_embedding_is_read(tmp_path: Path) -> None:
+    name = "model.model.language_model.embed_tokens.weight"
+
+    def untie(config: dict[str, Any], weights: dict[str, torch.Tensor]) -> None:
+        weights[name] = weights[TOKENS].clone()
+        weights[TOKENS] = torch.zeros_like(weights[TOKENS])
+        config[LEROBOT_BACKBONE]["tie_word_embeddings"] = False
+
+    case = next(case for case in CASES if case.config == CHECKPOINT.parent)
+    engine = Engine.from_checkpoint(str(changed(tmp_path, untie)), base_model=str(BASE))
+    check(engine.evaluate(case.samples(case.content.get("cropped_to_last"))), case.content["decoded"], 1, TOLERANCES[1])
