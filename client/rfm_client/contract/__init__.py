@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What client and server share: samples, results, errors, names, and the tensors in which they travel."""
+"""Samples, results, errors, names and tensors that client and server share."""
 
 from rfm_client.contract.errors import (
     AccessDeniedError,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where a server is, and the certificates of one: URLs, addresses of this machine, PEM files."""
+"""Checks of a server's URL, address and certificate files (PEM)."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _PORTS = {"grpc": 8001, "http": 8000}
 
 
 def split_url(url: str) -> tuple[str, str]:
-    """The parts of a URL: ``grpc``, ``http``, ``grpcs`` or ``https``, and ``host:port``. Raises ValueError.
+    """Return the scheme (``grpc``, ``http``, ``grpcs`` or ``https``) and ``host:port`` of a URL. Raises ValueError.
 
-    ``dns:///host:port``, as gRPC writes it, is ``grpc://host:port``. An IPv6 address stands in brackets.
+    ``dns:///host:port``, gRPC's own form, means ``grpc://host:port``. An IPv6 address needs brackets.
     """
     scheme, _, address = url.rstrip("/").partition("://")
     for host, port in (address.rpartition(":")[::2], (address, str(_PORTS.get(scheme.removesuffix("s"), 8000)))):
@@ -32,12 +32,12 @@ def split_url(url: str) -> tuple[str, str]:
 
 
 def host_of(address: str) -> str:
-    """The host of ``host:port``; an IPv6 address without its brackets."""
+    """Return the host of ``host:port``, an IPv6 address without its brackets."""
     return address.rpartition(":")[0].strip("[]")
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address is of this machine alone; of names only ``localhost`` is."""
+    """True if the host is a loopback address or the name ``localhost``. Resolves no names."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -52,12 +52,12 @@ def _is_ipv6(host: str) -> bool:
 
 
 def check_certificate(certificate: str | Path, key: str | Path, where: str) -> None:
-    """Raises ValueError (``where: ...``) unless a server could serve with these files."""
+    """Raise ValueError (``where: ...``) unless a server can serve with this certificate and key (PEM)."""
     load_certificate(ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), certificate, key, where)
 
 
 def check_authorities(file: str | Path, where: str) -> None:
-    """Raises ValueError (``where: ...``) unless certificates can be judged by those in the file."""
+    """Raise ValueError (``where: ...``) unless the file holds certificates of authorities (PEM)."""
     try:
         ssl.create_default_context(cafile=file)
     except OSError as error:
@@ -65,9 +65,9 @@ def check_authorities(file: str | Path, where: str) -> None:
 
 
 def load_certificate(context: ssl.SSLContext, certificate: str | Path, key: str | Path, where: str) -> None:
-    """Raises ValueError (``where: ...``) unless the context can use these files."""
+    """Load a certificate and its key (PEM) into the context. Raises ValueError (``where: ...``)."""
     try:
-        context.load_cert_chain(certificate, key, password="")  # no password: OpenSSL must not prompt for one
+        context.load_cert_chain(certificate, key, password="")  # else OpenSSL prompts for a password
     except OSError as error:
         expected = f"a certificate and its key (PEM, unencrypted) at {certificate} and {key}"
         raise ValueError(f"{where}: expected {expected}, got: {_reason(error)}") from None

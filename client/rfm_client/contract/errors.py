@@ -1,28 +1,27 @@
 # SPDX-License-Identifier: MIT
-"""What can go wrong when asking for a reward.
+"""Errors of a call to the server.
 
     RewardError
-    +-- InvalidSampleError        the sample is at fault; sending it again gives the same answer
-    +-- ServerError               the server is at fault, or cannot be reached
-        +-- ServerUnavailableError    no connection, not ready, or its queue is full
-            +-- ProcessEndedError     a process, or the connection, has ended, perhaps because of this request
-        +-- DeadlineExceededError     no answer within the time that the caller gave
-        +-- ModelNotFoundError        the server does not serve a model of that name
-        +-- AccessDeniedError         server and client do not trust each other: certificate, key, or TLS on one side
-        +-- InferenceFailedError      the server tried and failed; its log has the reason
+    +-- InvalidSampleError        the sample is at fault; a retry gives the same answer
+    +-- ServerError               the server is at fault or unreachable
+        +-- ServerUnavailableError    no connection, not ready, or a full queue
+            +-- ProcessEndedError     a process or the connection ended, perhaps because of this request
+        +-- DeadlineExceededError     no answer within the caller's time limit
+        +-- ModelNotFoundError        the server does not serve this model
+        +-- AccessDeniedError         client and server disagree on certificate, key or TLS
+        +-- InferenceFailedError      the server failed (see its log), or its answer is invalid
 
-No error is ever replaced by a number.
+An error never becomes a number.
 """
 
 from __future__ import annotations
 
 
 class RewardError(Exception):
-    """Base of every error that this library raises.
+    """Base of this library's own errors.
 
-    request_id: the id of the failed request in the server's log, at the end of the message; None: none was sent
-    may_have_ended_server: a process of the model had ended, or the connection ended under the request, which may be
-        why
+    request_id: id of the failed request in the server's log, appended to the message; None: no request was sent
+    may_have_ended_server: True if a model process or the connection ended, perhaps because of the request
     """
 
     request_id: str | None = None
@@ -30,7 +29,7 @@ class RewardError(Exception):
 
     @property
     def message(self) -> str:
-        """What is wrong, without the request's id."""
+        """Description of the error, without the request's id."""
         return super().__str__()
 
     def __str__(self) -> str:
@@ -38,30 +37,30 @@ class RewardError(Exception):
 
 
 class InvalidSampleError(RewardError, ValueError):
-    """A sample that cannot be scored, reported as ``where: expected X, got Y``."""
+    """An invalid sample, reported as ``where: expected X, got Y``."""
 
     @classmethod
     def at(cls, where: str, expected: str, got: str) -> InvalidSampleError:
-        """The error at the field ``where``."""
+        """Return the error at the field ``where``."""
         return cls(f"{where}: expected {expected}, got {got}")
 
     def inside(self, where: str) -> InvalidSampleError:
-        """The same error, seen from the object that holds the field: ``where.field: ...``."""
+        """Return the error with the name of the object around its field: ``where.field: ...``."""
         located = type(self)(f"{where}.{self.message}")
         located.request_id = self.request_id
         return located
 
 
 class ServerError(RewardError):
-    """The server did not answer as it should; the sample may be fine."""
+    """A failure of the server or of the connection to it; the sample may be valid."""
 
 
 class ServerUnavailableError(ServerError):
-    """The server cannot be reached, is not ready, or refuses more work for now."""
+    """A server that is unreachable, is not ready, or refuses more requests for now."""
 
 
 class ProcessEndedError(ServerUnavailableError):
-    """A process of the model had ended when the request reached it, or it or the connection ended under the request."""
+    """A model process had ended when the request arrived, or it or the connection ended during the request."""
 
     may_have_ended_server = True
 
@@ -71,12 +70,12 @@ class DeadlineExceededError(ServerError, TimeoutError):
 
 
 class ModelNotFoundError(ServerError):
-    """The server does not serve the requested model."""
+    """A model that the server does not serve."""
 
 
 class AccessDeniedError(ServerError):
-    """One side refuses the other: a certificate or key is missing or another, or only one of them speaks TLS."""
+    """One side refuses the other: a missing or wrong certificate or key, or TLS on one side only."""
 
 
 class InferenceFailedError(ServerError):
-    """The server failed while scoring; its log names the reason."""
+    """A failure of the server at a request (its log has the reason), or an invalid answer."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Frames that are named by a digest of what they show, so that pixels which the server knows need not be sent again."""
+"""Frame references: digests sent in place of frames whose features the server keeps."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy as np
 from rfm_client.contract.errors import InvalidSampleError
 from rfm_client.contract.samples import UInt8Array, check_frame_steps, check_task
 
-DIGEST_BYTES = 32  # of SHA-256: nobody can make two frames of one digest
+DIGEST_BYTES = 32  # of SHA-256, which excludes two frames of one digest, even by intent
 
 
 def frame_digest(frame: UInt8Array) -> bytes:
-    """The digest of a frame, uint8 [H, W, 3]: SHA-256 of H and W, each as 4 bytes, the lowest first, and the pixels."""
+    """Return the SHA-256 of a frame, uint8 [H, W, 3]: of H and W (4 bytes each, little-endian), then the pixels."""
     digest = hashlib.sha256(np.array(frame.shape[:2], "<u4").tobytes())
     digest.update(np.ascontiguousarray(frame).data)
     return digest.digest()
@@ -24,10 +24,10 @@ def frame_digest(frame: UInt8Array) -> bytes:
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryRefs:
-    """A trajectory whose frames are named.
+    """A trajectory with frame references.
 
-    digests: of each frame
-    pixels: uint8 [H, W, 3] by digest, which the receiver has computed; frames of other trajectories may be among them
+    digests: digest of each frame, DIGEST_BYTES long
+    pixels: frames, uint8 [H, W, 3], by digests that the receiver computed. Other trajectories' frames may be among them
     """
 
     digests: tuple[bytes, ...]
@@ -41,21 +41,21 @@ class TrajectoryRefs:
 
     @classmethod
     def of(cls, frames: UInt8Array, task: str) -> TrajectoryRefs:
-        """The trajectory of the frames [T, H, W, 3], all of which are at hand."""
+        """Return the trajectory of frames, uint8 [T, H, W, 3], with all pixels."""
         digests = tuple(map(frame_digest, frames))
         return cls(digests, dict(zip(digests, frames, strict=True)), task)
 
 
 @dataclass(frozen=True, eq=False)
 class EncoderSampleRefs:
-    """The trajectories of one sample, for an encoder, with named frames."""
+    """An ``EncoderSample`` whose trajectories have frame references."""
 
     trajectories: tuple[TrajectoryRefs, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class ProgressSampleRefs:
-    """A ``ProgressSample`` of a trajectory with named frames. Raises InvalidSampleError."""
+    """A ``ProgressSample`` whose trajectory has frame references. Raises InvalidSampleError."""
 
     trajectory: TrajectoryRefs
     frame_steps: int = 0
@@ -68,5 +68,5 @@ class ProgressSampleRefs:
 
     @property
     def trajectories(self) -> tuple[TrajectoryRefs, ...]:
-        """The trajectory alone, as of any sample."""
+        """The trajectory in a tuple, as other samples have theirs."""
         return (self.trajectory,)

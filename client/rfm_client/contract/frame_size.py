@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""To what size a served checkpoint brings frames."""
+"""Size to which a served checkpoint resizes frames."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _TEXT = re.compile(r"(?:(shortest|longest) ([1-9][0-9]*))|(?:(exact) ([1-9][0-9]
 
 @dataclass(frozen=True)
 class FrameSize:
-    """The size to which a served checkpoint brings every frame before it reads it.
+    """The size to which a served checkpoint resizes every frame.
 
-    rule: ``shortest``, as ReWiND's encoders: that edge to so many pixels, the other in proportion, rounded down;
-        ``longest``, as SmolVLM: that edge, the other in proportion and even;
-        ``exact``: height and width
-    edges_px: (px,), or (height, width) of ``exact``
+    rule: ``shortest`` (ReWiND's encoders): the shorter edge becomes px pixels, the other in proportion, rounded down;
+        ``longest`` (SmolVLM): the longer edge becomes px pixels, the other in proportion and even;
+        ``exact``: the frame gets this height and width
+    edges_px: (px,), or (height, width) for ``exact``
     """
 
     rule: Rule
@@ -28,9 +28,7 @@ class FrameSize:
 
     @classmethod
     def parse(cls, text: str) -> FrameSize:
-        """The size that ``shortest 256``, ``longest 512`` or ``exact 224x320`` names, as ``str`` writes it. Raises
-        ValueError.
-        """
+        """Parse ``shortest 256``, ``longest 512`` or ``exact 224x320``, as ``str`` writes them. Raises ValueError."""
         match = _TEXT.fullmatch(text)
         if match is None:
             raise ValueError(f"frame_size: expected {_FORMS}, got {text!r}")
@@ -41,14 +39,14 @@ class FrameSize:
         return f"{self.rule} {'x'.join(map(str, self.edges_px))}"
 
     def fitted(self, height: int, width: int) -> tuple[int, int]:
-        """Height and width to which frames of this size are brought; never larger, so the server does the enlarging."""
+        """Return (height, width) to shrink frames of this size to; never larger, since the server enlarges frames."""
         if self.rule == "exact":
             return min(height, self.edges_px[0]), min(width, self.edges_px[1])
         (px,) = self.edges_px
         edge = min(height, width) if self.rule == "shortest" else max(height, width)
         if edge <= px:
             return height, width
-        # The same expressions as the server's: with other rounding the server would resize once more.
+        # The server's own expressions: after other rounding it would resize again.
         if self.rule == "shortest":
             other = int(px * max(height, width) / edge)
             return (px, other) if height <= width else (other, px)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Addresses that a server listens at: how a URL writes them, and whether one is free."""
+"""Listen addresses of a server: their form in a URL, and a check for a free port."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import socket
 
 
 def in_url(host: str) -> str:
-    """The address as a URL writes it: IPv6 in brackets."""
+    """Return the host as a URL writes it: IPv6 in brackets."""
     return f"[{host}]" if ":" in host else host
 
 
 def from_here(host: str) -> str:
-    """The address at which this machine itself reaches a server that listens at ``host``."""
+    """Return the address by which this machine reaches a server that listens at ``host``."""
     return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
 
 
 def check_free(host: str, port: int, where: str, *, port_option: str, host_option: str = "--host") -> None:
-    """Raises ValueError (``where: ...``) unless a server could listen there; it ends in the option to change."""
+    """Raise ValueError (``where: ...``) unless a server can listen there. The message names the option to change."""
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         socket.create_server((host, port), family=family).close()

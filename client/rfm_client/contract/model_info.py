@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a server says of a model before the first sample: its limits, and the widths that it reads."""
+"""A server's description of a model: limits, input widths, origin."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import Any
 from rfm_client.contract import wire
 from rfm_client.contract.frame_size import FrameSize
 
-MAX_FRAMES_PARAMETER = "max_frames"  # parameters of config.pbtxt; empty: no limit
+MAX_FRAMES_PARAMETER = "max_frames"  # parameters of config.pbtxt; empty: unknown
 FRAME_SIZE_PARAMETER = "frame_size"
 FRAMES_PER_VALUE_PARAMETER = "frames_per_value"
-TRAINED_PADDING_PARAMETER = "trained_padding"  # "false", or anything else for true
+TRAINED_PADDING_PARAMETER = "trained_padding"  # "false"; any other value: true
 SOURCE_PARAMETER = "source"
 REVISION_PARAMETER = "revision"
 DIGEST_PARAMETER = "weights_digest"
@@ -27,25 +27,23 @@ RUN_CONFIG_PARAMETER = "run_config"
 class ModelInfo:
     """A served model.
 
-    versions: those that its configuration asks the server to serve; empty: the latest
-    max_batch_size: most samples of one request
-    by_digest: whether it keeps what it made of frames, and takes their digests in place of pixels
-    instances: of the model that one server runs; 0: of an ensemble, whose parts have them
-    max_frames: the most frames of a trajectory in training; if the checkpoint does not say, the most that its network
-        takes; None: neither is known
-    trained_padding: training padded shorter trajectories with their last frame, as upstream's does; True also of a
-        checkpoint that does not say
-    frame_size: to what the checkpoint brings each frame; None: that depends on the frame
-    video_dim, text_dim: widths D and Dt of the embeddings; None: it reads raw frames
-    progress_bins: K of a discrete checkpoint; None: continuous
-    frames_per_value: frames that share their scores; 2 where a vision-language model sees a trajectory as a video
-    source: which checkpoint was exported: its Hub id, or the end of its path; None: it does not say
-    revision: the commit of the Hub that was exported; None: it was a folder
-    weights_digest: 16 hex digits, a digest of the exported weights; None: the server does not say
-    settings_digest: 16 hex digits, a digest of what else decides scores: the files beside the weights (configuration,
-        tokenizer, image processor), the dtype and the kind of device; None: the server does not say
-    network: its class, its configuration (config), and how many numbers each part of it has (parameters)
-    run_config: config.yaml of the training run, without secrets; empty: the checkpoint had none
+    versions: versions that its configuration asks the server to serve; empty: the latest
+    max_batch_size: most samples in a request
+    by_digest: True if the model keeps features of frames, and takes digests in place of these frames
+    instances: number of instances on a server; 0 for an ensemble, whose parts have the instances
+    max_frames: most frames of a trajectory, in training or for the network, the smaller number; None: both unknown
+    trained_padding: True if training padded shorter trajectories with their last frame, as upstream does, or if unknown
+    frame_size: size to which the checkpoint resizes frames; None: it depends on the frame
+    video_dim, text_dim: widths D and Dt of embeddings that the model reads, or writes as an encoder; None: neither
+    progress_bins: number K of progress bins of a discrete checkpoint; None: continuous
+    frames_per_value: consecutive frames that share a score; 2 if a vision-language model reads trajectories as videos
+    source: Hub id of the exported checkpoint, or the end of its path; None: unknown
+    revision: exported commit of the Hub; None: the checkpoint was a folder
+    weights_digest: 16 hex digits, digest of the exported weights; None: unknown
+    settings_digest: 16 hex digits, digest of all else that decides scores: the files beside the weights (configuration,
+        tokenizer, image processor), the dtype and the kind of device; None: unknown
+    network: ``class``, ``config``, and the number of weights of each part (``parameters``)
+    run_config: config.yaml of the training run, without secrets; empty: the checkpoint has none
     """
 
     name: str
@@ -69,14 +67,14 @@ class ModelInfo:
 
     @property
     def widths(self) -> tuple[int, int] | None:
-        """D and Dt of the embeddings that it reads; None: it reads raw frames."""
+        """``video_dim`` and ``text_dim``; None: the model reads raw frames and writes scores."""
         return None if self.video_dim is None or self.text_dim is None else (self.video_dim, self.text_dim)
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> ModelInfo:
-        """What Triton's model configuration, as its HTTP API writes it, says of the model.
+        """Read Triton's model configuration, in the form of its HTTP API.
 
-        Raises ValueError, LookupError or TypeError for a configuration that is not one of ours.
+        Raises ValueError, LookupError or TypeError for a model that this project did not export.
         """
         last_dims = {tensor["name"]: int(tensor["dims"][-1]) for tensor in (*config["input"], *config["output"])}
         parameters = {name: value.get("string_value", "") for name, value in config.get("parameters", {}).items()}
@@ -106,5 +104,5 @@ class ModelInfo:
 
 
 def _num_instances(group: Mapping[str, Any]) -> int:
-    """Instances of one group of a configuration: so many on each of its GPUs, or on the CPU."""
+    """Instances of a group: ``count`` on each of its GPUs, or on the CPU."""
     return int(group.get("count", 1)) * max(len(group.get("gpus", [])), 1)

@@ -1,25 +1,25 @@
 # SPDX-License-Identifier: MIT
-"""Names of models, requests and variables on which client and server agree."""
+"""Names of models, requests and environment variables that client and server share."""
 
 from __future__ import annotations
 
 from typing import Literal, TypeAlias
 
-Part: TypeAlias = Literal["embeddings", "encoder", "frames"]  # of a served checkpoint: a model each
+Part: TypeAlias = Literal["embeddings", "encoder", "frames"]  # models of a served checkpoint
 
-DEFAULT_MODEL = "rfm"  # scores embeddings; the names of the others are made from it
+DEFAULT_MODEL = "rfm"  # scores embeddings; the names of the other models derive from it
 
-PROBE_PREFIX = "rfm-probe"  # of the request ids of health probes; a model does not count those for a blank sample
+PROBE_PREFIX = "rfm-probe"  # of the request ids of probes, which a model's metrics leave out
 
 ADMIN_KEY_VARIABLE = "RFM_ADMIN_KEY"
 GATEWAY_KEY_VARIABLE = "RFM_GATEWAY_API_KEY"
 
 
 def encoder_name(model: str) -> str:
-    """Name of the model that turns frames into the embeddings that ``model`` scores."""
+    """Return the name of the encoder whose embeddings ``model`` scores."""
     return f"{model}_encoder"
 
 
 def frames_name(model: str) -> str:
-    """Name of the model that scores raw frames, beside ``model``, which scores embeddings."""
+    """Return the name of the model that scores raw frames, beside ``model`` for embeddings."""
     return f"{model}_frames"

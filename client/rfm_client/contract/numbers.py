@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Numbers that callers give, checked: Python's or numpy's, and no bool, text or NaN. Each raises ValueError."""
+"""Checks of numbers from callers: Python's or numpy's, but no bool, text or NaN."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 def checked_count(where: str, value: Any, *, least: int = 1) -> int:
-    """A whole number, at least ``least``."""
+    """Return a whole number of at least ``least``. Raises ValueError."""
     if not isinstance(value, numbers.Integral) or isinstance(value, bool):
         raise ValueError(f"{where}: expected a whole number, got {value!r}")
     if value < least:
@@ -18,21 +18,21 @@ def checked_count(where: str, value: Any, *, least: int = 1) -> int:
 
 
 def checked_finite(where: str, value: Any, expected: str = "a number") -> float:
-    """A number that is neither infinite nor NaN. expected: what the error says"""
+    """Return a finite number. Raises ValueError, whose message says ``expected``."""
     if not isinstance(value, numbers.Real) or isinstance(value, bool) or not math.isfinite(value):
         raise ValueError(f"{where}: expected {expected}, got {_shown(value)}")
     return float(value)
 
 
 def checked_positive(where: str, value: Any, expected: str = "a number above 0", *, most: float = math.inf) -> float:
-    """A number above 0, at most ``most``. expected: what the error says"""
+    """Return a number above 0 and at most ``most``. Raises ValueError, whose message says ``expected``."""
     if not 0 < checked_finite(where, value, expected) <= most:
         raise ValueError(f"{where}: expected {expected}, got {_shown(value)}")
     return float(value)
 
 
 def checked_share(where: str, value: Any) -> float:
-    """A number from 0 to 1."""
+    """Return a number from 0 to 1. Raises ValueError."""
     expected = "a number from 0 to 1"
     number = checked_finite(where, value, expected)
     if not 0 <= number <= 1:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Which calls go through a proxy that the environment names. Those to this machine go through none.
+"""Proxies that the environment names. Calls to this machine use none.
 
-To other hosts gRPC and urllib decide, each by its own variables. What is here only says what they decide, for errors.
-The client's HTTP transport takes no proxy.
+For other hosts gRPC and urllib decide, each by its own variables. This module repeats their rules for error messages.
+The client's HTTP transport uses no proxy.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from urllib.parse import urlsplit
 
 from rfm_client.contract.addresses import host_of, is_loopback
 
-_OF_GRPC = ("grpc_proxy", "https_proxy", "http_proxy")  # the first that is set counts, also if it is empty
+_OF_GRPC = ("grpc_proxy", "https_proxy", "http_proxy")  # the first that is set counts, even if empty
 _NOT_OF_GRPC = ("no_grpc_proxy", "no_proxy")
 _CREDENTIALS = re.compile(r"[^/@]*@")
 
 
 def grpc_proxy(address: str) -> str | None:
-    """The variable and the value by which gRPC goes to ``host:port`` through a proxy; None: it goes there itself."""
+    """Return ``VARIABLE=VALUE`` of the proxy that gRPC uses for ``host:port``, without a password; None: no proxy."""
     host = host_of(address)
     name = next((name for name in _OF_GRPC if name in os.environ), None)
     if name is None or not os.environ[name] or is_loopback(host):
@@ -34,10 +34,10 @@ def grpc_proxy(address: str) -> str | None:
 
 
 def open_url(url: str, timeout_s: float) -> Any:
-    """The open response of an HTTP server. Raises OSError, HTTPException."""
+    """Open the URL and return the response. Raises OSError or HTTPException."""
     scheme, host = urlsplit(url).scheme, urlsplit(url).hostname or ""
     proxies = urllib.request.ProxyHandler({} if is_loopback(host) else None)
-    try:  # with an opener of its own: that of urlopen keeps the proxies of its first call
+    try:  # a new opener, since urlopen keeps the proxies of its first call
         return urllib.request.build_opener(proxies).open(url, timeout=timeout_s)
     except OSError as error:
         proxy = urllib.request.getproxies().get(scheme)
@@ -47,7 +47,7 @@ def open_url(url: str, timeout_s: float) -> Any:
 
 
 def _matches(host: str, entry: str) -> bool:
-    """Whether an entry of no_proxy names the host, as gRPC reads it: the end of a name, or a network (CIDR)."""
+    """True if an entry of no_proxy names the host by gRPC's rules: the end of a name, or a network (CIDR)."""
     if host.lower().endswith(entry.lower()):
         return True
     try:
@@ -57,5 +57,5 @@ def _matches(host: str, entry: str) -> bool:
 
 
 def _shown(name: str, value: str) -> str:
-    """The variable as an error shows it, without a password."""
+    """``VARIABLE=VALUE`` for an error message, without the password."""
     return f"{name}={_CREDENTIALS.sub('***@', value)}"

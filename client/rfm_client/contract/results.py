@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Results: what a reward model answers. T frames, K progress bins."""
+"""Results of a reward model. T frames, K progress bins."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from rfm_client.contract.numbers import checked_count, checked_share
 from rfm_client.contract.samples import Float32Array
 
 SUCCESS_THRESHOLD = 0.5
-EVEN = 0.5  # the preference for neither of two trajectories
+EVEN = 0.5  # preference for neither trajectory
 
 
 @dataclass(frozen=True)
 class BatchTiming:
-    """Milliseconds that the server spent on the batch in which a sample was scored."""
+    """Milliseconds that the server spent on the batch of a sample."""
 
     collate_ms: float
     forward_ms: float
@@ -31,8 +31,8 @@ class FrameScores:
 
     progress: float32 [T], share of the task done, 0..1
     success: float32 [T], probability that the task is done; NaN throughout: the checkpoint does not predict it
-    progress_logits: float32 [T, K], raw scores of the progress bins; only of discrete checkpoints, on request
-    frame_indices: int64 [T], which frames of the trajectory were scored; None: all of them
+    progress_logits: float32 [T, K], raw scores of the progress bins, on request, from discrete checkpoints only
+    frame_indices: int64 [T], indices of the scored frames in the trajectory; None: all frames
     """
 
     progress: Float32Array
@@ -47,7 +47,7 @@ class FrameScores:
 
     @property
     def progress_deltas(self) -> Float32Array:
-        """float32 [T], how far each scored frame has come since the one before; 0 for the first.
+        """float32 [T], change of progress since the previous scored frame; 0 for the first.
 
         Raises ValueError if the checkpoint does not predict progress.
         """
@@ -55,9 +55,9 @@ class FrameScores:
         return np.diff(progress, prepend=progress[:1])
 
     def succeeded(self, *, last: int = 1, threshold: float = SUCCESS_THRESHOLD) -> bool:
-        """Whether more than half of the ``last`` frames (all, if there are fewer) reach the probability ``threshold``.
+        """True if success reaches ``threshold`` at more than half of the ``last`` frames (all, if there are fewer).
 
-        Raises ValueError if the checkpoint does not predict success, or for a threshold outside 0..1.
+        Raises ValueError if the checkpoint does not predict success, for a ``threshold`` outside 0..1 or ``last`` < 1.
         """
         newest = _known("success", self.success)[-checked_count("last", last) :]
         votes = newest >= checked_share("threshold", threshold)
@@ -68,7 +68,7 @@ class FrameScores:
 class ProgressResult(FrameScores):
     """Answer to a ProgressSample: the scores of its trajectory's frames.
 
-    model_version: which version of the checkpoint answered
+    model_version: version of the checkpoint that answered
     """
 
     timing: BatchTiming | None = None
@@ -79,11 +79,10 @@ class ProgressResult(FrameScores):
 class PreferenceResult:
     """Answer to a PreferenceSample: the probability that ``first`` is preferred, and each frame's scores.
 
-    preference: of both orders, if both were asked, the mean
-    first, second: scores of the order (first, second)
-    timing: of that order
-    both_orders: the probability that ``first`` is preferred as told in the order (first, second) and in the order
-        (second, first); None: only the former was asked
+    preference: if both orders were asked, their mean
+    first, second, timing: from the order (first, second)
+    both_orders: probability that ``first`` is preferred, from the order (first, second) and from (second, first);
+        None: only the order (first, second) was asked
     """
 
     preference: float
@@ -95,9 +94,9 @@ class PreferenceResult:
 
     @classmethod
     def of_both_orders(cls, asked: PreferenceResult, swapped: PreferenceResult) -> PreferenceResult:
-        """One result of the answers to a sample and to its ``swapped``.
+        """Return one result from the answers to a sample and to its ``swapped``.
 
-        Raises InferenceFailedError if two versions of the checkpoint gave them.
+        Raises InferenceFailedError if two versions of the checkpoint answered.
         """
         if asked.model_version != swapped.model_version:
             got = f"{asked.model_version}, {swapped.model_version}"
@@ -107,18 +106,18 @@ class PreferenceResult:
 
     @property
     def orders_agree(self) -> bool | None:
-        """Whether both orders prefer the same trajectory, or both none (exactly 0.5); None if only one was asked."""
+        """True if both orders prefer the same trajectory, or both neither (exactly 0.5); None: one order was asked."""
         return None if self.both_orders is None else len(set(map(_preferred, self.both_orders))) == 1
 
     @property
     def verdict(self) -> Literal["first", "second"] | None:
-        """The preferred trajectory; None if the orders disagree, or if the preference is exactly 0.5."""
+        """The preferred trajectory; None: the orders disagree, or the preference is exactly 0.5."""
         return None if self.orders_agree is False else _preferred(self.preference)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimilarityResult:
-    """Answer to a SimilaritySample: the model's raw similarity score (unbounded), and each frame's scores."""
+    """Answer to a SimilaritySample: the raw, unbounded similarity score, and each frame's scores."""
 
     similarity: float
     reference: FrameScores

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Samples: what a reward model scores.
+"""Samples: questions to a reward model.
 
-Shapes: T frames, H x W pixels, D width of a frame embedding, Dt width of a text embedding.
-Arrays are checked once, here; everything behind trusts them.
+Letters: T frames, H x W pixels, D width of a frame embedding, Dt width of a text embedding.
+Samples check their arrays once, here; all other code relies on it.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from rfm_client.contract.errors import InvalidSampleError
 Float32Array: TypeAlias = npt.NDArray[np.float32]
 UInt8Array: TypeAlias = npt.NDArray[np.uint8]
 
-MIN_FRAME_STEPS = 2  # a prefix of the trajectory sampled to one frame would not be a trajectory
-MAX_FRAME_STEPS = 4096  # more samples of a prefix than any checkpoint takes
+MIN_FRAME_STEPS = 2  # a prefix sampled to a single frame is no trajectory
+MAX_FRAME_STEPS = 4096  # more frames than any checkpoint takes
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Trajectory:
-    """The frames, or precomputed frame embeddings, of one episode, and its task.
+    """The frames of one episode, or their embeddings, and its task.
 
     frames: uint8 [T, H, W, 3], RGB
-    video_embeddings: float32 [T, D]
-    text_embedding: float32 [Dt], embedding of the task; goes with video_embeddings
-    task: the task as a sentence; goes with frames
+    video_embeddings: float32 [T, D], in place of ``frames``
+    text_embedding: float32 [Dt], embedding of the task, for ``video_embeddings``
+    task: a sentence, for ``frames``
 
-    Exactly one of ``frames`` and ``video_embeddings`` is given. Raises InvalidSampleError.
+    Raises InvalidSampleError.
     """
 
     frames: UInt8Array | None = None
@@ -58,16 +58,16 @@ class Trajectory:
             object.__setattr__(self, "text_embedding", text)
 
     def __repr__(self) -> str:
-        """The trajectory with shapes in place of values, which would fill pages."""
+        """The trajectory with shapes in place of values."""
         arrays = {"frames": self.frames, "video_embeddings": self.video_embeddings, "text": self.text_embedding}
         shapes = [f"{name}={array.dtype} {list(array.shape)}" for name, array in arrays.items() if array is not None]
         return f"Trajectory({', '.join([*shapes, f'task={self.task!r}'])})"
 
     @property
     def positions(self) -> npt.NDArray[Any]:
-        """The array whose first axis is time: ``frames`` or ``video_embeddings``."""
+        """``frames``, uint8 [T, H, W, 3], or ``video_embeddings``, float32 [T, D]: time is the first axis."""
         array = self.video_embeddings if self.frames is None else self.frames
-        assert array is not None  # __post_init__ has seen to it
+        assert array is not None  # by __post_init__
         return array
 
     @property
@@ -78,10 +78,10 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class ProgressSample:
-    """How far has ``trajectory`` come, and has it succeeded, at each of its frames?
+    """The question for progress and success at each frame of ``trajectory``.
 
-    frame_steps: 0 scores the trajectory as a whole. K >= 2 is dense mode: frame t is scored on the
-    prefix 0..t alone, sampled to K frames, as an RL loop would have seen it at that step.
+    frame_steps: 0 scores the trajectory as a whole. N >= 2 is dense mode: frame t is scored on its prefix 0..t alone,
+        sampled to N frames, as an RL loop sees it at that step.
     """
 
     trajectory: Trajectory
@@ -93,13 +93,13 @@ class ProgressSample:
 
     @property
     def trajectories(self) -> tuple[Trajectory, ...]:
-        """The trajectories in the order in which they lie on the time axis."""
+        """The trajectories, in their order on the time axis."""
         return (self.trajectory,)
 
 
 @dataclass(frozen=True, eq=False)
 class PreferenceSample:
-    """Which trajectory does the task of ``first`` better?"""
+    """The question for the trajectory that does the task of ``first`` better."""
 
     first: Trajectory
     second: Trajectory
@@ -110,19 +110,19 @@ class PreferenceSample:
 
     @property
     def trajectories(self) -> tuple[Trajectory, ...]:
-        """The trajectories in the order in which they lie on the time axis."""
+        """The trajectories, in their order on the time axis."""
         return (self.first, self.second)
 
     @property
     def swapped(self) -> PreferenceSample:
-        """The same question with ``second`` in the first place: its task stays that of ``first``."""
+        """The same question with ``second`` first; the task remains the task of ``first``."""
         asked = self.first
         return PreferenceSample(replace(self.second, task=asked.task, text_embedding=asked.text_embedding), asked)
 
 
 @dataclass(frozen=True, eq=False)
 class SimilaritySample:
-    """How similar is ``other`` to ``reference``, as ways of doing the task of ``reference``?"""
+    """The question for the similarity of ``other`` to ``reference`` in doing the task of ``reference``."""
 
     reference: Trajectory
     other: Trajectory
@@ -133,7 +133,7 @@ class SimilaritySample:
 
     @property
     def trajectories(self) -> tuple[Trajectory, ...]:
-        """The trajectories in the order in which they lie on the time axis."""
+        """The trajectories, in their order on the time axis."""
         return (self.reference, self.other)
 
 
@@ -142,16 +142,17 @@ Sample: TypeAlias = ProgressSample | PreferenceSample | SimilaritySample
 
 @dataclass(frozen=True, eq=False)
 class EncoderSample:
-    """The trajectories of one sample, for an encoder: those that it reads have frames, and the first one's task counts.
+    """The trajectories of one sample, for an encoder.
 
-    Those that it gives have embeddings of the frames and of that task.
+    The encoder reads trajectories with frames, and the first trajectory's task. It returns trajectories with embeddings
+    of the frames and of that task.
     """
 
     trajectories: tuple[Trajectory, ...]
 
 
 def check_frame_steps(steps: Any) -> None:
-    """Raises InvalidSampleError for what is no number of frames of dense mode, nor 0."""
+    """Raise InvalidSampleError unless ``steps`` is 0 or a number of frames for dense mode."""
     is_whole = isinstance(steps, (int, np.integer)) and not isinstance(steps, bool)
     if not is_whole or not (steps == 0 or MIN_FRAME_STEPS <= steps <= MAX_FRAME_STEPS):
         expected = f"0 or a whole number from {MIN_FRAME_STEPS} to {MAX_FRAME_STEPS}"
@@ -159,7 +160,7 @@ def check_frame_steps(steps: Any) -> None:
 
 
 def check_task(task: Any) -> None:
-    """Raises InvalidSampleError for what is no text that can be sent."""
+    """Raise InvalidSampleError unless ``task`` is text that UTF-8 can encode."""
     if not isinstance(task, str):
         raise InvalidSampleError.at("task", "str", type(task).__name__)
     if any(0xD800 <= ord(character) <= 0xDFFF for character in task):
@@ -167,14 +168,14 @@ def check_task(task: Any) -> None:
 
 
 def stackable(trajectories: Sequence[Trajectory]) -> list[list[Trajectory]]:
-    """The trajectories, those together that one array can hold: neighbours whose positions have one shape."""
+    """Return groups of neighbouring trajectories whose positions fit one array: equal shape behind the time axis."""
     if len(trajectories) == 1:
         return [list(trajectories)]
     return [list(group) for _, group in groupby(trajectories, lambda trajectory: trajectory.positions.shape[1:])]
 
 
 def with_trajectories(sample: Sample, trajectories: Sequence[Trajectory]) -> Sample:
-    """A sample that asks the same of other trajectories."""
+    """Return a sample that asks the same about other trajectories."""
     if isinstance(sample, ProgressSample):
         return replace(sample, trajectory=trajectories[0])
     first, second = trajectories
@@ -182,9 +183,9 @@ def with_trajectories(sample: Sample, trajectories: Sequence[Trajectory]) -> Sam
 
 
 def float_frames_to_uint8(frames: npt.ArrayLike) -> UInt8Array:
-    """uint8 frames from float frames in 0..255, as the original evaluation server made them: clip, then truncate.
+    """Return uint8 frames from float frames in 0..255 of the same shape: clip and truncate, as upstream's server does.
 
-    Raises InvalidSampleError for frames in 0..1, which truncation would turn black, and for NaN.
+    Raises InvalidSampleError for frames in 0..1, which truncation would turn black, and for NaN, Inf or no values.
     """
     array = as_array(frames)
     if array.size == 0 or not np.isfinite(array).all():
@@ -196,13 +197,13 @@ def float_frames_to_uint8(frames: npt.ArrayLike) -> UInt8Array:
 
 
 def as_array(values: Any) -> npt.NDArray[Any]:
-    """The values as an array; so are torch tensors, on a GPU or with a gradient too, bfloat16 as float32.
+    """Return the values as an array; torch tensors too, on a GPU or with a gradient, bfloat16 as float32.
 
     Raises ValueError for rows of unequal length.
     """
     if isinstance(values, (list, tuple)) and values and hasattr(values[0], "detach"):
         values = [as_array(tensor) for tensor in values]
-    if hasattr(values, "detach"):  # a tensor, recognised without importing torch
+    if hasattr(values, "detach"):  # a tensor; torch may not be installed
         tensor = values.detach().cpu()
         values = (tensor.float() if str(tensor.dtype) == "torch.bfloat16" else tensor).numpy()
     return np.asarray(values)
@@ -234,7 +235,7 @@ def _checked_floats(where: str, values: Any, axes: tuple[str, ...]) -> Float32Ar
     if 0 in array.shape:
         raise InvalidSampleError.at(where, f"{expected} without an empty axis", f"{array.dtype} {list(array.shape)}")
     if array.dtype != np.float32:
-        with np.errstate(over="ignore"):  # a value too large for float32 becomes Inf and is refused below
+        with np.errstate(over="ignore"):  # a value too large for float32 becomes Inf, which is refused below
             array = array.astype(np.float32)
     finite = np.isfinite(array)
     if not finite.all():
@@ -244,7 +245,7 @@ def _checked_floats(where: str, values: Any, axes: tuple[str, ...]) -> Float32Ar
 
 
 def _check_text(trajectory: Trajectory, where: str) -> None:
-    """The first trajectory's text is the one that the model reads."""
+    """Check the first trajectory's text, the only text that the model reads."""
     if not isinstance(trajectory, Trajectory):
         raise InvalidSampleError.at(where, "Trajectory", type(trajectory).__name__)
     if trajectory.frames is None and trajectory.text_embedding is None:
@@ -254,7 +255,7 @@ def _check_text(trajectory: Trajectory, where: str) -> None:
 
 
 def _check_pair(first: Trajectory, second: Trajectory, where: str) -> None:
-    """Both are of one kind. Embeddings are of one width; frames may be of two sizes."""
+    """Check that both are of one kind. Embeddings need one width; frames may differ in size."""
     if not isinstance(second, Trajectory):
         raise InvalidSampleError.at(where, "Trajectory", type(second).__name__)
     if (first.frames is None) != (second.frames is None):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Settings: fields of a frozen dataclass that say what they mean and take, for files, command lines and documents."""
+"""Settings: frozen dataclasses whose fields have a help text and bounds, for files, command lines and documents."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ _NAMES: dict[Any, str] = {types.NoneType: "null", Path: "str", Texts: "list of s
 
 
 class ConfigError(ValueError):
-    """A setting that cannot be used.
+    """A setting with an invalid value.
 
-    key: which one, or several with commas between; expected: ``expected X, got Y``
+    key: name of the setting, or several names with commas between
+    expected: ``expected X, got Y``
     """
 
     def __init__(self, key: str, expected: str) -> None:
@@ -34,9 +35,10 @@ class Setting:
     """One field of a ``Settings``.
 
     least, most: bounds of a number
-    flag: its name on a command line; None: made of its own name
-    metavar, variable: what a command's help shows for a value, and an environment variable that gives one
-    parse: makes the value of the text on a command line; raises ValueError
+    flag: option on a command line; None: made from ``name``
+    metavar: placeholder for the value in a command's help
+    variable: environment variable for the value
+    parse: converts the text on a command line to the value; raises ValueError
     has_option: False: only files and programs set it
     """
 
@@ -54,18 +56,18 @@ class Setting:
 
     @property
     def option(self) -> str:
-        """The option of this setting, in a command that has no other settings of that name."""
+        """Option of this setting, in a command without another setting of the same name."""
         return self.flag or f"--{self.name.replace('_', '-')}"
 
     def from_plain(self, value: Any) -> Any:
-        """The value that YAML or JSON spells so. Raises ConfigError for one of another type."""
+        """Convert a plain value of YAML or JSON. Raises ConfigError for a wrong type."""
         for kind in self._kinds:
             if _spells(value, kind):
                 return None if value is None else kind(value)
         raise ConfigError(self.name, f"expected {self._expected}, got {value!r:.200}")
 
     def check(self, value: Any) -> None:
-        """Raises ConfigError for a value that is out of bounds, or none of the choices."""
+        """Raise ConfigError for a value out of bounds or not among the choices."""
         if value is None:
             return
         if self._choices and value not in self._choices:
@@ -84,14 +86,13 @@ class Setting:
 
     @property
     def _choices(self) -> Texts:
-        """The texts that a value may be; none: any."""
+        """Texts to choose from; empty: any value."""
         return tuple(
             text for part in self._parts if typing.get_origin(part) is Literal for text in typing.get_args(part)
         )
 
     @property
     def _kinds(self) -> tuple[Any, ...]:
-        """The types of a value."""
         return tuple(str if typing.get_origin(part) is Literal else part for part in self._parts)
 
     @property
@@ -102,14 +103,14 @@ class Setting:
 
 
 def setting(default: Any, help: str, **more: Any) -> Any:
-    """A field of a ``Settings``. more: fields of ``Setting``"""
+    """Return a field of a ``Settings``; ``more`` are fields of ``Setting``."""
     return field(default=default, metadata={"help": help, **more})
 
 
 class Settings:
-    """Base of frozen dataclasses whose fields are each a ``setting``. Raises ConfigError for what is out of bounds.
+    """Base of frozen dataclasses whose fields are made by ``setting``. Raises ConfigError for an invalid value.
 
-    TITLE: what a command's help writes above their options
+    TITLE: heading of their options in a command's help
     """
 
     TITLE: ClassVar[str] = "Options"
@@ -120,17 +121,17 @@ class Settings:
 
 
 def settings_of(kind: Any) -> dict[str, Setting]:
-    """The settings of a ``Settings`` by name, in their order."""
+    """Return the settings of a ``Settings`` class by name, in their order."""
     hints = typing.get_type_hints(kind)
     return {each.name: Setting(each.name, hints[each.name], each.default, **each.metadata) for each in fields(kind)}
 
 
 def _is_number(value: Any) -> bool:
-    """Whether it is an int, or a float that is neither NaN nor infinite; not what isinstance says: True is none."""
+    """True for an int or a finite float. Not isinstance, for which True is an int."""
     return type(value) is int or (type(value) is float and math.isfinite(value))
 
 
 def _spells(value: Any, kind: Any) -> bool:
-    """Whether a plain value is of this type; not what isinstance says: True is no number."""
+    """True if a plain value has this type. Not isinstance, for which True is an int."""
     is_plain = type(value) in _PLAIN.get(kind, (kind,))
     return is_plain and (kind != Texts or all(type(each) is str for each in value))

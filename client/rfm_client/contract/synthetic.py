@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Synthetic trajectories: blank ones, to see whether a model answers, and random ones, to compare answers.
+"""Synthetic trajectories: blank, to probe a model, and random, to compare answers.
 
-``widths`` are Dv and Dt of the embeddings that a model reads; None: it reads raw frames.
+``widths``: D and Dt of the embeddings that the model reads; None: it reads raw frames.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ Widths: TypeAlias = tuple[int, int] | None
 
 BLANK_FRAMES = 2
 SIDE_PX = 64
-PROBE_TASK = "probe"  # of a blank trajectory: every probe has the same inputs, by which a model recognises it
+PROBE_TASK = "probe"  # of a blank trajectory
 
 
 def blank_trajectory(widths: Widths, task: str = PROBE_TASK) -> Trajectory:
-    """Two embeddings, or frames, of zeros."""
+    """Return BLANK_FRAMES embeddings, or frames, of zeros."""
     if widths is None:
         return Trajectory(frames=np.zeros((BLANK_FRAMES, SIDE_PX, SIDE_PX, 3), np.uint8), task=task)
     video_dim, text_dim = widths
@@ -37,7 +37,7 @@ def random_trajectory(
     task: str,
     size_px: tuple[int, int] = (SIDE_PX, SIDE_PX),
 ) -> Trajectory:
-    """Normal embeddings, or frames of noise with the height and width ``size_px`` and the task."""
+    """Return normally distributed embeddings, or frames of noise with ``task``. size_px: height and width of frames"""
     if widths is None:
         return Trajectory(frames=random.integers(0, 256, (num_frames, *size_px, 3), np.uint8), task=task)
     video_dim, text_dim = widths

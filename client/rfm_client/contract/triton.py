@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""What went wrong between client and server, in our own errors: the one table of tritonclient's.
+"""Translation of Triton's and tritonclient's errors into RewardErrors.
 
-Statuses are as tritonclient gives them: gRPC's by name, HTTP's by number. tests/triton/test_wording.py asks a real
-Triton for each of its phrases.
+A status is text, as tritonclient gives it: a name from gRPC, a number from HTTP. tests/triton/test_wording.py makes a
+real Triton say each of its phrases.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rfm_client.contract.wire import SECOND_FRAMES
 UNAVAILABLE = ("StatusCode.UNAVAILABLE", "503")
 OUT_OF_TIME = ("StatusCode.DEADLINE_EXCEEDED", "504")
 CANCELLED = ("StatusCode.CANCELLED", "499")
-BAD_GATEWAY = ("502",)  # of a proxy whose connection to the server ended, or was refused
+BAD_GATEWAY = ("502",)  # a proxy's connection to the server ended or was refused
 DENIED = ("StatusCode.UNAUTHENTICATED", "StatusCode.PERMISSION_DENIED", "401", "403")
 
 _ERRORS: dict[tuple[str, ...], type[errors.RewardError]] = {
@@ -31,18 +31,18 @@ _ERRORS: dict[tuple[str, ...], type[errors.RewardError]] = {
 _ERROR_OF = {status: error for statuses, error in _ERRORS.items() for status in statuses}
 
 PROCESS_ENDED = "is not healthy"  # "Stub process 'rfm_0_0' is not healthy."
-NO_VERSIONS = "no available versions"  # of a model that is being loaded again, or failed
-LOST_REGION = "Unable to find shared memory region"  # of a server that was started again
-REGION_IN_USE = "it is currently in use"  # of a region to unmap: tests/client/test_shared_memory_faults.py
-RESTRICTED = "is restricted, expecting header"  # of an API that wants a key
+NO_VERSIONS = "no available versions"  # the model failed, or is being loaded again
+LOST_REGION = "Unable to find shared memory region"  # the server was restarted
+REGION_IN_USE = "it is currently in use"  # a region to unmap: tests/client/test_shared_memory_faults.py
+RESTRICTED = "is restricted, expecting header"  # the API needs a key
 LATE = "no answer in time"
 
-_NO_CONNECTION = re.compile(  # of gRPC itself: nothing was sent
+_NO_CONNECTION = re.compile(  # gRPC's own words: nothing was sent
     "failed to connect|connections to all backends failing|errors resolving|resolution failed"
 )
-_LOST_CONNECTION = re.compile("Socket closed|Connection reset|Broken pipe|connection termination")  # or of a proxy
+_LOST_CONNECTION = re.compile("Socket closed|Connection reset|Broken pipe|connection termination")  # or a proxy's
 _NO_TRUST = re.compile(f"CERTIFICATE|certificate|[Vv]erification [Cc]heck failed|WRONG_VERSION_NUMBER|{RESTRICTED}")
-_WRONG_SHAPE = re.compile(  # behind the batch axis, which the caller did not make
+_WRONG_SHAPE = re.compile(  # without the batch axis, which the caller did not make
     r"unexpected shape for input '(?P<name>\w+)'.*?Expected \[-1,(?P<expected>[^\]]*)\], got \[\d+,(?P<got>[^\]]*)\]"
 )
 _NO_SECOND_FRAMES = re.compile(rf"expected \d+ inputs but got .*'{SECOND_FRAMES}'|unexpected .*input '{SECOND_FRAMES}'")
@@ -67,17 +67,17 @@ def error_from(
     proxy: str | None = None,
     bad_request: type[errors.RewardError] = errors.InvalidSampleError,
 ) -> errors.RewardError | None:
-    """The error that an exception of tritonclient, or of a library below it, means to a caller; None: no such one.
+    """Translate an exception of tritonclient or of a library below it; None: of no such library.
 
-    proxy: through which the call went (``grpc_proxy``)
-    bad_request: what INVALID_ARGUMENT means; Triton answers it for an unknown model, too
+    proxy: proxy of the call (``grpc_proxy``)
+    bad_request: error for the status INVALID_ARGUMENT, which Triton also gives for an unknown model
     """
     where = f"{url} through {proxy}" if proxy else url
-    for kind in type(raised).__mro__:  # by name: those libraries are imported late, or not at all
+    for kind in type(raised).__mro__:  # by name, since these libraries may not be imported
         match kind.__name__:
             case "InferenceServerException":
                 return _error_of_answer(raised, url, proxy, bad_request)
-            case "TimeoutError":  # in Python 3.10 asyncio's, too
+            case "TimeoutError":  # asyncio has its own class in Python 3.10
                 return errors.DeadlineExceededError(f"{where}: {LATE}")
             case "SSLError" | "ClientSSLError":
                 return denied(url, "", str(raised))
@@ -85,11 +85,11 @@ def error_from(
                 return errors.InferenceFailedError(f"{url}: no answer of an HTTP server: {type(raised).__name__}")
             case "ClientConnectorError" | "OSError" | "EOFError" | "HTTPException":
                 return unreachable(url, str(raised) or type(raised).__name__)
-            case "ClientError":  # of aiohttp, after the request was sent
+            case "ClientError":  # aiohttp's, after the request was sent
                 lost = unreachable(url, str(raised) or type(raised).__name__)
                 lost.may_have_ended_server = True
                 return lost
-            case "ValueError" | "LookupError" | "TypeError" | "AttributeError":  # reading what is no answer of Triton
+            case "ValueError" | "LookupError" | "TypeError" | "AttributeError":  # from an answer that is not Triton's
                 return errors.InferenceFailedError(f"{url}: the answer cannot be read: {raised!r}")
     return None
 
@@ -106,7 +106,7 @@ def _error_of_answer(
 
 
 def error_of(status: str, message: str, bad_request: type[errors.RewardError]) -> errors.RewardError:
-    """The error that an answer of Triton means to a caller; ``bad_request`` as of ``error_from``."""
+    """Translate Triton's status and message; ``bad_request`` as in ``error_from``."""
     text = _PREFIX.sub("", message or "no reason given")
     shape = _WRONG_SHAPE.search(text)
     if shape is not None:
@@ -117,7 +117,7 @@ def error_of(status: str, message: str, bad_request: type[errors.RewardError]) -
         return bad_request(f"{SECOND_FRAMES}: expected {expected}, got {got}")
     if PROCESS_ENDED in text and "Stub process" in text:
         return errors.ProcessEndedError(text)
-    if LOST_REGION in text or f"has {NO_VERSIONS}" in text:  # the sample is not at fault: another try may succeed
+    if LOST_REGION in text or f"has {NO_VERSIONS}" in text:  # the sample is not at fault: a retry may succeed
         return errors.ServerUnavailableError(text)
     if _TOO_MANY_FRAMES.search(text):
         text += ": score some of them (subsample=True), each on few before it (frame_steps), or by a sampling rule"
@@ -130,12 +130,12 @@ def error_of(status: str, message: str, bad_request: type[errors.RewardError]) -
 
 
 def is_denied(status: str, message: str) -> bool:
-    """Whether one side refused the other: no key, a wrong one, or a certificate that is not trusted."""
+    """True if one side refused the other: a missing or wrong key, or an untrusted certificate."""
     return status in DENIED or (status == "StatusCode.UNAVAILABLE" and _NO_TRUST.search(message) is not None)
 
 
 def denied(url: str, status: str, message: str) -> errors.AccessDeniedError:
-    """The error of two sides of which one refuses the other, with what mends it."""
+    """Return the error of a refused connection or request, with its remedy."""
     is_keyed = status in DENIED or RESTRICTED in message
     fitting = (remedy for words, remedy in _TRUST.items() if re.search(words, message))
     remedy = _SHOW_KEY if is_keyed else next(fitting, None)
@@ -143,13 +143,13 @@ def denied(url: str, status: str, message: str) -> errors.AccessDeniedError:
 
 
 def unreachable(url: str, reason: str, proxy: str | None = None) -> errors.ServerUnavailableError:
-    """The error of a server to which there is no connection, be it because of a proxy."""
+    """Return the error of a failed connection to the server, or to its proxy."""
     if proxy is None:
         return errors.ServerUnavailableError(f"{url}: no connection: {reason}: {_START}")
     return errors.ServerUnavailableError(f"{url}: no connection through {proxy}: {reason}: {_NO_PROXY}")
 
 
 def not_served(message: str, served: Collection[str]) -> errors.ModelNotFoundError:
-    """The error of a server that lacks a model, with those that it serves."""
+    """Return the error of a missing model, with the names of the served models."""
     names = ", ".join(sorted(served)) or "none"
     return errors.ModelNotFoundError(f"{message}; served: {names}: give the checkpoint's name with model (--model)")

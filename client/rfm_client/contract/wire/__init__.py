@@ -1,19 +1,17 @@
 # SPDX-License-Identifier: MIT
 """The wire contract: samples and results as named tensors.
 
-Letters: B samples of one request (the batch axis), P frame positions: the first trajectory's frames, then
-the second's, then zero padding; D, Dt, K, H, W as in ``rfm_client.contract.samples``.
+Letters: B samples of one request (the batch axis); P frame positions: the first trajectory's frames, then the second's,
+then zero padding; K progress bins; D, Dt, H, W as in ``rfm_client.contract.samples``.
 
-Whatever changes the answer is an input, and every input but two is always present: that is what lets Triton put
-requests of different callers, lengths and sample types into one batch. The two are optional; Triton batches requests
-that have one among themselves:
+Everything that changes the answer is an input. All inputs but two are always present, so that Triton can batch requests
+of different callers, lengths and sample types. Requests with an optional input share batches only with each other:
 
-- ``second_frames``, for pairs whose trajectories differ in frame size: ``frames`` then holds the first trajectories
-  alone, and it the second ones. P is then the positions of both arrays.
-- ``frame_digests``, of a model that keeps what it made of frames: the name of each of the P frames (``named_frames``).
-  ``frames`` then holds, in any order and in any sample's row, the pixels of those that the model may not know; zeros
-  may lie between them. A request with a digest that the model does not know is refused, and its caller asks again with
-  all pixels.
+- ``second_frames``, for pairs whose trajectories differ in frame size. ``frames`` then has the first trajectories,
+  ``second_frames`` the second, and P counts the positions of both.
+- ``frame_digests``, for a model that keeps features of frames: a digest for each of the P frames. ``frames`` then has
+  the pixels of frames that the model may lack, in any order and in any sample's row; zeros may lie between them. The
+  model refuses a digest that it does not know, and the caller sends the request again with all pixels.
 """
 
 from rfm_client.contract.wire.results import *  # noqa: F403

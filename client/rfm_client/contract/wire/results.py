@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Results as tensors, and back."""
+"""Conversion of results to tensors and back."""
 
 from __future__ import annotations
 
@@ -35,24 +35,24 @@ _OF_SAMPLES = (PREFERENCE, SIMILARITY)  # outputs [B, 1], named as the fields of
 
 
 def outputs_for(samples: Sequence[Sample]) -> tuple[str, ...]:
-    """The scores that these samples ask for. The others would be NaN, and cost their way from the server."""
+    """Return the names of the scores that these samples ask for. Others would be NaN, and cost their transfer."""
     kinds = set(map(type, samples))
     asked_by = {PREFERENCE: PreferenceSample, SIMILARITY: SimilaritySample}
     return (PROGRESS, SUCCESS, *(name for name, kind in asked_by.items() if kind in kinds))
 
 
 def encode_results(results: Sequence[Result], num_positions: int, outputs: Collection[str]) -> Tensors:
-    """The requested outputs of one request of ``num_positions`` = P; what a result lacks is NaN, never 0."""
+    """Return the requested outputs, float32 [B, ...]; P = ``num_positions``. A missing score is NaN, never 0."""
     return {name: _encoded(name, results, num_positions) for name in outputs}
 
 
 def decode_results(
     tensors: Mapping[str, npt.NDArray[Any]], samples: Sequence[Sample], model_version: str | None = None
 ) -> list[Result]:
-    """The results of the samples of one request, which ``model_version`` answered.
+    """Return the results of the samples of one request, which ``model_version`` answered.
 
-    Raises InferenceFailedError for an answer that lacks a score: a missing reward is no reward of 0 or NaN. Success
-    alone may be NaN, at all frames: then the checkpoint does not predict it.
+    Raises InferenceFailedError if the answer lacks a score: a missing reward is not 0 or NaN. Only success may be NaN,
+    at all frames: then the checkpoint does not predict it.
     """
     return [_decode_result(tensors, row, sample, model_version) for row, sample in enumerate(samples)]
 
@@ -60,7 +60,7 @@ def decode_results(
 def decode_progress(
     tensors: Mapping[str, npt.NDArray[Any]], row: int, num_frames: int, model_version: str | None = None
 ) -> ProgressResult:
-    """The result of one sample of type progress, whose trajectory has ``num_frames``. Raises InferenceFailedError."""
+    """Return the result of the progress sample ``row``, of ``num_frames`` frames. Raises InferenceFailedError."""
     scores = _scores_between(tensors, row, slice(0, num_frames))
     return ProgressResult(
         progress=scores.progress,
@@ -123,9 +123,9 @@ def _scores_between(tensors: Mapping[str, npt.NDArray[Any]], row: int, positions
 def _present(
     tensors: Mapping[str, npt.NDArray[Any]], name: str, row: int, positions: slice, *, may_lack: bool = False
 ) -> Float32Array:
-    """One row's scores at some positions. Raises InferenceFailedError unless all are there and finite.
+    """One row's scores at some positions. Raises InferenceFailedError unless all are present and finite.
 
-    may_lack: they may also be NaN throughout, of a checkpoint that does not predict them
+    may_lack: True: all may be NaN, if the checkpoint does not predict them
     """
     scores, count = tensors[name], positions.stop - positions.start
     if scores.ndim < 2 or row >= len(scores):

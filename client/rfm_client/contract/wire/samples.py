@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Samples as tensors, and back: requests to a reward model and to an encoder, and the encoder's answers."""
+"""Conversion of samples to tensors and back: requests to reward models and encoders, answers of encoders."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from rfm_client.contract.wire.specs import (
 )
 
 Decoded = TypeVar("Decoded")
-Row: TypeAlias = dict[str, npt.NDArray[Any]]  # of the tensors of one request: those of one sample
+Row: TypeAlias = dict[str, npt.NDArray[Any]]  # tensors of one sample
 
 _SAMPLE_TYPES = {
     ProgressSample: SampleType.PROGRESS,
@@ -54,7 +54,7 @@ _SAMPLE_TYPES = {
 
 
 def encode_samples(samples: Sequence[Sample]) -> Tensors:
-    """One request for samples whose positions have the same shape beyond the time axis, trajectory by trajectory."""
+    """Return one request. The samples' positions need equal shapes behind the time axis, trajectory by trajectory."""
     tensors: Tensors = {
         SAMPLE_TYPE: np.array([[_SAMPLE_TYPES[type(sample)]] for sample in samples], np.uint8),
         NUM_FRAMES: np.array([_lengths(sample) for sample in samples], np.int32),
@@ -74,18 +74,18 @@ def encode_samples(samples: Sequence[Sample]) -> Tensors:
 
 
 def decode_samples(tensors: Mapping[str, npt.NDArray[Any]]) -> list[Sample | ProgressSampleRefs]:
-    """The samples of one request. Raises InvalidSampleError that names the sample and the field."""
+    """Return the samples of one request. Raises InvalidSampleError, which names the sample and the field."""
     return _decode_rows(tensors, _decode_sample)
 
 
 def encode_frames(trajectory: Trajectory) -> Tensors:
-    """One request to the encoder, for one trajectory of raw frames."""
+    """Return a request to the encoder for one trajectory of raw frames."""
     tensors = encode_samples([ProgressSample(trajectory)])
     return {spec.name: tensors[spec.name] for spec in encoder_inputs() if spec.name in tensors}
 
 
 def decode_embeddings(tensors: Mapping[str, npt.NDArray[Any]], trajectory: Trajectory) -> Trajectory:
-    """The encoder's answer for one trajectory. Raises InferenceFailedError if it lacks an embedding."""
+    """Return the trajectory with the encoder's embeddings. Raises InferenceFailedError if the answer is invalid."""
     count, video, text = trajectory.num_frames, tensors[VIDEO_EMBEDDINGS], tensors[TEXT_EMBEDDING]
     if video.ndim != 3 or text.ndim != 2 or video.shape[:2] != (1, count) or len(text) != 1:
         raise InferenceFailedError(f"embeddings: expected [1, {count}, D] and [1, Dt], got {video.shape}, {text.shape}")
@@ -96,14 +96,14 @@ def decode_embeddings(tensors: Mapping[str, npt.NDArray[Any]], trajectory: Traje
 
 
 def decode_trajectories(tensors: Mapping[str, npt.NDArray[Any]]) -> list[EncoderSample | EncoderSampleRefs]:
-    """What the encoder is to encode: of each sample the frames of its trajectories, without padding, and its task."""
+    """Return the trajectories of each sample, without padding, for the encoder. Raises InvalidSampleError."""
     return _decode_rows(tensors, _decode_encoder_sample)
 
 
 def encode_refs(trajectories: Sequence[TrajectoryRefs], sent: Sequence[UInt8Array]) -> Tensors:
-    """One request for the progress of each trajectory, whose frames have the digests.
+    """Return one request for the progress of trajectories with frame references.
 
-    sent: uint8 [H, W, 3] of one size, the frames that the model may not know; none: it knows all
+    sent: frames that the model may lack, uint8 [H, W, 3] of one size; empty: it has all frames
     """
     count = len(trajectories)
     num_rows = -(-len(sent) // count)
@@ -123,7 +123,7 @@ def encode_refs(trajectories: Sequence[TrajectoryRefs], sent: Sequence[UInt8Arra
 
 
 def encode_trajectories(encoded: Sequence[EncoderSample], num_positions: int, outputs: Collection[str]) -> Tensors:
-    """The requested outputs of the encoder for one request of ``num_positions`` = P, padded with zeros."""
+    """Return the encoder's requested outputs, float32 [B, P, D] padded with zeros and [B, Dt]; P = ``num_positions``."""
     rows = [[trajectory.positions for trajectory in encoder_sample.trajectories] for encoder_sample in encoded]
     texts = [encoder_sample.trajectories[0].text_embedding for encoder_sample in encoded]
     embeddings = {
@@ -141,7 +141,7 @@ def _lengths(sample: Sample) -> tuple[int, int]:
 def _decode_rows(
     tensors: Mapping[str, npt.NDArray[Any]], decode: Callable[[Row, dict[bytes, UInt8Array]], Decoded]
 ) -> list[Decoded]:
-    """What ``decode`` makes of each sample, and of the pixels that came, by the digests that it computes of them."""
+    """Decode each sample, with the request's pixels by their digests, which are computed here."""
     pixels = {}
     if FRAME_DIGESTS in tensors:
         if SECOND_FRAMES in tensors:
@@ -205,7 +205,7 @@ def _named(row: Row, digests: npt.NDArray[Any], pixels: dict[bytes, UInt8Array])
 def _positions(row: Row, lengths: Sequence[int]) -> list[npt.NDArray[Any]]:
     """The frame positions of the first and the second trajectory of one sample, without padding.
 
-    Both are in one array or, if there are second frames, each is in its own.
+    Both lie in one array, unless there are second frames.
     """
     if SECOND_FRAMES in row:
         return [_unpadded(row, name, length) for name, length in zip((FRAMES, SECOND_FRAMES), lengths, strict=True)]
@@ -215,7 +215,7 @@ def _positions(row: Row, lengths: Sequence[int]) -> list[npt.NDArray[Any]]:
 
 
 def _unpadded(row: Row, name: str, total: int) -> npt.NDArray[Any]:
-    """Positions up to ``total``; what lies behind must be padding, or num_frames is wrong."""
+    """Positions up to ``total``. The rest must be zero padding, or num_frames is wrong."""
     positions = row[name]
     if total > len(positions):
         raise InvalidSampleError.at(NUM_FRAMES, f"at most the {len(positions)} frames in {name}", str(total))

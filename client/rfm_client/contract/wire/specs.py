@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Names, types and dimensions of the tensors. The only place where they stand; letters as in the package."""
+"""Names, types and dimensions of the tensors, defined only here. Letters as in the package."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ SIMILARITY = "similarity"
 PROGRESS_LOGITS = "progress_logits"
 TIMING_MS = "timing_ms"
 
-REQUEST_ID = re.compile(r"[\w.:/+=@-]{1,64}", re.ASCII)  # what a request's id may be
+REQUEST_ID = re.compile(r"[\w.:/+=@-]{1,64}", re.ASCII)  # ids that a request may have
 
-UNKNOWN_FRAMES = "digests of frames that this model knows or has been sent"  # what is told of others
+UNKNOWN_FRAMES = "digests of frames that this model knows or has been sent"  # expected by the error for unknown digests
 
-VARIABLE = -1  # a dimension that differs from request to request
+VARIABLE = -1  # a dimension that differs between requests
 
 
 class SampleType(IntEnum):
@@ -52,8 +52,8 @@ class SampleType(IntEnum):
 class TensorSpec:
     """Name, element type and dimensions (without the batch axis) of one input or output.
 
-    ragged: requests in which the variable dimensions differ may still share a batch.
-    optional: a request may leave it out; those with it and those without share no batch.
+    ragged: True if requests with different variable dimensions may share a batch
+    optional: True if a request may omit it; requests with and without it share no batch
     """
 
     name: str
@@ -74,23 +74,23 @@ _DIGESTS_SPEC = TensorSpec(FRAME_DIGESTS, "UINT8", (VARIABLE, DIGEST_BYTES), rag
 
 
 def embedding_inputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
-    """Inputs of a model that scores embeddings of widths D = video_dim and Dt = text_dim."""
+    """Return the inputs of a model that scores embeddings of widths D = video_dim and Dt = text_dim."""
     video = TensorSpec(VIDEO_EMBEDDINGS, "FP32", (VARIABLE, video_dim), ragged=True)
     return (*_QUESTION_SPECS, video, TensorSpec(TEXT_EMBEDDING, "FP32", (text_dim,)))
 
 
 def frame_inputs(*, by_digest: bool = False) -> tuple[TensorSpec, ...]:
-    """Inputs of a model that scores raw frames. ``by_digest``: of one that takes the digests of those it knows."""
+    """Return the inputs of a model that scores raw frames; ``by_digest``: with the digests of frames."""
     return (*_QUESTION_SPECS, *_FRAMES_SPECS, *([_DIGESTS_SPEC] if by_digest else []))
 
 
 def encoder_inputs(*, by_digest: bool = False) -> tuple[TensorSpec, ...]:
-    """Inputs of the encoder; num_frames keeps it from encoding padding. ``by_digest``: as of ``frame_inputs``."""
+    """Return the inputs of the encoder; num_frames excludes padding. ``by_digest`` as in ``frame_inputs``."""
     return (_NUM_FRAMES_SPEC, *_FRAMES_SPECS, *([_DIGESTS_SPEC] if by_digest else []))
 
 
 def encoder_outputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
-    """Outputs of the encoder: what ``embedding_inputs`` takes in place of frames and task."""
+    """Return the outputs of the encoder: the embeddings among ``embedding_inputs``."""
     return tuple(
         TensorSpec(spec.name, spec.datatype, spec.dims)
         for spec in embedding_inputs(video_dim, text_dim)
@@ -99,7 +99,7 @@ def encoder_outputs(video_dim: int, text_dim: int) -> tuple[TensorSpec, ...]:
 
 
 def score_outputs(progress_bins: int | None) -> tuple[TensorSpec, ...]:
-    """Outputs of every reward model; progress_bins is K of a discrete checkpoint, None of a continuous one."""
+    """Return the outputs of a reward model; progress_bins: K of a discrete checkpoint, None: continuous."""
     scores = (
         TensorSpec(PROGRESS, "FP32", (VARIABLE,)),
         TensorSpec(SUCCESS, "FP32", (VARIABLE,)),
@@ -113,7 +113,7 @@ def score_outputs(progress_bins: int | None) -> tuple[TensorSpec, ...]:
 
 
 def num_positions(inputs: Mapping[str, npt.NDArray[Any]]) -> int:
-    """P, the frame positions of one request: its widths of the time axis, added up."""
+    """Return P, the number of frame positions of one request, over all its arrays."""
     if FRAME_DIGESTS in inputs:
         return int(inputs[FRAME_DIGESTS].shape[1])
     return sum(int(inputs[name].shape[1]) for name in (FRAMES, SECOND_FRAMES, VIDEO_EMBEDDINGS) if name in inputs)
@@ -122,14 +122,14 @@ def num_positions(inputs: Mapping[str, npt.NDArray[Any]]) -> int:
 def pad_stack(
     rows: Sequence[Sequence[npt.NDArray[Any]]], length: int | None = None, *, fill: float = 0
 ) -> npt.NDArray[Any]:
-    """[B, length, ...] from B rows of arrays [P, ...] of one dtype, which lie one after the other.
+    """Return [B, length, ...] from B rows; a row joins arrays [N, ...] of one dtype and is padded with ``fill``.
 
-    length: the longest row's unless given
+    length: None: the length of the longest row
     """
     if length is None:
         length = max(sum(map(len, parts)) for parts in rows)
     first = rows[0][0]
-    if len(rows) == 1 and sum(map(len, rows[0])) == length:  # a single sample: no padding, and of one array no copy
+    if len(rows) == 1 and sum(map(len, rows[0])) == length:  # a single sample needs no padding; a single array, no copy
         return (first if len(rows[0]) == 1 else np.concatenate(rows[0]))[np.newaxis]
     shape = len(rows), length, *first.shape[1:]
     padded = np.full(shape, fill, first.dtype) if fill else np.zeros(shape, first.dtype)
