@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A reward for every frame of a dataset, written where training reads it. Needs ``pip install "./client[label]"``.
+"""Label every frame of a dataset, in files that training reads. Needs ``pip install "./client[label]"``.
 
 from rfm_client import RewardClient
 from rfm_client.labelling import ClientScorer, LabelOptions, label, open_dataset

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The labels of one episode: every camera's frames decoded once, scored, and fused. T frames."""
+"""Labels of one episode: decode each camera's frames once, score them, fuse the scores. T frames, H x W pixels."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from rfm_client.labelling.scorer import Scorer
 Columns: TypeAlias = dict[str, Float32Array]
 
 PROGRESS, SUCCESS = "progress", "success"
-FRAMES_AT_A_TIME = 64  # of one request to the encoder: as many as it encodes in one forward pass
-MAX_BYTES = 32 * 2**20  # of the samples that are made and sent together
-MAX_FRAME_BYTES = 2 * 2**30  # that the workers of a process hold together
+FRAMES_AT_A_TIME = 64  # in a request to the encoder: one forward pass of it
+MAX_BYTES = 32 * 2**20  # of the samples in one call of the scorer
+MAX_FRAME_BYTES = 2 * 2**30  # of all workers of a process
 
 
 class FrameMemory:
-    """A bound on the frames that all workers together hold; more only where one video alone has more."""
+    """A limit on the bytes of frames that all workers hold together; a larger video is held alone."""
 
     def __init__(self, max_bytes: int = MAX_FRAME_BYTES) -> None:
         self._max_bytes = max_bytes
@@ -40,14 +40,14 @@ class FrameMemory:
 
     @contextmanager
     def holding(self, num_bytes: int) -> Iterator[None]:
-        """Holds so many bytes, after a wait until they fit. A worker that holds some must not ask for more."""
+        """Wait until ``num_bytes`` fit, and hold them during the block. A worker must not hold twice."""
         with self._changed:
             self._changed.wait_for(lambda: not self._held_bytes or self._held_bytes + num_bytes <= self._max_bytes)
             self._held_bytes += num_bytes
         try:
             yield
         except Exception as error:
-            clear_frames(error.__traceback__)  # or the error would hold them for as long as it is there itself
+            clear_frames(error.__traceback__)  # otherwise the error's traceback keeps the frames in memory
             raise
         finally:
             with self._changed:
@@ -64,13 +64,13 @@ def episode_columns(
     memory: FrameMemory,
     go_on: Callable[[], None],
 ) -> Columns:
-    """float32 [T] each: ``progress``, ``success`` if the checkpoint predicts it, and of several cameras each one's,
-    ``progress.<camera>`` and ``success.<camera>``.
+    """Return the columns of an episode's labels, float32 [T] each. Raises RewardError.
 
-    memory: of all workers; the frames of one camera are held at a time, if the checkpoint does not encode them first
-    go_on: called between requests; what it raises ends the episode
+    Columns: ``progress``, and ``success`` if the checkpoint predicts it. Several cameras add ``progress.<camera>`` and
+    ``success.<camera>``.
 
-    Raises RewardError.
+    memory: shared by all workers, for the frames of one camera at a time; unused if the checkpoint encodes frames
+    go_on: called between requests; its exception ends the episode
     """
     by_camera = {}
     for camera in recipe.cameras:
@@ -108,7 +108,7 @@ def _scores(trajectory: Trajectory, scorer: Scorer, recipe: Recipe, go_on: Calla
 
 
 def _shrunk(frames: Iterator[UInt8Array], recipe: Recipe, go_on: Callable[[], None]) -> Iterator[UInt8Array]:
-    """The frames in arrays of at most FRAMES_AT_A_TIME, as small as the recipe says."""
+    """Yield arrays of at most FRAMES_AT_A_TIME frames, resized if the recipe says so."""
     while chunk := list(itertools.islice(frames, FRAMES_AT_A_TIME)):
         go_on()
         stacked = np.stack(chunk)
@@ -118,13 +118,11 @@ def _shrunk(frames: Iterator[UInt8Array], recipe: Recipe, go_on: Callable[[], No
 
 
 def _joined(parts: Sequence[Trajectory]) -> Trajectory:
-    """One trajectory of the embeddings of parts that follow one another."""
     embeddings = np.concatenate([part.positions for part in parts])
     return Trajectory(video_embeddings=embeddings, text_embedding=parts[0].text_embedding)
 
 
 def _held(first: UInt8Array, others: Iterator[UInt8Array], episode: DatasetEpisode) -> Trajectory:
-    """All frames of the episode, in one array."""
     frames = np.empty((episode.num_frames, *first.shape[1:]), np.uint8)
     start = 0
     for chunk in itertools.chain([first], others):
@@ -134,7 +132,7 @@ def _held(first: UInt8Array, others: Iterator[UInt8Array], episode: DatasetEpiso
 
 
 def _by_bytes(samples: Iterable[ProgressSample]) -> Iterator[list[ProgressSample]]:
-    """The samples in lists of at most MAX_BYTES, or of one sample."""
+    """Yield lists of samples, each of at most MAX_BYTES or a single sample."""
     together: list[ProgressSample] = []
     num_bytes = 0
     for sample in samples:
@@ -148,7 +146,7 @@ def _by_bytes(samples: Iterable[ProgressSample]) -> Iterator[list[ProgressSample
 
 
 def _checked(frames: Iterator[UInt8Array], episode: DatasetEpisode, camera: str) -> Iterator[UInt8Array]:
-    """The frames. Raises DatasetError if there are more or fewer than the episode has, or of several sizes."""
+    """Yield the frames. Raises DatasetError for a wrong number of frames, or several sizes."""
     where, count, shape = f"{episode.name}: {camera}", 0, None
     for frame in frames:
         shape = shape or frame.shape

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""One file for each finished episode, in a folder or behind any URL that fsspec knows. Needs pyarrow and fsspec.
+"""Parts: a Parquet file for each finished episode, in a folder or at an fsspec URL. Needs pyarrow and fsspec.
 
-A part is there whole or not at all, and its name says what it is made of: so whoever finds it may use it.
+A part exists whole or not at all. Its name has the digest of everything that decides its labels, so any run may use it.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _SUFFIX = ".parquet"
 
 
 class Parts:
-    """The parts of one labelling in one place.
+    """The parts of a labelling run. Raises ImportError for a missing package, OSError for a place without write access.
 
-    url: a folder, or a URL of fsspec, for example ``s3://bucket/folder``
+    url: a folder, or an fsspec URL, for example ``s3://bucket/folder``
     """
 
     def __init__(self, url: str) -> None:
@@ -46,17 +46,17 @@ class Parts:
             self._fs.makedirs(self._root, exist_ok=True)
 
     def finished(self, items: Sequence[Item]) -> set[str]:
-        """Keys of the items whose parts are there."""
+        """Return the keys of the items whose parts exist."""
         self._fs.invalidate_cache()
         names = {path.rpartition("/")[2] for path in self._fs.ls(self._root, detail=False)}
         return {item.key for item in items if item.key + _SUFFIX in names}
 
     def has(self, item: Item) -> bool:
-        """True if the item's part is there."""
+        """True if the item's part exists."""
         return bool(self._fs.exists(self._path(item)))
 
     def write(self, item: Item, columns: Columns) -> None:
-        """Writes the item's part, or leaves none. Raises OSError."""
+        """Write the item's part, whole or not at all; columns are float32 [T], for T frames. Raises OSError."""
         import pyarrow as pa
         from pyarrow import parquet
 
@@ -71,16 +71,16 @@ class Parts:
                 with whole_file(Path(self._path(item))) as file:
                     file.write_bytes(content.getvalue())
             else:
-                self._fs.pipe_file(self._path(item), content.getvalue())  # object stores show no half of an object
+                self._fs.pipe_file(self._path(item), content.getvalue())  # object stores show only whole objects
 
     def read(self, item: Item) -> Any:
-        """The item's table. Raises DatasetError for a part that is missing or not whole."""
+        """Return the item's part, a pyarrow Table. Raises DatasetError if it is missing, damaged or of another item."""
         import pyarrow as pa
         from pyarrow import parquet
 
         path = self._path(item)
         try:
-            # without Arrow's threads: one that let go of Python's bytes as the interpreter ends would abort it
+            # no Arrow threads: a thread that releases Python's bytes while the interpreter ends aborts the process
             part = parquet.ParquetFile(pa.BufferReader(self._fs.cat_file(path)), pre_buffer=False)
             table = part.read(use_threads=False)
         except FileNotFoundError as error:
@@ -94,9 +94,9 @@ class Parts:
         return table
 
     def read_all(self, plan: Plan) -> Any:
-        """The rows of all items of a plan, in order.
+        """Return the rows of all items of a plan, in order, a pyarrow Table.
 
-        Raises DatasetError for a part that is missing, has other columns than the first, or is out of order.
+        Raises DatasetError for a part that is missing, damaged, out of order, or has other columns than the first part.
         """
         import pyarrow as pa
 
@@ -116,7 +116,7 @@ class Parts:
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """Makes an OSError say what to do."""
+        """Add the remedy to an OSError."""
         try:
             yield
         except OSError as error:
@@ -126,7 +126,7 @@ class Parts:
 
 @contextmanager
 def whole_file(target: Path) -> Iterator[Path]:
-    """A file to be written. At the end of the block it takes the place of ``target``, which others see whole or not."""
+    """Yield a file to write, which replaces ``target`` in one step after the block, but not after an exception."""
     written = target.with_name(f".tmp-{uuid.uuid4().hex}")
     try:
         yield written

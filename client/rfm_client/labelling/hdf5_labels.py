@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Labels of an HDF5 dataset as HDF5: ``data/demo_<i>/<name>_progress`` and so on, float32 [T]. Needs h5py.
+"""Labels of an HDF5 dataset in HDF5: ``data/demo_<i>/<name>_<column>``, float32 [T], for T frames. Needs h5py.
 
-They go to a file of their own beside the dataset, or into the dataset's file if the caller asks for that.
+The labels have a file of their own, or with ``in_place`` are in the dataset's file.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from rfm_client.labelling.label_files import canonical_json
 from rfm_client.labelling.labelled_before import LabelFile
 from rfm_client.labelling.plan import Item, Plan
 
-_DATASET_BYTES, _FILE_BYTES = 2**12, 2**20  # more than HDF5 takes for a dataset of one column, and for all attributes
+_DATASET_BYTES, _FILE_BYTES = 2**12, 2**20  # upper bounds of HDF5's overhead: for one column, for all attributes
 _REMEDY = "make room, or leave --in-place away: then the labels are in a file of their own"
 
 
 def hdf5_labels(file: Path, name: str) -> LabelFile | None:
-    """The labels of this name in the file; None: there are none. Raises DatasetError for what is no HDF5 file."""
+    """Return the labels of this name in the file; None: no such labels. Raises DatasetError if it is no HDF5 file."""
     import h5py
 
     if not file.exists():
@@ -42,7 +42,7 @@ def hdf5_labels(file: Path, name: str) -> LabelFile | None:
 
 
 def check_room(file: Path, plan: Plan) -> None:
-    """Raises DatasetError if the disk has no room for a copy of the dataset's file with labels in it."""
+    """Raise DatasetError if the disk has no room for a copy of the dataset's file with labels."""
     target = file.resolve()
     needed, free = target.stat().st_size + _most_bytes(plan), shutil.disk_usage(target.parent).free
     expected = f"{needed} bytes of free disk, for a copy that takes its place when it is whole"
@@ -50,16 +50,14 @@ def check_room(file: Path, plan: Plan) -> None:
 
 
 def write_hdf5(file: Path, plan: Plan, labels: Any, name: str, *, in_place: bool) -> None:
-    """Writes labels to a new file, which takes the file's place when it is whole.
+    """Write labels to a new file, then replace ``file`` by it. Raises OSError, with ``file`` unchanged.
 
-    labels: of ``Parts.read_all``
-    in_place: the file is the dataset's own: the new one is a copy of it, in which the labels of this name give way
-
-    Raises OSError; then the file is as it was.
+    labels: table of ``Parts.read_all``
+    in_place: True: ``file`` is the dataset's own; the new file is its copy with the labels of this name replaced
     """
     import h5py
 
-    target = file.resolve()  # or a link would give way to the copy
+    target = file.resolve()  # otherwise the copy would replace a link, not its target
     try:
         with whole_file(target) as written:
             if in_place:
@@ -69,22 +67,22 @@ def write_hdf5(file: Path, plan: Plan, labels: Any, name: str, *, in_place: bool
             _reserve(written, _most_bytes(plan))
             with h5py.File(written, "r+") as opened:
                 _write(opened.require_group("data"), plan, labels, name)
-    except (OSError, RuntimeError) as error:  # RuntimeError is how h5py reports some failed writes
+    except (OSError, RuntimeError) as error:  # h5py reports some failed writes as RuntimeError
         advice = _REMEDY if in_place else "make room, and run the same command"
         got = f"{error}, and no file has changed: {advice}"
         raise OSError(f"{file}: expected to write the labels, got {got}") from error
 
 
 def _most_bytes(plan: Plan) -> int:
-    """More than the labels of the plan take."""
+    """An upper bound of the labels' size in the file."""
     num_columns = len((PROGRESS, SUCCESS)) * (1 + len(plan.recipe.cameras))
     return _FILE_BYTES + num_columns * (4 * plan.num_frames + _DATASET_BYTES * len(plan.items))
 
 
 def _reserve(file: Path, num_bytes: int) -> None:
-    """Appends so many bytes, of which HDF5 keeps what it needs: h5py breaks down where the disk is full in the middle.
+    """Append zeros, so that a full disk raises OSError here: h5py breaks down if the disk fills while it writes.
 
-    Raises OSError.
+    HDF5 keeps only the bytes that it needs.
     """
     with file.open("ab") as opened:
         while num_bytes > 0:
@@ -92,7 +90,7 @@ def _reserve(file: Path, num_bytes: int) -> None:
 
 
 def _write(group: Any, plan: Plan, labels: Any, name: str) -> None:
-    """The labels of the plan in place of all of this name."""
+    """Replace all labels of this name by those of the plan."""
     columns = [column for column in labels.column_names if column not in IDENTITY]
     start = 0
     for label in _labels(group, name):
@@ -117,7 +115,7 @@ def _read(file: Path, name: str, items: Sequence[Item]) -> Iterator[tuple[Item, 
 
 
 def _labels(group: Any, name: str) -> list[str]:
-    """Paths of the labels of this name, and of no other that begins alike, in all demonstrations."""
+    """Paths of the labels of this name in all demonstrations, without longer names that begin with it."""
     column = re.compile(rf"{re.escape(name)}_({PROGRESS}|{SUCCESS})(\..+)?")
     demos = {demo: content for demo, content in group.items() if hasattr(content, "keys")}
     return [f"{demo}/{each}" for demo, content in demos.items() for each in content if column.fullmatch(each)]

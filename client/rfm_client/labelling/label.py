@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""From a dataset and a scorer to files of labels: plan, score, put together."""
+"""Label a dataset: plan, score, write the label files."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ _ANY_CLUSTER = RayOptions()
 
 @dataclass(frozen=True)
 class Report:
-    """What a run has done.
+    """The result of a labelling run.
 
-    files: that were written; none if an episode failed, or if only a shard was labelled
+    files: label files that were written; empty if an episode failed, or for a shard
     failures: episodes without labels
-    parts: where the finished episodes are
+    parts: folder or URL of the finished episodes
     summary: None: no file was written
-    plan: which episodes were to be labelled, and how
+    plan: the episodes to label, and the recipe
     """
 
     files: Sequence[Path]
@@ -57,7 +57,12 @@ class Report:
 
 @dataclass(frozen=True)
 class Outputs:
-    """Where the labels go. dataset: None: only the names of the Parquet files are asked for"""
+    """Paths of parts and label files, without formats that are not to be written.
+
+    dataset: None: only the paths of Parquet files are needed
+
+    Raises DatasetError for HDF5 labels of a dataset that is no HDF5 file.
+    """
 
     folder: Path
     options: LabelOptions
@@ -70,13 +75,13 @@ class Outputs:
 
     @property
     def formats(self) -> Sequence[Format]:
-        """Which files are written."""
+        """The formats to write; by default those of the dataset's kind."""
         by_kind: Sequence[Format] = ("hdf5",) if isinstance(self.dataset, Hdf5Dataset) else ("progress", "signals")
         return self.options.formats or by_kind
 
     @property
     def progress(self) -> list[Path]:
-        """The progress file, and the same under another name."""
+        """The progress file, then its alias."""
         named = self.folder / f"{self.options.name}{PROGRESS_ENDING}"
         alias = [self.folder / f"{self.options.alias}.parquet"] if self.options.alias else []
         return [named, *alias] if "progress" in self.formats else []
@@ -88,7 +93,7 @@ class Outputs:
 
     @property
     def hdf5(self) -> list[Path]:
-        """The HDF5 file: of its own, or the dataset's."""
+        """The labels' own HDF5 file, or the dataset's."""
         if "hdf5" not in self.formats or not isinstance(self.dataset, Hdf5Dataset):
             return []
         own = self.folder / f"{self.dataset.file.stem}.{self.options.name}_rewards.hdf5"
@@ -96,11 +101,11 @@ class Outputs:
 
     @cached_property
     def parts(self) -> Parts:
-        """The finished episodes. Makes their folder."""
+        """The finished episodes. The first access makes their folder."""
         return Parts(self.options.parts or str(self.folder / f".{self.options.name}_parts"))
 
     def make_folder(self) -> None:
-        """Makes the folder, if it is not there. Raises DatasetError if labels cannot be written there."""
+        """Make the folder if it is missing. Raises DatasetError if labels cannot be written there."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             if not os.access(self.folder, os.W_OK):
@@ -110,7 +115,7 @@ class Outputs:
             raise DatasetError.at(self.folder, "a folder for the labels", got) from error
 
     def before(self) -> list[LabelFile]:
-        """Those of the files that are there already. Raises DatasetError for an HDF5 file that cannot be read."""
+        """Return the label files that exist already. Raises DatasetError for an unreadable HDF5 file."""
         named = zip(self.progress, ("--name", "--alias"), strict=False)
         found = [parquet_labels(path, option) for path, option in named]
         found += [parquet_labels(path) for path in self.signals]
@@ -118,7 +123,7 @@ class Outputs:
         return [each for each in found if each is not None]
 
     def write(self, plan: Plan, labels: Any) -> list[Path]:
-        """Writes the labels, those of all parts, to all files. Raises OSError."""
+        """Write ``labels``, the table of ``Parts.read_all``, to all files, and return their paths. Raises OSError."""
         columns = [name for name in labels.column_names if name not in IDENTITY]
         sidecars = [progress_file(path, plan, columns) for path in self.progress]
         sidecars += [signals_file(path, plan, columns, self.options.name) for path in self.signals]
@@ -133,9 +138,9 @@ class Outputs:
 
 
 def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch = _QUIET) -> Plan:
-    """What would be labelled, and how; all that contradicts itself is found here, but for missing frames.
+    """Check everything except the frames, report decisions to ``watch``, and return the plan.
 
-    Raises DatasetError, and RewardError where the scorer does not answer.
+    Raises DatasetError, RewardError if the scorer does not answer, ValueError if the rule lacks its number of frames.
     """
     recipe = Recipe.of(options, dataset, scorer.checkpoint())
     episodes = selected(dataset, options)
@@ -149,7 +154,7 @@ def plan_labels(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: 
 
 
 def check_frames(dataset: Dataset, recipe: Recipe, items: Sequence[Item], watch: Watch = _QUIET) -> int:
-    """Finds every frame of these episodes. Gives how many bytes they take as they are stored; raises DatasetError."""
+    """Find every frame of these episodes, and return their stored size in bytes. Raises DatasetError."""
     watch.checking(len(items))
     num_bytes = 0
     for item in items:
@@ -159,12 +164,13 @@ def check_frames(dataset: Dataset, recipe: Recipe, items: Sequence[Item], watch:
 
 
 def label(dataset: Dataset, scorer: Scorer, options: LabelOptions = _DEFAULTS, watch: Watch = _QUIET) -> Report:
-    """Labels every frame of the chosen episodes, and writes the files. What is finished stays finished.
+    """Label every frame of the chosen episodes, and write the label files.
 
-    An episode that fails is in the report; then no file is written, and the same call goes on with what is missing.
+    If an episode fails, the report names it, and no label file is written. The same call then labels only the missing
+    episodes.
 
-    Raises DatasetError before the first frame is scored for a dataset that contradicts itself, or a file of labels that
-    is there and not this run's; RewardError for a scorer that is gone; OSError for a full disk.
+    Raises DatasetError, before the first score, for a contradictory dataset or a label file that it may not replace;
+    RewardError if the scorer is gone; OSError for a full disk.
     """
     outputs, plan = _begin(dataset, scorer, options, watch)
     failures = Run(plan, dataset, scorer, outputs.parts, watch).finish_all(options.workers)
@@ -182,10 +188,10 @@ def label_with_ray(
     orient: Orient = Orient(),
     ray: RayOptions = _ANY_CLUSTER,
 ) -> Report:
-    """Labels as ``label`` does, on a Ray cluster, whose actors open the dataset and connect themselves.
+    """Label as ``label`` does, on a Ray cluster. Each actor opens the dataset and connects by itself.
 
     source, task, override_task, orient: as in ``open_dataset``
-    connect: gives a scorer, on any node; here it tells the checkpoint's facts
+    connect: returns a context with a scorer, on any node; this process reads the checkpoint's facts with it
     """
     opening = {"task": task, "override_task": override_task, "orient": orient}
     dataset = open_dataset(source, task=task, override_task=override_task, orient=orient)
@@ -197,7 +203,7 @@ def label_with_ray(
 
 
 def _begin(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch) -> tuple[Outputs, Plan]:
-    """The plan, when all of its frames that have no labels yet are known to be there."""
+    """Make the plan, restore parts from label files, and check the frames of all others."""
     outputs = Outputs(options.output or dataset.root, options, dataset)
     before: list[LabelFile] = []
     if options.shard is None:
@@ -215,13 +221,13 @@ def _begin(dataset: Dataset, scorer: Scorer, options: LabelOptions, watch: Watch
 
 
 def _put_together(plan: Plan, outputs: Outputs, failures: Sequence[FailedEpisode], watch: Watch) -> Report:
-    """Writes the files, unless an episode failed or only a shard was labelled."""
+    """Write the label files, unless an episode failed or the run labelled only a shard."""
     report = Report([], failures, outputs.parts.url, None, plan)
     if failures or outputs.options.shard is not None:
         return report
     labels = outputs.parts.read_all(plan)
     files = outputs.write(plan, labels)
-    assert outputs.dataset is not None  # of a run
+    assert outputs.dataset is not None  # ``_begin`` sets it
     num_episodes = len(outputs.dataset.episodes)
     if len(plan.items) < num_episodes:
         others = "; LeRobot's reader gives frames of the others the weight 1.0" if outputs.progress else ""

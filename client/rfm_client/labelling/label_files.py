@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""The Parquet files of labels that training reads, written and read: one row a frame, in the dataset's order.
+"""Write and read Parquet label files: a row for each frame, in the dataset's order. Needs pyarrow.
 
-``<name>_progress.parquet``: the form of LeRobot's reward-aligned behaviour cloning and of the Hub's visualizer. Columns
-int64 ``index``, ``episode_index``, ``frame_index``, then float32 ``progress_sparse``, ``success``, and each camera's.
+``<name>_progress.parquet``: the format of LeRobot's reward-aligned behaviour cloning and of the Hub's visualizer.
+Columns: int64 ``index``, ``episode_index``, ``frame_index``, then float32 ``progress_sparse``, ``success``, and those
+of each camera.
 
-``reward_signals/<name>.parquet``: the form of LeRobot's frame signals (schema version 1), as its open pull requests
-propose it. The same first columns, then ``reward.<name>.progress``, ``reward.<name>.success_probability``, and each
-camera's, with a description of each in the metadata.
-
-Needs pyarrow. T frames of an episode.
+``reward_signals/<name>.parquet``: LeRobot's frame signals (schema version 1), as its open pull requests propose them.
+Columns: the same int64 columns, then float32 ``reward.<name>.progress``, ``reward.<name>.success_probability``, and
+those of each camera. The metadata describes each.
 """
 
 from __future__ import annotations
@@ -35,9 +34,9 @@ SIGNALS_FOLDER = "reward_signals"
 PROVENANCE_KEY = b"rfm.provenance"
 SIGNALS_PROVENANCE_KEY = b"lerobot.reward_scoring.provenance"
 
-_EPISODES_KEY = b"rfm.episodes"  # the digest of each, so that a later run knows whether its labels still hold
-_ROWS_AT_A_TIME = 2**17  # of one row group
-_OWN_NAME = "rfm"  # of labels whose name nobody chose
+_EPISODES_KEY = b"rfm.episodes"  # each episode's digest, by which a later run sees if its labels still hold
+_ROWS_AT_A_TIME = 2**17  # in a row group
+_OWN_NAME = "rfm"  # default of ``LabelOptions.name``
 _PROGRESS_NAMES = ("progress_sparse", "progress_dense", "progress")
 _SIGNAL_NAMES = {PROGRESS: "progress", SUCCESS: "success_probability"}
 _DESCRIPTIONS = {PROGRESS: "Share of the task that is done", SUCCESS: "Probability that the task is done"}
@@ -45,9 +44,9 @@ _DESCRIPTIONS = {PROGRESS: "Share of the task that is done", SUCCESS: "Probabili
 
 @dataclass(frozen=True)
 class Sidecar:
-    """One file of labels to be written.
+    """A Parquet label file to write.
 
-    columns: name of each column of scores, by its name in the parts
+    columns: each score column's name in the file, by its name in the parts
     metadata: of the Parquet schema
     """
 
@@ -57,7 +56,7 @@ class Sidecar:
 
 
 def progress_file(path: Path, plan: Plan, columns: Sequence[str]) -> Sidecar:
-    """The progress file for these columns of the parts."""
+    """Return the progress file for these columns of the parts."""
     checkpoint = plan.recipe.checkpoint
     model = checkpoint.source or checkpoint.weights_digest
     metadata = {
@@ -69,7 +68,7 @@ def progress_file(path: Path, plan: Plan, columns: Sequence[str]) -> Sidecar:
 
 
 def signals_file(path: Path, plan: Plan, columns: Sequence[str], name: str) -> Sidecar:
-    """The file of frame signals for these columns of the parts."""
+    """Return the file of frame signals for these columns of the parts."""
     signals = {}
     for column in columns:
         score, dot, camera = column.partition(".")
@@ -94,16 +93,14 @@ def _descriptor(column: str) -> dict[str, Any]:
         "bounds": [0.0, 1.0],
         "unit": None,
         "missing_values": "forbidden",
-        "allow_nan": False,  # how another revision of the proposal says the same
+        "allow_nan": False,  # the same in another revision of the proposal
     }
 
 
 def write_sidecars(labels: Any, sidecars: Sequence[Sidecar]) -> None:
-    """Writes these labels to all files, and puts each in its place when all are whole.
+    """Write new files with the labels, then put all in place. Raises OSError; a failed write changes no file.
 
-    labels: of ``Parts.read_all``
-
-    Raises OSError: then no file changes.
+    labels: table of ``Parts.read_all``
     """
     import pyarrow as pa
     from pyarrow import parquet
@@ -120,7 +117,7 @@ def write_sidecars(labels: Any, sidecars: Sequence[Sidecar]) -> None:
 
 
 def parquet_labels(path: Path, option: str = "--name") -> LabelFile | None:
-    """The labels in the file of this path; None: there is none. option: chooses another path"""
+    """Return the labels in the file; None: no file. ``option``: the command-line option that chooses another path."""
     from pyarrow import ArrowException, parquet
 
     if not path.exists():
@@ -144,13 +141,13 @@ def _read(path: Path, items: Sequence[Item]) -> Iterator[tuple[Item, Columns]]:
 
 
 def canonical_json(document: Any) -> bytes:
-    """The document as JSON, the same bytes for the same document."""
+    """Return the document as JSON; equal documents give equal bytes."""
     return json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """float32 [T] each, NaN where there is no label. success: None: the checkpoint does not predict it"""
+    """Scores of T frames, float32 [T] each, NaN for a frame without a label. success: None: not predicted"""
 
     progress: Float32Array
     success: Float32Array | None
@@ -158,10 +155,11 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class EpisodeLabels:
-    """The labels of one episode.
+    """The labels of one episode, with T labelled frames.
 
-    frames: int64 [T], the numbers of its frames that are labelled
-    cameras: each camera's curve, where there are several; ``fused`` is what became of them
+    frames: int64 [T], numbers of the labelled frames in the episode
+    fused: scores fused over all cameras
+    cameras: each camera's scores; empty for a single camera
     """
 
     frames: npt.NDArray[np.int64]
@@ -170,9 +168,9 @@ class EpisodeLabels:
 
 
 def find_label_files(root: Path) -> list[Path]:
-    """The files of labels in a dataset's folder. Those under the default name come first.
+    """Return the Parquet label files in a dataset's folder, those with the default name first.
 
-    Of labels that are there in both forms, only the progress file is named.
+    For labels in both formats, return only the progress file.
     """
     progress = sorted(root.glob(f"*{PROGRESS_ENDING}"))
     named = {file.name.removesuffix(PROGRESS_ENDING) for file in progress}
@@ -182,11 +180,11 @@ def find_label_files(root: Path) -> list[Path]:
 
 
 def read_label_table(file: Path, *, episode: int | None = None) -> Any:
-    """The table of a file of labels of either form, whose columns of scores are named as in the parts.
+    """Return a label file of either format as a pyarrow Table, with the parts' column names. Raises DatasetError.
 
-    These are ``progress``, ``success``, and each camera's, ``progress.<camera>``. episode: the rows of this one alone
+    Score columns: ``progress``, ``success``, ``progress.<camera>``, ``success.<camera>``, as far as the file has them.
 
-    Raises DatasetError.
+    episode: only this episode's rows; None: all
     """
     from pyarrow import ArrowException, parquet
 
@@ -201,7 +199,7 @@ def read_label_table(file: Path, *, episode: int | None = None) -> Any:
 
 
 def read_episode_labels(file: Path, episode: int) -> EpisodeLabels | None:
-    """The labels of an episode; None: the file has none of it. Raises DatasetError."""
+    """Return the labels of an episode; None: the file does not have the episode. Raises DatasetError."""
     table = read_label_table(file, episode=episode)
     require(file, "frame_index" in table.column_names, "the column frame_index", ", ".join(table.column_names))
     if not len(table):
@@ -217,7 +215,7 @@ def read_episode_labels(file: Path, episode: int) -> EpisodeLabels | None:
 
 
 def _score_columns(file: Path, names: Sequence[str]) -> dict[str, str]:
-    """The columns of scores by their names in the parts. Raises DatasetError if there is no progress, or no episode."""
+    """Score columns by their names in the parts. Raises DatasetError without progress or ``episode_index``."""
     require(file, "episode_index" in names, "the column episode_index", ", ".join(names))
     own = next((name for name in _PROGRESS_NAMES if name in names), None)
     signal = next((name for name in names if name.startswith("reward.") and name.endswith(".progress")), None)

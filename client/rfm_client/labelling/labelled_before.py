@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Labels that are there when a run begins: kept if they are of the same recipe, and else replaced only on request."""
+"""Labels that exist when a run begins: kept if their recipe is the same, else replaced only on request."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _OTHERS = "those of others, or of videos that have changed or were copied (--ver
 
 @dataclass(frozen=True)
 class LabelFile:
-    """A file of labels that is there.
+    """An existing label file.
 
-    flaw: why nothing of it can be kept, whatever the run; None: it says what its labels are made of
-    digests: those of the items that its episodes were, by number
-    read: gives the scores of items, as far as they are there
-    option: chooses another name for it
+    flaw: why no run can keep its labels; None: its metadata tells how they were made
+    digests: digest of each labelled item, by episode number
+    read: yields the scores of items, as far as the file has them
+    option: command-line option that chooses another name
     """
 
     path: Path
@@ -41,7 +41,7 @@ class LabelFile:
 
     @classmethod
     def of(cls, path: Path, provenance: Any, digests: Any, read: Reader, option: str = "--name") -> LabelFile:
-        """The file with these documents as it holds them, JSON."""
+        """Return the label file with these JSON texts of its metadata, None if absent."""
         told, by_episode = _parsed(provenance), _parsed(digests)
         if not str(told.get("writer")).startswith("rfm-client") or not isinstance(told.get("dataset"), dict):
             return cls(path, "labels of another program", {}, {}, read, option)
@@ -49,9 +49,9 @@ class LabelFile:
         return cls(path, flaw, told, {int(index): digest for index, digest in by_episode.items()}, read, option)
 
     def check(self, plan: Plan, dataset: Dataset, known: Mapping[int, Item]) -> Mapping[int, Item]:
-        """The items of its episodes. Raises DatasetError if its labels would be lost, or are not those of the frames.
+        """Return its items by episode number. Raises DatasetError if labels would be lost, or do not fit the frames.
 
-        known: the items that are chosen to be labelled, or of which other files have labels
+        known: items of the plan, and of label files checked before
         """
         there, now = _settings(_recipe(self.provenance)), _settings(_recipe(plan.provenance()))
         names = [name for name in dict.fromkeys([*now, *there]) if there.get(name) != now.get(name)]
@@ -76,10 +76,9 @@ class LabelFile:
 
 
 def joined(plan: Plan, dataset: Dataset, files: Sequence[LabelFile], overwrite: bool, watch: Watch) -> Plan:
-    """The plan, and all episodes besides that the files have labels of.
+    """Return the plan with all other episodes whose labels are in the files.
 
-    Raises DatasetError for a file whose labels would be lost, or would not be those of the frames any more. On
-    ``overwrite`` such a file is replaced.
+    Raises DatasetError, without ``overwrite``, for a file whose labels would be lost or do not fit the frames.
     """
     known: Mapping[int, Item] = {item.episode.index: item for item in plan.items}
     for file in files:
@@ -96,7 +95,7 @@ def joined(plan: Plan, dataset: Dataset, files: Sequence[LabelFile], overwrite: 
 
 
 def restore(plan: Plan, parts: Parts, files: Sequence[LabelFile]) -> None:
-    """Writes the parts of the plan that are gone, and whose labels the files have. Raises OSError."""
+    """Write each missing part of the plan whose labels are in a file. Raises OSError."""
     cameras = ("", *(f".{camera}" for camera in plan.recipe.cameras))
     order = [name + camera for name in (PROGRESS, SUCCESS) for camera in cameras]
     finished = parts.finished(plan.items)
@@ -112,13 +111,13 @@ def restore(plan: Plan, parts: Parts, files: Sequence[LabelFile]) -> None:
 
 
 def _recipe(provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """What decides labels, whatever the episode: the digests of episodes tell a dataset from another one."""
+    """The provenance without the dataset's source: the episodes' digests identify the dataset."""
     dataset = provenance.get("dataset", {})
     return {**provenance, "writer": None, "dataset": {"kind": dataset.get("kind")}}
 
 
 def _settings(document: Mapping[str, Any]) -> dict[str, str]:
-    """Each setting by its path, as messages show it: ``sampling.frames``."""
+    """Settings by their paths in messages, for example ``sampling.frames``."""
     settings: dict[str, str] = {}
     for name, value in document.items():
         if isinstance(value, Mapping):
@@ -129,7 +128,7 @@ def _settings(document: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _parsed(document: Any) -> dict[str, Any]:
-    """The object of a JSON text; empty: there is none."""
+    """The object of a JSON text; empty if there is none."""
     try:
         parsed = json.loads(document)
     except (TypeError, ValueError):

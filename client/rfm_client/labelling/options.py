@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a caller says of a labelling run, checked once: fields for programs, options for command lines."""
+"""Options of a labelling run, checked once: fields for programs, options for command lines."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _RANGE = re.compile(r"(\d+)(?::(\d+))?")
 
 
 def parse_episodes(text: str) -> list[int]:
-    """The numbers that ``0:100,205`` names: 0 to 99, and 205. Raises ValueError."""
+    """Return the sorted numbers in ``0:100,205``: 0 to 99, and 205. Raises ValueError."""
     numbers: list[int] = []
     for part in text.split(","):
         match = _RANGE.fullmatch(part.strip())
@@ -36,7 +36,7 @@ def parse_episodes(text: str) -> list[int]:
 
 
 def parse_shard(text: str) -> tuple[int, int]:
-    """i and n of ``i/n``. Raises ValueError."""
+    """Return i and n of ``i/n``. Raises ValueError."""
     match = re.fullmatch(r"(\d+)/(\d+)", text)
     if match is None:
         raise ValueError(f"shard: expected i/n, for example 0/8, got {text!r}")
@@ -49,15 +49,14 @@ def _names(text: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class LabelOptions(Settings):
-    """How a dataset is labelled. Raises ConfigError, a ValueError.
+    """Options of a labelling run. Raises ConfigError, a ValueError.
 
-    formats: empty: ``progress`` and ``signals``, of an HDF5 dataset ``hdf5``
+    formats: empty: ``progress`` and ``signals``, for an HDF5 dataset ``hdf5``
     cameras: empty: all but depth cameras
-    sampling, frames: None: as the checkpoint was trained (``Sampling.of``)
-    episodes: by number; None: all
-    shard: (i, n): part i, from 0, of n equal parts; then only parts are written, and a run without shard puts them
-        together
-    parts: None: ``.<name>_parts`` in the output
+    sampling, frames: None: those of the checkpoint's training (``Sampling.of``)
+    episodes: numbers; None: all
+    shard: (i, n): label share i, from 0, of n equal shares, without label files; a later run without shard writes them
+    parts: None: ``.<name>_parts`` in the output folder
     """
 
     TITLE: ClassVar[str] = "Labels"
@@ -125,7 +124,7 @@ class LabelOptions(Settings):
 
 @dataclass(frozen=True)
 class RayOptions(Settings):
-    """Where and how many Ray actors label. Raises ConfigError, a ValueError."""
+    """Ray cluster, number of actors and their GPUs. Raises ConfigError, a ValueError."""
 
     TITLE: ClassVar[str] = "With --engine ray"
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which episodes are labelled, and what each one's label is made of, before the first frame is scored."""
+"""The plan of a labelling run, made before the first frame is scored: its episodes and its recipe."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from rfm_client.data.sampling import Sampling
 from rfm_client.labelling.options import LabelOptions, Mode
 from rfm_client.labelling.scorer import CheckpointFacts
 
-_RECIPE_FORMAT = 4  # another one wherever the same recipe would give other scores, or other digests
+_RECIPE_FORMAT = 4  # increased when the same recipe gives other scores or other digests
 _OF_TRAINING = {True: "as upstream's training pads shorter clips", False: "the checkpoint's training did not pad"}
 _OF_CHECKPOINT = "the most in training; if the checkpoint does not say, the most its network takes"
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """How an episode's frames become labels: what decides them besides the frames.
+    """All settings that decide a label, besides the frames.
 
-    decoders: what decodes each camera's pictures, since versions differ in colours; None: they are stored as pixels
+    decoders: library that decodes each camera's frames, with version, since versions differ in colours; None: pixels
     orientations: of the cameras that are turned
-    verify: videos are told from others by their content
+    verify: True: videos are identified by their content
     """
 
     checkpoint: CheckpointFacts
@@ -48,9 +48,9 @@ class Recipe:
 
     @classmethod
     def of(cls, options: LabelOptions, dataset: Dataset, checkpoint: CheckpointFacts) -> Recipe:
-        """The recipe that the options, or else the dataset and the checkpoint, decide.
+        """Return the recipe of the options; the dataset and the checkpoint decide the rest.
 
-        Raises DatasetError for a camera that is not there, ValueError if nobody says how many frames the rule shows.
+        Raises DatasetError for an unknown camera, ValueError if the rule lacks its number of frames.
         """
         require(dataset.source, bool(dataset.cameras), "at least one camera", "none")
         cameras = chosen_cameras(dataset, options.cameras)
@@ -70,13 +70,13 @@ class Recipe:
         )
 
     def in_one_pass(self, num_frames: int) -> bool:
-        """True if one pass over an episode of so many frames gives every frame's score."""
+        """True if one pass over ``num_frames`` frames gives every frame's score."""
         rule, frames = self.sampling.rule, self.sampling.frames
         shows_all = rule == "all" or (rule == "rint" and frames is not None and num_frames <= frames)
         return self.mode == "whole" or (shows_all and self.checkpoint.is_causal)
 
     def document(self) -> dict[str, Any]:
-        """The recipe as provenance tells it."""
+        """Return the recipe as it stands in the provenance."""
         return {
             "format": _RECIPE_FORMAT,
             "checkpoint": self.checkpoint.document(),
@@ -91,7 +91,7 @@ class Recipe:
         }
 
     def told(self, options: LabelOptions) -> list[str]:
-        """What is done, a line each, with who decided it."""
+        """Return a line for each decision, with its reason."""
         lines = [f"cameras: {', '.join(self.cameras)} ({'asked for' if options.cameras else 'all but depth cameras'})"]
         if self.mode == "whole":
             lines.append("mode: whole: the score of frame t may depend on later frames, unless the network is causal")
@@ -103,7 +103,7 @@ class Recipe:
         return lines + [f"fuse: {self.fuse} of {len(self.cameras)} cameras"] * (len(self.cameras) > 1)
 
     def check_lengths(self, episodes: Sequence[DatasetEpisode]) -> None:
-        """Raises DatasetError for an episode that the checkpoint cannot take at once, where it must."""
+        """Raise DatasetError for an episode above the checkpoint's limit, if the recipe shows whole episodes."""
         limit = self.checkpoint.max_frames
         longest = max(episodes, key=lambda episode: episode.num_frames)
         shows_all = self.mode == "whole" or self.sampling.frames is None
@@ -114,22 +114,22 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Item:
-    """One episode to be labelled. digest: of everything that decides its labels"""
+    """One episode to label. digest: of everything that decides its labels"""
 
     episode: DatasetEpisode
     digest: str
 
     @property
     def key(self) -> str:
-        """Name of its part."""
+        """Name of the item's part."""
         return f"episode-{self.episode.index:06d}-{self.digest}"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The episodes in the order of their frames, and how they are labelled.
+    """The episodes to label, in the order of their frames, and the recipe.
 
-    dataset: what provenance says of it
+    dataset: its kind, source and revision, for the provenance
     """
 
     items: Sequence[Item]
@@ -138,15 +138,15 @@ class Plan:
 
     @property
     def num_frames(self) -> int:
-        """Frames of all episodes."""
+        """Number of frames of all episodes."""
         return sum(item.episode.num_frames for item in self.items)
 
     def digests(self) -> dict[str, str]:
-        """Of what each episode's labels are made, by its number."""
+        """Return each item's digest by episode number."""
         return {str(item.episode.index): item.digest for item in self.items}
 
     def provenance(self) -> dict[str, Any]:
-        """What the labels are made of. The same for the same labels, whoever made them, and when."""
+        """Return writer, dataset and recipe of the labels, without user and time: equal runs give equal files."""
         digest = digest_of(item.digest.encode() for item in self.items)
         version = importlib.metadata.version("rfm-client")
         dataset = {**self.dataset, "digest": digest}
@@ -154,7 +154,7 @@ class Plan:
 
 
 def selected(dataset: Dataset, options: LabelOptions) -> list[DatasetEpisode]:
-    """The episodes that the options choose. Raises DatasetError for one that the dataset does not have."""
+    """Return the episodes that the options choose. Raises DatasetError for an episode that the dataset lacks."""
     episodes = {episode.index: episode for episode in dataset.episodes}
     wanted = sorted(episodes) if options.episodes is None else sorted(set(options.episodes))
     missing = [index for index in wanted if index not in episodes]
@@ -168,7 +168,7 @@ def selected(dataset: Dataset, options: LabelOptions) -> list[DatasetEpisode]:
 
 
 def make_plan(dataset: Dataset, recipe: Recipe, episodes: Iterable[DatasetEpisode]) -> Plan:
-    """The plan of these episodes. Looks at no frame of a video; raises DatasetError for a file that is not there."""
+    """Return the plan of these episodes, without a look at a video's frames. Raises DatasetError for a missing file."""
     document = json.dumps(recipe.document(), sort_keys=True)
     items = []
     for episode in episodes:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Labels on a Ray cluster: Ray Data hands episodes to actors, each of which holds a scorer. Needs ``rfm-client[ray]``.
+"""Label on a Ray cluster: Ray Data hands episodes to actors, and each actor holds a scorer. Needs ``rfm-client[ray]``.
 
-Ray only schedules. Parts and provenance are those of a run without Ray, so either goes on with what the other has left.
-Dataset and parts must be at the same place for every node: a shared folder, or for the parts a URL.
+Ray only schedules. Parts and provenance equal those of a run without Ray, so either run can continue the other. Every
+node must find dataset and parts at the same place: a shared folder, or for the parts a URL.
 """
 
 from __future__ import annotations
@@ -22,15 +22,17 @@ from rfm_client.labelling.scorer import Scorer
 
 Connect: TypeAlias = Callable[[], AbstractContextManager[Scorer]]
 
-_BATCHES_AN_ACTOR = 4  # at least, where there are enough episodes, so that all actors end at about the same time
+_BATCHES_AN_ACTOR = 4  # at least, if there are enough episodes: all actors then end at about the same time
 
 
 @dataclass(frozen=True)
 class RayJob:
-    """What every actor is told.
+    """The work of all actors.
 
-    source, opening: with which ``open_dataset`` opens the dataset
-    connect: gives the actor's scorer
+    source, opening: arguments of ``open_dataset``
+    connect: returns a context with the actor's scorer
+    parts: folder or URL of the parts
+    workers: episodes in progress at a time in an actor
     """
 
     source: str
@@ -42,21 +44,21 @@ class RayJob:
 
 
 class EpisodeActor:
-    """Labels batches of episodes: while one is scored, the next is decoded."""
+    """An actor that labels batches of episodes. It scores an episode while it decodes the next."""
 
     def __init__(self, job: RayJob) -> None:
-        self._held = ExitStack()  # what it holds is closed as soon as nothing refers to it
+        self._held = ExitStack()  # ``__del__`` closes it, also if ``__init__`` fails
         self._job = job
         self._parts = Parts(job.parts)
         self._dataset = open_dataset(job.source, **job.opening)
-        self._scorer = self._held.enter_context(job.connect())  # open as long as the actor lives
+        self._scorer = self._held.enter_context(job.connect())
 
     def __del__(self) -> None:
-        """Closes the scorer: Ray lets go of an actor's object before the actor ends."""
+        """Close the scorer: Ray releases an actor's object before the actor ends."""
         self._held.close()
 
     def __call__(self, batch: Mapping[str, Any]) -> dict[str, list[Any]]:
-        """Labels the episodes of these places in the plan. Gives for each the reason if it failed, else nothing."""
+        """Label the episodes at these places in the plan. Return a reason for each; empty: no failure."""
         (places,) = batch["places"]
         plan = replace(self._job.plan, items=[self._job.plan.items[int(place)] for place in places])
         failures = Run(plan, self._dataset, self._scorer, self._parts, Watch()).finish_all(self._job.workers)
@@ -68,7 +70,7 @@ class EpisodeActor:
 
 
 def finish_all_with_ray(job: RayJob, options: RayOptions, watch: Watch) -> list[FailedEpisode]:
-    """Labels what has no part, on a cluster. Gives what failed; raises what stops an actor, as ``RewardError``."""
+    """Label all items without a part on a cluster, and return the failures. Raises RewardError if an actor stops."""
     try:
         import ray
         import ray.data
@@ -95,9 +97,9 @@ def finish_all_with_ray(job: RayJob, options: RayOptions, watch: Watch) -> list[
 
 
 def _labelled(ray: Any, job: RayJob, options: RayOptions, places: Sequence[int]) -> Any:
-    """The Ray dataset whose rows come as episodes are labelled."""
+    """The Ray dataset whose rows arrive as batches are labelled."""
     ray.data.DataContext.get_current().enable_progress_bars = False
-    # as many episodes together as an actor has under way, fewer if there are few for each actor
+    # a batch occupies all workers of an actor, if there are enough episodes
     size = max(1, min(job.workers, len(places) // (options.actors * _BATCHES_AN_ACTOR)))
     batches = [list(places[start : start + size]) for start in range(0, len(places), size)]
     dataset = ray.data.from_items([{"places": batch} for batch in batches], override_num_blocks=len(batches))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Labels the episodes of a plan that have no part yet, several at a time."""
+"""Label the episodes of a plan that have no part yet, several at a time."""
 
 from __future__ import annotations
 
@@ -28,41 +28,41 @@ _NOT_ABOUT_ONE_EPISODE = (ServerUnavailableError, DeadlineExceededError, ModelNo
 
 
 class Watch:
-    """What a caller sees of a run. This one shows nothing; override what you want to see."""
+    """Callbacks of a run. They do nothing here; override those that you need."""
 
     def note(self, text: str) -> None:
-        """Something that was decided, or that the caller should know."""
+        """Callback with a line for the user: a decision, or a warning."""
 
     def checking(self, num_episodes: int) -> None:
-        """So many episodes are about to be checked."""
+        """Callback before the check of all episodes."""
 
     def checked(self, episode: DatasetEpisode) -> None:
-        """All frames of the episode are there."""
+        """Callback when all frames of an episode are found."""
 
     def begin(self, num_frames: int, num_finished: int) -> None:
-        """So many frames are about to be scored, of which some are finished already."""
+        """Callback before the first score, with the frames of the run, and those already finished."""
 
     def scored(self, episode: DatasetEpisode) -> None:
-        """The episode is finished."""
+        """Callback when the episode is finished."""
 
     def failed(self, episode: DatasetEpisode, error: RewardError) -> None:
-        """The episode cannot be labelled."""
+        """Callback when the episode has failed."""
 
 
 @dataclass(frozen=True)
 class FailedEpisode:
-    """An episode that has no labels, and why."""
+    """An episode without labels, and the reason."""
 
     episode: DatasetEpisode
     error: RewardError
 
 
 class _StoppedError(RewardError):
-    """The run is stopping; the episode is left to the next one."""
+    """The run is stopping; the next run labels the episode."""
 
 
 class Run:
-    """The labelling of a plan by the threads of this process."""
+    """The labelling of a plan with threads of this process."""
 
     def __init__(self, plan: Plan, dataset: Dataset, scorer: Scorer, parts: Parts, watch: Watch) -> None:
         self._plan, self._dataset, self._scorer, self._parts, self._watch = plan, dataset, scorer, parts, watch
@@ -73,10 +73,9 @@ class Run:
         self._cause: Exception | None = None
 
     def finish_all(self, workers: int) -> list[FailedEpisode]:
-        """Labels what has no part, several episodes at a time. Gives what failed.
+        """Label all items without a part, ``workers`` at a time, and return the failures.
 
-        Raises, after the episodes under way have ended, what no episode is to blame for: a server that is gone
-        (RewardError), a full disk (OSError).
+        Raises, once the episodes in progress have ended, RewardError if the server is gone, OSError for a full disk.
         """
         pending = begin(self._plan, self._parts, self._watch)
         with ThreadPoolExecutor(workers, thread_name_prefix="rfm-label") as pool:
@@ -93,13 +92,13 @@ class Run:
     def _label(self, item: Item) -> None:
         try:
             self._go_on()
-            if not self._parts.has(item):  # or another process has finished it meanwhile
+            if not self._parts.has(item):  # another process may have finished it
                 self._score(item)
             self._watch.scored(item.episode)
         except _StoppedError:
             return
         except RewardError as error:
-            is_of_one = isinstance(error, ProcessEndedError)  # after the client has asked twice
+            is_of_one = isinstance(error, ProcessEndedError)  # also at the client's second try
             if isinstance(error, _NOT_ABOUT_ONE_EPISODE) and not is_of_one:
                 self._stop(error)
                 return
@@ -115,14 +114,14 @@ class Run:
             columns = episode_columns(
                 self._dataset, item.episode, self._scorer, recipe, memory=memory, go_on=self._go_on
             )
-        except InferenceFailedError:  # perhaps of a checkpoint that came meanwhile
+        except InferenceFailedError:  # the cause may be a new checkpoint
             self._check_checkpoint()
             raise
         self._check_checkpoint()
         self._parts.write(item, columns)
 
     def _check_checkpoint(self) -> None:
-        """Raises _StoppedError, and stops the run, where another checkpoint is served by now."""
+        """Stop the run and raise _StoppedError if another checkpoint is served now."""
         try:
             planned, now = self._plan.recipe.checkpoint, self._scorer.checkpoint()
             for name in ("weights_digest", "settings_digest"):
@@ -143,12 +142,12 @@ class Run:
 
 
 def begin(plan: Plan, parts: Parts, watch: Watch) -> list[Item]:
-    """The items that have no part yet; tells the watch how many frames that is."""
+    """Return the items without a part, and report the number of frames to ``watch``."""
     finished = parts.finished(plan.items)
     watch.begin(plan.num_frames, sum(item.episode.num_frames for item in plan.items if item.key in finished))
     return [item for item in plan.items if item.key not in finished]
 
 
 def by_episode(failures: Sequence[FailedEpisode]) -> list[FailedEpisode]:
-    """The failures in the order of their episodes."""
+    """Return the failures in the order of their episodes."""
     return sorted(failures, key=lambda failure: failure.episode.index)

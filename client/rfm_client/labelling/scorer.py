@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What scores: a server behind a client, or an engine in this process. T frames, H x W pixels."""
+"""Scorers of a labelling run: a server behind a client, or an engine in this process. T frames, H x W pixels."""
 
 from __future__ import annotations
 
@@ -18,17 +18,16 @@ from rfm_client.data.datasets.protocol import digest_of
 
 @dataclass(frozen=True)
 class CheckpointFacts:
-    """What decides a checkpoint's scores, and what it takes.
+    """Facts of a checkpoint: its origin, what decides its scores, and its limits.
 
-    source, revision: where it came from; None: not known
-    weights_digest: of its weights
-    settings_digest: of what else decides its scores: configuration, encoders, dtype, device
-    max_frames: the most frames of a trajectory in training; if it does not say, the most that its network takes; None:
-        neither is known
-    frame_size: to what it brings each frame; None: that depends on the frame
-    encodes: frames can be encoded by themselves, and prefixes scored from their embeddings
-    is_causal: no frame's score depends on later frames
-    trained_padding: training padded shorter trajectories; True also of a checkpoint that does not say
+    source, revision: origin; None: unknown
+    weights_digest: of the weights
+    settings_digest: of all other causes of scores: configuration, encoders, dtype, device
+    max_frames: most frames of a trajectory, in training or for the network, the smaller number; None: both unknown
+    frame_size: size to which the checkpoint resizes frames; None: it depends on the frame
+    encodes: True if the checkpoint can encode frames alone, and score prefixes from their embeddings
+    is_causal: True if no frame's score depends on later frames
+    trained_padding: True if training padded shorter trajectories, or if unknown
     """
 
     source: str | None
@@ -42,32 +41,32 @@ class CheckpointFacts:
     trained_padding: bool = True
 
     def document(self) -> dict[str, Any]:
-        """What provenance says of it."""
+        """Return the facts for the provenance."""
         told = ("source", "revision", "weights_digest", "settings_digest")
         return {name: value for name, value in asdict(self).items() if name in told}
 
 
 class Scorer(Protocol):
-    """Scores samples of one checkpoint. Used by several threads at a time."""
+    """Scores samples with one checkpoint. Several threads use it at a time."""
 
     def checkpoint(self) -> CheckpointFacts:
-        """The facts of the checkpoint that answers now. Raises RewardError."""
+        """Return the facts of the checkpoint that answers now. Raises RewardError."""
 
     def encode(self, frames: UInt8Array, task: str) -> Trajectory:
-        """The embeddings of frames, uint8 [T, H, W, 3], and task, if the checkpoint ``encodes``. Raises RewardError."""
+        """Return embeddings of frames, uint8 [T, H, W, 3], and task; needs ``encodes``. Raises RewardError."""
 
     def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
-        """The result of each sample. Raises RewardError for the first that fails."""
+        """Return the result of each sample. Raises RewardError for the first failure."""
 
 
 class ClientScorer:
-    """Scores by asking the servers of a client, which stays open."""
+    """A scorer that asks the servers of a client. It leaves the client open."""
 
     def __init__(self, client: RewardClient) -> None:
         self._client = client
 
     def checkpoint(self) -> CheckpointFacts:
-        """The facts that the servers tell. Raises RewardError, and so where they serve different checkpoints."""
+        """Return the facts from the servers. Raises RewardError, also if the servers have different checkpoints."""
         infos = self._client.model_infos()
         digests = [_digests(told) for told in infos.values()]
         info = infos["frames"][0] if "frames" in infos else self._client.model_info(frames=True)
@@ -90,16 +89,16 @@ class ClientScorer:
         )
 
     def encode(self, frames: UInt8Array, task: str) -> Trajectory:
-        """The embeddings of frames and task. Raises RewardError."""
+        """Return embeddings of frames, uint8 [T, H, W, 3], and task. Raises RewardError."""
         return self._client.encode(Trajectory(frames=frames, task=task))
 
     def evaluate(self, samples: Sequence[ProgressSample]) -> list[ProgressResult]:
-        """The result of each sample. Raises RewardError for the first that fails."""
+        """Return the result of each sample. Raises RewardError for the first failure."""
         return cast("list[ProgressResult]", self._client.evaluate(samples))
 
 
 def _digests(infos: Sequence[ModelInfo]) -> tuple[str, str | None, str | None]:
-    """A model's name and digests. Raises InvalidSampleError if the servers serve different ones."""
+    """A model's name and digests. Raises InvalidSampleError if the digests differ between servers."""
     digests = {(info.name, info.weights_digest, info.settings_digest) for info in infos}
     if len(digests) > 1:
         told = " and ".join(sorted(f"{weights}, {settings}" for _, weights, settings in digests))

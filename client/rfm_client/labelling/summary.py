@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a file of labels says of its episodes at a glance. Needs pyarrow. E episodes."""
+"""Summary of a Parquet label file. Needs pyarrow. E episodes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rfm_client.data.datasets.protocol import require
 from rfm_client.labelling.episode_scores import PROGRESS, SUCCESS
 from rfm_client.labelling.label_files import read_label_table
 
-_BACKWARDS_BY = 0.01  # the kappa of reward-aligned behaviour cloning: less is noise
+_BACKWARDS_BY = 0.01  # kappa of reward-aligned behaviour cloning; less is noise
 _MOST_LISTED = 12
 
 
@@ -23,12 +23,11 @@ _MOST_LISTED = 12
 class Summary:
     """Scores of each episode.
 
-    episodes: int64 [E], their numbers
-    final_progress: float32 [E]
-    best_success: float32 [E], the highest of each; None: the checkpoint does not predict success
+    episodes: int64 [E], numbers of the episodes
+    final_progress: float32 [E], at the last frame
+    best_success: float32 [E], highest success; None: the checkpoint does not predict success
     backwards: float64 [E], share of steps on which progress falls by more than 0.01
-    disagreement: float64 [E], how far the cameras' progress is apart, in the mean over its frames; None: there are no
-        scores of several cameras
+    disagreement: float64 [E], range of the cameras' progress, mean over frames; None: no scores of several cameras
     num_frames: of all episodes
     """
 
@@ -41,11 +40,11 @@ class Summary:
 
     @property
     def never_succeed(self) -> npt.NDArray[np.int64] | None:
-        """Numbers of the episodes in which no frame has a success of 0.5 or more; None: success is not predicted."""
+        """int64 [N], episodes in which no frame has a success of 0.5 or more; None: success is not predicted."""
         return None if self.best_success is None else self.episodes[self.best_success < SUCCESS_THRESHOLD]
 
     def rows(self) -> list[tuple[str, str]]:
-        """What a table tells, line by line."""
+        """Return name and value of each row of a table."""
         quantiles = np.quantile(self.final_progress, [0, 0.25, 0.5, 0.75, 1])
         names = ("lowest", "lower quarter", "median", "upper quarter", "highest")
         failing = "-"
@@ -63,14 +62,14 @@ class Summary:
 
 
 def summarise(file: Path) -> Summary:
-    """The summary of a progress file or a file of frame signals. Raises DatasetError for another file."""
+    """Return the summary of a Parquet label file. Raises DatasetError for another file."""
     table = read_label_table(file)
     require(file, len(table) > 0, "labels", "none")
     return summary_of(table)
 
 
 def summary_of(labels: Any) -> Summary:
-    """The summary of a table of labels, whose columns of scores are named as those of parts."""
+    """Return the summary of labels, a pyarrow Table with the parts' column names."""
     episodes = labels["episode_index"].to_numpy()
     starts = np.flatnonzero(np.diff(episodes, prepend=episodes[0] - 1)).tolist()
     numbers, final, best, backwards, apart = [], [], [], [], []
